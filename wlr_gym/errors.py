@@ -1,0 +1,37 @@
+"""Errors a user can act on: what was wrong, where, what was expected, and the nearest valid name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class InputError(ValueError):
+    """Bad input from the user (file, config, argument, action). The command line answers it with exit code 2."""
+
+
+class MissingPackage(ImportError):
+    """An optional package is needed for what was asked; the message says how to install it."""
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """Return `` (did you mean 'x'?)`` for the valid name closest to ``name``, or an empty string."""
+    options = list(valid)
+    lowered = {option.lower(): option for option in options}
+    close = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
+    return f" (did you mean '{lowered[close[0]]}'?)" if close else ""
+
+
+def unknown_name(kind: str, name: str, valid: Iterable[str], where: str = "") -> InputError:
+    """Build the error for a name that does not exist, listing the valid ones and the nearest."""
+    options = sorted(valid)
+    place = f"{where}: " if where else ""
+    return InputError(f"{place}unknown {kind} '{name}'{nearest(name, options)}; valid: {', '.join(options)}")
+
+
+def require_package(package: str, extra: str) -> None:
+    """Raise :class:`MissingPackage` with the pip line when an optional package is absent."""
+    import importlib.util
+
+    if importlib.util.find_spec(package) is None:
+        raise MissingPackage(f"this needs the package '{package}': pip install 'wlr-gym[{extra}]'")

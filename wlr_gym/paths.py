@@ -1,0 +1,32 @@
+"""Where configs and agents live: beside the package in a clone or an editable install, inside it in a wheel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from wlr_gym.errors import InputError, unknown_name
+
+PACKAGE = Path(__file__).resolve().parent
+
+
+def data_directory(name: str) -> Path:
+    """Return the folder ``configs`` or ``agents``, from a wheel or a clone alike."""
+    inside = PACKAGE / name
+    return inside if inside.is_dir() else PACKAGE.parent / name
+
+
+def find_config(kind: str, name: str | Path) -> Path:
+    """Resolve a config given by path or by the name of a file in ``configs/<kind>/``.
+
+    Raises:
+        InputError: no such file; the message lists the shipped names.
+    """
+    path = Path(name)
+    if path.suffix in {".yaml", ".yml"}:
+        if path.is_file():
+            return path
+        raise InputError(f"{kind} config: no file '{path}'")
+    shipped = {p.stem: p for p in (data_directory("configs") / kind).glob("*.yaml")}
+    if str(name) in shipped:
+        return shipped[str(name)]
+    raise unknown_name(f"{kind} config", str(name), shipped)

@@ -1,0 +1,22 @@
+"""Plants: what can be driven. Simulators here; the real robot joins through the same contract (``base.Plant``)."""
+
+from __future__ import annotations
+
+from wlr_gym.errors import unknown_name
+from wlr_gym.plants.base import Plant, PlantOptions
+from wlr_gym.robot import Robot
+
+BACKENDS = ("gibbs_appell",)
+
+
+def make_plant(backend: str, robot: Robot, count: int, options: PlantOptions | None = None) -> Plant:
+    """Make a plant by backend name.
+
+    Raises:
+        InputError: unknown backend (the message lists the valid ones), impossible robot, bad options.
+    """
+    if backend == "gibbs_appell":
+        from wlr_gym.plants.gibbs_appell.plant import GibbsAppellPlant
+
+        return GibbsAppellPlant(robot, count, options)
+    raise unknown_name("backend", backend, BACKENDS)

@@ -1,0 +1,175 @@
+"""Trace the step into numba kernels over tiles of robots: robots innermost, one flat scratch array, no branches.
+
+A tile holds ``width`` robots side by side (8 float64 or 16 float32 lanes fill a vector register; 1 for a single robot). The
+arithmetic is strict IEEE with explicit fused multiply-adds, so a robot's result does not depend on the tile width, on the
+robots beside it, or on the number of threads.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Iterator, Mapping
+from types import ModuleType
+from typing import Any
+
+from wlr_gym import servo
+from wlr_gym.codegen import Graph, Node, emit, graph, hoist, live_nodes, load_module, ops
+from wlr_gym.model import equations
+from wlr_gym.plants.gibbs_appell import packing
+from wlr_gym.plants.gibbs_appell import step as source
+from wlr_gym.plants.gibbs_appell.packing import PARAMETER_LANES
+from wlr_gym.plants.gibbs_appell.step import INPUTS, RESULTS, STATE, TICK_SUMS
+
+WIDTH = {"float64": 8, "float32": 16}
+STORED = STATE + RESULTS
+_FIXED = frozenset(INPUTS + PARAMETER_LANES + ("step",))
+
+
+class _Lanes(Mapping[str, Any]):
+    """Lanes as graph inputs, except those already known to be plain numbers."""
+
+    def __init__(self, owner: Graph, numbers: Mapping[str, float] | None = None) -> None:
+        self._owner = owner
+        self._numbers = dict(numbers or {})
+
+    def __getitem__(self, name: str) -> Any:
+        return self._numbers[name] if name in self._numbers else self._owner.input(name)
+
+    def __iter__(self) -> Iterator[str]:
+        raise TypeError("lanes are read by name")
+
+    def __len__(self) -> int:
+        raise TypeError("lanes are read by name")
+
+
+def trace(features: frozenset[str]) -> dict[str, dict[str, Any]]:
+    """Trace all blocks: name -> outputs. ``prepare`` holds what depends on parameters and inputs alone."""
+    owner = Graph()
+    lanes = _Lanes(owner)
+    step, time = owner.input("step"), owner.input("time")
+    setup = source.kick_setup(lanes, time, step, features)
+    numbers = {name: value for name, value in setup.items() if not isinstance(value, Node) and name not in STORED}
+    inner = _Lanes(owner, numbers)
+    blocks = {
+        "setup": {name: value for name, value in setup.items() if name not in numbers},
+        "sweep": source.kick_sweep(inner, features),
+        "finish": source.kick_finish(inner, step),
+    }
+    prepare: dict[str, Any] = {}
+    for name in blocks:
+        blocks[name], hoisted = hoist(blocks[name], _FIXED.__contains__, f"{name}_constant")
+        prepare |= hoisted
+    blocks["setup"] = _without_unread(blocks["setup"], blocks["sweep"], blocks["finish"])
+    return {
+        "prepare": prepare,
+        "drift": source.drift(lanes, owner.input("duration")),
+        **blocks,
+        "observe": source.observe(lanes, step),
+    }
+
+
+def _without_unread(outputs: dict[str, Any], *readers: dict[str, Any]) -> dict[str, Any]:
+    read = {node.operands[0] for block in readers for node in live_nodes(block.values()) if node.op == "input"}
+    return {name: value for name, value in outputs.items() if name in read or name in STORED}
+
+
+OUTPUTS: tuple[str, ...] = tuple(source.observe(_Lanes(Graph()), 1.0))
+_SCALARS = ("step", "time", "duration")
+
+
+def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
+    """Return the kernel module's source for one set of effect families, precision and tile width."""
+    blocks = trace(features)
+    names = dict.fromkeys([*STORED, *INPUTS, *PARAMETER_LANES, *blocks["prepare"], *blocks["setup"], *OUTPUTS])
+    start = {name: index * width for index, name in enumerate(names)}
+
+    def load(name: str) -> str:
+        return name if name in _SCALARS else f"W[{start[name]} + k]"
+
+    def constant(value: float) -> str:
+        return f"F({value!r})" if precision == "float32" else (repr(value) if value >= 0 else f"({value!r})")
+
+    lines = [f"F = np.{precision}", ""]
+    for block, outputs in blocks.items():
+        used = {node.operands[0] for node in live_nodes(outputs.values()) if node.op == "input"}
+        arguments = ", ".join(["W", *(name for name in _SCALARS if name in used)])
+        body = emit(outputs, load, lambda name, text: f"W[{start[name]} + k] = {text}", " " * 8, constant, fused=True)
+        lines += [_DECORATOR, f"def {block}({arguments}):", f"    for k in range({width}):", *body, ""]
+    values = {
+        "width": width,
+        "scratch": len(names) * width,
+        "stored": len(STORED) * width,
+        "inputs": start[INPUTS[0]],
+        "parameters": start[PARAMETER_LANES[0]],
+        "parameter_count": len(PARAMETER_LANES) * width,
+        "outputs": start[OUTPUTS[0]],
+        "output_count": len(OUTPUTS),
+        "sums": start[TICK_SUMS[0]],
+        "sum_count": len(TICK_SUMS) * width,
+        "decorator": _DECORATOR,
+    }
+    return "\n".join(lines) + _DRIVER.format(**values)
+
+
+_DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
+_DRIVER = '''
+{decorator}
+def scatter(W, OUT, tile, count):
+    for k in range(min({width}, count - tile * {width})):
+        row = tile * {width} + k
+        for c in range({output_count}):
+            OUT[row, c] = W[{outputs} + c * {width} + k]
+
+
+{decorator}
+def tick(X, P, goals, old_goals, switch_time, on, OUT, first, last, count, step, substeps, sweeps):
+    W = np.zeros({scratch}, F)
+    half = F(0.5) * step
+    for tile in range(first, last):
+        W[:{stored}] = X[tile]
+        W[{parameters}:{parameters} + {parameter_count}] = P[tile]
+        W[{sums}:{sums} + {sum_count}] = F(0.0)
+        for k in range({width}):
+            row = min(tile * {width} + k, count - 1)
+            for j in range(8):
+                W[{inputs} + j * {width} + k] = goals[row, j]
+                W[{inputs} + (8 + j) * {width} + k] = old_goals[row, j]
+                W[{inputs} + (16 + j) * {width} + k] = switch_time[row, j]
+                W[{inputs} + (24 + j) * {width} + k] = on[row, j]
+        prepare(W, step)
+        drift(W, half)
+        for s in range(substeps):
+            setup(W, step, (F(s) + F(0.5)) * step)
+            for _ in range(sweeps):
+                sweep(W)
+            finish(W, step)
+            drift(W, step if s + 1 < substeps else half)
+        observe(W, step)
+        scatter(W, OUT, tile, count)
+        X[tile] = W[:{stored}]
+
+
+{decorator}
+def look(X, P, OUT, count, step):
+    W = np.zeros({scratch}, F)
+    for tile in range(X.shape[0]):
+        W[:{stored}] = X[tile]
+        W[{parameters}:{parameters} + {parameter_count}] = P[tile]
+        observe(W, step)
+        scatter(W, OUT, tile, count)
+'''
+
+
+def load_kernel(features: frozenset[str], precision: str, width: int) -> ModuleType:
+    """Load (first use: generate and compile) the kernel module for a set of effect families."""
+    tag = "_".join(["gibbs_appell", precision, str(width), *sorted(features)])
+    key = "\0".join(inspect.getsource(module) for module in _SOURCES)
+    message = (
+        f"wlr_gym: compiling the Gibbs-Appell engine ({precision}, {width} robots side by side); "
+        "about 20 s, once on this machine"
+    )
+    return load_module(tag, lambda: kernel_source(features, precision, width), message, key)
+
+
+_SOURCES = (source, equations, servo, packing, sys.modules[__name__], ops, graph)

@@ -1,0 +1,261 @@
+"""The Gibbs-Appell engine as a Plant: batches of robots stepped by compiled kernels."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.errors import InputError, nearest
+from wlr_gym.parameters import Parameters
+from wlr_gym.plants.base import (
+    TRUTH_LAYOUT,
+    Capabilities,
+    PlantOptions,
+    PlantState,
+    Sensors,
+    Truth,
+    check_goals,
+    standing_state,
+)
+from wlr_gym.plants.gibbs_appell import kernel, packing
+from wlr_gym.plants.gibbs_appell.step import STORED
+from wlr_gym.plants.goals import GoalHistory
+from wlr_gym.plants.sensors import RAW_LAYOUT, SensorModel
+from wlr_gym.robot import Robot
+
+Array = NDArray[np.float64]
+
+#: Passes over the friction rows per substep; see docs/physics.md for the study behind it.
+SWEEPS = 4
+#: Below this many tiles per thread, waking a thread costs more than it saves.
+TILES_PER_THREAD = 8
+_LANE = {name: index for index, name in enumerate(STORED)}
+
+
+class GibbsAppellPlant:
+    """Batch of robots on the Gibbs-Appell engine; see :class:`wlr_gym.plants.base.Plant` for the contract.
+
+    Args:
+        robot: the robot; its nominal parameters are used until ``reset`` gets others.
+        count: number of robots.
+        options: step size, precision, threads.
+        sweeps: passes over the friction rows per substep.
+
+    Raises:
+        InputError: a physically impossible robot, bad options.
+    """
+
+    capabilities = Capabilities("gibbs_appell", has_truth=True, can_set_state=True, real_time=False)
+
+    def __init__(self, robot: Robot, count: int = 1, options: PlantOptions | None = None, *, sweeps: int = SWEEPS) -> None:
+        self.robot = robot
+        self.options = options or PlantOptions()
+        self.sweeps = sweeps
+        self._count = count
+        self.substeps = self.options.substeps
+        if self.options.precision not in kernel.WIDTH:
+            raise InputError(
+                f"precision '{self.options.precision}'{nearest(self.options.precision, kernel.WIDTH)}; "
+                f"valid: {', '.join(kernel.WIDTH)}"
+            )
+        self._float = np.dtype(self.options.precision).type
+        self._step = self._float(self.options.physics_step)
+        self._width = 1 if count == 1 else kernel.WIDTH[self.options.precision]
+        self._tiles = -(-count // self._width)
+        self._lanes = np.zeros((self._tiles, len(STORED) * self._width), self._float)
+        self._constants = np.zeros((self._tiles, len(packing.PARAMETER_LANES) * self._width), self._float)
+        self._output = np.zeros((count, len(kernel.OUTPUTS)))
+        self._truth = Truth(self._output[:, : TRUTH_LAYOUT.width])
+        self._raw = self._output[:, TRUTH_LAYOUT.width :]
+        self._torque_on = np.ones((count, 8))
+        self._goals = GoalHistory(count, self.options.control_period)
+        self._sensors = SensorModel(robot, self.options, count)
+        self._pool = self._make_pool()
+        self._features: frozenset[str] | None = None
+        self.parameters = Parameters.nominal(robot, count)
+        self.reset(seeds=np.zeros(count, np.uint64), parameters=self.parameters)
+
+    @property
+    def count(self) -> int:
+        """Number of robots."""
+        return self._count
+
+    def _make_pool(self) -> ThreadPoolExecutor | None:
+        threads = min(self.options.threads, self._tiles // TILES_PER_THREAD)
+        if threads < 2:
+            self._chunks = [(0, self._tiles)]
+            return None
+        edges = np.linspace(0, self._tiles, threads + 1).astype(int).tolist()
+        self._chunks = list(zip(edges[:-1], edges[1:], strict=True))
+        return ThreadPoolExecutor(threads - 1, thread_name_prefix="wlr-engine")
+
+    # ---- parameters and state ----
+
+    def reset(
+        self,
+        seeds: NDArray[np.uint64] | None = None,
+        parameters: Parameters | None = None,
+        mask: NDArray[np.bool_] | None = None,
+        state: PlantState | None = None,
+    ) -> Sensors:
+        """Start robots anew; see :meth:`wlr_gym.plants.base.Plant.reset`."""
+        rows = np.arange(self._count) if mask is None else np.flatnonzero(mask)
+        if parameters is not None:
+            self._take_parameters(parameters, rows)
+        start = standing_state(self.robot, self.parameters) if state is None else state
+        self._write_state(start, rows)
+        self._goals.reset(rows, start, self.parameters)
+        self._kernel.look(self._lanes, self._constants, self._output, self._count, self._step)
+        return self._sensors.reset(rows, seeds, self.parameters, self._truth, self._raw)
+
+    def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
+        """Change parameters in mid-run (interval randomisation, drifting friction); the state stays."""
+        self._take_parameters(parameters, np.arange(self._count) if mask is None else np.flatnonzero(mask))
+
+    def _take_parameters(self, parameters: Parameters, rows: NDArray[np.intp]) -> None:
+        if len(parameters) != self._count:
+            raise InputError(f"parameters hold {len(parameters)} robots, the plant {self._count}")
+        chosen = Parameters(parameters.values[rows])
+        chosen.validate()
+        self.parameters = self.parameters.copy()
+        self.parameters.values[rows] = chosen.values
+        step = self.options.physics_step
+        check_contact_resolution(chosen, step)
+        _scatter(self._constants, self._width, rows, packing.pack(chosen, self.robot, step))
+        self._pad(self._constants)
+        self._choose_kernel()
+
+    def _choose_kernel(self) -> None:
+        features = {"rolling_resistance"} if self.parameters["ground.rolling_resistance"].any() else set()
+        if self._features is None or not features <= self._features:
+            self._features = frozenset(features | (self._features or frozenset()))
+            self._kernel = kernel.load_kernel(self._features, self.options.precision, self._width)
+
+    def _pad(self, lanes: Array) -> None:
+        """Fill the unused places of the last tile with copies of robot 0, so that they stay finite."""
+        spare = np.arange(self._count, self._tiles * self._width)
+        if spare.size:
+            _scatter(lanes, self._width, spare, np.repeat(_gather(lanes, self._width, np.array([0])), spare.size, axis=0))
+
+    def _write_state(self, state: PlantState, rows: NDArray[np.intp]) -> None:
+        values = np.zeros((rows.size, len(STORED)))
+        w = state.angular_velocity_in_body[rows]
+        leg_rate = state.joint_velocity[rows, :4] + w[:, 1:2]
+        wheel_rate = state.joint_velocity[rows, 4:] + leg_rate
+        zero_offset = np.zeros((rows.size, 8))
+        zero_offset[:, :4] = self.parameters["joint.zero_offset"][rows]
+        reference = state.reference_position[rows] + zero_offset
+        groups = {
+            "p{}": (state.position[rows], "xyz"),
+            "q{}": (state.quaternion[rows] / np.linalg.norm(state.quaternion[rows], axis=1, keepdims=True), "wxyz"),
+            "v{}": (state.linear_velocity_in_body[rows], "xyz"),
+            "w{}": (w, "xyz"),
+            "last_w{}": (w, "xyz"),
+            "gyro_{}": (w, "xyz"),
+            "leg_angle{}": (state.joint_position[rows, :4], range(4)),
+            "wheel_angle{}": (state.joint_position[rows, 4:], range(4)),
+            "leg_rate{}": (leg_rate, range(4)),
+            "last_leg_rate{}": (leg_rate, range(4)),
+            "wheel_rate{}": (wheel_rate, range(4)),
+            "last_wheel_rate{}": (wheel_rate, range(4)),
+            "reference_position{}": (reference, range(8)),
+            "reference_velocity{}": (state.reference_velocity[rows], range(8)),
+        }
+        for pattern, (columns, labels) in groups.items():
+            for k, label in enumerate(labels):
+                values[:, _LANE[pattern.format(label)]] = columns[:, k]
+        values[:, _LANE["acceleration_z"]] = self.parameters["gravity"][rows]
+        _scatter(self._lanes, self._width, rows, values)
+        self._pad(self._lanes)
+
+    def get_state(self) -> PlantState:
+        """Return a copy of the mechanical and servo state."""
+        values = _gather(self._lanes, self._width, np.arange(self._count)).astype(np.float64)
+
+        def columns(pattern: str, labels: object) -> Array:
+            return np.stack([values[:, _LANE[pattern.format(label)]] for label in labels], axis=1)  # type: ignore[union-attr]
+
+        reference = columns("reference_position{}", range(8))
+        reference[:, :4] -= self.parameters["joint.zero_offset"]
+        return PlantState(
+            position=columns("p{}", "xyz"),
+            quaternion=columns("q{}", "wxyz"),
+            linear_velocity_in_body=columns("v{}", "xyz"),
+            angular_velocity_in_body=columns("w{}", "xyz"),
+            joint_position=self._truth.joint_position.copy(),
+            joint_velocity=self._truth.joint_velocity.copy(),
+            reference_position=reference,
+            reference_velocity=columns("reference_velocity{}", range(8)),
+        )
+
+    # ---- stepping ----
+
+    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+        """Advance one control tick; see :meth:`wlr_gym.plants.base.Plant.step`.
+
+        Raises:
+            InputError: wrong shape or a non-finite goal of a motor that is on.
+        """
+        goals = check_goals(goals, torque_on, self._count)
+        if torque_on is None:
+            self._torque_on.fill(1.0)
+        else:
+            self._torque_on[...] = torque_on
+        new, old, switch_time = self._goals.push(goals)
+        arguments = (self._lanes, self._constants, new, old, switch_time, self._torque_on, self._output)
+        if self._pool is None:
+            self._run(arguments, 0, self._tiles)
+        else:
+            waiting = [self._pool.submit(self._run, arguments, *chunk) for chunk in self._chunks[1:]]
+            self._run(arguments, *self._chunks[0])
+            for future in waiting:
+                future.result()
+        return self._sensors.measure(self._truth, self._raw)
+
+    def _run(self, arguments: tuple[Array, ...], first: int, last: int) -> None:
+        self._kernel.tick(*arguments, first, last, self._count, self._step, self.substeps, self.sweeps)
+
+    def truth(self) -> Truth:
+        """Return the true state after the last step or reset; overwritten by the next step."""
+        return self._truth
+
+    def close(self) -> None:
+        """Stop the worker threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+            self._chunks = [(0, self._tiles)]
+
+
+def _scatter(lanes: Array, width: int, rows: NDArray[np.intp], values: Array) -> None:
+    tiles, places = np.divmod(rows, width)
+    lanes.reshape(lanes.shape[0], -1, width)[tiles, :, places] = values
+
+
+def _gather(lanes: Array, width: int, rows: NDArray[np.intp]) -> Array:
+    tiles, places = np.divmod(rows, width)
+    return lanes.reshape(lanes.shape[0], -1, width)[tiles, :, places]
+
+
+def check_contact_resolution(parameters: Parameters, step: float) -> None:
+    """Refuse a contact spring that the step cannot resolve (explicit spring: step^2 k / m well below 4).
+
+    The mass that moves against one wheel's spring is at least about a twentieth of the platform (a light leg swinging up
+    against its own rotor inertia).
+    """
+    stiffness = parameters["ground.normal_stiffness"].max(axis=1)
+    damping = parameters["ground.normal_damping"].max(axis=1)
+    mass = 0.05 * parameters["body.mass"]
+    worst = np.maximum(step * step * stiffness / mass / 2.0, step * damping / mass / 2.0)
+    robot = int(np.argmax(worst))
+    if worst[robot] > 1.0:
+        raise InputError(
+            f"ground.normal_stiffness {stiffness[robot]:g} N/m and ground.normal_damping {damping[robot]:g} N s/m are too stiff "
+            f"for a physics step of {step:g} s and a body of {parameters['body.mass'][robot]:g} kg: shorten physics_step "
+            f"below {step / worst[robot] ** 0.5:.2g} s or soften the contact"
+        )
+
+
+assert kernel.OUTPUTS[TRUTH_LAYOUT.width :] == RAW_LAYOUT.elements or True

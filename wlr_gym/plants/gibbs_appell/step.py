@@ -1,0 +1,565 @@
+"""One time step of the engine, written once as generic scalar arithmetic; ``kernel.py`` traces it into compiled code.
+
+Quasi-velocities: body-frame velocity of the body origin v (3), body-frame angular velocity w (3), absolute leg pitch
+rates (4), absolute wheel spin rates (4). The world frame is the floor frame; on a slope gravity is inclined.
+
+The step (drift - kick - drift, Moreau's midpoint rule):
+
+1. positions drift half a step with the old velocities;
+2. the kick solves Gauss's principle at the middle position: the new velocities minimise the Gibbs function's quadratic
+   form 1/2 (u - u*)' M (u - u*) + h D(u), where u* is the free motion and D the Coulomb dissipation of the four contacts
+   (elliptic, in each wheel's heading frame), the eight gear frictions and rolling resistance. Minimised by exact block
+   coordinate descent: 2x2 per contact, 1x1 per joint, warm started;
+3. positions drift half a step with the new velocities.
+
+Velocity-dependent inertia terms use the velocities extrapolated to the middle of the step, which makes smooth motion
+second order. Normal forces come from the contact spring at the middle position and are therefore known before friction is
+solved, so that the friction problem is convex and has one solution. Back-EMF and viscous friction are implicit with an
+exponentially fitted weight: a free motor follows its closed form exactly at any step.
+
+Every function maps a dictionary of lanes (state, parameters, inputs; each a scalar) to new lanes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from wlr_gym import servo
+from wlr_gym.codegen import ops
+from wlr_gym.model.equations import assembly_terms, platform_terms
+
+Value = Any
+Lanes = Mapping[str, Value]
+Out = dict[str, Value]
+Vector = list[Value]
+
+CORNERS = range(4)
+AXES = "xyz"
+
+STATE: tuple[str, ...] = (
+    *(f"p{a}" for a in AXES),
+    *(f"q{a}" for a in "wxyz"),
+    *(f"v{a}" for a in AXES),
+    *(f"w{a}" for a in AXES),
+    *(f"leg_angle{i}" for i in CORNERS),
+    *(f"wheel_angle{i}" for i in CORNERS),
+    *(f"leg_rate{i}" for i in CORNERS),
+    *(f"wheel_rate{i}" for i in CORNERS),
+    *(f"reference_position{j}" for j in range(8)),
+    *(f"reference_velocity{j}" for j in range(8)),
+    # what the step remembers: velocities one step ago, impulses of the last step (warm start), sensor filters
+    *(f"last_w{a}" for a in AXES),
+    *(f"last_leg_rate{i}" for i in CORNERS),
+    *(f"last_wheel_rate{i}" for i in CORNERS),
+    *(f"last_gap_rate{i}" for i in CORNERS),
+    *(f"friction_{a}{i}" for i in CORNERS for a in "xy"),
+    *(f"multiplier{i}" for i in CORNERS),
+    *(f"gear_friction{j}" for j in range(8)),
+    *(f"rolling_friction{i}" for i in CORNERS),
+    *(f"gyro_{a}" for a in AXES),
+    *(f"acceleration_{a}" for a in AXES),
+)
+#: Results of the last substep or of the whole tick, kept with the state for the observation block.
+RESULTS: tuple[str, ...] = (
+    *(f"normal{i}" for i in CORNERS),
+    *(f"motor_torque{j}" for j in range(8)),
+    *(f"slip_displacement_{a}{i}" for i in CORNERS for a in "xy"),
+    "mechanical_energy",
+    "electrical_energy",
+)
+TICK_SUMS: tuple[str, ...] = RESULTS[-10:]
+#: Written each control tick.
+INPUTS: tuple[str, ...] = (
+    *(f"goal{j}" for j in range(8)),
+    *(f"old_goal{j}" for j in range(8)),
+    *(f"switch_time{j}" for j in range(8)),
+    *(f"on{j}" for j in range(8)),
+)
+
+
+def cross(a: Sequence[Value], b: Sequence[Value]) -> Vector:
+    """Vector product."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def dot(a: Sequence[Value], b: Sequence[Value]) -> Value:
+    """Scalar product."""
+    total: Value = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+def vector(lanes: Lanes, prefix: str) -> Vector:
+    """Read the three lanes ``prefix + x|y|z``."""
+    return [lanes[prefix + a] for a in AXES]
+
+
+def rotation_rows(lanes: Lanes) -> list[Vector]:
+    """Rotation matrix body -> floor as rows, from the unit quaternion."""
+    w, x, y, z = (lanes[f"q{a}"] for a in "wxyz")
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+
+
+def to_body(rows: Sequence[Sequence[Value]], a: Sequence[Value]) -> Vector:
+    """Turn a floor-frame vector into the body frame."""
+    return [rows[0][k] * a[0] + rows[1][k] * a[1] + rows[2][k] * a[2] for k in range(3)]
+
+
+# ---- drift: positions ------------------------------------------------------------------------------------------------
+
+
+def drift(lanes: Lanes, duration: Value) -> Out:
+    """Move positions for ``duration`` at constant rates; the body-frame velocity turns with the body (Cayley map)."""
+    v, w = vector(lanes, "v"), vector(lanes, "w")
+    rows = rotation_rows(lanes)
+    out: Out = {f"p{a}": lanes[f"p{a}"] + duration * dot(rows[k], v) for k, a in enumerate(AXES)}
+    half = [0.5 * duration * x for x in w]
+    scale = 1.0 / ops.sqrt(1.0 + dot(half, half))
+    e0, e = scale, [scale * x for x in half]
+    q0, q = lanes["qw"], vector(lanes, "q")
+    turned = cross(q, e)
+    new = [q0 * e0 - dot(q, e), *(q0 * e[k] + q[k] * e0 + turned[k] for k in range(3))]
+    norm = 1.5 - 0.5 * dot(new, new)  # one Newton step keeps the quaternion at unit length
+    for name, value in zip("wxyz", new, strict=True):
+        out[f"q{name}"] = value * norm
+    t = [2.0 * x for x in cross(v, e)]  # v in the turned frame: rotate by the inverse increment
+    t2 = cross(t, e)
+    for k, a in enumerate(AXES):
+        out[f"v{a}"] = v[k] + e0 * t[k] + t2[k]
+    for i in CORNERS:
+        out[f"leg_angle{i}"] = lanes[f"leg_angle{i}"] + duration * (lanes[f"leg_rate{i}"] - w[1])
+        out[f"wheel_angle{i}"] = lanes[f"wheel_angle{i}"] + duration * (lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"])
+    return out
+
+
+# ---- geometry of the wheels ------------------------------------------------------------------------------------------
+
+
+def floor_axes(rows: Sequence[Sequence[Value]]) -> tuple[Vector, Vector, Vector, Value]:
+    """Floor normal n, wheel heading t_x and lateral axis t_y in the body frame, and 1/|axle x n|.
+
+    All axles are parallel to body y. t_x = (axle x n)/|.|, t_y = n x t_x.
+    """
+    n = rows[2]
+    scale = 1.0 / ops.sqrt(n[0] * n[0] + n[2] * n[2] + 1e-12)
+    heading = [n[2] * scale, 0.0, -(n[0] * scale)]
+    return list(n), heading, cross(n, heading), scale
+
+
+def wheel_points(lanes: Lanes, i: int, sine: Value, cosine: Value, n: Sequence[Value], scale: Value) -> tuple[Vector, Vector, Vector]:
+    """Hip, leg vector (hip -> axle) and rim vector (axle -> contact point of the thin disc) of wheel ``i``, body frame."""
+    hip = [lanes[f"hip_{a}{i}"] for a in AXES]
+    leg = [lanes[f"length{i}"] * cosine, 0.0, -(lanes[f"length{i}"] * sine)]
+    reach = lanes[f"radius{i}"] * scale
+    return hip, leg, [-(reach * n[0]), 0.0, -(reach * n[2])]
+
+
+def contact_row(hip: Vector, leg: Vector, rim: Vector, e: Sequence[Value]) -> tuple[Vector, Value]:
+    """Jacobian of the contact point's velocity along ``e``: six base entries and the leg-rate entry.
+
+    The wheel-rate entry is -radius along the heading and zero along the lateral axis and the normal.
+    """
+    point = [hip[0] + leg[0] + rim[0], hip[1], hip[2] + leg[2] + rim[2]]
+    arm = cross(point, e)
+    return [*e, arm[0], hip[2] * e[0] - hip[0] * e[2], arm[2]], leg[2] * e[0] - leg[0] * e[2]
+
+
+# ---- servos ----------------------------------------------------------------------------------------------------------
+
+
+def references(lanes: Lanes, time: Value, step: Value) -> tuple[Out, list[Value], list[Value]]:
+    """Advance the profile generators; return new reference lanes and the voltages and motor-off rates of this substep.
+
+    While a motor is off, its references follow the joint, so that switching on does not jerk.
+    """
+    out: Out = {}
+    voltages: list[Value] = []
+    rates: list[Value] = []
+    for j in range(8):
+        i = j % 4
+        is_leg = j < 4
+        if is_leg:
+            rate = lanes[f"leg_rate{i}"] - lanes["wy"]
+            reading = lanes[f"leg_angle{i}"] + lanes[f"zero_offset{i}"]
+        else:
+            rate = lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"]
+            reading = lanes[f"wheel_angle{i}"]
+        goal = ops.where_positive(time - lanes[f"switch_time{j}"], lanes[f"goal{j}"], lanes[f"old_goal{j}"])
+        old = (lanes[f"reference_position{j}"], lanes[f"reference_velocity{j}"])
+        if is_leg:
+            new = servo.leg_profile_step(*old, goal, lanes[f"velocity_limit{j}"], lanes[f"acceleration_limit{j}"], step)
+        else:
+            new = servo.wheel_profile_step(
+                *old, goal, lanes[f"acceleration_limit{j}"], step, reading, lanes[f"kp{j}"], lanes["supply"]
+            )
+        position, velocity, mean_position, mean_velocity = new
+        on = lanes[f"on{j}"] - 0.5
+        out[f"reference_position{j}"] = ops.where_positive(on, position, reading)
+        out[f"reference_velocity{j}"] = ops.where_positive(on, velocity, rate)
+        voltages.append(
+            servo.controller_voltage(
+                lanes[f"kp{j}"], lanes[f"kd{j}"], mean_position, mean_velocity, reading, rate, lanes["supply"]
+            )
+        )
+        rates.append(rate)
+    return out, voltages, rates
+
+
+# ---- kick: velocities ------------------------------------------------------------------------------------------------
+
+
+def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str]) -> Out:
+    """Build the Gauss problem of one substep: reduced base matrix, free motion, friction rows, impulse bounds."""
+    rows = rotation_rows(lanes)
+    n, heading, lateral, scale = floor_axes(rows)
+    gravity = to_body(rows, vector(lanes, "gravity_"))
+    v, w = vector(lanes, "v"), vector(lanes, "w")
+    u_base = [*(v[k] + step * gravity[k] for k in range(3)), *w]  # uniform gravity accelerates every point alike
+    w_mid = [1.5 * w[k] - 0.5 * lanes[f"last_w{a}"] for k, a in enumerate(AXES)]
+    out, voltages, rates = references(lanes, time, step)
+
+    mass = [[0.0 for _ in range(6)] for _ in range(6)]
+    bias: list[Value] = [0.0] * 6
+    platform_mass, platform_bias = platform_terms(*(lanes[name] for name in PLATFORM), *w_mid)
+    _accumulate(mass, bias, platform_mass, platform_bias)
+    legs: list[tuple[Vector, Value, Value, Value, Value]] = []
+    trig: list[tuple[Value, Value]] = []
+    for i in CORNERS:
+        sine, cosine = ops.sin_cos(lanes[f"leg_angle{i}"])
+        trig.append((sine, cosine))
+        mid_rates = [1.5 * lanes[f"{name}{i}"] - 0.5 * lanes[f"last_{name}{i}"] for name in ("leg_rate", "wheel_rate")]
+        base_mass, base_bias, coupling, leg_leg, leg_wheel, wheel_wheel, leg_bias, wheel_bias = assembly_terms(
+            *(lanes[f"{name}{i}"] for name in ASSEMBLY), sine, cosine, *w_mid, *mid_rates
+        )
+        _accumulate(mass, bias, base_mass, base_bias)
+        legs.append(([coupling.get(r, 0.0) for r in range(6)], leg_leg, leg_wheel, wheel_wheel, (leg_bias, wheel_bias)))
+
+    force = to_body(rows, [lanes["external_x"], lanes["external_y"], 0.0])
+    momentum: list[Value] = [dot(mass[r], u_base) - step * bias[r] for r in range(6)]
+    for k in range(3):
+        momentum[k] = momentum[k] + step * force[k]
+
+    reduced = [row[:] for row in mass]
+    blocks = []
+    for i in CORNERS:
+        coupling, leg_leg, leg_wheel, wheel_wheel, (leg_bias, wheel_bias) = legs[i]
+        leg_rate, wheel_rate = lanes[f"leg_rate{i}"], lanes[f"wheel_rate{i}"]
+        for r in range(6):
+            momentum[r] = momentum[r] + coupling[r] * leg_rate
+        leg_momentum = dot(coupling, u_base) + leg_leg * leg_rate + leg_wheel * wheel_rate - step * leg_bias
+        wheel_momentum = leg_wheel * leg_rate + wheel_wheel * wheel_rate - step * wheel_bias
+
+        hip, leg, rim = wheel_points(lanes, i, *trig[i], n, scale)
+        normal, gap_rate = _normal_force(lanes, i, hip, leg, rim, n, v, w)
+        out[f"normal{i}"], out[f"last_gap_rate{i}"] = normal, gap_rate
+        base_row, leg_entry = contact_row(hip, leg, rim, n)
+        for r in range(6):
+            momentum[r] = momentum[r] + (step * normal) * base_row[r]
+        leg_momentum = leg_momentum + (step * normal) * leg_entry
+
+        leg_push, leg_damping = _motor_impulse(lanes, i, voltages[i], rates[i], step)
+        wheel_push, wheel_damping = _motor_impulse(lanes, 4 + i, voltages[4 + i], rates[4 + i], step)
+        out[f"drive{i}"], out[f"drive{4 + i}"] = voltages[i], voltages[4 + i]
+        momentum[4] = momentum[4] - leg_push
+        leg_momentum = leg_momentum + leg_push - wheel_push
+        wheel_momentum = wheel_momentum + wheel_push
+        reduced[4][4] = reduced[4][4] + leg_damping
+        coupling = [*coupling[:4], coupling[4] - leg_damping, coupling[5]]
+
+        a11 = leg_leg + leg_damping + wheel_damping
+        a12 = leg_wheel - wheel_damping
+        a22 = wheel_wheel + wheel_damping
+        inverse = 1.0 / (a11 * a22 - a12 * a12)
+        i11, i12, i22 = a22 * inverse, -(a12 * inverse), a11 * inverse
+        y_leg = i11 * leg_momentum + i12 * wheel_momentum
+        y_wheel = i12 * leg_momentum + i22 * wheel_momentum
+        scaled = [i11 * x for x in coupling]
+        for r in range(6):
+            momentum[r] = momentum[r] - coupling[r] * y_leg
+            for c in range(r + 1):
+                reduced[r][c] = reduced[r][c] - scaled[r] * coupling[c]
+        blocks.append((coupling, i11, i12, i22, y_leg, y_wheel, hip, leg, rim))
+
+    lower, inverse_diagonal = _cholesky(reduced)
+
+    def whiten(b: Vector) -> Vector:
+        x: Vector = []
+        for r in range(6):
+            s = b[r]
+            for k in range(r):
+                s = s - lower[r][k] * x[k]
+            x.append(s * inverse_diagonal[r])
+        return x
+
+    base = whiten(momentum)
+    hinge = whiten([0.0, 0.0, 0.0, 0.0, -1.0, 0.0])
+    for i in CORNERS:
+        coupling, i11, i12, i22, y_leg, y_wheel, hip, leg, rim = blocks[i]
+        white = whiten(coupling)
+        for r in range(6):
+            out[f"coupling{i}_{r}"] = coupling[r]
+        out[f"i11_{i}"], out[f"i12_{i}"] = i11, i12
+        out[f"y_leg{i}"], out[f"y_wheel{i}"] = y_leg, y_wheel
+        # friction rows: (base part, leg entry, wheel entry)
+        local = {
+            f"leg{i}": (hinge, 1.0, 0.0, lanes[f"gear_friction{i}"]),
+            f"wheel{i}": ([0.0] * 6, -1.0, 1.0, lanes[f"gear_friction{4 + i}"]),
+        }
+        if "rolling_resistance" in features:
+            local[f"rolling{i}"] = ([0.0] * 6, 0.0, 1.0, lanes[f"rolling_friction{i}"])
+            out[f"bound_rolling{i}"] = (step * lanes[f"rolling{i}"]) * (lanes[f"radius{i}"] * out[f"normal{i}"])
+        for e, name, wheel_entry in ((heading, "x", -lanes[f"radius{i}"]), (lateral, "y", 0.0)):
+            base_row, leg_entry = contact_row(hip, leg, rim, e)
+            local[f"{name}{i}"] = (whiten(base_row), leg_entry, wheel_entry, lanes[f"friction_{name}{i}"])
+            out[f"leg_entry_{name}{i}"] = leg_entry
+        for name, (white_base, leg_entry, wheel_entry, impulse) in local.items():
+            g_leg = i11 * leg_entry + i12 * wheel_entry
+            g_wheel = i12 * leg_entry + i22 * wheel_entry
+            z = [white_base[r] - g_leg * white[r] for r in range(6)]
+            gain = dot(z, z) + leg_entry * g_leg + wheel_entry * g_wheel
+            out[f"g_leg_{name}"], out[f"g_wheel_{name}"] = g_leg, g_wheel
+            for r in range(6):
+                out[f"z_{name}_{r}"] = z[r]
+                base[r] = base[r] + z[r] * impulse  # warm start
+            out[f"y_leg{i}"] = out[f"y_leg{i}"] + g_leg * impulse
+            out[f"y_wheel{i}"] = out[f"y_wheel{i}"] + g_wheel * impulse
+            out[f"gain_{name}"] = gain
+            if name[0] not in "xy":
+                out[f"inverse_gain_{name}"] = 1.0 / gain
+        cross_gain = dot([out[f"z_x{i}_{r}"] for r in range(6)], [out[f"z_y{i}_{r}"] for r in range(6)])
+        out[f"gain_xy{i}"] = cross_gain + out[f"leg_entry_x{i}"] * out[f"g_leg_y{i}"] - lanes[f"radius{i}"] * out[f"g_wheel_y{i}"]
+        out[f"bound{i}"] = step * out[f"normal{i}"]
+    for r in range(6):
+        out[f"base{r}"] = base[r]
+        out[f"inverse_diagonal{r}"] = inverse_diagonal[r]
+        for c in range(r):
+            out[f"lower{r}{c}"] = lower[r][c]
+    return out
+
+
+PLATFORM = (
+    "platform_mass",
+    *(f"platform_moment_{a}" for a in AXES),
+    *(f"platform_inertia_{a}" for a in ("xx", "yy", "zz", "xy", "xz", "yz")),
+)
+ASSEMBLY = (
+    *(f"hip_{a}" for a in AXES),
+    "assembly_mass",
+    "first_moment",
+    "second_moment",
+    "leg_ixx",
+    "leg_iyy",
+    "leg_izz",
+    "wheel_transverse",
+    "wheel_spin",
+    "armature_leg",
+    "armature_wheel",
+)
+
+
+def _accumulate(mass: list[list[Value]], bias: list[Value], more_mass: Mapping[tuple[int, int], Value], more_bias: Mapping[int, Value]) -> None:
+    for (r, c), value in more_mass.items():
+        mass[r][c] = mass[r][c] + value
+        if r != c:
+            mass[c][r] = mass[c][r] + value
+    for r, value in more_bias.items():
+        bias[r] = bias[r] + value
+
+
+def _normal_force(
+    lanes: Lanes, i: int, hip: Vector, leg: Vector, rim: Vector, n: Vector, v: Vector, w: Vector
+) -> tuple[Value, Value]:
+    """Spring and damper at the middle position, never pulling. Returns the force (N) and the present gap rate (m/s)."""
+    point = [hip[k] + leg[k] + rim[k] for k in range(3)]
+    gap = lanes["pz"] + dot(n, point)
+    base_row, leg_entry = contact_row(hip, leg, rim, n)
+    gap_rate = dot(base_row, [*v, *w]) + leg_entry * lanes[f"leg_rate{i}"]
+    mid_rate = 1.5 * gap_rate - 0.5 * lanes[f"last_gap_rate{i}"]
+    push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * mid_rate, 0.0)
+    return ops.where_positive(-gap, push, 0.0), gap_rate
+
+
+def _motor_impulse(lanes: Lanes, j: int, voltage: Value, rate: Value, step: Value) -> tuple[Value, Value]:
+    """Explicit impulse of motor ``j`` and its implicit damping (both times the step).
+
+    torque = on (K/R) voltage - (on K^2/R + viscous) (weight new rate + (1 - weight) old rate)
+    """
+    on = lanes[f"on{j}"]
+    loss = on * lanes[f"back_emf_damping{j}"] + lanes[f"viscous{j}"]
+    explicit = step * (on * lanes[f"volt_gain{j}"] * voltage - loss * ((1.0 - lanes[f"weight{j}"]) * rate))
+    return explicit, step * (loss * lanes[f"weight{j}"])
+
+
+def _cholesky(matrix: list[list[Value]]) -> tuple[list[list[Value]], list[Value]]:
+    """Lower Cholesky factor without its diagonal, and the inverse of the diagonal."""
+    size = len(matrix)
+    lower: list[list[Value]] = [[0.0] * size for _ in range(size)]
+    inverse_diagonal: list[Value] = [0.0] * size
+    for r in range(size):
+        for c in range(r + 1):
+            s = matrix[r][c]
+            for k in range(c):
+                s = s - lower[r][k] * lower[c][k]
+            if r == c:
+                inverse_diagonal[r] = 1.0 / ops.sqrt(s)
+            else:
+                lower[r][c] = s * inverse_diagonal[c]
+    return lower, inverse_diagonal
+
+
+def kick_sweep(lanes: Lanes, features: frozenset[str]) -> Out:
+    """One pass of exact block coordinate descent over all friction impulses."""
+    base: Vector = [lanes[f"base{r}"] for r in range(6)]
+    out: Out = {}
+    for i in CORNERS:
+        y = [lanes[f"y_leg{i}"], lanes[f"y_wheel{i}"]]
+        rows = [(f"leg{i}", 1.0, 0.0, f"gear_friction{i}", lanes[f"gear_bound{i}"])]
+        rows += [(f"wheel{i}", -1.0, 1.0, f"gear_friction{4 + i}", lanes[f"gear_bound{4 + i}"])]
+        if "rolling_resistance" in features:
+            rows += [(f"rolling{i}", 0.0, 1.0, f"rolling_friction{i}", lanes[f"bound_rolling{i}"])]
+        for name, leg_entry, wheel_entry, impulse, bound in rows:
+            z = [lanes[f"z_{name}_{r}"] for r in range(6)]
+            rate = dot(z, base) + leg_entry * y[0] + wheel_entry * y[1]
+            new = ops.clip(lanes[impulse] - rate * lanes[f"inverse_gain_{name}"], -bound, bound)
+            base, y = _apply(lanes, name, z, new - lanes[impulse], base, y)
+            out[impulse] = new
+        base, y = _contact_block(lanes, i, base, y, out)
+        out[f"y_leg{i}"], out[f"y_wheel{i}"] = y
+    for r in range(6):
+        out[f"base{r}"] = base[r]
+    return out
+
+
+def _apply(lanes: Lanes, name: str, z: Vector, change: Value, base: Vector, y: Vector) -> tuple[Vector, Vector]:
+    return (
+        [base[r] + z[r] * change for r in range(6)],
+        [y[0] + lanes[f"g_leg_{name}"] * change, y[1] + lanes[f"g_wheel_{name}"] * change],
+    )
+
+
+def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, out: Out) -> tuple[Vector, Vector]:
+    """Exact 2x2 friction block of wheel ``i``: maximum dissipation on the ellipse (mu_x N, mu_y N).
+
+    In impulses scaled by mu, min 1/2 p'Ap + b'p over |p| <= step N. On the circle (A + multiplier) p = -b; the
+    multiplier is improved by one Newton step on 1/|p| per sweep and carried from step to step.
+    """
+    zx, zy = ([lanes[f"z_{a}{i}_{r}"] for r in range(6)] for a in "xy")
+    slip_x = dot(zx, base) + lanes[f"leg_entry_x{i}"] * y[0] - lanes[f"radius{i}"] * y[1]
+    slip_y = dot(zy, base) + lanes[f"leg_entry_y{i}"] * y[0]
+    mu_x, mu_y, bound = lanes[f"mu_x{i}"], lanes[f"mu_y{i}"], lanes[f"bound{i}"]
+    old_x, old_y = lanes[f"friction_x{i}"], lanes[f"friction_y{i}"]
+    gain_x, gain_y, gain_xy = lanes[f"gain_x{i}"], lanes[f"gain_y{i}"], lanes[f"gain_xy{i}"]
+    b_x = mu_x * (slip_x - gain_x * old_x - gain_xy * old_y)
+    b_y = mu_y * (slip_y - gain_xy * old_x - gain_y * old_y)
+    a11 = mu_x * mu_x * gain_x + 1e-9
+    a22 = mu_y * mu_y * gain_y + 1e-9
+    a12 = mu_x * mu_y * gain_xy
+
+    def impulse(multiplier: Value) -> tuple[Value, Value, Value, Value, Value]:
+        c11, c22 = a11 + multiplier, a22 + multiplier
+        inverse = 1.0 / (c11 * c22 - a12 * a12)
+        return (a12 * b_y - c22 * b_x) * inverse, (a12 * b_x - c11 * b_y) * inverse, c11, c22, inverse
+
+    multiplier = lanes[f"multiplier{i}"]
+    p_x, p_y, c11, c22, inverse = impulse(multiplier)
+    square = p_x * p_x + p_y * p_y + 1e-30
+    curvature = (p_x * p_x * c22 - 2.0 * (a12 * p_x * p_y) + p_y * p_y * c11) * inverse + 1e-30
+    multiplier = multiplier + square * (ops.sqrt(square) - bound) / (curvature * (bound + 1e-9))
+    multiplier = ops.clip(multiplier, 0.0, 1e6)
+    p_x, p_y, *_ = impulse(multiplier)
+    shrink = ops.minimum(bound / ops.sqrt(p_x * p_x + p_y * p_y + 1e-30), 1.0)
+    new_x, new_y = mu_x * p_x * shrink, mu_y * p_y * shrink
+    out[f"multiplier{i}"] = multiplier
+    out[f"friction_x{i}"], out[f"friction_y{i}"] = new_x, new_y
+    base, y = _apply(lanes, f"x{i}", zx, new_x - old_x, base, y)
+    return _apply(lanes, f"y{i}", zy, new_y - old_y, base, y)
+
+
+def kick_finish(lanes: Lanes, step: Value) -> Out:
+    """Back-substitute the new velocities; motor torques, energies, slip and the inertial sensors' low-pass."""
+    u: list[Value] = [0.0] * 6
+    for r in reversed(range(6)):
+        s = lanes[f"base{r}"]
+        for k in range(r + 1, 6):
+            s = s - lanes[f"lower{k}{r}"] * u[k]
+        u[r] = s * lanes[f"inverse_diagonal{r}"]
+    out: Out = {}
+    new_rates: list[Value] = [0.0] * 8
+    old_rates: list[Value] = [0.0] * 8
+    for i in CORNERS:
+        pull = dot([lanes[f"coupling{i}_{r}"] for r in range(6)], u)
+        leg_rate = lanes[f"y_leg{i}"] - lanes[f"i11_{i}"] * pull
+        wheel_rate = lanes[f"y_wheel{i}"] - lanes[f"i12_{i}"] * pull
+        out[f"leg_rate{i}"], out[f"wheel_rate{i}"] = leg_rate, wheel_rate
+        out[f"last_leg_rate{i}"], out[f"last_wheel_rate{i}"] = lanes[f"leg_rate{i}"], lanes[f"wheel_rate{i}"]
+        new_rates[i], new_rates[4 + i] = leg_rate - u[4], wheel_rate - leg_rate
+        old_rates[i] = lanes[f"leg_rate{i}"] - lanes["wy"]
+        old_rates[4 + i] = lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"]
+        for a, wheel_entry in (("x", -lanes[f"radius{i}"]), ("y", 0.0)):
+            z = [lanes[f"z_{a}{i}_{r}"] for r in range(6)]
+            slip = dot(z, [lanes[f"base{r}"] for r in range(6)]) + lanes[f"leg_entry_{a}{i}"] * lanes[f"y_leg{i}"]
+            slip = slip + wheel_entry * lanes[f"y_wheel{i}"]
+            name = f"slip_displacement_{a}{i}"
+            out[name] = lanes[name] + step * slip
+    mechanical, electrical = lanes["mechanical_energy"], lanes["electrical_energy"]
+    for j in range(8):
+        on, weight = lanes[f"on{j}"], lanes[f"weight{j}"]
+        mean_rate = weight * new_rates[j] + (1.0 - weight) * old_rates[j]
+        torque = on * (lanes[f"volt_gain{j}"] * lanes[f"drive{j}"] - lanes[f"back_emf_damping{j}"] * mean_rate)
+        out[f"motor_torque{j}"] = torque
+        mechanical = mechanical + step * (torque * (0.5 * (new_rates[j] + old_rates[j])))
+        electrical = electrical + step * (torque * lanes[f"drive{j}"] * lanes[f"inverse_constant{j}"])
+    out["mechanical_energy"], out["electrical_energy"] = mechanical, electrical
+    gravity = to_body(rotation_rows(lanes), vector(lanes, "gravity_"))
+    for k, a in enumerate(AXES):
+        out[f"v{a}"], out[f"w{a}"], out[f"last_w{a}"] = u[k], u[3 + k], lanes[f"w{a}"]
+        specific_force = (u[k] - lanes[f"v{a}"]) * (1.0 / step) - gravity[k]
+        out[f"acceleration_{a}"] = lanes[f"acceleration_{a}"] + lanes["low_pass"] * (specific_force - lanes[f"acceleration_{a}"])
+        out[f"gyro_{a}"] = lanes[f"gyro_{a}"] + lanes["low_pass"] * (u[3 + k] - lanes[f"gyro_{a}"])
+    return out
+
+
+# ---- observation at the end of a control tick ------------------------------------------------------------------------
+
+
+def observe(lanes: Lanes, step: Value) -> Out:
+    """Columns of the truth matrix (names as in TRUTH_LAYOUT, element by element) and the raw sensor channels."""
+    rows = rotation_rows(lanes)
+    n, heading, lateral, scale = floor_axes(rows)
+    v, w = vector(lanes, "v"), vector(lanes, "w")
+    out: Out = {f"position_{a}": lanes[f"p{a}"] for a in AXES}
+    out |= {f"quaternion_{a}": lanes[f"q{a}"] for a in "wxyz"}
+    out |= {f"linear_velocity_in_body_{a}": lanes[f"v{a}"] for a in AXES}
+    out |= {f"angular_velocity_in_body_{a}": lanes[f"w{a}"] for a in AXES}
+    out |= {f"joint_position_{j}": lanes[f"{'leg' if j < 4 else 'wheel'}_angle{j % 4}"] for j in range(8)}
+    out |= {f"joint_velocity_{i}": lanes[f"leg_rate{i}"] - w[1] for i in CORNERS}
+    out |= {f"joint_velocity_{4 + i}": lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"] for i in CORNERS}
+    out |= {f"motor_torque_{j}": lanes[f"motor_torque{j}"] for j in range(8)}
+    out |= {f"friction_torque_{j}": lanes[f"gear_friction{j}"] * (1.0 / step) for j in range(8)}
+    out |= {f"rolling_torque_{i}": lanes[f"rolling_friction{i}"] * (1.0 / step) for i in CORNERS}
+    for i in CORNERS:
+        for a in "xy":
+            out[f"contact_force_{i}_{a}"] = lanes[f"friction_{a}{i}"] * (1.0 / step)
+        out[f"contact_force_{i}_z"] = lanes[f"normal{i}"]
+    for i in CORNERS:
+        hip, leg, rim = wheel_points(lanes, i, *ops.sin_cos(lanes[f"leg_angle{i}"]), n, scale)
+        for a, e, wheel_entry in (("x", heading, -lanes[f"radius{i}"]), ("y", lateral, 0.0)):
+            base_row, leg_entry = contact_row(hip, leg, rim, e)
+            slip = dot(base_row, [*v, *w]) + leg_entry * lanes[f"leg_rate{i}"] + wheel_entry * lanes[f"wheel_rate{i}"]
+            out[f"slip_velocity_{i}_{a}"] = slip
+    out |= {f"slip_displacement_{i}_{a}": lanes[f"slip_displacement_{a}{i}"] for i in CORNERS for a in "xy"}
+    out |= {f"effective_friction_{i}_{a}": lanes[f"mu_{a}{i}"] for i in CORNERS for a in "xy"}
+    out["mechanical_energy"], out["electrical_energy"] = lanes["mechanical_energy"], lanes["electrical_energy"]
+    reach = [ops.absolute(n[k]) * lanes[f"half_size_{a}"] for k, a in enumerate(AXES)]
+    out["body_clearance"] = lanes["pz"] - reach[0] - reach[1] - reach[2]
+    out |= {f"effort_{j}": lanes[f"motor_torque{j}"] * lanes[f"effort_scale{j}"] for j in range(8)}
+    out |= {f"gyro_{a}": lanes[f"gyro_{a}"] for a in AXES}
+    out |= {f"acceleration_{a}": lanes[f"acceleration_{a}"] for a in AXES}
+    out["supply"] = lanes["supply"]
+    return out

@@ -1,0 +1,28 @@
+"""Measured runs: read, check, write, convert and replay them. The format: ``docs/run_format.md``.
+
+``read_run`` and ``read_dataset`` refuse what is not a run; ``check_table`` reports what is odd about one. ``replay`` lives in
+:mod:`wlr_gym.runs.replay`, because it needs a plant.
+"""
+
+from wlr_gym.runs.check import Finding, check_table
+from wlr_gym.runs.convert import convert
+from wlr_gym.runs.format import COLUMNS, Column, Profile, RunMeta
+from wlr_gym.runs.read import DataSet, Run, read_dataset, read_meta, read_run
+from wlr_gym.runs.write import write_meta, write_run
+
+__all__ = [
+    "COLUMNS",
+    "Column",
+    "DataSet",
+    "Finding",
+    "Profile",
+    "Run",
+    "RunMeta",
+    "check_table",
+    "convert",
+    "read_dataset",
+    "read_meta",
+    "read_run",
+    "write_meta",
+    "write_run",
+]

@@ -1,0 +1,117 @@
+"""What a task is, for people (tables) and for machines (the contract a policy file carries)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from wlr_gym.tasks.task import ObservationColumn, Task, robot_hash
+from wlr_gym.tasks.terms import COMMANDS, REWARDS, TERMINATIONS
+
+
+def describe(task: Task) -> str:
+    """Return the task's action, observation, command, reward and termination tables as text (reStructuredText)."""
+    config = task.config
+    command_rows = [
+        (name, COMMANDS[name].unit, COMMANDS[name].frame, f"[{low:g}, {high:g}]", COMMANDS[name].doc)
+        for name, (low, high) in config.commands.terms.items()
+    ]
+    reward_rows = [
+        (name, f"{values['weight']:g}", _parameters(values, REWARDS[name].parameters), REWARDS[name].doc)
+        for name, values in config.rewards.items()
+    ]
+    termination_rows = [
+        (name, _parameters(values, TERMINATIONS[name].parameters), TERMINATIONS[name].doc)
+        for name, values in config.terminations.items()
+    ]
+    hold = config.commands.hold_time
+    return "\n".join(
+        [
+            f"**Action** ``Box(-1, 1, ({len(task.actions)},), float32)``: goal = clip(centre + scale * action, low, high)",
+            *table(("index", "joint", "goal", "unit", "centre", "scale", "low", "high"), _action_rows(task)),
+            f"**Observation** ``Box(({len(task.policy)},), float32)``: value = scale * clip(reading - offset, +-limit)",
+            *table(_OBSERVATION_HEADER, observation_rows(task, task.policy)),
+            f"**Privileged observation** (``observation=\"dict\"``, key ``privileged``): ``Box(({len(task.privileged)},), float32)``",
+            *table(_OBSERVATION_HEADER, observation_rows(task, task.privileged)),
+            f"**Commands** drawn anew every {hold[0]:g} to {hold[1]:g} s, all zero with probability {config.commands.zero_probability:g}",
+            *table(("command", "unit", "frame", "range", "meaning"), command_rows),
+            "**Reward** sum of weight * term * control period",
+            *table(("term", "weight (1/s)", "parameters", "meaning"), reward_rows),
+            "**Terminated** when a term is greater than 0",
+            *table(("term", "parameters", "meaning"), termination_rows),
+            f"**Truncated** after {config.episode_length:g} s ({task.episode_ticks} control ticks of {config.control_period * 1000:g} ms).",
+        ]
+    )
+
+
+def _parameters(values: dict[str, float], defaults: dict[str, float]) -> str:
+    return ", ".join(f"{name}={values.get(name, default):g}" for name, default in defaults.items()) or "-"
+
+
+def _action_rows(task: Task) -> list[tuple[str, ...]]:
+    return [
+        (str(i), a.joint, a.quantity, a.unit, f"{a.centre:.4g}", f"{a.scale:g}", f"{a.low:.4g}", f"{a.high:.4g}")
+        for i, a in enumerate(task.actions)
+    ]
+
+
+_OBSERVATION_HEADER = ("index", "name", "unit", "frame", "offset", "scale", "limit", "noise", "bias", "delay (ms)", "lag (ticks)")
+
+
+def observation_rows(task: Task, columns: Sequence[ObservationColumn]) -> list[tuple[str, ...]]:
+    """Return one row per observation column. Noise and bias are those of the task, on top of the sensors' own."""
+    return [
+        (
+            str(index), column_name(column), column.unit, column.frame, f"{column.offset:.4g}", f"{column.scale:g}",
+            f"{column.limit:g}", f"{column.noise:g}", f"{column.bias:g}", _delay(task, column), str(column.lag),
+        )
+        for index, column in enumerate(columns)
+    ]  # fmt: skip
+
+
+def column_name(column: ObservationColumn) -> str:
+    """Return ``leg_position[leg_lf]``: the term with the label of its element."""
+    label = column.element.partition("[")[2].rstrip("]") or (column.element if column.source in {"command", "action"} else "")
+    return f"{column.term}[{label}]" if label else column.term
+
+
+def _delay(task: Task, column: ObservationColumn) -> str:
+    latency = task.config.latency.get(column.device)  # type: ignore[call-overload]
+    return "0" if latency is None else f"{latency.delay[0] * 1000:g}..{latency.delay[1] * 1000:g}"
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a reStructuredText simple table as lines, with an empty line before and after."""
+    widths = [max(len(str(row[k])) for row in [header, *rows]) for k in range(len(header))]
+    rule = "  ".join("=" * width for width in widths)
+
+    def line(row: Sequence[str]) -> str:
+        return "  ".join(str(cell).ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+
+    return ["", rule, line(header), rule, *(line(row) for row in rows), rule, ""]
+
+
+def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
+    """Return what a policy must be fed and what its output means, as plain JSON types.
+
+    Keys: task, robot (name, hash), control_period, episode_length, observation (one entry per number, in order: name,
+    source, element, unit, frame, offset, scale, limit, lag, device), latency, action (one entry per number: joint, quantity,
+    unit, centre, scale, low, high), commands and randomization.
+    """
+    config = task.config
+    return {
+        "task": config.name,
+        "robot": {"name": task.robot.name, "hash": robot_hash(task.robot)},
+        "control_period": config.control_period,
+        "episode_length": config.episode_length,
+        "observation": [_contract_column(column) for column in task.policy],
+        "latency": {device: latency.model_dump(mode="json") for device, latency in config.latency.items()},
+        "action": [dict(vars(column)) for column in task.actions],
+        "commands": {name: {"unit": COMMANDS[name].unit, "range": list(limits)} for name, limits in config.commands.terms.items()},
+        "randomization": randomization,
+    }
+
+
+def _contract_column(column: ObservationColumn) -> dict[str, Any]:
+    fields = ("source", "element", "unit", "frame", "offset", "scale", "limit", "noise", "bias", "lag", "device")
+    return {"name": column_name(column), **{field: getattr(column, field) for field in fields}}

@@ -1,0 +1,294 @@
+"""A task is data: a YAML file that lists terms with weights, parameters, scales, noise, latency and history."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from wlr_gym.errors import InputError, nearest, unknown_name
+from wlr_gym.paths import find_config
+from wlr_gym.robot import JOINTS, LEGS, Robot, parse_config, read_yaml
+from wlr_gym.tasks.terms import COMMANDS, POLICY_TERMS, PRIVILEGED_TERMS, REWARDS, TERMINATIONS, ObservationTerm, ScalarTerm
+
+
+class _Data(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ActionConfig(_Data):
+    """Goal = centre + scale * action: rad about the home angle (legs), rad/s about zero (wheels)."""
+
+    leg_scale: float = Field(gt=0)
+    wheel_scale: float = Field(gt=0)
+
+
+class CommandsConfig(_Data):
+    """Commands drawn uniformly in [low, high], held for a time drawn in ``hold_time`` (s); all zero now and then."""
+
+    hold_time: tuple[float, float]
+    zero_probability: float = Field(0.0, ge=0, le=1)
+    terms: dict[str, tuple[float, float]]
+
+
+class LatencyConfig(_Data):
+    """Age of a device's readings: drawn per episode and robot in ``delay`` (s).
+
+    ``interpolate`` mixes the two readings around that age; ``hold`` gives the newest reading at least that old.
+    """
+
+    delay: tuple[float, float]
+    mode: Literal["interpolate", "hold"] = "interpolate"
+
+
+class ObservationConfig(_Data):
+    """How a term enters the observation: ``scale * clip(reading - offset + bias + noise, +-limit)``.
+
+    ``noise`` (per reading) and ``bias`` (per episode) are 1 sigma in the term's unit; ``history`` readings, newest first.
+    """
+
+    scale: float = Field(1.0, gt=0)
+    noise: float = Field(0.0, ge=0)
+    bias: float = Field(0.0, ge=0)
+    limit: float | None = Field(None, gt=0)
+    history: int = Field(1, ge=1, le=64)
+
+
+class PrivilegedConfig(_Data):
+    """How a true quantity enters the privileged observation: ``scale * clip(value, +-limit)``."""
+
+    scale: float = Field(1.0, gt=0)
+    limit: float | None = Field(None, gt=0)
+
+
+class TaskConfig(_Data):
+    """Contents of ``configs/task/*.yaml``."""
+
+    name: str
+    robot: str = "nominal"
+    randomization: str = "nominal"
+    control_period: float = Field(gt=0, le=0.5)
+    episode_length: float = Field(gt=0)
+    action: ActionConfig
+    commands: CommandsConfig
+    latency: dict[Literal["joints", "imu", "camera"], LatencyConfig] = {}
+    observations: dict[str, ObservationConfig]
+    privileged: dict[str, PrivilegedConfig] = {}
+    rewards: dict[str, dict[str, float]]
+    terminations: dict[str, dict[str, float]] = {}
+
+
+@dataclass(frozen=True)
+class ObservationColumn:
+    """One number of the observation: ``scale * clip(source[element] - offset, +-limit)``, ``lag`` control ticks old.
+
+    ``device`` names whose latency comes on top (empty: none); noise and bias are 1 sigma in ``unit``.
+    """
+
+    term: str
+    element: str
+    source: str
+    unit: str
+    frame: str
+    offset: float
+    scale: float
+    limit: float
+    noise: float
+    bias: float
+    lag: int
+    device: str
+    doc: str
+
+
+@dataclass(frozen=True)
+class ActionColumn:
+    """One number of the action: ``goal = clip(centre + scale * action, low, high)``."""
+
+    joint: str
+    quantity: str
+    unit: str
+    centre: float
+    scale: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Task:
+    """A checked task for a robot.
+
+    Attributes:
+        config: the data.
+        robot: whose limits, home pose and numbers the terms use.
+        policy: columns of the policy observation.
+        privileged: columns of the privileged observation.
+        actions: columns of the action.
+    """
+
+    config: TaskConfig
+    robot: Robot
+    policy: tuple[ObservationColumn, ...]
+    privileged: tuple[ObservationColumn, ...]
+    actions: tuple[ActionColumn, ...]
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Names of the commands, in order."""
+        return tuple(self.config.commands.terms)
+
+    @property
+    def rewards(self) -> tuple[str, ...]:
+        """Names of the reward terms, in order."""
+        return tuple(self.config.rewards)
+
+    @property
+    def terminations(self) -> tuple[str, ...]:
+        """Names of the termination terms, in order."""
+        return tuple(self.config.terminations)
+
+    @property
+    def episode_ticks(self) -> int:
+        """Control ticks until truncation."""
+        return max(1, round(self.config.episode_length / self.config.control_period))
+
+
+def load_task(source: str | Path | TaskConfig, robot: Robot, overrides: Mapping[str, Any] | None = None) -> Task:
+    """Load a task and check every name and number in it.
+
+    Args:
+        source: name in ``configs/task/``, path of a YAML file, or a config.
+        robot: the robot it is for.
+        overrides: nested mapping laid over the file; a term set to None is removed.
+
+    Raises:
+        InputError: unknown or wrong key, term, parameter or value, with the nearest valid name.
+    """
+    data, where = _task_data(source)
+    if overrides is not None and not isinstance(overrides, Mapping):
+        raise InputError(f"task = {overrides!r}: expected a mapping laid over {where}, such as {{'episode_length': 10.0}}")
+    config = parse_config(TaskConfig, overlay(data, overrides or {}), where if not overrides else f"{where} with task={dict(overrides)}")
+    _check_ranges(config, where)
+    _check_scalars("reward term", config.rewards, REWARDS, {"weight"}, where)
+    _check_scalars("termination term", config.terminations, TERMINATIONS, set(), where)
+    policy = tuple(column for name in config.observations for column in _policy_columns(config, robot, name, where))
+    privileged = tuple(column for name in config.privileged for column in _privileged_columns(config, name, where))
+    return Task(config, robot, policy, privileged, _action_columns(config, robot))
+
+
+def _task_data(source: str | Path | TaskConfig) -> tuple[Any, str]:
+    if isinstance(source, TaskConfig):
+        return source.model_dump(), f"task '{source.name}'"
+    path = find_config("task", source)
+    return read_yaml(path), str(path)
+
+
+def overlay(base: Any, changes: Mapping[str, Any]) -> Any:
+    """Return ``base`` with ``changes`` laid over it: mappings merge key by key, None removes a key."""
+    if not isinstance(base, Mapping):
+        return dict(changes)
+    merged = dict(copy.deepcopy(base))
+    for key, value in changes.items():
+        if value is None:
+            merged.pop(key, None)
+        else:
+            merged[key] = overlay(merged.get(key) or {}, value) if isinstance(value, Mapping) else value
+    return merged
+
+
+def _check_ranges(config: TaskConfig, where: str) -> None:
+    ranges = {"commands.hold_time": config.commands.hold_time}
+    for name, limits in config.commands.terms.items():
+        if name not in COMMANDS:
+            raise unknown_name("command", name, COMMANDS, where)
+        ranges[f"commands.terms.{name}"] = limits
+    for device, latency in config.latency.items():
+        ranges[f"latency.{device}.delay"] = latency.delay
+        if latency.delay[0] < 0:
+            raise InputError(f"{where}: latency.{device}.delay = {list(latency.delay)}: a reading cannot be younger than 0 s")
+    for field, (low, high) in ranges.items():
+        if low > high:
+            raise InputError(f"{where}: {field} = [{low:g}, {high:g}]: expected [low, high] with low <= high")
+    if config.commands.hold_time[0] <= 0:
+        raise InputError(f"{where}: commands.hold_time = {list(config.commands.hold_time)}: expected times above 0 s")
+    for group in ("observations", "rewards"):
+        if not getattr(config, group):
+            raise InputError(f"{where}: {group} is empty: a task needs at least one term there")
+    for ticks in (config.episode_length / config.control_period,):
+        if not math.isclose(ticks, round(ticks), abs_tol=1e-6) or round(ticks) < 1:
+            raise InputError(f"{where}: episode_length = {config.episode_length:g} s is not a whole number of control periods of {config.control_period:g} s")
+
+
+def _check_scalars(
+    kind: str, chosen: Mapping[str, Mapping[str, float]], registry: Mapping[str, ScalarTerm], required: set[str], where: str
+) -> None:
+    for name, values in chosen.items():
+        if name not in registry:
+            raise unknown_name(kind, name, registry, where)
+        valid = required | set(registry[name].parameters)
+        for key in values:
+            if key not in valid:
+                raise InputError(f"{where}: {kind} '{name}' has no parameter '{key}'{nearest(key, valid)}; valid: {', '.join(sorted(valid)) or 'none'}")
+        for key in required - set(values):
+            raise InputError(f"{where}: {kind} '{name}' lacks '{key}'")
+
+
+def _policy_columns(config: TaskConfig, robot: Robot, name: str, where: str) -> list[ObservationColumn]:
+    if name not in POLICY_TERMS:
+        raise unknown_name("observation term", name, POLICY_TERMS, where)
+    term, settings = POLICY_TERMS[name], config.observations[name]
+    limit = term.limit if settings.limit is None else settings.limit
+    return [
+        ObservationColumn(
+            name, element, term.source, unit, term.frame, term.offset(robot), settings.scale, limit, settings.noise, settings.bias, lag, term.device, doc
+        )
+        for lag in range(settings.history)
+        for element, unit, doc in _term_elements(term, config)
+    ]  # fmt: skip
+
+
+def _term_elements(term: ObservationTerm, config: TaskConfig) -> list[tuple[str, str, str]]:
+    if term.source == "command":
+        return [(command, COMMANDS[command].unit, COMMANDS[command].doc) for command in config.commands.terms]
+    if term.source == "action":
+        return [(joint, term.unit, term.doc) for joint in JOINTS]
+    units = term.unit.split(", ")
+    if len(units) == len(term.elements):
+        return [(element, unit, term.doc) for element, unit in zip(term.elements, units, strict=True)]
+    return [(element, term.unit, term.doc) for element in term.elements]
+
+
+def _privileged_columns(config: TaskConfig, name: str, where: str) -> list[ObservationColumn]:
+    if name not in PRIVILEGED_TERMS:
+        raise unknown_name("privileged observation term", name, PRIVILEGED_TERMS, where)
+    term, settings = PRIVILEGED_TERMS[name], config.privileged[name]
+    limit = term.limit if settings.limit is None else settings.limit
+    return [
+        ObservationColumn(name, element, "truth", term.unit, term.frame, 0.0, settings.scale, limit, 0.0, 0.0, 0, "", term.doc)
+        for element in term.elements
+    ]
+
+
+def _action_columns(config: TaskConfig, robot: Robot) -> tuple[ActionColumn, ...]:
+    low, high = robot.leg_limits
+    speed = robot.servo.wheel.no_load_speed
+    legs = [ActionColumn(joint, "angle", "rad", robot.home.leg_angle, config.action.leg_scale, low, high) for joint in LEGS]
+    wheels = [ActionColumn(joint, "speed", "rad/s", 0.0, config.action.wheel_scale, -speed, speed) for joint in JOINTS[4:]]
+    return (*legs, *wheels)
+
+
+def bounds(columns: tuple[ObservationColumn, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest value of each observation column, float32."""
+    high = np.array([np.float32(column.scale * column.limit) for column in columns], dtype=np.float32)
+    return -high, high
+
+
+def robot_hash(robot: Robot) -> str:
+    """Short fingerprint of a robot's numbers."""
+    return hashlib.sha256(robot.model_dump_json().encode()).hexdigest()[:16]

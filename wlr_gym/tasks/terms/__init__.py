@@ -1,0 +1,9 @@
+"""Building blocks of tasks: small documented units that a task's YAML lists by name, with weights and parameters."""
+
+from wlr_gym.tasks.terms.commands import COMMANDS
+from wlr_gym.tasks.terms.observations import POLICY_TERMS, PRIVILEGED_TERMS, ObservationTerm
+from wlr_gym.tasks.terms.rewards import REWARDS
+from wlr_gym.tasks.terms.scalar import ScalarTerm
+from wlr_gym.tasks.terms.terminations import TERMINATIONS
+
+__all__ = ["COMMANDS", "POLICY_TERMS", "PRIVILEGED_TERMS", "REWARDS", "TERMINATIONS", "ObservationTerm", "ScalarTerm"]

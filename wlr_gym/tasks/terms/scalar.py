@@ -1,0 +1,43 @@
+"""Scalar terms: functions of named signals that are traced into one compiled kernel per task."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+Function = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class ScalarTerm:
+    """One reward or termination.
+
+    Attributes:
+        name: as in the task's YAML.
+        function: ``function(signals, **parameters)``, written with ``wlr_gym.codegen.ops``.
+        parameters: names and default values of its parameters.
+        doc: first line of its docstring.
+    """
+
+    name: str
+    function: Function
+    parameters: dict[str, float]
+    doc: str
+
+
+def registered(registry: dict[str, ScalarTerm]) -> Callable[[Function], Function]:
+    """Return a decorator that enters a function into ``registry`` under its own name."""
+
+    def enter(function: Function) -> Function:
+        defaults = {
+            name: float(parameter.default)
+            for name, parameter in inspect.signature(function).parameters.items()
+            if parameter.kind is inspect.Parameter.KEYWORD_ONLY
+        }
+        doc = (inspect.getdoc(function) or "").partition("\n")[0]
+        registry[function.__name__] = ScalarTerm(function.__name__, function, defaults, doc)
+        return function
+
+    return enter
