@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 #: Stands for "no limit" on profile velocity (rad/s) and acceleration (rad/s2). Finite, so that no select meets inf - inf.
 NO_LIMIT = 1e6
 #: Distance (rad) at which a leg's profile counts as arrived: a few float32 roundings, 1/1500 of an encoder count.
-ARRIVAL = 5e-7
+ARRIVAL = 1e-6
 #: Braking may be this much harder than nominal. In exact arithmetic it is only used when a new goal lies too close to stop at;
 #: in float32 it makes up for rounding along the braking curve, without which the profile overshoots by up to 2e-4 rad.
 BRAKING_RESERVE = 1.02
@@ -188,7 +188,7 @@ def _trapezoid(to_goal: Value, velocity: Value, limit: Value, acceleration: Valu
     braking = 2.0 * left / (0.5 * step + ops.sqrt(0.25 * step * step + left * (2.0 / acceleration)))
     new_along = ops.clip(ops.minimum(limit, braking), along - BRAKING_RESERVE * room, along + room)
     near = ops.maximum(0.5 * step * room, ARRIVAL)
-    arrived = ops.minimum(near - distance, 4.0 * acceleration * near - along * along)
+    arrived = ops.minimum(near - distance, 8.0 * acceleration * near - along * along)
     new_velocity = ops.where_positive(arrived, 0.0, direction * new_along)
     mean_velocity = 0.5 * (velocity + new_velocity)
     return step * mean_velocity, new_velocity, mean_velocity, arrived

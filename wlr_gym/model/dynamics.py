@@ -90,26 +90,25 @@ def mass_matrix_and_bias(
     constants = inertial_constants(parameters)
     mass_matrix, bias = np.zeros((len(parameters), 14, 14)), np.zeros((len(parameters), 14))
     platform = (constants["platform_mass"], *constants["platform_first_moment"].T, *constants["platform_inertia"].T)
-    _add_base(mass_matrix, bias, *platform_terms(*platform, *w.T))
+    _add(mass_matrix, bias, *platform_terms(*platform, *w.T))
     for corner in range(4):
         leg, wheel = 6 + corner, 10 + corner
-        sin_q, cos_q = np.sin(joint_position[:, corner]), np.cos(joint_position[:, corner])
-        assembly = (constants[name][:, corner] for name in ASSEMBLY_CONSTANTS)
-        base_mass, base_bias, coupling, leg_leg, leg_wheel, wheel_wheel, leg_bias, wheel_bias = assembly_terms(
-            *assembly, sin_q, cos_q, *w.T, leg_rate[:, corner], wheel_rate[:, corner]
-        )
+        angle = joint_position[:, corner]
+        arguments = [constants[name][:, corner] for name in ASSEMBLY_CONSTANTS]
+        arguments += [np.sin(angle), np.cos(angle), *w.T, leg_rate[:, corner], wheel_rate[:, corner]]
+        base_mass, base_bias, coupling, leg_leg, leg_wheel, wheel_wheel, leg_bias, wheel_bias = assembly_terms(*arguments)
         leg_block = {(row, leg): value for row, value in coupling.items()} | {
             (leg, leg): leg_leg,
             (leg, wheel): leg_wheel,
             (wheel, wheel): wheel_wheel,
         }
-        _add_base(mass_matrix, bias, base_mass | leg_block, base_bias | {leg: leg_bias, wheel: wheel_bias})
+        _add(mass_matrix, bias, base_mass | leg_block, base_bias | {leg: leg_bias, wheel: wheel_bias})
     lower = np.tril_indices(14, -1)
     mass_matrix[:, lower[0], lower[1]] = mass_matrix[:, lower[1], lower[0]]
     return mass_matrix, bias
 
 
-def _add_base(mass_matrix: Array, bias: Array, entries: dict, rows: dict) -> None:
+def _add(mass_matrix: Array, bias: Array, entries: dict, rows: dict) -> None:
     for (row, column), value in entries.items():
         mass_matrix[:, row, column] += value
     for row, value in rows.items():
@@ -149,7 +148,7 @@ def accelerations(
     """
     leg_rate, wheel_rate = absolute_rates(w, joint_velocity)
     mass_matrix, bias = mass_matrix_and_bias(parameters, joint_position, w, leg_rate, wheel_rate)
-    result = np.linalg.solve(mass_matrix, (absolute_forces(force) - bias)[:, :, None])[:, :, 0]
+    result = np.asarray(np.linalg.solve(mass_matrix, (absolute_forces(force) - bias)[:, :, None])[:, :, 0], dtype=np.float64)
     gravity_in_body = np.einsum("nji,nj->ni", rotation_matrix(quaternion), gravity_in_floor(parameters))
     result[:, :3] += gravity_in_body - np.cross(w, v)
     result[:, _WHEEL_ROWS] -= result[:, _LEG_ROWS]
@@ -196,8 +195,8 @@ def gravity_in_floor(parameters: Parameters) -> Array:
         robot = int(np.argmax(squared < 0))
         pitch, roll = parameters["ground.slope"][robot]
         raise InputError(
-            f"parameter ground.slope = ({pitch:g}, {roll:g}) rad (robot {robot} of the batch): no plane is inclined so much along "
-            "both axes, sin(pitch)^2 + sin(roll)^2 must not exceed 1"
+            f"parameter ground.slope = ({pitch:g}, {roll:g}) rad (robot {robot} of the batch): no plane climbs so much "
+            "along both axes, sin(pitch)^2 + sin(roll)^2 must not exceed 1"
         )
     return -parameters["gravity"][:, None] * np.column_stack([uphill, np.sqrt(squared)])
 

@@ -286,16 +286,15 @@ def _should_vary(table: Table, name: str) -> bool:
 
 
 def _clipped(table: Table) -> Iterable[Finding]:
-    """Readings that pile up, bit-equal, at the channel's extreme and far from its usual values."""
+    """Readings that pile up, bit-equal, at a channel's extreme; noise alone puts fewer there than next to it."""
     for name in (name for name in table if COLUMNS[name].noisy or COLUMNS[name].group.startswith("eff")):
         values = table[name]
         levels, counts = np.unique(values[np.isfinite(values)], return_counts=True)
         if len(levels) < 10:
             continue
-        centre = np.nanmedian(values)
-        usual = 3 * np.nanmedian(np.abs(values - centre))
-        for end, inner in ((0, 1), (-1, -2)):  # noise alone puts fewer readings at the extreme than next to it
-            if counts[end] >= max(_CLIPPED_ROWS, 2 * counts[inner] + 1) and abs(levels[end] - centre) > usual:
+        for end, inner in ((0, 1), (-1, -2)):
+            longest = max((length for row, length in _plateaus(values) if values[row] == levels[end]), default=0)
+            if longest >= _CLIPPED_ROWS and counts[end] > 2 * counts[inner] and levels[end] != 0.0:
                 rows = np.flatnonzero(values == levels[end])
                 message = f"{len(rows)} rows clipped at {levels[end]:g} {COLUMNS[name].unit}, the first row {rows[0]}"
                 yield Finding("clipped", name, tuple(map(int, rows)), message)

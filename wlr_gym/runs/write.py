@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import csv
-import os
-import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +12,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.errors import InputError
+from wlr_gym.files import replace_file
 from wlr_gym.runs.check import check_table
 from wlr_gym.runs.format import COLUMNS, META_FILE, SUFFIXES, RunMeta
 from wlr_gym.runs.read import read_meta
@@ -58,21 +57,6 @@ def write_meta(folder: str | Path, meta: RunMeta) -> Path:
     text = yaml.safe_dump(meta.model_dump(mode="json", exclude_none=True), sort_keys=False, allow_unicode=True)
     replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
     return path
-
-
-def replace_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill a temporary file in the folder of ``path``, then move it there in one step."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
-    os.close(handle)
-    try:
-        write(Path(name))
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)  # mkstemp makes files private
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def _write_csv(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:

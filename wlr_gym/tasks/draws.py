@@ -1,49 +1,66 @@
-"""Counter-based random numbers: a pure function of (seed, named stream, counter).
+"""Compiled draws of many named streams at once, on the counter-based generator of ``wlr_gym.random``.
 
-Nothing is consumed from a shared generator, so a new stream shifts no other, and a robot draws the same numbers alone or
-in a batch. The functions below work on numpy arrays and, compiled by numba (``wlr_gym.envs.kernels``), on scalars.
-Mixing function: SplitMix64 (Steele, Lea, Flood: Fast splittable pseudorandom number generators, OOPSLA 2014).
+Nothing is consumed from a shared generator: a new stream shifts no other, and a robot draws the same numbers alone or in a
+batch.
 """
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
 
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-_FIRST = np.uint64(0xBF58476D1CE4E5B9)
-_SECOND = np.uint64(0x94D049BB133111EB)
-_S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
-_UNIT = 2.0**-53
+from wlr_gym.random import stream_number, words4
 
-
-def mix(x: Any) -> Any:
-    """SplitMix64 finaliser: uint64 to well-scrambled uint64."""
-    x = (x ^ (x >> _S30)) * _FIRST
-    x = (x ^ (x >> _S27)) * _SECOND
-    return x ^ (x >> _S31)
+_EPISODE = stream_number("episode")
 
 
-def random_bits(seed: Any, key: Any, counter: Any) -> Any:
-    """64 random bits for (seed, stream key, counter), all uint64."""
-    return mix(mix(mix(seed + _GOLDEN) ^ key) + counter * _GOLDEN)
+@njit(cache=True, nogil=True, inline="always")
+def uniform(seed: Any, stream: Any, counter: Any) -> Any:
+    """One uniform number in [0, 1) of 53 bits: a function of (seed, stream, counter) alone."""
+    high, low, _, _ = words4(seed, stream, counter, 0)
+    return float(np.int64(((high >> np.uint64(5)) << np.uint64(26)) | (low >> np.uint64(6)))) * 2.0**-53
 
 
-def unit(bits: Any) -> Any:
-    """Map 64 random bits to a uniform number in [0, 1)."""
-    return (bits >> _S11) * _UNIT
+@njit(cache=True, nogil=True)
+def _fill(seeds: Any, streams: Any, counters: Any, out: Any) -> None:
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            out[row, column] = uniform(seeds[row, column], streams[column], counters[row, column])
 
 
-def stream_key(*names: str) -> np.uint64:
-    """Return the key of a named stream."""
-    digest = hashlib.blake2b("\0".join(names).encode(), digest_size=8).digest()
-    return np.uint64(int.from_bytes(digest, "little"))
+@njit(cache=True, nogil=True)
+def _fill_seeds(seeds: Any, stream: Any, counters: Any, out: Any) -> None:
+    for row in range(out.shape[0]):
+        high, low, _, _ = words4(seeds[row], stream, counters[row], 0)
+        out[row] = (high << np.uint64(32)) | low
 
 
-def uniforms(seeds: NDArray[np.uint64], key: np.uint64, counters: NDArray[np.uint64] | int = 0) -> NDArray[np.float64]:
-    """Return one uniform number in [0, 1) per seed; ``counters`` is one number or one per seed."""
-    counter = np.broadcast_to(np.asarray(counters, dtype=np.uint64), seeds.shape)
-    return unit(random_bits(seeds, np.full(seeds.shape, key), counter))
+def uniforms(seeds: NDArray[np.uint64], streams: NDArray[np.uint64], counters: ArrayLike = 0) -> NDArray[np.float64]:
+    """Return uniform numbers in [0, 1), shape (M, K).
+
+    Args:
+        seeds: (M,), or (M, K) where streams draw from different seeds.
+        streams: (K,) stream numbers.
+        counters: whole numbers that broadcast to (M, K).
+    """
+    shape = (seeds.shape[0], len(streams))
+    out = np.empty(shape)
+    if seeds.ndim == 1:
+        seeds = seeds[:, None]
+    _fill(np.broadcast_to(seeds, shape), streams, np.broadcast_to(np.asarray(counters, dtype=np.int64), shape), out)
+    return out
+
+
+def stream_numbers(*names: str) -> NDArray[np.uint64]:
+    """Return the stream numbers of names."""
+    return np.array([stream_number(name) for name in names], dtype=np.uint64)
+
+
+def episode_seeds(robot_seeds: NDArray[np.uint64], episodes: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Return the seed of each robot's n-th episode, shape (M,)."""
+    out = np.empty(len(robot_seeds), dtype=np.uint64)
+    _fill_seeds(robot_seeds, _EPISODE, episodes, out)
+    return out

@@ -16,13 +16,15 @@ from typing import Any
 from wlr_gym import servo
 from wlr_gym.codegen import Graph, Node, emit, graph, hoist, live_nodes, load_module, ops
 from wlr_gym.model import equations
+from wlr_gym.plants.base import TRUTH_LAYOUT
 from wlr_gym.plants.gibbs_appell import packing
 from wlr_gym.plants.gibbs_appell import step as source
 from wlr_gym.plants.gibbs_appell.packing import PARAMETER_LANES
-from wlr_gym.plants.gibbs_appell.step import INPUTS, RESULTS, STATE, TICK_SUMS
+from wlr_gym.plants.gibbs_appell.step import INPUTS, STORED, TICK_SUMS
+from wlr_gym.plants.sensors import RAW_LAYOUT
 
 WIDTH = {"float64": 8, "float32": 16}
-STORED = STATE + RESULTS
+
 _FIXED = frozenset(INPUTS + PARAMETER_LANES + ("step",))
 
 
@@ -103,8 +105,12 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
         "inputs": start[INPUTS[0]],
         "parameters": start[PARAMETER_LANES[0]],
         "parameter_count": len(PARAMETER_LANES) * width,
-        "outputs": start[OUTPUTS[0]],
-        "output_count": len(OUTPUTS),
+        "truth": start[OUTPUTS[0]],
+        "truth_count": TRUTH_LAYOUT.width,
+        "raw": start[OUTPUTS[TRUTH_LAYOUT.width]],
+        "raw_count": RAW_LAYOUT.width - 1,
+        "cosine": start["heading_cosine"],
+        "sine": start["heading_sine"],
         "sums": start[TICK_SUMS[0]],
         "sum_count": len(TICK_SUMS) * width,
         "decorator": _DECORATOR,
@@ -115,15 +121,18 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
 _DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
 _DRIVER = '''
 {decorator}
-def scatter(W, OUT, tile, count):
+def scatter(W, TRUTH, RAW, tile, count):
     for k in range(min({width}, count - tile * {width})):
         row = tile * {width} + k
-        for c in range({output_count}):
-            OUT[row, c] = W[{outputs} + c * {width} + k]
+        for c in range({truth_count}):
+            TRUTH[row, c] = W[{truth} + c * {width} + k]
+        for c in range({raw_count}):
+            RAW[row, c] = W[{raw} + c * {width} + k]
+        RAW[row, {raw_count}] = math.atan2(W[{sine} + k], W[{cosine} + k])
 
 
 {decorator}
-def tick(X, P, goals, old_goals, switch_time, on, OUT, first, last, count, step, substeps, sweeps):
+def tick(X, P, goals, old_goals, switch_time, on, TRUTH, RAW, first, last, count, step, substeps, sweeps):
     W = np.zeros({scratch}, F)
     half = F(0.5) * step
     for tile in range(first, last):
@@ -146,18 +155,18 @@ def tick(X, P, goals, old_goals, switch_time, on, OUT, first, last, count, step,
             finish(W, step)
             drift(W, step if s + 1 < substeps else half)
         observe(W, step)
-        scatter(W, OUT, tile, count)
+        scatter(W, TRUTH, RAW, tile, count)
         X[tile] = W[:{stored}]
 
 
 {decorator}
-def look(X, P, OUT, count, step):
+def look(X, P, TRUTH, RAW, count, step):
     W = np.zeros({scratch}, F)
     for tile in range(X.shape[0]):
         W[:{stored}] = X[tile]
         W[{parameters}:{parameters} + {parameter_count}] = P[tile]
         observe(W, step)
-        scatter(W, OUT, tile, count)
+        scatter(W, TRUTH, RAW, tile, count)
 '''
 
 

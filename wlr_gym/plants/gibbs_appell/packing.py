@@ -13,7 +13,7 @@ from wlr_gym.robot import Robot
 
 Array = NDArray[np.float64]
 
-_CORNER_LANES = (*ASSEMBLY, "length", "radius", "zero_offset", "stiffness", "damping", "mu_x", "mu_y", "rolling")
+_CORNER_LANES = (*ASSEMBLY, "length", "radius", "zero_offset", "stiffness", "damping", "look_ahead", "mu_x", "mu_y", "rolling")
 _JOINT_LANES = (
     "kp", "kd", "volt_gain", "back_emf_damping", "viscous", "weight", "gear_bound", "inverse_constant", "effort_scale",
     "velocity_limit", "acceleration_limit",
@@ -55,6 +55,7 @@ def pack(parameters: Parameters, robot: Robot, step: float) -> Array:
         "zero_offset": parameters["joint.zero_offset"],
         "stiffness": parameters["ground.normal_stiffness"],
         "damping": parameters["ground.normal_damping"],
+        "look_ahead": damper_look_ahead(parameters, step),
         "mu_x": parameters["ground.mu_x"],
         "mu_y": parameters["ground.mu_y"],
         "rolling": parameters["ground.rolling_resistance"],
@@ -106,6 +107,17 @@ def _nominal_motor(robot: Robot) -> tuple[Array, Array]:
         np.array([leg.stall_torque] * 4 + [wheel.stall_torque] * 4),
         np.array([leg.no_load_speed] * 4 + [wheel.no_load_speed] * 4),
     )
+
+
+def damper_look_ahead(parameters: Parameters, step: float) -> Array:
+    """How far the contact damper's rate is extrapolated, in steps, shape (N, 4).
+
+    Half a step makes it second order, but an extrapolated damper is unstable at step * damping / mass = 1. So it fades to
+    none between 0.3 and 0.6, where the lightest mass that a wheel's damper can act on alone is the pitching platform's.
+    """
+    mass = parameters["body.mass"][:, None] / 12.0
+    stiffness_ratio = step * parameters["ground.normal_damping"] / mass
+    return 0.5 * np.clip(2.0 - stiffness_ratio / 0.3, 0.0, 1.0)
 
 
 def fitted_weight(z: Array) -> Array:

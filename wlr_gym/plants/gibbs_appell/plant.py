@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from wlr_gym.errors import InputError, nearest
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import (
+    SENSOR_LAYOUT,
     TRUTH_LAYOUT,
     Capabilities,
     PlantOptions,
@@ -66,9 +67,9 @@ class GibbsAppellPlant:
         self._tiles = -(-count // self._width)
         self._lanes = np.zeros((self._tiles, len(STORED) * self._width), self._float)
         self._constants = np.zeros((self._tiles, len(packing.PARAMETER_LANES) * self._width), self._float)
-        self._output = np.zeros((count, len(kernel.OUTPUTS)))
-        self._truth = Truth(self._output[:, : TRUTH_LAYOUT.width])
-        self._raw = self._output[:, TRUTH_LAYOUT.width :]
+        self._truth = Truth(np.zeros((count, TRUTH_LAYOUT.width)))
+        self._raw = np.zeros((count, RAW_LAYOUT.width))
+        self._readings = Sensors(np.zeros((count, SENSOR_LAYOUT.width)))
         self._torque_on = np.ones((count, 8))
         self._goals = GoalHistory(count, self.options.control_period)
         self._sensors = SensorModel(robot, self.options, count)
@@ -107,8 +108,9 @@ class GibbsAppellPlant:
         start = standing_state(self.robot, self.parameters) if state is None else state
         self._write_state(start, rows)
         self._goals.reset(rows, start, self.parameters)
-        self._kernel.look(self._lanes, self._constants, self._output, self._count, self._step)
-        return self._sensors.reset(rows, seeds, self.parameters, self._truth, self._raw)
+        self._kernel.look(self._lanes, self._constants, self._truth.values, self._raw, self._count, self._step)
+        self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)
+        return self._readings
 
     def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
         """Change parameters in mid-run (interval randomisation, drifting friction); the state stays."""
@@ -204,7 +206,7 @@ class GibbsAppellPlant:
         else:
             self._torque_on[...] = torque_on
         new, old, switch_time = self._goals.push(goals)
-        arguments = (self._lanes, self._constants, new, old, switch_time, self._torque_on, self._output)
+        arguments = (self._lanes, self._constants, new, old, switch_time, self._torque_on, self._truth.values, self._raw)
         if self._pool is None:
             self._run(arguments, 0, self._tiles)
         else:
@@ -212,10 +214,11 @@ class GibbsAppellPlant:
             self._run(arguments, *self._chunks[0])
             for future in waiting:
                 future.result()
-        return self._sensors.measure(self._truth, self._raw)
+        return self._readings
 
     def _run(self, arguments: tuple[Array, ...], first: int, last: int) -> None:
         self._kernel.tick(*arguments, first, last, self._count, self._step, self.substeps, self.sweeps)
+        self._sensors.measure(self._raw, self._readings.values, first * self._width, min(last * self._width, self._count))
 
     def truth(self) -> Truth:
         """Return the true state after the last step or reset; overwritten by the next step."""
@@ -257,5 +260,3 @@ def check_contact_resolution(parameters: Parameters, step: float) -> None:
             f"below {step / worst[robot] ** 0.5:.2g} s or soften the contact"
         )
 
-
-assert kernel.OUTPUTS[TRUTH_LAYOUT.width :] == RAW_LAYOUT.elements or True

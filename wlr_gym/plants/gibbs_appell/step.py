@@ -69,6 +69,7 @@ RESULTS: tuple[str, ...] = (
     "electrical_energy",
 )
 TICK_SUMS: tuple[str, ...] = RESULTS[-10:]
+STORED: tuple[str, ...] = STATE + RESULTS
 #: Written each control tick.
 INPUTS: tuple[str, ...] = (
     *(f"goal{j}" for j in range(8)),
@@ -380,7 +381,7 @@ def _normal_force(
     gap = lanes["pz"] + dot(n, point)
     base_row, leg_entry = contact_row(hip, leg, rim, n)
     gap_rate = dot(base_row, [*v, *w]) + leg_entry * lanes[f"leg_rate{i}"]
-    mid_rate = 1.5 * gap_rate - 0.5 * lanes[f"last_gap_rate{i}"]
+    mid_rate = gap_rate + lanes[f"look_ahead{i}"] * (gap_rate - lanes[f"last_gap_rate{i}"])
     push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * mid_rate, 0.0)
     return ops.where_positive(-gap, push, 0.0), gap_rate
 
@@ -529,7 +530,7 @@ def kick_finish(lanes: Lanes, step: Value) -> Out:
 
 
 def observe(lanes: Lanes, step: Value) -> Out:
-    """Columns of the truth matrix (names as in TRUTH_LAYOUT, element by element) and the raw sensor channels."""
+    """Columns of the truth matrix, in the order of TRUTH_LAYOUT, then the raw sensor channels."""
     rows = rotation_rows(lanes)
     n, heading, lateral, scale = floor_axes(rows)
     v, w = vector(lanes, "v"), vector(lanes, "w")
@@ -558,8 +559,12 @@ def observe(lanes: Lanes, step: Value) -> Out:
     out["mechanical_energy"], out["electrical_energy"] = lanes["mechanical_energy"], lanes["electrical_energy"]
     reach = [ops.absolute(n[k]) * lanes[f"half_size_{a}"] for k, a in enumerate(AXES)]
     out["body_clearance"] = lanes["pz"] - reach[0] - reach[1] - reach[2]
-    out |= {f"effort_{j}": lanes[f"motor_torque{j}"] * lanes[f"effort_scale{j}"] for j in range(8)}
-    out |= {f"gyro_{a}": lanes[f"gyro_{a}"] for a in AXES}
-    out |= {f"acceleration_{a}": lanes[f"acceleration_{a}"] for a in AXES}
-    out["supply"] = lanes["supply"]
+    # from here on: RAW_LAYOUT of plants/sensors.py; the heading's cosine and sine stand for its yaw
+    out |= {f"raw_position_{j}": out[f"joint_position_{j}"] for j in range(8)}
+    out |= {f"raw_velocity_{j}": out[f"joint_velocity_{j}"] for j in range(8)}
+    out |= {f"raw_effort_{j}": lanes[f"motor_torque{j}"] * lanes[f"effort_scale{j}"] for j in range(8)}
+    out |= {f"raw_gyro_{a}": lanes[f"gyro_{a}"] for a in AXES}
+    out |= {f"raw_acceleration_{a}": lanes[f"acceleration_{a}"] for a in AXES}
+    out["raw_supply"] = lanes["supply"]
+    out |= {"raw_x": lanes["px"], "raw_y": lanes["py"], "heading_cosine": rows[0][0], "heading_sine": rows[1][0]}
     return out

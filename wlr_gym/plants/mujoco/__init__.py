@@ -1,0 +1,1 @@
+"""MuJoCo as an independent second opinion: the same robot and parameters as an ``MjModel``."""

@@ -1,0 +1,195 @@
+"""Robot states from measurements: where a replay starts, and where each of its segments starts again.
+
+What the run measures is taken from it, smoothed; the rest (height, attitude, servo references) comes from a background state.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.parameters import Parameters
+from wlr_gym.plants.base import PlantState, standing_state
+from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.runs.read import Run
+from wlr_gym.servo import motor_constants
+
+Array = NDArray[np.float64]
+
+#: Half width (s) of the window a joint or gyro reading is smoothed over; the camera is slower and noisier.
+JOINT_WINDOW = 0.07
+CAMERA_WINDOW = 0.2
+
+
+def local_fit(t: Array, values: Array, at: Array, window: float) -> tuple[Array, Array]:
+    """Smooth a sampled signal: value and slope at the times ``at`` of local parabolas (tricube weights over +-``window``).
+
+    Missing samples are skipped; where fewer than three are left, the nearest three are used. Shapes (T,), (T,), (K,) -> (K,), (K,).
+    """
+    known = np.isfinite(values)
+    t, values = t[known], values[known]
+    fits = np.zeros((len(at), 2))
+    for k, time in enumerate(at):
+        offset = t - time
+        reach = max(window, 1.001 * float(np.sort(np.abs(offset))[min(2, len(t) - 1)]))
+        near = np.abs(offset) < reach
+        root_weight = (1 - np.abs(offset[near] / reach) ** 3) ** 1.5
+        powers = np.vander(offset[near] / reach, 3, increasing=True)
+        solution = np.linalg.lstsq(powers * root_weight[:, None], values[near] * root_weight, rcond=1e-8)[0]
+        fits[k] = solution[0], solution[1] / reach
+    return fits[:, 0], fits[:, 1]
+
+
+def start_state(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
+    """Return the state (1 robot) at the run's first row: measured joints, legs on the floor, references at the goals.
+
+    The integral of a wheel's speed controller, which holds a standing robot under tension, is read off its measured effort.
+    """
+    background = standing_state(robot, parameters)
+    first = run["t"][:1]
+    legs = np.array([[run[f"cmd_{joint}"][0] for joint in JOINTS[:4]]])
+    measured = _joints(run, first, parameters)[0]
+    goal = legs - parameters["joint.zero_offset"]
+    background.reference_position[:, :4] = np.where(np.isnan(goal), measured[:, :4], goal)
+    background.reference_position[:, 4:] += _wheel_tension(run, robot, parameters)
+    state = measured_state(run, first, background, parameters)
+    state.reference_velocity[:, 4:] = state.joint_velocity[:, 4:]
+    return state
+
+
+def measured_state(run: Run, times: Array, background: PlantState, parameters: Parameters) -> PlantState:
+    """Return one state per time: measured where the run measures, else the background's.
+
+    Measured: joint angles and rates; x, y, yaw and their rates from the camera; body rates from the gyroscope. Height, pitch
+    and roll are the background's, moved by what the difference between measured and background leg angles means for a
+    body on four wheels. Servo references are the background's; a wheel's moves along with its angle.
+
+    Args:
+        run: the run.
+        times: (K,) s on the run's clock.
+        background: (K) states.
+        parameters: (K) parameters.
+    """
+    state = background.copy()
+    state.joint_position, state.joint_velocity = _joints(run, times, parameters)
+    state.reference_position[:, 4:] += state.joint_position[:, 4:] - background.joint_position[:, 4:]
+
+    yaw, pitch, roll = euler_angles(background.quaternion)
+    moved = rest_pose(parameters, state.joint_position[:, :4]) - rest_pose(parameters, background.joint_position[:, :4])
+    state.position[:, 2] += moved[:, 0]
+    pitch, roll = pitch + moved[:, 1], roll + moved[:, 2]
+    velocity = np.einsum("nij,nj->ni", rotation(yaw, pitch, roll), background.linear_velocity_in_body)
+    if {"gyro_x", "gyro_y", "gyro_z"} <= set(run.table.columns):
+        gyro = [local_fit(run["t"], run[f"gyro_{axis}"], times, JOINT_WINDOW)[0] for axis in "xyz"]
+        state.angular_velocity_in_body = np.stack(gyro, axis=1) - parameters["imu.gyro_bias"]
+    if has_camera(run):
+        (x, vx), (y, vy), (yaw, _) = _camera(run, times, parameters)
+        state.position[:, 0], state.position[:, 1] = x, y
+        velocity[:, 0], velocity[:, 1] = vx, vy
+    turn = rotation(yaw, pitch, roll)
+    state.quaternion = quaternion(yaw, pitch, roll)
+    state.linear_velocity_in_body = np.einsum("nji,nj->ni", turn, velocity)
+    if has_camera(run):
+        offset = np.asarray(run.meta.marker_offset)
+        state.position[:, :2] -= (turn @ offset)[:, :2]
+        state.linear_velocity_in_body -= np.cross(state.angular_velocity_in_body, offset)
+    return state
+
+
+def has_camera(run: Run) -> bool:
+    """Whether the run holds a floor pose with at least three frames."""
+    columns = ("cam_x", "cam_y", "cam_yaw")
+    return all(name in run and np.isfinite(run[name]).sum() > 2 for name in columns)
+
+
+def _joints(run: Run, times: Array, parameters: Parameters) -> tuple[Array, Array]:
+    """True joint angles and rates (K, 8) at the given times."""
+    positions = np.zeros((len(times), 8))
+    velocities = np.zeros((len(times), 8))
+    for j, joint in enumerate(JOINTS):
+        positions[:, j], velocities[:, j] = local_fit(run["t"], run[f"pos_{joint}"], times, JOINT_WINDOW)
+        if f"vel_{joint}" in run and np.isfinite(run[f"vel_{joint}"]).sum() > 2:
+            velocities[:, j], _ = local_fit(run["t"], run[f"vel_{joint}"], times, JOINT_WINDOW)
+    positions[:, :4] -= parameters["joint.zero_offset"]
+    return positions, velocities
+
+
+def _camera(run: Run, times: Array, parameters: Parameters) -> list[tuple[Array, Array]]:
+    """Marker x, y and yaw in the floor frame, each with its rate, at the given times."""
+    exposed = run["t"] - parameters["camera.delay"][0]
+    x, y, yaw = (local_fit(exposed, unwrapped(run[f"cam_{name}"]), times, CAMERA_WINDOW) for name in ("x", "y", "yaw"))
+    mount = parameters["camera.mount_yaw"][0]
+    cosine, sine = np.cos(mount), np.sin(mount)
+    turned_x, turned_y = ((cosine * x[k] - sine * y[k], sine * x[k] + cosine * y[k]) for k in (0, 1))
+    return [(turned_x[0], turned_y[0]), (turned_x[1], turned_y[1]), yaw]
+
+
+def unwrapped(angle: Array) -> Array:
+    """Undo jumps of 2 pi in an angle with missing samples."""
+    known = np.isfinite(angle)
+    result = angle.copy()
+    result[known] = np.unwrap(angle[known])
+    return result
+
+
+def _wheel_tension(run: Run, robot: Robot, parameters: Parameters) -> Array:
+    """Distance of the wheels' reference from their angle (1, 4) that gives the measured effort at rest."""
+    nominal_voltage = robot.servo.supply_voltage
+    constant, resistance = motor_constants(robot.servo.wheel.stall_torque, robot.servo.wheel.no_load_speed, nominal_voltage)
+    early = run["t"] <= run["t"][0] + CAMERA_WINDOW
+    effort = [np.mean(run[f"eff_{joint}"][early]) if f"eff_{joint}" in run else 0.0 for joint in JOINTS[4:]]
+    return np.nan_to_num(effort) * resistance / constant / np.maximum(parameters["servo.kp"][:, 4:], 1e-9)
+
+
+# --- geometry ---------------------------------------------------------------------------------------------------------
+
+
+def rest_pose(parameters: Parameters, legs: Array) -> Array:
+    """Return height of the body origin, pitch and roll (N, 3) that put four wheels on a flat floor, least squares.
+
+    Args:
+        parameters: (N).
+        legs: (N, 4) true leg angles, rad.
+    """
+    signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
+    hip, length, radius = parameters["hip.position"], parameters["leg.length"], parameters["wheel.radius"]
+    x = signs[:, 0] * hip[:, :1] + length * np.cos(legs)
+    y = signs[:, 1] * hip[:, 1:2] + np.zeros_like(legs)
+    z = hip[:, 2:] - length * np.sin(legs)
+    pose = np.zeros((len(legs), 3))
+    for _ in range(5):  # Gauss-Newton; the problem is almost linear
+        height, pitch, roll = pose[:, :1], pose[:, 1:2], pose[:, 2:]
+        up = np.sin(roll) * y + np.cos(roll) * z
+        gap = height - np.sin(pitch) * x + np.cos(pitch) * up - radius
+        along = np.cos(pitch) * (np.cos(roll) * y - np.sin(roll) * z)
+        slope = np.stack([np.ones_like(x), -np.cos(pitch) * x - np.sin(pitch) * up, along], axis=2)
+        pose = pose - np.einsum("nij,nj->ni", np.linalg.pinv(slope), gap)
+    return pose
+
+
+def euler_angles(q: Array) -> tuple[Array, Array, Array]:
+    """Yaw, pitch and roll (N,) of quaternions (N, 4), (w, x, y, z): turn by yaw about z, then pitch about y, then roll about x."""
+    w, x, y, z = q.T
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1, 1))
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return yaw, pitch, roll
+
+
+def quaternion(yaw: Array, pitch: Array, roll: Array) -> Array:
+    """Quaternions (N, 4) of Rz(yaw) Ry(pitch) Rx(roll)."""
+    (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a / 2), np.sin(a / 2)) for a in (yaw, pitch, roll))
+    w, x = cy * cp * cr + sy * sp * sr, cy * cp * sr - sy * sp * cr
+    y, z = cy * sp * cr + sy * cp * sr, sy * cp * cr - cy * sp * sr
+    return np.stack([w, x, y, z], axis=1)
+
+
+def rotation(yaw: Array, pitch: Array, roll: Array) -> Array:
+    """Matrices (N, 3, 3) of Rz(yaw) Ry(pitch) Rx(roll), body to floor frame."""
+    (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
