@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from wlr_gym.errors import InputError, nearest
 from wlr_gym.paths import find_config
@@ -30,7 +30,7 @@ ModelType = TypeVar("ModelType", bound=BaseModel)
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Body(_Model):
@@ -167,6 +167,22 @@ class Robot(_Model):
     sensors: SensorSet
     tolerances: dict[str, float | str] = {}
 
+    @field_validator("leg_limits")
+    @classmethod
+    def _limits_are_ordered(cls, limits: tuple[float, float]) -> tuple[float, float]:
+        if not limits[0] < limits[1]:
+            raise ValueError("the lower limit must be below the upper one")
+        return limits
+
+    @field_validator("dynamixel_ids")
+    @classmethod
+    def _every_joint_has_its_own_id(cls, ids: dict[str, int]) -> dict[str, int]:
+        if set(ids) != set(JOINTS) or len(set(ids.values())) != len(JOINTS):
+            raise ValueError(f"expected one id of its own for each of {', '.join(JOINTS)}")
+        if not all(0 <= number <= 252 for number in ids.values()):
+            raise ValueError("Dynamixel ids are 0 to 252")
+        return ids
+
     @property
     def total_mass(self) -> float:
         """Mass of body, legs and wheels (kg)."""
@@ -190,6 +206,8 @@ def physical_faults(robot: Robot) -> list[str]:
             )
     faults += _triangle_faults("body.inertia", robot.body.inertia)
     faults += _triangle_faults("leg.inertia", robot.leg.inertia)
+    if not robot.leg_limits[0] <= robot.home.leg_angle <= robot.leg_limits[1]:
+        faults.append(f"home.leg_angle = {robot.home.leg_angle:g} rad is outside leg_limits {list(robot.leg_limits)}")
     if robot.joints != JOINTS:
         faults.append(f"joints must be {list(JOINTS)} in this order, not {list(robot.joints)}")
     return faults
@@ -282,6 +300,9 @@ def _explain(model: type[BaseModel], problem: Any, where: str) -> str:
 
 def _fields_at(model: Any, path: list[str]) -> list[str]:
     for part in path:
+        if get_origin(model) is dict:
+            model = get_args(model)[1]
+            continue
         field = getattr(model, "model_fields", {}).get(part)
         if field is None:
             return []

@@ -265,7 +265,9 @@ def test_duplicate_rows(table):
     assert 50 in next(iter(findings_of(table, "duplicate").values()))
 
 
-@pytest.mark.parametrize("column", ["gyro_x", "acc_z", "eff_leg_lf", "cam_y", "volt", "pos_leg_lf", "vel_leg_lf", "vel_wheel_lf"])
+@pytest.mark.parametrize(
+    "column", ["gyro_x", "acc_z", "eff_leg_lf", "cam_y", "volt", "pos_leg_lf", "vel_leg_lf", "vel_wheel_lf"]
+)
 def test_dead_channel(table, column):
     table[column] = np.where(np.isnan(table[column]), np.nan, table[column][0])
     assert column in findings_of(table, "constant")

@@ -110,7 +110,9 @@ def _parse(data: Any, source: str) -> Patch:
 
 def _parse_effect(entry: Any, source: str, index: int) -> PatchEffect:
     if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
-        raise InputError(f"{source}: effect {index + 1}: expected a mapping with 'name', 'where' and 'parameters', got {entry!r}")
+        raise InputError(
+            f"{source}: effect {index + 1}: expected a mapping with 'name', 'where' and 'parameters', got {entry!r}"
+        )
     name = entry["name"]
     place = _place(source, index, name)
     if name in BEYOND_PARAMETERS:

@@ -104,71 +104,130 @@ def _xyz(unit: str, bound: float) -> dict[str, EffectParameter]:
 
 _ALL = (
     Effect(
-        "coulomb_friction", "dry friction in a joint on top of its own", {"torque": EffectParameter("N m", 0, 50)}, JOINTS,
+        "coulomb_friction",
+        "dry friction in a joint on top of its own",
+        {"torque": EffectParameter("N m", 0, 50)},
+        JOINTS,
         _add("servo.coulomb_friction", "torque"),
     ),
     Effect(
-        "viscous_friction", "friction proportional to speed, beyond back-EMF, on top of the joint's own",
-        {"coefficient": EffectParameter("N m s/rad", 0, 10)}, JOINTS, _add("servo.viscous_friction", "coefficient"),
+        "viscous_friction",
+        "friction proportional to speed, beyond back-EMF, on top of the joint's own",
+        {"coefficient": EffectParameter("N m s/rad", 0, 10)},
+        JOINTS,
+        _add("servo.viscous_friction", "coefficient"),
     ),
     Effect(
-        "command_delay", "goals act later than written, on top of the robot's own delay", {"delay": EffectParameter("s", 0, 0.2)},
-        JOINTS, _add("command.delay", "delay"),
+        "command_delay",
+        "goals act later than written, on top of the robot's own delay",
+        {"delay": EffectParameter("s", 0, 0.2)},
+        JOINTS,
+        _add("command.delay", "delay"),
     ),
     Effect(
-        "joint_zero_offset", "encoder reading = true angle + angle", {"angle": EffectParameter("rad", -0.5, 0.5)}, LEGS,
+        "joint_zero_offset",
+        "encoder reading = true angle + angle",
+        {"angle": EffectParameter("rad", -0.5, 0.5)},
+        LEGS,
         _add("joint.zero_offset", "angle"),
     ),
     Effect(
-        "friction_level", "friction coefficient of the floor, all wheels", {"mu": EffectParameter("-", 0, 5)}, ("ground",), _set_friction
+        "friction_level",
+        "friction coefficient of the floor, all wheels",
+        {"mu": EffectParameter("-", 0, 5)},
+        ("ground",),
+        _set_friction,
     ),
     Effect(
-        "friction_asymmetry", "friction coefficient of the named wheels; the others keep theirs", {"mu": EffectParameter("-", 0, 5)},
-        WHEELS, _set_friction,
+        "friction_asymmetry",
+        "friction coefficient of the named wheels; the others keep theirs",
+        {"mu": EffectParameter("-", 0, 5)},
+        WHEELS,
+        _set_friction,
     ),
     Effect(
-        "friction_anisotropy", "ratio mu_y/mu_x of lateral to longitudinal friction", {"ratio": EffectParameter("-", 0, 5)},
-        ("ground",), _set_anisotropy,
+        "friction_anisotropy",
+        "ratio mu_y/mu_x of lateral to longitudinal friction",
+        {"ratio": EffectParameter("-", 0, 5)},
+        ("ground",),
+        _set_anisotropy,
     ),
     Effect(
-        "rolling_resistance", "torque c N a opposing the wheel's spin over the floor", {"coefficient": EffectParameter("-", 0, 1)},
-        WHEELS, _add("ground.rolling_resistance", "coefficient"),
+        "rolling_resistance",
+        "torque c N a opposing the wheel's spin over the floor",
+        {"coefficient": EffectParameter("-", 0, 1)},
+        WHEELS,
+        _add("ground.rolling_resistance", "coefficient"),
     ),
     Effect(
         "wheel_radius_error", "factor on the wheel's radius", {"scale": EffectParameter("-", 0.5, 2)}, WHEELS, _scale_radius
     ),
     Effect(
-        "payload", "point-like mass fixed to the body", {"mass": EffectParameter("kg", 0, 20), **_xyz("m", 0.5)}, ("body",), _add_payload
+        "payload",
+        "point-like mass fixed to the body",
+        {"mass": EffectParameter("kg", 0, 20), **_xyz("m", 0.5)},
+        ("body",),
+        _add_payload,
     ),
     Effect(
-        "com_offset", "body's centre of mass displaced; IMU and marker stay", _xyz("m", 0.2), ("body",),
+        "com_offset",
+        "body's centre of mass displaced; IMU and marker stay",
+        _xyz("m", 0.2),
+        ("body",),
         _add_vector("body.com_offset", "xyz"),
     ),
     Effect(
-        "floor_slope", "floor inclined; positive = uphill along floor x (pitch) and y (roll)",
-        {"pitch": EffectParameter("rad", -1.2, 1.2, 0.0), "roll": EffectParameter("rad", -1.2, 1.2, 0.0)}, ("ground",),
+        "floor_slope",
+        "floor inclined; positive = uphill along floor x (pitch) and y (roll)",
+        {"pitch": EffectParameter("rad", -1.2, 1.2, 0.0), "roll": EffectParameter("rad", -1.2, 1.2, 0.0)},
+        ("ground",),
         _add_vector("ground.slope", ("pitch", "roll")),
     ),
     Effect(
-        "external_force", "constant force on the body in the floor frame",
-        {"fx": EffectParameter("N", -1e3, 1e3, 0.0), "fy": EffectParameter("N", -1e3, 1e3, 0.0)}, ("body",),
+        "external_force",
+        "constant force on the body in the floor frame",
+        {"fx": EffectParameter("N", -1e3, 1e3, 0.0), "fy": EffectParameter("N", -1e3, 1e3, 0.0)},
+        ("body",),
         _add_vector("external_force", ("fx", "fy")),
     ),
-    Effect("gyro_bias", "constant rate offset beyond specification", _xyz("rad/s", 1.0), ("sensor",), _add_vector("imu.gyro_bias", "xyz")),
     Effect(
-        "camera_delay", "vision pose older than its row", {"delay": EffectParameter("s", 0, 0.5)}, ("sensor",), _add_camera_delay
+        "gyro_bias",
+        "constant rate offset beyond specification",
+        _xyz("rad/s", 1.0),
+        ("sensor",),
+        _add_vector("imu.gyro_bias", "xyz"),
     ),
     Effect(
-        "camera_misalignment", "camera's floor frame turned by +yaw against the start heading",
-        {"yaw": EffectParameter("rad", -0.5, 0.5, 0.0), "scale": EffectParameter("-", 0.1, 10, 1.0)}, ("sensor",), _turn_camera,
+        "camera_delay",
+        "vision pose older than its row",
+        {"delay": EffectParameter("s", 0, 0.5)},
+        ("sensor",),
+        _add_camera_delay,
     ),
-)  # fmt: skip
+    Effect(
+        "camera_misalignment",
+        "camera's floor frame turned by +yaw against the start heading",
+        {"yaw": EffectParameter("rad", -0.5, 0.5, 0.0), "scale": EffectParameter("-", 0.1, 10, 1.0)},
+        ("sensor",),
+        _turn_camera,
+    ),
+)
 
 #: The effects this version can apply, by name.
 EFFECTS: dict[str, Effect] = {effect.name: effect for effect in _ALL}
 
 #: Names of the vocabulary whose effect takes more than a value of the parameter table.
 BEYOND_PARAMETERS = (
-    "stribeck_friction", "load_dependent_friction", "backlash", "torque_ripple", "weak_motor", "supply_sag", "friction_patch",
-    "slip_weakening", "tyre_creep", "tether", "imu_misalignment", "unknown_effect",
-)  # fmt: skip
+    "stribeck_friction",
+    "load_dependent_friction",
+    "backlash",
+    "torque_ripple",
+    "weak_motor",
+    "supply_sag",
+    "friction_patch",
+    "slip_weakening",
+    "tyre_creep",
+    "tether",
+    "imu_misalignment",
+    "unknown_effect",
+)

@@ -126,7 +126,9 @@ def compile_evaluation(task: Task) -> Evaluation:
     outputs = expressions(task, graph.input)
     lines = emit(outputs, load, lambda name, value: f"{stores[name]} = {value}", "        ")
     source = "\n".join([*_HEAD, *lines, *_TAIL, ""])
-    module = load_module(f"evaluation_{task.config.name}", source, f"wlr_gym: compiling the rewards of task '{task.config.name}' (once)")
+    module = load_module(
+        f"evaluation_{task.config.name}", source, f"wlr_gym: compiling the rewards of task '{task.config.name}' (once)"
+    )
     return Evaluation(module.run, np.array([number(task, name) for name in numbers], dtype=np.float64))
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 from numba import njit
 
 from wlr_gym.random import normals4
@@ -49,13 +48,15 @@ def take_action(mask: Any, given: Any, limit: float, table: Any, action: Any, pr
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_command(i: int, now: int, seeds: Any, stream: Any, table: Any, timing: Any, command: Any, until: Any, draws: Any) -> None:
+def _draw_command(
+    i: int, now: int, seeds: Any, stream: Any, table: Any, timing: Any, command: Any, until: Any, draws: Any
+) -> None:
     """Draw robot i's commands and how long they hold. ``timing``: hold low and high (ticks), probability of all zero."""
     width = command.shape[1]
     counter = draws[i] * (width + 2)
     draws[i] += 1
     hold = timing[0] + (timing[1] - timing[0]) * uniform(seeds[i], stream, counter)
-    until[i] = now + max(1, int(math.floor(hold + 0.5)))
+    until[i] = now + max(1, math.floor(hold + 0.5))
     stop = uniform(seeds[i], stream, counter + 1) < timing[2]
     for c in range(width):
         u = uniform(seeds[i], stream, counter + 2 + c)
@@ -73,16 +74,26 @@ def start_commands(mask: Any, seeds: Any, stream: Any, table: Any, timing: Any, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def advance(
-    mask: Any, limit: int, ticks: Any, over: Any, terminated: Any, truncated: Any,
-    seeds: Any, stream: Any, table: Any, timing: Any, command: Any, until: Any, draws: Any,
+    mask: Any,
+    limit: int,
+    ticks: Any,
+    over: Any,
+    terminated: Any,
+    truncated: Any,
+    seeds: Any,
+    stream: Any,
+    table: Any,
+    timing: Any,
+    command: Any,
+    until: Any,
+    draws: Any,
 ) -> bool:
     """Count a tick, set the end flags, draw new commands where their time is up. Returns whether any episode ended."""
     any_done = False
     for i in range(command.shape[0]):
-        terminated[i] = False
-        truncated[i] = False
         if not mask[i]:
             continue
+        terminated[i] = False
         ticks[i] += 1
         for k in range(over.shape[1]):
             if over[i, k] > 0.0:
@@ -96,8 +107,22 @@ def advance(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def observe(
-    mask: Any, first: bool, sensors: Any, command: Any, action: Any, seeds: Any, ticks: Any, bias: Any, delays: Any,
-    sampled_index: Any, sampled_value: Any, sampled_stream: Any, column_index: Any, column_value: Any, ring: Any, out: Any,
+    mask: Any,
+    first: bool,
+    sensors: Any,
+    command: Any,
+    action: Any,
+    seeds: Any,
+    ticks: Any,
+    bias: Any,
+    delays: Any,
+    sampled_index: Any,
+    sampled_value: Any,
+    sampled_stream: Any,
+    column_index: Any,
+    column_value: Any,
+    ring: Any,
+    out: Any,
 ) -> None:
     """Take a reading of every sampled column into the ring, and assemble the observation from readings of the right age.
 
@@ -132,7 +157,7 @@ def observe(
         for d in range(out.shape[1]):
             w, device = column_index[d, 0], column_index[d, 2]
             age = delays[i, device] + column_index[d, 1]
-            whole = int(math.floor(age))
+            whole = math.floor(age)
             rest = age - whole
             value = ring[i, (now - whole + depth) % depth, w]
             if rest > 0.0:

@@ -94,7 +94,7 @@ def _camera(seed: Any, tick: int, pose: Any, settings: Any, state: Any, out: Any
     state[slot + 2] = last + turn - 2.0 * np.pi * np.rint(turn / (2.0 * np.pi))
     now = tick * period
     frame = math.floor((now - state[_DELAY]) * rate - state[_PHASE])
-    before = math.floor((now - period - state[_DELAY]) * rate - state[_PHASE])
+    before = math.floor(((tick - 1) * period - state[_DELAY]) * rate - state[_PHASE])
     exposed = (frame + state[_PHASE]) / rate
     is_new = tick == 0 or frame > before
     if is_new:

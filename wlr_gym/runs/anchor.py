@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import PlantState, standing_state
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import CORNER_SIGNS, JOINTS, Robot
 from wlr_gym.runs.read import Run
 from wlr_gym.servo import motor_constants
 
@@ -19,25 +19,34 @@ Array = NDArray[np.float64]
 #: Half width (s) of the window a joint or gyro reading is smoothed over; the camera is slower and noisier.
 JOINT_WINDOW = 0.07
 CAMERA_WINDOW = 0.2
+#: rad; a joint that stays within this stands still.
+REST = 0.004
 
 
-def local_fit(t: Array, values: Array, at: Array, window: float) -> tuple[Array, Array]:
-    """Smooth a sampled signal: value and slope at the times ``at`` of local parabolas (tricube weights over +-``window``).
+def local_fit(t: Array, values: Array, at: Array, window: float, degree: int = 2) -> tuple[Array, Array]:
+    """Smooth a sampled signal: value and slope at the times ``at`` of local polynomials (tricube weights over +-``window``).
 
-    Missing samples are skipped; where fewer than three are left, the nearest three are used. Shapes (T,), (T,), (K,) -> (K,), (K,).
+    Missing samples are skipped; where fewer than three are left, the nearest three are used. Shapes: ``t`` and ``values``
+    (T,), ``at`` and both results (K,).
     """
     known = np.isfinite(values)
     t, values = t[known], values[known]
-    fits = np.zeros((len(at), 2))
+    fits = np.zeros((len(at), 3))
     for k, time in enumerate(at):
         offset = t - time
         reach = max(window, 1.001 * float(np.sort(np.abs(offset))[min(2, len(t) - 1)]))
         near = np.abs(offset) < reach
         root_weight = (1 - np.abs(offset[near] / reach) ** 3) ** 1.5
-        powers = np.vander(offset[near] / reach, 3, increasing=True)
-        solution = np.linalg.lstsq(powers * root_weight[:, None], values[near] * root_weight, rcond=1e-8)[0]
-        fits[k] = solution[0], solution[1] / reach
+        powers = np.vander(offset[near] / reach, degree + 1, increasing=True)
+        fits[k, : degree + 1] = np.linalg.lstsq(powers * root_weight[:, None], values[near] * root_weight, rcond=1e-8)[0]
+        fits[k, 1] /= reach
     return fits[:, 0], fits[:, 1]
+
+
+def starts_at_rest(run: Run) -> bool:
+    """Whether no joint moves by more than two encoder counts or so in the first tenths of a second."""
+    early = run["t"] <= run["t"][0] + CAMERA_WINDOW
+    return all(np.ptp(run[f"pos_{joint}"][early]) < REST for joint in JOINTS)
 
 
 def start_state(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
@@ -48,16 +57,17 @@ def start_state(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
     background = standing_state(robot, parameters)
     first = run["t"][:1]
     legs = np.array([[run[f"cmd_{joint}"][0] for joint in JOINTS[:4]]])
-    measured = _joints(run, first, parameters)[0]
+    degree = 0 if starts_at_rest(run) else 2
+    measured = _joints(run, first, parameters, degree)[0]
     goal = legs - parameters["joint.zero_offset"]
     background.reference_position[:, :4] = np.where(np.isnan(goal), measured[:, :4], goal)
     background.reference_position[:, 4:] += _wheel_tension(run, robot, parameters)
-    state = measured_state(run, first, background, parameters)
+    state = measured_state(run, first, background, parameters, degree)
     state.reference_velocity[:, 4:] = state.joint_velocity[:, 4:]
     return state
 
 
-def measured_state(run: Run, times: Array, background: PlantState, parameters: Parameters) -> PlantState:
+def measured_state(run: Run, times: Array, background: PlantState, parameters: Parameters, degree: int = 2) -> PlantState:
     """Return one state per time: measured where the run measures, else the background's.
 
     Measured: joint angles and rates; x, y, yaw and their rates from the camera; body rates from the gyroscope. Height, pitch
@@ -69,9 +79,10 @@ def measured_state(run: Run, times: Array, background: PlantState, parameters: P
         times: (K,) s on the run's clock.
         background: (K) states.
         parameters: (K) parameters.
+        degree: of the smoothing polynomials; 0 where the robot stands still.
     """
     state = background.copy()
-    state.joint_position, state.joint_velocity = _joints(run, times, parameters)
+    state.joint_position, state.joint_velocity = _joints(run, times, parameters, degree)
     state.reference_position[:, 4:] += state.joint_position[:, 4:] - background.joint_position[:, 4:]
 
     yaw, pitch, roll = euler_angles(background.quaternion)
@@ -80,10 +91,10 @@ def measured_state(run: Run, times: Array, background: PlantState, parameters: P
     pitch, roll = pitch + moved[:, 1], roll + moved[:, 2]
     velocity = np.einsum("nij,nj->ni", rotation(yaw, pitch, roll), background.linear_velocity_in_body)
     if {"gyro_x", "gyro_y", "gyro_z"} <= set(run.table.columns):
-        gyro = [local_fit(run["t"], run[f"gyro_{axis}"], times, JOINT_WINDOW)[0] for axis in "xyz"]
+        gyro = [local_fit(run["t"], run[f"gyro_{axis}"], times, JOINT_WINDOW, degree)[0] for axis in "xyz"]
         state.angular_velocity_in_body = np.stack(gyro, axis=1) - parameters["imu.gyro_bias"]
     if has_camera(run):
-        (x, vx), (y, vy), (yaw, _) = _camera(run, times, parameters)
+        (x, vx), (y, vy), (yaw, _) = _camera(run, times, parameters, degree)
         state.position[:, 0], state.position[:, 1] = x, y
         velocity[:, 0], velocity[:, 1] = vx, vy
     turn = rotation(yaw, pitch, roll)
@@ -102,22 +113,22 @@ def has_camera(run: Run) -> bool:
     return all(name in run and np.isfinite(run[name]).sum() > 2 for name in columns)
 
 
-def _joints(run: Run, times: Array, parameters: Parameters) -> tuple[Array, Array]:
+def _joints(run: Run, times: Array, parameters: Parameters, degree: int) -> tuple[Array, Array]:
     """True joint angles and rates (K, 8) at the given times."""
     positions = np.zeros((len(times), 8))
     velocities = np.zeros((len(times), 8))
     for j, joint in enumerate(JOINTS):
-        positions[:, j], velocities[:, j] = local_fit(run["t"], run[f"pos_{joint}"], times, JOINT_WINDOW)
+        positions[:, j], velocities[:, j] = local_fit(run["t"], run[f"pos_{joint}"], times, JOINT_WINDOW, degree)
         if f"vel_{joint}" in run and np.isfinite(run[f"vel_{joint}"]).sum() > 2:
-            velocities[:, j], _ = local_fit(run["t"], run[f"vel_{joint}"], times, JOINT_WINDOW)
+            velocities[:, j], _ = local_fit(run["t"], run[f"vel_{joint}"], times, JOINT_WINDOW, degree)
     positions[:, :4] -= parameters["joint.zero_offset"]
     return positions, velocities
 
 
-def _camera(run: Run, times: Array, parameters: Parameters) -> list[tuple[Array, Array]]:
+def _camera(run: Run, times: Array, parameters: Parameters, degree: int) -> list[tuple[Array, Array]]:
     """Marker x, y and yaw in the floor frame, each with its rate, at the given times."""
     exposed = run["t"] - parameters["camera.delay"][0]
-    x, y, yaw = (local_fit(exposed, unwrapped(run[f"cam_{name}"]), times, CAMERA_WINDOW) for name in ("x", "y", "yaw"))
+    x, y, yaw = (local_fit(exposed, unwrapped(run[f"cam_{name}"]), times, CAMERA_WINDOW, degree) for name in ("x", "y", "yaw"))
     mount = parameters["camera.mount_yaw"][0]
     cosine, sine = np.cos(mount), np.sin(mount)
     turned_x, turned_y = ((cosine * x[k] - sine * y[k], sine * x[k] + cosine * y[k]) for k in (0, 1))
@@ -151,7 +162,7 @@ def rest_pose(parameters: Parameters, legs: Array) -> Array:
         parameters: (N).
         legs: (N, 4) true leg angles, rad.
     """
-    signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
+    signs = np.array(CORNER_SIGNS)
     hip, length, radius = parameters["hip.position"], parameters["leg.length"], parameters["wheel.radius"]
     x = signs[:, 0] * hip[:, :1] + length * np.cos(legs)
     y = signs[:, 1] * hip[:, 1:2] + np.zeros_like(legs)
@@ -168,7 +179,7 @@ def rest_pose(parameters: Parameters, legs: Array) -> Array:
 
 
 def euler_angles(q: Array) -> tuple[Array, Array, Array]:
-    """Yaw, pitch and roll (N,) of quaternions (N, 4), (w, x, y, z): turn by yaw about z, then pitch about y, then roll about x."""
+    """Yaw, pitch and roll (N,) of quaternions (N, 4), (w, x, y, z): Rz(yaw) Ry(pitch) Rx(roll), body to floor frame."""
     w, x, y, z = q.T
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1, 1))

@@ -10,6 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,7 +147,9 @@ def _check_clock(t: Array, where: str) -> None:
     back = np.diff(t) <= 0
     if back.any():
         row = int(np.argmax(back)) + 1
-        raise InputError(f"{where}: row {row}, column 't': {t[row]:.6f} s does not come after {t[row - 1]:.6f} s; t must increase")
+        raise InputError(
+            f"{where}: row {row}, column 't': {t[row]:.6f} s does not come after {t[row - 1]:.6f} s; t must increase"
+        )
     period = float(np.median(np.diff(t)))
     if period > 1.0:
         raise InputError(
@@ -205,7 +208,9 @@ def _check_pair(table: Table, rate: str, angle: str, where: str) -> None:
         raise _unit_mistake(where, row, rate, table[rate][row], f"degrees per second ({ratio:.0f} times the rate of '{angle}')")
     if _DEGREES / 2 < 1 / ratio < 2 * _DEGREES:
         row = int(rows[np.argmax(np.abs(table[angle][rows]))])
-        raise _unit_mistake(where, row, angle, table[angle][row], f"degrees (it turns {1 / ratio:.0f} times faster than '{rate}')")
+        raise _unit_mistake(
+            where, row, angle, table[angle][row], f"degrees (it turns {1 / ratio:.0f} times faster than '{rate}')"
+        )
 
 
 def _increments(t: Array, angle: Array, rate: Array) -> tuple[Array, Array]:
@@ -228,7 +233,9 @@ def _gaps(t: Array) -> Iterable[Finding]:
     if len(rows):
         lost = int(np.sum(np.round(steps[rows] / period) - 1))
         longest = int(rows[np.argmax(steps[rows])])
-        message = f"{len(rows)} gaps, about {lost} rows lost; the longest, after row {longest}, takes {1e3 * steps[longest]:.0f} ms"
+        message = (
+            f"{len(rows)} gaps, about {lost} rows lost; the longest, after row {longest}, takes {1e3 * steps[longest]:.0f} ms"
+        )
         yield Finding("gap", "t", tuple(map(int, rows)), message)
 
 
@@ -282,7 +289,7 @@ def _should_vary(table: Table, name: str) -> bool:
         return True
     command, position = table[f"cmd_{joint}"], table[f"pos_{joint}"]
     asked = np.ptp(command[np.isfinite(command)]) if np.isfinite(command).any() else 0.0
-    return max(asked, np.ptp(position)) > _MOVED
+    return bool(max(asked, np.ptp(position)) > _MOVED)
 
 
 def _clipped(table: Table) -> Iterable[Finding]:
@@ -303,4 +310,4 @@ def _clipped(table: Table) -> Iterable[Finding]:
 def _plateaus(values: Array) -> list[tuple[int, int]]:
     """Return first row and length of every stretch of bit-equal values."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(values) != 0) + 1, [len(values)]])
-    return [(int(start), int(end - start)) for start, end in zip(starts, starts[1:], strict=False)]
+    return [(int(start), int(end - start)) for start, end in pairwise(starts)]

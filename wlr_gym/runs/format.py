@@ -47,7 +47,9 @@ def _joint_columns(kind: str, unit: tuple[str, str], doc: str, **flags: bool) ->
 
 
 _TABLE: list[Column] = [
-    Column("t", "t", "s", "host clock when the row's sensors were read; strictly increasing, nominally 20 ms apart", required=True),
+    Column(
+        "t", "t", "s", "host clock when the row's sensors were read; strictly increasing, nominally 20 ms apart", required=True
+    ),
     *_joint_columns(
         "cmd",
         ("rad", "rad/s"),
@@ -55,7 +57,9 @@ _TABLE: list[Column] = [
         required=True,
         may_be_nan=True,
     ),
-    *_joint_columns("pos", ("rad", "rad"), "encoder; wheels unwrapped, relative to their leg, zero at the run's start", required=True),
+    *_joint_columns(
+        "pos", ("rad", "rad"), "encoder; wheels unwrapped, relative to their leg, zero at the run's start", required=True
+    ),
     *_joint_columns("vel", ("rad/s", "rad/s"), "the servo's own velocity reading"),
     *_joint_columns(
         "eff",
@@ -65,8 +69,20 @@ _TABLE: list[Column] = [
     ),
     *[Column(f"gyro_{axis}", "gyro", "rad/s", "angular velocity, body frame", noisy=True) for axis in XYZ],
     *[Column(f"acc_{axis}", "acc", "m/s2", "specific force, body frame (+9.81 on z at rest)", noisy=True) for axis in XYZ],
-    Column("cam_x", "cam_xy", "m", "vision position of the marker's centre in the floor frame; NaN without a new frame", may_be_nan=True),
-    Column("cam_y", "cam_xy", "m", "vision position of the marker's centre in the floor frame; NaN without a new frame", may_be_nan=True),
+    Column(
+        "cam_x",
+        "cam_xy",
+        "m",
+        "vision position of the marker's centre in the floor frame; NaN without a new frame",
+        may_be_nan=True,
+    ),
+    Column(
+        "cam_y",
+        "cam_xy",
+        "m",
+        "vision position of the marker's centre in the floor frame; NaN without a new frame",
+        may_be_nan=True,
+    ),
     Column("cam_yaw", "cam_yaw", "rad", "vision heading in the floor frame; NaN without a new frame", may_be_nan=True),
     Column("cam_z", "cam_z", "m", "side view: height of the marker's centre; NaN without a new frame", may_be_nan=True),
     Column("cam_pitch", "cam_pitch", "rad", "side view: pitch, nose down positive; NaN without a new frame", may_be_nan=True),

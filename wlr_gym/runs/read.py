@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Run:
     """One measured run.
 
@@ -51,7 +52,7 @@ class Run:
         return column in self.table.columns
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DataSet:
     """All runs of one folder, and the meta data they share."""
 
@@ -69,10 +70,10 @@ def read_run(path: str | Path) -> Run:
     import pandas
 
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path}: a run is a {' or '.join(SUFFIXES)} file")
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path}: a run is a {' or '.join(SUFFIXES)} file")
     meta = read_meta(path.parent)
     columns = _read_csv(path) if path.suffix.lower() == ".csv" else _read_parquet(path)
     findings = check_table(columns, str(path))
@@ -93,7 +94,7 @@ def read_dataset(folder: str | Path) -> DataSet:
         inside = sorted(child.name for child in folder.iterdir() if child.is_dir() and run_files(child))
         hint = f"; its folders {', '.join(inside)} have some: name one" if inside else ""
         raise InputError(f"{folder}: no run_*.csv or run_*.parquet{hint}")
-    for before, after in zip(paths, paths[1:], strict=False):
+    for before, after in pairwise(paths):
         if before.stem == after.stem:
             raise InputError(f"{folder}: {before.name} and {after.name} are the same run; keep one of them")
     return DataSet(tuple(read_run(path) for path in paths), read_meta(folder), folder)

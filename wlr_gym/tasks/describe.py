@@ -24,22 +24,27 @@ def describe(task: Task) -> str:
         (name, _parameters(values, TERMINATIONS[name].parameters), TERMINATIONS[name].doc)
         for name, values in config.terminations.items()
     ]
-    hold = config.commands.hold_time
+    privileged_rows = [
+        (str(index), column_name(column), column.unit, column.frame, f"{column.scale:g}", f"{column.limit:g}")
+        for index, column in enumerate(task.privileged)
+    ]
+    low, high = config.commands.hold_time
+    stop, period = config.commands.zero_probability, config.control_period * 1000
     return "\n".join(
         [
             f"**Action** ``Box(-1, 1, ({len(task.actions)},), float32)``: goal = clip(centre + scale * action, low, high)",
             *table(("index", "joint", "goal", "unit", "centre", "scale", "low", "high"), _action_rows(task)),
             f"**Observation** ``Box(({len(task.policy)},), float32)``: value = scale * clip(reading - offset, +-limit)",
-            *table(_OBSERVATION_HEADER, observation_rows(task, task.policy)),
-            f"**Privileged observation** (``observation=\"dict\"``, key ``privileged``): ``Box(({len(task.privileged)},), float32)``",
-            *table(_OBSERVATION_HEADER, observation_rows(task, task.privileged)),
-            f"**Commands** drawn anew every {hold[0]:g} to {hold[1]:g} s, all zero with probability {config.commands.zero_probability:g}",
+            *table(_OBSERVATION_HEADER, _observation_rows(task)),
+            f'**Privileged observation** (``observation="dict"``): ``Box(({len(task.privileged)},), float32)``',
+            *table(("index", "name", "unit", "frame", "scale", "limit"), privileged_rows),
+            f"**Commands** drawn anew every {low:g} to {high:g} s, all zero with probability {stop:g}",
             *table(("command", "unit", "frame", "range", "meaning"), command_rows),
             "**Reward** sum of weight * term * control period",
             *table(("term", "weight (1/s)", "parameters", "meaning"), reward_rows),
             "**Terminated** when a term is greater than 0",
             *table(("term", "parameters", "meaning"), termination_rows),
-            f"**Truncated** after {config.episode_length:g} s ({task.episode_ticks} control ticks of {config.control_period * 1000:g} ms).",
+            f"**Truncated** after {config.episode_length:g} s ({task.episode_ticks} control ticks of {period:g} ms).",
         ]
     )
 
@@ -55,18 +60,30 @@ def _action_rows(task: Task) -> list[tuple[str, ...]]:
     ]
 
 
-_OBSERVATION_HEADER = ("index", "name", "unit", "frame", "offset", "scale", "limit", "noise", "bias", "delay (ms)", "lag (ticks)")
+_OBSERVATION_HEADER = (
+    "index",
+    "name",
+    "unit",
+    "frame",
+    "offset",
+    "scale",
+    "limit",
+    "sensor noise",
+    "noise",
+    "bias",
+    "delay (ms)",
+    "lag (ticks)",
+)
 
 
-def observation_rows(task: Task, columns: Sequence[ObservationColumn]) -> list[tuple[str, ...]]:
-    """Return one row per observation column. Noise and bias are those of the task, on top of the sensors' own."""
-    return [
-        (
-            str(index), column_name(column), column.unit, column.frame, f"{column.offset:.4g}", f"{column.scale:g}",
-            f"{column.limit:g}", f"{column.noise:g}", f"{column.bias:g}", _delay(task, column), str(column.lag),
-        )
-        for index, column in enumerate(columns)
-    ]  # fmt: skip
+def _observation_rows(task: Task) -> list[tuple[str, ...]]:
+    """Return one row per policy observation column. ``noise`` and ``bias`` are the task's, on top of the sensor's own noise."""
+    rows = []
+    for index, column in enumerate(task.policy):
+        numbers = (column.offset, column.scale, column.limit, column.sensor_noise, column.noise, column.bias)
+        texts = [f"{value:.4g}" for value in numbers]
+        rows.append((str(index), column_name(column), column.unit, column.frame, *texts, _delay(task, column), str(column.lag)))
+    return rows
 
 
 def column_name(column: ObservationColumn) -> str:
@@ -107,11 +124,26 @@ def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
         "observation": [_contract_column(column) for column in task.policy],
         "latency": {device: latency.model_dump(mode="json") for device, latency in config.latency.items()},
         "action": [dict(vars(column)) for column in task.actions],
-        "commands": {name: {"unit": COMMANDS[name].unit, "range": list(limits)} for name, limits in config.commands.terms.items()},
+        "commands": {
+            name: {"unit": COMMANDS[name].unit, "range": list(limits)} for name, limits in config.commands.terms.items()
+        },
         "randomization": randomization,
     }
 
 
 def _contract_column(column: ObservationColumn) -> dict[str, Any]:
-    fields = ("source", "element", "unit", "frame", "offset", "scale", "limit", "noise", "bias", "lag", "device")
+    fields = (
+        "source",
+        "element",
+        "unit",
+        "frame",
+        "offset",
+        "scale",
+        "limit",
+        "sensor_noise",
+        "noise",
+        "bias",
+        "lag",
+        "device",
+    )
     return {"name": column_name(column), **{field: getattr(column, field) for field in fields}}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from wlr_gym.errors import InputError
-from wlr_gym.parameters import ELEMENTS, TABLE, Parameters, spec_of
+from wlr_gym.parameters import ELEMENTS, TABLE, XYZ, Parameters, spec_of
 from wlr_gym.paths import find_config
 from wlr_gym.plants.base import PlantState, standing_state
 from wlr_gym.robot import LEGS, Robot, parse_config, read_yaml
@@ -55,8 +55,8 @@ class EventConfig(_Data):
     high: Number | None = None
     mean: Number | None = None
     sigma: Number | None = None
-    sigmas: float = Field(1.0, gt=0)
-    cut: float = Field(3.0, gt=0)
+    sigmas: float = Field(default=1.0, gt=0)
+    cut: float = Field(default=3.0, gt=0)
     values: tuple[float, ...] | None = None
     interval: tuple[float, float] | None = None
 
@@ -64,10 +64,10 @@ class EventConfig(_Data):
 class InitialStateConfig(_Data):
     """Half-widths of the even spread around standing still at home: rad, rad, m/s, rad/s (body frame)."""
 
-    leg_angle: float = Field(0.0, ge=0)
-    yaw: float = Field(0.0, ge=0)
-    linear_velocity: float = Field(0.0, ge=0)
-    angular_velocity: float = Field(0.0, ge=0)
+    leg_angle: float = Field(default=0.0, ge=0)
+    yaw: float = Field(default=0.0, ge=0)
+    linear_velocity: float = Field(default=0.0, ge=0)
+    angular_velocity: float = Field(default=0.0, ge=0)
 
 
 class RandomizationConfig(_Data):
@@ -89,7 +89,7 @@ class RandomizationConfig(_Data):
 
 @dataclass(frozen=True)
 class _Entry:
-    """One event acting on one element: value = quantile(u; first, second, cut); ``draw`` tells its random number from others."""
+    """One event acting on one element: value = quantile(u; first, second, cut); ``draw`` names its random number."""
 
     event: str
     when: str
@@ -145,13 +145,23 @@ class Randomization:
         self._interval_streams = stream_numbers(*(f"interval/{name}" for name in self.intervals))
         self._at_startup = np.array([entry.when == "startup" for entry in entries], dtype=bool)
         self._interval_index = np.array(
-            [self.intervals.index(e.event) if e.event in self.intervals else len(self.intervals) for e in entries], dtype=np.int64
+            [self.intervals.index(e.event) if e.event in self.intervals else len(self.intervals) for e in entries],
+            dtype=np.int64,
         )
         self._first, self._second, self._cut = (np.array([getattr(e, f) for e in entries]) for f in ("first", "second", "cut"))
         self._choices = [(k, np.array(e.values)) for k, e in enumerate(entries) if e.distribution == "choice"]
         names = [entry.distribution for entry in entries]
-        self._groups = {name: np.flatnonzero([n == name for n in names]) for name in dict.fromkeys(names) if name in DISTRIBUTIONS}
+        self._groups = {
+            name: np.flatnonzero([n == name for n in names]) for name in dict.fromkeys(names) if name in DISTRIBUTIONS
+        }
         self._low, self._high = _table_bounds()
+        spread = config.initial_state
+        widths = {"leg_angle": (spread.leg_angle, LEGS), "yaw": (spread.yaw, ("z",))}
+        widths |= {"linear_velocity": (spread.linear_velocity, XYZ), "angular_velocity": (spread.angular_velocity, XYZ)}
+        self._spread = np.array([width for width, labels in widths.values() for _ in labels])
+        self._spread_streams = stream_numbers(
+            *(f"initial_state/{n}/{label}" for n, (_, labels) in widths.items() for label in labels)
+        )
 
     def parameters(self, robot_seeds: Seeds, episode_seeds: Seeds, occurrences: NDArray[np.int64] | None = None) -> Parameters:
         """Return the parameters of M robots.
@@ -174,7 +184,9 @@ class Randomization:
         u = uniforms(seeds, self._streams, counts[:, self._interval_index])
         drawn = np.empty_like(u)
         for distribution, which in self._groups.items():
-            drawn[:, which] = DISTRIBUTIONS[distribution](u[:, which], self._first[which], self._second[which], self._cut[which])
+            drawn[:, which] = DISTRIBUTIONS[distribution](
+                u[:, which], self._first[which], self._second[which], self._cut[which]
+            )
         for k, values in self._choices:
             drawn[:, k] = values[(u[:, k] * len(values)).astype(np.int64)]
         return drawn
@@ -201,24 +213,16 @@ class Randomization:
 
     def state(self, parameters: Parameters, episode_seeds: Seeds) -> PlantState:
         """Return where M robots start: standing at home, spread by ``initial_state``; the height follows the legs."""
-        spread = self.config.initial_state
         state = standing_state(self.robot, parameters)
-
-        def around_zero(width: float, *names: str) -> Array:
-            streams = stream_numbers(*(f"initial_state/{name}" for name in names))
-            return width * (2.0 * uniforms(episode_seeds, streams) - 1.0)
-
-        if spread.leg_angle:
-            home = state.joint_position[:, :4].copy()
-            angles = np.clip(home + around_zero(spread.leg_angle, *LEGS), *self.robot.leg_limits)
-            state.position[:, 2] += (parameters["leg.length"] * (np.sin(angles) - np.sin(home))).mean(axis=1)
-            state.joint_position[:, :4] = state.reference_position[:, :4] = angles
-        if spread.yaw:
-            half = 0.5 * around_zero(spread.yaw, "yaw")[:, 0]
-            state.quaternion[:, 0], state.quaternion[:, 3] = np.cos(half), np.sin(half)
-        for field, width in (("linear_velocity", spread.linear_velocity), ("angular_velocity", spread.angular_velocity)):
-            if width:
-                getattr(state, f"{field}_in_body")[:] = around_zero(width, *(f"{field}[{axis}]" for axis in "xyz"))
+        if not self._spread.any():
+            return state
+        offsets = self._spread * (2.0 * uniforms(episode_seeds, self._spread_streams) - 1.0)
+        home = state.joint_position[:, :4].copy()
+        angles = np.clip(home + offsets[:, :4], *self.robot.leg_limits)
+        state.position[:, 2] += (parameters["leg.length"] * (np.sin(angles) - np.sin(home))).mean(axis=1)
+        state.joint_position[:, :4] = state.reference_position[:, :4] = angles
+        state.quaternion[:, 0], state.quaternion[:, 3] = np.cos(0.5 * offsets[:, 4]), np.sin(0.5 * offsets[:, 4])
+        state.linear_velocity_in_body[:], state.angular_velocity_in_body[:] = offsets[:, 5:8], offsets[:, 8:11]
         return state
 
 
@@ -240,7 +244,13 @@ def _elements(parameter: str) -> list[str]:
 def _entry(name: str, event: EventConfig, robot: Robot, element: str, where: str) -> _Entry:
     label = element.partition("[")[2].rstrip("]")
     draw = {"robot": "", "label": label, "element": element}[event.per]
-    common: dict[str, Any] = {"event": name, "when": event.when, "column": ELEMENTS.index(element), "draw": draw, "cut": event.cut}
+    common: dict[str, Any] = {
+        "event": name,
+        "when": event.when,
+        "column": ELEMENTS.index(element),
+        "draw": draw,
+        "cut": event.cut,
+    }
     if event.distribution == "tolerance":
         return _tolerance_entry(event, robot, element, common)
     if event.operation is None:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from wlr_gym.errors import InputError, nearest, unknown_name
+from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.paths import find_config
 from wlr_gym.robot import JOINTS, LEGS, Robot, parse_config, read_yaml
 from wlr_gym.tasks.terms import COMMANDS, POLICY_TERMS, PRIVILEGED_TERMS, REWARDS, TERMINATIONS, ObservationTerm, ScalarTerm
@@ -34,7 +34,7 @@ class CommandsConfig(_Data):
     """Commands drawn uniformly in [low, high], held for a time drawn in ``hold_time`` (s); all zero now and then."""
 
     hold_time: tuple[float, float]
-    zero_probability: float = Field(0.0, ge=0, le=1)
+    zero_probability: float = Field(default=0.0, ge=0, le=1)
     terms: dict[str, tuple[float, float]]
 
 
@@ -54,18 +54,18 @@ class ObservationConfig(_Data):
     ``noise`` (per reading) and ``bias`` (per episode) are 1 sigma in the term's unit; ``history`` readings, newest first.
     """
 
-    scale: float = Field(1.0, gt=0)
-    noise: float = Field(0.0, ge=0)
-    bias: float = Field(0.0, ge=0)
-    limit: float | None = Field(None, gt=0)
-    history: int = Field(1, ge=1, le=64)
+    scale: float = Field(default=1.0, gt=0)
+    noise: float = Field(default=0.0, ge=0)
+    bias: float = Field(default=0.0, ge=0)
+    limit: float | None = Field(default=None, gt=0)
+    history: int = Field(default=1, ge=1, le=64)
 
 
 class PrivilegedConfig(_Data):
     """How a true quantity enters the privileged observation: ``scale * clip(value, +-limit)``."""
 
-    scale: float = Field(1.0, gt=0)
-    limit: float | None = Field(None, gt=0)
+    scale: float = Field(default=1.0, gt=0)
+    limit: float | None = Field(default=None, gt=0)
 
 
 class TaskConfig(_Data):
@@ -89,7 +89,8 @@ class TaskConfig(_Data):
 class ObservationColumn:
     """One number of the observation: ``scale * clip(source[element] - offset, +-limit)``, ``lag`` control ticks old.
 
-    ``device`` names whose latency comes on top (empty: none); noise and bias are 1 sigma in ``unit``.
+    ``device`` names whose latency comes on top (empty: none); ``noise`` and ``bias`` are 1 sigma in ``unit`` and come on top
+    of ``sensor_noise``, the sensor's own noise (an encoder: one count).
     """
 
     term: str
@@ -100,6 +101,7 @@ class ObservationColumn:
     offset: float
     scale: float
     limit: float
+    sensor_noise: float
     noise: float
     bias: float
     lag: int
@@ -159,32 +161,50 @@ class Task:
         return max(1, round(self.config.episode_length / self.config.control_period))
 
 
-def load_task(source: str | Path | TaskConfig, robot: Robot, overrides: Mapping[str, Any] | None = None) -> Task:
-    """Load a task and check every name and number in it.
+def load_task(source: str | Path | Mapping[str, Any], robot: Robot, overrides: Mapping[str, Any] | None = None) -> Task:
+    """Load a task for a robot; see :func:`read_task`."""
+    return build_task(read_task(source, overrides), robot)
+
+
+def read_task(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> TaskConfig:
+    """Read a task and check every name and number in it.
 
     Args:
-        source: name in ``configs/task/``, path of a YAML file, or a config.
-        robot: the robot it is for.
-        overrides: nested mapping laid over the file; a term set to None is removed.
+        source: name in ``configs/task/``, path of a YAML file, or a mapping with the same keys.
+        overrides: nested mapping laid over it; a term set to None is removed.
 
     Raises:
         InputError: unknown or wrong key, term, parameter or value, with the nearest valid name.
     """
     data, where = _task_data(source)
-    if overrides is not None and not isinstance(overrides, Mapping):
-        raise InputError(f"task = {overrides!r}: expected a mapping laid over {where}, such as {{'episode_length': 10.0}}")
-    config = parse_config(TaskConfig, overlay(data, overrides or {}), where if not overrides else f"{where} with task={dict(overrides)}")
+    if overrides:
+        data, where = overlay(data, overrides), f"{where} with overrides"
+    config = parse_config(TaskConfig, data, where)
     _check_ranges(config, where)
+    for kind, chosen, registry in (
+        ("observation term", config.observations, POLICY_TERMS),
+        ("privileged term", config.privileged, PRIVILEGED_TERMS),
+    ):
+        for name in chosen:
+            if name not in registry:
+                raise unknown_name(kind, name, registry, where)
     _check_scalars("reward term", config.rewards, REWARDS, {"weight"}, where)
     _check_scalars("termination term", config.terminations, TERMINATIONS, set(), where)
-    policy = tuple(column for name in config.observations for column in _policy_columns(config, robot, name, where))
-    privileged = tuple(column for name in config.privileged for column in _privileged_columns(config, name, where))
+    return config
+
+
+def build_task(config: TaskConfig, robot: Robot) -> Task:
+    """Resolve a checked task for a robot."""
+    policy = tuple(column for name in config.observations for column in _policy_columns(config, robot, name))
+    privileged = tuple(column for name in config.privileged for column in _privileged_columns(config, name))
     return Task(config, robot, policy, privileged, _action_columns(config, robot))
 
 
-def _task_data(source: str | Path | TaskConfig) -> tuple[Any, str]:
-    if isinstance(source, TaskConfig):
-        return source.model_dump(), f"task '{source.name}'"
+def _task_data(source: Any) -> tuple[Any, str]:
+    if isinstance(source, Mapping):
+        return dict(source), "task"
+    if not isinstance(source, (str, Path)):
+        raise InputError(f"task = {source!r}: expected a name, a path or a mapping")
     path = find_config("task", source)
     return read_yaml(path), str(path)
 
@@ -220,9 +240,10 @@ def _check_ranges(config: TaskConfig, where: str) -> None:
     for group in ("observations", "rewards"):
         if not getattr(config, group):
             raise InputError(f"{where}: {group} is empty: a task needs at least one term there")
-    for ticks in (config.episode_length / config.control_period,):
-        if not math.isclose(ticks, round(ticks), abs_tol=1e-6) or round(ticks) < 1:
-            raise InputError(f"{where}: episode_length = {config.episode_length:g} s is not a whole number of control periods of {config.control_period:g} s")
+    ticks = config.episode_length / config.control_period
+    if not math.isclose(ticks, round(ticks), abs_tol=1e-6) or round(ticks) < 1:
+        length, period = config.episode_length, config.control_period
+        raise InputError(f"{where}: episode_length = {length:g} s is not a whole number of control periods of {period:g} s")
 
 
 def _check_scalars(
@@ -234,23 +255,34 @@ def _check_scalars(
         valid = required | set(registry[name].parameters)
         for key in values:
             if key not in valid:
-                raise InputError(f"{where}: {kind} '{name}' has no parameter '{key}'{nearest(key, valid)}; valid: {', '.join(sorted(valid)) or 'none'}")
+                raise unknown_name(f"parameter of {kind} '{name}'", key, valid, where)
         for key in required - set(values):
             raise InputError(f"{where}: {kind} '{name}' lacks '{key}'")
 
 
-def _policy_columns(config: TaskConfig, robot: Robot, name: str, where: str) -> list[ObservationColumn]:
-    if name not in POLICY_TERMS:
-        raise unknown_name("observation term", name, POLICY_TERMS, where)
+def _policy_columns(config: TaskConfig, robot: Robot, name: str) -> list[ObservationColumn]:
     term, settings = POLICY_TERMS[name], config.observations[name]
     limit = term.limit if settings.limit is None else settings.limit
     return [
         ObservationColumn(
-            name, element, term.source, unit, term.frame, term.offset(robot), settings.scale, limit, settings.noise, settings.bias, lag, term.device, doc
+            term=name,
+            element=element,
+            source=term.source,
+            unit=unit,
+            frame=term.frame,
+            offset=term.offset(robot),
+            scale=settings.scale,
+            limit=limit,
+            sensor_noise=term.sensor_noise(robot),
+            noise=settings.noise,
+            bias=settings.bias,
+            lag=lag,
+            device=term.device,
+            doc=doc,
         )
         for lag in range(settings.history)
         for element, unit, doc in _term_elements(term, config)
-    ]  # fmt: skip
+    ]
 
 
 def _term_elements(term: ObservationTerm, config: TaskConfig) -> list[tuple[str, str, str]]:
@@ -264,13 +296,13 @@ def _term_elements(term: ObservationTerm, config: TaskConfig) -> list[tuple[str,
     return [(element, term.unit, term.doc) for element in term.elements]
 
 
-def _privileged_columns(config: TaskConfig, name: str, where: str) -> list[ObservationColumn]:
-    if name not in PRIVILEGED_TERMS:
-        raise unknown_name("privileged observation term", name, PRIVILEGED_TERMS, where)
+def _privileged_columns(config: TaskConfig, name: str) -> list[ObservationColumn]:
     term, settings = PRIVILEGED_TERMS[name], config.privileged[name]
     limit = term.limit if settings.limit is None else settings.limit
     return [
-        ObservationColumn(name, element, "truth", term.unit, term.frame, 0.0, settings.scale, limit, 0.0, 0.0, 0, "", term.doc)
+        ObservationColumn(
+            name, element, "truth", term.unit, term.frame, 0.0, settings.scale, limit, 0.0, 0.0, 0.0, 0, "", term.doc
+        )
         for element in term.elements
     ]
 

@@ -173,12 +173,14 @@ def look(X, P, TRUTH, RAW, count, step):
 def load_kernel(features: frozenset[str], precision: str, width: int) -> ModuleType:
     """Load (first use: generate and compile) the kernel module for a set of effect families."""
     tag = "_".join(["gibbs_appell", precision, str(width), *sorted(features)])
-    key = "\0".join(inspect.getsource(module) for module in _SOURCES)
     message = (
         f"wlr_gym: compiling the Gibbs-Appell engine ({precision}, {width} robots side by side); "
         "about 20 s, once on this machine"
     )
-    return load_module(tag, lambda: kernel_source(features, precision, width), message, key)
+    return load_module(tag, lambda: kernel_source(features, precision, width), message, _SOURCE_KEY)
 
 
-_SOURCES = (source, equations, servo, packing, sys.modules[__name__], ops, graph)
+#: Read at import, so that the key always tells of the code that is loaded.
+_SOURCE_KEY = "\0".join(
+    inspect.getsource(module) for module in (source, equations, servo, packing, sys.modules[__name__], ops, graph)
+)

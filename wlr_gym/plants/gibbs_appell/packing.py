@@ -13,7 +13,7 @@ from wlr_gym.robot import Robot
 
 Array = NDArray[np.float64]
 
-_CORNER_LANES = (*ASSEMBLY, "length", "radius", "zero_offset", "stiffness", "damping", "look_ahead", "mu_x", "mu_y", "rolling")
+_CORNER_LANES = (*ASSEMBLY, "length", "radius", "zero_offset", "stiffness", "damping", "look_ahead", "mu_x", "mu_y", "inverse_mu_x", "inverse_mu_y", "rolling")
 _JOINT_LANES = (
     "kp", "kd", "volt_gain", "back_emf_damping", "viscous", "weight", "gear_bound", "inverse_constant", "effort_scale",
     "velocity_limit", "acceleration_limit",
@@ -58,6 +58,8 @@ def pack(parameters: Parameters, robot: Robot, step: float) -> Array:
         "look_ahead": damper_look_ahead(parameters, step),
         "mu_x": parameters["ground.mu_x"],
         "mu_y": parameters["ground.mu_y"],
+        "inverse_mu_x": 1.0 / np.maximum(parameters["ground.mu_x"], 1e-9),
+        "inverse_mu_y": 1.0 / np.maximum(parameters["ground.mu_y"], 1e-9),
         "rolling": parameters["ground.rolling_resistance"],
     }
     for name in _CORNER_LANES:

@@ -248,6 +248,7 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
 
     reduced = [row[:] for row in mass]
     blocks = []
+    blocks_a = []
     for i in CORNERS:
         coupling, leg_leg, leg_wheel, wheel_wheel, (leg_bias, wheel_bias) = legs[i]
         leg_rate, wheel_rate = lanes[f"leg_rate{i}"], lanes[f"wheel_rate{i}"]
@@ -285,6 +286,7 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
             momentum[r] = momentum[r] - coupling[r] * y_leg
             for c in range(r + 1):
                 reduced[r][c] = reduced[r][c] - scaled[r] * coupling[c]
+        blocks_a.append((a11, a12, a22))
         blocks.append((coupling, i11, i12, i22, y_leg, y_wheel, hip, leg, rim))
 
     lower, inverse_diagonal = _cholesky(reduced)
@@ -306,18 +308,19 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
         for r in range(6):
             out[f"coupling{i}_{r}"] = coupling[r]
         out[f"i11_{i}"], out[f"i12_{i}"] = i11, i12
+        out[f"a11_{i}"], out[f"a12_{i}"], out[f"a22_{i}"] = blocks_a[i]
         out[f"y_leg{i}"], out[f"y_wheel{i}"] = y_leg, y_wheel
-        # friction rows: (base part, leg entry, wheel entry)
+        _warm_start(lanes, i, step, features, out)
+        # friction rows: (base part, leg entry, wheel entry, impulse)
         local = {
-            f"leg{i}": (hinge, 1.0, 0.0, lanes[f"gear_friction{i}"]),
-            f"wheel{i}": ([0.0] * 6, -1.0, 1.0, lanes[f"gear_friction{4 + i}"]),
+            f"leg{i}": (hinge, 1.0, 0.0, out[f"gear_friction{i}"]),
+            f"wheel{i}": ([0.0] * 6, -1.0, 1.0, out[f"gear_friction{4 + i}"]),
         }
         if "rolling_resistance" in features:
-            local[f"rolling{i}"] = ([0.0] * 6, 0.0, 1.0, lanes[f"rolling_friction{i}"])
-            out[f"bound_rolling{i}"] = (step * lanes[f"rolling{i}"]) * (lanes[f"radius{i}"] * out[f"normal{i}"])
+            local[f"rolling{i}"] = ([0.0] * 6, 0.0, 1.0, out[f"rolling_friction{i}"])
         for e, name, wheel_entry in ((heading, "x", -lanes[f"radius{i}"]), (lateral, "y", 0.0)):
             base_row, leg_entry = contact_row(hip, leg, rim, e)
-            local[f"{name}{i}"] = (whiten(base_row), leg_entry, wheel_entry, lanes[f"friction_{name}{i}"])
+            local[f"{name}{i}"] = (whiten(base_row), leg_entry, wheel_entry, out[f"friction_{name}{i}"])
             out[f"leg_entry_{name}{i}"] = leg_entry
         for name, (white_base, leg_entry, wheel_entry, impulse) in local.items():
             g_leg = i11 * leg_entry + i12 * wheel_entry
@@ -335,7 +338,6 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
                 out[f"inverse_gain_{name}"] = 1.0 / gain
         cross_gain = dot([out[f"z_x{i}_{r}"] for r in range(6)], [out[f"z_y{i}_{r}"] for r in range(6)])
         out[f"gain_xy{i}"] = cross_gain + out[f"leg_entry_x{i}"] * out[f"g_leg_y{i}"] - lanes[f"radius{i}"] * out[f"g_wheel_y{i}"]
-        out[f"bound{i}"] = step * out[f"normal{i}"]
     for r in range(6):
         out[f"base{r}"] = base[r]
         out[f"inverse_diagonal{r}"] = inverse_diagonal[r]
@@ -386,6 +388,23 @@ def _normal_force(
     return ops.where_positive(-gap, push, 0.0), gap_rate
 
 
+def _warm_start(lanes: Lanes, i: int, step: Value, features: frozenset[str], out: Out) -> None:
+    """Start from the last step's impulses, shrunk into this step's bounds: descent must begin at an admissible point."""
+    for j in (i, 4 + i):
+        bound = lanes[f"gear_bound{j}"]
+        out[f"gear_friction{j}"] = ops.clip(lanes[f"gear_friction{j}"], -bound, bound)
+    if "rolling_resistance" in features:
+        bound = (step * lanes[f"rolling{i}"]) * (lanes[f"radius{i}"] * out[f"normal{i}"])
+        out[f"bound_rolling{i}"] = bound
+        out[f"rolling_friction{i}"] = ops.clip(lanes[f"rolling_friction{i}"], -bound, bound)
+    out[f"bound{i}"] = step * out[f"normal{i}"]
+    x, y = (lanes[f"friction_{a}{i}"] * lanes[f"inverse_mu_{a}{i}"] for a in "xy")
+    shrink = ops.minimum(out[f"bound{i}"] / ops.sqrt(x * x + y * y + 1e-30), 1.0)
+    for a in "xy":
+        limit = lanes[f"mu_{a}{i}"] * out[f"bound{i}"]
+        out[f"friction_{a}{i}"] = ops.clip(lanes[f"friction_{a}{i}"] * shrink, -limit, limit)
+
+
 def _motor_impulse(lanes: Lanes, j: int, voltage: Value, rate: Value, step: Value) -> tuple[Value, Value]:
     """Explicit impulse of motor ``j`` and its implicit damping (both times the step).
 
@@ -415,26 +434,53 @@ def _cholesky(matrix: list[list[Value]]) -> tuple[list[list[Value]], list[Value]
 
 
 def kick_sweep(lanes: Lanes, features: frozenset[str]) -> Out:
-    """One pass of exact block coordinate descent over all friction impulses."""
+    """One pass of block coordinate descent over all friction impulses, front axle then rear axle.
+
+    Left and right wheel of an axle are solved from the same starting point and the joint step is scaled to the minimum of
+    the objective along it. The objective is convex, so every pass descends; and a mirrored robot gets mirrored impulses,
+    which solving left before right would not give.
+    """
     base: Vector = [lanes[f"base{r}"] for r in range(6)]
     out: Out = {}
-    for i in CORNERS:
-        y = [lanes[f"y_leg{i}"], lanes[f"y_wheel{i}"]]
-        rows = [(f"leg{i}", 1.0, 0.0, f"gear_friction{i}", lanes[f"gear_bound{i}"])]
-        rows += [(f"wheel{i}", -1.0, 1.0, f"gear_friction{4 + i}", lanes[f"gear_bound{4 + i}"])]
-        if "rolling_resistance" in features:
-            rows += [(f"rolling{i}", 0.0, 1.0, f"rolling_friction{i}", lanes[f"bound_rolling{i}"])]
-        for name, leg_entry, wheel_entry, impulse, bound in rows:
-            z = [lanes[f"z_{name}_{r}"] for r in range(6)]
-            rate = dot(z, base) + leg_entry * y[0] + wheel_entry * y[1]
-            new = ops.clip(lanes[impulse] - rate * lanes[f"inverse_gain_{name}"], -bound, bound)
-            base, y = _apply(lanes, name, z, new - lanes[impulse], base, y)
-            out[impulse] = new
-        base, y = _contact_block(lanes, i, base, y, out)
-        out[f"y_leg{i}"], out[f"y_wheel{i}"] = y
+    for left, right in ((0, 1), (2, 3)):
+        sides = [_leg_block(lanes, i, base, features) for i in (left, right)]
+        change = [(sides[0][0][r] - base[r]) + (sides[1][0][r] - base[r]) for r in range(6)]
+        slope, curvature = dot(base, change), dot(change, change)
+        moved = []
+        for i, (_, y, impulses) in zip((left, right), sides, strict=True):
+            start = [lanes[f"y_leg{i}"], lanes[f"y_wheel{i}"]]
+            dy = [y[0] - start[0], y[1] - start[1]]
+            pull = [lanes[f"a11_{i}"] * dy[0] + lanes[f"a12_{i}"] * dy[1], lanes[f"a12_{i}"] * dy[0] + lanes[f"a22_{i}"] * dy[1]]
+            slope = slope + dot(start, pull)
+            curvature = curvature + dot(dy, pull)
+            moved.append((i, start, dy, impulses))
+        scale = ops.clip(-slope / (curvature + 1e-30), 0.0, 1.0)
+        base = [base[r] + scale * change[r] for r in range(6)]
+        for i, start, dy, impulses in moved:
+            out[f"y_leg{i}"], out[f"y_wheel{i}"] = start[0] + scale * dy[0], start[1] + scale * dy[1]
+            out[f"multiplier{i}"] = impulses.pop(f"multiplier{i}")
+            out |= {name: lanes[name] + scale * (new - lanes[name]) for name, new in impulses.items()}
     for r in range(6):
         out[f"base{r}"] = base[r]
     return out
+
+
+def _leg_block(lanes: Lanes, i: int, base: Vector, features: frozenset[str]) -> tuple[Vector, Vector, Out]:
+    """Solve the friction rows of one leg in turn: gear of the leg, gear of the wheel, rolling resistance, contact."""
+    out: Out = {}
+    y = [lanes[f"y_leg{i}"], lanes[f"y_wheel{i}"]]
+    rows = [(f"leg{i}", 1.0, 0.0, f"gear_friction{i}", lanes[f"gear_bound{i}"])]
+    rows += [(f"wheel{i}", -1.0, 1.0, f"gear_friction{4 + i}", lanes[f"gear_bound{4 + i}"])]
+    if "rolling_resistance" in features:
+        rows += [(f"rolling{i}", 0.0, 1.0, f"rolling_friction{i}", lanes[f"bound_rolling{i}"])]
+    for name, leg_entry, wheel_entry, impulse, bound in rows:
+        z = [lanes[f"z_{name}_{r}"] for r in range(6)]
+        rate = dot(z, base) + leg_entry * y[0] + wheel_entry * y[1]
+        new = ops.clip(lanes[impulse] - rate * lanes[f"inverse_gain_{name}"], -bound, bound)
+        base, y = _apply(lanes, name, z, new - lanes[impulse], base, y)
+        out[impulse] = new
+    base, y = _contact_block(lanes, i, base, y, out)
+    return base, y, out
 
 
 def _apply(lanes: Lanes, name: str, z: Vector, change: Value, base: Vector, y: Vector) -> tuple[Vector, Vector]:
@@ -556,7 +602,8 @@ def observe(lanes: Lanes, step: Value) -> Out:
             out[f"slip_velocity_{i}_{a}"] = slip
     out |= {f"slip_displacement_{i}_{a}": lanes[f"slip_displacement_{a}{i}"] for i in CORNERS for a in "xy"}
     out |= {f"effective_friction_{i}_{a}": lanes[f"mu_{a}{i}"] for i in CORNERS for a in "xy"}
-    out["mechanical_energy"], out["electrical_energy"] = lanes["mechanical_energy"], lanes["electrical_energy"]
+    # own names: outputs lie side by side, apart from the stored sums they show
+    out["shown_mechanical_energy"], out["shown_electrical_energy"] = lanes["mechanical_energy"], lanes["electrical_energy"]
     reach = [ops.absolute(n[k]) * lanes[f"half_size_{a}"] for k, a in enumerate(AXES)]
     out["body_clearance"] = lanes["pz"] - reach[0] - reach[1] - reach[2]
     # from here on: RAW_LAYOUT of plants/sensors.py; the heading's cosine and sine stand for its yaw

@@ -34,10 +34,11 @@ from wlr_gym.robot import CORNER_SIGNS, JOINTS, LEGS, WHEELS, Robot, standing_he
 
 WheelShape = Literal["sphere", "capsule"]
 
-#: Contact impedance: the contact carries the virtual mass d / (1 - d) times the apparent mass of the wheel. Small, so that a
-#: contact is a spring and damper; ``IMPEDANCE_RATIO`` then keeps friction stiff (creep under load stays below 1 mm/s).
-CONTACT_IMPEDANCE = 0.1
-IMPEDANCE_RATIO = 1000.0
+#: MuJoCo's impedance d adds the virtual mass d / (1 - d) times the apparent mass to every contact. At 0.1 that already makes
+#: a robot that brakes with locked wheels jump off the floor; at 0.001 the contact is a spring and damper. ``impratio`` makes up
+#: for it where stiffness is wanted: friction creeps by less than 0.1 mm/s under half its limit.
+CONTACT_IMPEDANCE = 0.001
+IMPEDANCE_RATIO = 100.0 / CONTACT_IMPEDANCE
 FRICTION_DAMPING = 500.0
 CAPSULE_HALF_LENGTH = 5e-5
 

@@ -58,7 +58,9 @@ def tolerance_of(robot: Robot, element: str) -> tuple[str, float]:
     """
     spec = spec_of(element)
     if not spec.tolerance or spec.tolerance not in robot.tolerances:
-        raise InputError(f"robot '{robot.name}' states no tolerance for parameter '{spec.name}'; known: {', '.join(robot.tolerances)}")
+        raise InputError(
+            f"robot '{robot.name}' states no tolerance for parameter '{spec.name}'; known: {', '.join(robot.tolerances)}"
+        )
     stated = robot.tolerances[spec.tolerance]
     if not isinstance(stated, str):
         return "scale", float(stated)

@@ -9,7 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Layout
-from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
+from wlr_gym.robot import LEGS, WHEELS, Robot
+
+RobotNumber = Callable[[Robot], float]
 
 
 def _zero(_: Robot) -> float:
@@ -27,6 +29,7 @@ class ObservationTerm:
         unit, frame, doc: for the generated tables.
         limit: readings are clipped to +-limit about the offset (in ``unit``), so that the observation space is bounded.
         offset: subtracted from the reading, from the robot's numbers.
+        sensor_noise: what the sensor itself adds, from the robot's numbers: 1 sigma, or one count of an encoder.
         device: what it is read from: readings of one device share one latency; empty = no latency.
     """
 
@@ -37,20 +40,26 @@ class ObservationTerm:
     frame: str
     limit: float
     doc: str
-    offset: Callable[[Robot], float] = _zero
+    offset: RobotNumber = _zero
+    sensor_noise: RobotNumber = _zero
     device: str = ""
 
 
-def _elements(channel: str, labels: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(f"{channel}[{label}]" for label in labels)
-
-
-def _sensor(name: str, channel: str, frame: str, limit: float, device: str, **more: object) -> ObservationTerm:
+def _sensor(
+    name: str,
+    channel: str,
+    frame: str,
+    limit: float,
+    device: str,
+    sensor_noise: RobotNumber,
+    *,
+    labels: tuple[str, ...] | None = None,
+    offset: RobotNumber = _zero,
+    doc: str = "",
+) -> ObservationTerm:
     spec = SENSOR_LAYOUT.channels[channel]
-    labels: tuple[str, ...] = more.get("labels", spec.labels)  # type: ignore[assignment]
-    elements = _elements(channel, labels) or (channel,)
-    offset: Callable[[Robot], float] = more.get("offset", _zero)  # type: ignore[assignment]
-    return ObservationTerm(name, "sensors", elements, spec.unit, frame, limit, str(more.get("doc", spec.doc)), offset, device)
+    elements = tuple(spec.elements) if labels is None else tuple(f"{channel}[{label}]" for label in labels)
+    return ObservationTerm(name, "sensors", elements, spec.unit, frame, limit, doc or spec.doc, offset, sensor_noise, device)
 
 
 POLICY_TERMS = {
@@ -59,19 +68,29 @@ POLICY_TERMS = {
         ObservationTerm("command", "command", (), "", "body", 2.0, "what the robot is asked to follow"),
         ObservationTerm("last_action", "action", (), "-", "-", 1.0, "the action given one control tick before"),
         _sensor(
-            "leg_position", "joint_position", "joint", 2.0, "joints",
-            labels=LEGS, offset=lambda robot: robot.home.leg_angle, doc="leg encoder, from the home angle",
+            "leg_position", "joint_position", "joint", 2.0, "joints", lambda r: r.sensors.encoder.position,
+            labels=LEGS, offset=lambda r: r.home.leg_angle, doc="leg encoder, from the home angle",
         ),
-        _sensor("leg_velocity", "joint_velocity", "joint", 20.0, "joints", labels=LEGS),
-        _sensor("wheel_velocity", "joint_velocity", "joint", 20.0, "joints", labels=WHEELS, doc="wheel against its leg, the servo's own reading"),
-        _sensor("leg_effort", "joint_effort", "joint", 10.0, "joints", labels=LEGS),
-        _sensor("wheel_effort", "joint_effort", "joint", 5.0, "joints", labels=WHEELS),
-        _sensor("gyro", "gyro", "body", 20.0, "imu"),
-        _sensor("accelerometer", "accelerometer", "body", 60.0, "imu"),
-        _sensor("supply_voltage", "supply_voltage", "-", 5.0, "joints", offset=lambda robot: robot.servo.supply_voltage, doc="from nominal"),
-        _sensor("camera_pose", "camera_pose", "floor", 20.0, "camera"),
-        _sensor("camera_age", "camera_age", "-", 1.0, "camera"),
-        _sensor("camera_is_new", "camera_is_new", "-", 1.0, "camera"),
+        _sensor("leg_velocity", "joint_velocity", "joint", 20.0, "joints", lambda r: r.sensors.encoder.velocity, labels=LEGS),
+        _sensor(
+            "wheel_velocity", "joint_velocity", "joint", 20.0, "joints", lambda r: r.sensors.encoder.velocity,
+            labels=WHEELS, doc="wheel against its leg, the servo's own reading",
+        ),
+        _sensor("leg_effort", "joint_effort", "joint", 10.0, "joints", lambda r: r.sensors.effort.leg_noise, labels=LEGS),
+        _sensor("wheel_effort", "joint_effort", "joint", 5.0, "joints", lambda r: r.sensors.effort.wheel_noise, labels=WHEELS),
+        _sensor("gyro", "gyro", "body", 20.0, "imu", lambda r: r.sensors.imu.gyro_noise),
+        _sensor("accelerometer", "accelerometer", "body", 60.0, "imu", lambda r: r.sensors.imu.accel_noise),
+        _sensor(
+            "supply_voltage", "supply_voltage", "-", 5.0, "joints", lambda r: r.sensors.volt_noise,
+            offset=lambda r: r.servo.supply_voltage, doc="from nominal",
+        ),
+        _sensor(
+            "camera_position", "camera_pose", "floor", 20.0, "camera", lambda r: r.sensors.camera.position_noise,
+            labels=("x", "y"),
+        ),
+        _sensor("camera_yaw", "camera_pose", "floor", 20.0, "camera", lambda r: r.sensors.camera.yaw_noise, labels=("yaw",)),
+        _sensor("camera_age", "camera_age", "-", 1.0, "camera", _zero),
+        _sensor("camera_is_new", "camera_is_new", "-", 1.0, "camera", _zero),
     )
 }  # fmt: skip
 
@@ -82,6 +101,8 @@ _TRUTH_LIMITS = {
     "angular_velocity_in_body": ("body", 20.0),
     "joint_velocity": ("joint", 20.0),
     "motor_torque": ("joint", 10.0),
+    "friction_torque": ("joint", 10.0),
+    "rolling_torque": ("wheel", 5.0),
     "contact_force": ("wheel", 200.0),
     "slip_velocity": ("wheel", 5.0),
     "slip_displacement": ("wheel", 0.2),
@@ -98,6 +119,3 @@ def _truth(layout: Layout, channel: str, frame: str, limit: float) -> Observatio
 
 
 PRIVILEGED_TERMS = {name: _truth(TRUTH_LAYOUT, name, frame, limit) for name, (frame, limit) in _TRUTH_LIMITS.items()}
-
-#: Action elements, in order: what the numbers of the action vector move.
-ACTIONS = JOINTS

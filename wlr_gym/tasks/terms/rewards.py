@@ -59,30 +59,40 @@ def energy(signals: Signals, *, power: Value = 10.0) -> Value:
     return ops.maximum(signals.truth("electrical_energy")[0], 0.0) / (signals.control_period * power)
 
 
-def needed_lateral_slip(signals: Signals) -> list[Value]:
-    """Sideways slip speed (m/s) each wheel needs for the present yaw rate: a wheel x ahead of the body origin that turns
-    about it moves sideways at yaw rate times x (skid steering cannot do without)."""
-    yaw_rate = signals.truth("angular_velocity_in_body")[2]
-    hip, length = signals.robot("hip_position.x"), signals.robot("leg.length")
-    reach = [hip * signs[0] + length * ops.cos(angle) for signs, angle in zip(CORNER_SIGNS, signals.truth("joint_position")[:4], strict=True)]
-    return [ops.absolute(yaw_rate * x) for x in reach]
+def skid_turn_slip(signals: Signals) -> list[tuple[Value, Value]]:
+    """Slip speeds (m/s) that each wheel needs for the present yaw rate: along its heading, along its axle.
+
+    A wheel x ahead of the body origin and y beside it moves sideways at yaw rate * x, which skid steering cannot avoid. In a
+    steady turn on even friction its forward force must balance the moment of that sideways friction, F_x y = F_y x, and
+    friction points against slip: so it slips yaw rate * x^2 / y along its heading.
+    """
+    yaw_rate = ops.absolute(signals.truth("angular_velocity_in_body")[2])
+    hip, side, length = signals.robot("hip_position.x"), signals.robot("hip_position.y"), signals.robot("leg.length")
+    needed = []
+    for (front, _), angle in zip(CORNER_SIGNS, signals.truth("joint_position")[:4], strict=True):
+        reach = ops.absolute(hip * front + length * ops.cos(angle))
+        needed.append((yaw_rate * reach * reach / side, yaw_rate * reach))
+    return needed
 
 
 @registered(REWARDS)
 def slip(signals: Signals, *, speed: Value = 0.05) -> Value:
     """Mean wheel slip speed beyond what turning on skids needs, over ``speed`` (m/s); rolling costs nothing.
 
-    Slip is the mean over the tick (slip displacement over the control period). Along its heading a wheel needs no slip;
-    across it, :func:`needed_lateral_slip`.
+    Slip is the mean over the tick (slip displacement over the control period); what a turn needs: :func:`skid_turn_slip`.
     """
-    displacement = signals.truth("slip_displacement")
-    period = signals.control_period
-    along, across = displacement[0::2], displacement[1::2]
+    displacement, period = signals.truth("slip_displacement"), signals.control_period
     excess = [
-        norm(x / period, ops.maximum(ops.absolute(y / period) - needed, 0.0))
-        for x, y, needed in zip(along, across, needed_lateral_slip(signals), strict=True)
+        norm(_beyond(along / period, needed_along), _beyond(across / period, needed_across))
+        for along, across, (needed_along, needed_across) in zip(
+            displacement[0::2], displacement[1::2], skid_turn_slip(signals), strict=True
+        )
     ]
     return mean(excess) / speed
+
+
+def _beyond(value: Value, free: Value) -> Value:
+    return ops.maximum(ops.absolute(value) - free, 0.0)
 
 
 @registered(REWARDS)

@@ -1,0 +1,61 @@
+"""Settings of PPO training (``configs/agent/ppo*.yaml``)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+
+class PpoConfig(BaseModel):
+    """Proximal policy optimisation on one native batch of robots.
+
+    Attributes:
+        seed: of weights, exploration, minibatches and episodes; the same seed gives the same run bit for bit.
+        total_steps: control ticks of all robots together.
+        num_envs, steps_per_env: robots, and control ticks of each, per update.
+        batch_size: samples per gradient step. Small ones cap the speed: the optimiser, not the physics, takes the time.
+        epochs: passes over the samples of an update.
+        learning_rate, final_learning_rate: Adam's, falling linearly over the training.
+        gamma, gae_lambda, clip_range, entropy_coefficient, value_coefficient, max_gradient_norm: as in Stable-Baselines3.
+        target_kl: end the passes of an update early beyond 1.5 times this divergence; None = never.
+        hidden_layers, activation: of the networks of policy and value, which share nothing.
+        initial_log_std: logarithm of the exploration noise at the start, in actions.
+        checkpoint_every: control ticks between checkpoints.
+        keep_checkpoints: how many of the newest stay.
+        torch_threads: more than 1 was slower on busy machines, and changes the last bits.
+        environment: keywords of the environment (precision, randomization, task, ...).
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    seed: int = Field(0, ge=0)
+    total_steps: int = Field(5_000_000, gt=0)
+    num_envs: int = Field(512, gt=0)
+    steps_per_env: int = Field(32, gt=1)
+    batch_size: int = Field(4096, gt=1)
+    epochs: int = Field(5, gt=0)
+    learning_rate: float = Field(1e-3, gt=0)
+    final_learning_rate: float = Field(1e-4, gt=0)
+    gamma: float = Field(0.99, gt=0, lt=1)
+    gae_lambda: float = Field(0.95, ge=0, le=1)
+    clip_range: float = Field(0.2, gt=0)
+    entropy_coefficient: float = Field(0.0, ge=0)
+    value_coefficient: float = Field(0.5, ge=0)
+    max_gradient_norm: float = Field(0.5, gt=0)
+    target_kl: float | None = Field(None, gt=0)
+    hidden_layers: tuple[int, ...] = (64, 64)
+    activation: Literal["tanh", "elu", "relu"] = "tanh"
+    initial_log_std: float = 0.0
+    checkpoint_every: int = Field(1_000_000, gt=0)
+    keep_checkpoints: int = Field(3, gt=0)
+    torch_threads: int = Field(1, gt=0)
+    environment: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _whole_batches(self) -> PpoConfig:
+        if self.num_envs * self.steps_per_env % self.batch_size:
+            raise ValueError(
+                f"batch_size {self.batch_size} does not divide num_envs * steps_per_env = {self.num_envs * self.steps_per_env}"
+            )
+        return self

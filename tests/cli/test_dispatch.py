@@ -1,0 +1,92 @@
+"""The ``wlr`` command: exit codes and messages."""
+
+import sys
+import types
+from dataclasses import dataclass
+
+import pytest
+
+import wlr_gym
+from wlr_gym import cli
+from wlr_gym.errors import InputError, MissingPackage
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    pass
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Return a function that makes ``wlr probe`` raise what it is given."""
+
+    def make(outcome):
+        def run(options):
+            if isinstance(outcome, BaseException):
+                raise outcome
+            return outcome
+
+        module = types.ModuleType("wlr_gym.cli.probe")
+        module.__dict__.update(Options=NoOptions, run=run)
+        monkeypatch.setitem(sys.modules, "wlr_gym.cli.probe", module)
+        monkeypatch.setitem(cli.COMMANDS, "probe", "for tests")
+
+    return make
+
+
+def test_help_lists_every_command(capsys):
+    assert cli.main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in cli.COMMANDS)
+
+
+def test_no_command_shows_help(capsys):
+    assert cli.main([]) == 0
+    assert "usage: wlr" in capsys.readouterr().out
+
+
+def test_version(capsys):
+    assert cli.main(["--version"]) == 0
+    assert wlr_gym.__version__ in capsys.readouterr().out
+
+
+def test_unknown_command_names_the_nearest(capsys):
+    assert cli.main(["trian"]) == 2
+    shown = capsys.readouterr()
+    assert "did you mean 'train'?" in shown.err
+    assert shown.out == ""
+
+
+@pytest.mark.parametrize(
+    ("outcome", "code"), [(0, 0), (1, 1), (InputError("bad"), 2), (MissingPackage("absent"), 2), (KeyboardInterrupt(), 130)]
+)
+def test_exit_codes(command, outcome, code):
+    command(outcome)
+    assert cli.main(["probe"]) == code
+
+
+def test_input_error_is_one_line_without_traceback(command, capsys):
+    command(InputError("file x, line 3: expected [a], got 'b'"))
+    cli.main(["probe"])
+    assert capsys.readouterr().err == "wlr: file x, line 3: expected [a], got 'b'\n"
+
+
+def test_other_errors_are_not_swallowed(command):
+    command(RuntimeError("a fault of ours"))
+    with pytest.raises(RuntimeError, match="a fault of ours"):
+        cli.main(["probe"])
+
+
+def test_bad_option_exits_with_2(command):
+    command(0)
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["probe", "--nonsense"])
+    assert caught.value.code == 2
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_explains_itself(name, capsys):
+    with pytest.raises(SystemExit) as caught:
+        cli.main([name, "--help"])
+    assert caught.value.code == 0
+    assert f"usage: wlr {name}" in capsys.readouterr().out

@@ -1,0 +1,474 @@
+"""What happens inside an episode, on a kinematic plant whose answers are known."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import wlr_gym  # noqa: F401
+from wlr_gym.envs.core import make_task
+from wlr_gym.envs.evaluation import compile_evaluation, expressions, reader
+from wlr_gym.envs.settings import Settings
+from wlr_gym.errors import InputError
+from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
+from wlr_gym.tasks.describe import column_name
+
+ID = "WLR-Velocity-v0"
+
+
+def make(**keywords) -> Any:
+    return gym.make(ID, **keywords).unwrapped
+
+
+def make_vec(count, **keywords) -> Any:
+    return gym.make_vec(ID, num_envs=count, **keywords)
+
+
+def names(env):
+    return [column_name(column) for column in env.core.task.policy]
+
+
+# ---- action ----
+
+
+def test_action_is_scaled_about_home_and_clipped_to_the_limits(fake):
+    env = make(task={"action": {"leg_scale": 2.0, "wheel_scale": 100.0}})
+    env.reset(seed=0)
+    env.step(np.array([0.1, -0.1, 1.0, -1.0, 0.01, -0.01, 1.0, -1.0], np.float32))
+    robot = env.core.task.robot
+    home, (low, high), top = robot.home.leg_angle, robot.leg_limits, robot.servo.wheel.no_load_speed
+    expected = [home + 0.2, home - 0.2, high, low, 1.0, -1.0, top, -top]
+    assert fake["plants"][-1].goals_seen[-1][0] == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(np.nan, "nan"), (np.inf, "inf"), (-np.inf, "-inf"), (1.01, "1.01"), (-1e30, "-1e"), (1e300, "inf")]
+)
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_bad_actions_name_robot_and_joint_and_never_reach_the_plant(fake, value, text):
+    env = make_vec(3)
+    env.reset(seed=0)
+    plant = fake["plants"][-1]
+    actions = np.zeros((3, 8))
+    actions[1, 5] = value
+    steps, ticks = len(plant.goals_seen), env.core.ticks.copy()
+    with pytest.raises(InputError, match=rf"wheel_rf of robot 1 of the batch is {text}.*finite number in \[-1, 1\]"):
+        env.step(actions)
+    assert len(plant.goals_seen) == steps
+    assert np.array_equal(env.core.ticks, ticks)
+
+
+@pytest.mark.parametrize("action", [np.zeros(7), np.zeros((1, 8)), 0.5, np.zeros((2, 8)), "forward", None, [None] * 8])
+def test_actions_of_wrong_shape_or_type(fake, action):
+    env = make()
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="action"):
+        env.step(action)
+
+
+def test_rounding_beyond_one_is_accepted(fake):
+    env = make()
+    env.reset(seed=0)
+    env.step(np.full(8, np.nextafter(np.float32(1), np.float32(2))))
+    assert env.core.action.max() == 1.0
+
+
+def test_free_wheels_spin_free(fake):
+    env = make(free_wheels=["wheel_lf", "wheel_rr"], randomization="none")
+    env.reset(seed=0)
+    env.step(np.array([0, 0, 0, 0, 1, 1, 1, 1], np.float32))
+    moving = fake["plants"][-1].truth()["joint_velocity"][0, 4:] != 0
+    assert moving.tolist() == [False, True, True, False]
+
+
+# ---- observation ----
+
+
+def test_observation_holds_the_scaled_readings(fake):
+    env = make(randomization="none", task={"latency": None})
+    env.reset(seed=0)
+    action = np.linspace(-0.5, 0.5, 8).astype(np.float32)
+    observation, *_ = env.step(action)
+    named = dict(zip(names(env), observation.tolist(), strict=True))
+    assert named["leg_position[leg_lf]"] == pytest.approx(-0.5 * 0.4)
+    assert named["wheel_velocity[wheel_rr]"] == pytest.approx(0.2 * 6.0 * 0.5)
+    assert named["accelerometer[z]"] == pytest.approx(0.981)
+    assert named["last_action[leg_rf]"] == pytest.approx(action[1])
+    assert named["command[yaw_rate]"] == pytest.approx(5.0 * env.core.command[0, 1])
+
+
+def wheel_speeds(env, speeds):
+    """Drive the first wheel through given speeds (rad/s); return what the observation shows of it after each tick."""
+    env.reset(seed=0)
+    shown = []
+    for speed in speeds:
+        action = np.zeros(8, np.float32)
+        action[4] = speed / 6.0
+        shown.append(env.step(action)[0][names(env).index("wheel_velocity[wheel_lf]")])
+    return np.array(shown) / 0.2
+
+
+@pytest.mark.parametrize(
+    ("delay", "mode", "expected"),
+    [
+        (0.0, "interpolate", [1, 2, 4, 4]),
+        (0.02, "interpolate", [0, 1, 2, 4]),
+        (0.03, "interpolate", [0, 0.5, 1.5, 3]),
+        (0.03, "hold", [0, 0, 1, 2]),
+        (0.005, "interpolate", [0.75, 1.75, 3.5, 4]),
+        (0.005, "hold", [0, 1, 2, 4]),
+    ],
+)
+def test_latency_interpolates_or_holds(fake, delay, mode, expected):
+    env = make(randomization="none", task={"latency": {"joints": {"delay": [delay, delay], "mode": mode}}})
+    assert wheel_speeds(env, [1, 2, 4, 4]) == pytest.approx(expected, abs=1e-6)
+
+
+def test_history_comes_newest_first_and_starts_filled(fake):
+    env = make(
+        randomization="none",
+        task={"latency": None, "observations": {"wheel_velocity": {"history": 3}, "accelerometer": {"history": 2}}},
+    )
+    columns = [k for k, name in enumerate(names(env)) if name == "wheel_velocity[wheel_lf]"]
+    gravity = [k for k, name in enumerate(names(env)) if name == "accelerometer[z]"]
+    observation, _ = env.reset(seed=0)
+    assert observation[gravity] == pytest.approx(0.981)
+    for speed in (1.0, 2.0, 4.0, 5.0):
+        action = np.zeros(8, np.float32)
+        action[4] = speed / 6.0
+        observation, *_ = env.step(action)
+    assert observation[columns] / 0.2 == pytest.approx([5.0, 4.0, 2.0], rel=1e-6)
+
+
+def test_latency_differs_between_robots_within_its_range_and_is_shared_by_a_device(fake):
+    env = make_vec(200, task={"latency": {"joints": {"delay": [0.01, 0.03]}}})
+    env.reset(seed=0)
+    delays = env.core._delays * 0.02
+    assert 0.01 <= delays[:, 0].min() < 0.011
+    assert 0.029 < delays[:, 0].max() <= 0.03
+    assert np.all(delays[:, -1] == 0.0)
+
+
+def test_observation_noise_and_bias_have_the_stated_spread(fake):
+    task = {"observations": {"supply_voltage": {"noise": 0.3, "bias": 0.5}}, "latency": None}
+    env = make_vec(400, task=task, randomization={"initial_state": {}})
+    column = names(env).index("supply_voltage")
+    env.reset(seed=1)
+    values = np.array([env.step(np.zeros((400, 8)))[0][:, column] for _ in range(60)])
+    assert values.mean(axis=0).std() == pytest.approx(0.5, rel=0.1)
+    assert (values - values.mean(axis=0)).std() == pytest.approx(0.3, rel=0.05)
+    quiet = make_vec(5, task=task, randomization="none")
+    quiet.reset(seed=1)
+    assert np.ptp(quiet.step(np.zeros((5, 8)))[0][:, column]) == 0.0
+
+
+def test_dict_observation_adds_exact_truth(fake):
+    env = make(observation="dict", randomization="none")
+    first, _ = env.reset(seed=0)
+    second, *_ = env.step(np.array([0, 0, 0, 0, 1, 1, 1, 1], np.float32))
+    assert set(second) == {"policy", "privileged"}
+    assert env.observation_space.contains(second)
+    assert second["privileged"][0] == pytest.approx(5.0 * 6.0 * env.core.task.robot.wheel.radius)
+    flat = make(randomization="none")
+    assert np.array_equal(first["policy"], flat.reset(seed=0)[0])
+
+
+def test_observations_never_leave_their_space(fake):
+    env = make(task={"observations": {"wheel_velocity": {"limit": 1.0}}})
+    env.reset(seed=0)
+    observation, *_ = env.step(np.ones(8, np.float32))
+    assert env.observation_space.contains(observation)
+    assert observation.max() == env.observation_space.high.max() or observation[
+        names(env).index("wheel_velocity[wheel_lf]")
+    ] == np.float32(0.2)
+
+
+# ---- commands ----
+
+
+def test_commands_are_held_then_redrawn_within_range_and_sometimes_zero(fake):
+    env = make_vec(300, autoreset_mode="SameStep")
+    env.reset(seed=0)
+    held, commands = [], [env.core.command.copy()]
+    for _ in range(900):
+        env.step(np.zeros((300, 8)))
+        commands.append(env.core.command.copy())
+    history = np.array(commands)
+    changed = (np.diff(history, axis=0) != 0).any(axis=2)
+    for robot in range(300):
+        held += np.diff(np.flatnonzero(changed[:, robot])).tolist()
+    # two stand-stills in a row look like one longer hold
+    assert min(held) >= 200
+    assert np.median(held) == pytest.approx(300, abs=15)
+    assert np.abs(history[..., 0]).max() == pytest.approx(0.1, rel=0.01)
+    assert np.abs(history[..., 1]).max() == pytest.approx(0.3, rel=0.01)
+    assert np.mean((history == 0).all(axis=2)) == pytest.approx(0.1, abs=0.03)
+
+
+def test_command_can_be_fixed_for_an_episode_and_live(fake):
+    env = make()
+    env.reset(seed=0, options={"command": {"linear_velocity_x": 0.07, "yaw_rate": 0.0}})
+    for _ in range(600):
+        env.step(np.zeros(8, np.float32))
+    assert env.core.command.tolist() == [[0.07, 0.0]]
+    env.set_command(yaw_rate=0.3)
+    observation, *_ = env.step(np.zeros(8, np.float32))
+    assert observation[1] == pytest.approx(1.5)
+    with pytest.raises(InputError, match="did you mean 'yaw_rate'"):
+        env.set_command(yaw_rat=0.3)
+    with pytest.raises(InputError, match="finite"):
+        env.reset(options={"command": {"yaw_rate": np.nan}})
+
+
+# ---- rewards and terminations ----
+
+
+def random_matrices(task, count=50):
+    rng = np.random.default_rng(0)
+    widths = {
+        "sensors": SENSOR_LAYOUT.width,
+        "truth": TRUTH_LAYOUT.width,
+        "command": len(task.commands),
+        "action": 8,
+        "previous_action": 8,
+    }
+    matrices = {name: rng.normal(size=(count, width)) for name, width in widths.items()}
+    matrices["truth"][:, TRUTH_LAYOUT.slices["quaternion"]] /= 2.0
+    return matrices
+
+
+def every_reward():
+    from wlr_gym.tasks.terms import REWARDS, TERMINATIONS
+
+    return {
+        "rewards": {name: {"weight": 0.5 + k} for k, name in enumerate(REWARDS)},
+        "terminations": {name: {} for name in TERMINATIONS},
+    }
+
+
+def test_compiled_rewards_equal_the_same_terms_on_numpy():
+    task = make_task("velocity", Settings(task=every_reward()))
+    matrices = random_matrices(task)
+    count = len(matrices["truth"])
+    expected = expressions(task, reader(task, matrices))
+    terms, over = np.zeros((count, len(task.rewards))), np.zeros((count, len(task.terminations)))
+    total, sums = np.zeros(count), np.ones((count, len(task.rewards)))
+    evaluation = compile_evaluation(task)
+    bad = evaluation.run(np.ones(count, bool), *matrices.values(), evaluation.numbers, terms, total, over, sums)
+    assert bad == -1
+    for k, name in enumerate(task.rewards):
+        np.testing.assert_allclose(
+            terms[:, k], np.broadcast_to(expected[f"term.{name}"], count), rtol=1e-12, atol=1e-13, err_msg=name
+        )
+    for k, name in enumerate(task.terminations):
+        np.testing.assert_allclose(over[:, k], expected[f"over.{name}"], rtol=1e-12, atol=1e-13, err_msg=name)
+    np.testing.assert_allclose(total, terms.sum(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(sums, 1.0 + terms)
+    assert (over > 0).any(axis=1).sum() > 0
+
+
+def value_of(name, parameters=None, **truth):
+    """One reward term, weighted 1 per tick, of a still robot with some true quantities set."""
+    task = make_task("velocity", Settings(task={"rewards": {name: {"weight": 50.0, **(parameters or {})}}}))
+    matrices = random_matrices(task, 1)
+    for matrix in matrices.values():
+        matrix[:] = 0.0
+    matrices["truth"][:, TRUTH_LAYOUT.slices["joint_position"]] = np.pi / 2
+    matrices["truth"][:, TRUTH_LAYOUT.slices["quaternion"]] = [1.0, 0.0, 0.0, 0.0]
+    matrices["truth"][:, TRUTH_LAYOUT.slices["body_clearance"]] = 0.1
+    for channel, value in truth.items():
+        source = "command" if channel == "command" else "truth"
+        where = slice(None) if source == "command" else TRUTH_LAYOUT.slices[channel]
+        matrices[source][:, where] = value
+    return float(np.squeeze(expressions(task, reader(task, matrices))[f"term.{name}"]))
+
+
+def test_reward_terms_by_hand():
+    assert value_of("track_linear_velocity", command=[0.1, 0.0], linear_velocity_in_body=[0.1, 0, 0]) == pytest.approx(1.0)
+    assert value_of("track_linear_velocity", {"width": 0.1}, command=[0.1, 0.0]) == pytest.approx(np.exp(-1.0))
+    assert value_of("track_yaw_rate", {"width": 0.3}, angular_velocity_in_body=[0, 0, 0.6]) == pytest.approx(np.exp(-4.0))
+    assert value_of(
+        "other_motion", linear_velocity_in_body=[9.0, 0.1, 0], angular_velocity_in_body=[0.5, 0, 9.0]
+    ) == pytest.approx(2.0)
+    assert value_of("energy", electrical_energy=0.2) == pytest.approx(1.0)
+    assert value_of("energy", electrical_energy=-0.2) == 0.0
+    torque = [0.9 * 7.3, 0, 0, 0, 1.5, 0, 0, 0]
+    assert value_of("torque_saturation", motor_torque=torque) == pytest.approx((0.5 + 1.0) / 8)
+    assert value_of("leg_posture", joint_position=[np.pi / 2 + 0.5] * 4 + [0] * 4) == pytest.approx(1.0)
+    tipped = [np.cos(0.6), np.sin(0.6), 0, 0]
+    assert value_of("alive", quaternion=tipped) == 0.0
+    assert value_of("termination", quaternion=tipped) == 1.0
+    assert value_of("termination") == 0.0
+
+
+def test_slip_reward_spares_rolling_and_what_a_skid_turn_needs():
+    period, speed, hip = 0.02, 0.05, 0.175
+    rolling = {"linear_velocity_in_body": [0.2, 0, 0], "joint_velocity": [0] * 4 + [6.0] * 4}
+    assert value_of("slip", **rolling) == 0.0
+    needed = np.zeros(8)
+    needed[1::2] = [1, 1, -1, -1] * np.full(4, 0.5 * hip * period)
+    turning = {"angular_velocity_in_body": [0, 0, 0.5]}
+    assert value_of("slip", slip_displacement=needed, **turning) == pytest.approx(0.0, abs=1e-12)
+    assert value_of("slip", slip_displacement=needed) == pytest.approx(0.5 * hip / speed)
+    spinning = np.zeros(8)
+    spinning[0::2] = -0.3 * period
+    assert value_of("slip", slip_displacement=spinning) == pytest.approx(0.3 / speed)
+    assert value_of("slip", slip_displacement=spinning, **turning) == pytest.approx((0.3 - 0.5 * hip**2 / 0.16) / speed)
+
+
+def test_action_rate_compares_with_the_tick_before(fake):
+    env = make(task={"rewards": {"action_rate": {"weight": -50.0}}})
+    env.reset(seed=0)
+    changes = [env.step(np.full(8, value, np.float32))[4]["reward_terms"]["action_rate"] for value in (0.5, 0.5, -0.25)]
+    assert changes == pytest.approx([-0.25, 0.0, -0.5625])
+    env.reset()
+    assert env.step(np.zeros(8, np.float32))[4]["reward_terms"]["action_rate"] == 0.0
+
+
+def test_weights_and_parameters_compile_nothing_new():
+    base = compile_evaluation(make_task("velocity", Settings()))
+    changed = compile_evaluation(make_task("velocity", Settings(task={"rewards": {"slip": {"weight": -9.0, "speed": 0.3}}})))
+    assert changed.run is base.run
+    assert not np.array_equal(changed.numbers, base.numbers)
+
+
+def test_falling_terminates_and_the_time_limit_truncates(fake):
+    fake["fall_at"] = 0.1
+    env = make(episode_length=0.2)
+    env.reset(seed=0)
+    flags = [env.step(np.zeros(8, np.float32))[2:4] for _ in range(5)]
+    assert flags == [(False, False)] * 4 + [(True, False)]
+    fake["fall_at"] = np.inf
+    env = make(episode_length=0.2)
+    env.reset(seed=0)
+    steps = [env.step(np.zeros(8, np.float32)) for _ in range(10)]
+    assert [step[2:4] for step in steps] == [(False, False)] * 9 + [(False, True)]
+    total = steps[-1][4]["episode_reward_terms"]
+    assert sum(total.values()) == pytest.approx(sum(step[1] for step in steps))
+    assert "episode_reward_terms" not in steps[-2][4]
+    for _, reward, _, _, info in steps:
+        assert sum(info["reward_terms"].values()) == pytest.approx(reward)
+
+
+def test_robots_outside_the_mask_keep_time_flags_and_observation(fake):
+    env = make_vec(2, episode_length=0.1)
+    env.reset(seed=0)
+    core = env.core
+    for _ in range(5):
+        core.step(np.zeros((2, 8)), core.everyone)
+    assert core.truncated.all()
+    before = core.observation[0].copy()
+    core.step(np.full((2, 8), [[np.nan], [0.5]]), np.array([False, True]))
+    assert core.ticks.tolist() == [5, 6]
+    assert core.truncated.all()
+    assert core.reward[0] == 0.0
+    assert np.array_equal(core.observation[0], before)
+    assert fake["plants"][-1].goals_seen[-1][0, 4:].tolist() == [0.0] * 4
+
+
+def test_a_plant_that_leaves_the_finite_numbers_is_reported(fake):
+    env = make()
+    env.reset(seed=0)
+    plant = fake["plants"][-1]
+    publish = plant._publish
+
+    def broken(rows):
+        publish(rows)
+        plant.truth()["linear_velocity_in_body"][:, 0] = np.nan
+
+    plant._publish = broken
+    with pytest.raises(FloatingPointError, match="robot 0"):
+        env.step(np.zeros(8, np.float32))
+
+
+# ---- episodes ----
+
+
+def test_reset_options_set_parameters_after_randomisation(fake):
+    env = make(randomization="nominal")
+    _, info = env.reset(seed=0, options={"parameters": {"ground.mu_x": 0.2, "wheel.radius[wheel_lf]": 0.033}})
+    plant = fake["plants"][-1]
+    assert plant.parameters["ground.mu_x"].tolist() == [[0.2] * 4]
+    assert plant.parameters["wheel.radius[wheel_lf]"].tolist() == [0.033]
+    assert info["randomization"]["ground.mu_x[wheel_rr]"] == 0.2
+    env.reset(seed=0)
+    assert plant.parameters["ground.mu_x"].min() >= 0.3
+    for options, expected in (
+        ({"parameters": {"ground.mux": 1.0}}, "did you mean 'ground.mu_x'"),
+        ({"parameters": {"ground.mu_x": -1.0}}, r"outside \[0, 5\]"),
+        ({"comand": {}}, "did you mean 'command'"),
+    ):
+        with pytest.raises(InputError, match=expected):
+            env.reset(options=options)
+
+
+def interval_event(parameter, low, high, interval):
+    return {
+        "parameters": [parameter],
+        "when": "interval",
+        "interval": interval,
+        "distribution": "uniform",
+        "operation": "set",
+        "low": low,
+        "high": high,
+        "per": "element",
+    }
+
+
+def test_interval_events_strike_each_in_its_own_time_and_leave_reset_options_alone(fake):
+    events = {
+        "push": interval_event("external_force", -2.0, 2.0, [0.04, 0.2]),
+        "drift": interval_event("ground.mu_x", 0.3, 0.9, [0.5, 0.5]),
+    }
+    env = make_vec(4, randomization={"events": events})
+    env.reset(seed=0, options={"parameters": {"ground.mu_x[wheel_lf]": 0.1}})
+    friction, force = [], []
+    for _ in range(60):
+        env.step(np.zeros((4, 8)))
+        friction.append(fake["plants"][-1].parameters["ground.mu_x"].copy())
+        force.append(fake["plants"][-1].parameters["external_force[x]"].copy())
+    friction, force = np.array(friction), np.array(force)
+    assert np.array_equal(np.flatnonzero((np.diff(friction[:, :, 1], axis=0) != 0).all(axis=1)), [23, 48])
+    assert np.all(friction[:, :, 0] == 0.1)
+    strikes = [np.flatnonzero(np.diff(force[:, robot])) for robot in range(4)]
+    assert len({tuple(ticks.tolist()) for ticks in strikes}) == 4
+    assert all(np.diff(ticks).min() >= 2 and np.diff(ticks).max() <= 10 for ticks in strikes)
+
+
+def test_interval_events_reach_the_plant_in_mid_episode(fake):
+    push = interval_event("external_force", -2.0, 2.0, [0.1, 0.1])
+    env = make_vec(3, randomization={"events": {"push": push}})
+    env.reset(seed=0)
+    forces = []
+    for _ in range(20):
+        env.step(np.zeros((3, 8)))
+        forces.append(fake["plants"][-1].parameters["external_force"].copy())
+    changed = (np.diff(np.array(forces), axis=0) != 0).all(axis=2)
+    assert np.array_equal(np.flatnonzero(changed[:, 0]), [3, 8, 13, 18])
+    assert np.all(changed == changed[:, :1])
+    alone = make(randomization={"events": {"push": push}})
+    alone.reset(seed=2)
+    for _ in range(20):
+        alone.step(np.zeros(8))
+    assert np.array_equal(fake["plants"][-1].parameters["external_force"][0], forces[-1][2])
+
+
+def test_every_episode_of_a_robot_is_another_one_and_all_repeat_with_the_seed(fake):
+    env = make()
+
+    def episodes():
+        return [env.reset(seed=5)[0], *(env.reset()[0] for _ in range(3))]
+
+    first, second = episodes(), episodes()
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    assert len({tuple(observation.tolist()) for observation in first}) == 4
+    assert not np.array_equal(env.reset(seed=6)[0], first[0])
+
+
+def test_unseeded_environments_differ_and_tell_their_seed(fake):
+    one, two = make(), make()
+    observation, _ = one.reset()
+    assert not np.array_equal(observation, two.reset()[0])
+    again = make()
+    assert np.array_equal(again.reset(seed=one.np_random_seed)[0], observation)

@@ -1,0 +1,285 @@
+"""Three faces, one robot: Gymnasium single and vector, calling conventions, autoreset, errors."""
+
+import pickle
+import subprocess
+import sys
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import wlr_gym
+from wlr_gym.errors import InputError
+
+ID = "WLR-Velocity-v0"
+
+
+def make(**keywords) -> Any:
+    return gym.make(ID, **keywords).unwrapped
+
+
+def make_vec(count, **keywords) -> Any:
+    return gym.make_vec(ID, num_envs=count, **keywords)
+
+
+SHORT = {"episode_length": 0.4, "randomization": "wide"}
+
+
+def actions_for(steps, count, seed=3):
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, count, 8)).astype(np.float32)
+
+
+# ---- Gymnasium's own checks ----
+
+
+@pytest.mark.parametrize("observation", ["policy", "dict"])
+@pytest.mark.parametrize("randomization", ["none", "wide"])
+def test_gymnasium_check_env_without_a_warning(fake, observation, randomization):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make(observation=observation, randomization=randomization))
+
+
+def test_ways_to_make_it(fake):
+    assert str(gym.make(f"wlr_gym:{ID}").unwrapped) == f"<VelocityEnv<{ID}>>"
+    assert gym.make_vec(f"wlr_gym:{ID}", num_envs=2).num_envs == 2
+    assert make_vec(2, vectorization_mode="sync").num_envs == 2
+    limited = make_vec(2, max_episode_steps=3)
+    limited.reset(seed=0)
+    flags = [limited.step(np.zeros((2, 8)))[3].tolist() for _ in range(3)]
+    assert flags == [[False] * 2, [False] * 2, [True] * 2]
+
+
+def test_import_is_light():
+    code = (
+        "import sys, wlr_gym;"
+        "heavy = {'numba', 'mujoco', 'torch', 'scipy', 'pandas', 'pydantic', 'yaml', 'stable_baselines3', 'matplotlib'};"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_spec_and_pickle_round_trips(fake):
+    env: Any = gym.make(ID, randomization="wide", task={"episode_length": 1.0})
+    spec = EnvSpec.from_json(env.spec.to_json())
+    copies = [gym.make(spec), pickle.loads(pickle.dumps(env.unwrapped)), env.spec.make()]
+    expected = env.reset(seed=4)[0]
+    for copy in copies:
+        assert np.array_equal(copy.reset(seed=4)[0], expected)
+        assert copy.unwrapped.core.limit == 50
+
+
+def test_class_documentation_is_made_from_the_data(fake):
+    from wlr_gym.envs.velocity import VelocityEnv, VelocityVectorEnv
+
+    for cls in (VelocityEnv, VelocityVectorEnv):
+        for text in ("wheel_velocity[wheel_lf]", "track_yaw_rate", "free_wheels", "v0: first version", "leg_rr"):
+            assert text in str(cls.__doc__)
+    env = make()
+    assert env.describe() in str(VelocityEnv.__doc__)
+
+
+def test_contract_names_the_task_robot_and_randomization(fake):
+    for env in (make(randomization="wide"), make_vec(2, randomization="wide")):
+        contract = env.contract()
+        assert (contract["task"], contract["robot"]["name"], contract["randomization"]["name"]) == (
+            "velocity",
+            "wlr-nominal",
+            "wide",
+        )
+        assert len(contract["observation"]) == 36
+
+
+# ---- errors ----
+
+
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+@pytest.mark.parametrize(
+    ("keywords", "expected"),
+    [
+        ({"randomisation": "none"}, "did you mean 'randomization'"),
+        ({"randomization": "wid"}, "did you mean 'wide'"),
+        ({"randomization": {"event": {}}}, "did you mean 'events'"),
+        ({"robot": "nominl"}, "did you mean 'nominal'"),
+        ({"robot": "paper"}, "cannot be simulated"),
+        ({"task": {"reward": {}}}, "did you mean 'rewards'"),
+        ({"task": "velocit"}, "did you mean 'velocity'"),
+        ({"task": 3}, "task = 3"),
+        ({"observation": "dct"}, "did you mean 'dict'"),
+        ({"free_wheels": ["wheel_lg"]}, "unknown wheel 'wheel_lg'"),
+        ({"free_wheels": "wheel_lf"}, "expected a list"),
+        ({"episode_length": -1.0}, "above 0 s"),
+        ({"physics_step": 0.003}, "does not divide"),
+    ],
+)
+def test_bad_keywords_name_the_nearest_valid_one(fake, make, keywords, expected):
+    with pytest.raises(InputError, match=expected):
+        make(ID, **keywords)
+
+
+def test_unknown_backend():
+    with pytest.raises(InputError, match="did you mean 'gibbs_appell'"):
+        gym.make(ID, backend="gibbs_apell")
+
+
+def test_pictures_are_refused_with_a_reason(fake):
+    with pytest.raises(InputError, match="no pictures"), pytest.warns(UserWarning, match="render_mode"):
+        gym.make(ID, render_mode="rgb_array")
+
+
+@pytest.mark.parametrize(
+    ("keywords", "expected"),
+    [
+        ({"num_envs": 0}, "num_envs = 0"),
+        ({"num_envs": 2, "autoreset_mode": "NextStp"}, "did you mean 'NextStep'"),
+        ({"num_envs": 2, "max_episode_steps": 0}, "max_episode_steps = 0"),
+    ],
+)
+def test_bad_vector_keywords(fake, keywords, expected):
+    with pytest.raises(InputError, match=expected):
+        gym.make_vec(ID, **keywords)
+
+
+def test_bad_seeds_and_masks(fake):
+    env = make_vec(3)
+    for seed, expected in (([1, 2], "2 seeds for 3 robots"), ([1, -2, 3], "seed = -2"), ([1, 2.5, 3], "seed = 2.5")):
+        with pytest.raises(InputError, match=expected):
+            env.reset(seed=seed)
+    for mask in (np.zeros(3, bool), np.ones(2, bool), np.ones(3)):
+        with pytest.raises(InputError, match="reset_mask"):
+            env.reset(options={"reset_mask": mask})
+
+
+@pytest.mark.parametrize("env", [lambda: make(), lambda: make_vec(2)])
+def test_step_before_reset(fake, env):
+    made = env()
+    with pytest.raises(gym.error.ResetNeeded):
+        made.step(made.action_space.sample())
+
+
+# ---- vector = single ----
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("observation", ["policy", "dict"])
+def test_vector_equals_gymnasiums_loop_over_single_environments(fake, mode, observation):
+    """Observations, rewards, flags and infos, masks and all, over several episodes that end at different times."""
+    keywords = {**SHORT, "observation": observation}
+    ours = make_vec(3, autoreset_mode=mode, **keywords)
+    loop = SyncVectorEnv([lambda: gym.make(ID, **keywords)] * 3, autoreset_mode=AutoresetMode(mode))
+    ours_first, loop_first = ours.reset(seed=11), loop.reset(seed=11)
+    assert data_equivalence(ours_first[0], loop_first[0], exact=True)
+    assert data_equivalence(ours_first[1], loop_first[1], exact=True)
+    stagger = np.array([True, False, False])
+    for step, action in enumerate(actions_for(70, 3)):
+        if step == 7:
+            for env in (ours, loop):
+                env.reset(options={"reset_mask": stagger.copy()})
+        result, expected = ours.step(action), loop.step(action)
+        for name, one, two in zip(("observation", "reward", "terminated", "truncated"), result, expected, strict=False):
+            assert data_equivalence(one, two, exact=True), (step, name)
+        assert set(result[4]) == set(expected[4]), step
+        for key in result[4]:
+            assert same_where_masked(result[4], expected[4], key), (step, key)
+
+
+def same_where_masked(ours, loop, key):
+    if key.startswith("_"):
+        return np.array_equal(ours[key], loop[key])
+    if isinstance(ours[key], dict):
+        return ours[key].keys() == loop[key].keys() and all(same_where_masked(ours[key], loop[key], k) for k in ours[key])
+    mask = ours[f"_{key}"]
+    return all(data_equivalence(a, b, exact=True) for a, b in zip(ours[key][mask], loop[key][mask], strict=True))
+
+
+def test_a_robot_is_the_same_in_a_batch_of_any_size(fake):
+    many, few = make_vec(40, **SHORT), make_vec(3, **SHORT)
+    many.reset(seed=100)
+    few.reset(seed=[117, 100, 139])
+    for action in actions_for(50, 40):
+        a, b = many.step(action), few.step(action[[17, 0, 39]])
+        for one, two in zip(a[:4], b[:4], strict=True):
+            assert np.array_equal(one[[17, 0, 39]], two)
+
+
+# ---- autoreset ----
+
+
+def run_until_over(env, count):
+    env.reset(seed=0)
+    while True:
+        result = env.step(np.zeros((count, 8), np.float32))
+        if (result[2] | result[3]).any():
+            return result
+
+
+def test_next_step_resets_on_the_following_step_and_ignores_the_action(fake):
+    env = make_vec(2, **SHORT)
+    observation, _, _, truncated, infos = run_until_over(env, 2)
+    assert truncated.all()
+    assert "episode_reward_terms" in infos
+    following, reward, terminated, truncated, infos = env.step(np.full((2, 8), np.nan))
+    assert np.all(reward == 0)
+    assert not terminated.any()
+    assert not truncated.any()
+    assert infos["_randomization"].all()
+    assert not np.array_equal(following, observation)
+    assert env.core.ticks.tolist() == [0, 0]
+
+
+def test_same_step_hands_out_the_final_observation_and_info(fake):
+    env = make_vec(2, autoreset_mode="SameStep", **SHORT)
+    single = gym.make(ID, **SHORT)
+    observation, _, _, truncated, infos = run_until_over(env, 2)
+    single.reset(seed=1)
+    last = [single.step(np.zeros(8, np.float32)) for _ in range(20)][-1]
+    assert truncated.all()
+    assert np.array_equal(infos["final_obs"][1], last[0])
+    assert infos["final_info"]["reward_terms"]["slip"][1] == last[4]["reward_terms"]["slip"]
+    assert np.array_equal(observation[1], single.reset()[0])
+
+
+def test_disabled_waits_for_the_user(fake):
+    env = make_vec(2, autoreset_mode=AutoresetMode.DISABLED, **SHORT)
+    run_until_over(env, 2)
+    with pytest.raises(gym.error.ResetNeeded, match="robot 0 is over"):
+        env.step(np.zeros((2, 8)))
+    env.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(gym.error.ResetNeeded, match="robot 1 is over"):
+        env.step(np.zeros((2, 8)))
+    env.reset(options={"reset_mask": np.array([False, True])})
+    env.step(np.zeros((2, 8)))
+
+
+def test_a_masked_reset_leaves_the_others_alone(fake):
+    env, other = make_vec(3, **SHORT), make_vec(3, **SHORT)
+    env.reset(seed=0)
+    other.reset(seed=0)
+    for action in actions_for(5, 3):
+        env.step(action)
+        other.step(action)
+    env.reset(seed=50, options={"reset_mask": np.array([False, True, False])})
+    action = actions_for(1, 3)[0]
+    a, b = env.step(action), other.step(action)
+    assert np.array_equal(a[0][[0, 2]], b[0][[0, 2]])
+    assert not np.array_equal(a[0][1], b[0][1])
+
+
+def test_returned_arrays_are_the_users_own(fake):
+    env = make_vec(2, observation="dict", **SHORT)
+    kept = [env.reset(seed=0)]
+    kept += [env.step(action) for action in actions_for(3, 2)]
+    copies = pickle.loads(pickle.dumps(kept))
+    for action in actions_for(40, 2):
+        env.step(action)
+    assert all(data_equivalence(a, b, exact=True) for a, b in zip(kept, copies, strict=True))
+
+
+def test_version():
+    assert wlr_gym.__version__.count(".") == 2

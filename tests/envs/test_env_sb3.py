@@ -1,0 +1,118 @@
+"""The Stable-Baselines3 face."""
+
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import wlr_gym  # noqa: F401
+
+pytest.importorskip("stable_baselines3")
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+
+from wlr_gym.envs import Sb3VecEnv
+from wlr_gym.errors import InputError
+
+ID = "WLR-Velocity-v0"
+SHORT = {"episode_length": 0.4, "randomization": "wide"}
+
+
+@pytest.mark.parametrize("observation", ["policy", "dict"])
+def test_check_env_without_a_warning(fake, observation):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gym.make(ID, observation=observation).unwrapped, warn=True)
+
+
+@pytest.mark.parametrize("observation", ["policy", "dict"])
+def test_equals_dummy_vec_env_with_the_same_seeds(fake, observation):
+    keywords = {**SHORT, "observation": observation}
+    ours = Sb3VecEnv(ID, 3, seed=5, **keywords)
+    loop = DummyVecEnv([lambda: gym.make(ID, **keywords)] * 3)
+    loop.seed(5)
+    same(ours.reset(), loop.reset())
+    actions = np.random.default_rng(0).uniform(-1, 1, (70, 3, 8)).astype(np.float32)
+    ended = 0
+    for action in actions:
+        a, b = ours.step(action), loop.step(action)
+        same(a[0], b[0])
+        assert np.array_equal(a[1], b[1])
+        assert np.array_equal(a[2], b[2])
+        for one, two, done in zip(a[3], b[3], a[2], strict=True):
+            ended += bool(done)
+            if done:
+                same(one["terminal_observation"], two["terminal_observation"])
+                assert one["TimeLimit.truncated"] == two["TimeLimit.truncated"]
+                assert one["episode_reward_terms"] == two["episode_reward_terms"]
+            else:
+                assert one == {}
+    assert ended == 9
+    assert ours.reset_infos == loop.reset_infos
+
+
+def same(a, b):
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        assert all(np.array_equal(a[key], b[key]) for key in a)
+    else:
+        assert a.dtype == b.dtype
+        assert np.array_equal(a, b)
+
+
+def test_a_fall_is_not_a_time_limit(fake):
+    fake["fall_at"] = 0.1
+    env = Sb3VecEnv(ID, 2, seed=0)
+    env.reset()
+    _, _, done, infos = [env.step(np.zeros((2, 8), np.float32)) for _ in range(5)][-1]
+    assert done.all()
+    assert not infos[0]["TimeLimit.truncated"]
+
+
+def test_works_with_sb3s_own_tools(fake):
+    env = VecNormalize(VecMonitor(Sb3VecEnv(ID, 4, seed=0, **SHORT)))
+    model = PPO("MlpPolicy", env, n_steps=32, batch_size=64, n_epochs=1, device="cpu", seed=0)
+    model.learn(256)
+    assert model.ep_info_buffer is not None
+    assert len(model.ep_info_buffer) > 0
+    assert model.ep_info_buffer[0]["l"] == 20
+
+
+def test_make_vec_env(fake):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*render_mode.*")
+        env: Any = make_vec_env(ID, n_envs=2, seed=0, env_kwargs={"randomization": "none"})
+    assert np.shape(env.reset()) == (2, 36)
+    assert np.shape(env.step(np.zeros((2, 8), np.float32))[0]) == (2, 36)
+
+
+def test_options_attributes_and_methods(fake):
+    env = Sb3VecEnv(ID, 3, seed=0, randomization="none")
+    env.set_options([{}, {"command": {"linear_velocity_x": 0.05, "yaw_rate": 0.1}}, {"parameters": {"ground.mu_x": 0.2}}])
+    env.reset()
+    assert env.core.command[1].tolist() == [0.05, 0.1]
+    assert env.core.parameters["ground.mu_x"][:, 0].tolist() == [0.6, 0.6, 0.2]
+    assert env.get_attr("render_mode", [0, 2]) == [None, None]
+    assert env.env_method("contract", indices=1)[0]["task"] == "velocity"
+    env.env_method("set_command", linear_velocity_x=0.02)
+    assert env.core.command[:, 0].tolist() == [0.02] * 3
+    assert env.has_attr("core")
+    assert not env.has_attr("no_such_thing")
+    with pytest.raises(InputError, match="without indices"):
+        env.set_attr("anything", 1, indices=[0])
+    env.close()
+
+
+def test_bad_input(fake):
+    with pytest.raises(InputError, match="did you mean 'WLR-Velocity-v0'"):
+        Sb3VecEnv("WLR-Velocty-v0", 2)
+    with pytest.raises(InputError, match="did you mean 'randomization'"):
+        Sb3VecEnv(ID, 2, randomisation="none")
+    env = Sb3VecEnv(ID, 2, seed=0)
+    env.reset()
+    with pytest.raises(InputError, match="leg_lf of robot 1"):
+        env.step(np.array([[0.0] * 8, [np.nan] * 8]))

@@ -1,0 +1,99 @@
+"""The policy folder and its contract: what is refused, and how the refusal reads."""
+
+import copy
+import json
+
+import pytest
+
+from wlr_gym.errors import InputError
+from wlr_gym.evaluation import make_core
+from wlr_gym.policy import check_contract, load_policy, make_policy, read_contract, write_contract
+
+
+@pytest.fixture(scope="module")
+def contract():
+    core = make_core("WLR-Velocity-v0", 1, {})
+    yield json.loads(json.dumps(core.contract()))
+    core.close()
+
+
+@pytest.fixture
+def folder(tmp_path, contract):
+    write_contract(tmp_path, "do_nothing", {}, contract, {"steps": 0})
+    return tmp_path
+
+
+def changed(contract, change):
+    other = copy.deepcopy(contract)
+    change(other)
+    return other
+
+
+def test_contract_survives_writing_and_reading(folder, contract):
+    saved = read_contract(folder)
+    assert saved["environment"] == contract
+    assert "numpy" in saved["versions"]
+    check_contract(saved["environment"], contract, "here")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c["robot"].update(hash="0"), r"robot\.hash"),
+        (lambda c: c.update(control_period=0.04), r"control_period is 0\.02 in the policy, 0\.04 in the environment"),
+        (lambda c: c["observation"][3].update(scale=9.0), r"observation\[3\]\.scale"),
+        (lambda c: c["observation"][5].update(unit="deg"), r"observation\[5\]\.unit"),
+        (lambda c: c["observation"].insert(0, c["observation"].pop(1)), r"observation\[0\]\.name"),
+        (lambda c: c["observation"].pop(), r"length of observation is 36 in the policy, 35 in the environment"),
+        (lambda c: c["action"][0].update(centre=1.0), r"action\[0\]\.centre"),
+    ],
+)
+def test_first_difference_is_named(contract, change, message):
+    with pytest.raises(InputError, match=message):
+        check_contract(contract, changed(contract, change), "policy")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c.update(randomization={"name": "wide"}),
+        lambda c: c["observation"][2].update(noise=0.3),
+        lambda c: c["commands"].clear(),
+    ],
+)
+def test_other_conditions_are_not_refused(contract, change):
+    check_contract(contract, changed(contract, change), "policy")
+
+
+def test_the_environment_itself_decides(folder):
+    core = make_core("WLR-Velocity-v0", 1, {"task": {"action": {"wheel_scale": 3.0}}})
+    write_contract(folder, "ppo", {}, read_contract(folder)["environment"], {})
+    with pytest.raises(InputError, match=r"action\[4\]\.scale is 6\.0 in the policy, 3\.0 in the environment"):
+        load_policy(folder, core.contract())
+    core.close()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"{", "line 1, column 2: broken JSON"),
+        (b'{"format": 99}', "not a policy contract of format 1"),
+        (b"[]", "not a policy contract"),
+        (b'{"format": 1, "agent": "ppo"}', "'environment' is missing"),
+        (b"\xff\xfe", "cannot be read"),
+    ],
+)
+def test_broken_contracts_are_refused(tmp_path, content, message):
+    (tmp_path / "contract.json").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_contract(tmp_path)
+
+
+def test_a_place_without_a_policy(tmp_path, contract):
+    with pytest.raises(InputError, match="no policy there"):
+        make_policy(tmp_path, contract)
+
+
+def test_neither_agent_nor_folder(contract):
+    with pytest.raises(InputError, match=r"neither a policy folder nor an agent \(did you mean 'do_nothing'"):
+        make_policy("do_nothin", contract)

@@ -1,0 +1,196 @@
+"""Drive a simulator with the commands of measured runs and report where the two part.
+
+Writes errors.json (run, channel: errors in units and in sensor noise), overlay plots, config.yaml and provenance.yaml.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from wlr_gym.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from wlr_gym.effects import Patch
+    from wlr_gym.runs import Run
+    from wlr_gym.runs.replay import ChannelError, ReplayResult
+
+ERRORS_FILE = "errors.json"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Replay measured runs.
+
+    Attributes:
+        runs: a run (CSV or Parquet) or a folder of runs.
+        out: folder for errors.json, plots and provenance; made if it is not there.
+        effects: patch file: effects to add to the nominal model.
+        backend: simulator.
+        robot: robot file or config name; left out, the one meta.yaml names, else the nominal one.
+        segment: s between the points at which a segment starts anew from the measured state.
+        plots: write overlay plots.
+    """
+
+    runs: Annotated[Path, tyro.conf.Positional]
+    out: Path
+    effects: Path | None = None
+    backend: str = "gibbs_appell"
+    robot: str | None = None
+    segment: float = 1.0
+    plots: bool = True
+
+
+def run(options: Options) -> int:
+    """Replay, print the tables, write the files; 0 when done.
+
+    Raises:
+        InputError: unreadable runs, patch, robot or backend.
+    """
+    from rich.console import Console
+
+    from wlr_gym.effects import load_patch
+    from wlr_gym.files import write_json
+    from wlr_gym.provenance import record_provenance
+    from wlr_gym.runs.plot import save_plots
+
+    console = Console()
+    runs = _read(options.runs)
+    patch = load_patch(options.effects)
+    _make_folder(options.out)
+    results = []
+    for result in _replay_all(options, runs, patch, console):
+        results.append(result)
+        if options.plots:
+            save_plots(result, options.out)
+    _print(results, patch, console)
+    errors = {result.run.name: {name: error.as_dict() for name, error in result.errors.items()} for result in results}
+    write_json(options.out / ERRORS_FILE, errors)
+    record_provenance(options.out, _resolved(options, results, patch))
+    console.print(f"errors, plots and provenance: {options.out}")
+    return 0
+
+
+def _read(path: Path) -> Sequence[Run]:
+    from wlr_gym.runs import read_dataset, read_run
+
+    return read_dataset(path).runs if path.is_dir() else [read_run(path)]
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {path}: cannot be a folder: {error.strerror}") from None
+
+
+def _replay_all(options: Options, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
+    from rich.progress import track
+
+    from wlr_gym.runs.replay import replay
+
+    for measured in track(runs, description=f"replaying on {options.backend}", console=console):
+        yield replay(measured, options.backend, options.robot, effects=patch, segment=options.segment)
+
+
+def _resolved(options: Options, results: Sequence[ReplayResult], patch: Patch) -> dict[str, object]:
+    return {
+        **{name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()},
+        "robot": results[0].robot.name,
+        "clock": results[0].clock,
+        "physics_step": results[0].physics_step,
+        "runs": [str(result.run.path) for result in results],
+        "effects": [{"name": e.name, "where": list(e.where), "parameters": dict(e.parameters)} for e in patch.effects],
+    }
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def _print(results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
+    for result in results:
+        for finding in result.run.findings:
+            line = f"{result.run.name}: {finding.kind} in '{finding.column}': {finding.message}"
+            console.print(line, style="yellow", highlight=False, soft_wrap=True)
+    errors = [pair for result in results for pair in result.errors.items()]
+    added = ", ".join(effect.name for effect in patch.effects) or "none"
+    console.print(_error_table(errors, f"{len(results)} run{'s' if len(results) > 1 else ''}, effects added: {added}"))
+    console.print(_joint_table(errors))
+    if len(results) > 1:
+        console.print(_run_table(results))
+
+
+def _table(title: str, headings: Sequence[str]) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE, padding=(0, 1, 0, 0))
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading in {"channel", "unit", "run"} else "right", no_wrap=True)
+    return table
+
+
+def _grouped(errors: Sequence[tuple[str, ChannelError]]) -> dict[str, list[ChannelError]]:
+    """Put the errors of a joint group (``pos_leg``) together, and those of every other channel by themselves."""
+    from wlr_gym.robot import JOINTS
+    from wlr_gym.runs.format import CHANNELS, COLUMNS
+
+    groups: dict[str, list[ChannelError]] = {}
+    for name, error in sorted(errors, key=lambda pair: CHANNELS.index(pair[0])):
+        key = COLUMNS[name].group if name.partition("_")[2] in JOINTS else name
+        groups.setdefault(key, []).append(error)
+    return groups
+
+
+def _in_noise_units(errors: Sequence[ChannelError]) -> str:
+    from wlr_gym.runs.replay import pooled
+
+    return f"{pooled(errors, lambda error: error.segment_rms / error.noise):.1f}" if errors else "-"
+
+
+def _error_table(errors: Sequence[tuple[str, ChannelError]], title: str) -> Table:
+    from wlr_gym.runs.replay import pooled
+
+    headings = ("channel", "unit", "noise", "segment", "full run", "segment\n/noise", "full run\n/noise")
+    table = _table(f"Measured minus simulated, rms ({title})", headings)
+    for group, members in _grouped(errors).items():
+        noise, unit = members[0].noise, members[0].unit
+        segment, full = pooled(members, lambda e: e.segment_rms), pooled(members, lambda e: e.full_run_rms)
+        ratios = (f"{segment / noise:.1f}", f"{full / noise:.1f}")
+        table.add_row(group, unit, f"{noise:.2g}", f"{segment:.3g}", f"{full:.3g}", *ratios)
+    return table
+
+
+def _joint_table(errors: Sequence[tuple[str, ChannelError]]) -> Table:
+    from wlr_gym.robot import CORNERS
+    from wlr_gym.runs.format import COLUMNS
+
+    table = _table("Segment error of each joint, in units of sensor noise", ("channel", *CORNERS))
+    for group in ("pos_leg", "vel_leg", "eff_leg", "pos_wheel", "vel_wheel", "eff_wheel"):
+        if any(COLUMNS[name].group == group for name, _ in errors):
+            table.add_row(
+                group, *(_in_noise_units([e for name, e in errors if name == f"{group}_{corner}"]) for corner in CORNERS)
+            )
+    return table
+
+
+def _run_table(results: Sequence[ReplayResult]) -> Table:
+    from wlr_gym.runs.format import COLUMNS
+
+    def kind(name: str) -> str:
+        group = COLUMNS[name].group
+        return group.partition("_")[0] if group.startswith("cam") else group
+
+    kinds = list(dict.fromkeys(kind(name) for result in results for name in result.errors if name != "volt"))
+    table = _table("Segment error of each run, in units of sensor noise", ("run", *(name.replace("_", "\n") for name in kinds)))
+    for result in results:
+        members = [[error for name, error in result.errors.items() if kind(name) == wanted] for wanted in kinds]
+        table.add_row(result.run.name, *map(_in_noise_units, members))
+    return table

@@ -1,0 +1,78 @@
+"""Train an agent on an environment. Ctrl-C saves a checkpoint; --resume goes on from the newest one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from wlr_gym.cli import OK
+from wlr_gym.envs.registry import task_name_of
+from wlr_gym.errors import InputError
+from wlr_gym.policy import Training, load_agent_config
+from wlr_gym.policy.agents import agent_function
+from wlr_gym.provenance import CONFIG_FILE
+from wlr_gym.robot import read_yaml
+
+
+@dataclass(frozen=True)
+class Options:
+    env: tyro.conf.Positional[str] = "WLR-Velocity-v0"
+    """Environment id; see: wlr envs."""
+    agent: str = "ppo"
+    """Agent to train: a folder of agents/."""
+    config: str | None = None
+    """Settings of the agent: name in configs/agent/ or path of a YAML file; default: the agent's own."""
+    set: tuple[str, ...] = ()
+    """Settings to change, as key=value: --set total_steps=20_000_000 environment.randomization=wide"""
+    seed: int | None = None
+    """Seed of everything random; default: that of the settings."""
+    out: Path | None = None
+    """Run folder; default: runs_out/<env>_<agent>_<seed>."""
+    resume: Path | None = None
+    """Run folder to go on with; its own environment, agent and settings are used."""
+    max_minutes: float | None = None
+    """Stop in good order after this time."""
+    progress: bool = True
+    """Show a progress bar."""
+
+
+def run(options: Options) -> int:
+    """Train and print where the policy is."""
+    agent, training = _resumed(options) if options.resume is not None else _new(options)
+    train = agent_function(agent, "train")
+    policy = train(training)
+    print(f"policy: {policy}\nscore it: wlr evaluate {policy} --env {training.environment}")
+    return OK
+
+
+def _new(options: Options) -> tuple[str, Training]:
+    task_name_of(options.env)
+    config = load_agent_config(options.config or options.agent, options.set)
+    if options.seed is not None:
+        config["seed"] = options.seed
+    folder = options.out or Path("runs_out") / f"{options.env.rpartition(':')[2]}_{options.agent}_{config.get('seed', 0)}"
+    if folder.exists() and any(folder.iterdir()):
+        raise InputError(f"{folder}: not empty; give another --out, or go on with what is there: wlr train --resume {folder}")
+    return options.agent, _training(options, options.env, folder, config, resume=False)
+
+
+def _resumed(options: Options) -> tuple[str, Training]:
+    folder = options.resume
+    assert folder is not None
+    if options.out is not None or options.config is not None or options.seed is not None or options.set:
+        raise InputError("--resume uses the settings of the run folder; leave out --out, --config, --set and --seed")
+    path = folder / CONFIG_FILE
+    if not path.is_file():
+        raise InputError(f"{folder}: not a run folder: {CONFIG_FILE} is missing")
+    saved = read_yaml(path)
+    for key in ("environment", "agent", "settings"):
+        if not isinstance(saved, dict) or key not in saved:
+            raise InputError(f"{path}: '{key}' is missing")
+    return saved["agent"], _training(options, saved["environment"], folder, saved["settings"], resume=True)
+
+
+def _training(options: Options, environment: str, folder: Path, config: dict, *, resume: bool) -> Training:
+    seconds = None if options.max_minutes is None else 60.0 * options.max_minutes
+    return Training(environment, folder, config, resume=resume, max_seconds=seconds, progress=options.progress)

@@ -1,0 +1,394 @@
+"""The batched core of every environment: N robots, one task, one plant.
+
+The three faces (``gym.Env``, ``gym.vector.VectorEnv``, Stable-Baselines3's ``VecEnv``) only translate calling conventions.
+What happens to a robot is a function of its own seed and actions: the same alone or in a batch, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from wlr_gym import plants
+from wlr_gym.envs import kernels
+from wlr_gym.envs.evaluation import compile_evaluation
+from wlr_gym.envs.settings import Settings
+from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.parameters import Parameters
+from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, PlantState
+from wlr_gym.random import stream_number
+from wlr_gym.robot import JOINTS, load_robot
+from wlr_gym.tasks.describe import contract, describe
+from wlr_gym.tasks.draws import episode_seeds, stream_numbers, uniforms
+from wlr_gym.tasks.randomization import load_randomization
+from wlr_gym.tasks.task import ObservationColumn, Task, TaskConfig, bounds, build_task, read_task
+from wlr_gym.tasks.terms.events import normal
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Actions may exceed +-1 by rounding only.
+ACTION_LIMIT = 1.0 + 1e-6
+FOREVER = np.iinfo(np.int64).max
+OPTIONS = ("command", "parameters", "reset_mask")
+
+
+def make_task(task_name: str, settings: Settings) -> Task:
+    """Load the task of an environment with the user's overrides."""
+    changes: dict[str, Any] = {}
+    source: str | Path = task_name
+    if isinstance(settings.task, Mapping):
+        changes = dict(settings.task)
+    elif settings.task is not None:
+        source = settings.task
+    if settings.episode_length is not None:
+        changes["episode_length"] = settings.episode_length
+    config = read_task(source, changes)
+    return build_task(config, load_robot(config.robot if settings.robot is None else settings.robot))
+
+
+class Core:
+    """N robots on a task.
+
+    Attributes:
+        task, plant, randomization: what it is made of.
+        count: N.
+        observation: (N, D) float32 policy observation of every robot, overwritten by each step.
+        privileged: (N, P) float32 privileged observation (only with ``observation="dict"``).
+        reward: (N,) reward of the last step. terms: (N, T) its weighted terms. sums: (N, T) their sums over the episode.
+        terminated, truncated: (N,) flags of the last step.
+        command: (N, C) present commands. action: (N, 8) last actions. ticks: (N,) control ticks since the episode began.
+    """
+
+    def __init__(self, task_name: str, settings: Settings, count: int) -> None:
+        if not isinstance(count, (int, np.integer)) or count < 1:
+            raise InputError(f"num_envs = {count!r}: expected a whole number of 1 or more")
+        self.settings = settings
+        self.count = int(count)
+        self.task = make_task(task_name, settings)
+        config, robot = self.task.config, self.task.robot
+        self.randomization = load_randomization(
+            config.randomization if settings.randomization is None else settings.randomization, robot
+        )
+        options = PlantOptions(
+            control_period=config.control_period,
+            physics_step=settings.physics_step,
+            precision=settings.precision,
+            threads=settings.threads,
+            sensor_noise=self.randomization.config.sensor_noise,
+        )
+        self.plant = plants.make_plant(settings.backend, robot, self.count, options)
+        self.limit = self.task.episode_ticks
+        self.dictionary = settings.observation == "dict"
+        self._evaluation = compile_evaluation(self.task)
+        self._make_spaces()
+        self._make_tables(config)
+        self._make_buffers()
+        self.everyone: Mask = np.ones(self.count, dtype=bool)
+        self.seeded: Mask = np.zeros(self.count, dtype=bool)
+
+    # ---- set-up ----
+
+    def _make_spaces(self) -> None:
+        low, high = bounds(self.task.policy)
+        policy = spaces.Box(low, high, dtype=np.float32)
+        low, high = bounds(self.task.privileged)
+        privileged = spaces.Box(low, high, dtype=np.float32)
+        self.observation_space = spaces.Dict({"policy": policy, "privileged": privileged}) if self.dictionary else policy
+        self.action_space = spaces.Box(-1.0, 1.0, (len(self.task.actions),), dtype=np.float32)
+
+    def _make_tables(self, config: TaskConfig) -> None:
+        task = self.task
+        columns = {"sensors": SENSOR_LAYOUT.elements, "command": task.commands, "action": JOINTS}
+        sampled = list({(c.term, c.element): c for c in task.policy}.values())
+        place = {(c.term, c.element): index for index, c in enumerate(sampled)}
+        noisy = float(self.randomization.config.sensor_noise)
+        self._sampled_index = np.array([[kernels.SOURCES.index(c.source), columns[c.source].index(c.element)] for c in sampled])
+        self._sampled_value = np.array([[c.offset, c.noise * noisy] for c in sampled])
+        self._sampled_stream = stream_numbers(*(f"noise/{c.term}/{c.element}" for c in sampled))
+        self._bias_sigma = np.array([c.bias * noisy for c in sampled])
+        self._bias_stream = stream_numbers(*(f"bias/{c.term}/{c.element}" for c in sampled))
+        devices = tuple(config.latency)
+        self._latency = np.array([config.latency[device].delay for device in devices]).reshape(-1, 2) / config.control_period
+        self._latency_stream = stream_numbers(*(f"latency/{device}" for device in devices))
+        self._column_index = np.array([self._column(c, place, devices) for c in task.policy])
+        self._column_value = np.array([[c.limit, c.scale] for c in task.policy])
+        self._privileged_columns = np.array([TRUTH_LAYOUT.elements.index(c.element) for c in task.privileged], dtype=np.int64)
+        self._privileged_value = np.array([[c.limit, c.scale] for c in task.privileged]).reshape(-1, 2)
+        self._action_table = np.array([[a.centre, a.scale, a.low, a.high] for a in task.actions])
+        self._command_table = np.array([config.commands.terms[name] for name in task.commands]).reshape(-1, 2)
+        hold = [time / config.control_period for time in config.commands.hold_time]
+        self._command_timing = np.array([*hold, config.commands.zero_probability])
+        self._command_stream = stream_number("command")
+        longest_lag = max(c.lag for c in task.policy)
+        longest_delay = float(self._latency.max()) if devices else 0.0
+        self._ring_depth = longest_lag + int(np.ceil(longest_delay)) + 1
+
+    def _column(self, column: ObservationColumn, place: dict[tuple[str, str], int], devices: tuple[str, ...]) -> list[int]:
+        latency = self.task.config.latency
+        if column.device not in devices:
+            return [place[column.term, column.element], column.lag, len(devices), 0]
+        mode = latency[column.device].mode  # type: ignore[index]
+        return [place[column.term, column.element], column.lag, devices.index(column.device), int(mode == "interpolate")]
+
+    def _make_buffers(self) -> None:
+        count, task = self.count, self.task
+        actions, sampled = len(task.actions), len(self._sampled_index)
+        self.observation = np.zeros((count, len(task.policy)), np.float32)
+        self.privileged = np.zeros((count, len(task.privileged)), np.float32)
+        self.reward = np.zeros(count)
+        self.terms = np.zeros((count, len(task.rewards)))
+        self.sums = np.zeros((count, len(task.rewards)))
+        self._over = np.zeros((count, len(task.terminations)))
+        self.terminated = np.zeros(count, bool)
+        self.truncated = np.zeros(count, bool)
+        self.ticks = np.zeros(count, np.int64)
+        self.command = np.zeros((count, len(task.commands)))
+        self._command_until = np.zeros(count, np.int64)
+        self._command_draws = np.zeros(count, np.int64)
+        self.action = np.zeros((count, actions))
+        self._previous_action = np.zeros((count, actions))
+        self._goals = np.zeros((count, actions))
+        self._bias = np.zeros((count, sampled))
+        self._delays = np.zeros((count, len(self._latency) + 1))
+        self._ring = np.zeros((count, self._ring_depth, sampled))
+        self.robot_seeds = np.zeros(count, np.uint64)
+        self.episodes = np.zeros(count, np.int64)
+        self.episode_seeds = np.zeros(count, np.uint64)
+        self.parameters = Parameters.nominal(task.robot, count)
+        self._overrides: dict[int, dict[str, float]] = {}
+        self._state: PlantState = self.randomization.state(self.parameters, self.episode_seeds)
+        intervals = len(self.randomization.intervals)
+        self._occurrences = np.zeros((count, intervals), np.int64)
+        self._strike_at = np.zeros((count, intervals), np.int64)
+        free = [JOINTS.index(wheel) for wheel in self.settings.free_wheels]
+        self._torque_on: Mask | None = None
+        if free:
+            self._torque_on = np.ones((count, actions), bool)
+            self._torque_on[:, free] = False
+
+    # ---- episodes ----
+
+    def seed(self, row: int, seed: int) -> None:
+        """Give a robot its seed; its next episode is its first."""
+        self.robot_seeds[row] = seed % 2**64
+        self.episodes[row] = -1
+        self.seeded[row] = True
+
+    def begin_episodes(self, mask: Mask, options: Mapping[str, Any] | None = None) -> None:
+        """Start a new episode for the robots in ``mask``.
+
+        Args:
+            mask: (N,) which robots; all must have been seeded.
+            options: ``command`` {name: value} held for the whole episode, ``parameters`` {name or element: value} set after
+                randomisation.
+
+        Raises:
+            InputError: unknown option, command or parameter, or a value out of bounds.
+        """
+        options = options or {}
+        for name in options:
+            if name not in OPTIONS:
+                raise unknown_name("reset option", str(name), OPTIONS)
+        fixed_command = self._read_command(options.get("command") or {})
+        rows = np.flatnonzero(mask)
+        seeds = episode_seeds(self.robot_seeds[rows], self.episodes[rows] + 1)
+        robots = self.randomization.parameters(self.robot_seeds[rows], seeds)
+        overrides = dict(options.get("parameters") or {})
+        _override(robots, overrides)
+        self.episodes[rows] += 1
+        self.episode_seeds[rows] = seeds
+        self.parameters.values[rows] = robots.values
+        self._overrides |= dict.fromkeys(rows.tolist(), overrides)
+        for name, value in vars(self.randomization.state(robots, seeds)).items():
+            getattr(self._state, name)[rows] = value
+        sensors = self.plant.reset(seeds=self.episode_seeds, parameters=self.parameters, mask=mask, state=self._state)
+        self._clear(rows)
+        self._draw_imperfections(rows, seeds)
+        kernels.start_commands(
+            mask, self.episode_seeds, self._command_stream, self._command_table, self._command_timing,
+            self.command, self._command_until, self._command_draws,
+        )  # fmt: skip
+        if fixed_command:
+            self._hold_command(rows, fixed_command)
+        self._observe(mask, sensors.values, True)
+
+    def _clear(self, rows: NDArray[np.intp]) -> None:
+        for buffer in (self.ticks, self.action, self._previous_action, self.sums, self.terms, self.reward, self._occurrences):
+            buffer[rows] = 0
+        self.terminated[rows] = self.truncated[rows] = False
+        if self.randomization.intervals:
+            self._strike_at[rows] = self._next_strike(rows)
+
+    def _draw_imperfections(self, rows: NDArray[np.intp], seeds: NDArray[np.uint64]) -> None:
+        """Latency and observation bias of an episode."""
+        low, high = self._latency[:, 0], self._latency[:, 1]
+        share = uniforms(seeds, self._latency_stream) if self.randomization.config.latency else 0.5
+        self._delays[rows, :-1] = low + (high - low) * share
+        if self._bias_sigma.any():
+            u = uniforms(seeds, self._bias_stream)
+            self._bias[rows] = normal(u, np.zeros(1), self._bias_sigma, np.full(1, 4.0))
+
+    def _read_command(self, given: Mapping[str, float]) -> dict[int, float]:
+        values: dict[int, float] = {}
+        for name, value in given.items():
+            if name not in self.task.commands:
+                raise unknown_name("command", str(name), self.task.commands)
+            if not np.isfinite(value):
+                raise InputError(f"command {name} = {value!r}: expected a finite number")
+            values[self.task.commands.index(name)] = float(value)
+        return values
+
+    def _hold_command(self, rows: NDArray[np.intp], values: Mapping[int, float]) -> None:
+        self._command_until[rows] = FOREVER
+        for column, value in values.items():
+            self.command[rows, column] = value
+
+    def set_command(self, values: Mapping[str, float]) -> None:
+        """Command all robots from the next step on, until the episode ends (teleoperation, evaluation)."""
+        self._hold_command(np.arange(self.count), self._read_command(values))
+
+    # ---- stepping ----
+
+    def step(self, actions: ArrayLike, mask: Mask) -> bool:
+        """Advance one control tick.
+
+        Robots outside ``mask`` move with action 0 and get reward 0; their time, flags and observation stay as they are.
+
+        Returns:
+            Whether an episode ended.
+
+        Raises:
+            InputError: wrong shape, or an action that is not finite or out of [-1, 1]; names robot and joint.
+        """
+        given = read_actions(actions, self.action.shape)
+        bad = kernels.take_action(
+            mask, given, ACTION_LIMIT, self._action_table, self.action, self._previous_action, self._goals
+        )
+        if bad >= 0:
+            raise self._bad_action(given, bad)
+        sensors = self.plant.step(self._goals, self._torque_on).values
+        evaluation = self._evaluation
+        bad = evaluation.run(
+            mask, sensors, self.plant.truth().values, self.command, self.action, self._previous_action,
+            evaluation.numbers, self.terms, self.reward, self._over, self.sums,
+        )  # fmt: skip
+        if bad >= 0:
+            raise FloatingPointError(
+                f"robot {bad} of the batch left the finite numbers (episode seed {self.episode_seeds[bad]})"
+            )
+        any_done = kernels.advance(
+            mask, self.limit, self.ticks, self._over, self.terminated, self.truncated, self.episode_seeds, self._command_stream,
+            self._command_table, self._command_timing, self.command, self._command_until, self._command_draws,
+        )  # fmt: skip
+        if self.randomization.intervals:
+            self._strike(mask)
+        self._observe(mask, sensors, False)
+        return any_done
+
+    def _observe(self, mask: Mask, sensors: Array, first: bool) -> None:
+        kernels.observe(
+            mask, first, sensors, self.command, self.action, self.episode_seeds, self.ticks, self._bias, self._delays,
+            self._sampled_index, self._sampled_value, self._sampled_stream, self._column_index, self._column_value,
+            self._ring, self.observation,
+        )  # fmt: skip
+        if self.dictionary:
+            kernels.pick(mask, self.plant.truth().values, self._privileged_columns, self._privileged_value, self.privileged)
+
+    def _bad_action(self, given: NDArray[np.float32], index: int) -> InputError:
+        row, joint = divmod(int(index), given.shape[1])
+        robot = f" of robot {row} of the batch" if self.count > 1 else ""
+        return InputError(f"action for {JOINTS[joint]}{robot} is {given[row, joint]:g}, expected a finite number in [-1, 1]")
+
+    def _next_strike(self, rows: NDArray[np.intp]) -> NDArray[np.int64]:
+        period = self.task.config.control_period
+        wait = self.randomization.next_strike(self.episode_seeds[rows], self._occurrences[rows], period)
+        return self.ticks[rows, None] + wait
+
+    def _strike(self, mask: Mask) -> None:
+        """Redraw the parameters of interval events whose time has come."""
+        due = (self._strike_at <= self.ticks[:, None]) & mask[:, None]
+        struck = due.any(axis=1)
+        if not struck.any():
+            return
+        rows = np.flatnonzero(struck)
+        self._occurrences[due] += 1
+        self._strike_at[rows] = np.where(due[rows], self._next_strike(rows), self._strike_at[rows])
+        robots = self.randomization.parameters(self.robot_seeds[rows], self.episode_seeds[rows], self._occurrences[rows])
+        for index, row in enumerate(rows.tolist()):
+            if self._overrides.get(row):
+                _override(Parameters(robots.values[index : index + 1]), self._overrides[row])
+        self.parameters.values[rows] = robots.values
+        self.plant.set_parameters(self.parameters, struck)
+
+    # ---- what the faces hand out: fresh objects every time ----
+
+    def observations(self) -> Any:
+        """Return a copy of all observations: (N, D) array, or dict of arrays."""
+        if self.dictionary:
+            return {"policy": self.observation.copy(), "privileged": self.privileged.copy()}
+        return self.observation.copy()
+
+    def observation_of(self, row: int) -> Any:
+        """Return a copy of one robot's observation."""
+        if self.dictionary:
+            return {"policy": self.observation[row].copy(), "privileged": self.privileged[row].copy()}
+        return self.observation[row].copy()
+
+    def step_info(self) -> dict[str, Any]:
+        """Return the last step's ``reward_terms`` {name: (N,)}, ``slip_velocity`` (N, 4, 2) m/s along each wheel's heading
+        and axle, and ``effective_friction`` (N, 4, 2) along them."""
+        truth, terms = self.plant.truth(), self.terms.T.copy()
+        return {
+            "reward_terms": dict(zip(self.task.rewards, terms, strict=True)),
+            "slip_velocity": truth["slip_velocity"].reshape(self.count, 4, 2).copy(),
+            "effective_friction": truth["effective_friction"].reshape(self.count, 4, 2).copy(),
+        }
+
+    def episode_info(self) -> dict[str, Any]:
+        """Return ``episode_reward_terms`` {name: (N,)}: sums over the episode so far."""
+        return {"episode_reward_terms": dict(zip(self.task.rewards, self.sums.T.copy(), strict=True))}
+
+    def reset_info(self) -> dict[str, Any]:
+        """Return ``randomization`` {element: (N,)}: the present values of all parameters that randomisation changes."""
+        values = self.parameters.values[:, self.randomization.columns].T.copy()
+        return {"randomization": dict(zip(self.randomization.elements, values, strict=True))}
+
+    def describe(self) -> str:
+        """Return the task's tables as text."""
+        return describe(self.task)
+
+    def contract(self) -> dict[str, Any]:
+        """Return what a policy must be fed and what its output means (see :func:`wlr_gym.tasks.describe.contract`)."""
+        return contract(self.task, self.randomization.config.model_dump(mode="json", exclude_none=True))
+
+    def close(self) -> None:
+        """Release the plant."""
+        self.plant.close()
+
+
+def read_actions(actions: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return actions as float32 of the given shape.
+
+    Raises:
+        InputError: not numbers, or another shape.
+    """
+    try:
+        given = np.asarray(actions, dtype=np.float32)
+    except (TypeError, ValueError):
+        raise InputError(f"action of type {type(actions).__name__}: expected numbers of shape {shape}") from None
+    if given.shape != shape:
+        raise InputError(f"action has shape {given.shape}, expected {shape}; joints {', '.join(JOINTS)}")
+    return given
+
+
+def _override(parameters: Parameters, values: Mapping[str, float]) -> None:
+    for name, value in values.items():
+        parameters[name] = value
+    if values:
+        parameters.validate()

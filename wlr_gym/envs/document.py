@@ -1,0 +1,26 @@
+"""Documentation of an environment, made from the data it runs on."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+
+from wlr_gym.envs.settings import Settings
+from wlr_gym.robot import load_robot
+from wlr_gym.tasks.describe import describe
+from wlr_gym.tasks.task import build_task, read_task
+
+_INFO = """**Info** ``reset``: ``randomization`` {parameter element: value}. ``step``: ``reward_terms`` {term: weighted value},
+``slip_velocity`` (4, 2) m/s along each wheel's heading and axle, ``effective_friction`` (4, 2) along them; in an episode's
+last step also ``episode_reward_terms`` {term: sum}. Reset options: ``command`` {name: value} held for the episode,
+``parameters`` {name or element: value} set after randomisation."""
+
+
+def class_document(task_name: str, summary: str, history: Mapping[str, str]) -> str:
+    """Return the class documentation of an environment: summary, tables, keywords, version history."""
+    config = read_task(task_name)
+    tables = describe(build_task(config, load_robot(config.robot)))
+    keywords = (inspect.getdoc(Settings) or "").partition("Attributes:\n")[2]
+    versions = "\n".join(f"- {version}: {change}" for version, change in history.items())
+    parts = (summary, tables, _INFO, "**Keywords**", inspect.cleandoc(keywords), "**Version history**", versions)
+    return "\n\n".join(parts) + "\n"

@@ -1,0 +1,126 @@
+"""A batch of robots as a Stable-Baselines3 ``VecEnv``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.envs.core import Core, Mask
+from wlr_gym.envs.registry import task_name_of
+from wlr_gym.envs.settings import check_render_mode, read_settings
+from wlr_gym.envs.vector import seed_robots
+from wlr_gym.errors import InputError, require_package
+
+require_package("stable_baselines3", "train")
+
+from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
+
+
+class Sb3VecEnv(VecEnv):
+    """N robots for Stable-Baselines3, without the loop of ``DummyVecEnv``; bit-identical to it with the same seeds.
+
+    An ended episode is followed by the next in the same step. Its info then holds ``terminal_observation``,
+    ``TimeLimit.truncated`` and ``episode_reward_terms``; infos of other robots are empty, to be cheap (the present values of
+    all robots are in ``core``: ``reward``, ``terms``, ``plant.truth()``).
+
+    Args:
+        env_id: id such as ``WLR-Velocity-v0``.
+        num_envs: N.
+        seed: robot i gets seed + i at the first reset; None = fresh entropy.
+        **keywords: those of :class:`wlr_gym.envs.settings.Settings`.
+    """
+
+    render_mode: str | None = None
+
+    def __init__(
+        self, env_id: str, num_envs: int, *, seed: int | None = None, render_mode: str | None = None, **keywords: Any
+    ) -> None:
+        check_render_mode(render_mode)
+        self.core = Core(task_name_of(env_id), read_settings(keywords), num_envs)
+        self.spec = gym.spec(env_id)
+        super().__init__(self.core.count, self.core.observation_space, self.core.action_space)
+        self._actions: Any = None
+        if seed is not None:
+            self.seed(seed)
+
+    def reset(self) -> Any:
+        """Start new episodes with the seeds and options given before."""
+        seed_robots(self.core, self._seeds, self.core.everyone)
+        plain = np.array([not options for options in self._options])
+        if plain.any():
+            self.core.begin_episodes(plain)
+        for row in np.flatnonzero(~plain).tolist():
+            self.core.begin_episodes(np.arange(self.num_envs) == row, self._options[row])
+        self._reset_seeds()
+        self._reset_options()
+        self._keep_reset_infos(self.core.everyone)
+        return self.core.observations()
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        """Take the actions of the next step."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, NDArray[np.float32], Mask, list[dict[str, Any]]]:
+        """Advance one control tick."""
+        core = self.core
+        any_done = core.step(self._actions, core.everyone)
+        reward = core.reward.astype(np.float32)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        done = core.terminated | core.truncated
+        if any_done:
+            sums = core.sums.copy()
+            for row in np.flatnonzero(done).tolist():
+                infos[row] = {
+                    "terminal_observation": core.observation_of(row),
+                    "TimeLimit.truncated": bool(core.truncated[row] and not core.terminated[row]),
+                    "episode_reward_terms": dict(zip(core.task.rewards, sums[row].tolist(), strict=True)),
+                }
+            core.begin_episodes(done)
+            self._keep_reset_infos(done)
+        return core.observations(), reward, done, infos
+
+    def _keep_reset_infos(self, mask: Mask) -> None:
+        values = self.core.reset_info()["randomization"]
+        for row in np.flatnonzero(mask).tolist():
+            self.reset_infos[row] = {"randomization": {name: float(column[row]) for name, column in values.items()}}
+
+    def close(self) -> None:
+        """Release the plant."""
+        self.core.close()
+
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
+        """Return an attribute, the same for all robots."""
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
+        """Set an attribute for all robots."""
+        if len(list(self._get_indices(indices))) != self.num_envs:
+            raise InputError(f"'{attr_name}' is shared by all robots: set it without indices")
+        setattr(self, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of the batch once; the result stands for every robot asked for."""
+        result = getattr(self, method_name)(*method_args, **method_kwargs)
+        return [result] * len(list(self._get_indices(indices)))
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: int | Iterable[int] | None = None) -> list[bool]:
+        """Return False for every robot: there are no single environments to wrap."""
+        return [False] * len(list(self._get_indices(indices)))
+
+    def set_command(self, **values: float) -> None:
+        """Command all robots from the next step on, until their episodes end."""
+        self.core.set_command(values)
+
+    def describe(self) -> str:
+        """Return the task's tables as text."""
+        return self.core.describe()
+
+    def contract(self) -> dict[str, Any]:
+        """Return what a policy must be fed and what its output means."""
+        return self.core.contract()

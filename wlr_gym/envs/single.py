@@ -1,0 +1,92 @@
+"""One robot as a ``gymnasium.Env``."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import EzPickle
+
+from wlr_gym.envs.core import Core, read_actions
+from wlr_gym.envs.settings import check_render_mode, read_settings
+
+
+class WlrEnv(gym.Env[Any, np.ndarray], EzPickle):
+    """One robot on a task. Subclasses name the task; keywords are those of :class:`wlr_gym.envs.settings.Settings`."""
+
+    task_name: ClassVar[str]
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # type: ignore[misc]
+
+    def __init__(self, *, render_mode: str | None = None, **keywords: Any) -> None:
+        EzPickle.__init__(self, render_mode=render_mode, **keywords)
+        check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.core = Core(self.task_name, read_settings(keywords), 1)
+        self.observation_space = self.core.observation_space
+        self.action_space = self.core.action_space
+        self._everyone = self.core.everyone
+        self._shape = self.core.action_space.shape
+        self._rewards = self.core.task.rewards
+        self._ready = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: whole number; starts a new, reproducible series of episodes. None goes on with the present series.
+            options: ``command`` {name: value} held for the whole episode; ``parameters`` {name or element: value} set
+                after randomisation.
+        """
+        super().reset(seed=seed)
+        if seed is not None or not self.core.seeded[0]:
+            self.core.seed(0, self.np_random_seed if seed is None else seed)
+        self.core.begin_episodes(self._everyone, options)
+        self._ready = True
+        return self.core.observation_of(0), _first_rows(self.core.reset_info())
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Advance one control tick.
+
+        Raises:
+            InputError: wrong shape, or an action that is not finite or out of [-1, 1].
+        """
+        if not self._ready:
+            raise ResetNeeded("call reset() before step()")
+        core = self.core
+        done = core.step(read_actions(action, self._shape)[None], self._everyone)
+        truth = core.plant.truth()
+        info = {
+            "reward_terms": dict(zip(self._rewards, core.terms[0].tolist(), strict=True)),
+            "slip_velocity": truth.slip_velocity.reshape(4, 2).copy(),
+            "effective_friction": truth.effective_friction.reshape(4, 2).copy(),
+        }
+        if done:
+            info |= _first_rows(core.episode_info())
+        return core.observation_of(0), float(core.reward[0]), bool(core.terminated[0]), bool(core.truncated[0]), info
+
+    def set_command(self, **values: float) -> None:
+        """Command the robot from the next step on, until the episode ends: ``set_command(linear_velocity_x=0.1)``."""
+        self.core.set_command(values)
+
+    def describe(self) -> str:
+        """Return the task's tables as text."""
+        return self.core.describe()
+
+    def contract(self) -> dict[str, Any]:
+        """Return what a policy must be fed and what its output means."""
+        return self.core.contract()
+
+    def render(self) -> None:
+        """Raise: this version has no pictures."""
+        check_render_mode("render()")
+
+    def close(self) -> None:
+        """Release the plant."""
+        self.core.close()
+
+
+def _first_rows(batched: dict[str, Any]) -> dict[str, Any]:
+    """Turn the core's {key: {name: (1,)}} into {key: {name: float}}."""
+    return {key: {name: float(value[0]) for name, value in group.items()} for key, group in batched.items()}

@@ -1,0 +1,200 @@
+"""A batch of robots as a ``gymnasium.vector.VectorEnv``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from wlr_gym.envs.core import Core, Mask
+from wlr_gym.envs.settings import check_render_mode, read_settings
+from wlr_gym.errors import InputError, nearest
+
+
+class WlrVectorEnv(VectorEnv[Any, Any, Any]):
+    """N robots on a task, bit-identical to N single environments with seeds ``seed + i``.
+
+    Args:
+        num_envs: N.
+        autoreset_mode: ``NextStep`` (default), ``SameStep`` or ``Disabled``, as text or ``gymnasium.vector.AutoresetMode``.
+        max_episode_steps: truncate after so many control ticks, if that is before the task's own limit.
+        render_mode: only None in this version.
+        **keywords: those of :class:`wlr_gym.envs.settings.Settings`.
+    """
+
+    task_name: ClassVar[str]
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **keywords: Any,
+    ) -> None:
+        check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.autoreset_mode = _read_mode(autoreset_mode)
+        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        self.core = Core(self.task_name, read_settings(keywords), num_envs)
+        self.num_envs = self.core.count
+        if max_episode_steps is not None:
+            if not isinstance(max_episode_steps, (int, np.integer)) or max_episode_steps < 1:
+                raise InputError(f"max_episode_steps = {max_episode_steps!r}: expected a whole number of 1 or more")
+            self.core.limit = min(self.core.limit, int(max_episode_steps))
+        self.single_observation_space = self.core.observation_space
+        self.single_action_space = self.core.action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._over: Mask = np.zeros(self.num_envs, bool)
+
+    # ---- reset ----
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes.
+
+        Args:
+            seed: one number s (robot i gets s + i), or one number or None per robot. None goes on with the present series.
+            options: as in the single environment, and ``reset_mask`` (N,) bool: only these robots.
+        """
+        mask = _read_mask((options or {}).get("reset_mask"), self.num_envs)
+        seeds = _read_seeds(seed, self.num_envs)
+        if isinstance(seed, (int, np.integer)):
+            super().reset(seed=int(seed))
+        seed_robots(self.core, seeds, mask)
+        self.core.begin_episodes(mask, options)
+        self._over = self._over & ~mask
+        return self.core.observations(), _masked(self.core.reset_info(), mask)
+
+    # ---- step ----
+
+    def step(self, actions: Any) -> tuple[Any, NDArray[np.float64], Mask, Mask, dict[str, Any]]:
+        """Advance all robots one control tick; an ended episode is followed by the next as ``autoreset_mode`` says.
+
+        ``SameStep`` hands out the last observation and info of ended episodes as ``final_obs`` and ``final_info``.
+
+        Raises:
+            InputError: wrong shape, or an action that is not finite or out of [-1, 1].
+            gymnasium.error.ResetNeeded: before the first reset, or (``Disabled``) on an ended episode.
+        """
+        core = self.core
+        if not core.seeded.all():
+            raise ResetNeeded("call reset() before step()")
+        if self.autoreset_mode is AutoresetMode.DISABLED and self._over.any():
+            raise ResetNeeded(
+                f"the episode of robot {int(np.argmax(self._over))} is over: reset it with options={{'reset_mask': ...}}"
+            )
+        waiting = self._over.any()
+        active = ~self._over if waiting else core.everyone
+        any_done = core.step(actions, active)
+        reward, terminated, truncated = core.reward.copy(), core.terminated & active, core.truncated & active
+        over = terminated | truncated
+        if any_done and self.autoreset_mode is AutoresetMode.SAME_STEP:
+            return self._restart_now(reward, terminated, truncated, over)
+        infos = _masked(core.step_info(), active)
+        if any_done:
+            infos |= _masked(core.episode_info(), over)
+        if waiting:
+            core.begin_episodes(self._over)
+            infos |= _masked(core.reset_info(), self._over)
+        self._over = over
+        return core.observations(), reward, terminated, truncated, infos
+
+    def _restart_now(
+        self, reward: NDArray[np.float64], terminated: Mask, truncated: Mask, over: Mask
+    ) -> tuple[Any, NDArray[np.float64], Mask, Mask, dict[str, Any]]:
+        core = self.core
+        final = np.full(self.num_envs, None, dtype=object)
+        for row in np.flatnonzero(over).tolist():
+            final[row] = core.observation_of(row)
+        infos = {} if over.all() else _masked(core.step_info(), ~over)
+        infos["final_obs"], infos["_final_obs"] = final, over.copy()
+        infos["final_info"] = _masked(core.step_info() | core.episode_info(), over)
+        infos["_final_info"] = over.copy()
+        core.begin_episodes(over)
+        infos |= _masked(core.reset_info(), over)
+        return core.observations(), reward, terminated, truncated, infos
+
+    # ---- the rest ----
+
+    def set_command(self, **values: float) -> None:
+        """Command all robots from the next step on, until their episodes end."""
+        self.core.set_command(values)
+
+    def describe(self) -> str:
+        """Return the task's tables as text."""
+        return self.core.describe()
+
+    def contract(self) -> dict[str, Any]:
+        """Return what a policy must be fed and what its output means."""
+        return self.core.contract()
+
+    def render(self) -> None:
+        """Raise: this version has no pictures."""
+        check_render_mode("render()")
+
+    def close_extras(self, **_: Any) -> None:
+        """Release the plant."""
+        self.core.close()
+
+
+def seed_robots(core: Core, seeds: Sequence[int | None], mask: Mask) -> None:
+    """Seed the robots in ``mask``: with the given number, with fresh entropy if they never had one, else not at all."""
+    for row in np.flatnonzero(mask).tolist():
+        given = seeds[row]
+        if given is not None:
+            core.seed(row, given)
+        elif not core.seeded[row]:
+            core.seed(row, int(np.random.SeedSequence().generate_state(1, np.uint64)[0]))
+
+
+def _read_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
+    if seed is None:
+        return [None] * count
+    seeds = [int(seed) + i for i in range(count)] if isinstance(seed, (int, np.integer)) else list(seed)
+    if len(seeds) != count:
+        raise InputError(f"{len(seeds)} seeds for {count} robots")
+    for value in seeds:
+        if value is not None and (not isinstance(value, (int, np.integer)) or value < 0):
+            raise InputError(f"seed = {value!r}: expected a whole number of 0 or more")
+    return [None if value is None else int(value) for value in seeds]
+
+
+def _read_mask(given: Any, count: int) -> Mask:
+    if given is None:
+        return np.ones(count, bool)
+    mask = np.asarray(given)
+    if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
+        raise InputError(
+            f"reset_mask: expected ({count},) booleans of which at least one is True, got {mask.dtype} {mask.shape}"
+        )
+    return mask
+
+
+def _read_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    if isinstance(mode, AutoresetMode):
+        return mode
+    valid = {name: member for member in AutoresetMode for name in (member.value, member.name)}
+    if mode not in valid:
+        raise InputError(
+            f"autoreset_mode = {mode!r}{nearest(str(mode), valid)}; valid: {', '.join(m.value for m in AutoresetMode)}"
+        )
+    return valid[mode]
+
+
+def _masked(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
+    """Add to every key the mask of robots it holds for, in nested dicts too (Gymnasium's info convention)."""
+    own = mask.copy()
+    result: dict[str, Any] = {}
+    for key, value in values.items():
+        result[key] = {**value, **{f"_{name}": own for name in value}} if isinstance(value, dict) else value
+        result[f"_{key}"] = own
+    return result

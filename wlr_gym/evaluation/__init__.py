@@ -1,0 +1,7 @@
+"""Evaluation: whole episodes as one batch, score cards with confidence intervals, and their plots."""
+
+from wlr_gym.evaluation.card import METRICS, Card, Estimate, rows, score, write_card
+from wlr_gym.evaluation.curve import read_curve
+from wlr_gym.evaluation.rollout import Rollout, make_core, roll_out
+
+__all__ = ["METRICS", "Card", "Estimate", "Rollout", "make_core", "read_curve", "roll_out", "rows", "score", "write_card"]

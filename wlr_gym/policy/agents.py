@@ -1,0 +1,146 @@
+"""Agents by name. An agent is a folder ``agents/<name>/`` whose ``agent.py`` offers the functions of :class:`Agent`."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.paths import data_directory, find_config
+from wlr_gym.robot import read_yaml
+
+Contract = Mapping[str, Any]
+Config = Mapping[str, Any]
+
+
+class Policy(Protocol):
+    """What drives N robots: observations in, actions out."""
+
+    def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return actions (N, 8) in [-1, 1] for observations (N, D), as the contract lists them."""
+        ...
+
+    def reset(self, mask: NDArray[np.bool_]) -> None:
+        """Forget what was remembered of the robots in ``mask`` (N,): their episodes start anew."""
+        ...
+
+
+@dataclass(frozen=True)
+class Training:
+    """One request to train.
+
+    Attributes:
+        environment: id, such as ``WLR-Velocity-v0``.
+        folder: run folder to fill.
+        config: the agent's settings; ``seed`` among them decides everything random.
+        resume: continue from the newest checkpoint in ``folder``.
+        max_seconds: stop in good order after this wall time; None = no limit.
+        progress: show a progress bar.
+    """
+
+    environment: str
+    folder: Path
+    config: Config = field(default_factory=dict)
+    resume: bool = False
+    max_seconds: float | None = None
+    progress: bool = True
+
+
+class Agent(Protocol):
+    """The functions of an ``agent.py``. ``load_policy`` and ``train`` are absent where there is nothing to learn."""
+
+    def make_policy(self, contract: Contract, config: Config) -> Policy:
+        """Return the policy an agent has before any training, for an environment's contract."""
+        ...
+
+    def load_policy(self, folder: Path, contract: Contract) -> Policy:
+        """Return the trained policy saved in ``folder``."""
+        ...
+
+    def train(self, training: Training) -> Path:
+        """Train and return the folder of the final policy."""
+        ...
+
+
+def agent_names() -> list[str]:
+    """Return the names of the agents there are."""
+    return sorted(path.parent.name for path in data_directory("agents").glob("*/agent.py"))
+
+
+def load_agent(name: str) -> Agent:
+    """Import ``agents/<name>/agent.py`` by its place on disk.
+
+    Raises:
+        InputError: no such agent; the message lists those there are.
+    """
+    if name not in agent_names():
+        raise unknown_name("agent", name, agent_names())
+    return cast(Agent, _import_folder(data_directory("agents") / name))
+
+
+def _import_folder(folder: Path) -> types.ModuleType:
+    """Import ``agent.py`` as a module of a package made for its folder, so that it can import its neighbours relatively."""
+    package = f"wlr_gym_agents_{folder.name}"
+    if package not in sys.modules:
+        module = types.ModuleType(package)
+        module.__path__ = [str(folder)]
+        sys.modules[package] = module
+    return importlib.import_module(f"{package}.agent")
+
+
+def agent_function(name: str, function: str) -> Callable[..., Any]:
+    """Return a function of an agent.
+
+    Raises:
+        InputError: the agent does not have it, such as ``train`` where there is nothing to learn.
+    """
+    agent = load_agent(name)
+    if not hasattr(agent, function):
+        able = [other for other in agent_names() if hasattr(load_agent(other), function)]
+        raise InputError(f"agent '{name}' has no '{function}'; agents that have: {', '.join(able)}")
+    return getattr(agent, function)
+
+
+def load_agent_config(name: str | Path, changes: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Read ``configs/agent/<name>.yaml`` (or a path) and lay changes such as ``environment.precision=float64`` over it.
+
+    A name without a file is an agent without settings: empty.
+
+    Raises:
+        InputError: no such file, broken YAML, or a change that is not ``key=value``.
+    """
+    shipped = data_directory("configs") / "agent" / f"{name}.yaml"
+    if str(name) in agent_names() and not shipped.is_file():
+        config: Any = {}
+    else:
+        path = find_config("agent", name)
+        config = read_yaml(path) or {}
+        if not isinstance(config, dict):
+            raise InputError(f"{path}: expected a mapping, got {type(config).__name__}")
+    for change in changes:
+        _apply(config, change)
+    return config
+
+
+def _apply(config: dict[str, Any], change: str) -> None:
+    key, equals, text = change.partition("=")
+    if not (equals and key.strip()):
+        raise InputError(f"setting '{change}': expected key=value, such as total_steps=1000000")
+    *parents, last = key.strip().split(".")
+    for parent in parents:
+        config = config.setdefault(parent, {})
+        if not isinstance(config, dict):
+            raise InputError(f"setting '{change}': '{parent}' is a value, not a group")
+    try:
+        config[last] = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputError(f"setting '{change}': '{text}' is not a YAML value") from None

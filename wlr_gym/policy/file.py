@@ -1,0 +1,133 @@
+"""A policy on disk: a folder with the agent's files and ``contract.json``: what it must be fed, what its output means."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.errors import InputError, nearest
+from wlr_gym.files import write_json
+from wlr_gym.policy.agents import Config, Contract, Policy, agent_function, agent_names, load_agent_config
+from wlr_gym.provenance import versions
+
+FORMAT = 1
+CONTRACT_FILE = "contract.json"
+#: Keys of an environment's contract that a policy depends on. The others (randomisation, commands, latency) are recorded only:
+#: a policy may be tried under conditions it was not trained in.
+BINDING = ("robot", "control_period", "observation", "action")
+#: Of an observation, what differs by conditions and not by meaning.
+CONDITIONS = ("noise", "bias", "sensor_noise")
+
+
+def write_contract(folder: Path, agent: str, config: Config, environment: Contract, training: Mapping[str, Any]) -> None:
+    """Write ``contract.json``.
+
+    Args:
+        folder: of the policy.
+        agent: its name.
+        config: the agent's settings, resolved.
+        environment: what ``env.contract()`` returned.
+        training: how it came about (environment id, steps, seed).
+    """
+    content = {
+        "format": FORMAT,
+        "agent": agent,
+        "environment": environment,
+        "training": training,
+        "config": config,
+        "versions": versions(),
+    }
+    write_json(folder / CONTRACT_FILE, content)
+
+
+def read_contract(folder: str | Path) -> dict[str, Any]:
+    """Read the ``contract.json`` of a policy folder.
+
+    Raises:
+        InputError: absent, broken, or of another format version.
+    """
+    path = Path(folder) / CONTRACT_FILE
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from None
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}, line {error.lineno}, column {error.colno}: broken JSON: {error.msg}") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(f"{path}: not a policy contract of format {FORMAT}")
+    for key in ("agent", "environment", "config"):
+        if key not in content:
+            raise InputError(f"{path}: '{key}' is missing")
+    return content
+
+
+def check_contract(policy: Contract, environment: Contract, where: str) -> None:
+    """Refuse a policy made for another robot, observation, action or control period.
+
+    Raises:
+        InputError: naming the first difference, with both values.
+    """
+    for key in BINDING:
+        difference = next(_differences(key, policy.get(key), environment.get(key)), None)
+        if difference is not None:
+            name, mine, theirs = difference
+            raise InputError(
+                f"{where}: made for another environment: {name} is {mine!r} in the policy, {theirs!r} in the environment"
+            )
+
+
+def _differences(name: str, mine: Any, theirs: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield (path, value here, value there) of everything that differs, in order."""
+    if isinstance(mine, Mapping) and isinstance(theirs, Mapping):
+        for key in dict.fromkeys([*mine, *theirs]):
+            if key not in CONDITIONS:
+                yield from _differences(f"{name}.{key}", mine.get(key), theirs.get(key))
+    elif isinstance(mine, list | tuple) and isinstance(theirs, list | tuple):
+        for index, (left, right) in enumerate(zip(mine, theirs, strict=False)):
+            yield from _differences(f"{name}[{index}]", left, right)
+        if len(mine) != len(theirs):
+            yield f"length of {name}", len(mine), len(theirs)
+    elif mine != theirs:
+        yield name, mine, theirs
+
+
+def policy_folder(source: str | Path) -> Path | None:
+    """Return the policy folder that ``source`` names: itself, or the ``policy`` in a run folder; None where it is neither."""
+    for folder in (Path(source), Path(source) / "policy"):
+        if (folder / CONTRACT_FILE).is_file():
+            return folder
+    return None
+
+
+def load_policy(source: str | Path, environment: Contract) -> Policy:
+    """Load a trained policy for an environment.
+
+    Args:
+        source: policy folder, or run folder with a ``policy`` in it.
+        environment: what ``env.contract()`` returns.
+
+    Raises:
+        InputError: no policy there, broken contract, or a contract that does not fit, naming the first difference.
+    """
+    folder = policy_folder(source)
+    if folder is None:
+        raise InputError(f"'{source}': no policy there (looked for {CONTRACT_FILE} in it and in its folder 'policy')")
+    contract = read_contract(folder)
+    check_contract(contract["environment"], environment, str(folder))
+    return agent_function(contract["agent"], "load_policy")(folder, contract)
+
+
+def make_policy(source: str | Path, environment: Contract) -> Policy:
+    """Return the policy of an agent's name (with its shipped settings), or the trained one of a folder.
+
+    Raises:
+        InputError: neither an agent nor a policy folder, or a policy that does not fit the environment.
+    """
+    if str(source) in agent_names():
+        return agent_function(str(source), "make_policy")(environment, load_agent_config(source))
+    if not Path(source).exists():
+        hint = nearest(str(source), agent_names())
+        raise InputError(f"'{source}' is neither a policy folder nor an agent{hint}; agents: {', '.join(agent_names())}")
+    return load_policy(source, environment)
