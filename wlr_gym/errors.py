@@ -10,7 +10,7 @@ class InputError(ValueError):
     """Bad input from the user (file, config, argument, action). The command line answers it with exit code 2."""
 
 
-class MissingPackage(ImportError):
+class MissingPackageError(ImportError):
     """An optional package is needed for what was asked; the message says how to install it."""
 
 
@@ -30,8 +30,8 @@ def unknown_name(kind: str, name: str, valid: Iterable[str], where: str = "") ->
 
 
 def require_package(package: str, extra: str) -> None:
-    """Raise :class:`MissingPackage` with the pip line when an optional package is absent."""
+    """Raise :class:`MissingPackageError` with the pip line when an optional package is absent."""
     import importlib.util
 
     if importlib.util.find_spec(package) is None:
-        raise MissingPackage(f"this needs the package '{package}': pip install 'wlr-gym[{extra}]'")
+        raise MissingPackageError(f"this needs the package '{package}': pip install 'wlr-gym[{extra}]'")

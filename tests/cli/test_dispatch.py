@@ -8,7 +8,7 @@ import pytest
 
 import wlr_gym
 from wlr_gym import cli
-from wlr_gym.errors import InputError, MissingPackage
+from wlr_gym.errors import InputError, MissingPackageError
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ def test_unknown_command_names_the_nearest(capsys):
 
 
 @pytest.mark.parametrize(
-    ("outcome", "code"), [(0, 0), (1, 1), (InputError("bad"), 2), (MissingPackage("absent"), 2), (KeyboardInterrupt(), 130)]
+    ("outcome", "code"),
+    [(0, 0), (1, 1), (InputError("bad"), 2), (MissingPackageError("absent"), 2), (KeyboardInterrupt(), 130)],
 )
 def test_exit_codes(command, outcome, code):
     command(outcome)

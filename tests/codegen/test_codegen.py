@@ -15,9 +15,7 @@ def formula(x, y, p):
 def compiled(width, dtype="float64", fused=True):
     graph = Graph()
     out = formula(graph.input("x"), graph.input("y"), graph.input("p") * graph.input("p"))
-    lines = emit(
-        {"out": out}, lambda n: f"W[{'xyp'.index(n)}, k]", lambda n, v: f"W[3, k] = {v}", "            ", fused=fused
-    )
+    lines = emit({"out": out}, lambda n: f"W[{'xyp'.index(n)}, k]", lambda n, v: f"W[3, k] = {v}", "            ", fused=fused)
     body = [
         "@njit(cache=True, nogil=True, error_model='numpy')",
         "def run(X):",

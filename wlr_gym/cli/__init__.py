@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from wlr_gym import __version__
-from wlr_gym.errors import InputError, MissingPackage, unknown_name
+from wlr_gym.errors import InputError, MissingPackageError, unknown_name
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(words)
-    except (InputError, MissingPackage) as error:
+    except (InputError, MissingPackageError) as error:
         _say(str(error), "red")
         return BAD_INPUT
     except KeyboardInterrupt as interruption:

@@ -115,7 +115,9 @@ def _ordered(roots: Iterable[Operand], children: Callable[[Node], list[Operand]]
     return order
 
 
-def hoist(outputs: Mapping[str, Operand], is_constant: Callable[[str], bool], prefix: str) -> tuple[dict[str, Operand], dict[str, Node]]:
+def hoist(
+    outputs: Mapping[str, Operand], is_constant: Callable[[str], bool], prefix: str
+) -> tuple[dict[str, Operand], dict[str, Node]]:
     """Split off what depends only on constant inputs, so that it can be computed once outside the time loop.
 
     Args:
@@ -193,7 +195,9 @@ def emit(
         return names[operand.index] if isinstance(operand, Node) else constant(float(operand))
 
     for node in _needed(outputs.values(), absorbed):
-        expression = load(node.operands[0]) if node.op == "input" else _expression(node, text, constant, absorbed.get(node.index))
+        expression = (
+            load(node.operands[0]) if node.op == "input" else _expression(node, text, constant, absorbed.get(node.index))
+        )
         names[node.index] = f"t{node.index}"
         lines.append(f"{indent}t{node.index} = {expression}")
     lines += [indent + store(name, text(value)) for name, value in outputs.items()]

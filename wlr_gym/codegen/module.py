@@ -66,7 +66,8 @@ def load_module(tag: str, source: str | Callable[[], str], message: str = "", ke
             print(message, file=sys.stderr, flush=True)
         _write_whole(path, HEADER + (source() if callable(source) else source))
     spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:

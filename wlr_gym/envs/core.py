@@ -313,7 +313,7 @@ class Core:
     def _strike(self, mask: Mask) -> None:
         """Redraw the parameters of interval events whose time has come."""
         due = (self._strike_at <= self.ticks[:, None]) & mask[:, None]
-        struck = due.any(axis=1)
+        struck: Mask = np.asarray(due.any(axis=1))
         if not struck.any():
             return
         rows = np.flatnonzero(struck)

@@ -63,7 +63,12 @@ SENSOR_LAYOUT = Layout(
     (
         Channel("joint_position", JOINTS, "rad", "encoder; wheels relative to their leg, unwrapped, zero at the run's start"),
         Channel("joint_velocity", JOINTS, "rad/s", "the servo's own velocity reading"),
-        Channel("joint_effort", JOINTS, "N m", "motor current (legs) or load (wheels) times the nominal torque constant, before gear friction"),
+        Channel(
+            "joint_effort",
+            JOINTS,
+            "N m",
+            "motor current (legs) or load (wheels) times the nominal torque constant, before gear friction",
+        ),
         Channel("gyro", XYZ, "rad/s", "body frame"),
         Channel("accelerometer", XYZ, "m/s2", "body frame, specific force (+9.81 on z at rest)"),
         Channel("supply_voltage", (), "V", "at the servos"),
@@ -86,12 +91,18 @@ TRUTH_LAYOUT = Layout(
         Channel("motor_torque", JOINTS, "N m", "motor torque at the output shaft before gear friction, last substep"),
         Channel("friction_torque", JOINTS, "N m", "gear friction on each joint, last substep"),
         Channel("rolling_torque", WHEELS, "N m", "rolling resistance on each wheel about its axle, last substep"),
-        Channel("contact_force", _WHEEL_XYZ, "N", "on the wheel: along its heading, along its axle (left), normal; last substep"),
-        Channel("slip_velocity", _WHEEL_XY, "m/s", "of the contact point over the floor: along the wheel's heading, along its axle"),
+        Channel(
+            "contact_force", _WHEEL_XYZ, "N", "on the wheel: along its heading, along its axle (left), normal; last substep"
+        ),
+        Channel(
+            "slip_velocity", _WHEEL_XY, "m/s", "of the contact point over the floor: along the wheel's heading, along its axle"
+        ),
         Channel("slip_displacement", _WHEEL_XY, "m", "slip velocity integrated over the last control tick"),
         Channel("effective_friction", _WHEEL_XY, "-", "friction coefficients acting at each wheel"),
         Channel("mechanical_energy", (), "J", "work of all motors on their shafts over the last control tick"),
-        Channel("electrical_energy", (), "J", "energy drawn from the supply over the last control tick (braking counts as negative)"),
+        Channel(
+            "electrical_energy", (), "J", "energy drawn from the supply over the last control tick (braking counts as negative)"
+        ),
         Channel("body_clearance", (), "m", "height of the body box's lowest corner above the floor"),
     )
 )
@@ -185,7 +196,10 @@ def standing_state(robot: Robot, parameters: Parameters, leg_angle: float | None
     angle = robot.home.leg_angle if leg_angle is None else leg_angle
     height = parameters["leg.length"] * np.sin(angle) + parameters["wheel.radius"] - parameters["hip.position"][:, 2:3]
     mass = (
-        parameters["body.mass"] + parameters["payload.mass"] + parameters["leg.mass"].sum(axis=1) + parameters["wheel.mass"].sum(axis=1)
+        parameters["body.mass"]
+        + parameters["payload.mass"]
+        + parameters["leg.mass"].sum(axis=1)
+        + parameters["wheel.mass"].sum(axis=1)
     )
     sag = mass * parameters["gravity"] / parameters["ground.normal_stiffness"].sum(axis=1)
     joints = np.zeros((count, 8))
@@ -195,7 +209,9 @@ def standing_state(robot: Robot, parameters: Parameters, leg_angle: float | None
     quaternion = np.zeros((count, 4))
     quaternion[:, 0] = 1.0
     zeros = np.zeros((count, 3))
-    return PlantState(position, quaternion, zeros, zeros.copy(), joints, np.zeros((count, 8)), joints.copy(), np.zeros((count, 8)))
+    return PlantState(
+        position, quaternion, zeros, zeros.copy(), joints, np.zeros((count, 8)), joints.copy(), np.zeros((count, 8))
+    )
 
 
 @dataclass(frozen=True)
@@ -220,7 +236,9 @@ class PlantOptions:
         if not (0.0 < self.physics_step <= self.control_period):
             raise InputError(f"physics_step {self.physics_step!r} s must be in (0, control_period = {self.control_period!r} s]")
         if abs(self.substeps * self.physics_step - self.control_period) > 1e-9 * self.control_period:
-            raise InputError(f"physics_step {self.physics_step!r} s does not divide the control period {self.control_period!r} s")
+            raise InputError(
+                f"physics_step {self.physics_step!r} s does not divide the control period {self.control_period!r} s"
+            )
         if self.threads < 1:
             raise InputError(f"threads = {self.threads}, expected 1 or more")
 
@@ -284,6 +302,10 @@ class Plant(Protocol):
         ``torque_on`` (N, 8) False leaves a motor open-circuit (free-spinning); None = all on. The returned matrix is
         overwritten by the next step; copy what must be kept.
         """
+        ...
+
+    def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
+        """Change parameters in mid-run (interval randomisation, drifting friction); the state stays."""
         ...
 
     def truth(self) -> Truth:

@@ -119,7 +119,7 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
 
 
 _DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
-_DRIVER = '''
+_DRIVER = """
 {decorator}
 def scatter(W, TRUTH, RAW, tile, count):
     for k in range(min({width}, count - tile * {width})):
@@ -167,7 +167,7 @@ def look(X, P, TRUTH, RAW, count, step):
         W[{parameters}:{parameters} + {parameter_count}] = P[tile]
         observe(W, step)
         scatter(W, TRUTH, RAW, tile, count)
-'''
+"""
 
 
 def load_kernel(features: frozenset[str], precision: str, width: int) -> ModuleType:

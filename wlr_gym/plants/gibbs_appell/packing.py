@@ -13,7 +13,20 @@ from wlr_gym.robot import Robot
 
 Array = NDArray[np.float64]
 
-_CORNER_LANES = (*ASSEMBLY, "length", "radius", "zero_offset", "stiffness", "damping", "look_ahead", "mu_x", "mu_y", "inverse_mu_x", "inverse_mu_y", "rolling")
+_CORNER_LANES = (
+    *ASSEMBLY,
+    "length",
+    "radius",
+    "zero_offset",
+    "stiffness",
+    "damping",
+    "look_ahead",
+    "mu_x",
+    "mu_y",
+    "inverse_mu_x",
+    "inverse_mu_y",
+    "rolling",
+)
 _JOINT_LANES = (
     "kp", "kd", "volt_gain", "back_emf_damping", "viscous", "weight", "gear_bound", "inverse_constant", "effort_scale",
     "velocity_limit", "acceleration_limit",

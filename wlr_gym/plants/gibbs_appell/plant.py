@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -89,7 +90,7 @@ class GibbsAppellPlant:
             self._chunks = [(0, self._tiles)]
             return None
         edges = np.linspace(0, self._tiles, threads + 1).astype(int).tolist()
-        self._chunks = list(zip(edges[:-1], edges[1:], strict=True))
+        self._chunks = list(itertools.pairwise(edges))
         return ThreadPoolExecutor(threads - 1, thread_name_prefix="wlr-engine")
 
     # ---- parameters and state ----
@@ -255,8 +256,7 @@ def check_contact_resolution(parameters: Parameters, step: float) -> None:
     robot = int(np.argmax(worst))
     if worst[robot] > 1.0:
         raise InputError(
-            f"ground.normal_stiffness {stiffness[robot]:g} N/m and ground.normal_damping {damping[robot]:g} N s/m are too stiff "
-            f"for a physics step of {step:g} s and a body of {parameters['body.mass'][robot]:g} kg: shorten physics_step "
+            f"ground.normal_stiffness {stiffness[robot]:g} N/m and ground.normal_damping {damping[robot]:g} N s/m are too "
+            f"stiff for a physics step of {step:g} s and a body of {parameters['body.mass'][robot]:g} kg: shorten physics_step "
             f"below {step / worst[robot] ** 0.5:.2g} s or soften the contact"
         )
-

@@ -23,6 +23,7 @@ Every function maps a dictionary of lanes (state, parameters, inputs; each a sca
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from wlr_gym import servo
@@ -153,7 +154,9 @@ def floor_axes(rows: Sequence[Sequence[Value]]) -> tuple[Vector, Vector, Vector,
     return list(n), heading, cross(n, heading), scale
 
 
-def wheel_points(lanes: Lanes, i: int, sine: Value, cosine: Value, n: Sequence[Value], scale: Value) -> tuple[Vector, Vector, Vector]:
+def wheel_points(
+    lanes: Lanes, i: int, sine: Value, cosine: Value, n: Sequence[Value], scale: Value
+) -> tuple[Vector, Vector, Vector]:
     """Hip, leg vector (hip -> axle) and rim vector (axle -> contact point of the thin disc) of wheel ``i``, body frame."""
     hip = [lanes[f"hip_{a}{i}"] for a in AXES]
     leg = [lanes[f"length{i}"] * cosine, 0.0, -(lanes[f"length{i}"] * sine)]
@@ -215,6 +218,34 @@ def references(lanes: Lanes, time: Value, step: Value) -> tuple[Out, list[Value]
 # ---- kick: velocities ------------------------------------------------------------------------------------------------
 
 
+@dataclass
+class _Corner:
+    """One leg with its wheel while the Gauss problem is being set up.
+
+    Attributes:
+        coupling: leg-rate column of the mass matrix against the six base rows.
+        leg_leg, leg_wheel, wheel_wheel: its own 2x2 block.
+        leg_bias, wheel_bias: velocity-dependent inertia terms.
+        hip, leg, rim: geometry in the body frame, see :func:`wheel_points`.
+        block, inverse: the 2x2 block with implicit damping as (11, 12, 22), and its inverse.
+        free: free motion of the pair for a resting base.
+    """
+
+    coupling: Vector
+    leg_leg: Value
+    leg_wheel: Value
+    wheel_wheel: Value
+    leg_bias: Value
+    wheel_bias: Value
+    trig: tuple[Value, Value]
+    hip: Vector = field(default_factory=list)
+    leg: Vector = field(default_factory=list)
+    rim: Vector = field(default_factory=list)
+    block: tuple[Value, Value, Value] = (0.0, 0.0, 0.0)
+    inverse: tuple[Value, Value, Value] = (0.0, 0.0, 0.0)
+    free: tuple[Value, Value] = (0.0, 0.0)
+
+
 def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str]) -> Out:
     """Build the Gauss problem of one substep: reduced base matrix, free motion, friction rows, impulse bounds."""
     rows = rotation_rows(lanes)
@@ -224,70 +255,25 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
     u_base = [*(v[k] + step * gravity[k] for k in range(3)), *w]  # uniform gravity accelerates every point alike
     w_mid = [1.5 * w[k] - 0.5 * lanes[f"last_w{a}"] for k, a in enumerate(AXES)]
     out, voltages, rates = references(lanes, time, step)
-
-    mass = [[0.0 for _ in range(6)] for _ in range(6)]
-    bias: list[Value] = [0.0] * 6
-    platform_mass, platform_bias = platform_terms(*(lanes[name] for name in PLATFORM), *w_mid)
-    _accumulate(mass, bias, platform_mass, platform_bias)
-    legs: list[tuple[Vector, Value, Value, Value, Value]] = []
-    trig: list[tuple[Value, Value]] = []
-    for i in CORNERS:
-        sine, cosine = ops.sin_cos(lanes[f"leg_angle{i}"])
-        trig.append((sine, cosine))
-        mid_rates = [1.5 * lanes[f"{name}{i}"] - 0.5 * lanes[f"last_{name}{i}"] for name in ("leg_rate", "wheel_rate")]
-        base_mass, base_bias, coupling, leg_leg, leg_wheel, wheel_wheel, leg_bias, wheel_bias = assembly_terms(
-            *(lanes[f"{name}{i}"] for name in ASSEMBLY), sine, cosine, *w_mid, *mid_rates
-        )
-        _accumulate(mass, bias, base_mass, base_bias)
-        legs.append(([coupling.get(r, 0.0) for r in range(6)], leg_leg, leg_wheel, wheel_wheel, (leg_bias, wheel_bias)))
+    mass, bias, corners = _inertia(lanes, w_mid)
 
     force = to_body(rows, [lanes["external_x"], lanes["external_y"], 0.0])
     momentum: list[Value] = [dot(mass[r], u_base) - step * bias[r] for r in range(6)]
     for k in range(3):
         momentum[k] = momentum[k] + step * force[k]
-
     reduced = [row[:] for row in mass]
-    blocks = []
-    blocks_a = []
-    for i in CORNERS:
-        coupling, leg_leg, leg_wheel, wheel_wheel, (leg_bias, wheel_bias) = legs[i]
+    for i, corner in enumerate(corners):
         leg_rate, wheel_rate = lanes[f"leg_rate{i}"], lanes[f"wheel_rate{i}"]
         for r in range(6):
-            momentum[r] = momentum[r] + coupling[r] * leg_rate
-        leg_momentum = dot(coupling, u_base) + leg_leg * leg_rate + leg_wheel * wheel_rate - step * leg_bias
-        wheel_momentum = leg_wheel * leg_rate + wheel_wheel * wheel_rate - step * wheel_bias
-
-        hip, leg, rim = wheel_points(lanes, i, *trig[i], n, scale)
-        normal, gap_rate = _normal_force(lanes, i, hip, leg, rim, n, v, w)
-        out[f"normal{i}"], out[f"last_gap_rate{i}"] = normal, gap_rate
-        base_row, leg_entry = contact_row(hip, leg, rim, n)
-        for r in range(6):
-            momentum[r] = momentum[r] + (step * normal) * base_row[r]
-        leg_momentum = leg_momentum + (step * normal) * leg_entry
-
-        leg_push, leg_damping = _motor_impulse(lanes, i, voltages[i], rates[i], step)
-        wheel_push, wheel_damping = _motor_impulse(lanes, 4 + i, voltages[4 + i], rates[4 + i], step)
-        out[f"drive{i}"], out[f"drive{4 + i}"] = voltages[i], voltages[4 + i]
-        momentum[4] = momentum[4] - leg_push
-        leg_momentum = leg_momentum + leg_push - wheel_push
-        wheel_momentum = wheel_momentum + wheel_push
-        reduced[4][4] = reduced[4][4] + leg_damping
-        coupling = [*coupling[:4], coupling[4] - leg_damping, coupling[5]]
-
-        a11 = leg_leg + leg_damping + wheel_damping
-        a12 = leg_wheel - wheel_damping
-        a22 = wheel_wheel + wheel_damping
-        inverse = 1.0 / (a11 * a22 - a12 * a12)
-        i11, i12, i22 = a22 * inverse, -(a12 * inverse), a11 * inverse
-        y_leg = i11 * leg_momentum + i12 * wheel_momentum
-        y_wheel = i12 * leg_momentum + i22 * wheel_momentum
-        scaled = [i11 * x for x in coupling]
-        for r in range(6):
-            momentum[r] = momentum[r] - coupling[r] * y_leg
-            for c in range(r + 1):
-                reduced[r][c] = reduced[r][c] - scaled[r] * coupling[c]
-        blocks_a.append((a11, a12, a22))
-        blocks.append((coupling, i11, i12, i22, y_leg, y_wheel, hip, leg, rim))
+            momentum[r] = momentum[r] + corner.coupling[r] * leg_rate
+        own = [
+            dot(corner.coupling, u_base) + corner.leg_leg * leg_rate + corner.leg_wheel * wheel_rate - step * corner.leg_bias,
+            corner.leg_wheel * leg_rate + corner.wheel_wheel * wheel_rate - step * corner.wheel_bias,
+        ]
+        corner.hip, corner.leg, corner.rim = wheel_points(lanes, i, *corner.trig, n, scale)
+        _push_of_floor(lanes, i, corner, n, [*v, *w], step, momentum, own, out)
+        damping = _push_of_motors(lanes, i, voltages, rates, step, momentum, own, out)
+        _eliminate(corner, damping, own, momentum, reduced)
 
     lower, inverse_diagonal = _cholesky(reduced)
 
@@ -302,14 +288,13 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
 
     base = whiten(momentum)
     hinge = whiten([0.0, 0.0, 0.0, 0.0, -1.0, 0.0])
-    for i in CORNERS:
-        coupling, i11, i12, i22, y_leg, y_wheel, hip, leg, rim = blocks[i]
-        white = whiten(coupling)
+    for i, corner in enumerate(corners):
+        white = whiten(corner.coupling)
         for r in range(6):
-            out[f"coupling{i}_{r}"] = coupling[r]
-        out[f"i11_{i}"], out[f"i12_{i}"] = i11, i12
-        out[f"a11_{i}"], out[f"a12_{i}"], out[f"a22_{i}"] = blocks_a[i]
-        out[f"y_leg{i}"], out[f"y_wheel{i}"] = y_leg, y_wheel
+            out[f"coupling{i}_{r}"] = corner.coupling[r]
+        out[f"i11_{i}"], out[f"i12_{i}"] = corner.inverse[0], corner.inverse[1]
+        out[f"a11_{i}"], out[f"a12_{i}"], out[f"a22_{i}"] = corner.block
+        out[f"y_leg{i}"], out[f"y_wheel{i}"] = corner.free
         _warm_start(lanes, i, step, features, out)
         # friction rows: (base part, leg entry, wheel entry, impulse)
         local = {
@@ -319,25 +304,10 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
         if "rolling_resistance" in features:
             local[f"rolling{i}"] = ([0.0] * 6, 0.0, 1.0, out[f"rolling_friction{i}"])
         for e, name, wheel_entry in ((heading, "x", -lanes[f"radius{i}"]), (lateral, "y", 0.0)):
-            base_row, leg_entry = contact_row(hip, leg, rim, e)
+            base_row, leg_entry = contact_row(corner.hip, corner.leg, corner.rim, e)
             local[f"{name}{i}"] = (whiten(base_row), leg_entry, wheel_entry, out[f"friction_{name}{i}"])
             out[f"leg_entry_{name}{i}"] = leg_entry
-        for name, (white_base, leg_entry, wheel_entry, impulse) in local.items():
-            g_leg = i11 * leg_entry + i12 * wheel_entry
-            g_wheel = i12 * leg_entry + i22 * wheel_entry
-            z = [white_base[r] - g_leg * white[r] for r in range(6)]
-            gain = dot(z, z) + leg_entry * g_leg + wheel_entry * g_wheel
-            out[f"g_leg_{name}"], out[f"g_wheel_{name}"] = g_leg, g_wheel
-            for r in range(6):
-                out[f"z_{name}_{r}"] = z[r]
-                base[r] = base[r] + z[r] * impulse  # warm start
-            out[f"y_leg{i}"] = out[f"y_leg{i}"] + g_leg * impulse
-            out[f"y_wheel{i}"] = out[f"y_wheel{i}"] + g_wheel * impulse
-            out[f"gain_{name}"] = gain
-            if name[0] not in "xy":
-                out[f"inverse_gain_{name}"] = 1.0 / gain
-        cross_gain = dot([out[f"z_x{i}_{r}"] for r in range(6)], [out[f"z_y{i}_{r}"] for r in range(6)])
-        out[f"gain_xy{i}"] = cross_gain + out[f"leg_entry_x{i}"] * out[f"g_leg_y{i}"] - lanes[f"radius{i}"] * out[f"g_wheel_y{i}"]
+        _friction_rows(lanes, i, corner, white, local, base, out)
     for r in range(6):
         out[f"base{r}"] = base[r]
         out[f"inverse_diagonal{r}"] = inverse_diagonal[r]
@@ -366,7 +336,102 @@ ASSEMBLY = (
 )
 
 
-def _accumulate(mass: list[list[Value]], bias: list[Value], more_mass: Mapping[tuple[int, int], Value], more_bias: Mapping[int, Value]) -> None:
+def _inertia(lanes: Lanes, w_mid: Vector) -> tuple[list[list[Value]], list[Value], list[_Corner]]:
+    """Mass matrix and bias of the base, and the four corners, from the generated Gibbs-Appell equations."""
+    mass: list[list[Value]] = [[0.0 for _ in range(6)] for _ in range(6)]
+    bias: list[Value] = [0.0] * 6
+    platform_mass, platform_bias = platform_terms(*(lanes[name] for name in PLATFORM), *w_mid)
+    _accumulate(mass, bias, platform_mass, platform_bias)
+    corners: list[_Corner] = []
+    for i in CORNERS:
+        sine, cosine = ops.sin_cos(lanes[f"leg_angle{i}"])
+        mid_rates = [1.5 * lanes[f"{name}{i}"] - 0.5 * lanes[f"last_{name}{i}"] for name in ("leg_rate", "wheel_rate")]
+        arguments = [*(lanes[f"{name}{i}"] for name in ASSEMBLY), sine, cosine, *w_mid, *mid_rates]
+        base_mass, base_bias, coupling, *own = assembly_terms(*arguments)
+        _accumulate(mass, bias, base_mass, base_bias)
+        corners.append(_Corner([coupling.get(r, 0.0) for r in range(6)], *own, trig=(sine, cosine)))
+    return mass, bias, corners
+
+
+def _push_of_floor(
+    lanes: Lanes, i: int, corner: _Corner, n: Vector, twist: Vector, step: Value, momentum: Vector, own: Vector, out: Out
+) -> None:
+    """Add the normal impulse of wheel ``i``."""
+    base_row, leg_entry = contact_row(corner.hip, corner.leg, corner.rim, n)
+    normal, gap_rate = _normal_force(lanes, i, corner, n, dot(base_row, twist) + leg_entry * lanes[f"leg_rate{i}"])
+    out[f"normal{i}"], out[f"last_gap_rate{i}"] = normal, gap_rate
+    for r in range(6):
+        momentum[r] = momentum[r] + (step * normal) * base_row[r]
+    own[0] = own[0] + (step * normal) * leg_entry
+
+
+def _push_of_motors(
+    lanes: Lanes, i: int, voltages: Vector, rates: Vector, step: Value, momentum: Vector, own: Vector, out: Out
+) -> tuple[Value, Value]:
+    """Add the explicit impulses of both motors of leg ``i``; return their implicit damping (times the step)."""
+    leg_push, leg_damping = _motor_impulse(lanes, i, voltages[i], rates[i], step)
+    wheel_push, wheel_damping = _motor_impulse(lanes, 4 + i, voltages[4 + i], rates[4 + i], step)
+    out[f"drive{i}"], out[f"drive{4 + i}"] = voltages[i], voltages[4 + i]
+    momentum[4] = momentum[4] - leg_push
+    own[0] = own[0] + leg_push - wheel_push
+    own[1] = own[1] + wheel_push
+    return leg_damping, wheel_damping
+
+
+def _eliminate(
+    corner: _Corner, damping: tuple[Value, Value], own: Vector, momentum: Vector, reduced: list[list[Value]]
+) -> None:
+    """Take leg and wheel out of the system: Schur complement onto the base."""
+    leg_damping, wheel_damping = damping
+    reduced[4][4] = reduced[4][4] + leg_damping
+    corner.coupling = [*corner.coupling[:4], corner.coupling[4] - leg_damping, corner.coupling[5]]
+    a11 = corner.leg_leg + leg_damping + wheel_damping
+    a12 = corner.leg_wheel - wheel_damping
+    a22 = corner.wheel_wheel + wheel_damping
+    determinant = 1.0 / (a11 * a22 - a12 * a12)
+    i11, i12, i22 = a22 * determinant, -(a12 * determinant), a11 * determinant
+    corner.block, corner.inverse = (a11, a12, a22), (i11, i12, i22)
+    corner.free = (i11 * own[0] + i12 * own[1], i12 * own[0] + i22 * own[1])
+    scaled = [i11 * x for x in corner.coupling]
+    for r in range(6):
+        momentum[r] = momentum[r] - corner.coupling[r] * corner.free[0]
+        for c in range(r + 1):
+            reduced[r][c] = reduced[r][c] - scaled[r] * corner.coupling[c]
+
+
+def _friction_rows(
+    lanes: Lanes,
+    i: int,
+    corner: _Corner,
+    white: Vector,
+    local: Mapping[str, tuple[Vector, Value, Value, Value]],
+    base: Vector,
+    out: Out,
+) -> None:
+    """Whitened rows of all friction at one leg, their gains, and the effect of the warm-started impulses."""
+    i11, i12, i22 = corner.inverse
+    for name, (white_base, leg_entry, wheel_entry, impulse) in local.items():
+        g_leg = i11 * leg_entry + i12 * wheel_entry
+        g_wheel = i12 * leg_entry + i22 * wheel_entry
+        z = [white_base[r] - g_leg * white[r] for r in range(6)]
+        gain = dot(z, z) + leg_entry * g_leg + wheel_entry * g_wheel
+        out[f"g_leg_{name}"], out[f"g_wheel_{name}"] = g_leg, g_wheel
+        for r in range(6):
+            out[f"z_{name}_{r}"] = z[r]
+            base[r] = base[r] + z[r] * impulse
+        out[f"y_leg{i}"] = out[f"y_leg{i}"] + g_leg * impulse
+        out[f"y_wheel{i}"] = out[f"y_wheel{i}"] + g_wheel * impulse
+        out[f"gain_{name}"] = gain
+        if name[0] not in "xy":
+            out[f"inverse_gain_{name}"] = 1.0 / gain
+    cross_gain = dot([out[f"z_x{i}_{r}"] for r in range(6)], [out[f"z_y{i}_{r}"] for r in range(6)])
+    own_gain = cross_gain + out[f"leg_entry_x{i}"] * out[f"g_leg_y{i}"]
+    out[f"gain_xy{i}"] = own_gain - lanes[f"radius{i}"] * out[f"g_wheel_y{i}"]
+
+
+def _accumulate(
+    mass: list[list[Value]], bias: list[Value], more_mass: Mapping[tuple[int, int], Value], more_bias: Mapping[int, Value]
+) -> None:
     for (r, c), value in more_mass.items():
         mass[r][c] = mass[r][c] + value
         if r != c:
@@ -375,14 +440,10 @@ def _accumulate(mass: list[list[Value]], bias: list[Value], more_mass: Mapping[t
         bias[r] = bias[r] + value
 
 
-def _normal_force(
-    lanes: Lanes, i: int, hip: Vector, leg: Vector, rim: Vector, n: Vector, v: Vector, w: Vector
-) -> tuple[Value, Value]:
+def _normal_force(lanes: Lanes, i: int, corner: _Corner, n: Vector, gap_rate: Value) -> tuple[Value, Value]:
     """Spring and damper at the middle position, never pulling. Returns the force (N) and the present gap rate (m/s)."""
-    point = [hip[k] + leg[k] + rim[k] for k in range(3)]
+    point = [corner.hip[k] + corner.leg[k] + corner.rim[k] for k in range(3)]
     gap = lanes["pz"] + dot(n, point)
-    base_row, leg_entry = contact_row(hip, leg, rim, n)
-    gap_rate = dot(base_row, [*v, *w]) + leg_entry * lanes[f"leg_rate{i}"]
     mid_rate = gap_rate + lanes[f"look_ahead{i}"] * (gap_rate - lanes[f"last_gap_rate{i}"])
     push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * mid_rate, 0.0)
     return ops.where_positive(-gap, push, 0.0), gap_rate
@@ -450,7 +511,10 @@ def kick_sweep(lanes: Lanes, features: frozenset[str]) -> Out:
         for i, (_, y, impulses) in zip((left, right), sides, strict=True):
             start = [lanes[f"y_leg{i}"], lanes[f"y_wheel{i}"]]
             dy = [y[0] - start[0], y[1] - start[1]]
-            pull = [lanes[f"a11_{i}"] * dy[0] + lanes[f"a12_{i}"] * dy[1], lanes[f"a12_{i}"] * dy[0] + lanes[f"a22_{i}"] * dy[1]]
+            pull = [
+                lanes[f"a11_{i}"] * dy[0] + lanes[f"a12_{i}"] * dy[1],
+                lanes[f"a12_{i}"] * dy[0] + lanes[f"a22_{i}"] * dy[1],
+            ]
             slope = slope + dot(start, pull)
             curvature = curvature + dot(dy, pull)
             moved.append((i, start, dy, impulses))
@@ -567,7 +631,9 @@ def kick_finish(lanes: Lanes, step: Value) -> Out:
     for k, a in enumerate(AXES):
         out[f"v{a}"], out[f"w{a}"], out[f"last_w{a}"] = u[k], u[3 + k], lanes[f"w{a}"]
         specific_force = (u[k] - lanes[f"v{a}"]) * (1.0 / step) - gravity[k]
-        out[f"acceleration_{a}"] = lanes[f"acceleration_{a}"] + lanes["low_pass"] * (specific_force - lanes[f"acceleration_{a}"])
+        out[f"acceleration_{a}"] = lanes[f"acceleration_{a}"] + lanes["low_pass"] * (
+            specific_force - lanes[f"acceleration_{a}"]
+        )
         out[f"gyro_{a}"] = lanes[f"gyro_{a}"] + lanes["low_pass"] * (u[3 + k] - lanes[f"gyro_{a}"])
     return out
 

@@ -1,0 +1,83 @@
+"""A test bench for the engine: batches of nominal robots with a few things changed, driven for a while."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from wlr_gym.parameters import Parameters
+from wlr_gym.plants.base import PlantOptions, PlantState, Truth, standing_state
+from wlr_gym.plants.gibbs_appell.plant import SWEEPS, GibbsAppellPlant
+from wlr_gym.robot import load_robot
+
+ROBOT = load_robot()
+G = ROBOT.gravity
+WEIGHT = ROBOT.total_mass * G
+RADIUS = ROBOT.wheel.radius
+#: Rotor and disc of a wheel about its axle, kg m2.
+WHEEL_INERTIA = ROBOT.wheel.spin_inertia + ROBOT.servo.wheel.armature
+STEPS = (2.5e-4, 1e-3, 4e-3)
+LEGS_DOWN = np.full(4, np.pi / 2)
+HOME = np.concatenate([LEGS_DOWN, np.zeros(4)])
+MIRROR = [1, 0, 3, 2, 5, 4, 7, 6]
+
+
+def make_plant(
+    count: int,
+    edit: Callable[[Parameters], None] | None = None,
+    place: Callable[[PlantState], None] | None = None,
+    *,
+    step: float = 1e-3,
+    period: float = 0.02,
+    sweeps: int = SWEEPS,
+    precision: str = "float64",
+    threads: int = 1,
+) -> GibbsAppellPlant:
+    """Return ``count`` robots with ``edit`` applied to their parameters and ``place`` to their standing state."""
+    parameters = Parameters.nominal(ROBOT, count)
+    if edit is not None:
+        edit(parameters)
+    state = standing_state(ROBOT, parameters)
+    if place is not None:
+        place(state)
+    options = PlantOptions(
+        control_period=period, physics_step=step, precision=precision, threads=threads, sensor_noise=False
+    )
+    plant = GibbsAppellPlant(ROBOT, count, options, sweeps=sweeps)
+    plant.reset(parameters=parameters, state=state)
+    return plant
+
+
+def drive(plant: GibbsAppellPlant, seconds: float, goals=HOME, torque_on=None) -> Truth:
+    """Hold ``goals`` (8,) or (N, 8) for ``seconds``; return a copy of the truth at the end."""
+    goals = np.array(np.broadcast_to(goals, (plant.count, 8)))
+    for _ in range(round(seconds / plant.options.control_period)):
+        plant.step(goals, torque_on)
+    return Truth(plant.truth().values.copy())
+
+
+def lock(parameters: Parameters, robots=slice(None)) -> None:
+    """Gear friction that no torque here overcomes: wheels and legs stand still on the body."""
+    parameters["servo.coulomb_friction"][robots] = 50.0
+
+
+def free_wheels(parameters: Parameters, robots=slice(None)) -> None:
+    """Wheels without gear friction, legs locked."""
+    lock(parameters, robots)
+    parameters["servo.coulomb_friction"][robots, 4:] = 0.0
+
+
+def wheels_off(count: int) -> np.ndarray:
+    """Torque switches (N, 8): legs on, wheels off."""
+    torque_on = np.ones((count, 8), bool)
+    torque_on[:, 4:] = False
+    return torque_on
+
+
+def turn(state: PlantState, yaw) -> None:
+    """Turn standing robots to headings ``yaw`` (N,), rad."""
+    state.quaternion[:] = np.column_stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)])
+
+
+def contact_force(truth: Truth) -> np.ndarray:
+    """Contact forces (N, 4, 3): heading, axle, normal."""
+    return truth.contact_force.reshape(-1, 4, 3)
