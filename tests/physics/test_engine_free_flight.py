@@ -52,7 +52,7 @@ def test_engine_accelerations_equal_the_equations():
 
     table = []
     for level in range(6):
-        step = 4e-4 / 2**level
+        step = 2e-4 / 2**level
         plant = make_plant(
             COUNT, lambda p: p.values.__setitem__(..., parameters.values), lambda s: assign(s, state), step=step, period=step
         )
@@ -80,6 +80,7 @@ def test_engine_accelerations_equal_the_equations():
         force,
     )
     error = np.abs(table[0] - expected).max(axis=1) / np.abs(expected).max(axis=1)
+    print("MEASURED accel", error.max())
     assert error.max() < 1e-9
 
 
@@ -126,9 +127,12 @@ def energies(plant):
 
 def test_free_flight_conserves_energy():
     assert ROBOT.servo.leg.viscous_friction == 0.0
-    assert fly(1e-5).max() < 1e-8
+    drift = fly(1e-5).max()
+    print("MEASURED drift", drift)
+    assert drift < 1e-8
 
 
 def test_free_flight_is_second_order():
     ratio = fly(1e-3) / fly(5e-4)
+    print("MEASURED ratio", ratio)
     assert np.median(ratio) > 3.6

@@ -44,7 +44,7 @@ def _dispatch(words: list[str]) -> int:
         return OK
     name, *rest = words
     if name not in COMMANDS:
-        raise unknown_name("command", name, COMMANDS, "wlr")
+        raise unknown_name("command", name, COMMANDS)
     return run_command(name, rest)
 
 

@@ -58,10 +58,12 @@ def run(options: Options) -> int:
 
     from wlr_gym.effects import load_patch
     from wlr_gym.files import write_json
+    from wlr_gym.plants import check_backend
     from wlr_gym.provenance import record_provenance
     from wlr_gym.runs.plot import save_plots
 
     console = Console()
+    check_backend(options.backend)
     runs = _read(options.runs)
     patch = load_patch(options.effects)
     _make_folder(options.out)

@@ -15,8 +15,13 @@ def make_plant(backend: str, robot: Robot, count: int, options: PlantOptions | N
     Raises:
         InputError: unknown backend (the message lists the valid ones), impossible robot, bad options.
     """
-    if backend == "gibbs_appell":
-        from wlr_gym.plants.gibbs_appell.plant import GibbsAppellPlant
+    check_backend(backend)
+    from wlr_gym.plants.gibbs_appell.plant import GibbsAppellPlant
 
-        return GibbsAppellPlant(robot, count, options)
-    raise unknown_name("backend", backend, BACKENDS)
+    return GibbsAppellPlant(robot, count, options)
+
+
+def check_backend(backend: str) -> None:
+    """Raise :class:`InputError` for a backend that does not exist, before anything is made or written for it."""
+    if backend not in BACKENDS:
+        raise unknown_name("backend", backend, BACKENDS)

@@ -1,0 +1,168 @@
+"""Servos of a robot held in the air against the closed forms of the DC motor and of gear friction; delays and zero errors."""
+
+import numpy as np
+import pytest
+from rig import HOME, ROBOT, STEPS, WHEEL_INERTIA, drive, make_plant, wheels_off
+
+from wlr_gym import servo
+
+LEG = ROBOT.servo.leg
+WHEEL = ROBOT.servo.wheel
+#: A leg's inertia about its hip, N.B. with a wheel whose gear drags only its disc along.
+LEG_INERTIA = (
+    LEG.armature
+    + ROBOT.leg.inertia[1]
+    + ROBOT.leg.mass * ROBOT.leg.com_along_leg**2
+    + ROBOT.wheel.mass * ROBOT.leg.length**2
+    + ROBOT.wheel.spin_inertia * WHEEL.armature / WHEEL_INERTIA
+)
+
+
+def in_the_air(parameters):
+    """Weightless, with a body too heavy to move, gears without friction."""
+    parameters["gravity"] = 0.0
+    parameters["body.mass"], parameters["body.inertia"] = 100.0, 10.0
+    parameters["servo.coulomb_friction"] = 0.0
+
+
+def lift(state):
+    state.position[:, 2] = 5.0
+
+
+def damping(motor):
+    constant, resistance = servo.motor_constants(motor.stall_torque, motor.no_load_speed, 12.0)
+    return constant**2 / resistance
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_wheel_at_full_voltage_follows_the_dc_motor(step):
+    """w(t) = w_0 (1 - exp(-t/T)), T = J R / K^2; the second robot has a rotor 30 times as heavy."""
+
+    def edit(parameters):
+        in_the_air(parameters)
+        parameters["servo.armature"][1, 4:] *= 30.0
+
+    sign = np.array([1.0, -1.0, 1.0, -1.0])
+    goals = np.concatenate([HOME[:4], 100.0 * sign])
+    plant = make_plant(2, edit, lift, step=step, period=4e-3)
+    inertia = ROBOT.wheel.spin_inertia + WHEEL.armature * np.array([1.0, 30.0])
+    for tick in range(1, 11):
+        truth = drive(plant, 4e-3, goals)
+        expected = WHEEL.no_load_speed * (1 - np.exp(-4e-3 * tick * damping(WHEEL) / inertia))
+        np.testing.assert_allclose(sign * truth.joint_velocity[:, 4:], np.tile(expected[:, None], (1, 4)), rtol=1e-3)
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_leg_at_full_voltage_follows_the_dc_motor(step):
+    """A step of 2.5 rad: the voltage stays at its limit, so that the speed rises as a first-order lag."""
+    plant = make_plant(2, in_the_air, lift, step=step, period=4e-3)
+    sign = np.array([1.0, -1.0, 1.0, -1.0])
+    goals = np.concatenate([HOME[:4] + 2.5 * sign, np.zeros(4)])
+    for tick in range(1, 11):
+        truth = drive(plant, 4e-3, goals, wheels_off(2))
+        expected = LEG.no_load_speed * (1 - np.exp(-4e-3 * tick * damping(LEG) / LEG_INERTIA))
+        np.testing.assert_allclose(truth.joint_velocity[:, :4], np.tile(expected * sign, (2, 1)), rtol=2e-3)
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_free_wheel_without_torque(step):
+    """Motors off: no loss, viscous friction w_0 exp(-b t/J), Coulomb friction w_0 - c t/J and then rest, exactly."""
+    start, time = 5.0, 0.04
+    viscous, coulomb = 0.003, 0.02
+
+    def edit(parameters):
+        in_the_air(parameters)
+        parameters["servo.viscous_friction"][1, 4:] = viscous
+        parameters["servo.coulomb_friction"][2:, 4:] = coulomb
+
+    def place(state):
+        lift(state)
+        state.joint_velocity[:, 4:] = start
+
+    plant = make_plant(4, edit, place, step=step, period=4e-3)
+    rate = drive(plant, time, torque_on=wheels_off(4)).joint_velocity[:, 4:]
+    np.testing.assert_allclose(rate[0], start, rtol=1e-4)
+    # the implicit weight of the damping is fitted to a motor that is on: first order for one that is off
+    np.testing.assert_allclose(rate[1], start * np.exp(-viscous * time / WHEEL_INERTIA), rtol=1.5 * step)
+    np.testing.assert_allclose(rate[2], start - coulomb * time / WHEEL_INERTIA, rtol=1e-3)
+    rate = drive(plant, 2.0 * time, torque_on=wheels_off(4)).joint_velocity[:, 4:]
+    assert np.abs(rate[2]).max() < 1e-12
+
+
+def test_gear_friction_holds_a_leg_against_less_torque():
+    """A goal so near that kp (goal - q) K/R stays below the Coulomb friction does not move the joint; farther, it does."""
+
+    def edit(parameters):
+        in_the_air(parameters)
+        parameters["servo.coulomb_friction"] = 0.1
+
+    constant, resistance = servo.motor_constants(LEG.stall_torque, LEG.no_load_speed, 12.0)
+    reach = 0.1 / (LEG.kp * constant / resistance)
+    goals = np.tile(HOME, (2, 1))
+    goals[:, :4] += np.array([[0.98], [1.1]]) * reach
+    plant = make_plant(2, edit, lift)
+    moved = drive(plant, 0.5, goals).joint_position[:, :4] - np.pi / 2
+    assert np.abs(moved[0]).max() < 1e-12
+    assert moved[1].min() > 0.01 * reach
+
+
+def test_zero_offset_is_reading_minus_truth_and_the_servo_regulates_the_reading():
+    offset = np.array([0.1, -0.05, 0.0, 0.2])
+
+    def edit(parameters):
+        in_the_air(parameters)
+        parameters["joint.zero_offset"] = offset
+
+    plant = make_plant(2, edit, lift)
+    goals = np.concatenate([np.full(4, 1.2), np.zeros(4)])
+    truth = drive(plant, 1.0, goals)
+    reading = plant.step(np.tile(goals, (2, 1)))
+    np.testing.assert_allclose(truth.joint_position[:, :4], np.tile(1.2 - offset, (2, 1)), atol=1e-6)
+    np.testing.assert_allclose(reading.joint_position[:, :4], 1.2, atol=1e-6)
+
+
+GOALS = np.concatenate([[1.0, 1.2, 1.9, 2.1], [3.0, -2.0, 4.0, 1.0]])
+
+
+@pytest.mark.parametrize("milliseconds", [7, 20, 50, 133])
+def test_delay_shifts_the_response_by_exactly_the_delay(milliseconds):
+    """20 ms ticks with a delay against 1 ms ticks without: equal to rounding, for whole and broken numbers of ticks."""
+
+    def edit(parameters):
+        in_the_air(parameters)
+        parameters["command.delay"] = 1e-3 * milliseconds
+
+    delayed = make_plant(2, edit, lift)
+    prompt = make_plant(2, in_the_air, lift, period=1e-3)
+    ticks = milliseconds // 20 + 3
+    truth = drive(delayed, 0.02 * ticks, GOALS)
+    expected = drive(prompt, 1e-3 * (20 * ticks - milliseconds), GOALS)
+    np.testing.assert_allclose(truth.joint_position, expected.joint_position, atol=1e-13)
+    np.testing.assert_allclose(truth.joint_velocity, expected.joint_velocity, atol=1e-11)
+    assert np.abs(truth.joint_velocity).max() > 0.1
+
+
+def test_delay_is_per_joint_and_per_robot():
+    def edit(parameters):
+        in_the_air(parameters)
+        parameters["command.delay"][1, 2] = 0.1
+
+    plant = make_plant(2, edit, lift)
+    moved = np.abs(drive(plant, 0.06, GOALS).joint_velocity) > 1e-3
+    assert moved[0].all()
+    assert not moved[1, 2]
+    assert moved[1, [0, 1, 3]].all()
+
+
+def test_supply_voltage_and_stall_torque_set_top_speed():
+    """No-load speed is proportional to the supply voltage; the stall torque does not change it."""
+
+    def edit(parameters):
+        in_the_air(parameters)
+        parameters["servo.supply_voltage"][1] = 9.0
+        parameters["servo.stall_torque"][2] *= 0.5
+
+    plant = make_plant(3, edit, lift)
+    rate = drive(plant, 1.0, np.concatenate([HOME[:4], np.full(4, 100.0)])).joint_velocity[:, 4:]
+    expected = WHEEL.no_load_speed * np.array([1.0, 0.75, 1.0])
+    np.testing.assert_allclose(rate, np.tile(expected[:, None], (1, 4)), rtol=1e-3)
