@@ -13,6 +13,14 @@ ROBOT = load_robot()
 G = ROBOT.gravity
 WEIGHT = ROBOT.total_mass * G
 RADIUS = ROBOT.wheel.radius
+_NOMINAL = Parameters.nominal(ROBOT)
+BODY_MASS = float(_NOMINAL["body.mass"][0])
+LEG_MASS = float(_NOMINAL["leg.mass"][0, 0])
+#: A leg about its own centre of mass, axis parallel to the axle, kg m2.
+LEG_PITCH_INERTIA = float(_NOMINAL["leg.inertia[leg_lf,y]"][0])
+WHEEL_MASS = float(_NOMINAL["wheel.mass"][0, 0])
+#: Hip to the leg's own centre of mass, m.
+LEG_COM = float(_NOMINAL["leg.com_along_leg"][0, 0])
 #: Rotor and disc of a wheel about its axle, kg m2.
 WHEEL_INERTIA = ROBOT.wheel.spin_inertia + ROBOT.servo.wheel.armature
 STEPS = (2.5e-4, 1e-3, 4e-3)
@@ -39,9 +47,7 @@ def make_plant(
     state = standing_state(ROBOT, parameters)
     if place is not None:
         place(state)
-    options = PlantOptions(
-        control_period=period, physics_step=step, precision=precision, threads=threads, sensor_noise=False
-    )
+    options = PlantOptions(control_period=period, physics_step=step, precision=precision, threads=threads, sensor_noise=False)
     plant = GibbsAppellPlant(ROBOT, count, options, sweeps=sweeps)
     plant.reset(parameters=parameters, state=state)
     return plant

@@ -82,7 +82,6 @@ def test_energy_balance_closes(audit):
     total = sum(term.sum(axis=0) for term in work.values())
     done = np.abs(work["motor"]).sum(axis=0)
     error = np.abs(end - start - total) / done
-    print("MEASURED energy balance", error, "work", done, {name: term.sum(axis=0) for name, term in work.items()})
     assert done.min() > 1.0
     assert error.max() < 1e-5
 
@@ -91,7 +90,7 @@ def test_energy_balance_closes(audit):
 def test_every_friction_dissipates(audit, term):
     work = audit[2][term]
     assert work.sum(axis=0).max() < -1e-3
-    assert work.max() < -1e-3 * work.sum(axis=0).max() / 10_000 * 10
+    assert work.max() < 1e-6  # J per tick: slip that reverses within a tick is averaged over its ends
 
 
 def test_mechanical_energy_is_the_motors_work(audit):

@@ -212,7 +212,6 @@ def test_friction_points_where_it_dissipates_most(step, mode, mu):
     squared = np.square(mu)
     exact = np.arctan2(-squared[1] * slip[..., 1], -squared[0] * slip[..., 0])
     error = np.angle(np.exp(1j * (np.arctan2(force[..., 1], force[..., 0]) - exact)))
-    print("MEASURED direction", step, mode, mu, np.degrees(np.abs(error)).max(), np.linalg.norm(slip, axis=2).min())
     assert np.linalg.norm(slip, axis=2).min() > 0.5
     assert np.degrees(np.abs(error)).max() < 0.05
     np.testing.assert_allclose(np.hypot(*(force[..., :2] / mu).transpose(2, 0, 1)), force[..., 2], rtol=1e-6)
@@ -256,9 +255,6 @@ def test_anisotropic_friction_is_the_same_at_any_heading():
     truth = plant.truth()
     x, y = truth.position[:, 0], truth.position[:, 1]
     path = np.column_stack([np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x, truth.position[:, 2]])
-    print("MEASURED heading", np.abs(path - path[0]).max())
     assert np.linalg.norm(path[0, :2]) > 0.02
     np.testing.assert_allclose(path, np.tile(path[0], (8, 1)), atol=1e-6)
-    np.testing.assert_allclose(
-        truth.linear_velocity_in_body, np.tile(truth.linear_velocity_in_body[0], (8, 1)), atol=1e-6
-    )
+    np.testing.assert_allclose(truth.linear_velocity_in_body, np.tile(truth.linear_velocity_in_body[0], (8, 1)), atol=1e-6)

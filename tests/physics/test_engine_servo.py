@@ -2,18 +2,30 @@
 
 import numpy as np
 import pytest
-from rig import HOME, ROBOT, STEPS, WHEEL_INERTIA, drive, make_plant, wheels_off
+from rig import (
+    HOME,
+    LEG_COM,
+    LEG_MASS,
+    LEG_PITCH_INERTIA,
+    ROBOT,
+    STEPS,
+    WHEEL_INERTIA,
+    WHEEL_MASS,
+    drive,
+    make_plant,
+    wheels_off,
+)
 
 from wlr_gym import servo
 
 LEG = ROBOT.servo.leg
 WHEEL = ROBOT.servo.wheel
-#: A leg's inertia about its hip, N.B. with a wheel whose gear drags only its disc along.
+#: A leg's inertia about its hip; its free wheel is dragged along by disc and rotor in series.
 LEG_INERTIA = (
     LEG.armature
-    + ROBOT.leg.inertia[1]
-    + ROBOT.leg.mass * ROBOT.leg.com_along_leg**2
-    + ROBOT.wheel.mass * ROBOT.leg.length**2
+    + LEG_PITCH_INERTIA
+    + LEG_MASS * LEG_COM**2
+    + WHEEL_MASS * ROBOT.leg.length**2
     + ROBOT.wheel.spin_inertia * WHEEL.armature / WHEEL_INERTIA
 )
 

@@ -23,9 +23,9 @@ def test_skid_turns_turn_towards_the_slower_side():
     truth = drive(make_plant(6), 3.0, goals)
     rate, speed = truth.angular_velocity_in_body[:, 2], truth.linear_velocity_in_body[:, 0]
     assert (np.sign(rate[:4]) == [1, -1, 1, -1]).all()
-    np.testing.assert_allclose(rate[[1, 3]], -rate[[0, 2]], rtol=1e-9)
-    assert np.abs(rate[4:]).max() < 1e-9
-    assert np.abs(truth.position[4:, 1]).max() < 1e-9
+    np.testing.assert_allclose(rate[[1, 3]], -rate[[0, 2]], rtol=1e-8)
+    assert np.abs(rate[4:]).max() < 1e-8
+    assert np.abs(truth.position[4:, 1]).max() < 1e-8
     # a skid turn yaws slower than its wheels would without slip
     ideal = RADIUS * 8 / (2 * ROBOT.hip_position.y)
     assert 0.2 * ideal < rate[0] < 0.9 * ideal
@@ -41,12 +41,9 @@ def test_mirrored_commands_give_mirrored_motion():
         goals = np.hstack([rng.uniform(1.0, 2.0, (8, 4)), rng.uniform(-5.0, 5.0, (8, 4))])
         drive(plant, 0.5, np.vstack([goals, goals[:, MIRROR]]))
     truth = plant.truth()
-    ours, mirrored = truth.values[:8], truth.values[8:]
-    assert np.linalg.norm(ours[:, :2], axis=1).min() > 1e-3
+    assert np.linalg.norm(truth.position[:, :2], axis=1).min() > 1e-3
     position, joints = truth.position, truth.joint_position
     error = np.abs(position[8:] * [1, -1, 1] - position[:8]).max()
-    print("MEASURED mirror", error, np.abs(joints[8:, MIRROR] - joints[:8]).max())
-    assert mirrored.shape == ours.shape
     assert error < 1e-9
     assert np.abs(joints[8:, MIRROR] - joints[:8]).max() < 1e-9
     np.testing.assert_allclose(truth.quaternion[8:] * [1, -1, 1, -1], truth.quaternion[:8], atol=1e-9)

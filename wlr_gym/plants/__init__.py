@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
+
 from wlr_gym.errors import unknown_name
 from wlr_gym.plants.base import Plant, PlantOptions
 from wlr_gym.robot import Robot
 
-BACKENDS = ("gibbs_appell",)
+#: Backend -> "module:class", imported when it is first made.
+BACKENDS = {"gibbs_appell": "wlr_gym.plants.gibbs_appell.plant:GibbsAppellPlant"}
 
 
 def make_plant(backend: str, robot: Robot, count: int, options: PlantOptions | None = None) -> Plant:
@@ -16,9 +19,8 @@ def make_plant(backend: str, robot: Robot, count: int, options: PlantOptions | N
         InputError: unknown backend (the message lists the valid ones), impossible robot, bad options.
     """
     check_backend(backend)
-    from wlr_gym.plants.gibbs_appell.plant import GibbsAppellPlant
-
-    return GibbsAppellPlant(robot, count, options)
+    module, _, name = BACKENDS[backend].partition(":")
+    return getattr(importlib.import_module(module), name)(robot, count, options)
 
 
 def check_backend(backend: str) -> None:

@@ -31,6 +31,10 @@ class GoalHistory:
         hold = state.reference_velocity[rows].copy()
         hold[:, :4] = state.reference_position[rows, :4]
         self._ring[:, rows] = hold
+        self.set_delays(rows, parameters)
+
+    def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
+        """Take new delays; goals already written act at their new time."""
         delay = parameters["command.delay"][rows]
         self._ticks[rows] = np.floor(delay / self._period + 1e-9)
         self._switch_time[rows] = np.maximum(delay - self._ticks[rows] * self._period, 0.0)
@@ -38,10 +42,10 @@ class GoalHistory:
 
     def push(self, goals: Array) -> tuple[Array, Array, Array]:
         """Take this tick's goals (N, 8); return the newer goals, the older goals and the switch time (s), each (N, 8)."""
-        if not self._delayed:
-            return goals, goals, self._switch_time
         self._head = (self._head + 1) % len(self._ring)
         self._ring[self._head] = goals
+        if not self._delayed:
+            return goals, goals, self._switch_time
         return self._at(self._ticks), self._at(self._ticks + 1), self._switch_time
 
     def _at(self, ticks: NDArray[np.intp]) -> Array:

@@ -222,14 +222,18 @@ class SensorModel:
         if seeds is not None:
             self._seeds[rows] = np.asarray(seeds, np.uint64)[rows]
         if parameters is not None:
-            errors = [parameters[name].reshape(self.count, -1)[rows] for name in _CALIBRATION]
-            self._states[rows, :_WHEEL_ZERO] = np.concatenate(errors, axis=1)
+            self.set_errors(rows, parameters)
         self._ticks[rows] = 0
         self._states[rows, _WHEEL_ZERO:_START_POSE] = raw[rows, 4:8]
         self._states[rows, _START_POSE:_SHOWN_POSE] = raw[rows, _RAW_POSE:]
         self._states[rows, _PHASE] = [_camera_phase(seed) for seed in self._seeds[rows]]
         for i in rows:
             _measure(raw, self._seeds, self._ticks, self._settings, self._states, out, i, i + 1)
+
+    def set_errors(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
+        """Take the zero errors, biases, mounting error and camera delay of robots ``rows``; nothing is forgotten."""
+        errors = [parameters[name].reshape(self.count, -1)[rows] for name in _CALIBRATION]
+        self._states[rows, :_WHEEL_ZERO] = np.concatenate(errors, axis=1)
 
     def measure(self, raw: Array, out: Array, start: int = 0, stop: int | None = None) -> None:
         """Read the sensors of robots ``start`` to ``stop`` one control tick on; the rest of ``out`` stays.

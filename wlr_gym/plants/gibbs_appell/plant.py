@@ -115,7 +115,10 @@ class GibbsAppellPlant:
 
     def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
         """Change parameters in mid-run (interval randomisation, drifting friction); the state stays."""
-        self._take_parameters(parameters, np.arange(self._count) if mask is None else np.flatnonzero(mask))
+        rows = np.arange(self._count) if mask is None else np.flatnonzero(mask)
+        self._take_parameters(parameters, rows)
+        self._goals.set_delays(rows, self.parameters)
+        self._sensors.set_errors(rows, self.parameters)
 
     def _take_parameters(self, parameters: Parameters, rows: NDArray[np.intp]) -> None:
         if len(parameters) != self._count:

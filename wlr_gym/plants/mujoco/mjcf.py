@@ -23,6 +23,7 @@ Choices, and why:
 # (MuJoCo fills its namespace when it is imported.)
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import mujoco
@@ -51,6 +52,7 @@ def build_model(
     contacts: bool = True,
     physics_step: float = 0.001,
     wheel_shape: WheelShape | None = None,
+    extend: Callable[[mujoco.MjSpec], None] | None = None,
 ) -> mujoco.MjModel:
     """Return the MuJoCo model of row ``index`` of ``parameters``.
 
@@ -61,6 +63,7 @@ def build_model(
         contacts: False leaves the wheels' contacts out (the floor is only drawn).
         physics_step: s.
         wheel_shape: None = "sphere" where friction has no direction and rolling no resistance, else "capsule".
+        extend: adds to the specification (actuators, cameras) before it is compiled.
 
     Raises:
         InputError: an index outside the batch, or spheres for friction that has a direction.
@@ -82,6 +85,8 @@ def build_model(
     if contacts:
         for wheel in range(4):
             _add_contact(spec, row, wheel)
+    if extend is not None:
+        extend(spec)
     model = spec.compile()
     if contacts:
         _set_contact_springs(model, row)

@@ -1,0 +1,75 @@
+"""``wlr bench`` runs and reports; no test looks at a time."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from wlr_gym.bench.measure import Measurement, against_fastest, interleave
+from wlr_gym.bench.mujoco_loop import MujocoLoopPlant
+from wlr_gym.cli import main
+from wlr_gym.plants.gibbs_appell.plant import GibbsAppellPlant
+from wlr_gym.robot import load_robot
+
+
+@pytest.mark.parametrize("name", ["engine", "env_step", "ppo", "import", "start", "batch", "convergence"])
+def test_measurement_runs_and_reports(name, tmp_path, capsys):
+    file = tmp_path / "bench.json"
+    assert main(["bench", "--quick", "--rounds", "1", "--only", name, "--json", str(file)]) == 0
+    assert name in capsys.readouterr().out
+    report = json.loads(file.read_text())
+    assert report["schema"] == 1
+    assert report["machine"]["cores"] >= 1
+    assert report["machine"]["processor"]
+    rows = report["convergence" if name == "convergence" else "measurements"]
+    assert rows
+    for row in rows:
+        if name == "convergence":
+            assert math.isfinite(row["worst"])
+            continue
+        assert row["name"] == name
+        assert len(row["ours"]["values"]) == 1
+        assert math.isfinite(row["ours"]["median"])
+        assert (row["ratio"] is None) == (row["peer"] is None)
+        assert (row["met"] is None) == (row["bar"] is None)
+
+
+def test_rounds_are_interleaved():
+    calls: list[str] = []
+    contenders = {name: lambda name=name: float(calls.append(name) or len(calls)) for name in "AB"}
+    values = interleave(contenders, 2)
+    assert "".join(calls) == "ABABAB"  # the first pair is not measured
+    assert values == {"A": (3.0, 5.0), "B": (4.0, 6.0)}
+
+
+def test_ratio_is_pair_by_pair_against_the_fastest_peer():
+    row = against_fastest("n", "w", "1/s", (10.0, 40.0, 30.0), {"slow": (1.0, 1.0, 1.0), "fast": (5.0, 10.0, 10.0)}, 3.0)
+    assert row.peer_name == "fast"
+    assert row.ratios == (2.0, 4.0, 3.0)
+    assert row.met is True
+    assert row.others == {"slow": 1.0}
+    assert Measurement("n", "w", "s", (0.5,), bar=0.3).met is False
+
+
+@pytest.mark.parametrize(("arguments", "message"), [(["--only", "engin"], "engine"), (["--rounds", "0"], "1 or more")])
+def test_bad_input_is_named(arguments, message, capsys):
+    assert main(["bench", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_peer_is_the_same_robot_under_the_same_servo_law():
+    """The comparison is fair only if both do the same work: same motion, here within the contact models' difference."""
+    robot = load_robot()
+    plants = MujocoLoopPlant(robot), GibbsAppellPlant(robot)
+    goals = np.array([[*[robot.home.leg_angle] * 4, *[3.0] * 4]])
+    goals[0, :4] += 0.1
+    for plant in plants:
+        plant.reset()
+        for _ in range(50):
+            plant.step(goals)
+    peer, ours = (plant.truth() for plant in plants)
+    assert np.abs(ours.position[0, 0]) > 0.05
+    np.testing.assert_allclose(peer.position[0], ours.position[0], atol=2e-3)
+    np.testing.assert_allclose(peer.joint_position[0], ours.joint_position[0], atol=0.05)
+    np.testing.assert_allclose(peer.joint_velocity[0, 4:], ours.joint_velocity[0, 4:], atol=0.05)

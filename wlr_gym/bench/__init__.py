@@ -1,0 +1,1 @@
+"""Speed and accuracy measurements of this machine: paired with the peer, interleaved, with their spread."""

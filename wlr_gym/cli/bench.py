@@ -1,0 +1,111 @@
+"""Measure speed and accuracy on this machine, paired and interleaved with the peer: medians and the spread of the ratio."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.table import Table
+
+from wlr_gym.bench.measure import Measurement, Size, machine
+from wlr_gym.cli import OK
+from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.files import write_json
+
+if TYPE_CHECKING:
+    from wlr_gym.bench.convergence import Deviation
+
+#: Measurement -> function. Imported when it is run.
+MEASUREMENTS = {
+    "engine": "wlr_gym.bench.speed:measure_engine",
+    "env_step": "wlr_gym.bench.speed:measure_env_step",
+    "ppo": "wlr_gym.bench.training:measure_ppo",
+    "import": "wlr_gym.bench.speed:measure_import",
+    "start": "wlr_gym.bench.speed:measure_start",
+    "batch": "wlr_gym.bench.speed:measure_batch",
+    "convergence": "wlr_gym.bench.convergence:measure_convergence",
+}
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Options:
+    only: tuple[str, ...] = ()
+    """Measurements to make: engine, env_step, ppo, import, start, batch, convergence; default: all."""
+    json: Path | None = None
+    """File for all numbers."""
+    rounds: int = 5
+    """Rounds of every pair."""
+    quick: bool = False
+    """Tiny sizes: shows that it runs; the numbers mean nothing."""
+
+
+def run(options: Options) -> int:
+    """Measure, print, write."""
+    for name in options.only:
+        if name not in MEASUREMENTS:
+            raise unknown_name("measurement", name, MEASUREMENTS)
+    if options.rounds < 1:
+        raise InputError(f"--rounds {options.rounds}: expected 1 or more")
+    if options.json is not None and not options.json.parent.is_dir():
+        raise InputError(f"--json {options.json}: folder {options.json.parent} does not exist")
+    console, size = Console(), Size(options.rounds, options.quick)
+    report: dict[str, Any] = {"schema": SCHEMA, "machine": machine(), "rounds": options.rounds, "quick": options.quick}
+    report |= {"measurements": [], "convergence": []}
+    console.print(_machine_line(report["machine"]))
+    for name in options.only or tuple(MEASUREMENTS):
+        with console.status(f"measuring {name}"):
+            rows = _measure(name, size)
+        report["convergence" if name == "convergence" else "measurements"] += [row.as_dict() for row in rows]
+        _print(console, _convergence_table(rows) if name == "convergence" else _speed_table(rows))
+    if options.json is not None:
+        write_json(options.json, report)
+        print(f"written: {options.json}")
+    return OK
+
+
+def _measure(name: str, size: Size) -> list[Any]:
+    module, _, function = MEASUREMENTS[name].partition(":")
+    return getattr(importlib.import_module(module), function)(size)
+
+
+def _machine_line(found: dict[str, Any]) -> str:
+    packages = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+    return f"{found['processor']}, {found['cores']} cores, {found['system']}; {packages}"
+
+
+def _print(console: Console, table: Table) -> None:
+    console.width = max(console.width, 150)  # rather a wide line than a cut number
+    console.print(table)
+
+
+def _speed_table(rows: Sequence[Measurement]) -> Table:
+    table = Table("what", "ours", "peer", "ratio [min..max]", "bar", "met", box=None, title=rows[0].name, title_justify="left")
+    for row in rows:
+        found = row.as_dict()
+        peer = f"{found['peer']['median']:,.0f} {row.unit} ({row.peer_name})" if row.peer else "-"
+        ratio = "{median:.1f} [{min:.1f}..{max:.1f}]".format(**found["ratio"]) if row.peer else "-"
+        bar = "-" if row.bar is None else f">= {row.bar:g}x" if row.peer else f"< {row.bar:g} {row.unit}"
+        table.add_row(row.what, _number(found["ours"], row.unit), peer, ratio, bar, _YES_NO[row.met])
+    return table
+
+
+_YES_NO = {True: "yes", False: "NO", None: "-"}
+
+
+def _number(found: dict[str, Any], unit: str) -> str:
+    form = "{median:.2f} [{min:.2f}..{max:.2f}]" if unit == "s" else "{median:,.0f}"
+    return f"{form.format(**found)} {unit}"
+
+
+def _convergence_table(rows: Sequence[Deviation]) -> Table:
+    table = Table("case", "quantity", "value", "median", "90 %", "worst", box=None, title_justify="left")
+    table.title = "convergence: deviation of the position after 1 s, mm (64 robots)"
+    for row in rows:
+        millimetres = [f"{1e3 * value:.2g}" for value in (row.median, row.percentile_90, row.worst)]
+        table.add_row(row.case, row.quantity, str(row.value), *millimetres)
+    return table
