@@ -62,7 +62,7 @@ class FakePlant:
         self.parameters.values[rows] = chosen.values
 
     def step(self, goals, torque_on=None):
-        goals = check_goals(goals, torque_on, self.count)
+        goals = check_goals(goals if torque_on is None else np.where(torque_on, goals, 0.0), self.count)
         self.goals_seen.append(goals.copy())
         on = np.ones_like(goals) if torque_on is None else np.asarray(torque_on, float)
         period, truth = self.options.control_period, self._truth

@@ -293,3 +293,62 @@ def test_parameters_out_of_bounds_are_refused_by_name():
 def test_parameters_for_another_number_of_robots_are_refused():
     with pytest.raises(InputError, match="parameters hold 2 robots, the plant 3"):
         make(3).reset(parameters=Parameters.nominal(ROBOT, 2))
+
+
+def test_goals_of_a_motor_that_is_off_never_act_later():
+    def delayed(parameters):
+        parameters["command.delay"] = 0.03
+
+    plant = make(2, delayed)
+    goals = np.tile(np.r_[[np.pi / 2] * 4, [0.0] * 4], (2, 1))
+    off = np.ones((2, 8), bool)
+    off[:, :4] = False
+    for _ in range(10):
+        plant.step(goals)
+    for _ in range(5):
+        plant.step(np.where(off, goals, np.nan), off)
+    lowest = before = plant.truth().joint_position[:, :4].copy()
+    for _ in range(10):
+        plant.step(goals)
+        lowest = np.minimum(lowest, plant.truth().joint_position[:, :4])
+    assert (lowest > before - 0.02).all()
+
+
+def test_accelerometer_starts_with_the_specific_force_of_standing_still():
+    def inclined(parameters):
+        parameters["ground.slope[pitch]"] = 0.3
+        parameters["ground.slope[roll]"] = -0.1
+        parameters["imu.accel_bias"] = 0.0
+
+    plant = make(1, inclined)
+    up = np.array([np.sin(0.3), np.sin(-0.1), np.sqrt(1 - np.sin(0.3) ** 2 - np.sin(0.1) ** 2)])
+    assert plant.reset().accelerometer[0] == pytest.approx(9.81 * up, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"mask": np.ones(3, bool)}, "mask has shape"),
+        ({"state": "broken"}, "not finite"),
+    ],
+)
+def test_bad_resets_are_refused(arguments, message):
+    plant = make(2)
+    if arguments.get("state") == "broken":
+        state = plant.get_state()
+        state.position[0, 0] = np.nan
+        arguments = {"state": state}
+    with pytest.raises(InputError, match=message):
+        plant.reset(**arguments)
+
+
+@pytest.mark.parametrize("options", [{"threads": 1.5}, {"physics_step": "a"}, {"precision": 64}])
+def test_options_of_the_wrong_kind_are_refused(options):
+    with pytest.raises(InputError, match=next(iter(options))):
+        PlantOptions(**options)
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.5])
+def test_count_must_be_a_positive_whole_number(count):
+    with pytest.raises(InputError, match="number of robots"):
+        GibbsAppellPlant(ROBOT, count, QUIET)

@@ -181,7 +181,7 @@ class MujocoLoopPlant:
 
     def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick with the servos as actuators."""
-        row = check_goals(goals, torque_on, 1)[0]
+        row = check_goals(goals, 1)[0]
         self._data.ctrl[:8] = row
         self._data.ctrl[8:] = row[4:]
         mujoco.mj_step(self._model, self._data, nstep=self.options.substeps)

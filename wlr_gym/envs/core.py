@@ -15,6 +15,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym import plants
+from wlr_gym.effects import apply_patch, load_patch
 from wlr_gym.envs import kernels
 from wlr_gym.envs.evaluation import compile_evaluation
 from wlr_gym.envs.settings import Settings
@@ -35,7 +36,7 @@ Mask = NDArray[np.bool_]
 #: Actions may exceed +-1 by rounding only.
 ACTION_LIMIT = 1.0 + 1e-6
 FOREVER = np.iinfo(np.int64).max
-OPTIONS = ("command", "parameters", "reset_mask")
+OPTIONS = ("command", "parameters")
 
 
 def make_task(task_name: str, settings: Settings) -> Task:
@@ -56,7 +57,7 @@ class Core:
     """N robots on a task.
 
     Attributes:
-        task, plant, randomization: what it is made of.
+        task, plant, randomization, patch: what it is made of.
         count: N.
         observation: (N, D) float32 policy observation of every robot, overwritten by each step.
         privileged: (N, P) float32 privileged observation (only with ``observation="dict"``).
@@ -75,6 +76,7 @@ class Core:
         self.randomization = load_randomization(
             config.randomization if settings.randomization is None else settings.randomization, robot
         )
+        self.patch = load_patch(settings.effects)
         options = PlantOptions(
             control_period=config.control_period,
             physics_step=settings.physics_step,
@@ -160,7 +162,7 @@ class Core:
         self.robot_seeds = np.zeros(count, np.uint64)
         self.episodes = np.zeros(count, np.int64)
         self.episode_seeds = np.zeros(count, np.uint64)
-        self.parameters = Parameters.nominal(task.robot, count)
+        self.parameters = apply_patch(self.patch, Parameters.nominal(task.robot, count))
         self._overrides: dict[int, dict[str, float]] = {}
         self._state: PlantState = self.randomization.state(self.parameters, self.episode_seeds)
         intervals = len(self.randomization.intervals)
@@ -186,20 +188,17 @@ class Core:
         Args:
             mask: (N,) which robots; all must have been seeded.
             options: ``command`` {name: value} held for the whole episode, ``parameters`` {name or element: value} set after
-                randomisation.
+                randomisation and effects.
 
         Raises:
-            InputError: unknown option, command or parameter, or a value out of bounds.
+            InputError: unknown option, command or parameter, or a value of the wrong type or out of bounds.
         """
-        options = options or {}
-        for name in options:
-            if name not in OPTIONS:
-                raise unknown_name("reset option", str(name), OPTIONS)
-        fixed_command = self._read_command(options.get("command") or {})
+        options = read_options(options)
+        fixed_command = self._read_command(_mapping("command", options.get("command")))
+        overrides = dict(_mapping("parameters", options.get("parameters")))
         rows = np.flatnonzero(mask)
         seeds = episode_seeds(self.robot_seeds[rows], self.episodes[rows] + 1)
-        robots = self.randomization.parameters(self.robot_seeds[rows], seeds)
-        overrides = dict(options.get("parameters") or {})
+        robots = self._draw_parameters(rows, seeds)
         _override(robots, overrides)
         self.episodes[rows] += 1
         self.episode_seeds[rows] = seeds
@@ -217,6 +216,13 @@ class Core:
         if fixed_command:
             self._hold_command(rows, fixed_command)
         self._observe(mask, sensors.values, True)
+
+    def _draw_parameters(
+        self, rows: NDArray[np.intp], seeds: NDArray[np.uint64], occurrences: NDArray[np.int64] | None = None
+    ) -> Parameters:
+        """Randomisation of some robots, then the effects."""
+        robots = self.randomization.parameters(self.robot_seeds[rows], seeds, occurrences)
+        return apply_patch(self.patch, robots) if self.patch else robots
 
     def _clear(self, rows: NDArray[np.intp]) -> None:
         for buffer in (self.ticks, self.action, self._previous_action, self.sums, self.terms, self.reward, self._occurrences):
@@ -239,7 +245,8 @@ class Core:
         for name, value in given.items():
             if name not in self.task.commands:
                 raise unknown_name("command", str(name), self.task.commands)
-            if not np.isfinite(value):
+            number = np.asarray(value)
+            if number.shape != () or number.dtype.kind not in "iuf" or not np.isfinite(number):
                 raise InputError(f"command {name} = {value!r}: expected a finite number")
             values[self.task.commands.index(name)] = float(value)
         return values
@@ -319,7 +326,7 @@ class Core:
         rows = np.flatnonzero(struck)
         self._occurrences[due] += 1
         self._strike_at[rows] = np.where(due[rows], self._next_strike(rows), self._strike_at[rows])
-        robots = self.randomization.parameters(self.robot_seeds[rows], self.episode_seeds[rows], self._occurrences[rows])
+        robots = self._draw_parameters(rows, self.episode_seeds[rows], self._occurrences[rows])
         for index, row in enumerate(rows.tolist()):
             if self._overrides.get(row):
                 _override(Parameters(robots.values[index : index + 1]), self._overrides[row])
@@ -379,16 +386,39 @@ def read_actions(actions: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float
         InputError: not numbers, or another shape.
     """
     try:
+        if np.iscomplexobj(actions):
+            raise TypeError
         given = np.asarray(actions, dtype=np.float32)
     except (TypeError, ValueError):
-        raise InputError(f"action of type {type(actions).__name__}: expected numbers of shape {shape}") from None
+        raise InputError(f"action of type {type(actions).__name__}: expected real numbers of shape {shape}") from None
     if given.shape != shape:
         raise InputError(f"action has shape {given.shape}, expected {shape}; joints {', '.join(JOINTS)}")
     return given
 
 
+def read_options(options: Any, valid: tuple[str, ...] = OPTIONS) -> Mapping[str, Any]:
+    """Return reset options, empty for None.
+
+    Raises:
+        InputError: not a mapping, or an option that is not in ``valid``.
+    """
+    options = _mapping("options", options)
+    for name in options:
+        if name not in valid:
+            raise unknown_name("reset option", str(name), valid)
+    return options
+
+
+def _mapping(name: str, given: Any) -> Mapping[str, Any]:
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise InputError(f"{name} = {given!r}: expected a mapping {{name: value}}")
+    return given
+
+
 def _override(parameters: Parameters, values: Mapping[str, float]) -> None:
     for name, value in values.items():
-        parameters[name] = value
+        parameters[str(name)] = value
     if values:
         parameters.validate()

@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from wlr_gym.envs.core import Core, Mask
@@ -20,7 +21,7 @@ require_package("stable_baselines3", "train")
 from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
 
 
-class Sb3VecEnv(VecEnv):
+class Sb3VecEnv(VecEnv, EzPickle):
     """N robots for Stable-Baselines3, without the loop of ``DummyVecEnv``; bit-identical to it with the same seeds.
 
     An ended episode is followed by the next in the same step. Its info then holds ``terminal_observation``,
@@ -39,6 +40,7 @@ class Sb3VecEnv(VecEnv):
     def __init__(
         self, env_id: str, num_envs: int, *, seed: int | None = None, render_mode: str | None = None, **keywords: Any
     ) -> None:
+        EzPickle.__init__(self, env_id, num_envs, seed=seed, render_mode=render_mode, **keywords)
         check_render_mode(render_mode)
         self.core = Core(task_name_of(env_id), read_settings(keywords), num_envs)
         self.spec = gym.spec(env_id)
@@ -97,17 +99,29 @@ class Sb3VecEnv(VecEnv):
         return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Set an attribute for all robots."""
-        if len(list(self._get_indices(indices))) != self.num_envs:
-            raise InputError(f"'{attr_name}' is shared by all robots: set it without indices")
+        """Set an attribute for all robots.
+
+        Raises:
+            InputError: ``indices`` leaves robots out.
+        """
+        self._require_everyone(attr_name, "set", indices)
         setattr(self, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the batch once; the result stands for every robot asked for."""
+        """Call a method of the batch once; the result stands for every robot.
+
+        Raises:
+            InputError: ``indices`` leaves robots out.
+        """
+        self._require_everyone(method_name, "call", indices)
         result = getattr(self, method_name)(*method_args, **method_kwargs)
-        return [result] * len(list(self._get_indices(indices)))
+        return [result] * self.num_envs
+
+    def _require_everyone(self, name: str, verb: str, indices: int | Iterable[int] | None) -> None:
+        if set(self._get_indices(indices)) != set(range(self.num_envs)):
+            raise InputError(f"'{name}' is shared by all robots: {verb} it without indices")
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: int | Iterable[int] | None = None) -> list[bool]:
         """Return False for every robot: there are no single environments to wrap."""

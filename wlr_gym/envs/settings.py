@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
+from wlr_gym.effects import Patch
 from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.robot import WHEELS, Robot
+from wlr_gym.tasks.randomization import RandomizationConfig
 
 OBSERVATIONS = ("policy", "dict")
+
+#: Keyword -> types it takes, in Python and in words.
+_TYPES: dict[str, tuple[tuple[type, ...], str]] = {
+    "backend": ((str,), "a name"),
+    "robot": ((str, Path, Robot, type(None)), "a name, a path or a Robot"),
+    "randomization": ((str, Path, Mapping, RandomizationConfig, type(None)), "a name, a path or a mapping"),
+    "task": ((str, Path, Mapping, type(None)), "a name, a path or a mapping"),
+    "effects": ((str, Path, list, tuple, Patch, type(None)), "a path or a list of effects"),
+    "episode_length": ((Real, type(None)), "a time above 0 s"),
+    "observation": ((str,), "a name"),
+    "free_wheels": ((Iterable,), "a list of wheels, such as ['wheel_lf']"),
+    "physics_step": ((Real,), "a time above 0 s"),
+    "precision": ((str,), "a name"),
+    "threads": ((Integral,), "a whole number of 1 or more"),
+}
 
 
 class RenderModeError(InputError, TypeError):
@@ -26,6 +44,8 @@ class Settings:
         robot: name in ``configs/robot/``, path of a YAML file, or a :class:`wlr_gym.robot.Robot`; None = the task's.
         randomization: name in ``configs/randomization/`` (none, nominal, wide), path, or mapping; None = the task's.
         task: mapping laid over the task's file (``{"rewards": {"slip": {"weight": -2.0}}}``), or another task file.
+        effects: patch laid over the randomised parameters: path of a YAML file, or a list of effects as mappings
+            (``[{"name": "floor_friction", ...}]``, see :mod:`wlr_gym.effects`); None = no effects.
         episode_length: s until truncation; None = the task's.
         observation: ``policy`` (flat Box) or ``dict`` (``policy`` and ``privileged``, for asymmetric critics).
         free_wheels: wheels whose motors are off (they spin free, their actions are ignored).
@@ -38,6 +58,7 @@ class Settings:
     robot: str | Path | Robot | None = None
     randomization: str | Path | Mapping[str, Any] | None = None
     task: str | Path | Mapping[str, Any] | None = None
+    effects: str | Path | Sequence[Mapping[str, Any]] | Patch | None = None
     episode_length: float | None = None
     observation: str = "policy"
     free_wheels: Sequence[str] = ()
@@ -46,6 +67,10 @@ class Settings:
     threads: int = 1
 
     def __post_init__(self) -> None:
+        for keyword, (types, expected) in _TYPES.items():
+            value = getattr(self, keyword)
+            if isinstance(value, bool) or not isinstance(value, types):
+                raise InputError(f"{keyword} = {value!r}: expected {expected}")
         if self.observation not in OBSERVATIONS:
             raise unknown_name("observation", str(self.observation), OBSERVATIONS, "environment")
         if isinstance(self.free_wheels, str):

@@ -7,16 +7,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.error import ResetNeeded
+from gymnasium.utils import EzPickle
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from wlr_gym.envs.core import Core, Mask
+from wlr_gym.envs.core import OPTIONS, Core, Mask, read_options
 from wlr_gym.envs.settings import check_render_mode, read_settings
 from wlr_gym.errors import InputError, nearest
 
 
-class WlrVectorEnv(VectorEnv[Any, Any, Any]):
+class WlrVectorEnv(VectorEnv[Any, Any, Any], EzPickle):
     """N robots on a task, bit-identical to N single environments with seeds ``seed + i``.
 
     Args:
@@ -38,6 +39,14 @@ class WlrVectorEnv(VectorEnv[Any, Any, Any]):
         render_mode: str | None = None,
         **keywords: Any,
     ) -> None:
+        EzPickle.__init__(
+            self,
+            num_envs,
+            autoreset_mode=autoreset_mode,
+            max_episode_steps=max_episode_steps,
+            render_mode=render_mode,
+            **keywords,
+        )
         check_render_mode(render_mode)
         self.render_mode = render_mode
         self.autoreset_mode = _read_mode(autoreset_mode)
@@ -65,12 +74,13 @@ class WlrVectorEnv(VectorEnv[Any, Any, Any]):
             seed: one number s (robot i gets s + i), or one number or None per robot. None goes on with the present series.
             options: as in the single environment, and ``reset_mask`` (N,) bool: only these robots.
         """
-        mask = _read_mask((options or {}).get("reset_mask"), self.num_envs)
+        given = dict(read_options(options, (*OPTIONS, "reset_mask")))
+        mask = _read_mask(given.pop("reset_mask", None), self.num_envs)
         seeds = _read_seeds(seed, self.num_envs)
         if isinstance(seed, (int, np.integer)):
             super().reset(seed=int(seed))
         seed_robots(self.core, seeds, mask)
-        self.core.begin_episodes(mask, options)
+        self.core.begin_episodes(mask, given)
         self._over = self._over & ~mask
         return self.core.observations(), _masked(self.core.reset_info(), mask)
 

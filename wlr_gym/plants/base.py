@@ -233,6 +233,13 @@ class PlantOptions:
     sensor_noise: bool = True
 
     def __post_init__(self) -> None:
+        for name in ("control_period", "physics_step"):
+            if isinstance(value := getattr(self, name), bool) or not isinstance(value, int | float):
+                raise InputError(f"{name} = {value!r}, expected a number of seconds")
+        if isinstance(self.threads, bool) or not isinstance(self.threads, int):
+            raise InputError(f"threads = {self.threads!r}, expected a whole number")
+        if not isinstance(self.precision, str):
+            raise InputError(f"precision = {self.precision!r}, expected 'float64' or 'float32'")
         if not (0.0 < self.physics_step <= self.control_period):
             raise InputError(f"physics_step {self.physics_step!r} s must be in (0, control_period = {self.control_period!r} s]")
         if abs(self.substeps * self.physics_step - self.control_period) > 1e-9 * self.control_period:
@@ -248,22 +255,39 @@ class PlantOptions:
         return round(self.control_period / self.physics_step)
 
 
-def check_goals(goals: Array, torque_on: NDArray[np.bool_] | None, count: int) -> Array:
-    """Return goals as a float64 (count, 8) matrix in which motors that are off have goal 0.
+def check_goals(goals: Array, count: int) -> Array:
+    """Return goals as a float64 (count, 8) matrix.
 
     Raises:
-        InputError: wrong shape, or a non-finite goal of a motor that is on; names robot and joint.
+        InputError: wrong shape, or a non-finite goal; names robot and joint.
     """
     goals = np.ascontiguousarray(goals, dtype=np.float64)
     if goals.shape != (count, len(JOINTS)):
         raise InputError(f"goals have shape {goals.shape}, expected ({count}, {len(JOINTS)})")
-    if math.isfinite(goals.sum()):
-        return goals
-    bad = ~np.isfinite(goals) if torque_on is None else ~np.isfinite(goals) & np.asarray(torque_on, dtype=bool)
-    if bad.any():
+    if not math.isfinite(goals.sum()) and (bad := ~np.isfinite(goals)).any():
         row, joint = np.argwhere(bad)[0]
         raise InputError(f"goal of {JOINTS[joint]} (robot {row} of the batch) is {goals[row, joint]}, expected a finite number")
-    return np.where(np.isfinite(goals), goals, 0.0)
+    return goals
+
+
+def hold_where_off(goals: Array, torque_on: NDArray[np.bool_], present: Array) -> Array:
+    """Return goals in which a motor that is off is told to stay as it is.
+
+    As on the servo, whose goal returns to the present position (speed 0) when torque is switched on: what was asked of a
+    motor while it was off, NaN included, never acts later.
+
+    Args:
+        goals: (N, 8).
+        torque_on: (N, 8).
+        present: (N, 8) goals that keep each joint as it is: leg readings (rad), zero wheel speeds.
+
+    Raises:
+        InputError: wrong shape.
+    """
+    for name, value in (("goals", goals), ("torque_on", torque_on)):
+        if np.shape(value) != present.shape:
+            raise InputError(f"{name} has shape {np.shape(value)}, expected {present.shape}")
+    return np.where(np.asarray(torque_on, dtype=bool), goals, present)
 
 
 class Plant(Protocol):

@@ -6,7 +6,7 @@ a robot gets the same values alone or in a batch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -107,7 +107,8 @@ def load_randomization(source: str | Path | Mapping[str, Any] | RandomizationCon
     """Load randomisation by config name, path, mapping (same keys as the file) or None (= ``none``).
 
     Raises:
-        InputError: unknown key, parameter or element (with the nearest valid name), missing or impossible number.
+        InputError: unknown key, parameter or element (with the nearest valid name), missing or impossible number, or a range
+            to ``set`` that is not within the parameter's bounds.
     """
     if isinstance(source, RandomizationConfig):
         config = source
@@ -259,6 +260,7 @@ def _entry(name: str, event: EventConfig, robot: Robot, element: str, where: str
     if event.distribution == "choice":
         if not event.values:
             raise InputError(f"{where}: distribution 'choice' needs 'values: [...]'")
+        _refuse_out_of_bounds(event, element, event.values, where)
         return _Entry(first=0.0, second=0.0, values=event.values, **common)
     first, second = ("mean", "sigma") if event.distribution == "normal" else ("low", "high")
     numbers = []
@@ -275,7 +277,18 @@ def _entry(name: str, event: EventConfig, robot: Robot, element: str, where: str
         raise InputError(f"{where}: low = {numbers[0]:g} is above high = {numbers[1]:g}")
     if event.distribution == "loguniform" and numbers[0] <= 0:
         raise InputError(f"{where}: low = {numbers[0]:g}: 'loguniform' needs low > 0")
+    _refuse_out_of_bounds(event, element, numbers[:1] if event.distribution == "normal" else numbers, where)
     return _Entry(first=numbers[0], second=numbers[1], **common)
+
+
+def _refuse_out_of_bounds(event: EventConfig, element: str, values: Sequence[float], where: str) -> None:
+    """Only tails of a ``normal`` may be clipped: a range that clipping would change is not what was asked for."""
+    spec, low, high = spec_of(element), min(values), max(values)
+    if event.operation == "set" and not spec.low <= low <= high <= spec.high:
+        raise InputError(
+            f"{where}: sets {element} in [{low:g}, {high:g}], which is not within its bounds "
+            f"[{spec.low:g}, {spec.high:g}] {spec.unit}"
+        )
 
 
 def _tolerance_entry(event: EventConfig, robot: Robot, element: str, common: dict[str, Any]) -> _Entry:

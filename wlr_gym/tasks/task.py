@@ -258,6 +258,11 @@ def _check_scalars(
                 raise unknown_name(f"parameter of {kind} '{name}'", key, valid, where)
         for key in required - set(values):
             raise InputError(f"{where}: {kind} '{name}' lacks '{key}'")
+        for key, (low, high) in registry[name].ranges.items():
+            if key in values and not low < values[key] < high:
+                raise InputError(
+                    f"{where}: {kind} '{name}': {key} = {values[key]:g}: expected a number above {low:g} and below {high:g}"
+                )
 
 
 def _policy_columns(config: TaskConfig, robot: Robot, name: str) -> list[ObservationColumn]:

@@ -160,9 +160,9 @@ def tick(X, P, goals, old_goals, switch_time, on, TRUTH, RAW, first, last, count
 
 
 {decorator}
-def look(X, P, TRUTH, RAW, count, step):
+def look(X, P, TRUTH, RAW, tiles, count, step):
     W = np.zeros({scratch}, F)
-    for tile in range(X.shape[0]):
+    for tile in tiles:
         W[:{stored}] = X[tile]
         W[{parameters}:{parameters} + {parameter_count}] = P[tile]
         observe(W, step)

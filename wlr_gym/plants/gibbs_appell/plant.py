@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.errors import InputError, nearest
+from wlr_gym.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import (
     SENSOR_LAYOUT,
@@ -19,6 +20,7 @@ from wlr_gym.plants.base import (
     Sensors,
     Truth,
     check_goals,
+    hold_where_off,
     standing_state,
 )
 from wlr_gym.plants.gibbs_appell import kernel, packing
@@ -52,6 +54,8 @@ class GibbsAppellPlant:
     capabilities = Capabilities("gibbs_appell", has_truth=True, can_set_state=True, real_time=False)
 
     def __init__(self, robot: Robot, count: int = 1, options: PlantOptions | None = None, *, sweeps: int = SWEEPS) -> None:
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+            raise InputError(f"number of robots is {count!r}, expected 1 or more")
         self.robot = robot
         self.options = options or PlantOptions()
         self.sweeps = sweeps
@@ -103,29 +107,36 @@ class GibbsAppellPlant:
         state: PlantState | None = None,
     ) -> Sensors:
         """Start robots anew; see :meth:`wlr_gym.plants.base.Plant.reset`."""
-        rows = np.arange(self._count) if mask is None else np.flatnonzero(mask)
+        rows = self._rows(mask)
         if parameters is not None:
             self._take_parameters(parameters, rows)
         start = standing_state(self.robot, self.parameters) if state is None else state
         self._write_state(start, rows)
         self._goals.reset(rows, start, self.parameters)
-        self._kernel.look(self._lanes, self._constants, self._truth.values, self._raw, self._count, self._step)
+        tiles = np.unique(rows // self._width)
+        self._kernel.look(self._lanes, self._constants, self._truth.values, self._raw, tiles, self._count, self._step)
         self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)
         return self._readings
 
     def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
         """Change parameters in mid-run (interval randomisation, drifting friction); the state stays."""
-        rows = np.arange(self._count) if mask is None else np.flatnonzero(mask)
+        rows = self._rows(mask)
         self._take_parameters(parameters, rows)
         self._goals.set_delays(rows, self.parameters)
         self._sensors.set_errors(rows, self.parameters)
+
+    def _rows(self, mask: NDArray[np.bool_] | None) -> NDArray[np.intp]:
+        if mask is None:
+            return np.arange(self._count)
+        if np.shape(mask) != (self._count,):
+            raise InputError(f"mask has shape {np.shape(mask)}, expected ({self._count},)")
+        return np.flatnonzero(mask)
 
     def _take_parameters(self, parameters: Parameters, rows: NDArray[np.intp]) -> None:
         if len(parameters) != self._count:
             raise InputError(f"parameters hold {len(parameters)} robots, the plant {self._count}")
         chosen = Parameters(parameters.values[rows])
         chosen.validate()
-        self.parameters = self.parameters.copy()
         self.parameters.values[rows] = chosen.values
         step = self.options.physics_step
         check_contact_resolution(chosen, step)
@@ -172,7 +183,11 @@ class GibbsAppellPlant:
         for pattern, (columns, labels) in groups.items():
             for k, label in enumerate(labels):
                 values[:, _LANE[pattern.format(label)]] = columns[:, k]
-        values[:, _LANE["acceleration_z"]] = self.parameters["gravity"][rows]
+        if not np.isfinite(values).all():
+            raise InputError("state holds numbers that are not finite")
+        still = -np.einsum("nji,nj->ni", rotation_matrix(state.quaternion[rows]), gravity_in_floor(self.parameters)[rows])
+        for k, axis in enumerate("xyz"):
+            values[:, _LANE[f"acceleration_{axis}"]] = still[:, k]
         _scatter(self._lanes, self._width, rows, values)
         self._pad(self._lanes)
 
@@ -204,11 +219,12 @@ class GibbsAppellPlant:
         Raises:
             InputError: wrong shape or a non-finite goal of a motor that is on.
         """
-        goals = check_goals(goals, torque_on, self._count)
         if torque_on is None:
             self._torque_on.fill(1.0)
         else:
-            self._torque_on[...] = torque_on
+            goals = hold_where_off(goals, torque_on, self._present_goals())
+            self._torque_on[...] = np.asarray(torque_on, dtype=bool)
+        goals = check_goals(goals, self._count)
         new, old, switch_time = self._goals.push(goals)
         arguments = (self._lanes, self._constants, new, old, switch_time, self._torque_on, self._truth.values, self._raw)
         if self._pool is None:
@@ -219,6 +235,12 @@ class GibbsAppellPlant:
             for future in waiting:
                 future.result()
         return self._readings
+
+    def _present_goals(self) -> Array:
+        """Goals that keep every joint as it is: leg angles as the servo reads them, wheels at rest."""
+        present = np.zeros((self._count, 8))
+        present[:, :4] = self._truth.joint_position[:, :4] + self.parameters["joint.zero_offset"]
+        return present
 
     def _run(self, arguments: tuple[Array, ...], first: int, last: int) -> None:
         self._kernel.tick(*arguments, first, last, self._count, self._step, self.substeps, self.sweeps)

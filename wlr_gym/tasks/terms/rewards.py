@@ -5,10 +5,12 @@ A task gives every term a weight per second (negative for costs), so returns do 
 
 from __future__ import annotations
 
+import math
+
 from wlr_gym.codegen import ops
 from wlr_gym.robot import CORNER_SIGNS
 from wlr_gym.tasks.signals import Signals, Value, mean, norm
-from wlr_gym.tasks.terms.scalar import ScalarTerm, registered
+from wlr_gym.tasks.terms.scalar import POSITIVE, ScalarTerm, registered
 
 REWARDS: dict[str, ScalarTerm] = {}
 
@@ -18,19 +20,19 @@ def _kernel(error: Value, width: Value) -> Value:
     return ops.exp(-(ratio * ratio))
 
 
-@registered(REWARDS)
+@registered(REWARDS, width=POSITIVE)
 def track_linear_velocity(signals: Signals, *, width: Value = 0.1) -> Value:
     """exp(-(error / width)^2) of the body's forward velocity; width in m/s."""
     return _kernel(signals.command("linear_velocity_x") - signals.truth("linear_velocity_in_body")[0], width)
 
 
-@registered(REWARDS)
+@registered(REWARDS, width=POSITIVE)
 def track_yaw_rate(signals: Signals, *, width: Value = 0.3) -> Value:
     """exp(-(error / width)^2) of the body's yaw rate; width in rad/s."""
     return _kernel(signals.command("yaw_rate") - signals.truth("angular_velocity_in_body")[2], width)
 
 
-@registered(REWARDS)
+@registered(REWARDS, linear=POSITIVE, angular=POSITIVE)
 def other_motion(signals: Signals, *, linear: Value = 0.1, angular: Value = 0.5) -> Value:
     """Squared sideways and vertical velocity over ``linear`` (m/s) and roll and pitch rate over ``angular`` (rad/s)."""
     _, lateral, vertical = signals.truth("linear_velocity_in_body")
@@ -45,7 +47,7 @@ def action_rate(signals: Signals) -> Value:
     return mean([change * change for change in changes])
 
 
-@registered(REWARDS)
+@registered(REWARDS, scale=POSITIVE)
 def leg_posture(signals: Signals, *, scale: Value = 0.5) -> Value:
     """Mean squared leg angle from home over ``scale`` (rad)."""
     home = signals.robot("home.leg_angle")
@@ -53,7 +55,7 @@ def leg_posture(signals: Signals, *, scale: Value = 0.5) -> Value:
     return mean([offset * offset for offset in offsets])
 
 
-@registered(REWARDS)
+@registered(REWARDS, power=POSITIVE)
 def energy(signals: Signals, *, power: Value = 10.0) -> Value:
     """Electrical power drawn from the supply over ``power`` (W); braking earns nothing."""
     return ops.maximum(signals.truth("electrical_energy")[0], 0.0) / (signals.control_period * power)
@@ -75,7 +77,7 @@ def skid_turn_slip(signals: Signals) -> list[tuple[Value, Value]]:
     return needed
 
 
-@registered(REWARDS)
+@registered(REWARDS, speed=POSITIVE)
 def slip(signals: Signals, *, speed: Value = 0.05) -> Value:
     """Mean wheel slip speed beyond what turning on skids needs, over ``speed`` (m/s); rolling costs nothing.
 
@@ -95,7 +97,7 @@ def _beyond(value: Value, free: Value) -> Value:
     return ops.maximum(ops.absolute(value) - free, 0.0)
 
 
-@registered(REWARDS)
+@registered(REWARDS, threshold=(-math.inf, 1.0))
 def torque_saturation(signals: Signals, *, threshold: Value = 0.8) -> Value:
     """Mean motor torque beyond ``threshold`` of its stall torque, over the rest up to stall."""
     stall = [signals.robot("servo.leg.stall_torque")] * 4 + [signals.robot("servo.wheel.stall_torque")] * 4

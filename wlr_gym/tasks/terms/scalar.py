@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 Function = Callable[..., Any]
+
+POSITIVE = (0.0, math.inf)
 
 
 @dataclass(frozen=True)
@@ -18,17 +21,19 @@ class ScalarTerm:
         name: as in the task's YAML.
         function: ``function(signals, **parameters)``, written with ``wlr_gym.codegen.ops``.
         parameters: names and default values of its parameters.
+        ranges: name -> (low, high) that the parameter must lie between, both excluded.
         doc: first line of its docstring.
     """
 
     name: str
     function: Function
     parameters: dict[str, float]
+    ranges: dict[str, tuple[float, float]]
     doc: str
 
 
-def registered(registry: dict[str, ScalarTerm]) -> Callable[[Function], Function]:
-    """Return a decorator that enters a function into ``registry`` under its own name."""
+def registered(registry: dict[str, ScalarTerm], **ranges: tuple[float, float]) -> Callable[[Function], Function]:
+    """Return a decorator that enters a function into ``registry`` under its own name, with ranges of its parameters."""
 
     def enter(function: Function) -> Function:
         defaults = {
@@ -37,7 +42,7 @@ def registered(registry: dict[str, ScalarTerm]) -> Callable[[Function], Function
             if parameter.kind is inspect.Parameter.KEYWORD_ONLY
         }
         doc = (inspect.getdoc(function) or "").partition("\n")[0]
-        registry[function.__name__] = ScalarTerm(function.__name__, function, defaults, doc)
+        registry[function.__name__] = ScalarTerm(function.__name__, function, defaults, ranges, doc)
         return function
 
     return enter
