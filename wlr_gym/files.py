@@ -9,6 +9,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from wlr_gym.errors import InputError
+
+
+def make_output_folder(path: Path, option: str = "--out") -> None:
+    """Make a folder for results, if it is not there.
+
+    Raises:
+        InputError: it cannot be made, or not be written to; the message names the command's ``option``.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{option} {path}: cannot be a folder: {error.strerror}") from None
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"{option} {path}: cannot be written to")
+
 
 def replace_file(path: Path, write: Callable[[Path], object]) -> None:
     """Let ``write`` fill a temporary file in the folder of ``path``, then move it there in one step."""

@@ -472,3 +472,58 @@ def test_unseeded_environments_differ_and_tell_their_seed(fake):
     assert not np.array_equal(observation, two.reset()[0])
     again = make()
     assert np.array_equal(again.reset(seed=one.np_random_seed)[0], observation)
+
+
+# ---- effects ----
+
+PUSH = {
+    "events": {
+        "push": {
+            "parameters": ["external_force[x]"],
+            "distribution": "uniform",
+            "operation": "set",
+            "low": 1.0,
+            "high": 2.0,
+            "when": "interval",
+            "interval": [0.04, 0.1],
+        },
+    }
+}
+EFFECTS = [
+    {"name": "external_force", "where": ["body"], "parameters": {"fx": 10.0}},
+    {"name": "friction_level", "parameters": {"mu": 0.4}},
+]
+
+
+def test_effects_come_after_randomization_and_before_the_users_parameters(fake):
+    plain, patched = make_vec(3, randomization=PUSH), make_vec(3, randomization=PUSH, effects=EFFECTS)
+    for env in (plain, patched):
+        env.reset(seed=0, options={"parameters": {"ground.mu_y": 0.3}})
+    before = patched.core.parameters["external_force[x]"].copy()
+    for _ in range(10):
+        for env in (plain, patched):
+            env.step(np.zeros((3, 8)))
+        force = plain.core.parameters["external_force[x]"]
+        assert np.array_equal(patched.core.parameters["external_force[x]"], force + 10.0)
+        assert np.all(patched.core.parameters["ground.mu_x"] == 0.4)
+        assert np.all(patched.core.parameters["ground.mu_y"] == 0.3)
+    assert not np.array_equal(before, patched.core.parameters["external_force[x]"])
+    changed = np.flatnonzero((plain.core.parameters.values != patched.core.parameters.values).any(axis=0))
+    assert len(changed) == 5
+    assert patched.contract() == plain.contract()
+
+
+def test_effects_file_and_masked_reset(fake, tmp_path):
+    path = tmp_path / "patch.yaml"
+    path.write_text("effects: [{name: payload, parameters: {mass: 0.5, x: 0.0, y: 0.0, z: 0.05}}]")
+    env, nominal = make_vec(2, effects=str(path), randomization="none"), make_vec(2, randomization="none")
+    env.reset(seed=0)
+    env.reset(options={"reset_mask": np.array([True, False])})
+    assert env.core.parameters["payload.mass"].tolist() == [0.5, 0.5]
+    nominal.reset(seed=0)
+    assert nominal.core.parameters["payload.mass"].tolist() == [0.0, 0.0]
+
+
+def test_effects_beyond_the_bounds_are_refused_when_made(fake):
+    with pytest.raises(InputError, match=r"effect 2 \(floor_slope\)"):
+        make(effects=[{"name": "floor_slope", "where": "ground", "parameters": {"pitch": 1.2}}] * 2)

@@ -75,6 +75,13 @@ def test_spec_and_pickle_round_trips(fake):
         assert copy.unwrapped.core.limit == 50
 
 
+def test_a_vector_environment_is_pickled_by_its_arguments(fake):
+    env = make_vec(3, autoreset_mode="SameStep", max_episode_steps=5, randomization="wide")
+    copy = pickle.loads(pickle.dumps(env))
+    assert (copy.num_envs, copy.autoreset_mode, copy.core.limit) == (3, AutoresetMode.SAME_STEP, 5)
+    assert np.array_equal(copy.reset(seed=4)[0], env.reset(seed=4)[0])
+
+
 def test_class_documentation_is_made_from_the_data(fake):
     from wlr_gym.envs.velocity import VelocityEnv, VelocityVectorEnv
 
@@ -116,11 +123,57 @@ def test_contract_names_the_task_robot_and_randomization(fake):
         ({"free_wheels": "wheel_lf"}, "expected a list"),
         ({"episode_length": -1.0}, "above 0 s"),
         ({"physics_step": 0.003}, "does not divide"),
+        ({"episode_length": "20"}, "episode_length = '20': expected a time"),
+        ({"physics_step": "a"}, "physics_step = 'a': expected a time"),
+        ({"robot": 3}, "robot = 3: expected a name, a path or a Robot"),
+        ({"threads": 1.5}, "threads = 1.5: expected a whole number"),
+        ({"threads": True}, "threads = True: expected a whole number"),
+        ({"backend": None}, "backend = None: expected a name"),
+        ({"randomization": 3}, "randomization = 3: expected a name, a path or a mapping"),
+        ({"effects": 3}, "effects = 3: expected a path or a list"),
+        ({"effects": [{"name": "paylod"}]}, "did you mean 'payload'"),
+        ({"effects": [{"name": "payload", "parameters": {"mass": "heavy"}}]}, "mass = 'heavy'"),
+        ({"task": {"rewards": {"track_yaw_rate": {"width": 0}}}}, "width = 0: expected a number above 0"),
+        ({"task": {"rewards": {"torque_saturation": {"weight": -1.0, "threshold": 1}}}}, "threshold = 1: .* below 1"),
     ],
 )
 def test_bad_keywords_name_the_nearest_valid_one(fake, make, keywords, expected):
     with pytest.raises(InputError, match=expected):
         make(ID, **keywords)
+
+
+@pytest.mark.parametrize("make", [make, lambda: make_vec(2)])
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (3, "options = 3: expected a mapping"),
+        ({"command": 3}, "command = 3: expected a mapping"),
+        ({"command": {"yaw_rate": "fast"}}, "command yaw_rate = 'fast': expected a finite number"),
+        ({"command": {"yaw_rate": [0.1, 0.2]}}, "expected a finite number"),
+        ({"command": {"yaw_rate": np.nan}}, "expected a finite number"),
+        ({"parameters": 3}, "parameters = 3: expected a mapping"),
+        ({"parameters": {3: 1.0}}, "unknown parameter '3'"),
+        ({"comand": {}}, "did you mean 'command'"),
+    ],
+)
+def test_bad_reset_options(fake, make, options, expected):
+    with pytest.raises(InputError, match=expected):
+        make().reset(seed=0, options=options)
+
+
+def test_only_a_batch_knows_reset_mask(fake):
+    with pytest.raises(InputError, match="unknown reset option 'reset_mask'; valid: command, parameters$"):
+        make().reset(seed=0, options={"reset_mask": np.array([True])})
+    with pytest.raises(InputError, match="did you mean 'reset_mask'"):
+        make_vec(2).reset(seed=0, options={"rest_mask": np.ones(2, bool)})
+
+
+@pytest.mark.parametrize("actions", [np.zeros(8, complex), [1j] * 8])
+def test_complex_actions_are_refused(fake, actions):
+    env = make()
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="expected real numbers"):
+        env.step(actions)
 
 
 def test_unknown_backend():

@@ -1,5 +1,6 @@
 """The Stable-Baselines3 face."""
 
+import pickle
 import warnings
 from typing import Any
 
@@ -97,14 +98,25 @@ def test_options_attributes_and_methods(fake):
     assert env.core.command[1].tolist() == [0.05, 0.1]
     assert env.core.parameters["ground.mu_x"][:, 0].tolist() == [0.6, 0.6, 0.2]
     assert env.get_attr("render_mode", [0, 2]) == [None, None]
-    assert env.env_method("contract", indices=1)[0]["task"] == "velocity"
+    assert [contract["task"] for contract in env.env_method("contract", indices=[2, 0, 1])] == ["velocity"] * 3
     env.env_method("set_command", linear_velocity_x=0.02)
     assert env.core.command[:, 0].tolist() == [0.02] * 3
     assert env.has_attr("core")
     assert not env.has_attr("no_such_thing")
     with pytest.raises(InputError, match="without indices"):
         env.set_attr("anything", 1, indices=[0])
+    for indices in (0, [0], [0, 0, 0]):
+        with pytest.raises(InputError, match="'set_command' is shared by all robots: call it without indices"):
+            env.env_method("set_command", linear_velocity_x=0.07, indices=indices)
+    assert env.core.command[:, 0].tolist() == [0.02] * 3
     env.close()
+
+
+def test_pickle_builds_a_fresh_environment(fake):
+    env = Sb3VecEnv(ID, 3, seed=5, effects=[{"name": "friction_level", "parameters": {"mu": 0.4}}], **SHORT)
+    copy = pickle.loads(pickle.dumps(env))
+    same(copy.reset(), env.reset())
+    assert np.array_equal(copy.core.parameters.values, env.core.parameters.values)
 
 
 def test_bad_input(fake):

@@ -176,6 +176,31 @@ def test_bad_events_are_refused(robot, event, expected):
         load_randomization({"events": {"mass": {k: v for k, v in event.items() if v is not None}}}, robot)
 
 
+FRICTION = {"parameters": ["ground.mu_x"], "distribution": "uniform", "operation": "set", "low": 10.0, "high": 20.0}
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        FRICTION,
+        {**FRICTION, "low": 0.5},
+        {**FRICTION, "low": -1.0, "high": 0.5},
+        {**FRICTION, "distribution": "loguniform"},
+        {**FRICTION, "distribution": "choice", "values": [0.5, 20.0]},
+        {**FRICTION, "distribution": "normal", "mean": 20.0, "sigma": 1.0},
+    ],
+)
+def test_a_range_to_set_lies_within_the_bounds(robot, event):
+    with pytest.raises(InputError, match=r"event 'floor': sets ground.mu_x\[wheel_lf\] in \[.*bounds \[0, 5\]"):
+        load_randomization({"events": {"floor": event}}, robot)
+
+
+def test_the_tail_of_a_normal_is_clipped_at_the_bounds(robot):
+    tail = {**FRICTION, "distribution": "normal", "mean": 0.2, "sigma": 0.2}
+    friction = draw(robot, floor=tail)["ground.mu_x"]
+    assert friction.min() == 0.0
+
+
 def test_two_events_may_not_set_the_same_element(robot):
     with pytest.raises(InputError, match="'a' and 'b' both set body"):
         load_randomization({"events": {"a": MASS, "b": MASS}}, robot)

@@ -45,7 +45,7 @@ class Settings:
         randomization: name in ``configs/randomization/`` (none, nominal, wide), path, or mapping; None = the task's.
         task: mapping laid over the task's file (``{"rewards": {"slip": {"weight": -2.0}}}``), or another task file.
         effects: patch laid over the randomised parameters: path of a YAML file, or a list of effects as mappings
-            (``[{"name": "floor_friction", ...}]``, see :mod:`wlr_gym.effects`); None = no effects.
+            (``[{"name": "friction_level", "parameters": {"mu": 0.4}}]``, see :mod:`wlr_gym.effects`); None = no effects.
         episode_length: s until truncation; None = the task's.
         observation: ``policy`` (flat Box) or ``dict`` (``policy`` and ``privileged``, for asymmetric critics).
         free_wheels: wheels whose motors are off (they spin free, their actions are ignored).

@@ -25,7 +25,7 @@ from wlr_gym.parameters import Parameters
 from wlr_gym.paths import data_directory
 from wlr_gym.plants import make_plant
 from wlr_gym.plants.base import Plant, PlantOptions, PlantState, Sensors, Truth
-from wlr_gym.robot import Robot, load_robot, read_yaml
+from wlr_gym.robot import JOINTS, Robot, load_robot, read_yaml
 from wlr_gym.runs.anchor import euler_angles, measured_state, rotation, start_state, starts_at_rest
 from wlr_gym.runs.format import ANGLES_OF_THE_BODY, CHANNELS, COLUMNS, COMMANDS, META_FILE, Profile
 from wlr_gym.runs.noise import channel_noise
@@ -237,14 +237,32 @@ def _goals(run: Run, parameters: Parameters, begin: Array, ticks: int, clock: fl
     Goals are delayed, switching the torque is not: as in :class:`wlr_gym.plants.goals.GoalHistory`.
     """
     commands = np.stack([run[name] for name in COMMANDS], axis=1)
+    written = held_goals(run)
     now = begin + clock * (np.arange(ticks)[:, None] + 0.5)  # nearest tick, on average neither early nor late
 
     def row(time: Array) -> NDArray[np.intp]:
         return np.maximum(np.searchsorted(run["t"], time, side="right") - 1, 0)
 
     torque_on = np.isfinite(commands[row(now)])
-    goals = np.stack([commands[row(now - parameters["command.delay"][:, j]), j] for j in range(8)], axis=2)
-    return np.nan_to_num(goals, nan=0.0), torque_on
+    goals = np.stack([written[row(now - parameters["command.delay"][:, j]), j] for j in range(8)], axis=2)
+    return goals, torque_on
+
+
+def held_goals(run: Run) -> Array:
+    """Goals (rows, 8) that the servos hold: a motor that is off gets no new goal, so it keeps the one before.
+
+    Before its first goal a joint has the first one; a joint without any stays: a leg at its first measured angle, a wheel at
+    speed 0.
+    """
+    import pandas
+
+    commands = pandas.DataFrame({name: run[name] for name in COMMANDS}).ffill().bfill().to_numpy()
+    measured = np.stack([run[f"pos_{joint}"] for joint in JOINTS], axis=1)
+    stay = np.zeros(8)
+    for joint in np.flatnonzero(np.isnan(commands).all(axis=0)[:4]):
+        angles = measured[np.isfinite(measured[:, joint]), joint]
+        stay[joint] = angles[0] if angles.size else 0.0
+    return np.where(np.isnan(commands), stay, commands)
 
 
 def _readings(sensors: Sensors, truth: Truth, wheel_shift: Array, marker_offset: Array) -> Array:
