@@ -162,7 +162,7 @@ def test_bad_reset_options(fake, make, options, expected):
 
 
 def test_only_a_batch_knows_reset_mask(fake):
-    with pytest.raises(InputError, match="unknown reset option 'reset_mask'; valid: command, parameters$"):
+    with pytest.raises(InputError, match=r"unknown reset option 'reset_mask'; valid: command, parameters$"):
         make().reset(seed=0, options={"reset_mask": np.array([True])})
     with pytest.raises(InputError, match="did you mean 'reset_mask'"):
         make_vec(2).reset(seed=0, options={"rest_mask": np.ones(2, bool)})
