@@ -86,6 +86,8 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv) -> Path:
     start = checkpoint.newest(folder / "checkpoints") if training.resume else None
     if start is not None:
         checkpoint.restore(start, model)
+    elif training.resume:
+        print(f"{folder}: no checkpoint yet; training starts from the beginning", flush=True)
     begin_episodes(model, env, config.seed)
     curve = LearningCurve(folder / "learning_curve.csv", model.num_timesteps)
     meter = Meter(env.core, folder / "failure.npz")

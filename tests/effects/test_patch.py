@@ -160,3 +160,16 @@ def test_effects_the_parameters_cannot_take_are_refused(effects, words):
 def test_missing_patch_file():
     with pytest.raises(InputError, match=r"nowhere\.yaml"):
         load_patch("nowhere.yaml")
+
+
+def test_the_order_in_the_patch_does_not_matter(tmp_path):
+    effects = [
+        {"name": "friction_anisotropy", "parameters": {"ratio": 0.5}},
+        {"name": "friction_asymmetry", "where": ["wheel_lf"], "parameters": {"mu": 0.2}},
+        {"name": "friction_level", "parameters": {"mu": 0.8}},
+    ]
+    there, back = patched(*effects), patched(*reversed(effects))
+    np.testing.assert_array_equal(there.values, back.values)
+    np.testing.assert_allclose(there["ground.mu_y"][0], [0.1, 0.4, 0.4, 0.4])
+    patch = load_patch(effects)
+    assert load_patch(save_patch(patch, tmp_path / "patch.yaml")).effects == patch.effects

@@ -325,21 +325,14 @@ def test_accelerometer_starts_with_the_specific_force_of_standing_still():
     assert plant.reset().accelerometer[0] == pytest.approx(9.81 * up, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"mask": np.ones(3, bool)}, "mask has shape"),
-        ({"state": "broken"}, "not finite"),
-    ],
-)
-def test_bad_resets_are_refused(arguments, message):
+def test_bad_resets_are_refused():
     plant = make(2)
-    if arguments.get("state") == "broken":
-        state = plant.get_state()
-        state.position[0, 0] = np.nan
-        arguments = {"state": state}
-    with pytest.raises(InputError, match=message):
-        plant.reset(**arguments)
+    with pytest.raises(InputError, match="mask has shape"):
+        plant.reset(mask=np.ones(3, bool))
+    state = plant.get_state()
+    state.position[0, 0] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        plant.reset(state=state)
 
 
 @pytest.mark.parametrize("options", [{"threads": 1.5}, {"physics_step": "a"}, {"precision": 64}])

@@ -22,7 +22,7 @@ from wlr_gym.runs import Profile, Run, RunMeta, read_dataset, read_run
 from wlr_gym.runs.anchor import euler_angles, local_fit, quaternion, rest_pose, rotation
 from wlr_gym.runs.format import CHANNELS
 from wlr_gym.runs.noise import channel_noise
-from wlr_gym.runs.replay import ReplayResult, profile_parameters, replay, robot_of
+from wlr_gym.runs.replay import ReplayResult, held_goals, profile_parameters, replay, robot_of
 
 DATA = Path(__file__).parent / "data"
 TWIN = Path(__file__).parents[3] / "shared" / "data" / "twin_dev"
@@ -232,6 +232,29 @@ def test_the_robot_is_the_one_the_meta_data_name(tmp_path):
         robot_of(with_robot("wlr-nominall"))
 
 
+def test_legs_that_were_off_do_not_jump_when_torque_is_back():
+    run = simulated_run([DELAY], [10], seconds=3.0)
+    off = (run["t"] > 1.0) & (run["t"] < 1.3)
+    run.table.loc[off, [f"cmd_{joint}" for joint in JOINTS[:4]]] = np.nan
+    held = held_goals(run)
+    assert np.isfinite(held).all()
+    assert (held[off, :4] > 1.0).all()  # not 0
+    result = replay(run, effects=[DELAY])
+    assert min(result.full[f"pos_{joint}"][run["t"] < 1.32].min() for joint in JOINTS[:4]) > 0.2
+    back = (run["t"] > 1.3) & (run["t"] < 1.4)
+    assert min(np.diff(result.full[f"pos_{joint}"][back]).min() for joint in JOINTS[:4]) > -0.03
+
+
+def test_a_joint_without_goals_stays():
+    run = simulated_run([], [10], seconds=1.0)
+    run.table.loc[:, ["cmd_leg_lf", "cmd_wheel_lf"]] = np.nan
+    run.table.loc[:5, "cmd_leg_rf"] = np.nan
+    held = held_goals(run)
+    assert (held[:, JOINTS.index("leg_lf")] == run["pos_leg_lf"][0]).all()
+    assert (held[:, JOINTS.index("wheel_lf")] == 0.0).all()
+    assert (held[:6, JOINTS.index("leg_rf")] == run["cmd_leg_rf"][6]).all()
+
+
 # --- building blocks --------------------------------------------------------------------------------------------------
 
 
@@ -320,6 +343,12 @@ def test_command_answers_bad_input_with_exit_code_2(tmp_path, capsys, arguments,
     message = capsys.readouterr().err.replace("\n", " ")
     for word in words:
         assert word in message
+
+
+@pytest.mark.parametrize("arguments", [["--segment", "0.05"], ["--segment", "20"], ["--robot", "nominall"]])
+def test_a_refused_replay_leaves_no_folder(tmp_path, arguments):
+    assert cli.main(["replay", str(DATA), *arguments, "--out", str(tmp_path / "out")]) == 2
+    assert not (tmp_path / "out").exists()
 
 
 def test_fixture_is_a_data_set():

@@ -15,6 +15,7 @@ from wlr_gym.cli import OK
 from wlr_gym.cli.evaluate import play, print_cards
 from wlr_gym.errors import InputError, require_package
 from wlr_gym.evaluation import Rollout, read_curve, score, write_card
+from wlr_gym.files import make_output_folder
 from wlr_gym.policy import Training, load_agent, load_agent_config
 from wlr_gym.provenance import PROVENANCE_FILE, record_provenance
 
@@ -45,6 +46,7 @@ def run(options: Options) -> int:
     """Train, evaluate, draw, and name the files."""
     require_package("torch", "train")
     require_package("stable_baselines3", "train")
+    make_output_folder(options.out)
     began = time.monotonic()
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"[bold]1/3 train[/] PPO on {ENVIRONMENT}: follow commands of forward velocity and yaw rate")

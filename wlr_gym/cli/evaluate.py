@@ -13,7 +13,9 @@ from rich.progress import Progress
 from rich.table import Table
 
 from wlr_gym.cli import OK
+from wlr_gym.errors import InputError
 from wlr_gym.evaluation import Card, Rollout, make_core, roll_out, rows, score, write_card
+from wlr_gym.files import make_output_folder
 from wlr_gym.policy import make_policy
 from wlr_gym.provenance import record_provenance
 
@@ -42,6 +44,10 @@ class Options:
 
 def run(options: Options) -> int:
     """Play, print the card, write it."""
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: expected 0 or more")
+    if options.out is not None:
+        make_output_folder(options.out)
     keywords = {"randomization": options.randomization, "robot": options.robot}
     subjects = list(dict.fromkeys([options.policy, *options.baselines]))
     rollouts = play(options.env, subjects, options.episodes, options.seed, keywords, options.progress)

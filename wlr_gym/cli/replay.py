@@ -57,16 +57,19 @@ def run(options: Options) -> int:
     from rich.console import Console
 
     from wlr_gym.effects import load_patch
-    from wlr_gym.files import write_json
+    from wlr_gym.files import make_output_folder, write_json
     from wlr_gym.plants import check_backend
     from wlr_gym.provenance import record_provenance
     from wlr_gym.runs.plot import save_plots
+    from wlr_gym.runs.replay import prepare
 
     console = Console()
     check_backend(options.backend)
     runs = _read(options.runs)
     patch = load_patch(options.effects)
-    _make_folder(options.out)
+    for measured in runs:  # a refusal leaves no folder behind
+        prepare(measured, options.robot, effects=patch, segment=options.segment)
+    make_output_folder(options.out)
     results = []
     for result in _replay_all(options, runs, patch, console):
         results.append(result)
@@ -83,14 +86,9 @@ def run(options: Options) -> int:
 def _read(path: Path) -> Sequence[Run]:
     from wlr_gym.runs import read_dataset, read_run
 
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; expected a run (CSV or Parquet) or a folder of runs")
     return read_dataset(path).runs if path.is_dir() else [read_run(path)]
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {path}: cannot be a folder: {error.strerror}") from None
 
 
 def _replay_all(options: Options, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:

@@ -10,6 +10,7 @@ import tyro
 from wlr_gym.cli import OK
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.errors import InputError
+from wlr_gym.files import make_output_folder
 from wlr_gym.policy import Training, load_agent_config
 from wlr_gym.policy.agents import agent_function
 from wlr_gym.provenance import CONFIG_FILE
@@ -40,6 +41,8 @@ class Options:
 
 def run(options: Options) -> int:
     """Train and print where the policy is."""
+    if options.max_minutes is not None and not options.max_minutes > 0:
+        raise InputError(f"--max-minutes {options.max_minutes:g}: expected more than 0")
     agent, training = _resumed(options) if options.resume is not None else _new(options)
     train = agent_function(agent, "train")
     policy = train(training)
@@ -53,8 +56,9 @@ def _new(options: Options) -> tuple[str, Training]:
     if options.seed is not None:
         config["seed"] = options.seed
     folder = options.out or Path("runs_out") / f"{options.env.rpartition(':')[2]}_{options.agent}_{config.get('seed', 0)}"
-    if folder.exists() and any(folder.iterdir()):
+    if folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: not empty; give another --out, or go on with what is there: wlr train --resume {folder}")
+    make_output_folder(folder)
     return options.agent, _training(options, options.env, folder, config, resume=False)
 
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import yaml
 
-from wlr_gym.effects.registry import BEYOND_PARAMETERS, EFFECTS, Effect, EffectParameter
+from wlr_gym.effects.registry import BEYOND_PARAMETERS, EFFECTS, Effect, EffectParameter, stage
 from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.files import replace_file
 from wlr_gym.parameters import Parameters
@@ -81,13 +81,15 @@ def save_patch(patch: Patch, path: str | Path) -> Path:
 
 
 def apply_patch(patch: Patch, parameters: Parameters) -> Parameters:
-    """Return ``parameters`` with every effect added, in the order of the patch.
+    """Return ``parameters`` with every effect added; the order in the patch does not matter.
+
+    Levels come first, then ratios and scales, then additions (:data:`wlr_gym.effects.registry.STAGES`).
 
     Raises:
         InputError: an effect that these parameters cannot take, or a result outside the bounds of the table.
     """
     patched = parameters.copy()
-    for index, effect in enumerate(patch.effects):
+    for index, effect in sorted(enumerate(patch.effects), key=lambda entry: stage(entry[1].name)):
         try:
             EFFECTS[effect.name].apply(patched, effect.where, effect.parameters)
             patched.validate()
@@ -116,7 +118,9 @@ def _parse_effect(entry: Any, source: str, index: int) -> PatchEffect:
     name = entry["name"]
     place = _place(source, index, name)
     if name in BEYOND_PARAMETERS:
-        raise InputError(f"{place}: takes more than a value of the parameter table; available: {', '.join(sorted(EFFECTS))}")
+        raise InputError(
+            f"{place}: not in this version (it takes more than a value of the parameter table); available: {', '.join(sorted(EFFECTS))}"
+        )
     if name not in EFFECTS:
         raise unknown_name("effect", name, EFFECTS, f"{source}: effect {index + 1}")
     effect = EFFECTS[name]

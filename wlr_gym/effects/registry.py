@@ -231,3 +231,11 @@ BEYOND_PARAMETERS = (
     "imu_misalignment",
     "unknown_effect",
 )
+
+#: What is applied first: levels of the whole floor, then of single wheels, then ratios and scales. All others add, last.
+STAGES = (("friction_level",), ("friction_asymmetry",), ("friction_anisotropy", "wheel_radius_error"))
+
+
+def stage(name: str) -> int:
+    """Return the place of an effect in the order of application."""
+    return next((place for place, names in enumerate(STAGES) if name in names), len(STAGES))

@@ -143,14 +143,8 @@ def replay(
     Raises:
         InputError: unknown backend, robot or effect, a segment shorter than its lead, a run shorter than half a segment.
     """
-    if not segment > LEAD:
-        raise InputError(f"segment = {segment:g} s: expected more than {LEAD:g} s")
-    robot = robot_of(run, robot)
-    parameters = Parameters.nominal(robot) if parameters is None else parameters
-    parameters = apply_patch(load_patch(effects), profile_parameters(parameters, run.meta.profile))
+    robot, parameters = prepare(run, robot, parameters, effects, segment)
     t = run["t"]
-    if t[-1] - t[0] < 0.5 * segment:
-        raise InputError(f"{run.path}: {t[-1] - t[0]:.2f} s long: too short for segments of {segment:g} s")
     starts = _segment_starts(t, segment)
     options = PlantOptions(control_period=clock, physics_step=physics_step, sensor_noise=False)
 
@@ -166,6 +160,29 @@ def replay(
     segment_rows = {name: _join(pieces, name, t, starts, ends) for name in full_rows}
     errors = _compare(run, full_rows, segment_rows, channel_noise(robot))
     return ReplayResult(run, full_rows, segment_rows, tuple(map(int, starts)), errors, robot, clock, physics_step)
+
+
+def prepare(
+    run: Run,
+    robot: Robot | str | Path | None = None,
+    parameters: Parameters | None = None,
+    effects: Patch | str | Path | Sequence[Mapping[str, Any]] | None = None,
+    segment: float = 1.0,
+) -> tuple[Robot, Parameters]:
+    """Check what :func:`replay` is given, without simulating; return the robot and its patched parameters.
+
+    Raises:
+        InputError: as :func:`replay`.
+    """
+    if not segment > LEAD:
+        raise InputError(f"segment = {segment:g} s: expected more than {LEAD:g} s")
+    robot = robot_of(run, robot)
+    parameters = Parameters.nominal(robot) if parameters is None else parameters
+    parameters = apply_patch(load_patch(effects), profile_parameters(parameters, run.meta.profile))
+    t = run["t"]
+    if t[-1] - t[0] < 0.5 * segment:
+        raise InputError(f"{run.path}: {t[-1] - t[0]:.2f} s long: too short for segments of {segment:g} s")
+    return robot, parameters
 
 
 def _segment_starts(t: Array, segment: float) -> NDArray[np.intp]:
@@ -259,7 +276,7 @@ def held_goals(run: Run) -> Array:
     commands = pandas.DataFrame({name: run[name] for name in COMMANDS}).ffill().bfill().to_numpy()
     measured = np.stack([run[f"pos_{joint}"] for joint in JOINTS], axis=1)
     stay = np.zeros(8)
-    for joint in np.flatnonzero(np.isnan(commands).all(axis=0)[:4]):
+    for joint in np.flatnonzero(np.isnan(commands[:, :4]).all(axis=0)):
         angles = measured[np.isfinite(measured[:, joint]), joint]
         stay[joint] = angles[0] if angles.size else 0.0
     return np.where(np.isnan(commands), stay, commands)
