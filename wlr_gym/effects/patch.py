@@ -118,10 +118,8 @@ def _parse_effect(entry: Any, source: str, index: int) -> PatchEffect:
     name = entry["name"]
     place = _place(source, index, name)
     if name in BEYOND_PARAMETERS:
-        raise InputError(
         reason = "not in this version (it takes more than a value of the parameter table)"
         raise InputError(f"{place}: {reason}; available: {', '.join(sorted(EFFECTS))}")
-        )
     if name not in EFFECTS:
         raise unknown_name("effect", name, EFFECTS, f"{source}: effect {index + 1}")
     effect = EFFECTS[name]
