@@ -22,6 +22,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
 from wlr_gym.envs import Sb3VecEnv
+from wlr_gym.files import make_output_folder
 from wlr_gym.policy import Training
 from wlr_gym.provenance import provenance, record_provenance, write_yaml
 
@@ -54,6 +55,7 @@ def _record(training: Training, config: PpoConfig) -> None:
     if training.resume:
         write_yaml(training.folder / "provenance_resumed.yaml", provenance(config.seed))
         return
+    make_output_folder(training.folder)  # only now: bad settings leave nothing behind
     settings = {"environment": training.environment, "agent": "ppo", "settings": config.model_dump(mode="json")}
     record_provenance(training.folder, settings, config.seed)
 

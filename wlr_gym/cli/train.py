@@ -10,7 +10,6 @@ import tyro
 from wlr_gym.cli import OK
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.errors import InputError
-from wlr_gym.files import make_output_folder
 from wlr_gym.policy import Training, load_agent_config
 from wlr_gym.policy.agents import agent_function
 from wlr_gym.provenance import CONFIG_FILE
@@ -58,7 +57,6 @@ def _new(options: Options) -> tuple[str, Training]:
     folder = options.out or Path("runs_out") / f"{options.env.rpartition(':')[2]}_{options.agent}_{config.get('seed', 0)}"
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: not empty; give another --out, or go on with what is there: wlr train --resume {folder}")
-    make_output_folder(folder)
     return options.agent, _training(options, options.env, folder, config, resume=False)
 
 
