@@ -11,6 +11,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from wlr_gym.envs.core import Core, Mask
+from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.settings import check_render_mode, read_settings
 from wlr_gym.envs.vector import seed_robots
@@ -21,7 +22,7 @@ require_package("stable_baselines3", "train")
 from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
 
 
-class Sb3VecEnv(VecEnv, EzPickle):
+class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
     """N robots for Stable-Baselines3, without the loop of ``DummyVecEnv``; bit-identical to it with the same seeds.
 
     An ended episode is followed by the next in the same step. Its info then holds ``terminal_observation``,
@@ -126,15 +127,3 @@ class Sb3VecEnv(VecEnv, EzPickle):
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: int | Iterable[int] | None = None) -> list[bool]:
         """Return False for every robot: there are no single environments to wrap."""
         return [False] * len(list(self._get_indices(indices)))
-
-    def set_command(self, **values: float) -> None:
-        """Command all robots from the next step on, until their episodes end."""
-        self.core.set_command(values)
-
-    def describe(self) -> str:
-        """Return the task's tables as text."""
-        return self.core.describe()
-
-    def contract(self) -> dict[str, Any]:
-        """Return what a policy must be fed and what its output means."""
-        return self.core.contract()

@@ -10,10 +10,11 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils import EzPickle
 
 from wlr_gym.envs.core import Core, read_actions
+from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.settings import check_render_mode, read_settings
 
 
-class WlrEnv(gym.Env[Any, np.ndarray], EzPickle):
+class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
     """One robot on a task. Subclasses name the task; keywords are those of :class:`wlr_gym.envs.settings.Settings`."""
 
     task_name: ClassVar[str]
@@ -65,18 +66,6 @@ class WlrEnv(gym.Env[Any, np.ndarray], EzPickle):
         if done:
             info |= _first_rows(core.episode_info())
         return core.observation_of(0), float(core.reward[0]), bool(core.terminated[0]), bool(core.truncated[0]), info
-
-    def set_command(self, **values: float) -> None:
-        """Command the robot from the next step on, until the episode ends: ``set_command(linear_velocity_x=0.1)``."""
-        self.core.set_command(values)
-
-    def describe(self) -> str:
-        """Return the task's tables as text."""
-        return self.core.describe()
-
-    def contract(self) -> dict[str, Any]:
-        """Return what a policy must be fed and what its output means."""
-        return self.core.contract()
 
     def render(self) -> None:
         """Raise: this version has no pictures."""

@@ -13,11 +13,12 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from wlr_gym.envs.core import OPTIONS, Core, Mask, read_options
+from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.settings import check_render_mode, read_settings
 from wlr_gym.errors import InputError, nearest
 
 
-class WlrVectorEnv(VectorEnv[Any, Any, Any], EzPickle):
+class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
     """N robots on a task, bit-identical to N single environments with seeds ``seed + i``.
 
     Args:
@@ -134,18 +135,6 @@ class WlrVectorEnv(VectorEnv[Any, Any, Any], EzPickle):
         return core.observations(), reward, terminated, truncated, infos
 
     # ---- the rest ----
-
-    def set_command(self, **values: float) -> None:
-        """Command all robots from the next step on, until their episodes end."""
-        self.core.set_command(values)
-
-    def describe(self) -> str:
-        """Return the task's tables as text."""
-        return self.core.describe()
-
-    def contract(self) -> dict[str, Any]:
-        """Return what a policy must be fed and what its output means."""
-        return self.core.contract()
 
     def render(self) -> None:
         """Raise: this version has no pictures."""

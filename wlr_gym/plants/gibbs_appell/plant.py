@@ -137,9 +137,9 @@ class GibbsAppellPlant:
             raise InputError(f"parameters hold {len(parameters)} robots, the plant {self._count}")
         chosen = Parameters(parameters.values[rows])
         chosen.validate()
-        self.parameters.values[rows] = chosen.values
         step = self.options.physics_step
         check_contact_resolution(chosen, step)
+        self.parameters.values[rows] = chosen.values
         _scatter(self._constants, self._width, rows, packing.pack(chosen, self.robot, step))
         self._pad(self._constants)
         self._choose_kernel()
@@ -158,6 +158,7 @@ class GibbsAppellPlant:
 
     def _write_state(self, state: PlantState, rows: NDArray[np.intp]) -> None:
         values = np.zeros((rows.size, len(STORED)))
+        quaternion = state.quaternion[rows] / np.linalg.norm(state.quaternion[rows], axis=1, keepdims=True)
         w = state.angular_velocity_in_body[rows]
         leg_rate = state.joint_velocity[rows, :4] + w[:, 1:2]
         wheel_rate = state.joint_velocity[rows, 4:] + leg_rate
@@ -166,7 +167,7 @@ class GibbsAppellPlant:
         reference = state.reference_position[rows] + zero_offset
         groups = {
             "p{}": (state.position[rows], "xyz"),
-            "q{}": (state.quaternion[rows] / np.linalg.norm(state.quaternion[rows], axis=1, keepdims=True), "wxyz"),
+            "q{}": (quaternion, "wxyz"),
             "v{}": (state.linear_velocity_in_body[rows], "xyz"),
             "w{}": (w, "xyz"),
             "last_w{}": (w, "xyz"),
@@ -185,7 +186,7 @@ class GibbsAppellPlant:
                 values[:, _LANE[pattern.format(label)]] = columns[:, k]
         if not np.isfinite(values).all():
             raise InputError("state holds numbers that are not finite")
-        still = -np.einsum("nji,nj->ni", rotation_matrix(state.quaternion[rows]), gravity_in_floor(self.parameters)[rows])
+        still = -np.einsum("nji,nj->ni", rotation_matrix(quaternion), gravity_in_floor(self.parameters)[rows])
         for k, axis in enumerate("xyz"):
             values[:, _LANE[f"acceleration_{axis}"]] = still[:, k]
         _scatter(self._lanes, self._width, rows, values)
