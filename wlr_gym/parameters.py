@@ -19,6 +19,8 @@ from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 
 XYZ = ("x", "y", "z")
+#: Areas of the floor that may have a friction of their own.
+PATCHES = ("patch_1", "patch_2", "patch_3", "patch_4")
 Array = NDArray[np.float64]
 
 
@@ -120,6 +122,16 @@ TABLE: tuple[ParameterSpec, ...] = (
         "about the leg's own centre of mass, leg straight down: about x, about y, about its own axis",
     ),
     ParameterSpec("wheel.radius", "m", WHEELS, lambda r: [r.wheel.radius] * 4, 0.005, 0.5, "wheel.radius", "rolling radius"),
+    ParameterSpec(
+        "wheel.grip",
+        "-",
+        WHEELS,
+        lambda r: [1.0] * 4,
+        0,
+        5,
+        "",
+        "factor on the friction of every floor under this wheel (wear)",
+    ),
     ParameterSpec("wheel.mass", "kg", WHEELS, lambda r: [r.wheel.mass] * 4, 0, 10, "", "wheel, at the end of its leg"),
     ParameterSpec(
         "wheel.spin_inertia",
@@ -206,6 +218,81 @@ TABLE: tuple[ParameterSpec, ...] = (
         "beyond back-EMF",
     ),
     ParameterSpec(
+        "servo.torque_scale",
+        "-",
+        JOINTS,
+        lambda r: [1.0] * 8,
+        0,
+        2,
+        "",
+        "torque of the motor over what its current says: a weak magnet, not seen in the reported effort",
+    ),
+    ParameterSpec(
+        "servo.stribeck_torque",
+        "N m",
+        JOINTS,
+        lambda r: [0.0] * 8,
+        0,
+        50,
+        "",
+        "dry gear friction at rest beyond that in motion; fades with exp(-(rate/stribeck_speed)^2)",
+    ),
+    ParameterSpec(
+        "servo.stribeck_speed", "rad/s", JOINTS, lambda r: [0.1] * 8, 1e-4, 20, "", "rate over which stribeck_torque fades"
+    ),
+    ParameterSpec(
+        "servo.load_friction",
+        "-",
+        JOINTS,
+        lambda r: [0.0] * 8,
+        0,
+        1,
+        "",
+        "dry gear friction per motor torque: grows with what the gear transmits",
+    ),
+    ParameterSpec(
+        "servo.ripple_amplitude",
+        "N m",
+        JOINTS,
+        lambda r: [0.0] * 8,
+        0,
+        10,
+        "",
+        "motor torque periodic in the joint angle: amplitude sin(order angle + phase)",
+    ),
+    ParameterSpec("servo.ripple_order", "-", JOINTS, lambda r: [1.0] * 8, 0, 1000, "", "periods of the ripple per turn"),
+    ParameterSpec("servo.ripple_phase", "rad", JOINTS, lambda r: [0.0] * 8, -10, 10, "", "phase of the ripple at angle 0"),
+    ParameterSpec(
+        "servo.backlash",
+        "rad",
+        JOINTS,
+        lambda r: [0.0] * 8,
+        0,
+        0.5,
+        "",
+        "full width of the gear's play; encoder and link are on its output side, rotor and gear friction on the motor's",
+    ),
+    ParameterSpec(
+        "servo.gear_stiffness",
+        "N m/rad",
+        JOINTS,
+        _motor("gear_stiffness"),
+        1,
+        1e5,
+        "",
+        "of the teeth that meet at the end of the play; without play the gear is rigid",
+    ),
+    ParameterSpec(
+        "servo.supply_resistance",
+        "ohm",
+        (),
+        lambda r: 0.0,
+        0,
+        5,
+        "",
+        "internal resistance: the supply drops by it times the sum of absolute motor currents",
+    ),
+    ParameterSpec(
         "servo.profile_velocity",
         "rad/s",
         JOINTS,
@@ -245,6 +332,43 @@ TABLE: tuple[ParameterSpec, ...] = (
         "torque over normal force and radius, opposing the spin",
     ),
     ParameterSpec(
+        "ground.kinetic_ratio",
+        "-",
+        WHEELS,
+        lambda r: [1.0] * 4,
+        0,
+        1,
+        "",
+        "friction at fast slip over friction at rest: ratio + (1 - ratio) exp(-slip speed/weakening_speed)",
+    ),
+    ParameterSpec(
+        "ground.weakening_speed", "m/s", WHEELS, lambda r: [0.1] * 4, 1e-3, 10, "", "slip speed over which friction falls"
+    ),
+    ParameterSpec(
+        "ground.creep_speed",
+        "m/s",
+        WHEELS,
+        lambda r: [0.0] * 4,
+        0,
+        1,
+        "",
+        "friction builds up with slip speed as tanh(speed/creep_speed); 0 = dry friction that sticks",
+    ),
+    ParameterSpec(
+        "patch.mu",
+        "-",
+        PATCHES,
+        lambda r: [0.0] * 4,
+        0,
+        5,
+        "",
+        "friction along the heading inside an area of the floor (along the axle: times ground.mu_y/mu_x); later patches win",
+    ),
+    ParameterSpec("patch.x_min", "m", PATCHES, lambda r: [0.0] * 4, -1e3, 1e3, "", "area of the patch, floor frame"),
+    ParameterSpec("patch.x_max", "m", PATCHES, lambda r: [0.0] * 4, -1e3, 1e3, "", "no patch where x_max <= x_min"),
+    ParameterSpec("patch.y_min", "m", PATCHES, lambda r: [0.0] * 4, -1e3, 1e3, "", "area of the patch, floor frame"),
+    ParameterSpec("patch.y_max", "m", PATCHES, lambda r: [0.0] * 4, -1e3, 1e3, "", "no patch where y_max <= y_min"),
+    ParameterSpec(
         "ground.normal_stiffness",
         "N/m",
         WHEELS,
@@ -271,6 +395,17 @@ TABLE: tuple[ParameterSpec, ...] = (
         "external_force", "N", ("x", "y"), lambda r: (0.0, 0.0), -1e3, 1e3, "", "constant force on the body origin, floor frame"
     ),
     ParameterSpec(
+        "tether.stiffness",
+        "N/m",
+        (),
+        lambda r: 0.0,
+        0,
+        1e4,
+        "",
+        "horizontal pull on the body origin towards the anchor, no rest length",
+    ),
+    ParameterSpec("tether.anchor", "m", ("x", "y"), lambda r: (0.0, 0.0), -1e3, 1e3, "", "point on the floor, floor frame"),
+    ParameterSpec(
         "joint.zero_offset",
         "rad",
         LEGS,
@@ -282,6 +417,16 @@ TABLE: tuple[ParameterSpec, ...] = (
     ),
     ParameterSpec("imu.gyro_bias", "rad/s", XYZ, lambda r: (0.0, 0.0, 0.0), -1, 1, "", "constant gyroscope offset"),
     ParameterSpec("imu.accel_bias", "m/s2", XYZ, lambda r: (0.0, 0.0, 0.0), -5, 5, "", "constant accelerometer offset"),
+    ParameterSpec(
+        "imu.mount",
+        "rad",
+        ("roll", "pitch", "yaw"),
+        lambda r: (0.0, 0.0, 0.0),
+        -0.5,
+        0.5,
+        "",
+        "rotation from sensor to body, Rz(yaw) Ry(pitch) Rx(roll)",
+    ),
     ParameterSpec(
         "imu.bandwidth",
         "Hz",
@@ -302,6 +447,7 @@ TABLE: tuple[ParameterSpec, ...] = (
         "camera.mount_yaw",
         "camera's floor frame turned against the start heading",
     ),
+    ParameterSpec("camera.scale", "-", (), lambda r: 1.0, 0.5, 2, "", "measured over true lengths of the camera's floor frame"),
     ParameterSpec("camera.delay", "s", (), lambda r: 0.0, 0, 0.5, "camera.delay", "age of a vision pose when it is delivered"),
 )
 

@@ -79,6 +79,7 @@ class Motor(_Model):
     kd: float = Field(ge=0)
     armature: float = Field(gt=0)
     coulomb_friction: float = Field(ge=0)
+    gear_stiffness: float = Field(gt=0)
     viscous_friction: float = Field(ge=0)
 
 
