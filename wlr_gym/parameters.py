@@ -66,6 +66,7 @@ def _motor(field: str) -> Callable[[Robot], list[float]]:
     return _per_joint(lambda r: getattr(r.servo.leg, field), lambda r: getattr(r.servo.wheel, field))
 
 
+INERTIA_LABELS = ("xx", "yy", "zz", "xy", "xz", "yz")
 LEG_INERTIA_LABELS = tuple(f"{leg},{axis}" for leg in LEGS for axis in XYZ)
 INF = math.inf
 
@@ -94,8 +95,20 @@ TABLE: tuple[ParameterSpec, ...] = (
         "body.com_offset",
         "centre of mass of the platform from the body's geometric origin; IMU and marker stay at the origin",
     ),
-    ParameterSpec("payload.mass", "kg", (), lambda r: 0.0, 0, 20, "", "point-like mass fixed to the body"),
-    ParameterSpec("payload.position", "m", XYZ, lambda r: (0.0, 0.0, 0.0), -0.5, 0.5, "", "payload in the body frame"),
+    ParameterSpec("payload.mass", "kg", (), lambda r: 0.0, 0, 20, "", "mass fixed to the body"),
+    ParameterSpec(
+        "payload.position", "m", XYZ, lambda r: (0.0, 0.0, 0.0), -0.5, 0.5, "", "its centre of mass in the body frame"
+    ),
+    ParameterSpec(
+        "payload.inertia",
+        "kg m2",
+        INERTIA_LABELS,
+        lambda r: [0.0] * 6,
+        -10,
+        10,
+        "",
+        "of a payload of several masses about its own centre, axes of the body frame; xy = -integral of x y dm",
+    ),
     ParameterSpec(
         "hip.position",
         "m",

@@ -307,7 +307,8 @@ def _fields_at(model: Any, path: list[str]) -> list[str]:
         field = getattr(model, "model_fields", {}).get(part)
         if field is None:
             return []
-        model = field.annotation
+        options = get_args(field.annotation)
+        model = options[0] if type(None) in options else field.annotation  # X | None
     return list(getattr(model, "model_fields", {}))
 
 

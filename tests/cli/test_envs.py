@@ -1,5 +1,7 @@
 """``wlr envs``."""
 
+import matplotlib.image
+
 from wlr_gym.cli import main
 from wlr_gym.envs.registry import ENVIRONMENTS
 
@@ -20,3 +22,29 @@ def test_description_has_units_and_terms(capsys):
 def test_unknown_environment(capsys):
     assert main(["envs", "WLR-Velocty-v0"]) == 2
     assert "did you mean 'WLR-Velocity-v0'?" in capsys.readouterr().err
+
+
+def test_description_shows_what_a_randomization_draws(capsys):
+    assert main(["envs", "WLR-Velocity-v0", "--randomization", "patches"]) == 0
+    shown = capsys.readouterr().out
+    for text in ("``patches``", "drift 2..6 s", "area x_min -1.2..0.7 m", "tolerance x 1, cut at 2", "sensors.imu.gyro_bias"):
+        assert text in shown
+    assert main(["envs", "WLR-Velocity-v0"]) == 0
+    assert "``nominal``" in capsys.readouterr().out
+
+
+def test_bad_randomization(capsys):
+    assert main(["envs", "WLR-Velocity-v0", "--randomization", "wid"]) == 2
+    assert "did you mean 'wide'?" in capsys.readouterr().err
+    assert main(["envs", "--randomization", "wide"]) == 2
+    assert "name the environment too" in capsys.readouterr().err
+
+
+def test_picture_of_the_floors(tmp_path, capsys):
+    path = tmp_path / "new" / "floors.png"
+    assert main(["envs", "WLR-Velocity-v0", "--randomization", "patches", "--picture", str(path)]) == 0
+    picture = matplotlib.image.imread(path)
+    assert picture.shape[1] > 1000
+    assert picture.reshape(-1, picture.shape[2]).std(axis=0)[:3].min() > 0.05
+    assert main(["envs", "WLR-Velocity-v0", "--picture", str(tmp_path / "floors.jpg.txt")]) == 2
+    assert "ends in .png" in capsys.readouterr().err

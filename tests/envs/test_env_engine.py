@@ -110,7 +110,7 @@ def test_friction_randomisation_acts_at_the_contacts():
 
 
 def test_standing_still_lasts_the_whole_episode_under_every_randomization():
-    for randomization in ("none", "nominal", "wide"):
+    for randomization in ("none", "nominal", "wide", "ice", "split", "patches"):
         env = make_vec(32, randomization=randomization, episode_length=2.0)
         env.reset(seed=0)
         truncated = np.zeros(32, bool)

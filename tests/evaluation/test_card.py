@@ -36,6 +36,8 @@ def rollout(**changes):
         "energy": 1.0 * PERIOD * one,
         "saturated": np.zeros((TICKS, EPISODES, 8), bool),
         "friction": np.ones((EPISODES, 4, 2)),
+        "sampled": ("body.mass",),
+        "samples": np.ones((EPISODES, 1)),
     }
     return Rollout(**(content | changes))
 

@@ -1,11 +1,12 @@
 """A test bench for the engine: batches of nominal robots with a few things changed, driven for a while."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import PlantOptions, PlantState, Truth, standing_state
+from wlr_gym.plants.forces import Force
 from wlr_gym.plants.gibbs_appell.plant import SWEEPS, GibbsAppellPlant
 from wlr_gym.robot import load_robot
 
@@ -39,6 +40,7 @@ def make_plant(
     sweeps: int = SWEEPS,
     precision: str = "float64",
     threads: int = 1,
+    forces: Sequence[Force] = (),
 ) -> GibbsAppellPlant:
     """Return ``count`` robots with ``edit`` applied to their parameters and ``place`` to their standing state."""
     parameters = Parameters.nominal(ROBOT, count)
@@ -48,7 +50,7 @@ def make_plant(
     if place is not None:
         place(state)
     options = PlantOptions(control_period=period, physics_step=step, precision=precision, threads=threads, sensor_noise=False)
-    plant = GibbsAppellPlant(ROBOT, count, options, sweeps=sweeps)
+    plant = GibbsAppellPlant(ROBOT, count, options, forces, sweeps=sweeps)
     plant.reset(parameters=parameters, state=state)
     return plant
 
@@ -87,3 +89,24 @@ def turn(state: PlantState, yaw) -> None:
 def contact_force(truth: Truth) -> np.ndarray:
     """Contact forces (N, 4, 3): heading, axle, normal."""
     return truth.contact_force.reshape(-1, 4, 3)
+
+
+def float_in_space(parameters: Parameters, robots=slice(None)) -> None:
+    """No gravity and no friction; with :func:`lift`, nothing touches the floor."""
+    parameters["gravity"][robots] = 0.0
+    parameters["servo.coulomb_friction"][robots] = 0.0
+
+
+def lift(state: PlantState) -> None:
+    """Put the robots high above the floor."""
+    state.position[:, 2] = 1.0
+
+
+def record(plant: GibbsAppellPlant, seconds: float, goals=HOME, torque_on=None) -> np.ndarray:
+    """Hold ``goals`` for ``seconds``; return the truth matrices after every control tick, (ticks, N, columns)."""
+    goals = np.array(np.broadcast_to(goals, (plant.count, 8)))
+    history = []
+    for _ in range(round(seconds / plant.options.control_period)):
+        plant.step(goals, torque_on)
+        history.append(plant.truth().values.copy())
+    return np.array(history)

@@ -116,6 +116,8 @@ def random_case(count, ticks=40):
         parameters[name] = rng.normal(scale=0.01, size=parameters[name].shape)
     parameters["camera.delay"] = rng.uniform(0, 0.5, count)
     parameters["camera.mount_yaw"] = rng.uniform(-0.1, 0.1, count)
+    parameters["camera.scale"] = rng.uniform(0.9, 1.1, count)
+    parameters["imu.mount"] = rng.uniform(-0.2, 0.2, (count, 3))
     return raws, spawn_seeds(2, count), parameters
 
 
@@ -167,8 +169,6 @@ def test_without_noise_the_readings_are_exact_and_biases_stay():
     legs, wheels = truth[:, :4], truth[:, 4:8]
     np.testing.assert_allclose(sensors.joint_position[:, :4], legs + parameters["joint.zero_offset"], atol=1e-15)
     np.testing.assert_allclose(sensors.joint_position[:, 4:], wheels - raws[0][:, 4:8], atol=1e-15)
-    for name, bias in (("gyro", "imu.gyro_bias"), ("accelerometer", "imu.accel_bias")):
-        np.testing.assert_allclose(sensors[name], truth[:, RAW_LAYOUT.slices[name]] + parameters[bias], atol=1e-15)
     for name in ("joint_velocity", "joint_effort"):
         np.testing.assert_array_equal(sensors[name], truth[:, RAW_LAYOUT.slices[name]])
     np.testing.assert_array_equal(sensors.supply_voltage, truth[:, RAW_LAYOUT.slices["supply_voltage"]][:, 0])
@@ -212,6 +212,57 @@ def test_camera_frame_is_the_start_pose_turned_by_the_mounting():
     turn = -(0.8 + mount)
     expected = [0.3 * np.cos(turn) - 0.4 * np.sin(turn), 0.3 * np.sin(turn) + 0.4 * np.cos(turn), 0.25]
     assert shown[-1] == pytest.approx(expected)
+
+
+def test_camera_scale_stretches_the_measured_path_and_leaves_the_yaw():
+    raws, _ = along_path(np.arange(0, 2, PERIOD), 2)
+    parameters = Parameters.nominal(ROBOT, 2)
+    parameters["camera.mount_yaw"] = 0.2
+    parameters["camera.scale"] = [1.0, 1.07]
+    readings = record(SensorModel(ROBOT, QUIET, 2), raws, np.full(2, 9, np.uint64), parameters)
+    shown = channel(readings, "camera_pose")
+    assert np.abs(shown[-1, 0, :2]).min() > 0.01
+    np.testing.assert_allclose(shown[:, 1, :2], 1.07 * shown[:, 0, :2], rtol=1e-14)
+    np.testing.assert_array_equal(shown[:, 1, 2], shown[:, 0, 2])
+
+
+def test_a_tilted_imu_reads_gravity_along_its_own_axes():
+    raw = np.zeros((2, 3, RAW_LAYOUT.width))
+    raw[:, :, RAW_LAYOUT.slices["accelerometer"]] = [0.0, 0.0, 9.81]
+    raw[:, :, RAW_LAYOUT.slices["gyro"]] = [0.0, 0.0, 2.0]
+    parameters = Parameters.nominal(ROBOT, 3)
+    parameters["imu.mount"] = [[0.0, 0.1, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 0.3]]
+    sensors = Sensors(record(SensorModel(ROBOT, QUIET, 3), raw, spawn_seeds(0, 3), parameters)[-1])
+    sine, cosine = np.sin(0.1), np.cos(0.1)
+    # nose of the sensor down: its x axis looks down; right side down: its y axis looks up; turned about z: nothing changes
+    directions = [[-sine, 0, cosine], [0, sine, cosine], [0, 0, 1]]
+    np.testing.assert_allclose(sensors.accelerometer, 9.81 * np.array(directions), atol=1e-14)
+    np.testing.assert_allclose(sensors.gyro, 2.0 * np.array(directions), atol=1e-14)
+
+
+def test_mounting_is_the_rotation_from_sensor_to_body_and_biases_are_the_sensors():
+    raws, seeds, parameters = random_case(3)
+    roll, pitch, yaw = parameters["imu.mount"].T
+    readings = record(SensorModel(ROBOT, QUIET, 3), raws, seeds, parameters)
+    sensors = Sensors(readings[-1])
+    for name, bias in (("gyro", "imu.gyro_bias"), ("accelerometer", "imu.accel_bias")):
+        for robot in range(3):
+            to_body = np.eye(3)
+            for axis, angle in ((2, yaw[robot]), (1, pitch[robot]), (0, roll[robot])):
+                turn, (a, b) = np.eye(3), ((1, 2), (2, 0), (0, 1))[axis]
+                turn[a, a] = turn[b, b] = np.cos(angle)
+                turn[b, a], turn[a, b] = np.sin(angle), -np.sin(angle)
+                to_body = to_body @ turn
+            measured = sensors[name][robot] - parameters[bias][robot]
+            np.testing.assert_allclose(to_body @ measured, raws[-1][robot, RAW_LAYOUT.slices[name]], atol=1e-14)
+
+
+def test_without_mounting_errors_the_readings_are_the_truth_to_the_bit():
+    raws, seeds, _ = random_case(4)
+    raws[3], raws[4] = 0.0, -1e-300
+    readings = record(SensorModel(ROBOT, QUIET, 4), raws, seeds, Parameters.nominal(ROBOT, 4))
+    for name in ("gyro", "accelerometer"):
+        assert np.array_equal(channel(readings, name), raws[..., RAW_LAYOUT.slices[name]])
 
 
 def test_yaw_unwraps_over_many_turns():

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from wlr_gym.effects import EFFECTS
-from wlr_gym.robot import JOINTS, LEGS, WHEELS
+from wlr_gym.robot import JOINTS, LEGS
 from wlr_gym.runs.format import COLUMNS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "run_format.md").read_text(encoding="utf-8")
@@ -27,16 +26,3 @@ def test_columns():
                 documented[name.replace("<j>", joint)] = (units[0] if joint in LEGS else units[-1], doc, missing == "no")
     assert documented == {name: (column.unit, column.doc, column.required) for name, column in COLUMNS.items()}
     assert list(documented) == list(COLUMNS)
-
-
-def test_effects():
-    places = {JOINTS: "joints", LEGS: "legs", WHEELS: "wheels"}
-    assert table("effects") == [
-        [
-            f"`{effect.name}`",
-            effect.doc,
-            ", ".join(f"`{name}` {parameter.unit}" for name, parameter in effect.parameters.items()),
-            places.get(effect.where, ", ".join(effect.where)),
-        ]
-        for effect in EFFECTS.values()
-    ]

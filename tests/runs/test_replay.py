@@ -34,7 +34,15 @@ DELAY = {"name": "command_delay", "where": list(JOINTS), "parameters": {"delay":
 ZERO = {"name": "joint_zero_offset", "where": ["leg_lf"], "parameters": {"angle": 0.05}}
 RESISTANCE = {"name": "rolling_resistance", "where": ["wheel_lf", "wheel_lr"], "parameters": {"coefficient": 0.1}}
 CAMERA = {"name": "camera_delay", "parameters": {"delay": 0.06}}
-MOUNT = {"name": "camera_misalignment", "parameters": {"yaw": 0.1}}
+MOUNT = {"name": "camera_misalignment", "parameters": {"yaw": 0.1, "scale": 1.08}}
+TILTED_IMU = {"name": "imu_misalignment", "parameters": {"roll": 0.1, "pitch": -0.15, "yaw": 0.2}}
+SPRING = {
+    "name": "unknown_effect",
+    "where": ["leg_lr"],
+    "formula": "-k * (leg_angle - a0)",
+    "parameters": {"k": 0.8, "a0": 0.5},
+    "units": {"k": "N m/rad", "a0": "rad"},
+}
 PAYLOAD = {"name": "payload", "parameters": {"mass": 0.5, "x": 0.08, "z": 0.05}}
 
 
@@ -51,9 +59,10 @@ def commands(t: float) -> np.ndarray:
 
 def simulated_run(effects: Sequence[dict], steps: Sequence[int], meta: RunMeta = META, seconds: float = 5.0) -> Run:
     """Record a run on the exact sensors of the simulator, rows ``steps`` (repeated) plant ticks of 2 ms apart."""
-    parameters = apply_patch(load_patch(list(effects)), profile_parameters(Parameters.nominal(ROBOT), meta.profile))
+    patch = load_patch(list(effects))
+    parameters = apply_patch(patch, profile_parameters(Parameters.nominal(ROBOT), meta.profile))
     delay, parameters["camera.delay"] = float(parameters["camera.delay"][0]), 0.0
-    plant = make_plant("gibbs_appell", ROBOT, 1, PlantOptions(control_period=CLOCK, sensor_noise=False))
+    plant = make_plant("gibbs_appell", ROBOT, 1, PlantOptions(control_period=CLOCK, sensor_noise=False), patch.forces)
     state = standing_state(ROBOT, parameters, 1.4)
     state.joint_position[:, :4] -= parameters["joint.zero_offset"]
     state.reference_position[:, :4] -= parameters["joint.zero_offset"]
@@ -83,11 +92,15 @@ def simulated_run(effects: Sequence[dict], steps: Sequence[int], meta: RunMeta =
     table = pandas.DataFrame(np.array(rows), columns=names)
     pose = np.array(poses)
     x, y, yaw = (np.interp(table["t"] - delay, pose[:, 0], pose[:, k]) for k in (1, 2, 3))
-    mount = float(parameters["camera.mount_yaw"][0])
-    table["cam_x"], table["cam_y"] = np.cos(mount) * x + np.sin(mount) * y, np.cos(mount) * y - np.sin(mount) * x
+    mount, scale = float(parameters["camera.mount_yaw"][0]), float(parameters["camera.scale"][0])
+    table["cam_x"], table["cam_y"] = scale * _turned(x, y, -mount)
     table["cam_yaw"] = yaw
     table.loc[::2, ["cam_x", "cam_y", "cam_yaw"]] = np.nan
     return Run(table, meta, Path("run_01.parquet"))
+
+
+def _turned(x: np.ndarray, y: np.ndarray, angle: float) -> np.ndarray:
+    return np.array([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y])
 
 
 def worst(result: ReplayResult, kind: str, *, segments: bool = True) -> float:
@@ -107,8 +120,9 @@ def worst(result: ReplayResult, kind: str, *, segments: bool = True) -> float:
         ([DELAY], [10]),
         ([ZERO, RESISTANCE, PAYLOAD], [10]),
         ([CAMERA, MOUNT], [10]),
+        ([TILTED_IMU], [10]),
     ],
-    ids=["plain", "jitter", "delay", "effects", "camera"],
+    ids=["plain", "jitter", "delay", "effects", "camera", "imu"],
 )
 def test_own_run_comes_back(effects, steps):
     result = replay(simulated_run(effects, steps), effects=effects)
@@ -135,6 +149,8 @@ def test_own_run_with_the_marker_off_the_centre_comes_back():
         (PAYLOAD, "eff_leg"),
         (CAMERA, "cam_x"),
         (MOUNT, "cam_y"),
+        (TILTED_IMU, "acc_x"),
+        (SPRING, "eff_leg_lr"),
         (ZERO, "eff_leg"),
     ],
 )

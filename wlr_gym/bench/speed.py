@@ -47,7 +47,7 @@ def measure_engine(size: Size) -> list[Measurement]:
         precision: _engine(count, size(50, 2), precision, threads=1) for precision in ENGINE_BARS
     }
     contenders |= {
-        f"mujoco.batch, {label} contact": _mujoco_batch(count, size(2, 1), soft=soft)
+        f"mujoco.batch, {label} contact": mujoco_batch(count, size(2, 1), soft=soft)
         for label, soft in (("matched", False), ("default", True))
     }
     values = interleave(contenders, size.rounds)
@@ -75,7 +75,8 @@ def _engine(count: int, ticks: int, precision: str, threads: int) -> Contender:
     return run
 
 
-def _mujoco_batch(count: int, ticks: int, *, soft: bool) -> Contender:
+def mujoco_batch(count: int, ticks: int, *, soft: bool) -> Contender:
+    """Bare ``mujoco.batch`` with the servos as MuJoCo's actuators: a control tick is one call."""
     robot = load_robot()
     parameters = Parameters.nominal(robot)
     batch = mujoco.batch.Batch(build_servo_model(robot, parameters, soft=soft), count, 1)

@@ -14,9 +14,16 @@ OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 #: Command -> what it does, in one line. The module of the same name is imported only when the command is used.
 COMMANDS = {
     "envs": "list the environments, or describe one: its actions, observations and rewards",
+    "effects": "list the effects that can be added to the robot, explain one, or check patch files",
     "train": "train an agent on an environment; resumes after an interruption",
     "evaluate": "score a policy or agent over many episodes, against baselines, with confidence intervals",
+    "play": "drive a robot in a window with keys or a gamepad, or into a video",
     "replay": "drive a simulator with the commands of measured runs and report where they part",
+    "compare": "drive two plants with the same goals and report where they part, in noise units",
+    "vision": "measure pose and slip from a video of the robot with ring markers",
+    "calibrate": "calibrate a camera, or write the marker sheets to print",
+    "compare": "drive two plants with the same goals and report where they part, in noise units",
+    "emulate": "emulate the robot's servos on pseudo-terminals, for any Dynamixel tool; faults on command",
     "bench": "measure the speed of the engine, the environments and training on this machine",
     "demo": "train, evaluate and plot in about three minutes",
 }

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -18,24 +19,33 @@ from wlr_gym.files import write_json
 
 if TYPE_CHECKING:
     from wlr_gym.bench.convergence import Deviation
+    from wlr_gym.bench.vision import Result
 
 #: Measurement -> function. Imported when it is run.
 MEASUREMENTS = {
     "engine": "wlr_gym.bench.speed:measure_engine",
+    "mujoco": "wlr_gym.bench.mujoco_plant:measure_mujoco",
     "env_step": "wlr_gym.bench.speed:measure_env_step",
     "ppo": "wlr_gym.bench.training:measure_ppo",
     "import": "wlr_gym.bench.speed:measure_import",
     "start": "wlr_gym.bench.speed:measure_start",
     "batch": "wlr_gym.bench.speed:measure_batch",
     "convergence": "wlr_gym.bench.convergence:measure_convergence",
+    "vision": "wlr_gym.bench.vision:measure_vision",
 }
+#: Measurements with rows of their own kind; each has its list in the report.
+_OWN_ROWS = ("convergence", "vision")
+#: Takes a quarter of an hour: only made when it is asked for.
+_ON_REQUEST = ("vision",)
 SCHEMA = 1
 
 
 @dataclass(frozen=True)
 class Options:
+    what: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Measurements to make, as with --only."""
     only: tuple[str, ...] = ()
-    """Measurements to make: engine, env_step, ppo, import, start, batch, convergence; default: all."""
+    """engine, mujoco, env_step, ppo, import, start, batch, convergence, vision; default: all but the last"""
     json: Path | None = None
     """File for all numbers."""
     rounds: int = 5
@@ -46,7 +56,8 @@ class Options:
 
 def run(options: Options) -> int:
     """Measure, print, write."""
-    for name in options.only:
+    asked = (*options.what, *options.only)
+    for name in asked:
         if name not in MEASUREMENTS:
             raise unknown_name("measurement", name, MEASUREMENTS)
     if options.rounds < 1:
@@ -55,13 +66,13 @@ def run(options: Options) -> int:
         raise InputError(f"--json {options.json}: folder {options.json.parent} does not exist")
     console, size = Console(), Size(options.rounds, options.quick)
     report: dict[str, Any] = {"schema": SCHEMA, "machine": machine(), "rounds": options.rounds, "quick": options.quick}
-    report |= {"measurements": [], "convergence": []}
+    report |= {"measurements": [], "convergence": [], "vision": []}
     console.print(_machine_line(report["machine"]))
-    for name in options.only or tuple(MEASUREMENTS):
+    for name in asked or [name for name in MEASUREMENTS if name not in _ON_REQUEST]:
         with console.status(f"measuring {name}"):
             rows = _measure(name, size)
-        report["convergence" if name == "convergence" else "measurements"] += [row.as_dict() for row in rows]
-        _print(console, _convergence_table(rows) if name == "convergence" else _speed_table(rows))
+        report[name if name in _OWN_ROWS else "measurements"] += [row.as_dict() for row in rows]
+        _print(console, _TABLES.get(name, _speed_table)(rows))
     if options.json is not None:
         write_json(options.json, report)
         print(f"written: {options.json}")
@@ -88,8 +99,8 @@ def _speed_table(rows: Sequence[Measurement]) -> Table:
     for row in rows:
         found = row.as_dict()
         peer = f"{found['peer']['median']:,.0f} {row.unit} ({row.peer_name})" if row.peer else "-"
-        ratio = "{median:.1f} [{min:.1f}..{max:.1f}]".format(**found["ratio"]) if row.peer else "-"
-        bar = "-" if row.bar is None else f">= {row.bar:g}x" if row.peer else f"< {row.bar:g} {row.unit}"
+        ratio = "{median:.3g} [{min:.3g}..{max:.3g}]".format(**found["ratio"]) if row.peer else "-"
+        bar = "-" if row.bar is None else f">= {row.bar:.3g}x" if row.peer else f"< {row.bar:g} {row.unit}"
         table.add_row(row.what, _number(found["ours"], row.unit), peer, ratio, bar, _YES_NO[row.met])
     return table
 
@@ -109,3 +120,14 @@ def _convergence_table(rows: Sequence[Deviation]) -> Table:
         millimetres = [f"{1e3 * value:.2g}" for value in (row.median, row.percentile_90, row.worst)]
         table.add_row(row.case, row.quantity, str(row.value), *millimetres)
     return table
+
+
+def _vision_table(rows: Sequence[Result]) -> Table:
+    table = Table("what", "method", "value", "bar", "met", "samples", box=None, title="vision (rendered)", title_justify="left")
+    for row in rows:
+        bar = "-" if row.bar is None else f"{'>=' if row.least else '<='} {row.bar:g}"
+        table.add_row(row.what, row.method, f"{row.value:.3g} {row.unit}", bar, _YES_NO[row.met], str(row.count))
+    return table
+
+
+_TABLES = {"convergence": _convergence_table, "vision": _vision_table}

@@ -13,6 +13,8 @@ from rich.console import Console
 
 from wlr_gym.cli import OK
 from wlr_gym.cli.evaluate import play, print_cards
+from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.train import add_effects
 from wlr_gym.errors import InputError, require_package
 from wlr_gym.evaluation import Rollout, read_curve, score, write_card
 from wlr_gym.files import make_output_folder
@@ -29,7 +31,7 @@ MAX_TRAINING_SECONDS = 120.0
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(EffectsOption):
     out: Path = Path("out/demo")
     """Folder for the policy, the score card and the pictures; a demo already in it is replaced."""
     steps: int | None = None
@@ -46,6 +48,7 @@ def run(options: Options) -> int:
     """Train, evaluate, draw, and name the files."""
     require_package("torch", "train")
     require_package("stable_baselines3", "train")
+    options.patch()  # a bad one is refused before anything is written
     make_output_folder(options.out)
     began = time.monotonic()
     console = Console(highlight=False, soft_wrap=True)
@@ -63,6 +66,7 @@ def _train(options: Options) -> Path:
     config = load_agent_config("ppo") | {"seed": options.seed}
     if options.steps is not None:
         config["total_steps"] = options.steps
+    add_effects(config, options.patch())
     _clear(options.out / "run")
     record_provenance(options.out, {"environment": ENVIRONMENT, "agent": "ppo", "settings": config}, options.seed)
     training = Training(ENVIRONMENT, options.out / "run", config, max_seconds=MAX_TRAINING_SECONDS, progress=options.progress)
@@ -70,12 +74,14 @@ def _train(options: Options) -> Path:
 
 
 def _evaluate(options: Options, policy: Path) -> dict[str, Rollout]:
-    keywords = {"precision": "float32"}  # as in training: the engine is compiled once
+    patch = options.patch()
+    keywords = {"precision": "float32", "effects": patch}  # precision as in training: the engine is compiled once
     rollouts = play(ENVIRONMENT, [policy, *BASELINES], options.episodes, FIRST_SEED, keywords, options.progress)
     rollouts = {"PPO" if name == str(policy) else name: rollout for name, rollout in rollouts.items()}
     cards = {name: score(rollout) for name, rollout in rollouts.items()}
     print_cards(cards)
-    write_card(options.out, cards, {"environment": ENVIRONMENT, "episodes": options.episodes, "first seed": FIRST_SEED})
+    conditions = {"environment": ENVIRONMENT, "episodes": options.episodes, "first seed": FIRST_SEED}
+    write_card(options.out, cards, conditions | {"effects": patch.summary()})
     return rollouts
 
 

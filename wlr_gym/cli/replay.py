@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from wlr_gym.cli.options import EffectsOption
 from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,26 +27,27 @@ ERRORS_FILE = "errors.json"
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(EffectsOption):
     """Replay measured runs.
 
     Attributes:
         runs: a run (CSV or Parquet) or a folder of runs.
         out: folder for errors.json, plots and provenance; made if it is not there.
-        effects: patch file: effects to add to the nominal model.
         backend: simulator.
         robot: robot file or config name; left out, the one meta.yaml names, else the nominal one.
         segment: s between the points at which a segment starts anew from the measured state.
         plots: write overlay plots.
+        video: file (.webp, .gif, .png, .mp4) for a film of the run beside its simulation; with several runs, one film each,
+            named FILE_<run>.
     """
 
     runs: Annotated[Path, tyro.conf.Positional]
     out: Path
-    effects: Path | None = None
     backend: str = "gibbs_appell"
     robot: str | None = None
     segment: float = 1.0
     plots: bool = True
+    video: Path | None = None
 
 
 def run(options: Options) -> int:
@@ -56,17 +58,19 @@ def run(options: Options) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.effects import load_patch
     from wlr_gym.files import make_output_folder, write_json
     from wlr_gym.plants import check_backend
     from wlr_gym.provenance import record_provenance
+    from wlr_gym.render.video import check_video
     from wlr_gym.runs.plot import save_plots
     from wlr_gym.runs.replay import prepare
 
     console = Console()
     check_backend(options.backend)
+    if options.video is not None:
+        check_video(options.video)
     runs = _read(options.runs)
-    patch = load_patch(options.effects)
+    patch = options.patch()
     for measured in runs:  # a refusal leaves no folder behind
         prepare(measured, options.robot, effects=patch, segment=options.segment)
     make_output_folder(options.out)
@@ -80,7 +84,26 @@ def run(options: Options) -> int:
     write_json(options.out / ERRORS_FILE, errors)
     record_provenance(options.out, _resolved(options, results, patch))
     console.print(f"errors, plots and provenance: {options.out}")
+    if options.video is not None:
+        _film(options, options.video, results, patch, console)
     return 0
+
+
+def _film(options: Options, path: Path, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
+    from rich.progress import track
+
+    from wlr_gym.render import write_video
+    from wlr_gym.runs.film import FPS, film_length, replay_film
+    from wlr_gym.runs.replay import prepare
+
+    for result in results:
+        _, parameters = prepare(result.run, options.robot, effects=patch, segment=options.segment)
+        target = path if len(results) == 1 else path.with_name(f"{path.stem}_{result.run.name}{path.suffix}")
+        count = film_length(result.run)
+        pictures = replay_film(result, parameters, options.backend)
+        described = f"drawing {result.run.name}"
+        write_video(target, track(pictures, described, count, console=console, transient=True), FPS, count)
+        console.print(f"video: {target}")
 
 
 def _read(path: Path) -> Sequence[Run]:
@@ -107,7 +130,7 @@ def _resolved(options: Options, results: Sequence[ReplayResult], patch: Patch) -
         "clock": results[0].clock,
         "physics_step": results[0].physics_step,
         "runs": [str(result.run.path) for result in results],
-        "effects": [{"name": e.name, "where": list(e.where), "parameters": dict(e.parameters)} for e in patch.effects],
+        "effects": patch.content()["effects"],
     }
 
 
@@ -120,8 +143,8 @@ def _print(results: Sequence[ReplayResult], patch: Patch, console: Console) -> N
             line = f"{result.run.name}: {finding.kind} in '{finding.column}': {finding.message}"
             console.print(line, style="yellow", highlight=False, soft_wrap=True)
     errors = [pair for result in results for pair in result.errors.items()]
-    added = ", ".join(effect.name for effect in patch.effects) or "none"
-    console.print(_error_table(errors, f"{len(results)} run{'s' if len(results) > 1 else ''}, effects added: {added}"))
+    runs = f"{len(results)} run{'s' if len(results) > 1 else ''}"
+    console.print(_error_table(errors, f"{runs}, effects added: {patch.summary()}"))
     console.print(_joint_table(errors))
     if len(results) > 1:
         console.print(_run_table(results))

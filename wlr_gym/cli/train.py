@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from wlr_gym.cli import OK
+from wlr_gym.cli.options import EffectsOption
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.errors import InputError
 from wlr_gym.policy import Training, load_agent_config
@@ -15,9 +17,12 @@ from wlr_gym.policy.agents import agent_function
 from wlr_gym.provenance import CONFIG_FILE
 from wlr_gym.robot import read_yaml
 
+if TYPE_CHECKING:
+    from wlr_gym.effects import Patch
+
 
 @dataclass(frozen=True)
-class Options:
+class Options(EffectsOption):
     env: tyro.conf.Positional[str] = "WLR-Velocity-v0"
     """Environment id; see: wlr envs."""
     agent: str = "ppo"
@@ -54,17 +59,24 @@ def _new(options: Options) -> tuple[str, Training]:
     config = load_agent_config(options.config or options.agent, options.set)
     if options.seed is not None:
         config["seed"] = options.seed
+    add_effects(config, options.patch())
     folder = options.out or Path("runs_out") / f"{options.env.rpartition(':')[2]}_{options.agent}_{config.get('seed', 0)}"
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: not empty; give another --out, or go on with what is there: wlr train --resume {folder}")
     return options.agent, _training(options, options.env, folder, config, resume=False)
 
 
+def add_effects(config: dict[str, Any], patch: Patch) -> None:
+    """Put a patch into an agent's settings, in place: its content, so that the run folder says what was added."""
+    if patch:
+        config["environment"] = (config.get("environment") or {}) | {"effects": patch.content()["effects"]}
+
+
 def _resumed(options: Options) -> tuple[str, Training]:
     folder = options.resume
     assert folder is not None
-    if options.out is not None or options.config is not None or options.seed is not None or options.set:
-        raise InputError("--resume uses the settings of the run folder; leave out --out, --config, --set and --seed")
+    if options.out is not None or options.config is not None or options.seed is not None or options.set or options.effects:
+        raise InputError("--resume uses the settings of the run folder; leave out --out, --config, --set, --seed and --effects")
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise InputError(f"{folder}: not a run folder: {CONFIG_FILE} is missing")

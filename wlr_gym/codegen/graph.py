@@ -162,7 +162,7 @@ def hoist(
 
 
 _BINARY = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
-_CALLS = {"exp": "math.exp", "tanh": "math.tanh", "floor": "np.floor", "sqrt": "math.sqrt"}
+_CALLS = {"exp": "math.exp", "tanh": "math.tanh", "floor": "np.floor", "sqrt": "math.sqrt", "arctan2": "math.atan2"}
 
 
 def emit(
@@ -238,9 +238,11 @@ def _expression(node: Node, text: Callable[[Operand], str], constant: Callable[[
     if node.op in _BINARY:
         return f"{args[0]} {_BINARY[node.op]} {args[1]}"
     if node.op in _CALLS:
-        return f"{_CALLS[node.op]}({args[0]})"
+        return f"{_CALLS[node.op]}({', '.join(args)})"
     zero = constant(0.0)
     match node.op:
+        case "rounded":
+            return args[0]
         case "neg":
             return f"-{args[0]}"
         case "where":

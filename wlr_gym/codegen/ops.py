@@ -35,6 +35,11 @@ def tanh(x: Value) -> Value:
     return _apply("tanh", np.tanh, x)
 
 
+def arctan2(y: Value, x: Value) -> Value:
+    """Angle of the vector (x, y), in (-pi, pi]."""
+    return _apply("arctan2", np.arctan2, y, x)
+
+
 def absolute(x: Value) -> Value:
     """Absolute value."""
     return _apply("absolute", np.abs, x)
@@ -63,6 +68,11 @@ def where_positive(condition: Value, a: Value, b: Value) -> Value:
 def sign(x: Value) -> Value:
     """-1, 0 or 1."""
     return where_positive(x, 1.0, where_positive(-x, -1.0, 0.0))
+
+
+def rounded(x: Value) -> Value:
+    """``x`` as a number of its own: a product is rounded before it is added, never fused into the sum."""
+    return _apply("rounded", lambda value: value, x)
 
 
 def floor(x: Value) -> Value:
@@ -102,3 +112,31 @@ def sin(x: Value) -> Value:
 def cos(x: Value) -> Value:
     """Cosine (traced: see :func:`sin_cos`)."""
     return sin_cos(x)[1]
+
+
+_EXPM1 = tuple(1.0 / factorial(k + 1) for k in range(12))
+_DOUBLINGS = 7
+
+
+def _expm1_of_minus(x: Value) -> Value:
+    """exp(-x) - 1 for x >= 0, to a few roundings of itself: a polynomial at x/128, then (e + 1)^2 - 1 seven times."""
+    small = minimum(x, 36.0) * (-(0.5**_DOUBLINGS))
+    e = small * _polynomial(small, _EXPM1)
+    for _ in range(_DOUBLINGS):
+        e = e * (e + 2.0)
+    return e
+
+
+def decay(x: Value) -> Value:
+    """exp(-x) for x >= 0, to a rounding of 1: no library call when traced, so it vectorises (see :func:`sin_cos`)."""
+    if not isinstance(x, Node):
+        return np.exp(-x)
+    return 1.0 + _expm1_of_minus(x)
+
+
+def saturation(x: Value) -> Value:
+    """tanh(x) for x >= 0, to a few roundings of itself: no library call when traced (see :func:`sin_cos`)."""
+    if not isinstance(x, Node):
+        return np.tanh(x)
+    e = _expm1_of_minus(2.0 * x)
+    return -e / (2.0 + e)

@@ -1,6 +1,20 @@
-"""Named effects and patch files: what the nominal model lacks, added to any plant through its parameters."""
+"""Named effects, formulas and patch files: what the nominal model lacks, added to any simulator."""
 
-from wlr_gym.effects.patch import Patch, PatchEffect, apply_patch, load_patch, save_patch
-from wlr_gym.effects.registry import EFFECTS, Effect, EffectParameter
+from wlr_gym.effects.effect import STAGES, Effect, EffectParameter, PatchEffect
+from wlr_gym.effects.patch import Patch, Source, apply_patch, compose, load_patch, save_patch
+from wlr_gym.effects.registry import EFFECTS, UNKNOWN_EFFECT
 
-__all__ = ["EFFECTS", "Effect", "EffectParameter", "Patch", "PatchEffect", "apply_patch", "load_patch", "save_patch"]
+__all__ = [
+    "EFFECTS",
+    "STAGES",
+    "UNKNOWN_EFFECT",
+    "Effect",
+    "EffectParameter",
+    "Patch",
+    "PatchEffect",
+    "Source",
+    "apply_patch",
+    "compose",
+    "load_patch",
+    "save_patch",
+]

@@ -1,4 +1,4 @@
-"""Patches: effects as YAML, loaded, checked, applied and saved.
+"""Patches: effects as YAML, loaded, checked, composed, applied and saved.
 
 ```yaml
 effects:
@@ -11,28 +11,25 @@ provenance: {made_by: hand}     # optional
 
 from __future__ import annotations
 
-import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from wlr_gym.effects.registry import BEYOND_PARAMETERS, EFFECTS, Effect, EffectParameter, stage
+from wlr_gym.codegen.expression import finite_number
+from wlr_gym.effects.effect import Effect, EffectParameter, PatchEffect
+from wlr_gym.effects.formula import KEYS, PLACES, force_of, parse_formula
+from wlr_gym.effects.registry import EFFECTS, UNKNOWN_EFFECT, stage
 from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.files import replace_file
 from wlr_gym.parameters import Parameters
+from wlr_gym.paths import find_config
+from wlr_gym.plants.forces import Force
 from wlr_gym.robot import read_yaml
-
-
-@dataclass(frozen=True)
-class PatchEffect:
-    """One effect of a patch: its name, where it acts, and all its parameters."""
-
-    name: str
-    where: tuple[str, ...]
-    parameters: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -46,56 +43,111 @@ class Patch:
     def __bool__(self) -> bool:
         return bool(self.effects)
 
+    @cached_property
+    def forces(self) -> tuple[Force, ...]:
+        """What the plant itself must be given: the formulas of unknown effects."""
+        return tuple(force_of(effect) for effect in self.effects if effect.name == UNKNOWN_EFFECT)
 
-def load_patch(source: Patch | str | Path | Sequence[Mapping[str, Any]] | None) -> Patch:
-    """Load a patch from what users pass as ``effects=``.
+    def summary(self) -> str:
+        """Return the effects' names in order, or ``none``."""
+        return ", ".join(effect.name for effect in self.effects) or "none"
+
+    def content(self) -> dict[str, Any]:
+        """Return the patch as plain YAML types: what :func:`save_patch` writes and :func:`load_patch` reads."""
+        content: dict[str, Any] = {"effects": [effect.content() for effect in self.effects]}
+        if self.provenance:
+            content["provenance"] = dict(self.provenance)
+        return content
+
+
+Source = Patch | str | Path | Mapping[str, Any] | Sequence[Any] | None
+
+
+def load_patch(source: Source) -> Patch:
+    """Load a patch from what users pass as ``effects=`` or after ``--effects``.
 
     Args:
-        source: path of a YAML file, list of effects as dictionaries, a :class:`Patch`, or None (no effects).
+        source: path of a YAML file or name of one in ``configs/effects/``, an effect or a whole patch as a mapping, a
+            :class:`Patch`, a list of any of these (composed in order), or None (no effects).
 
     Raises:
         InputError: naming file, effect, key and the nearest valid name.
     """
-    if isinstance(source, Patch):
-        return source
-    if source is None:
-        return Patch()
-    if isinstance(source, str | Path):
-        return _parse(read_yaml(source), str(source))
-    return _parse({"effects": list(source)}, "effects")
+    match source:
+        case Patch():
+            return source
+        case None:
+            return Patch()
+        case str() | Path():
+            path = find_config("effects", source)
+            return _parse(read_yaml(path), str(path))
+        case Mapping():
+            return _parse({"effects": [source]} if "name" in source else source, "effects")
+        case Sequence():
+            return _compose_entries(source)
+    raise InputError(f"effects = {source!r}: expected a path, a mapping or a list of effects")
+
+
+def compose(*patches: Patch) -> Patch:
+    """Return one patch with the effects of all, in order."""
+    given = [patch for patch in patches if patch.effects or patch.provenance]
+    if len(given) == 1:
+        return given[0]
+    effects = tuple(effect for patch in given for effect in patch.effects)
+    origins = [{"source": patch.source, **patch.provenance} for patch in given if patch.provenance]
+    sources = dict.fromkeys(patch.source for patch in given)
+    return Patch(effects, {"composed_of": origins} if origins else {}, ", ".join(sources))
+
+
+def _compose_entries(entries: Sequence[Any]) -> Patch:
+    patches: list[Patch] = []
+    for index, entry in enumerate(entries):
+        if isinstance(entry, Patch | str | Path) or (isinstance(entry, Mapping) and "effects" in entry):
+            patches.append(load_patch(entry))
+        else:
+            patches.append(Patch((_parse_effect(entry, "effects", index),), source="effects"))
+    return compose(*patches)
 
 
 def save_patch(patch: Patch, path: str | Path) -> Path:
     """Write a patch as YAML; :func:`load_patch` reads back the same effects."""
-    effects = [
-        {"name": effect.name, "where": list(effect.where), "parameters": dict(effect.parameters)} for effect in patch.effects
-    ]
-    content: dict[str, Any] = {"effects": effects}
-    if patch.provenance:
-        content["provenance"] = dict(patch.provenance)
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    text = yaml.dump(patch.content(), Dumper=_Dumper, sort_keys=False)  # in ASCII: PyYAML loses U+0085 and its kin otherwise
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
     return path
 
 
-def apply_patch(patch: Patch, parameters: Parameters) -> Parameters:
-    """Return ``parameters`` with every effect added; the order in the patch does not matter.
+class _Dumper(yaml.SafeDumper):
+    """Quotes text that :func:`wlr_gym.robot.read_yaml` would take for a number, such as the commit 12345e6."""
 
-    Levels come first, then ratios and scales, then additions (:data:`wlr_gym.effects.registry.STAGES`).
+
+_Dumper.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
+
+
+def apply_patch(patch: Patch, parameters: Parameters) -> Parameters:
+    """Return ``parameters`` with every effect added; kinds act in the order of :data:`wlr_gym.effects.effect.STAGES`.
+
+    Formulas are no parameters: the plant takes them as ``forces=patch.forces``.
 
     Raises:
         InputError: an effect that these parameters cannot take, or a result outside the bounds of the table.
     """
     patched = parameters.copy()
-    for index, effect in sorted(enumerate(patch.effects), key=lambda entry: stage(entry[1].name)):
+    for effect in sorted(patch.effects, key=lambda effect: stage(effect.name)):
+        if effect.name == UNKNOWN_EFFECT:
+            continue
         try:
             EFFECTS[effect.name].apply(patched, effect.where, effect.parameters)
             patched.validate()
         except InputError as error:
-            raise InputError(f"{_place(patch.source, index, effect.name)}: {error}") from None
+            raise InputError(f"{effect.place or effect.name}: {error}") from None
     return patched
+
+
+# ---- reading ---------------------------------------------------------------------------------------------------------
 
 
 def _parse(data: Any, source: str) -> Patch:
@@ -103,7 +155,7 @@ def _parse(data: Any, source: str) -> Patch:
         raise InputError(f"{source}: expected a mapping with 'effects', got {type(data).__name__}")
     _require_keys(data, ("effects", "provenance"), source)
     effects, provenance = data.get("effects"), data.get("provenance") or {}
-    if not isinstance(effects, list):
+    if not isinstance(effects, list | tuple):
         raise InputError(f"{source}: 'effects' must be a list of effects, got {type(effects).__name__}")
     if not isinstance(provenance, Mapping):
         raise InputError(f"{source}: 'provenance' must be a mapping, got {type(provenance).__name__}")
@@ -116,26 +168,27 @@ def _parse_effect(entry: Any, source: str, index: int) -> PatchEffect:
             f"{source}: effect {index + 1}: expected a mapping with 'name', 'where' and 'parameters', got {entry!r}"
         )
     name = entry["name"]
-    place = _place(source, index, name)
-    if name in BEYOND_PARAMETERS:
-        reason = "not in this version (it takes more than a value of the parameter table)"
-        raise InputError(f"{place}: {reason}; available: {', '.join(sorted(EFFECTS))}")
+    place = f"{source}: effect {index + 1} ({name})"
+    if name == UNKNOWN_EFFECT:
+        _require_keys(entry, KEYS, place)
+        return parse_formula(entry, _parse_where(entry.get("where"), PLACES, place), place)
     if name not in EFFECTS:
-        raise unknown_name("effect", name, EFFECTS, f"{source}: effect {index + 1}")
+        raise unknown_name("effect", name, [*EFFECTS, UNKNOWN_EFFECT], f"{source}: effect {index + 1}")
     effect = EFFECTS[name]
     _require_keys(entry, ("name", "where", "parameters"), place)
-    return PatchEffect(name, _parse_where(entry.get("where"), effect, place), _parse_parameters(entry, effect, place))
+    where = _parse_where(entry.get("where"), effect.where, place)
+    return PatchEffect(name, where, _parse_parameters(entry, effect, place), place=place)
 
 
-def _parse_where(where: Any, effect: Effect, place: str) -> tuple[str, ...]:
-    if where is None and len(effect.where) == 1:
-        return effect.where
+def _parse_where(where: Any, valid: tuple[str, ...], place: str) -> tuple[str, ...]:
+    if where is None and len(valid) == 1:
+        return valid
     where = [where] if isinstance(where, str) else where
     if not isinstance(where, list | tuple) or not where:
-        raise InputError(f"{place}: where = {where!r}: expected a list of {', '.join(effect.where)}")
+        raise InputError(f"{place}: where = {where!r}: expected a list of {', '.join(valid)}")
     for name in where:
-        if name not in effect.where:
-            raise unknown_name("where", str(name), effect.where, place)
+        if name not in valid:
+            raise unknown_name("where", str(name), valid, place)
     if len(set(where)) < len(where):
         raise InputError(f"{place}: where = {list(where)}: a place occurs twice")
     return tuple(where)
@@ -146,24 +199,23 @@ def _parse_parameters(entry: Mapping[str, Any], effect: Effect, place: str) -> d
     if not isinstance(given, Mapping):
         raise InputError(f"{place}: 'parameters' must be a mapping of {', '.join(effect.parameters)}, got {given!r}")
     _require_keys(given, effect.parameters, place)
-    return {name: _number(given.get(name, spec.default), name, spec, place) for name, spec in effect.parameters.items()}
+    return {name: _number(given.get(name), name, spec, place) for name, spec in effect.parameters.items()}
 
 
 def _number(value: Any, name: str, spec: EffectParameter, place: str) -> float:
+    if value is None and spec.optional:
+        return float(spec.neutral)
     if value is None:
         raise InputError(f"{place}: parameter '{name}' ({spec.unit}) is missing")
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    number = finite_number(value)
+    if number is None:
         raise InputError(f"{place}: {name} = {value!r}: expected a finite number in {spec.unit}")
-    if not spec.low <= value <= spec.high:
-        raise InputError(f"{place}: {name} = {value:g} is outside [{spec.low:g}, {spec.high:g}] {spec.unit}")
-    return float(value)
+    if not spec.low <= number <= spec.high:
+        raise InputError(f"{place}: {name} = {number:g} is outside [{spec.low:g}, {spec.high:g}] {spec.unit}")
+    return number
 
 
 def _require_keys(data: Mapping[str, Any], valid: Sequence[str] | Mapping[str, Any], place: str) -> None:
     for key in data:
         if key not in valid:
             raise unknown_name("key", str(key), valid, place)
-
-
-def _place(source: str, index: int, name: str) -> str:
-    return f"{source}: effect {index + 1} ({name})"

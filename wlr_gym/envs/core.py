@@ -26,7 +26,7 @@ from wlr_gym.random import stream_number
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.tasks.describe import contract, describe
 from wlr_gym.tasks.draws import episode_seeds, stream_numbers, uniforms
-from wlr_gym.tasks.randomization import load_randomization
+from wlr_gym.tasks.randomization import DRIFT_PERIOD, load_randomization
 from wlr_gym.tasks.task import ObservationColumn, Task, TaskConfig, bounds, build_task, read_task
 from wlr_gym.tasks.terms.events import normal
 
@@ -64,6 +64,9 @@ class Core:
         reward: (N,) reward of the last step. terms: (N, T) its weighted terms. sums: (N, T) their sums over the episode.
         terminated, truncated: (N,) flags of the last step.
         command: (N, C) present commands. action: (N, 8) last actions. ticks: (N,) control ticks since the episode began.
+        goals: (N, 8) last goals, rad and rad/s. torque_on: (N, 8) whether the motors are on; None = all.
+        sensors: last readings, noise and all. state: where the robots of the present episodes started.
+        changed: (N,) whether randomisation changed the robot's parameters at the end of the last step.
     """
 
     def __init__(self, task_name: str, settings: Settings, count: int) -> None:
@@ -84,7 +87,7 @@ class Core:
             threads=settings.threads,
             sensor_noise=self.randomization.config.sensor_noise,
         )
-        self.plant = plants.make_plant(settings.backend, robot, self.count, options)
+        self.plant = plants.make_plant(settings.backend, robot, self.count, options, self.patch.forces)
         self.limit = self.task.episode_ticks
         self.dictionary = settings.observation == "dict"
         self._evaluation = compile_evaluation(self.task)
@@ -155,7 +158,7 @@ class Core:
         self._command_draws = np.zeros(count, np.int64)
         self.action = np.zeros((count, actions))
         self._previous_action = np.zeros((count, actions))
-        self._goals = np.zeros((count, actions))
+        self.goals = np.zeros((count, actions))
         self._bias = np.zeros((count, sampled))
         self._delays = np.zeros((count, len(self._latency) + 1))
         self._ring = np.zeros((count, self._ring_depth, sampled))
@@ -164,15 +167,17 @@ class Core:
         self.episode_seeds = np.zeros(count, np.uint64)
         self.parameters = apply_patch(self.patch, Parameters.nominal(task.robot, count))
         self._overrides: dict[int, dict[str, float]] = {}
-        self._state: PlantState = self.randomization.state(self.parameters, self.episode_seeds)
+        self.state: PlantState = self.randomization.state(self.parameters, self.episode_seeds)
         intervals = len(self.randomization.intervals)
         self._occurrences = np.zeros((count, intervals), np.int64)
         self._strike_at = np.zeros((count, intervals), np.int64)
+        self.changed = np.zeros(count, bool)
+        self._drift_ticks = max(1, round(DRIFT_PERIOD / task.config.control_period)) if self.randomization.drifts else 0
         free = [JOINTS.index(wheel) for wheel in self.settings.free_wheels]
-        self._torque_on: Mask | None = None
+        self.torque_on: Mask | None = None
         if free:
-            self._torque_on = np.ones((count, actions), bool)
-            self._torque_on[:, free] = False
+            self.torque_on = np.ones((count, actions), bool)
+            self.torque_on[:, free] = False
 
     # ---- episodes ----
 
@@ -205,8 +210,9 @@ class Core:
         self.parameters.values[rows] = robots.values
         self._overrides |= dict.fromkeys(rows.tolist(), overrides)
         for name, value in vars(self.randomization.state(robots, seeds)).items():
-            getattr(self._state, name)[rows] = value
-        sensors = self.plant.reset(seeds=self.episode_seeds, parameters=self.parameters, mask=mask, state=self._state)
+            if value is not None:
+                getattr(self.state, name)[rows] = value
+        self.sensors = self.plant.reset(seeds=self.episode_seeds, parameters=self.parameters, mask=mask, state=self.state)
         self._clear(rows)
         self._draw_imperfections(rows, seeds)
         kernels.start_commands(
@@ -215,19 +221,23 @@ class Core:
         )  # fmt: skip
         if fixed_command:
             self._hold_command(rows, fixed_command)
-        self._observe(mask, sensors.values, True)
+        self._observe(mask, self.sensors.values, True)
 
     def _draw_parameters(
-        self, rows: NDArray[np.intp], seeds: NDArray[np.uint64], occurrences: NDArray[np.int64] | None = None
+        self,
+        rows: NDArray[np.intp],
+        seeds: NDArray[np.uint64],
+        occurrences: NDArray[np.int64] | None = None,
+        time: Array | None = None,
     ) -> Parameters:
         """Randomisation of some robots, then the effects."""
-        robots = self.randomization.parameters(self.robot_seeds[rows], seeds, occurrences)
+        robots = self.randomization.parameters(self.robot_seeds[rows], seeds, occurrences, time)
         return apply_patch(self.patch, robots) if self.patch else robots
 
     def _clear(self, rows: NDArray[np.intp]) -> None:
         for buffer in (self.ticks, self.action, self._previous_action, self.sums, self.terms, self.reward, self._occurrences):
             buffer[rows] = 0
-        self.terminated[rows] = self.truncated[rows] = False
+        self.terminated[rows] = self.truncated[rows] = self.changed[rows] = False
         if self.randomization.intervals:
             self._strike_at[rows] = self._next_strike(rows)
 
@@ -274,12 +284,11 @@ class Core:
             InputError: wrong shape, or an action that is not finite or out of [-1, 1]; names robot and joint.
         """
         given = read_actions(actions, self.action.shape)
-        bad = kernels.take_action(
-            mask, given, ACTION_LIMIT, self._action_table, self.action, self._previous_action, self._goals
-        )
+        bad = kernels.take_action(mask, given, ACTION_LIMIT, self._action_table, self.action, self._previous_action, self.goals)
         if bad >= 0:
             raise self._bad_action(given, bad)
-        sensors = self.plant.step(self._goals, self._torque_on).values
+        self.sensors = self.plant.step(self.goals, self.torque_on)
+        sensors = self.sensors.values
         evaluation = self._evaluation
         bad = evaluation.run(
             mask, sensors, self.plant.truth().values, self.command, self.action, self._previous_action,
@@ -293,8 +302,8 @@ class Core:
             mask, self.limit, self.ticks, self._over, self.terminated, self.truncated, self.episode_seeds, self._command_stream,
             self._command_table, self._command_timing, self.command, self._command_until, self._command_draws,
         )  # fmt: skip
-        if self.randomization.intervals:
-            self._strike(mask)
+        if self.randomization.timed_elements:
+            self._change_parameters(mask & ~(self.terminated | self.truncated) if any_done else mask)
         self._observe(mask, sensors, False)
         return any_done
 
@@ -317,21 +326,25 @@ class Core:
         wait = self.randomization.next_strike(self.episode_seeds[rows], self._occurrences[rows], period)
         return self.ticks[rows, None] + wait
 
-    def _strike(self, mask: Mask) -> None:
-        """Redraw the parameters of interval events whose time has come."""
+    def _change_parameters(self, mask: Mask) -> None:
+        """Redraw the parameters of interval events whose time has come, and of those that drift every few ticks."""
         due = (self._strike_at <= self.ticks[:, None]) & mask[:, None]
-        struck: Mask = np.asarray(due.any(axis=1))
-        if not struck.any():
+        self.changed[:] = due.any(axis=1)
+        if self._drift_ticks:
+            self.changed |= mask & (self.ticks % self._drift_ticks == 0)
+        if not self.changed.any():
             return
-        rows = np.flatnonzero(struck)
+        rows = np.flatnonzero(self.changed)
         self._occurrences[due] += 1
-        self._strike_at[rows] = np.where(due[rows], self._next_strike(rows), self._strike_at[rows])
-        robots = self._draw_parameters(rows, self.episode_seeds[rows], self._occurrences[rows])
+        if self.randomization.intervals:
+            self._strike_at[rows] = np.where(due[rows], self._next_strike(rows), self._strike_at[rows])
+        time = np.asarray(self.ticks[rows] * self.task.config.control_period, np.float64)
+        robots = self._draw_parameters(rows, self.episode_seeds[rows], self._occurrences[rows], time)
         for index, row in enumerate(rows.tolist()):
             if self._overrides.get(row):
                 _override(Parameters(robots.values[index : index + 1]), self._overrides[row])
         self.parameters.values[rows] = robots.values
-        self.plant.set_parameters(self.parameters, struck)
+        self.plant.set_parameters(self.parameters, self.changed)
 
     # ---- what the faces hand out: fresh objects every time ----
 
@@ -363,8 +376,15 @@ class Core:
 
     def reset_info(self) -> dict[str, Any]:
         """Return ``randomization`` {element: (N,)}: the present values of all parameters that randomisation changes."""
-        values = self.parameters.values[:, self.randomization.columns].T.copy()
-        return {"randomization": dict(zip(self.randomization.elements, values, strict=True))}
+        return self._samples(self.randomization.elements, self.randomization.columns)
+
+    def change_info(self) -> dict[str, Any]:
+        """Return ``randomization`` {element: (N,)}: the present values of those that also change within an episode."""
+        return self._samples(self.randomization.timed_elements, self.randomization.timed_columns)
+
+    def _samples(self, elements: tuple[str, ...], columns: NDArray[np.int64]) -> dict[str, Any]:
+        values = self.parameters.values[:, columns].T.copy()
+        return {"randomization": dict(zip(elements, values, strict=True))}
 
     def describe(self) -> str:
         """Return the task's tables as text."""

@@ -12,7 +12,8 @@ from wlr_gym.tasks.task import build_task, read_task
 
 _INFO = """**Info** ``reset``: ``randomization`` {parameter element: value}. ``step``: ``reward_terms`` {term: weighted value},
 ``slip_velocity`` (4, 2) m/s along each wheel's heading and axle, ``effective_friction`` (4, 2) along them; in an episode's
-last step also ``episode_reward_terms`` {term: sum}. Reset options: ``command`` {name: value} held for the episode,
+last step also ``episode_reward_terms`` {term: sum}; where randomisation changed parameters within the episode also
+``randomization`` {element: new value}. Reset options: ``command`` {name: value} held for the episode,
 ``parameters`` {name or element: value} set after randomisation."""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from wlr_gym.envs.core import Core, Mask
 from wlr_gym.envs.methods import TaskMethods
+from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
 from wlr_gym.envs.registry import task_name_of
-from wlr_gym.envs.settings import check_render_mode, read_settings
+from wlr_gym.envs.settings import read_settings
 from wlr_gym.envs.vector import seed_robots
 from wlr_gym.errors import InputError, require_package
 
@@ -21,31 +22,37 @@ require_package("stable_baselines3", "train")
 
 from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
 
+#: Robots in a picture of a batch.
+TILES = 16
+
 
 class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
     """N robots for Stable-Baselines3, without the loop of ``DummyVecEnv``; bit-identical to it with the same seeds.
 
     An ended episode is followed by the next in the same step. Its info then holds ``terminal_observation``,
     ``TimeLimit.truncated`` and ``episode_reward_terms``; infos of other robots are empty, to be cheap (the present values of
-    all robots are in ``core``: ``reward``, ``terms``, ``plant.truth()``).
+    all robots are in ``core``: ``reward``, ``terms``, ``plant.truth()``), but for ``randomization`` when it changed.
 
     Args:
         env_id: id such as ``WLR-Velocity-v0``.
         num_envs: N.
         seed: robot i gets seed + i at the first reset; None = fresh entropy.
+        render_mode: ``rgb_array`` (``render()`` returns the first robots as tiles of one picture), ``human`` (a window with the
+            first robot) or None.
         **keywords: those of :class:`wlr_gym.envs.settings.Settings`.
     """
-
-    render_mode: str | None = None
 
     def __init__(
         self, env_id: str, num_envs: int, *, seed: int | None = None, render_mode: str | None = None, **keywords: Any
     ) -> None:
         EzPickle.__init__(self, env_id, num_envs, seed=seed, render_mode=render_mode, **keywords)
         check_render_mode(render_mode)
+        self.render_mode = render_mode
         self.core = Core(task_name_of(env_id), read_settings(keywords), num_envs)
         self.spec = gym.spec(env_id)
         super().__init__(self.core.count, self.core.observation_space, self.core.action_space)
+        self.metadata = metadata(self.core.task.config.control_period)
+        self.pictures = Pictures(self.core, render_mode)
         self._actions: Any = None
         if seed is not None:
             self.seed(seed)
@@ -61,6 +68,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         self._reset_seeds()
         self._reset_options()
         self._keep_reset_infos(self.core.everyone)
+        self.pictures.after_tick()
         return self.core.observations()
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
@@ -73,6 +81,9 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         any_done = core.step(self._actions, core.everyone)
         reward = core.reward.astype(np.float32)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if core.changed.any():
+            for row, info in self._samples(core.change_info(), core.changed):
+                infos[row] = info
         done = core.terminated | core.truncated
         if any_done:
             sums = core.sums.copy()
@@ -84,15 +95,35 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
                 }
             core.begin_episodes(done)
             self._keep_reset_infos(done)
+        self.pictures.after_tick()
         return core.observations(), reward, done, infos
 
     def _keep_reset_infos(self, mask: Mask) -> None:
-        values = self.core.reset_info()["randomization"]
+        for row, info in self._samples(self.core.reset_info(), mask):
+            self.reset_infos[row] = info
+
+    @staticmethod
+    def _samples(info: dict[str, Any], mask: Mask) -> Iterator[tuple[int, dict[str, Any]]]:
+        values = info["randomization"]
         for row in np.flatnonzero(mask).tolist():
-            self.reset_infos[row] = {"randomization": {name: float(column[row]) for name, column in values.items()}}
+            yield row, {"randomization": {name: float(column[row]) for name, column in values.items()}}
+
+    def render(self, mode: str | None = None) -> NDArray[np.uint8] | None:
+        """Return the first robots as tiles of one picture with ``rgb_array``; show the first robot with ``human``.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+            InputError: no OpenGL on this machine; the message says what to install or set.
+        """
+        return self.pictures.show() if self.render_mode == "human" else super().render(mode)
+
+    def get_images(self) -> list[NDArray[np.uint8]]:
+        """Return the pictures (H, W, 3) of the first :data:`TILES` robots."""
+        return [self.pictures.frame(row) for row in range(min(self.num_envs, TILES))]
 
     def close(self) -> None:
-        """Release the plant."""
+        """Release the plant and what pictures need."""
+        self.pictures.close()
         self.core.close()
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:

@@ -11,20 +11,23 @@ from gymnasium.utils import EzPickle
 
 from wlr_gym.envs.core import Core, read_actions
 from wlr_gym.envs.methods import TaskMethods
-from wlr_gym.envs.settings import check_render_mode, read_settings
+from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
+from wlr_gym.envs.settings import read_settings
 
 
 class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
     """One robot on a task. Subclasses name the task; keywords are those of :class:`wlr_gym.envs.settings.Settings`."""
 
     task_name: ClassVar[str]
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # type: ignore[misc]
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 50}  # noqa: RUF012
 
     def __init__(self, *, render_mode: str | None = None, **keywords: Any) -> None:
         EzPickle.__init__(self, render_mode=render_mode, **keywords)
         check_render_mode(render_mode)
         self.render_mode = render_mode
         self.core = Core(self.task_name, read_settings(keywords), 1)
+        self.metadata = metadata(self.core.task.config.control_period)
+        self.pictures = Pictures(self.core, render_mode)
         self.observation_space = self.core.observation_space
         self.action_space = self.core.action_space
         self._everyone = self.core.everyone
@@ -45,6 +48,7 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
             self.core.seed(0, self.np_random_seed if seed is None else seed)
         self.core.begin_episodes(self._everyone, options)
         self._ready = True
+        self.pictures.after_tick()
         return self.core.observation_of(0), _first_rows(self.core.reset_info())
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -63,16 +67,27 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
             "slip_velocity": truth.slip_velocity.reshape(4, 2).copy(),
             "effective_friction": truth.effective_friction.reshape(4, 2).copy(),
         }
+        if core.changed[0]:
+            info |= _first_rows(core.change_info())
         if done:
             info |= _first_rows(core.episode_info())
+        self.pictures.after_tick()
         return core.observation_of(0), float(core.reward[0]), bool(core.terminated[0]), bool(core.truncated[0]), info
 
-    def render(self) -> None:
-        """Raise: this version has no pictures."""
-        check_render_mode("render()")
+    def render(self) -> np.ndarray | None:
+        """Return the picture (H, W, 3) of the robot with ``rgb_array``; show it with ``human``, which every step does itself.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+            InputError: no OpenGL on this machine; the message says what to install or set.
+        """
+        if self.render_mode is None:
+            return self.pictures.warn_without_mode()
+        return self.pictures.show() if self.render_mode == "human" else self.pictures.frame(0)
 
     def close(self) -> None:
-        """Release the plant."""
+        """Release the plant and what pictures need."""
+        self.pictures.close()
         self.core.close()
 
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.envs.core import OPTIONS, Core, Mask, read_options
 from wlr_gym.envs.methods import TaskMethods
-from wlr_gym.envs.settings import check_render_mode, read_settings
+from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
+from wlr_gym.envs.settings import read_settings
 from wlr_gym.errors import InputError, nearest
 
 
@@ -25,7 +26,8 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
         num_envs: N.
         autoreset_mode: ``NextStep`` (default), ``SameStep`` or ``Disabled``, as text or ``gymnasium.vector.AutoresetMode``.
         max_episode_steps: truncate after so many control ticks, if that is before the task's own limit.
-        render_mode: only None in this version.
+        render_mode: ``rgb_array`` (``render()`` returns one picture per robot), ``human`` (a window with the first robot)
+            or None.
         **keywords: those of :class:`wlr_gym.envs.settings.Settings`.
     """
 
@@ -51,8 +53,9 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
         check_render_mode(render_mode)
         self.render_mode = render_mode
         self.autoreset_mode = _read_mode(autoreset_mode)
-        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.core = Core(self.task_name, read_settings(keywords), num_envs)
+        self.metadata = {**metadata(self.core.task.config.control_period), "autoreset_mode": self.autoreset_mode}
+        self.pictures = Pictures(self.core, render_mode)
         self.num_envs = self.core.count
         if max_episode_steps is not None:
             if not isinstance(max_episode_steps, (int, np.integer)) or max_episode_steps < 1:
@@ -83,6 +86,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
         seed_robots(self.core, seeds, mask)
         self.core.begin_episodes(mask, given)
         self._over = self._over & ~mask
+        self.pictures.after_tick()
         return self.core.observations(), _masked(self.core.reset_info(), mask)
 
     # ---- step ----
@@ -110,19 +114,20 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
         over = terminated | truncated
         if any_done and self.autoreset_mode is AutoresetMode.SAME_STEP:
             return self._restart_now(reward, terminated, truncated, over)
-        infos = _masked(core.step_info(), active)
+        infos = _masked(core.step_info(), active) | self._changes()
         if any_done:
             infos |= _masked(core.episode_info(), over)
         if waiting:
             core.begin_episodes(self._over)
-            infos |= _masked(core.reset_info(), self._over)
+            _merge(infos, _masked(core.reset_info(), self._over))
         self._over = over
+        self.pictures.after_tick()
         return core.observations(), reward, terminated, truncated, infos
 
     def _restart_now(
         self, reward: NDArray[np.float64], terminated: Mask, truncated: Mask, over: Mask
     ) -> tuple[Any, NDArray[np.float64], Mask, Mask, dict[str, Any]]:
-        core = self.core
+        core, changes = self.core, self._changes()
         final = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(over).tolist():
             final[row] = core.observation_of(row)
@@ -131,17 +136,33 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
         infos["final_info"] = _masked(core.step_info() | core.episode_info(), over)
         infos["_final_info"] = over.copy()
         core.begin_episodes(over)
-        infos |= _masked(core.reset_info(), over)
+        _merge(infos, _masked(core.reset_info(), over))
+        _merge(infos, changes)
+        self.pictures.after_tick()
         return core.observations(), reward, terminated, truncated, infos
+
+    def _changes(self) -> dict[str, Any]:
+        """Info of the robots whose parameters changed within their episode."""
+        return _masked(self.core.change_info(), self.core.changed) if self.core.changed.any() else {}
 
     # ---- the rest ----
 
-    def render(self) -> None:
-        """Raise: this version has no pictures."""
-        check_render_mode("render()")
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return one picture (H, W, 3) per robot with ``rgb_array``; show the first robot with ``human``.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+            InputError: no OpenGL on this machine; the message says what to install or set.
+        """
+        if self.render_mode is None:
+            return self.pictures.warn_without_mode()
+        if self.render_mode == "human":
+            return self.pictures.show()
+        return tuple(self.pictures.frame(row) for row in range(self.num_envs))
 
     def close_extras(self, **_: Any) -> None:
-        """Release the plant."""
+        """Release the plant and what pictures need."""
+        self.pictures.close()
         self.core.close()
 
 
@@ -197,3 +218,16 @@ def _masked(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
         result[key] = {**value, **{f"_{name}": own for name in value}} if isinstance(value, dict) else value
         result[f"_{key}"] = own
     return result
+
+
+def _merge(infos: dict[str, Any], others: dict[str, Any]) -> None:
+    """Add infos of other robots, taken at the same time, in place: a key in both holds for the robots of both masks."""
+    for key, value in others.items():
+        if key not in infos:
+            infos[key] = value
+        elif isinstance(value, dict):
+            _merge(infos[key], value)
+        elif key.startswith("_"):
+            infos[key] = infos[key] | value
+        else:
+            infos[key] = np.where(others[f"_{key}"], value, infos[key])

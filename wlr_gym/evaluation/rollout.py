@@ -40,6 +40,7 @@ class Rollout:
         energy: (T, N) drawn from the supply, J; braking counts as negative.
         saturated: (T, N, 8) the motor was at its voltage or torque limit.
         friction: (N, 4, 2) coefficients at each wheel, along heading and axle, in the first tick.
+        sampled: (K,) parameter elements that randomisation draws. samples: (N, K) their values at the start.
     """
 
     control_period: float
@@ -57,6 +58,8 @@ class Rollout:
     energy: Array
     saturated: NDArray[np.bool_]
     friction: Array
+    sampled: tuple[str, ...]
+    samples: Array
 
     @property
     def episodes(self) -> int:
@@ -83,20 +86,30 @@ def make_core(environment: str, episodes: int, keywords: Mapping[str, Any]) -> C
     return Core(task_name_of(environment), read_settings(keywords), episodes)
 
 
-def roll_out(core: Core, policy: Policy, first_seed: int = 0, on_tick: Callable[[], object] | None = None) -> Rollout:
+def roll_out(
+    core: Core,
+    policy: Policy,
+    first_seed: int = 0,
+    on_tick: Callable[[], object] | None = None,
+    on_start: Callable[[], object] | None = None,
+) -> Rollout:
     """Play one episode per robot of ``core``; robot i has seed ``first_seed + i``. Deterministic.
 
     Args:
         core: batch of robots; nothing of its past matters.
         policy: what drives them.
         first_seed: seed of the first episode.
-        on_tick: called after every control tick (progress bars).
+        on_tick: called after every control tick (progress bars, logs).
+        on_start: called once when the episodes have begun.
     """
     seeds = first_seed + np.arange(core.count)
     for row, seed in enumerate(seeds.tolist()):
         core.seed(row, seed)
     core.begin_episodes(core.everyone)
+    samples = core.parameters.values[:, core.randomization.columns]
     policy.reset(core.everyone)
+    if on_start is not None:
+        on_start()
     active = core.everyone.copy()
     ticks: list[dict[str, NDArray]] = []
     while active.any():
@@ -114,6 +127,8 @@ def roll_out(core: Core, policy: Policy, first_seed: int = 0, on_tick: Callable[
         command_names=core.task.commands,
         fell=core.terminated.copy(),
         friction=friction,
+        sampled=core.randomization.elements,
+        samples=samples,
         **stacked,
     )
 

@@ -62,7 +62,7 @@ def _platform_constants(parameters: Parameters) -> dict[str, Array]:
     com, payload = parameters["body.com_offset"], parameters["payload.position"]
     inertia = np.zeros((len(parameters), 6))
     inertia[:, :3] = parameters["body.inertia"]
-    inertia += _point_inertia(body_mass, com) + _point_inertia(payload_mass, payload)
+    inertia += point_inertia(body_mass, com) + point_inertia(payload_mass, payload) + parameters["payload.inertia"]
     return {
         "platform_mass": body_mass + payload_mass,
         "platform_first_moment": body_mass[:, None] * com + payload_mass[:, None] * payload,
@@ -70,7 +70,7 @@ def _platform_constants(parameters: Parameters) -> dict[str, Array]:
     }
 
 
-def _point_inertia(mass: Array, position: Array) -> Array:
+def point_inertia(mass: Array, position: Array) -> Array:
     """Inertia (N, 6) about the origin of mass points (N,) at positions (N, 3)."""
     x, y, z = position.T
     return (mass * np.array([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])).T

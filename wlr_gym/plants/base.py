@@ -168,6 +168,10 @@ class PlantState:
         joint_velocity: (N, 8) rad/s, relative to the parent link.
         reference_position: (N, 8) position the servo's profile generator stands at, rad.
         reference_velocity: (N, 8) velocity it stands at, rad/s.
+        rotor_lead: (N, 8) angle of each rotor beyond its joint, at the output shaft, rad: only where the gear has play. None =
+            in the middle of the play.
+        rotor_rate: (N, 8) rate of each rotor relative to the parent link, rad/s. None = turning with its joint.
+        supply_drop: (N,) drop of the supply below its open-circuit voltage, V. None = none.
     """
 
     position: Array
@@ -178,13 +182,16 @@ class PlantState:
     joint_velocity: Array
     reference_position: Array
     reference_velocity: Array
+    rotor_lead: Array | None = None
+    rotor_rate: Array | None = None
+    supply_drop: Array | None = None
 
     def __len__(self) -> int:
         return self.position.shape[0]
 
     def copy(self) -> PlantState:
         """Return an independent copy."""
-        return PlantState(**{name: np.array(value) for name, value in vars(self).items()})
+        return PlantState(**{name: np.array(value) for name, value in vars(self).items() if value is not None})
 
 
 def standing_state(robot: Robot, parameters: Parameters, leg_angle: float | None = None) -> PlantState:

@@ -27,9 +27,12 @@ class GoalHistory:
         self._delayed = False
 
     def reset(self, rows: NDArray[np.intp], state: PlantState, parameters: Parameters) -> None:
-        """Forget old goals: legs are told to stay where their reference is, wheels to keep their reference speed."""
+        """Forget old goals: legs are told to stay where their reference is, wheels to keep their reference speed.
+
+        Goals are in terms of the reading, references in terms of the true angle.
+        """
         hold = state.reference_velocity[rows].copy()
-        hold[:, :4] = state.reference_position[rows, :4]
+        hold[:, :4] = state.reference_position[rows, :4] + parameters["joint.zero_offset"][rows]
         self._ring[:, rows] = hold
         self.set_delays(rows, parameters)
 

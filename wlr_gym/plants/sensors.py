@@ -3,7 +3,8 @@
 A simulator hands over one :data:`RAW_LAYOUT` row per robot and control tick; :class:`SensorModel` turns it into
 ``SENSOR_LAYOUT``. Noise is counter-based, so a robot reads the same bits alone or anywhere in a batch of any size.
 
-Order of errors: mounting and zero errors and biases, then noise, then register counts. The simulator itself low-passes
+Order of errors: mounting (``imu.mount``: what the IMU reads is in its own frame), then zero errors, scale and biases, then
+noise, then register counts. The simulator itself low-passes
 gyroscope and accelerometer (``imu.bandwidth``) inside its substeps.
 """
 
@@ -43,10 +44,11 @@ _CALIBRATION = (
     "imu.gyro_bias",
     "imu.accel_bias",
     "camera.mount_yaw",
+    "camera.scale",
     "camera.delay",
 )
-_ZERO_OFFSET, _GYRO_BIAS, _ACCEL_BIAS, _MOUNT_YAW, _DELAY = 0, 4, 7, 10, 11
-_WHEEL_ZERO, _START_POSE, _SHOWN_POSE, _PHASE, _POSES = 12, 16, 19, 22, 23
+_ZERO_OFFSET, _GYRO_BIAS, _ACCEL_BIAS, _MOUNT_YAW, _SCALE, _DELAY, _IMU_TO_BODY = 0, 4, 7, 10, 11, 12, 13
+_WHEEL_ZERO, _START_POSE, _SHOWN_POSE, _PHASE, _POSES = 22, 26, 29, 32, 33
 
 # Entries of the settings vector.
 _PERIOD, _CAMERA_RATE, _NOISY = 0, 1, 2
@@ -121,8 +123,8 @@ def _expose(seed: Any, frame: int, ticks: float, length: int, settings: Any, sta
     yaw = state[a + 2] + part * (state[b + 2] - state[a + 2]) - state[_START_POSE + 2]
     turn = state[_START_POSE + 2] + state[_MOUNT_YAW]
     c, s = math.cos(turn), math.sin(turn)
-    state[_SHOWN_POSE] = c * dx + s * dy
-    state[_SHOWN_POSE + 1] = c * dy - s * dx
+    state[_SHOWN_POSE] = state[_SCALE] * (c * dx + s * dy)
+    state[_SHOWN_POSE + 1] = state[_SCALE] * (c * dy - s * dx)
     state[_SHOWN_POSE + 2] = yaw
     if settings[_NOISY] > 0.0:
         n0, n1, n2, _ = normals4(seed, _CAMERA_STREAM, frame, 0)
@@ -149,6 +151,13 @@ def _add_noise(seed: Any, tick: int, settings: Any, out: Any) -> None:
     out[_OUT_ACCEL + 2] += settings[_ACCEL_NOISE] * n2
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _in_imu_frame(state: Any, row: Any, first: int, axis: int) -> float:
+    """Component ``axis`` in the IMU's frame of the body-frame vector in ``row[first:first + 3]`` (transposed rotation)."""
+    r = _IMU_TO_BODY + axis
+    return state[r] * row[first] + state[r + 3] * row[first + 1] + state[r + 6] * row[first + 2]
+
+
 @njit(cache=True, nogil=True)
 def _measure(raw: Any, seeds: Any, ticks: Any, settings: Any, states: Any, outs: Any, start: Any, stop: Any) -> None:
     for i in range(start, stop):
@@ -157,8 +166,8 @@ def _measure(raw: Any, seeds: Any, ticks: Any, settings: Any, states: Any, outs:
             out[k] = row[k] + state[_ZERO_OFFSET + k]
             out[4 + k] = row[4 + k] - state[_WHEEL_ZERO + k]
         for k in range(3):
-            out[_OUT_GYRO + k] = row[_RAW_GYRO + k] + state[_GYRO_BIAS + k]
-            out[_OUT_ACCEL + k] = row[_RAW_ACCEL + k] + state[_ACCEL_BIAS + k]
+            out[_OUT_GYRO + k] = _in_imu_frame(state, row, _RAW_GYRO, k) + state[_GYRO_BIAS + k]
+            out[_OUT_ACCEL + k] = _in_imu_frame(state, row, _RAW_ACCEL, k) + state[_ACCEL_BIAS + k]
         for k in range(8):
             out[_OUT_VELOCITY + k] = row[_RAW_VELOCITY + k]
             out[_OUT_EFFORT + k] = row[_RAW_EFFORT + k]
@@ -183,10 +192,12 @@ class SensorModel:
     """The sensors of ``count`` robots.
 
     Encoders: true angle (legs plus ``joint.zero_offset``, wheels from where they stood at reset) and rate in register
-    counts. Efforts, gyroscope, accelerometer, voltage: bias, white noise, counts. Camera: frames at ``camera.rate`` with a
-    phase drawn per robot, shown at the first tick at least ``camera.delay`` after their exposure, and until the next; pose from
-    the start pose (in the start heading turned by ``camera.mount_yaw``; yaw zeroed and unwrapped, not turned). Before the
-    reset the robot is taken to have stood still. ``camera_is_new`` is 1 at the reset.
+    counts. Efforts, gyroscope, accelerometer, voltage: bias, white noise, counts. Gyroscope and accelerometer read body-frame
+    vectors turned into the IMU's frame (``imu.mount``); their biases are along the IMU's own axes. Camera: frames at
+    ``camera.rate`` with a phase drawn per robot, shown at the first tick at least ``camera.delay`` after their exposure, and
+    until the next; pose from the start pose (x and y in the start heading turned by ``camera.mount_yaw``, then times
+    ``camera.scale``; yaw zeroed and unwrapped, not turned). Before the reset the robot is taken to have stood still.
+    ``camera_is_new`` is 1 at the reset.
 
     With ``options.sensor_noise`` False there is neither noise nor rounding; biases, offsets, delays and frame times stay.
     Sources: robot file's ``sensors``; counts of effort and voltage from :mod:`wlr_gym.servo`.
@@ -199,6 +210,8 @@ class SensorModel:
         self._seeds = np.zeros(count, np.uint64)
         self._ticks = np.zeros(count, np.int64)
         self._states = np.zeros((count, _POSES + 3 * history))
+        self._states[:, _SCALE] = 1.0
+        self._states[:, _IMU_TO_BODY:_WHEEL_ZERO] = np.eye(3).ravel()
 
     def reset(
         self,
@@ -231,8 +244,9 @@ class SensorModel:
             _measure(raw, self._seeds, self._ticks, self._settings, self._states, out, i, i + 1)
 
     def set_errors(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
-        """Take the zero errors, biases, mounting error and camera delay of robots ``rows``; nothing is forgotten."""
+        """Take zero errors, biases, mounting errors, camera scale and delay of robots ``rows``; nothing is forgotten."""
         errors = [parameters[name].reshape(self.count, -1)[rows] for name in _CALIBRATION]
+        errors.append(imu_to_body(parameters)[rows].reshape(-1, 9))
         self._states[rows, :_WHEEL_ZERO] = np.concatenate(errors, axis=1)
 
     def measure(self, raw: Array, out: Array, start: int = 0, stop: int | None = None) -> None:
@@ -255,6 +269,23 @@ class SensorModel:
                 f"sensors of {self.count} robots take raw ({self.count}, {RAW_LAYOUT.width}) and "
                 f"out ({self.count}, {SENSOR_LAYOUT.width}), got {raw.shape} and {out.shape}"
             )
+
+
+def imu_to_body(parameters: Parameters) -> Array:
+    """Return the rotation of ``imu.mount`` from the IMU's to the body frame, (N, 3, 3); exactly the identity without one."""
+    roll, pitch, yaw = parameters["imu.mount"].T
+    return rotation(yaw, pitch, roll)
+
+
+def rotation(yaw: Array, pitch: Array, roll: Array) -> Array:
+    """Return the matrices (N, 3, 3) of Rz(yaw) Ry(pitch) Rx(roll)."""
+    (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def _settings(robot: Robot, options: PlantOptions) -> Array:

@@ -1,13 +1,14 @@
 """Measured runs: read, check, write, convert and replay them. The format: ``docs/run_format.md``.
 
 ``read_run`` and ``read_dataset`` refuse what is not a run; ``check_table`` reports what is odd about one. ``replay`` lives in
-:mod:`wlr_gym.runs.replay`, because it needs a plant.
+:mod:`wlr_gym.runs.replay`. ``simulate_again`` repeats a simulated run that has its record beside it.
 """
 
 from wlr_gym.runs.check import Finding, check_table
 from wlr_gym.runs.convert import convert
 from wlr_gym.runs.format import COLUMNS, Column, Profile, RunMeta
 from wlr_gym.runs.read import DataSet, Run, read_dataset, read_meta, read_run
+from wlr_gym.runs.simulation import Simulation, simulate_again, simulated_parameters
 from wlr_gym.runs.write import write_meta, write_run
 
 __all__ = [
@@ -18,11 +19,14 @@ __all__ = [
     "Profile",
     "Run",
     "RunMeta",
+    "Simulation",
     "check_table",
     "convert",
     "read_dataset",
     "read_meta",
     "read_run",
+    "simulate_again",
+    "simulated_parameters",
     "write_meta",
     "write_run",
 ]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import PlantState, standing_state
+from wlr_gym.plants.sensors import imu_to_body, rotation
 from wlr_gym.robot import CORNER_SIGNS, JOINTS, Robot
 from wlr_gym.runs.read import Run
 from wlr_gym.servo import motor_constants
@@ -72,7 +73,8 @@ def measured_state(run: Run, times: Array, background: PlantState, parameters: P
 
     Measured: joint angles and rates; x, y, yaw and their rates from the camera; body rates from the gyroscope. Height, pitch
     and roll are the background's, moved by what the difference between measured and background leg angles means for a
-    body on four wheels. Servo references are the background's; a wheel's moves along with its angle.
+    body on four wheels. Servo references are the background's; a wheel's moves along with its angle. Rotors keep their place
+    in the play of their gears.
 
     Args:
         run: the run.
@@ -84,6 +86,8 @@ def measured_state(run: Run, times: Array, background: PlantState, parameters: P
     state = background.copy()
     state.joint_position, state.joint_velocity = _joints(run, times, parameters, degree)
     state.reference_position[:, 4:] += state.joint_position[:, 4:] - background.joint_position[:, 4:]
+    if state.rotor_rate is not None:
+        state.rotor_rate += state.joint_velocity - background.joint_velocity
 
     yaw, pitch, roll = euler_angles(background.quaternion)
     moved = rest_pose(parameters, state.joint_position[:, :4]) - rest_pose(parameters, background.joint_position[:, :4])
@@ -92,7 +96,8 @@ def measured_state(run: Run, times: Array, background: PlantState, parameters: P
     velocity = np.einsum("nij,nj->ni", rotation(yaw, pitch, roll), background.linear_velocity_in_body)
     if {"gyro_x", "gyro_y", "gyro_z"} <= set(run.table.columns):
         gyro = [local_fit(run["t"], run[f"gyro_{axis}"], times, JOINT_WINDOW, degree)[0] for axis in "xyz"]
-        state.angular_velocity_in_body = np.stack(gyro, axis=1) - parameters["imu.gyro_bias"]
+        measured = np.stack(gyro, axis=1) - parameters["imu.gyro_bias"]
+        state.angular_velocity_in_body = np.einsum("nij,nj->ni", imu_to_body(parameters), measured)
     if has_camera(run):
         (x, vx), (y, vy), (yaw, _) = _camera(run, times, parameters, degree)
         state.position[:, 0], state.position[:, 1] = x, y
@@ -129,8 +134,8 @@ def _camera(run: Run, times: Array, parameters: Parameters, degree: int) -> list
     """Marker x, y and yaw in the floor frame, each with its rate, at the given times."""
     exposed = run["t"] - parameters["camera.delay"][0]
     x, y, yaw = (local_fit(exposed, unwrapped(run[f"cam_{name}"]), times, CAMERA_WINDOW, degree) for name in ("x", "y", "yaw"))
-    mount = parameters["camera.mount_yaw"][0]
-    cosine, sine = np.cos(mount), np.sin(mount)
+    mount, scale = parameters["camera.mount_yaw"][0], parameters["camera.scale"][0]
+    cosine, sine = np.cos(mount) / scale, np.sin(mount) / scale
     turned_x, turned_y = ((cosine * x[k] - sine * y[k], sine * x[k] + cosine * y[k]) for k in (0, 1))
     return [(turned_x[0], turned_y[0]), (turned_x[1], turned_y[1]), yaw]
 
@@ -193,14 +198,3 @@ def quaternion(yaw: Array, pitch: Array, roll: Array) -> Array:
     w, x = cy * cp * cr + sy * sp * sr, cy * cp * sr - sy * sp * cr
     y, z = cy * sp * cr + sy * cp * sr, sy * cp * cr - cy * sp * sr
     return np.stack([w, x, y, z], axis=1)
-
-
-def rotation(yaw: Array, pitch: Array, roll: Array) -> Array:
-    """Matrices (N, 3, 3) of Rz(yaw) Ry(pitch) Rx(roll), body to floor frame."""
-    (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)

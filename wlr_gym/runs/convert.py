@@ -24,11 +24,11 @@ def convert(source: str | Path, target: str | Path, suffix: str | None = None) -
     source, target = Path(source), Path(target)
     if source.is_file():
         run = read_run(source)
-        return [write_run(target, run.table, run.meta if (source.parent / META_FILE).is_file() else None)]
+        return [write_run(target, run.table, run.meta if (source.parent / META_FILE).is_file() else None, run.simulation)]
     if suffix not in SUFFIXES:
         raise InputError(f"convert {source}: the format of a data set is {' or '.join(SUFFIXES)}, not {suffix!r}")
     data = read_dataset(source)
-    written = [write_run(target / f"{run.name}{suffix}", run.table) for run in data.runs]
+    written = [write_run(target / f"{run.name}{suffix}", run.table, simulation=run.simulation) for run in data.runs]
     if (source / META_FILE).is_file():
         write_meta(target, data.meta)
     return written

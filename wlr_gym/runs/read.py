@@ -16,6 +16,7 @@ from wlr_gym.errors import InputError
 from wlr_gym.robot import parse_config, read_yaml
 from wlr_gym.runs.check import Finding, check_names, check_table
 from wlr_gym.runs.format import META_FILE, SUFFIXES, RunMeta
+from wlr_gym.runs.simulation import Simulation, read_simulation
 
 if TYPE_CHECKING:
     import pandas
@@ -32,12 +33,14 @@ class Run:
         meta: what ``meta.yaml`` beside the file says; defaults where there is none.
         path: the file it came from.
         findings: what is odd about it (gaps, dead channels, ...).
+        simulation: how it was simulated, where the record of that stands beside it; replays do not look at it unless asked.
     """
 
     table: pandas.DataFrame
     meta: RunMeta
     path: Path
     findings: tuple[Finding, ...] = field(default=())
+    simulation: Simulation | None = None
 
     @property
     def name(self) -> str:
@@ -77,7 +80,7 @@ def read_run(path: str | Path) -> Run:
     meta = read_meta(path.parent)
     columns = _read_csv(path) if path.suffix.lower() == ".csv" else _read_parquet(path)
     findings = check_table(columns, str(path))
-    return Run(pandas.DataFrame(columns), meta, path, tuple(findings))
+    return Run(pandas.DataFrame(columns), meta, path, tuple(findings), read_simulation(path))
 
 
 def read_dataset(folder: str | Path) -> DataSet:

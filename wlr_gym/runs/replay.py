@@ -14,12 +14,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.effects import Patch, apply_patch, load_patch
+from wlr_gym.effects import Source, apply_patch, load_patch
 from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.parameters import Parameters
 from wlr_gym.paths import data_directory
@@ -123,7 +122,7 @@ def replay(
     backend: str = "gibbs_appell",
     robot: Robot | str | Path | None = None,
     parameters: Parameters | None = None,
-    effects: Patch | str | Path | Sequence[Mapping[str, Any]] | None = None,
+    effects: Source = None,
     segment: float = 1.0,
     clock: float = CLOCK,
     physics_step: float = 0.001,
@@ -135,7 +134,7 @@ def replay(
         backend: a simulator of :data:`wlr_gym.plants.BACKENDS`.
         robot: None = the one the run's meta data name.
         parameters: (1) physical parameters; None = nominal. The run's servo profile is written into them.
-        effects: patch to add to the parameters.
+        effects: patch to add: to the parameters, and formulas to the plant.
         segment: s between anchors.
         clock: s per tick of the plant.
         physics_step: s per physics step.
@@ -143,19 +142,22 @@ def replay(
     Raises:
         InputError: unknown backend, robot or effect, a segment shorter than its lead, a run shorter than half a segment.
     """
-    robot, parameters = prepare(run, robot, parameters, effects, segment)
+    patch = load_patch(effects)
+    robot, parameters = prepare(run, robot, parameters, patch, segment)
     t = run["t"]
     starts = _segment_starts(t, segment)
     options = PlantOptions(control_period=clock, physics_step=physics_step, sensor_noise=False)
 
     first = start_state(run, robot, parameters)
     begin = t[:1] - (LEAD if starts_at_rest(run) else 0.0)
-    full, passed = _simulate(run, make_plant(backend, robot, 1, options), parameters, first, begin, t[-1] - begin[0], t[starts])
+    plant = make_plant(backend, robot, 1, options, patch.forces)
+    full, passed = _simulate(run, plant, parameters, first, begin, t[-1] - begin[0], t[starts])
     many = Parameters(np.repeat(parameters.values, len(starts), axis=0))
     anchors = measured_state(run, t[starts], passed, many)
     ends = np.append(t[starts[1:]] + LEAD, t[-1])
     duration = float(np.max(ends - t[starts]))
-    pieces, _ = _simulate(run, make_plant(backend, robot, len(starts), options), many, anchors, t[starts], duration)
+    plant = make_plant(backend, robot, len(starts), options, patch.forces)
+    pieces, _ = _simulate(run, plant, many, anchors, t[starts], duration)
     full_rows = {name: full.at(0, name, t) for name in CHANNELS if name in run}
     segment_rows = {name: _join(pieces, name, t, starts, ends) for name in full_rows}
     errors = _compare(run, full_rows, segment_rows, channel_noise(robot))
@@ -166,7 +168,7 @@ def prepare(
     run: Run,
     robot: Robot | str | Path | None = None,
     parameters: Parameters | None = None,
-    effects: Patch | str | Path | Sequence[Mapping[str, Any]] | None = None,
+    effects: Source = None,
     segment: float = 1.0,
 ) -> tuple[Robot, Parameters]:
     """Check what :func:`replay` is given, without simulating; return the robot and its patched parameters.
@@ -299,7 +301,8 @@ def _to_camera_frame(values: Array, parameters: Parameters) -> None:
     other times than the measured ones.
     """
     x, y, yaw = (CHANNELS.index(name) for name in ("cam_x", "cam_y", "cam_yaw"))
-    cosine, sine = np.cos(parameters["camera.mount_yaw"]), np.sin(parameters["camera.mount_yaw"])
+    mount, scale = parameters["camera.mount_yaw"], parameters["camera.scale"]
+    cosine, sine = scale * np.cos(mount), scale * np.sin(mount)
     values[:, :, x], values[:, :, y] = (
         cosine * values[:, :, x] + sine * values[:, :, y],
         cosine * values[:, :, y] - sine * values[:, :, x],
@@ -310,7 +313,8 @@ def _to_camera_frame(values: Array, parameters: Parameters) -> None:
 def _stacked(states: list[PlantState]) -> PlantState:
     if not states:
         return PlantState(*(np.zeros((0, size)) for size in (3, 4, 3, 3, 8, 8, 8, 8)))
-    return PlantState(**{name: np.concatenate([getattr(state, name) for state in states]) for name in vars(states[0])})
+    known = [name for name, value in vars(states[0]).items() if value is not None]
+    return PlantState(**{name: np.concatenate([getattr(state, name) for state in states]) for name in known})
 
 
 # --- comparison -------------------------------------------------------------------------------------------------------

@@ -16,13 +16,21 @@ from wlr_gym.files import replace_file
 from wlr_gym.runs.check import check_table
 from wlr_gym.runs.format import COLUMNS, META_FILE, SUFFIXES, RunMeta
 from wlr_gym.runs.read import read_meta
+from wlr_gym.runs.simulation import Simulation, write_simulation
 
 if TYPE_CHECKING:
     import pandas
 
 
-def write_run(path: str | Path, table: pandas.DataFrame | Mapping[str, ArrayLike], meta: RunMeta | None = None) -> Path:
+def write_run(
+    path: str | Path,
+    table: pandas.DataFrame | Mapping[str, ArrayLike],
+    meta: RunMeta | None = None,
+    simulation: Simulation | None = None,
+) -> Path:
     """Write one run as CSV or Parquet, by the suffix of ``path``; with ``meta`` also the ``meta.yaml`` beside it.
+
+    A simulated run also gets its record, ``<run>.simulation.yaml``; the record of a run that was there before goes with it.
 
     Parquet keeps every bit; CSV holds the shortest text that reads back as the same float64.
 
@@ -40,6 +48,7 @@ def write_run(path: str | Path, table: pandas.DataFrame | Mapping[str, ArrayLike
         write_meta(path.parent, meta)
     write = _write_csv if path.suffix.lower() == ".csv" else _write_parquet
     replace_file(path, lambda temporary: write(temporary, columns))
+    write_simulation(path, simulation)
     return path
 
 

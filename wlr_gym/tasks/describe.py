@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from wlr_gym.tasks.entries import AreaConfig, EventConfig
+from wlr_gym.tasks.randomization import RandomizationConfig
 from wlr_gym.tasks.task import ObservationColumn, Task, robot_hash
 from wlr_gym.tasks.terms import COMMANDS, REWARDS, TERMINATIONS
 
@@ -106,6 +108,69 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
         return "  ".join(str(cell).ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
 
     return ["", rule, line(header), rule, *(line(row) for row in rows), rule, ""]
+
+
+RANDOMIZATION_HEADER = ("event", "parameters", "when", "operation", "distribution", "one draw per")
+
+
+def describe_randomization(config: RandomizationConfig) -> str:
+    """Return what a randomisation draws as text: switches, initial state, and the table of its events."""
+    state = ", ".join(f"{name} +-{width:.4g}" for name, width in config.initial_state if width) or "standing at home"
+    return "\n".join(
+        [
+            f"**Randomization** ``{config.name}``",
+            "",
+            f"Sensor noise {_on(config.sensor_noise)}, latency {_on(config.latency)}. Start: {state}.",
+            *(table(RANDOMIZATION_HEADER, randomization_rows(config)) if config.events else []),
+        ]
+    )
+
+
+def _on(switch: bool) -> str:
+    return "on" if switch else "off"
+
+
+def randomization_rows(config: RandomizationConfig) -> list[tuple[str, ...]]:
+    """Return one row of text per event, columns as in :data:`RANDOMIZATION_HEADER`."""
+    return [
+        (name, ", ".join(event.parameters), _when(event), event.operation or "scale or add", _distribution(event), event.per)
+        for name, event in config.events.items()
+    ]
+
+
+def randomization_table(config: RandomizationConfig, base: RandomizationConfig | None = None) -> list[str]:
+    """Return the events as the lines of a Markdown table, without those that ``base`` has just so."""
+    known = [] if base is None else randomization_rows(base)
+    rows = [row for row in randomization_rows(config) if row not in known]
+    code = [(f"`{name}`", ", ".join(f"`{item}`" for item in items.split(", ")), *rest) for name, items, *rest in rows]
+    return [f"| {' | '.join(cells)} |" for cells in [RANDOMIZATION_HEADER, ["---"] * len(RANDOMIZATION_HEADER), *code]]
+
+
+def _when(event: EventConfig) -> str:
+    return event.when if event.interval is None else f"{event.when} {_span(event.interval)} s"
+
+
+def _span(limits: Sequence[float | str | None]) -> str:
+    texts = [f"{value:.4g}" if isinstance(value, int | float) else str(value) for value in limits]
+    return texts[0] if texts[0] == texts[1] else "..".join(texts)
+
+
+def _distribution(event: EventConfig) -> str:
+    match event.distribution:
+        case "choice":
+            text = "choice of " + ", ".join(f"{value:.4g}" for value in event.values or ())
+        case "tolerance":
+            text = f"tolerance x {event.sigmas:g}, cut at {event.cut:g}"
+        case "normal":
+            mean = "" if event.mean is None else f"{_span((event.mean, event.mean))} "
+            text = f"normal {mean}+- {_span((event.sigma, event.sigma))}, cut at {event.cut:g}"
+        case _:
+            text = f"{event.distribution} {_span((event.low, event.high))}"
+    return text if event.area is None else f"{text}; {_area(event.area)}"
+
+
+def _area(area: AreaConfig) -> str:
+    return "area " + ", ".join(f"{name} {_span(limits)} m" for name, limits in area if limits is not None)
 
 
 def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from wlr_gym.errors import InputError, nearest
 from wlr_gym.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.parameters import Parameters
+from wlr_gym.plants import drive, ground
 from wlr_gym.plants.base import (
     SENSOR_LAYOUT,
     TRUTH_LAYOUT,
@@ -23,6 +25,7 @@ from wlr_gym.plants.base import (
     hold_where_off,
     standing_state,
 )
+from wlr_gym.plants.forces import Force, compile_forces
 from wlr_gym.plants.gibbs_appell import kernel, packing
 from wlr_gym.plants.gibbs_appell.step import STORED
 from wlr_gym.plants.goals import GoalHistory
@@ -36,6 +39,8 @@ SWEEPS = 4
 #: Below this many tiles per thread, waking a thread costs more than it saves.
 TILES_PER_THREAD = 8
 _LANE = {name: index for index, name in enumerate(STORED)}
+_ROTOR_LEAD = [_LANE[f"rotor_lead{j}"] for j in range(8)]
+_ROTOR_RATE = [_LANE[f"rotor_rate{j}"] for j in range(8)]
 
 
 class GibbsAppellPlant:
@@ -45,6 +50,7 @@ class GibbsAppellPlant:
         robot: the robot; its nominal parameters are used until ``reset`` gets others.
         count: number of robots.
         options: step size, precision, threads.
+        forces: formula forces that act beside what the parameters say.
         sweeps: passes over the friction rows per substep.
 
     Raises:
@@ -53,7 +59,15 @@ class GibbsAppellPlant:
 
     capabilities = Capabilities("gibbs_appell", has_truth=True, can_set_state=True, real_time=False)
 
-    def __init__(self, robot: Robot, count: int = 1, options: PlantOptions | None = None, *, sweeps: int = SWEEPS) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        count: int = 1,
+        options: PlantOptions | None = None,
+        forces: Sequence[Force] = (),
+        *,
+        sweeps: int = SWEEPS,
+    ) -> None:
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise InputError(f"number of robots is {count!r}, expected 1 or more")
         self.robot = robot
@@ -79,6 +93,9 @@ class GibbsAppellPlant:
         self._goals = GoalHistory(count, self.options.control_period)
         self._sensors = SensorModel(robot, self.options, count)
         self._pool = self._make_pool()
+        self._formulas = compile_forces(forces, self.options.precision) if forces else None
+        values = self._formulas.values if self._formulas else np.zeros(0)
+        self._formula_values = np.repeat(values[:, None], self._width, axis=1).astype(self._float)
         self._features: frozenset[str] | None = None
         self.parameters = Parameters.nominal(robot, count)
         self.reset(seeds=np.zeros(count, np.uint64), parameters=self.parameters)
@@ -139,16 +156,37 @@ class GibbsAppellPlant:
         chosen.validate()
         step = self.options.physics_step
         check_contact_resolution(chosen, step)
+        self._fit_rotors(rows, chosen)
         self.parameters.values[rows] = chosen.values
         _scatter(self._constants, self._width, rows, packing.pack(chosen, self.robot, step))
         self._pad(self._constants)
         self._choose_kernel()
 
+    def _fit_rotors(self, rows: NDArray[np.intp], chosen: Parameters) -> None:
+        """Keep how far the teeth are pressed together where the gear's play changes; a new rotor turns with its joint."""
+        old, new = self.parameters["servo.backlash"][rows], chosen["servo.backlash"]
+        changed = old != new
+        if not changed.any():
+            return
+        lanes = _gather(self._lanes, self._width, rows).astype(np.float64)
+        lead = lanes[:, _ROTOR_LEAD]
+        pressed = np.maximum(np.abs(lead) - 0.5 * old, 0.0)
+        kept = np.where(old > 0.0, np.minimum(np.abs(lead), 0.5 * new) + pressed, 0.0)
+        lanes[:, _ROTOR_LEAD] = np.where(changed, np.where(new > 0.0, np.copysign(kept, lead), 0.0), lead)
+        turning = self._truth.joint_velocity[rows]
+        lanes[:, _ROTOR_RATE] = np.where(changed & (old == 0.0), turning, lanes[:, _ROTOR_RATE])
+        _scatter(self._lanes, self._width, rows, lanes)
+
     def _choose_kernel(self) -> None:
-        features = {"rolling_resistance"} if self.parameters["ground.rolling_resistance"].any() else set()
+        features = drive.families(self.parameters) | ground.families(self.parameters)
+        if self.parameters["ground.rolling_resistance"].any():
+            features.add("rolling_resistance")
+        if self._formulas:
+            features.add("forces")
         if self._features is None or not features <= self._features:
             self._features = frozenset(features | (self._features or frozenset()))
-            self._kernel = kernel.load_kernel(self._features, self.options.precision, self._width)
+            formulas = self._formulas.module if self._formulas else None
+            self._kernel = kernel.load_kernel(self._features, self.options.precision, self._width, formulas)
 
     def _pad(self, lanes: Array) -> None:
         """Fill the unused places of the last tile with copies of robot 0, so that they stay finite."""
@@ -180,7 +218,12 @@ class GibbsAppellPlant:
             "last_wheel_rate{}": (wheel_rate, range(4)),
             "reference_position{}": (reference, range(8)),
             "reference_velocity{}": (state.reference_velocity[rows], range(8)),
+            "rotor_rate{}": ((state.joint_velocity if state.rotor_rate is None else state.rotor_rate)[rows], range(8)),
         }
+        if state.rotor_lead is not None:
+            groups["rotor_lead{}"] = (state.rotor_lead[rows], range(8))
+        if state.supply_drop is not None:
+            groups["supply_drop{}"] = (state.supply_drop[rows, None], ("",))
         for pattern, (columns, labels) in groups.items():
             for k, label in enumerate(labels):
                 values[:, _LANE[pattern.format(label)]] = columns[:, k]
@@ -201,6 +244,7 @@ class GibbsAppellPlant:
 
         reference = columns("reference_position{}", range(8))
         reference[:, :4] -= self.parameters["joint.zero_offset"]
+        has_play = self.parameters["servo.backlash"] > 0.0
         return PlantState(
             position=columns("p{}", "xyz"),
             quaternion=columns("q{}", "wxyz"),
@@ -210,6 +254,9 @@ class GibbsAppellPlant:
             joint_velocity=self._truth.joint_velocity.copy(),
             reference_position=reference,
             reference_velocity=columns("reference_velocity{}", range(8)),
+            rotor_lead=np.where(has_play, columns("rotor_lead{}", range(8)), 0.0),
+            rotor_rate=np.where(has_play, columns("rotor_rate{}", range(8)), self._truth.joint_velocity),
+            supply_drop=values[:, _LANE["supply_drop"]],
         )
 
     # ---- stepping ----
@@ -227,7 +274,8 @@ class GibbsAppellPlant:
             self._torque_on[...] = np.asarray(torque_on, dtype=bool)
         goals = check_goals(goals, self._count)
         new, old, switch_time = self._goals.push(goals)
-        arguments = (self._lanes, self._constants, new, old, switch_time, self._torque_on, self._truth.values, self._raw)
+        inputs = (new, old, switch_time, self._torque_on, self._formula_values)
+        arguments = (self._lanes, self._constants, *inputs, self._truth.values, self._raw)
         if self._pool is None:
             self._run(arguments, 0, self._tiles)
         else:

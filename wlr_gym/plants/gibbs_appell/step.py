@@ -26,9 +26,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from wlr_gym import servo
 from wlr_gym.codegen import ops
 from wlr_gym.model.equations import assembly_terms, platform_terms
+from wlr_gym.plants import drive, ground
+from wlr_gym.plants.forces import COORDINATES
+from wlr_gym.plants.forces import INPUTS as INPUTS_OF_FORMULAS
+from wlr_gym.robot import JOINTS
 
 Value = Any
 Lanes = Mapping[str, Value]
@@ -47,8 +50,7 @@ STATE: tuple[str, ...] = (
     *(f"wheel_angle{i}" for i in CORNERS),
     *(f"leg_rate{i}" for i in CORNERS),
     *(f"wheel_rate{i}" for i in CORNERS),
-    *(f"reference_position{j}" for j in range(8)),
-    *(f"reference_velocity{j}" for j in range(8)),
+    *drive.STATE,
     # what the step remembers: velocities one step ago, impulses of the last step (warm start), sensor filters
     *(f"last_w{a}" for a in AXES),
     *(f"last_leg_rate{i}" for i in CORNERS),
@@ -65,6 +67,7 @@ STATE: tuple[str, ...] = (
 RESULTS: tuple[str, ...] = (
     *(f"normal{i}" for i in CORNERS),
     *(f"motor_torque{j}" for j in range(8)),
+    *(f"current_torque{j}" for j in range(8)),
     *(f"slip_displacement_{a}{i}" for i in CORNERS for a in "xy"),
     "mechanical_energy",
     "electrical_energy",
@@ -116,7 +119,7 @@ def to_body(rows: Sequence[Sequence[Value]], a: Sequence[Value]) -> Vector:
 # ---- drift: positions ------------------------------------------------------------------------------------------------
 
 
-def drift(lanes: Lanes, duration: Value) -> Out:
+def drift(lanes: Lanes, duration: Value, features: frozenset[str] = frozenset()) -> Out:
     """Move positions for ``duration`` at constant rates; the body-frame velocity turns with the body (Cayley map)."""
     v, w = vector(lanes, "v"), vector(lanes, "w")
     rows = rotation_rows(lanes)
@@ -137,6 +140,9 @@ def drift(lanes: Lanes, duration: Value) -> Out:
     for i in CORNERS:
         out[f"leg_angle{i}"] = lanes[f"leg_angle{i}"] + duration * (lanes[f"leg_rate{i}"] - w[1])
         out[f"wheel_angle{i}"] = lanes[f"wheel_angle{i}"] + duration * (lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"])
+    if "backlash" in features:
+        for j, joint in enumerate(joints_of(lanes)):
+            out[f"rotor_lead{j}"] = lanes[f"rotor_lead{j}"] + duration * (lanes[f"rotor_rate{j}"] - joint.rate)
     return out
 
 
@@ -177,42 +183,16 @@ def contact_row(hip: Vector, leg: Vector, rim: Vector, e: Sequence[Value]) -> tu
 # ---- servos ----------------------------------------------------------------------------------------------------------
 
 
-def references(lanes: Lanes, time: Value, step: Value) -> tuple[Out, list[Value], list[Value]]:
-    """Advance the profile generators; return new reference lanes and the voltages and motor-off rates of this substep.
-
-    While a motor is off, its references follow the joint, so that switching on does not jerk.
-    """
-    out: Out = {}
-    voltages: list[Value] = []
-    rates: list[Value] = []
-    for j in range(8):
-        i = j % 4
-        is_leg = j < 4
-        if is_leg:
-            rate = lanes[f"leg_rate{i}"] - lanes["wy"]
-            reading = lanes[f"leg_angle{i}"] + lanes[f"zero_offset{i}"]
-        else:
-            rate = lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"]
-            reading = lanes[f"wheel_angle{i}"]
-        goal = ops.where_positive(time - lanes[f"switch_time{j}"], lanes[f"goal{j}"], lanes[f"old_goal{j}"])
-        old = (lanes[f"reference_position{j}"], lanes[f"reference_velocity{j}"])
-        if is_leg:
-            new = servo.leg_profile_step(*old, goal, lanes[f"velocity_limit{j}"], lanes[f"acceleration_limit{j}"], step)
-        else:
-            new = servo.wheel_profile_step(
-                *old, goal, lanes[f"acceleration_limit{j}"], step, reading, lanes[f"kp{j}"], lanes["supply"]
-            )
-        position, velocity, mean_position, mean_velocity = new
-        on = lanes[f"on{j}"] - 0.5
-        out[f"reference_position{j}"] = ops.where_positive(on, position, reading)
-        out[f"reference_velocity{j}"] = ops.where_positive(on, velocity, rate)
-        voltages.append(
-            servo.controller_voltage(
-                lanes[f"kp{j}"], lanes[f"kd{j}"], mean_position, mean_velocity, reading, rate, lanes["supply"]
-            )
-        )
-        rates.append(rate)
-    return out, voltages, rates
+def joints_of(lanes: Lanes) -> list[drive.Joint]:
+    """Return the eight joints as the drive sees them."""
+    joints: list[drive.Joint] = []
+    for i in CORNERS:
+        angle = lanes[f"leg_angle{i}"]
+        joints.append(drive.Joint(angle, lanes[f"leg_rate{i}"] - lanes["wy"], angle + lanes[f"zero_offset{i}"]))
+    for i in CORNERS:
+        angle = lanes[f"wheel_angle{i}"]
+        joints.append(drive.Joint(angle, lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"], angle))
+    return joints
 
 
 # ---- kick: velocities ------------------------------------------------------------------------------------------------
@@ -254,13 +234,12 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
     v, w = vector(lanes, "v"), vector(lanes, "w")
     u_base = [*(v[k] + step * gravity[k] for k in range(3)), *w]  # uniform gravity accelerates every point alike
     w_mid = [1.5 * w[k] - 0.5 * lanes[f"last_w{a}"] for k, a in enumerate(AXES)]
-    out, voltages, rates = references(lanes, time, step)
+    joints = joints_of(lanes)
+    out, voltages = drive.command(lanes, joints, time, step, features)
     mass, bias, corners = _inertia(lanes, w_mid)
 
-    force = to_body(rows, [lanes["external_x"], lanes["external_y"], 0.0])
     momentum: list[Value] = [dot(mass[r], u_base) - step * bias[r] for r in range(6)]
-    for k in range(3):
-        momentum[k] = momentum[k] + step * force[k]
+    _push_of_surroundings(lanes, rows, step, features, momentum)
     reduced = [row[:] for row in mass]
     for i, corner in enumerate(corners):
         leg_rate, wheel_rate = lanes[f"leg_rate{i}"], lanes[f"wheel_rate{i}"]
@@ -272,7 +251,8 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
         ]
         corner.hip, corner.leg, corner.rim = wheel_points(lanes, i, *corner.trig, n, scale)
         _push_of_floor(lanes, i, corner, n, [*v, *w], step, momentum, own, out)
-        damping = _push_of_motors(lanes, i, voltages, rates, step, momentum, own, out)
+        damping = _push_of_motors(lanes, i, voltages, joints, step, features, momentum, own, out)
+        _friction_under_wheel(lanes, i, corner, (rows, heading, lateral), [*v, *w], features, out)
         _eliminate(corner, damping, own, momentum, reduced)
 
     lower, inverse_diagonal = _cholesky(reduced)
@@ -298,8 +278,8 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
         _warm_start(lanes, i, step, features, out)
         # friction rows: (base part, leg entry, wheel entry, impulse)
         local = {
-            f"leg{i}": (hinge, 1.0, 0.0, out[f"gear_friction{i}"]),
-            f"wheel{i}": ([0.0] * 6, -1.0, 1.0, out[f"gear_friction{4 + i}"]),
+            f"leg{i}": (hinge, 1.0, 0.0, out[f"share{i}"] * out[f"gear_friction{i}"]),
+            f"wheel{i}": ([0.0] * 6, -1.0, 1.0, out[f"share{4 + i}"] * out[f"gear_friction{4 + i}"]),
         }
         if "rolling_resistance" in features:
             local[f"rolling{i}"] = ([0.0] * 6, 0.0, 1.0, out[f"rolling_friction{i}"])
@@ -365,17 +345,92 @@ def _push_of_floor(
     own[0] = own[0] + (step * normal) * leg_entry
 
 
+def _push_of_surroundings(
+    lanes: Lanes, rows: Sequence[Sequence[Value]], step: Value, features: frozenset[str], momentum: Vector
+) -> None:
+    """Add the impulses of external force, tether and formula forces on the body."""
+    pull = [lanes[f"external_{a}"] - lanes["tether_stiffness"] * (lanes[f"p{a}"] - lanes[f"anchor_{a}"]) for a in "xy"]
+    force = to_body(rows, [*pull, 0.0])
+    for k in range(3):
+        momentum[k] = momentum[k] + step * force[k]
+    if "forces" not in features:
+        return
+    on_floor = to_body(rows, [lanes[f"formula_floor_force_{a}"] for a in AXES])
+    for k, (a, turn) in enumerate(zip(AXES, ("roll", "pitch", "yaw"), strict=True)):
+        momentum[k] = momentum[k] + step * (lanes[f"formula_body_force_{a}"] + on_floor[k])
+        momentum[3 + k] = momentum[3 + k] + step * lanes[f"formula_body_torque_{turn}"]
+
+
 def _push_of_motors(
-    lanes: Lanes, i: int, voltages: Vector, rates: Vector, step: Value, momentum: Vector, own: Vector, out: Out
+    lanes: Lanes,
+    i: int,
+    voltages: Vector,
+    joints: Sequence[drive.Joint],
+    step: Value,
+    features: frozenset[str],
+    momentum: Vector,
+    own: Vector,
+    out: Out,
 ) -> tuple[Value, Value]:
-    """Add the explicit impulses of both motors of leg ``i``; return their implicit damping (times the step)."""
-    leg_push, leg_damping = _motor_impulse(lanes, i, voltages[i], rates[i], step)
-    wheel_push, wheel_damping = _motor_impulse(lanes, 4 + i, voltages[4 + i], rates[4 + i], step)
-    out[f"drive{i}"], out[f"drive{4 + i}"] = voltages[i], voltages[4 + i]
-    momentum[4] = momentum[4] - leg_push
-    own[0] = own[0] + leg_push - wheel_push
-    own[1] = own[1] + wheel_push
-    return leg_damping, wheel_damping
+    """Add the explicit impulses on both joints of leg ``i``; return their implicit damping (times the step)."""
+    pushes: list[drive.Push] = []
+    for j in (i, 4 + i):
+        pushed = drive.push(lanes, j, voltages[j], joints[j], step, step, features)
+        pushes.append(pushed)
+        out[f"drive{j}"], out[f"friction_bound{j}"] = voltages[j], pushed.bound
+        out |= drive.kept_for_finish(pushed, j)
+    leg, wheel = pushes
+    momentum[4] = momentum[4] - leg.impulse
+    own[0] = own[0] + leg.impulse - wheel.impulse
+    own[1] = own[1] + wheel.impulse
+    if "forces" in features:
+        leg_torque, wheel_torque = (lanes[f"formula_{JOINTS[j]}"] for j in (i, 4 + i))
+        momentum[4] = momentum[4] - step * leg_torque
+        own[0] = own[0] + step * (leg_torque - wheel_torque)
+        own[1] = own[1] + step * wheel_torque
+    return leg.damping, wheel.damping
+
+
+def _friction_under_wheel(
+    lanes: Lanes,
+    i: int,
+    corner: _Corner,
+    axes: tuple[Sequence[Sequence[Value]], Vector, Vector],
+    twist: Vector,
+    features: frozenset[str],
+    out: Out,
+) -> None:
+    """Find the friction coefficients under wheel ``i``, at its place and slip at the start of the kick."""
+    place: list[Value] = [0.0, 0.0]
+    speed: Value = 0.0
+    if "ground" in features:
+        rows, heading, lateral = axes
+        points = (corner.hip, corner.leg, corner.rim)
+        place = contact_place(lanes, rows, points)
+        slip = slip_velocity(lanes, i, points, heading, lateral, twist)
+        speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
+    found = ground.friction(lanes, i, place[0], place[1], speed, features)
+    out[f"acting_mu_x{i}"], out[f"acting_mu_y{i}"] = found.mu_x, found.mu_y
+    out[f"acting_inverse_mu_x{i}"], out[f"acting_inverse_mu_y{i}"] = found.inverse_mu_x, found.inverse_mu_y
+
+
+def contact_place(lanes: Lanes, rows: Sequence[Sequence[Value]], points: tuple[Vector, Vector, Vector]) -> Vector:
+    """Place (x, y) of a contact point on the floor, m."""
+    hip, leg, rim = points
+    point = [hip[k] + leg[k] + rim[k] for k in range(3)]
+    return [lanes[f"p{a}"] + dot(rows[k], point) for k, a in enumerate("xy")]
+
+
+def slip_velocity(
+    lanes: Lanes, i: int, points: tuple[Vector, Vector, Vector], heading: Vector, lateral: Vector, twist: Vector
+) -> Vector:
+    """Velocity of wheel ``i``'s contact point over the floor along heading and axle, at the present rates, m/s."""
+    slip: Vector = []
+    for e, wheel_entry in ((heading, -lanes[f"radius{i}"]), (lateral, 0.0)):
+        base_row, leg_entry = contact_row(*points, e)
+        speed = dot(base_row, twist) + leg_entry * lanes[f"leg_rate{i}"] + wheel_entry * lanes[f"wheel_rate{i}"]
+        slip.append(speed)
+    return slip
 
 
 def _eliminate(
@@ -383,8 +438,9 @@ def _eliminate(
 ) -> None:
     """Take leg and wheel out of the system: Schur complement onto the base."""
     leg_damping, wheel_damping = damping
-    reduced[4][4] = reduced[4][4] + leg_damping
-    corner.coupling = [*corner.coupling[:4], corner.coupling[4] - leg_damping, corner.coupling[5]]
+    on_base = ops.rounded(leg_damping)  # a constant where the gear is rigid; rounded like one where it has play
+    reduced[4][4] = reduced[4][4] + on_base
+    corner.coupling = [*corner.coupling[:4], corner.coupling[4] - on_base, corner.coupling[5]]
     a11 = corner.leg_leg + leg_damping + wheel_damping
     a12 = corner.leg_wheel - wheel_damping
     a22 = corner.wheel_wheel + wheel_damping
@@ -411,10 +467,13 @@ def _friction_rows(
     """Whitened rows of all friction at one leg, their gains, and the effect of the warm-started impulses."""
     i11, i12, i22 = corner.inverse
     for name, (white_base, leg_entry, wheel_entry, impulse) in local.items():
-        g_leg = i11 * leg_entry + i12 * wheel_entry
-        g_wheel = i12 * leg_entry + i22 * wheel_entry
+        on_leg, on_wheel = i12 * wheel_entry, i22 * wheel_entry
+        if not isinstance(wheel_entry, float):  # a constant where both gears are rigid: not to be fused where one has play
+            on_leg, on_wheel = ops.rounded(on_leg), ops.rounded(on_wheel)
+        g_leg = i11 * leg_entry + on_leg
+        g_wheel = i12 * leg_entry + on_wheel
         z = [white_base[r] - g_leg * white[r] for r in range(6)]
-        gain = dot(z, z) + leg_entry * g_leg + wheel_entry * g_wheel
+        gain = dot(z, z) + leg_entry * ops.rounded(g_leg) + wheel_entry * ops.rounded(g_wheel)
         out[f"g_leg_{name}"], out[f"g_wheel_{name}"] = g_leg, g_wheel
         for r in range(6):
             out[f"z_{name}_{r}"] = z[r]
@@ -422,6 +481,9 @@ def _friction_rows(
         out[f"y_leg{i}"] = out[f"y_leg{i}"] + g_leg * impulse
         out[f"y_wheel{i}"] = out[f"y_wheel{i}"] + g_wheel * impulse
         out[f"gain_{name}"] = gain
+        if (joint := {"leg": i, "wheel": 4 + i}.get(name[:-1])) is not None:  # friction acts on the rotor, which may have play
+            share = out[f"share{joint}"]
+            gain = share * share * gain + out[f"rotor_gain{joint}"]
         if name[0] not in "xy":
             out[f"inverse_gain_{name}"] = 1.0 / gain
     cross_gain = dot([out[f"z_x{i}_{r}"] for r in range(6)], [out[f"z_y{i}_{r}"] for r in range(6)])
@@ -452,29 +514,18 @@ def _normal_force(lanes: Lanes, i: int, corner: _Corner, n: Vector, gap_rate: Va
 def _warm_start(lanes: Lanes, i: int, step: Value, features: frozenset[str], out: Out) -> None:
     """Start from the last step's impulses, shrunk into this step's bounds: descent must begin at an admissible point."""
     for j in (i, 4 + i):
-        bound = lanes[f"gear_bound{j}"]
+        bound = out[f"friction_bound{j}"]
         out[f"gear_friction{j}"] = ops.clip(lanes[f"gear_friction{j}"], -bound, bound)
     if "rolling_resistance" in features:
         bound = (step * lanes[f"rolling{i}"]) * (lanes[f"radius{i}"] * out[f"normal{i}"])
         out[f"bound_rolling{i}"] = bound
         out[f"rolling_friction{i}"] = ops.clip(lanes[f"rolling_friction{i}"], -bound, bound)
     out[f"bound{i}"] = step * out[f"normal{i}"]
-    x, y = (lanes[f"friction_{a}{i}"] * lanes[f"inverse_mu_{a}{i}"] for a in "xy")
+    x, y = (lanes[f"friction_{a}{i}"] * out[f"acting_inverse_mu_{a}{i}"] for a in "xy")
     shrink = ops.minimum(out[f"bound{i}"] / ops.sqrt(x * x + y * y + 1e-30), 1.0)
     for a in "xy":
-        limit = lanes[f"mu_{a}{i}"] * out[f"bound{i}"]
+        limit = out[f"acting_mu_{a}{i}"] * out[f"bound{i}"]
         out[f"friction_{a}{i}"] = ops.clip(lanes[f"friction_{a}{i}"] * shrink, -limit, limit)
-
-
-def _motor_impulse(lanes: Lanes, j: int, voltage: Value, rate: Value, step: Value) -> tuple[Value, Value]:
-    """Explicit impulse of motor ``j`` and its implicit damping (both times the step).
-
-    torque = on (K/R) voltage - (on K^2/R + viscous) (weight new rate + (1 - weight) old rate)
-    """
-    on = lanes[f"on{j}"]
-    loss = on * lanes[f"back_emf_damping{j}"] + lanes[f"viscous{j}"]
-    explicit = step * (on * lanes[f"volt_gain{j}"] * voltage - loss * ((1.0 - lanes[f"weight{j}"]) * rate))
-    return explicit, step * (loss * lanes[f"weight{j}"])
 
 
 def _cholesky(matrix: list[list[Value]]) -> tuple[list[list[Value]], list[Value]]:
@@ -517,6 +568,8 @@ def kick_sweep(lanes: Lanes, features: frozenset[str]) -> Out:
             ]
             slope = slope + dot(start, pull)
             curvature = curvature + dot(dy, pull)
+            more_slope, more_curvature = _beside_the_bodies(lanes, i, impulses, features)
+            slope, curvature = slope + more_slope, curvature + more_curvature
             moved.append((i, start, dy, impulses))
         scale = ops.clip(-slope / (curvature + 1e-30), 0.0, 1.0)
         base = [base[r] + scale * change[r] for r in range(6)]
@@ -533,18 +586,46 @@ def _leg_block(lanes: Lanes, i: int, base: Vector, features: frozenset[str]) -> 
     """Solve the friction rows of one leg in turn: gear of the leg, gear of the wheel, rolling resistance, contact."""
     out: Out = {}
     y = [lanes[f"y_leg{i}"], lanes[f"y_wheel{i}"]]
-    rows = [(f"leg{i}", 1.0, 0.0, f"gear_friction{i}", lanes[f"gear_bound{i}"])]
-    rows += [(f"wheel{i}", -1.0, 1.0, f"gear_friction{4 + i}", lanes[f"gear_bound{4 + i}"])]
-    if "rolling_resistance" in features:
-        rows += [(f"rolling{i}", 0.0, 1.0, f"rolling_friction{i}", lanes[f"bound_rolling{i}"])]
-    for name, leg_entry, wheel_entry, impulse, bound in rows:
+    for name, leg_entry, wheel_entry, j in ((f"leg{i}", 1.0, 0.0, i), (f"wheel{i}", -1.0, 1.0, 4 + i)):
+        old, bound, share = lanes[f"gear_friction{j}"], lanes[f"friction_bound{j}"], lanes[f"share{j}"]
         z = [lanes[f"z_{name}_{r}"] for r in range(6)]
-        rate = dot(z, base) + leg_entry * y[0] + wheel_entry * y[1]
-        new = ops.clip(lanes[impulse] - rate * lanes[f"inverse_gain_{name}"], -bound, bound)
-        base, y = _apply(lanes, name, z, new - lanes[impulse], base, y)
-        out[impulse] = new
-    base, y = _contact_block(lanes, i, base, y, out)
+        rate = share * (dot(z, base) + leg_entry * y[0] + wheel_entry * y[1])
+        rate = rate + (lanes[f"rotor_free{j}"] + lanes[f"rotor_gain{j}"] * old)
+        new = ops.clip(old - rate * lanes[f"inverse_gain_{name}"], -bound, bound)
+        base, y = _apply(lanes, name, z, share * (new - old), base, y)
+        out[f"gear_friction{j}"] = new
+    if "rolling_resistance" in features:
+        old, bound = lanes[f"rolling_friction{i}"], lanes[f"bound_rolling{i}"]
+        z = [lanes[f"z_rolling{i}_{r}"] for r in range(6)]
+        rate = dot(z, base) + y[1]
+        new = ops.clip(old - rate * lanes[f"inverse_gain_rolling{i}"], -bound, bound)
+        base, y = _apply(lanes, f"rolling{i}", z, new - old, base, y)
+        out[f"rolling_friction{i}"] = new
+    base, y = _contact_block(lanes, i, base, y, features, out)
     return base, y, out
+
+
+def _beside_the_bodies(lanes: Lanes, i: int, new: Out, features: frozenset[str]) -> tuple[Value, Value]:
+    """Slope and curvature of the objective along a joint step that the bodies' motion does not show.
+
+    Rotors with play turn on their own; a creeping tyre's dissipation, taken at its present multiplier, is |p|^2/2 times that.
+    """
+    slope: Value = 0.0
+    curvature: Value = 0.0
+    for j in (i, 4 + i):
+        old, gain = lanes[f"gear_friction{j}"], lanes[f"rotor_gain{j}"]
+        change = new[f"gear_friction{j}"] - old
+        slope = slope + (lanes[f"rotor_free{j}"] + gain * old) * change
+        curvature = curvature + gain * (change * change)
+    if "creep" in features:
+        multiplier = ops.where_positive(lanes[f"creep_speed{i}"], new[f"multiplier{i}"], 0.0)
+        for a in "xy":
+            inverse = lanes[f"acting_inverse_mu_{a}{i}"]
+            old = inverse * lanes[f"friction_{a}{i}"]
+            change = inverse * new[f"friction_{a}{i}"] - old
+            slope = slope + multiplier * (old * change)
+            curvature = curvature + multiplier * (change * change)
+    return slope, curvature
 
 
 def _apply(lanes: Lanes, name: str, z: Vector, change: Value, base: Vector, y: Vector) -> tuple[Vector, Vector]:
@@ -554,16 +635,17 @@ def _apply(lanes: Lanes, name: str, z: Vector, change: Value, base: Vector, y: V
     )
 
 
-def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, out: Out) -> tuple[Vector, Vector]:
+def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, features: frozenset[str], out: Out) -> tuple[Vector, Vector]:
     """Exact 2x2 friction block of wheel ``i``: maximum dissipation on the ellipse (mu_x N, mu_y N).
 
     In impulses scaled by mu, min 1/2 p'Ap + b'p over |p| <= step N. On the circle (A + multiplier) p = -b; the
-    multiplier is improved by one Newton step on 1/|p| per sweep and carried from step to step.
+    multiplier is improved by one Newton step on 1/|p| per sweep and carried from step to step. With creep the multiplier is
+    that at which |p| = step N tanh(slip speed/creep_speed).
     """
     zx, zy = ([lanes[f"z_{a}{i}_{r}"] for r in range(6)] for a in "xy")
     slip_x = dot(zx, base) + lanes[f"leg_entry_x{i}"] * y[0] - lanes[f"radius{i}"] * y[1]
     slip_y = dot(zy, base) + lanes[f"leg_entry_y{i}"] * y[0]
-    mu_x, mu_y, bound = lanes[f"mu_x{i}"], lanes[f"mu_y{i}"], lanes[f"bound{i}"]
+    mu_x, mu_y, bound = lanes[f"acting_mu_x{i}"], lanes[f"acting_mu_y{i}"], lanes[f"bound{i}"]
     old_x, old_y = lanes[f"friction_x{i}"], lanes[f"friction_y{i}"]
     gain_x, gain_y, gain_xy = lanes[f"gain_x{i}"], lanes[f"gain_y{i}"], lanes[f"gain_xy{i}"]
     b_x = mu_x * (slip_x - gain_x * old_x - gain_xy * old_y)
@@ -578,11 +660,18 @@ def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, out: Out) -> t
         return (a12 * b_y - c22 * b_x) * inverse, (a12 * b_x - c11 * b_y) * inverse, c11, c22, inverse
 
     multiplier = lanes[f"multiplier{i}"]
+    least: Value = 0.0
+    if "creep" in features:  # the slope of tanh at rest
+        least = ops.minimum(lanes[f"creep_speed{i}"] * ops.minimum(mu_x, mu_y) / (bound + 1e-9), 1e6)
+        multiplier = ops.maximum(multiplier, least)
     p_x, p_y, c11, c22, inverse = impulse(multiplier)
     square = p_x * p_x + p_y * p_y + 1e-30
     curvature = (p_x * p_x * c22 - 2.0 * (a12 * p_x * p_y) + p_y * p_y * c11) * inverse + 1e-30
-    multiplier = multiplier + square * (ops.sqrt(square) - bound) / (curvature * (bound + 1e-9))
-    multiplier = ops.clip(multiplier, 0.0, 1e6)
+    better = multiplier + square * (ops.sqrt(square) - bound) / (curvature * (bound + 1e-9))
+    if "creep" in features:
+        creeping = _creep_multiplier(lanes, i, multiplier, (p_x, p_y), square, curvature)
+        better = ops.where_positive(lanes[f"creep_speed{i}"], creeping, better)
+    multiplier = ops.clip(better, least, 1e6)
     p_x, p_y, *_ = impulse(multiplier)
     shrink = ops.minimum(bound / ops.sqrt(p_x * p_x + p_y * p_y + 1e-30), 1.0)
     new_x, new_y = mu_x * p_x * shrink, mu_y * p_y * shrink
@@ -592,7 +681,23 @@ def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, out: Out) -> t
     return _apply(lanes, f"y{i}", zy, new_y - old_y, base, y)
 
 
-def kick_finish(lanes: Lanes, step: Value) -> Out:
+def _creep_multiplier(
+    lanes: Lanes, i: int, multiplier: Value, p: tuple[Value, Value], square: Value, curvature: Value
+) -> Value:
+    """One Newton step on 1/|p| = 1/(step N tanh(slip speed/creep_speed)), where the slip is -multiplier p/mu.
+
+    The slope of the slip speed is that of equal mu along both axes; unequal ones only make convergence linear.
+    """
+    size = ops.sqrt(square)
+    unscaled = [p[k] * lanes[f"acting_inverse_mu_{a}{i}"] for k, a in enumerate("xy")]
+    reach = ops.sqrt(unscaled[0] * unscaled[0] + unscaled[1] * unscaled[1])
+    share, slope = ground.creep_share(lanes, i, multiplier * reach)
+    target = lanes[f"bound{i}"] * share + 1e-30
+    rise = lanes[f"bound{i}"] * slope * reach * ops.maximum(1.0 - multiplier * curvature / square, 0.0)
+    return multiplier + (size - target) / (target * curvature / square + size * rise / target)
+
+
+def kick_finish(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
     """Back-substitute the new velocities; motor torques, energies, slip and the inertial sensors' low-pass."""
     u: list[Value] = [0.0] * 6
     for r in reversed(range(6)):
@@ -620,12 +725,11 @@ def kick_finish(lanes: Lanes, step: Value) -> Out:
             out[name] = lanes[name] + step * slip
     mechanical, electrical = lanes["mechanical_energy"], lanes["electrical_energy"]
     for j in range(8):
-        on, weight = lanes[f"on{j}"], lanes[f"weight{j}"]
-        mean_rate = weight * new_rates[j] + (1.0 - weight) * old_rates[j]
-        torque = on * (lanes[f"volt_gain{j}"] * lanes[f"drive{j}"] - lanes[f"back_emf_damping{j}"] * mean_rate)
-        out[f"motor_torque{j}"] = torque
-        mechanical = mechanical + step * (torque * (0.5 * (new_rates[j] + old_rates[j])))
-        electrical = electrical + step * (torque * lanes[f"drive{j}"] * lanes[f"inverse_constant{j}"])
+        friction = lanes[f"gear_friction{j}"]
+        done = drive.finish(lanes, j, lanes[f"drive{j}"], old_rates[j], new_rates[j], friction, step, features)
+        mechanical = mechanical + done.pop(f"work{j}")
+        electrical = electrical + done.pop(f"electrical_work{j}")
+        out |= done
     out["mechanical_energy"], out["electrical_energy"] = mechanical, electrical
     gravity = to_body(rotation_rows(lanes), vector(lanes, "gravity_"))
     for k, a in enumerate(AXES):
@@ -641,7 +745,7 @@ def kick_finish(lanes: Lanes, step: Value) -> Out:
 # ---- observation at the end of a control tick ------------------------------------------------------------------------
 
 
-def observe(lanes: Lanes, step: Value) -> Out:
+def observe(lanes: Lanes, step: Value, features: frozenset[str] = frozenset()) -> Out:
     """Columns of the truth matrix, in the order of TRUTH_LAYOUT, then the raw sensor channels."""
     rows = rotation_rows(lanes)
     n, heading, lateral, scale = floor_axes(rows)
@@ -660,14 +764,17 @@ def observe(lanes: Lanes, step: Value) -> Out:
         for a in "xy":
             out[f"contact_force_{i}_{a}"] = lanes[f"friction_{a}{i}"] * (1.0 / step)
         out[f"contact_force_{i}_z"] = lanes[f"normal{i}"]
+    frictions: list[ground.Friction] = []
     for i in CORNERS:
-        hip, leg, rim = wheel_points(lanes, i, *ops.sin_cos(lanes[f"leg_angle{i}"]), n, scale)
-        for a, e, wheel_entry in (("x", heading, -lanes[f"radius{i}"]), ("y", lateral, 0.0)):
-            base_row, leg_entry = contact_row(hip, leg, rim, e)
-            slip = dot(base_row, [*v, *w]) + leg_entry * lanes[f"leg_rate{i}"] + wheel_entry * lanes[f"wheel_rate{i}"]
-            out[f"slip_velocity_{i}_{a}"] = slip
+        points = wheel_points(lanes, i, *ops.sin_cos(lanes[f"leg_angle{i}"]), n, scale)
+        slip = slip_velocity(lanes, i, points, heading, lateral, [*v, *w])
+        out[f"slip_velocity_{i}_x"], out[f"slip_velocity_{i}_y"] = slip
+        place = contact_place(lanes, rows, points)
+        speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
+        frictions.append(ground.friction(lanes, i, place[0], place[1], speed, features))
     out |= {f"slip_displacement_{i}_{a}": lanes[f"slip_displacement_{a}{i}"] for i in CORNERS for a in "xy"}
-    out |= {f"effective_friction_{i}_{a}": lanes[f"mu_{a}{i}"] for i in CORNERS for a in "xy"}
+    for i, found in enumerate(frictions):
+        out[f"effective_friction_{i}_x"], out[f"effective_friction_{i}_y"] = found.mu_x, found.mu_y
     # own names: outputs lie side by side, apart from the stored sums they show
     out["shown_mechanical_energy"], out["shown_electrical_energy"] = lanes["mechanical_energy"], lanes["electrical_energy"]
     reach = [ops.absolute(n[k]) * lanes[f"half_size_{a}"] for k, a in enumerate(AXES)]
@@ -675,9 +782,22 @@ def observe(lanes: Lanes, step: Value) -> Out:
     # from here on: RAW_LAYOUT of plants/sensors.py; the heading's cosine and sine stand for its yaw
     out |= {f"raw_position_{j}": out[f"joint_position_{j}"] for j in range(8)}
     out |= {f"raw_velocity_{j}": out[f"joint_velocity_{j}"] for j in range(8)}
-    out |= {f"raw_effort_{j}": lanes[f"motor_torque{j}"] * lanes[f"effort_scale{j}"] for j in range(8)}
+    effort = "current_torque" if "drive" in features else "motor_torque"
+    out |= {f"raw_effort_{j}": lanes[f"{effort}{j}"] * lanes[f"effort_scale{j}"] for j in range(8)}
     out |= {f"raw_gyro_{a}": lanes[f"gyro_{a}"] for a in AXES}
     out |= {f"raw_acceleration_{a}": lanes[f"acceleration_{a}"] for a in AXES}
-    out["raw_supply"] = lanes["supply"]
+    out["raw_supply"] = drive.supply_voltage(lanes, features)
     out |= {"raw_x": lanes["px"], "raw_y": lanes["py"], "heading_cosine": rows[0][0], "heading_sine": rows[1][0]}
     return out
+
+
+#: Lanes that formula forces read and write; each group lies side by side in this order.
+FORMULA_INPUTS: tuple[str, ...] = tuple(f"formula_input_{name}" for name in INPUTS_OF_FORMULAS)
+FORMULA_OUTPUTS: tuple[str, ...] = tuple(f"formula_{name}" for name in COORDINATES)
+
+
+def sense(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
+    """What formula forces read at the start of a substep."""
+    seen = observe(lanes, step, features)
+    seen["supply_voltage"] = seen["raw_supply"]
+    return {f"formula_input_{name}": seen[name] for name in INPUTS_OF_FORMULAS}

@@ -1,1 +1,1 @@
-"""MuJoCo as an independent second opinion: the same robot and parameters as an ``MjModel``."""
+"""MuJoCo: the MJCF of a robot, and a plant of robots stepped by it, independent of the Gibbs-Appell engine's dynamics."""

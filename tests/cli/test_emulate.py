@@ -1,0 +1,60 @@
+"""``wlr emulate``: what it prints, takes and refuses."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from wlr_gym.cli import emulate
+from wlr_gym.errors import InputError
+
+pytest.importorskip("termios")
+
+
+def options(**changes):
+    return emulate.Options(**{"seconds": 0.05, **changes})
+
+
+def test_prints_ports_and_ends(tmp_path, capsys):
+    assert emulate.run(options(links=tmp_path, stepped=True)) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["legs", "wheels", "imu"]
+    assert str(tmp_path / "legs") in lines[0]
+    assert "XM540-W150-R, 1000000 bit/s: leg_lf, leg_rf, leg_lr, leg_rr" in lines[0]
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"fault": ("dorp legs",)}, "did you mean 'drop'"),
+        ({"backend": "mujocoo"}, "backend"),
+        ({"robot": "nominl"}, "did you mean 'nominal'"),
+        ({"hardware": "nominl"}, "did you mean 'nominal'"),
+        ({"tick": 0.0}, "--tick 0: expected more than 0"),
+        ({"usb_latency": -1.0}, "--usb-latency -1: expected"),
+        ({"firmware": 300}, "--firmware 300: expected 0 to 255"),
+    ],
+)
+def test_refusals(changes, words):
+    with pytest.raises(InputError, match=words):
+        emulate.run(options(**changes))
+
+
+def test_effects_are_taken_by_name_and_refused_when_unknown():
+    assert emulate.run(options(stepped=True, effects=("tired_battery",))) == 0
+    with pytest.raises(InputError, match="did you mean 'tired_battery'"):
+        emulate.run(options(stepped=True, effects=("tired_batery",)))
+
+
+def test_takes_command_lines_from_a_pipe():
+    script = "from wlr_gym.cli import emulate; emulate.run(emulate.Options(stepped=True, seconds=1.0))"
+    text = "drop legs probability=0.5\nfaults\nstep 0.25\nnonsense\n"
+    done = subprocess.run([sys.executable, "-c", script], input=text, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()[3:]
+    assert lines[0] == "0.000 s: drop legs probability=0.5"
+    assert lines[1] == "drop legs probability=0.5"
+    assert lines[2] == "0.250 s"
+    assert lines[3].startswith("error: unknown command 'nonsense'")

@@ -1,0 +1,143 @@
+"""``wlr play`` without a window, and with one that is not there."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo fills its namespace when it is imported.)
+import contextlib
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+from wlr_gym.cli import main
+from wlr_gym.cli import play as play_module
+from wlr_gym.evaluation import make_core
+from wlr_gym.evaluation.film import film, film_length
+from wlr_gym.policy import make_policy
+from wlr_gym.render.teleop import RESET, UP
+from wlr_gym.render.view import View
+
+
+@pytest.fixture
+def headless(monkeypatch):
+    monkeypatch.setattr("wlr_gym.render.display.platform.system", lambda: "Linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def test_video_by_schedule(tmp_path, capsys, graphics, headless):
+    path = tmp_path / "film.webp"
+    arguments = ["--seconds", "0.4", "--command", "0:0.1,0; 0.2:0,0.3", "--size", "96", "64", "--camera", "top", "--forces"]
+    assert main(["play", "--video", str(path), *arguments]) == 0
+    assert f"written: {path} (10 pictures, 0.4 s)" in capsys.readouterr().out
+    with Image.open(path) as image:
+        assert (image.n_frames, image.size) == (10, (96, 64))
+        first = np.asarray(image.convert("RGB")).copy()
+        image.seek(9)
+        assert not np.array_equal(np.asarray(image.convert("RGB")), first)
+    assert [child.name for child in tmp_path.iterdir()] == ["film.webp"]
+
+
+def test_evaluate_writes_policy_and_baseline_side_by_side(tmp_path, capsys, graphics):
+    path = tmp_path / "film.webp"
+    arguments = ["--episodes", "1", "--baselines", "do_nothing", "--video-seconds", "0.08", "--no-progress"]
+    assert main(["evaluate", "proportional", "--video", str(path), *arguments]) == 0
+    assert f"written: {path}" in capsys.readouterr().out
+    with Image.open(path) as image:
+        assert image.n_frames == 2
+        assert image.size[0] == 2 * 640 + 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "no display here"),
+        (["--video", "film.avi"], "--video film.avi: expected a file that ends in"),
+        (["--video", "nowhere/film.webp"], "--video nowhere/film.webp: folder nowhere does not exist"),
+        (["--video", "film.webp", "--seconds", "-1"], "--seconds -1: expected more than 0"),
+        (["--video", "film.webp", "--seed", "-1"], "--seed -1: expected 0 or more"),
+        (["--video", "film.webp", "--camera", "topp"], "did you mean 'top'"),
+        (["--video", "film.webp", "--size", "1", "1"], "64 to 4096 pixels"),
+        (["--video", "film.webp", "--command", "1"], "--command '1': expected linear_velocity_x,yaw_rate"),
+        (["--video", "film.webp", "--agent", "proportinal"], "did you mean 'proportional'"),
+        (["--video", "film.webp", "--backend", "mujocoo"], "unknown backend 'mujocoo'"),
+        (["--video", "film.webp", "--effects", "nothing.yaml"], "nothing.yaml"),
+        (["--video", "film.webp", "--gamepad"], "--gamepad drives in the window"),
+        (["WLR-Velocty-v0", "--video", "film.webp"], "did you mean 'WLR-Velocity-v0'"),
+    ],
+)
+def test_what_is_refused(monkeypatch, tmp_path, capsys, headless, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert main(["play", *arguments]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_films_of_other_commands_are_refused_first(tmp_path, capsys):
+    assert main(["evaluate", "do_nothing", "--video", str(tmp_path / "film.doc")]) == 2
+    assert "expected a file that ends in" in capsys.readouterr().err
+    assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out"), "--video", str(tmp_path / "film.doc")]) == 2
+    assert "expected a file that ends in" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+class Window:
+    """A window that presses keys: frame -> key; closes itself at the end."""
+
+    def __init__(self, model, data, on_key, keys, frames):
+        self.cam, self.user_scn = mujoco.MjvCamera(), mujoco.MjvScene(model, 100)
+        self.on_key, self.keys, self.frames = on_key, keys, frames
+        self.texts: list[str] = []
+
+    def is_running(self):
+        return len(self.texts) < self.frames
+
+    @contextlib.contextmanager
+    def lock(self):
+        yield
+
+    def set_texts(self, texts: Any):
+        self.texts.append(texts[0][2])
+
+    def sync(self):
+        if len(self.texts) in self.keys:
+            self.on_key(self.keys[len(self.texts)])
+
+    def close(self):
+        self.frames = 0
+
+
+def test_keys_drive_the_robot_until_the_window_is_closed(monkeypatch):
+    monkeypatch.setattr("wlr_gym.render.viewer.time.sleep", lambda seconds: None)
+    options = play_module.Options(randomization="none")
+    core = make_core(options.env, 1, {"randomization": "none"})
+    driver = play_module._driver(options, core)
+    windows = []
+
+    def open_window(model, data, on_key):
+        windows.append(Window(model, data, on_key, {1: UP, 2: UP, 30: RESET}, 40))
+        return windows[-1]
+
+    play_module.show(options, core, make_policy("proportional", core.contract()), driver, open_window)
+    texts = windows[0].texts
+    assert len(texts) == 40
+    assert "t 0.00 s" in texts[0]
+    assert "of 0.00 m/s" in texts[0]
+    assert "of 0.02 m/s" in texts[20]
+    speed = float(texts[29].partition("speed ")[2].partition(" of")[0])
+    assert speed == pytest.approx(0.02, abs=0.006)
+    assert "t 0.00 s" in texts[30]
+    assert "of 0.00 m/s" in texts[35]
+    core.close()
+
+
+def test_a_film_goes_on_after_the_end_of_an_episode(graphics):
+    core = make_core("WLR-Velocity-v0", 1, {"episode_length": 0.1, "randomization": "none"})
+    count, every, fps = film_length(core, 0.4)
+    assert (count, every, fps) == (10, 2, 25.0)
+    policy = make_policy("do_nothing", core.contract())
+    pictures = list(film(core, policy, 0, 0.4, view=View(size=(64, 64), text=False)))
+    assert len(pictures) == 10
+    assert core.episodes[0] >= 2
+    core.close()

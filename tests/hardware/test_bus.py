@@ -1,0 +1,397 @@
+"""Bus groups on the emulator: each defect of dynamixel-sdk shown in the SDK and guarded here, faults, clocks, blocks."""
+
+import time
+
+import pytest
+
+from wlr_gym.errors import InputError
+from wlr_gym.hardware import protocol
+from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
+from wlr_gym.hardware.emulator.line import NO_TIME
+from wlr_gym.hardware.tables import load_table
+from wlr_gym.robot import load_robot
+
+sdk = pytest.importorskip("dynamixel_sdk")
+pytest.importorskip("serial")
+pytest.importorskip("termios")
+
+from wlr_gym.hardware.bus import Block, BusGroup, NoAnswerError, RefusedError, TickClock, open_all  # noqa: E402
+from wlr_gym.hardware.sdk import BusGoneError, GuardedHandler, GuardedPort  # noqa: E402
+
+TABLE = load_table("XM540-W150-R")
+FAST_BLOCK = Block(TABLE, "realtime_tick", "present_position")
+LEGS = {2: TABLE, 3: TABLE, 1: TABLE, 4: TABLE}
+#: s a busy test machine may need to let the emulator's thread answer.
+PATIENCE = 0.15
+
+
+@pytest.fixture
+def server():
+    """The emulator in stepped time: what a test sees depends on no clock but the time-outs."""
+    machine = Machine(load_robot(), load_hardware(), MachineOptions(sensor_noise=False, timing=NO_TIME))
+    with Server(machine, real_time=False) as server:
+        yield server
+
+
+@pytest.fixture
+def group(server):
+    with connect(server) as group:
+        yield group
+
+
+def connect(server, patience=PATIENCE):
+    """A group on the emulator's legs; the servos' clocks are compared with emulated time."""
+    return BusGroup("legs", server.ports["legs"], 1_000_000, LEGS, patience, lambda: server.machine.time)
+
+
+# --- what it is for
+
+
+def test_items_by_name(group):
+    assert group.ping(2) == (1130, 45)
+    group.write(2, "goal_current", -1)
+    assert group.read(2, "goal_current") == -1
+    with pytest.raises(RefusedError, match=r"bus legs, id 2: write led = 7: refused \(data range error\)") as refusal:
+        group.write(2, "led", 7)
+    assert refusal.value.status.fault == protocol.Error.DATA_RANGE
+    with pytest.raises(InputError, match="no servo with id 9; there are 1, 2, 3, 4"):
+        group.read(9, "led")
+    with pytest.raises(InputError, match="did you mean 'goal_current'"):
+        group.read(2, "goal_curent")
+
+
+def test_blocks_of_all_servos_fast_and_not(group, server):
+    for id in LEGS:
+        group.write(id, "profile_velocity", 10 + id)
+    block = Block(TABLE, "profile_acceleration", "goal_position")
+    for fast in (True, False):
+        group.fast = fast
+        assert {id: r.counts["profile_velocity"] for id, r in group.read_all(block).items()} == {id: 10 + id for id in LEGS}
+    assert group.statistics.fallbacks == 0
+    readings = group.read_all(FAST_BLOCK)
+    assert set(readings) == set(LEGS)
+    assert readings[2].counts["present_position"] == server.machine.servos["leg_lf"]["present_position"]
+    assert "moving_status" in readings[2].counts
+
+
+def test_block_with_gaps_decodes_like_single_items(group):
+    block = Block(TABLE, "torque_enable", "position_p_gain")
+    counts = group.read_all(block)[3].counts
+    assert counts["position_p_gain"] == 800
+    assert counts == {name: group.read(3, name) for name in counts}
+
+
+def test_write_to_all_at_once(group):
+    group.write_all("goal_position", {2: 2100, 4: 1990})
+    assert (group.read(2, "goal_position"), group.read(4, "goal_position")) == (2100, 1990)
+
+
+def test_scan(group):
+    assert group.scan() == dict.fromkeys((1, 2, 3, 4), (1130, 45))
+
+
+def test_reboot_waits_until_the_servo_is_back():
+    machine = Machine(load_robot(), load_hardware(), MachineOptions())
+    with Server(machine) as server, connect(server) as group:
+        group.write(2, "led", 1)
+        group.reboot(2)
+        assert group.read(2, "led") == 0
+
+
+def test_fast_reads_fall_back_for_good_on_old_firmware():
+    machine = Machine(load_robot(), load_hardware(), MachineOptions(firmware=44, timing=NO_TIME))
+    with Server(machine, real_time=False) as server, connect(server) as group:
+        for _ in range(4):
+            assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+        assert not group.fast
+        assert group.statistics.fallbacks == 3
+
+
+# --- the SDK's defects, by number (docs/robot.md)
+
+
+def sdk_port(server):
+    port = sdk.PortHandler(server.ports["legs"])
+    port.openPort()
+    return port, sdk.Protocol2PacketHandler()
+
+
+def test_defect_1_stuffing_is_lost_on_sending(server, group):
+    port, handler = sdk_port(server)
+    data = (-3).to_bytes(4, "little", signed=True)  # FD FF FF FF behind FF FF of the current
+    both = TABLE["goal_current"].encode(-1) + data
+    server.machine.servos["leg_lf"].set("operating_mode", 1)
+    result, _ = handler.writeTxRx(port, 2, 102, len(both), list(both))
+    assert result != sdk.COMM_SUCCESS
+    assert server.machine.servos["leg_lf"]["goal_velocity"] == 0
+    port.closePort()
+    guarded = GuardedPort(server.ports["legs"], 1_000_000, PATIENCE)
+    guarded.openPort()
+    assert GuardedHandler().writeTxRx(guarded, 2, 102, len(both), list(both)) == (sdk.COMM_SUCCESS, 0)
+    assert server.machine.servos["leg_lf"]["goal_velocity"] == -3
+    guarded.closePort()
+
+
+def test_defect_2_stuffing_is_removed_wrongly_on_receiving(server, group):
+    data = b"\xff\xff\xfd\xff\xfd\xfd"
+    raw = protocol.encode_status(2, 0, data)
+    kept = sdk.Protocol2PacketHandler().removeStuffing(list(raw))
+    assert bytes(kept[9 : 9 + (kept[5] | kept[6] << 8) - 4]) != data
+    servo = server.machine.servos["leg_lf"]
+    for k, byte in enumerate(data):
+        servo.set(f"indirect_data_{k + 1}", byte)
+    block = Block(TABLE, "indirect_data_1", "indirect_data_6")
+    group.fast = False
+    assert bytes(group.read_all(block)[2].counts.values()) == data
+
+
+def test_defects_3_and_4_alert_and_missing_data_in_group_reads(server, group):
+    server.machine.inject("overload leg_rf duration=0.005")
+    server.advance(0.01)
+    port, handler = sdk_port(server)
+    reader = sdk.GroupSyncRead(port, handler, 132, 4)
+    reader.addParam(3)
+    assert reader.txRxPacket() == sdk.COMM_SUCCESS  # not a word about the alert
+    assert reader.getData(99, 132, 4) == 0  # nor about a servo that does not exist
+    port.closePort()
+    readings = group.read_all(FAST_BLOCK)
+    assert {id for id, reading in readings.items() if reading.alert} == {3}
+    assert group.statistics.alerts == {3: 1}
+    assert 99 not in readings
+
+
+def test_defect_5_one_missing_servo_costs_only_itself_and_those_behind(server, group):
+    server.machine.inject("drop leg_rf")  # its answer is lost; the others were heard on the line
+    port, handler = sdk_port(server)
+    reader = sdk.GroupSyncRead(port, handler, 132, 4)
+    for id in LEGS:
+        reader.addParam(id)
+    assert reader.txRxPacket() != sdk.COMM_SUCCESS
+    assert not any(reader.isAvailable(id, 132, 4) for id in LEGS)
+    port.closePort()
+    group.fast = False
+    assert set(group.read_all(FAST_BLOCK)) == {1, 2, 4}
+    assert group.statistics.missing == {3: 1}
+
+
+def test_defect_6_time_out_is_what_was_asked_for(server):
+    server.machine.inject("dead")
+    server.advance(0.002)
+    port, handler = sdk_port(server)
+    start = time.monotonic()
+    handler.ping(port, 2)
+    assert time.monotonic() - start > 0.033
+    port.closePort()
+    with connect(server, 0.005) as group:
+        spent = []
+        for _ in range(5):  # the second one also waits for a quiet line
+            start = time.monotonic()
+            with pytest.raises(NoAnswerError, match="bus legs, id 2: ping: no answer"):
+                group.ping(2)
+            spent.append(time.monotonic() - start)
+        assert min(spent) < 0.025
+
+
+def test_defect_7_waiting_takes_no_processor_time(server):
+    server.machine.inject("dead")
+    server.advance(0.002)
+    with connect(server, 0.5) as group:
+        start, busy = time.monotonic(), time.thread_time()
+        with pytest.raises(NoAnswerError):
+            group.ping(2)
+        assert time.monotonic() - start > 0.45
+        assert time.thread_time() - busy < 0.1
+
+
+def test_defect_8_an_exception_in_the_middle_does_not_block_torque_off(server, group, monkeypatch):
+    class Interrupted(sdk.PortHandler):
+        def readPort(self, length):  # noqa: N802
+            raise KeyboardInterrupt
+
+    port, handler = Interrupted(server.ports["legs"]), sdk.Protocol2PacketHandler()
+    port.openPort()
+    with pytest.raises(KeyboardInterrupt):
+        handler.read1ByteTxRx(port, 2, 64)
+    assert handler.write1ByteTxRx(port, 2, 64, 0)[0] == sdk.COMM_PORT_BUSY  # the SDK: motor stays on
+    port.closePort()
+
+    for id in LEGS:
+        group.write(id, "torque_enable", 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(GuardedPort, "readPort", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            group.read_all(FAST_BLOCK)
+    assert group.torque_off() == set()
+    assert not any(server.machine.servos[joint]["torque_enable"] for joint in ("leg_lf", "leg_rf", "leg_lr", "leg_rr"))
+
+
+def test_defect_9_late_answer_is_not_taken_for_the_next(server, group):
+    """Answers to a read that was given up come while the next read of the same servo waits: another length, then the same."""
+    group.write(2, "profile_velocity", 5)
+    group.write(2, "profile_acceleration", 9)
+    line = server.machine.lines["legs"]
+    late = protocol.encode_status(2, 0, (777).to_bytes(2, "little"))
+    answer = line.receive
+    line.receive = lambda data, now, baud=None: [type(e)(e.time, late + e.data) for e in answer(data, now, baud)]
+    assert group.read(2, "profile_velocity") == 5  # the two bytes in front do not fit
+    line.receive = answer
+    group._port.suspect = True  # the exchange before was given up ...
+    server.call(lambda: server._ports["legs"].write(protocol.encode_status(2, 0, (777).to_bytes(4, "little"))))
+    assert group.read(2, "profile_velocity") == 5  # ... so what is on its way is let pass first
+    assert group.statistics.discarded > 0
+
+
+def test_defect_9_in_group_reads(server, group):
+    """A leftover of another length from one of the servos asked comes first."""
+    line = server.machine.lines["legs"]
+    answer = line.receive
+    late = protocol.encode_status(3, 0, b"\1\2\3\4")
+    line.receive = lambda data, now, baud=None: [type(e)(e.time, late + e.data) for e in answer(data, now, baud)]
+    for fast in (True, False):
+        group.fast = fast
+        assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+
+
+def test_the_sdks_own_calls_work_on_the_guarded_classes(server):
+    server.machine.inject("echo legs")  # without the guard the echo would be the answer
+    port, handler = GuardedPort(server.ports["legs"], 1_000_000, PATIENCE), GuardedHandler()
+    port.openPort()
+    assert handler.ping(port, 2) == (1130, sdk.COMM_SUCCESS, 0)
+    assert handler.write4ByteTxRx(port, 2, 112, 33) == (sdk.COMM_SUCCESS, 0)
+    assert handler.read4ByteTxRx(port, 2, 112) == (33, sdk.COMM_SUCCESS, 0)
+    assert handler.read1ByteTxRx(port, 77, 65)[1] == sdk.COMM_RX_TIMEOUT
+    reader = sdk.GroupSyncRead(port, handler, 112, 4)
+    for id in LEGS:
+        reader.addParam(id)
+    assert reader.txRxPacket() == sdk.COMM_SUCCESS
+    assert reader.getData(2, 112, 4) == 33
+    port.closePort()
+
+
+def test_defect_10_unplugging_is_one_kind_of_error(server, group):
+    group.ping(2)
+    server.command("unplug legs")
+    server.advance(0.002)
+    for act in (lambda: group.ping(2), lambda: group.read_all(FAST_BLOCK), group.torque_off):
+        with pytest.raises(BusGoneError, match="is gone"):
+            act()
+
+
+def test_defect_11_missing_port_is_named(tmp_path):
+    path = str(tmp_path / "ttyUSB7")
+    with pytest.raises(OSError, match="ttyUSB7"):
+        sdk.PortHandler(path).openPort()
+    group = BusGroup("legs", path, 1_000_000, LEGS)
+    with pytest.raises(InputError, match="ttyUSB7: cannot be opened"):
+        group.open()
+    group.close()
+    with pytest.raises(InputError, match="baud rate 4500000"):
+        BusGroup("legs", path, 4_500_000, LEGS).open()
+
+
+def test_all_groups_open_or_none(server, tmp_path):
+    good = connect(server)
+    with pytest.raises(InputError):
+        open_all([good, BusGroup("wheels", str(tmp_path / "none"), 1_000_000, LEGS)])
+    assert not good._port.is_open
+
+
+# --- faults on the line
+
+
+@pytest.mark.parametrize("fault", ["echo legs", "noise probability=0.5", "noise value=3"])
+def test_what_must_not_matter(server, group, fault):
+    server.machine.inject(fault)
+    for fast in (True, False):
+        group.fast = fast
+        for _ in range(5):
+            assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+    group.write(2, "led", 1)
+    assert group.read(2, "led") == 1
+
+
+@pytest.mark.parametrize("fault", ["drop probability=0.2", "flip probability=0.2", "truncate probability=0.2"])
+def test_what_is_lost_is_reported_missing_and_never_wrong(server, fault):
+    server.machine.inject(fault)
+    with connect(server, 0.02) as group:
+        group.fast = False
+        truth = {id: server.machine.servos[joint]["present_position"] for joint, id in load_robot().dynamixel_ids.items()}
+        seen = 0
+        for _ in range(40):
+            for id, reading in group.read_all(FAST_BLOCK).items():
+                assert reading.counts["present_position"] == truth[id]
+                seen += 1
+        assert 80 < seen < 158
+        assert sum(group.statistics.missing.values()) == 160 - seen
+
+
+def test_torque_off_gets_through_heavy_loss(server):
+    for joint in ("leg_lf", "leg_rf", "leg_lr", "leg_rr"):
+        server.machine.servos[joint].set("torque_enable", 1)
+    server.machine.inject("drop probability=0.4")
+    server.machine.inject("deaf probability=0.3")
+    with connect(server, 0.02) as group:
+        left = group.torque_off(retries=30)
+    assert left == set()
+    assert not any(server.machine.servos[joint]["torque_enable"] for joint in ("leg_lf", "leg_rf", "leg_lr", "leg_rr"))
+
+
+# --- the servo's clock
+
+
+def feed(clock, samples):
+    return [clock.age(round(tick) % 32768, now) for now, tick in samples]
+
+
+@pytest.mark.parametrize("speed", [0.99, 1.0, 1.01])
+def test_steady_readings_are_fresh_whatever_the_clocks_speed(speed):
+    samples = [(100.0 + 0.02 * k + 0.001 * (k % 3), 5000 + 20.0 * speed * k) for k in range(3000)]  # wraps on the way
+    answers = feed(TickClock(), samples)
+    assert max(age for age, _ in answers) < 0.004
+    assert not any(restarted for _, restarted in answers)
+
+
+def test_an_answer_to_an_earlier_request_is_told_by_its_age():
+    clock = TickClock()
+    feed(clock, [(0.02 * k, 20.0 * k) for k in range(100)])
+    age, restarted = clock.age(1980 - 40, 2.0)  # what it would have said 60 ms before
+    assert age == pytest.approx(0.06, abs=0.003)
+    assert not restarted
+    assert clock.age(2020, 2.02) == (0.0, False)
+
+
+def test_a_reboot_is_told_from_lateness():
+    clock = TickClock()
+    feed(clock, [(0.02 * k, 7000 + 20.0 * k) for k in range(100)])
+    assert clock.age(320, 2.32) == (0.0, True)
+    assert clock.age(340, 2.34) == (0.0, False)
+
+
+def test_an_answer_that_waited_for_us_is_old_but_not_stale(server):
+    """Two buses are asked at once; while one times out, the other one's answer lies in the buffer."""
+    waited = 0.0
+    group = BusGroup("legs", server.ports["legs"], 1_000_000, LEGS, PATIENCE, lambda: server.machine.time + waited)
+    with group:
+        assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+        group.ask_all(FAST_BLOCK)
+        waited = 0.05
+        readings = group.answers()
+    assert set(readings) == set(LEGS)
+    assert readings[2].age == pytest.approx(0.05, abs=0.003)
+    assert group.statistics.stale == {}
+
+
+def test_stale_readings_are_dropped_and_counted(server, group):
+    group.fast = False
+    line = server.machine.lines["legs"]
+    receive = line.receive
+    assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+    old = receive(protocol.sync_read(FAST_BLOCK.address, FAST_BLOCK.length, list(LEGS)), 0.0)
+    server.advance(0.1)
+    line.receive = lambda data, now, baud=None: old
+    assert group.read_all(FAST_BLOCK) == {}
+    assert group.statistics.stale == dict.fromkeys(LEGS, 1)
+    line.receive = receive
+    server.advance(0.02)
+    assert set(group.read_all(FAST_BLOCK)) == set(LEGS)

@@ -1,0 +1,64 @@
+"""docs/robot.md says what the code does: faults, options, defects, hardware numbers."""
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+from wlr_gym.cli import emulate
+from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.emulator import FAULTS
+from wlr_gym.hardware.emulator import servo as firmware
+from wlr_gym.robot import JOINTS, load_robot
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "robot.md").read_text(encoding="utf-8")
+
+
+def table_under(heading):
+    part = PAGE.split(heading, 1)[1].split("\n#", 1)[0]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in part.splitlines() if line.startswith("|")][2:]
+
+
+def test_every_fault_is_listed_with_its_default():
+    listed = {}
+    for names, _, value in table_under("### Faults"):
+        numbers = re.findall(r"[\d.]+", value.partition(":")[2])
+        kinds = re.findall(r"`(\w+)`", names)
+        listed |= dict(zip(kinds, numbers or [None] * len(kinds), strict=True))
+    assert set(listed) == set(FAULTS)
+    for name, value in listed.items():
+        assert (value is None) == (not FAULTS[name].unit), name
+        assert value is None or float(value) == FAULTS[name].value, name
+
+
+def test_every_option_named_exists():
+    part = PAGE.split("## Emulator", 1)[1].split("### Faults", 1)[0]
+    options = {field.name for field in fields(emulate.Options)}
+    named = {name.replace("-", "_") for name in re.findall(r"`--([\w-]+)", part)}
+    assert named
+    assert named <= options
+
+
+def test_every_defect_is_guarded_where_the_page_says():
+    guarded = (ROOT / "wlr_gym/hardware/sdk.py").read_text(encoding="utf-8")
+    tested = (ROOT / "tests/hardware/test_bus.py").read_text(encoding="utf-8")
+    for number, *_ in table_under("## Bus driver"):
+        assert re.search(rf"Defects? [\d, ]*\b{number}\b", guarded), number
+        assert re.search(rf"def test_defects?_[\d_and]*{number}_", tested), number
+
+
+def test_ports_and_ids_are_those_of_the_files():
+    ids = load_robot().dynamixel_ids
+    rows = {row[0].strip("`"): row[1] for row in table_under("## Two buses, three ports")}
+    for name, bus in load_hardware().buses.items():
+        assert bus.model in rows[name]
+        assert [int(number) for number in re.findall(r"\b\d\b", rows[name].partition("ids")[2])] == [ids[j] for j in bus.joints]
+    assert len(JOINTS) == 8
+
+
+def test_chosen_numbers():
+    assert f"firmware {firmware.FIRMWARE} on" in PAGE
+    assert f"{firmware.BOOT_TIME:g} s of silence" in PAGE
+    assert f"above {firmware.OVERLOAD:.0%} of stall for {firmware.OVERLOAD_TIME:g} s".replace("80%", "80 %") in PAGE
+    heating = f"{firmware.AMBIENT:g} degC, {firmware.HEATING:g} degC above that in a lasting stall"
+    assert f"{heating}, time constant {firmware.THERMAL_TIME:g} s" in PAGE

@@ -1,0 +1,144 @@
+"""The batch's per-robot numbers are those of the model that is built for each robot alone; work and energy balance."""
+
+import numpy as np
+import pytest
+from two_plants import ROBOT, make
+
+from wlr_gym.model import dynamics
+from wlr_gym.parameters import Parameters
+from wlr_gym.plants.base import Truth
+from wlr_gym.plants.mujoco.batch import RobotBatch
+from wlr_gym.plants.mujoco.mjcf import build_model
+
+INERTIAL = (
+    "body_mass", "body_ipos", "body_iquat", "body_inertia", "body_pos", "body_quat", "body_subtreemass", "body_invweight0",
+    "dof_armature", "dof_M0", "dof_invweight0", "jnt_axis", "jnt_pos", "geom_bodyid",
+)  # fmt: skip
+
+
+def random_parameters(count):
+    parameters = Parameters.nominal(ROBOT, count)
+    rng = np.random.default_rng(2)
+    for name in ("body.mass", "body.inertia", "leg.length", "leg.mass", "leg.inertia", "leg.com_along_leg", "wheel.radius",
+                 "wheel.mass", "wheel.spin_inertia", "wheel.transverse_inertia", "servo.armature", "hip.position"):  # fmt: skip
+        spread = 0.01 if "inertia" in name else 0.1  # a rigid body obeys the triangle inequality
+        parameters[name] *= rng.uniform(1 - spread, 1 + spread, parameters[name].shape)
+    parameters["body.com_offset"] = rng.uniform(-0.02, 0.02, (count, 3))
+    parameters["payload.mass"] = rng.uniform(0.0, 1.0, count)
+    parameters["payload.position"] = rng.uniform(-0.05, 0.05, (count, 3))
+    parameters["ground.slope"] = rng.uniform(-0.2, 0.2, (count, 2))
+    return parameters
+
+
+def test_every_robot_of_a_batch_has_the_model_built_for_it_alone():
+    """Fields expanded and derived in the batch against the MJCF of each robot, compiled by itself."""
+    count = 4
+    parameters = random_parameters(count)
+    batch = RobotBatch(ROBOT, count, 1e-3, threads=1)
+    batch.set_parameters(np.arange(count), Parameters.nominal(ROBOT, count))
+    batch.set_parameters(np.array([1, 3]), Parameters(parameters.values[[1, 3]]))
+    for row in range(count):
+        expected_from = parameters if row in (1, 3) else Parameters.nominal(ROBOT, count)
+        alone = build_model(ROBOT, expected_from, row, wheel_shape="capsule")
+        model = batch.model_of(row)
+        for name in INERTIAL:
+            np.testing.assert_allclose(getattr(model, name), getattr(alone, name), rtol=1e-9, atol=1e-15, err_msg=name)
+        np.testing.assert_allclose(model.opt.gravity, alone.opt.gravity, atol=1e-12)
+
+
+# ---- work and energy ---------------------------------------------------------------------------------------------------
+
+STEP = 1e-3
+VISCOUS = 0.005
+EFFECTS = {
+    "none": {},
+    "rolling_resistance": {"ground.rolling_resistance": 0.02},
+    "tyre_creep": {"ground.creep_speed": 0.02},
+    "slip_weakening": {"ground.kinetic_ratio": 0.5},
+    "stribeck_and_load": {"servo.stribeck_torque": 0.1, "servo.load_friction": 0.1},
+    "torque_ripple": {"servo.ripple_amplitude": 0.05, "servo.ripple_order": 8.0},
+    "weak_motor": {"servo.torque_scale": 0.7},
+    "supply_sag": {"servo.supply_resistance": 0.3},
+    "tether": {"tether.stiffness": 3.0},
+    "slope_and_payload": {"ground.slope": (0.1, 0.05), "payload.mass": 0.5, "payload.position": (0.03, 0.02, 0.05)},
+}
+
+
+def edit(parameters):
+    parameters["ground.mu_x"], parameters["ground.mu_y"] = 0.5, 0.35
+    parameters["servo.viscous_friction"] = VISCOUS
+    for robot, changes in enumerate(EFFECTS.values()):
+        for name, value in changes.items():
+            parameters[name][robot] = value
+
+
+def stored(parameters, truth):
+    v, w = truth.linear_velocity_in_body, truth.angular_velocity_in_body
+    kinetic = dynamics.kinetic_energy(parameters, v, w, truth.joint_position, truth.joint_velocity)
+    tether = 0.5 * parameters["tether.stiffness"] * (truth.position[:, :2] ** 2).sum(axis=1)
+    return kinetic + tether + dynamics.potential_energy(parameters, truth.position, truth.quaternion, truth.joint_position)
+
+
+def wheel_gaps(parameters, truth):
+    normal = dynamics.rotation_matrix(truth.quaternion)[:, 2]
+    angle = truth.joint_position[:, :4]
+    axle = parameters["hip.position"][:, None, :] * [[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]]
+    axle += parameters["leg.length"][..., None] * np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], axis=-1)
+    reach = parameters["wheel.radius"] * np.hypot(normal[:, :1], normal[:, 2:])
+    return truth.position[:, 2:] + np.einsum("nwk,nk->nw", axle, normal) - reach
+
+
+@pytest.fixture(scope="module")
+def audit():
+    """Work (N,) of every force over 3 s of random driving, by name, and the change of stored energy."""
+    count = len(EFFECTS)
+    rng = np.random.default_rng(0)
+    plant = make("mujoco", count, edit, step=STEP, period=STEP)
+    parameters = plant.parameters
+    work = {name: np.zeros(count) for name in ("motor", "gear", "viscous", "friction", "normal", "rolling")}
+    worst = {name: np.zeros(count) for name in ("gear", "friction", "rolling")}
+    done = np.zeros(count)
+    start = stored(parameters, plant.truth())
+    old = Truth(plant.truth().values.copy())
+    old_gap = wheel_gaps(parameters, old)
+    goals = np.zeros((count, 8))
+    for tick in range(3000):
+        if tick % 250 == 0:
+            goals = np.tile(np.hstack([rng.uniform(1.1, 2.0, 4), rng.uniform(-5.0, 5.0, 4)]), (count, 1))
+        plant.step(goals)
+        truth = plant.truth()
+        gap = wheel_gaps(parameters, truth)
+        rate = 0.5 * STEP * (truth.joint_velocity + old.joint_velocity)
+        slip = 0.5 * STEP * (truth.slip_velocity + old.slip_velocity)
+        spins = [t.angular_velocity_in_body[:, 1:2] + t.joint_velocity[:, :4] + t.joint_velocity[:, 4:] for t in (truth, old)]
+        force = truth.contact_force.reshape(count, 4, 3)
+        now = {
+            "motor": (truth.motor_torque * rate).sum(axis=1),
+            "gear": (truth.friction_torque * rate).sum(axis=1),
+            "viscous": -VISCOUS * (rate**2).sum(axis=1) / STEP,
+            "friction": (force[..., :2].reshape(count, 8) * slip).sum(axis=1),
+            "normal": (force[..., 2] * (gap - old_gap)).sum(axis=1),
+            "rolling": (truth.rolling_torque * 0.5 * STEP * (spins[0] + spins[1])).sum(axis=1),
+        }
+        for name, value in now.items():
+            work[name] += value
+        for name in worst:
+            worst[name] = np.maximum(worst[name], now[name])
+        done += np.abs(now["motor"])
+        old, old_gap = Truth(truth.values.copy()), gap
+    return stored(parameters, plant.truth()) - start, work, worst, done
+
+
+def test_energy_balance_closes_with_every_effect(audit):
+    change, work, _, done = audit
+    error = np.abs(change - sum(work.values())) / done
+    assert done.min() > 1.0
+    assert dict(zip(EFFECTS, error, strict=True)) == pytest.approx(dict.fromkeys(EFFECTS, 0.0), abs=1e-4)
+
+
+@pytest.mark.parametrize("term", ["gear", "friction", "rolling"])
+def test_no_friction_adds_energy(audit, term):
+    _, work, worst, _ = audit
+    robots = slice(1, 2) if term == "rolling" else slice(None)
+    assert work[term][robots].max() < -1e-3
+    assert worst[term].max() < 1e-5  # J per step: a slip that reverses within a step is averaged over its ends

@@ -1,0 +1,49 @@
+"""The same robots on either simulator, for tests that hold on both."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from wlr_gym.parameters import Parameters
+from wlr_gym.plants import make_plant
+from wlr_gym.plants.base import Plant, PlantOptions, PlantState, standing_state
+from wlr_gym.robot import load_robot
+
+BACKENDS = ("gibbs_appell", "mujoco")
+ROBOT = load_robot()
+HOME = np.concatenate([np.full(4, np.pi / 2), np.zeros(4)])
+
+
+def make(
+    backend: str,
+    count: int,
+    edit: Callable[[Parameters], None] | None = None,
+    place: Callable[[PlantState], None] | None = None,
+    *,
+    step: float = 1e-3,
+    period: float = 0.02,
+) -> Plant:
+    """Return ``count`` robots with ``edit`` applied to their parameters and ``place`` to their standing state."""
+    parameters = Parameters.nominal(ROBOT, count)
+    if edit is not None:
+        edit(parameters)
+    state = standing_state(ROBOT, parameters)
+    if place is not None:
+        place(state)
+    options = PlantOptions(control_period=period, physics_step=step, sensor_noise=False)
+    plant = make_plant(backend, ROBOT, count, options)
+    plant.reset(parameters=parameters, state=state)
+    return plant
+
+
+def drive(plant: Plant, seconds: float, goals=HOME, torque_on=None) -> np.ndarray:
+    """Hold ``goals`` (8,) or (N, 8) for ``seconds``; return a copy of the linear velocities in the body (N, 3)."""
+    goals = np.array(np.broadcast_to(goals, (plant.count, 8)))
+    for _ in range(round(seconds / plant.options.control_period)):
+        plant.step(goals, torque_on)
+    return plant.truth().linear_velocity_in_body.copy()
+
+
+def turn(state: PlantState, yaw: np.ndarray) -> None:
+    """Turn standing robots to headings ``yaw`` (N,), rad."""
+    state.quaternion[:] = np.column_stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)])

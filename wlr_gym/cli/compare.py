@@ -1,0 +1,188 @@
+"""Drive two plants with the same goals and parameters, and report where they part, in units of sensor noise.
+
+Writes compare.json, report.md, a map of all differences, a figure per motion, config.yaml and provenance.yaml. docs/compare.md
+says how to read them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wlr_gym.cli.options import EffectsOption
+from wlr_gym.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from wlr_gym.effects import Patch
+    from wlr_gym.robot import Robot
+    from wlr_gym.runs.compare import Comparison, Contender
+    from wlr_gym.runs.compare_report import Table
+    from wlr_gym.runs.excitations import Motion
+
+
+@dataclass(frozen=True)
+class Options(EffectsOption):
+    out: Path
+    """Folder for the report; made if it is not there."""
+    plants: tuple[str, str] = ("gibbs_appell", "mujoco")
+    """Two of: BACKEND or BACKEND:option=value,... with the options physics_step (s) and precision; for example
+    gibbs_appell gibbs_appell:precision=float32."""
+    excitation: tuple[str, ...] = ()
+    """Motions to drive: straight, posture, turns, s_curve, stop_and_go, rear_legs, all_legs, random, chirp, steps;
+    default: all."""
+    runs: Path | None = None
+    """Drive the commands of this measured run, or folder of runs, instead."""
+    seed: int = 0
+    """Of the excitations: another seed, another motion of the same kind."""
+    seconds: float | None = None
+    """Cut every motion off after this long."""
+    robot: str | None = None
+    """Robot file or config name; default: the one the runs' meta.yaml names, else the nominal one."""
+    physics_step: float = 0.001
+    """s per substep of both plants."""
+    halve: bool = False
+    """Repeat at half of both steps: shows whether the difference shrinks, and each plant's own step error."""
+    every_effect: bool = False
+    """Also compare with each effect of the library at its default severity, one at a time, on top of --effects."""
+    threshold: float = 5.0
+    """Two signals have parted when they differ by more than this many units of sensor noise."""
+    threads: int = 1
+    """Worker threads of each plant."""
+    plots: bool = True
+    """Write figures."""
+    strict: bool = False
+    """Exit with 1 when the plants agree less than they should: 2 % of the travel and 2 degrees of yaw after 10 s, 5 % rms of
+    the joint torques; at half the steps where --halve is given."""
+
+
+def run(options: Options) -> int:
+    """Compare, print the tables, write the files; 0 when done, with ``--strict`` 1 when a bound is broken.
+
+    Raises:
+        InputError: unknown plant, excitation, effect or robot, unreadable runs, numbers out of range.
+    """
+    from rich.console import Console
+
+    from wlr_gym.cli import FAILED, OK
+    from wlr_gym.files import make_output_folder, replace_file, write_json
+    from wlr_gym.provenance import record_provenance
+    from wlr_gym.runs.compare import parse_contender
+    from wlr_gym.runs.compare_report import markdown, summary_table
+
+    first, second = (parse_contender(text, options.physics_step) for text in options.plants)
+    if not options.threshold > 0.0:
+        raise InputError(f"--threshold {options.threshold:g}: expected more than 0 units of sensor noise")
+    motions, robot = _motions(options)
+    patches = _patches(options, motions, robot)
+    make_output_folder(options.out)
+    console, comparisons = Console(), []
+    for comparison in _compare_all(options, motions, (first, second), robot, patches, console):
+        comparisons.append(comparison)
+        if len(patches) == 1:
+            _print_all(console, comparison)
+    if len(patches) > 1:
+        _print(console, summary_table(comparisons))
+    write_json(options.out / "compare.json", [comparison.as_dict() for comparison in comparisons])
+    text = markdown(comparisons, f"{first.label} and {second.label}")
+    replace_file(options.out / "report.md", lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    record_provenance(options.out, _resolved(options, motions, robot, patches[0]))
+    console.print(f"report: {options.out / 'report.md'}", soft_wrap=True)
+    return FAILED if options.strict and any(comparison.broken for comparison in comparisons) else OK
+
+
+def _motions(options: Options) -> tuple[list[Motion], Robot]:
+    from wlr_gym.robot import load_robot
+    from wlr_gym.runs import read_dataset, read_run
+    from wlr_gym.runs.compare import motion_of
+    from wlr_gym.runs.excitations import EXCITATIONS, excite
+    from wlr_gym.runs.replay import robot_of
+
+    if options.seconds is not None and not options.seconds > 0.0:
+        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
+    if options.runs is None:
+        robot = load_robot(options.robot) if options.robot else load_robot()
+        names = options.excitation or tuple(EXCITATIONS)
+        return [excite(name, options.seed, robot, seconds=options.seconds) for name in names], robot
+    if options.excitation:
+        raise InputError("--runs and --excitation: expected one of them")
+    if not options.runs.exists():
+        raise InputError(f"{options.runs}: no such file or folder; expected a run (CSV or Parquet) or a folder of runs")
+    runs = read_dataset(options.runs).runs if options.runs.is_dir() else [read_run(options.runs)]
+    return [motion_of(measured).cut(options.seconds) for measured in runs], robot_of(runs[0], options.robot)
+
+
+def _patches(options: Options, motions: Sequence[Motion], robot: Robot) -> list[Patch]:
+    """Return what to compare with, each tried on the parameters first so that a refusal leaves no folder behind."""
+    from wlr_gym.effects import EFFECTS, apply_patch, compose
+    from wlr_gym.parameters import Parameters
+    from wlr_gym.runs.compare import severe_patch
+
+    given = options.patch()
+    patches = [given]
+    if options.every_effect:
+        patches += [compose(given, severe_patch(name)) for name in EFFECTS]
+    for patch in patches:
+        apply_patch(patch, Parameters.nominal(robot))
+    return patches
+
+
+def _compare_all(
+    options: Options,
+    motions: Sequence[Motion],
+    plants: tuple[Contender, Contender],
+    robot: Robot,
+    patches: Sequence[Patch],
+    console: Console,
+) -> Iterator[Comparison]:
+    from rich.progress import track
+
+    from wlr_gym.runs.compare import compare
+    from wlr_gym.runs.compare_report import save_map, save_motion_plot
+
+    for patch in track(patches, description="comparing", console=console, disable=len(patches) == 1):
+        found = compare(
+            motions, plants, robot, None, patch, options.threshold, halve=options.halve, threads=options.threads
+        )  # fmt: skip
+        if options.plots:
+            label = re.sub(r"[^\w]+", "_", found.effects)
+            save_map(found, options.out / f"{label}.png")
+            for index, motion in enumerate(found.motions):
+                save_motion_plot(found, index, options.out / f"{label}_{motion.name}.png")
+        yield found
+
+
+def _resolved(options: Options, motions: Sequence[Motion], robot: Robot, patch: Patch) -> dict[str, object]:
+    given = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
+    return {
+        **given,
+        "plants": list(options.plants),
+        "excitation": list(options.excitation),
+        "robot": robot.name,
+        "motions": [motion.name for motion in motions],
+        "effects": patch.content()["effects"],
+    }
+
+
+def _print_all(console: Console, comparison: Comparison) -> None:
+    from wlr_gym.runs.compare_report import tables
+
+    for table in tables(comparison):
+        _print(console, table)
+
+
+def _print(console: Console, table: Table) -> None:
+    from rich import box
+    from rich.table import Table as RichTable
+
+    shown = RichTable(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE, padding=(0, 1, 0, 0))
+    for number, heading in enumerate(table.headings):
+        shown.add_column(heading, justify="left" if number == 0 else "right", overflow="fold")
+    for row in table.rows:
+        shown.add_row(*row, style="red" if any(cell.endswith(" !") for cell in row) else None)
+    console.width = max(console.width, 150)  # rather a wide line than a cut number
+    console.print(shown)

@@ -1,0 +1,133 @@
+"""List the effects that can be added to the nominal model, explain some, or check patch files.
+
+Without words the whole library; with names of effects their laws and numbers (unknown_effect: where formulas may act, and
+what they may depend on); with "check FILE ..." patches are read and applied to the robot, and what they change is printed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from wlr_gym.cli import OK
+from wlr_gym.effects import EFFECTS, UNKNOWN_EFFECT, Effect, Patch, PatchEffect, apply_patch, load_patch
+from wlr_gym.effects.document import places
+from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.parameters import ELEMENTS, Parameters, spec_of
+from wlr_gym.plants.forces import COORDINATES, FEATURES
+from wlr_gym.robot import load_robot
+
+
+@dataclass(frozen=True)
+class Options:
+    words: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Names of effects, or: check FILE ..."""
+    robot: str = "nominal"
+    """Robot that check applies the patches to: name in configs/robot/ or path."""
+
+
+def run(options: Options) -> int:
+    """Print the library, one effect, or what patch files change."""
+    match options.words:
+        case ():
+            _show(_library())
+            print("one of them: wlr effects NAME; what is beyond the library: wlr effects unknown_effect; docs/effects.md")
+        case ("check",):
+            raise InputError("wlr effects check: give the patch files to check")
+        case ("check", *files):
+            _check([load_patch(file) for file in files], load_patch(list(files)), options.robot)
+        case names:
+            for name in names:
+                _explain(name)
+    return OK
+
+
+def _show(*tables: Table) -> None:
+    console = Console(highlight=False)
+    console.width = max(console.width, 160)  # rather a wide line than a broken one
+    for table in tables:
+        console.print(table)
+
+
+def _table(title: str, *headings: str) -> Table:
+    return Table(*map(_plain, headings), title=title, title_justify="left", box=None, padding=(0, 2, 0, 0))
+
+
+def _library() -> Table:
+    table = _table("", "name", "what is missing", "where", "parameters, unit, plausible range")
+    for effect in EFFECTS.values():
+        numbers = "\n".join(f"{name} {p.unit} {_range(p.prior)}" for name, p in effect.parameters.items())
+        table.add_row(effect.name, effect.doc, places(effect), _plain(numbers))
+    return table
+
+
+def _range(bounds: tuple[float, float]) -> str:
+    return f"[{bounds[0]:.3g}, {bounds[1]:.3g}]"
+
+
+def _plain(text: str) -> str:
+    """Keep rich from reading brackets as markup."""
+    from rich.markup import escape
+
+    return escape(text)
+
+
+def _explain(name: str) -> None:
+    if name == UNKNOWN_EFFECT:
+        _explain_formulas()
+    elif name in EFFECTS:
+        _explain_effect(EFFECTS[name])
+    else:
+        raise unknown_name("effect", name, [*EFFECTS, UNKNOWN_EFFECT])
+
+
+def _explain_effect(effect: Effect) -> None:
+    table = _table("", "parameter", "unit", "meaning", "bounds", "plausible range", "neutral", "typical")
+    for name, p in effect.parameters.items():
+        cells = (p.doc, _range((p.low, p.high)), _range(p.prior), _neutral(p.neutral), f"{p.severity:g}")
+        table.add_row(f"{name} (optional)" if p.optional else name, p.unit, *map(_plain, cells))
+    print(f"{effect.name}: {effect.doc}\n  {effect.equation}\n  where: {', '.join(effect.where)}\n")
+    _show(table)
+
+
+def _neutral(value: float | str) -> str:
+    return f"the robot's {value}" if isinstance(value, str) else f"{value:g}"
+
+
+def _explain_formulas() -> None:
+    where = _table("where a formula may act", "where", "unit")
+    for name, unit in COORDINATES.items():
+        where.add_row(name, unit)
+    features = _table("what it may depend on", "name", "unit", "meaning", "of the")
+    for name, feature in FEATURES.items():
+        features.add_row(name, feature.unit, feature.doc, feature.scope)
+    _show(where, features)
+
+
+def _check(patches: Sequence[Patch], together: Patch, robot_name: str) -> None:
+    robot = load_robot(robot_name)
+    nominal = Parameters.nominal(robot)
+    patched = apply_patch(together, nominal)
+    table = _table("", "effect", "where", "parameters", "from")
+    for patch in patches:
+        for effect in patch.effects:
+            table.add_row(effect.name, ", ".join(effect.where), _plain(_numbers(effect)), patch.source)
+    _show(table)
+    changes = _table(f"what changes in robot '{robot.name}'", "parameter", "nominal", "patched", "unit")
+    for name, before, after in zip(ELEMENTS, nominal.values[0], patched.values[0], strict=True):
+        if before != after:
+            changes.add_row(_plain(name), f"{before:.6g}", f"{after:.6g}", spec_of(name).unit)
+    if changes.row_count:
+        _show(changes)
+    else:
+        print("no parameter changes")
+
+
+def _numbers(effect: PatchEffect) -> str:
+    units = effect.units or {name: EFFECTS[effect.name].parameters[name].unit for name in effect.parameters}
+    numbers = ", ".join(f"{name} = {value:g} {units[name]}" for name, value in effect.parameters.items())
+    return f"{effect.formula}; {numbers}" if effect.formula else numbers

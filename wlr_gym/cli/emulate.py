@@ -1,0 +1,149 @@
+"""Emulate the robot's eight servos and its IMU on pseudo-terminals; any Dynamixel tool can connect to them.
+
+Prints the ports and runs until Ctrl-C. Type a fault (``drop wheels probability=0.01``, ``dead leg_lf after=2``), ``status``,
+``faults``, ``clear`` or ``help``; the same lines are taken by --fault and by the --control socket.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wlr_gym.cli import OK
+from wlr_gym.cli.options import EffectsOption
+from wlr_gym.errors import InputError
+
+if TYPE_CHECKING:
+    from wlr_gym.hardware.emulator import Server
+
+
+@dataclass(frozen=True)
+class Options(EffectsOption):
+    """Emulate the robot.
+
+    Attributes:
+        backend: simulator behind the servos.
+        robot: robot file or config name.
+        hardware: wiring and mounting: file or config name.
+        links: folder for links to the ports with fixed names (one per bus, and imu); made if it is not there.
+        control: path of a Unix socket that takes command lines.
+        fault: faults to start with; may be given several times.
+        stepped: time passes only by the command ``step SECONDS``; answers then come at once.
+        tick: s of emulated time per step.
+        usb_latency: s the adapter holds back unfilled packets (16 ms is an FTDI adapter's default, 1 ms the advised setting).
+        wire_time: let bytes take their time on the wire.
+        factory: servos as out of the box: id 1, 57600 bit/s. They then answer all at once, as real ones do.
+        firmware: version the servos report; fast reads need 45.
+        seed: of sensor noise and faults.
+        seconds: stop after this long; 0 = run until Ctrl-C.
+    """
+
+    backend: str = "gibbs_appell"
+    robot: str = "nominal"
+    hardware: str = "nominal"
+    links: Path | None = None
+    control: Path | None = None
+    fault: tuple[str, ...] = ()
+    stepped: bool = False
+    tick: float = 0.001
+    usb_latency: float = 0.001
+    wire_time: bool = True
+    factory: bool = False
+    firmware: int = 45
+    seed: int = 0
+    seconds: float = 0.0
+
+
+def run(options: Options) -> int:
+    """Emulate until Ctrl-C; 0 then.
+
+    Raises:
+        InputError: unknown robot, hardware, backend or fault; ports that cannot be made.
+    """
+    from wlr_gym.effects import apply_patch
+    from wlr_gym.hardware.config import load_hardware
+    from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
+    from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
+    from wlr_gym.parameters import Parameters
+    from wlr_gym.robot import load_robot
+
+    for name in ("tick", "usb_latency", "seconds"):
+        if getattr(options, name) < 0 or (name == "tick" and options.tick == 0):
+            raise InputError(f"--{name.replace('_', '-')} {getattr(options, name):g}: expected more than 0")
+    if not 0 <= options.firmware <= 255:
+        raise InputError(f"--firmware {options.firmware}: expected 0 to 255")
+    timing = NO_TIME if options.stepped else LineTiming(wire=options.wire_time, usb_latency=options.usb_latency)
+    machine_options = MachineOptions(
+        backend=options.backend,
+        tick=options.tick,
+        seed=options.seed,
+        firmware=options.firmware,
+        factory=options.factory,
+        timing=timing,
+    )
+    robot, patch = load_robot(options.robot), options.patch()
+    parameters = apply_patch(patch, Parameters.nominal(robot, 1))
+    machine = Machine(robot, load_hardware(options.hardware), machine_options, parameters=parameters, forces=patch.forces)
+    for fault in options.fault:
+        machine.inject(fault)
+    with Server(machine, real_time=not options.stepped, links=options.links, control=options.control) as server:
+        _print_ports(server, options.links)
+        try:
+            _take_commands(server, options.seconds)
+        except KeyboardInterrupt:
+            print("stopped")
+    if server.failure is not None:
+        raise server.failure
+    if server.slipped > 0.0:
+        print(f"this computer was too busy: emulated time fell behind by {server.slipped:.2f} s", file=sys.stderr)
+    machine.close()
+    return OK
+
+
+def _print_ports(server: Server, links: Path | None) -> None:
+    buses = server.machine.hardware.buses
+    for name, path in server.ports.items():
+        bus = buses.get(name)
+        text = f"{bus.model}, {bus.baud_rate} bit/s: {', '.join(bus.joints)}" if bus else "frames of the IMU"
+        print(f"{name:8} {links / name if links else path}  {text}", flush=True)
+
+
+def _take_commands(server: Server, seconds: float) -> None:
+    """Read command lines from the terminal or a pipe until the time is over; at the end of input, wait."""
+    import math
+    import os
+    import select
+    import signal
+    import time
+
+    end = time.monotonic() + seconds if seconds > 0.0 else math.inf
+    source = _standard_input()
+    text = b""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that links are removed then too
+    while (left := end - time.monotonic()) > 0.0 and server.failure is None:
+        wait = min(left, 0.5)
+        if source is None:
+            time.sleep(wait)
+        elif select.select([source], [], [], wait)[0]:
+            data = os.read(source, 4096)
+            *lines, text = (text + data).split(b"\n")
+            for line in filter(None, map(bytes.strip, lines)):
+                print(_answer(server, line.decode("utf-8", "replace")), flush=True)
+            source = source if data else None
+
+
+def _standard_input() -> int | None:
+    """File descriptor of the standard input; None where there is none."""
+    try:
+        return sys.stdin.fileno()
+    except (AttributeError, OSError, ValueError):
+        return None
+
+
+def _answer(server: Server, line: str) -> str:
+    try:
+        return server.command(line)
+    except InputError as error:
+        return f"error: {error}"

@@ -1,0 +1,27 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from wlr_gym.effects import Patch
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectsOption:
+    """``--effects`` of every command that simulates."""
+
+    effects: tuple[str, ...] = ()
+    """Patch files, or names in configs/effects/: what is added to the nominal model; see: wlr effects."""
+
+    def patch(self) -> Patch:
+        """Return all given patches as one.
+
+        Raises:
+            InputError: see :func:`wlr_gym.effects.load_patch`.
+        """
+        from wlr_gym.effects import load_patch
+
+        return load_patch(list(self.effects))

@@ -1,0 +1,144 @@
+"""Drive a robot: in a window with the arrow keys or a gamepad, or into a video with commands by schedule."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from wlr_gym.cli import OK
+from wlr_gym.cli.options import EffectsOption
+from wlr_gym.errors import InputError
+from wlr_gym.render.display import require_display
+from wlr_gym.render.view import View
+
+if TYPE_CHECKING:
+    from wlr_gym.envs.core import Core
+    from wlr_gym.evaluation.film import Driver
+    from wlr_gym.policy import Policy
+    from wlr_gym.render.viewer import OpenWindow
+
+#: s; length of a video unless asked otherwise.
+SECONDS = 10.0
+
+
+@dataclass(frozen=True)
+class Options(EffectsOption):
+    env: tyro.conf.Positional[str] = "WLR-Velocity-v0"
+    """Environment id; see: wlr envs."""
+    agent: str = "proportional"
+    """Policy folder, run folder, or name of an agent."""
+    backend: str = "gibbs_appell"
+    """Simulator."""
+    randomization: str | None = None
+    """Name in configs/randomization/ or path; default: the task's."""
+    robot: str | None = None
+    """Name in configs/robot/ or path; default: the task's."""
+    seed: int = 0
+    """Seed of the first episode."""
+    command: str | None = None
+    """Commands by schedule instead of keys: 0.1,0 for good, or 0:0.1,0; 3:0.05,0.3 from these times (s) on."""
+    gamepad: bool = False
+    """Take commands from the first gamepad instead of the keys."""
+    video: Path | None = None
+    """Write a video (.webp, .gif, .png, .mp4) instead of opening a window; without --command, the task's own commands."""
+    seconds: float | None = None
+    """Length; default: 10 s of video, or until the window is closed."""
+    camera: str = "follow"
+    """follow, chase, side or top."""
+    size: tuple[int, int] = (640, 480)
+    """Width and height of the video, pixels."""
+    forces: bool = False
+    """Also draw the friction force on each wheel."""
+
+
+def run(options: Options) -> int:
+    """Play, until the window is closed or the video is written."""
+    from wlr_gym.evaluation import make_core
+    from wlr_gym.policy import make_policy
+
+    _check(options)
+    keywords = {name: getattr(options, name) for name in ("backend", "randomization", "robot")}
+    core = make_core(options.env, 1, keywords | {"effects": options.patch()})
+    try:
+        policy = make_policy(options.agent, core.contract())
+        driver = _driver(options, core)
+        if options.video is not None:
+            _film(options, core, policy, driver)
+        else:
+            show(options, core, policy, driver)
+    finally:
+        core.close()
+    return OK
+
+
+def _check(options: Options) -> None:
+    from wlr_gym.render.video import check_video
+
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: expected 0 or more")
+    if options.seconds is not None and not 0 < options.seconds < float("inf"):
+        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
+    if options.gamepad and (options.command is not None or options.video is not None):
+        raise InputError("--gamepad drives in the window: leave out --command and --video")
+    _view(options)
+    if options.video is not None:
+        check_video(options.video)
+    else:
+        require_display()
+
+
+def _view(options: Options) -> View:
+    return View(size=options.size, camera=options.camera, forces=options.forces)
+
+
+def _driver(options: Options, core: Core) -> Driver | None:
+    from wlr_gym.render.teleop import Gamepad, Keyboard, Script
+
+    names = core.task.commands
+    if options.command is not None:
+        return Script(options.command, names)
+    if options.video is not None:
+        return None
+    terms = core.task.config.commands.terms
+    ranges = {name: (float(terms[name][0]), float(terms[name][1])) for name in names}
+    return Gamepad(ranges) if options.gamepad else Keyboard(ranges)
+
+
+def _film(options: Options, core: Core, policy: Policy, driver: Driver | None) -> None:
+    from rich.progress import track
+
+    from wlr_gym.evaluation.film import film, film_length
+    from wlr_gym.render import write_video
+
+    assert options.video is not None
+    seconds = SECONDS if options.seconds is None else options.seconds
+    count, _, fps = film_length(core, seconds)
+    title = f"{options.agent} on {core.plant.capabilities.name}"
+    pictures = film(core, policy, options.seed, seconds, view=_view(options), driver=driver, title=title)
+    write_video(options.video, track(pictures, total=count, description="drawing", transient=True), fps, count)
+    print(f"written: {options.video} ({count} pictures, {count / fps:g} s)")
+
+
+def show(options: Options, core: Core, policy: Policy, driver: Driver | None, open: OpenWindow | None = None) -> None:
+    """Play in a window until it is closed, or for ``options.seconds``; ``open`` is how it is opened (tests)."""
+    from wlr_gym.evaluation.film import commands, drive, present_time
+    from wlr_gym.render.teleop import HELP, Keyboard
+    from wlr_gym.render.viewer import Viewer, open_window
+
+    period = core.task.config.control_period
+    on_key = driver.press if isinstance(driver, Keyboard) else None
+    viewer = Viewer(core.task.robot, _view(options), on_key, open or open_window)
+    if on_key is not None:
+        print(HELP)
+    try:
+        for tick, _ in enumerate(drive(core, policy, options.seed, driver)):
+            if options.seconds is not None and tick * period > options.seconds:
+                break
+            texts = {"time": present_time(core), "command": commands(core), "title": options.agent}
+            if not viewer.show(core.plant.truth(), core.parameters, period=period, **texts):
+                break
+    finally:
+        viewer.close()

@@ -1,0 +1,96 @@
+"""How a robot is wired and mounted, loaded from ``configs/hardware/*.yaml``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from wlr_gym.errors import InputError
+from wlr_gym.hardware.tables import BAUD_RATES, load_table
+from wlr_gym.paths import find_config
+from wlr_gym.robot import JOINTS, parse_config, read_yaml
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Bus(_Model):
+    """One electrical bus: serial port, servo model, joints on it, and what the servos' EEPROM must hold (counts)."""
+
+    port: str
+    model: str
+    baud_rate: int
+    joints: tuple[str, ...] = Field(min_length=1)
+    eeprom: dict[str, int] = {}
+
+    @model_validator(mode="after")
+    def _is_possible(self) -> Bus:
+        table = load_table(self.model)
+        if self.baud_rate not in BAUD_RATES:
+            raise ValueError(f"baud rate {self.baud_rate}; the servos know {', '.join(map(str, BAUD_RATES))}")
+        outside = [name for name in self.eeprom if not table[name].in_eeprom]
+        if outside:
+            raise ValueError(f"{', '.join(outside)}: not in the EEPROM")
+        return self
+
+
+class ImuPort(_Model):
+    """Serial stream of the IMU: port, frames per second, ranges (deg/s, g)."""
+
+    port: str
+    baud_rate: int = 115200
+    rate: float = Field(gt=0, le=1000)
+    gyro_range: Literal[250, 500, 1000, 2000] = 500
+    accel_range: Literal[2, 4, 8, 16] = 4
+
+
+class Mounting(_Model):
+    """How a servo sits on its joint: count = zero + sign * angle / count size."""
+
+    sign: Literal[-1, 1] = 1
+    zero: int = Field(0, ge=0, le=4095)
+
+
+class Hardware(_Model):
+    """Wiring and mounting of a whole robot, as one ``configs/hardware/*.yaml`` describes it."""
+
+    name: str
+    buses: dict[str, Bus]
+    imu: ImuPort
+    joints: dict[str, Mounting]
+
+    @model_validator(mode="after")
+    def _every_joint_is_wired_once(self) -> Hardware:
+        wired = [joint for bus in self.buses.values() for joint in bus.joints]
+        if sorted(wired) != sorted(JOINTS) or set(self.joints) != set(JOINTS):
+            raise ValueError(f"buses and joints must name each of {', '.join(JOINTS)} once")
+        return self
+
+
+def load_hardware(source: str | Path | Hardware = "nominal") -> Hardware:
+    """Load a hardware description by config name or path.
+
+    Raises:
+        InputError: unreadable file, unknown or missing key, a joint wired twice or not at all, an impossible baud rate.
+    """
+    if isinstance(source, Hardware):
+        return source
+    path = find_config("hardware", source)
+    return parse_config(Hardware, read_yaml(path), str(path))
+
+
+def with_ports(hardware: Hardware, ports: dict[str, str]) -> Hardware:
+    """Return the same hardware on other ports: bus name or ``imu`` -> path.
+
+    Raises:
+        InputError: a name that is no bus.
+    """
+    unknown = set(ports) - set(hardware.buses) - {"imu"}
+    if unknown:
+        raise InputError(f"no bus '{sorted(unknown)[0]}'; the buses are {', '.join([*hardware.buses, 'imu'])}")
+    buses = {name: bus.model_copy(update={"port": ports.get(name, bus.port)}) for name, bus in hardware.buses.items()}
+    imu = hardware.imu.model_copy(update={"port": ports.get("imu", hardware.imu.port)})
+    return hardware.model_copy(update={"buses": buses, "imu": imu})

@@ -1,0 +1,174 @@
+"""Faults on command: what can go wrong on the bus, in a servo and at the supply.
+
+A fault is one line of text: ``KIND [WHERE ...] [probability=P] [value=X] [after=S] [duration=S]``, for example
+``drop wheels probability=0.01`` or ``dead leg_lf after=2 duration=0.5``. WHERE is a joint, a bus or ``imu``; none = everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from wlr_gym.errors import InputError, unknown_name
+
+
+class FaultKind(NamedTuple):
+    """What a kind of fault does, its value's default and unit, and how long it lasts unless told (s)."""
+
+    doc: str
+    value: float = 0.0
+    unit: str = ""
+    duration: float = math.inf
+
+
+#: Kinds of faults. The first group hits bytes on their way to the host (packet by packet, with the probability given).
+FAULTS: dict[str, FaultKind] = {
+    "drop": FaultKind("the answer is lost on its way to the host"),
+    "delay": FaultKind("the answer comes later than it should", 0.002, "s"),
+    "late": FaultKind("the answer comes when the host has given up", 0.05, "s"),
+    "flip": FaultKind("one random bit of the answer is wrong"),
+    "truncate": FaultKind("the end of the answer is missing"),
+    "noise": FaultKind("random bytes come before the answer", 8, "bytes"),
+    "echo": FaultKind("the host's own bytes come back before the answers (adapter without echo suppression)"),
+    "deaf": FaultKind("the instruction does not reach the servo"),
+    "dead": FaultKind("the servo has no power: silent, motor off; comes back rebooted"),
+    "brownout": FaultKind("the supply breaks down for the duration: every servo named reboots", duration=0.05),
+    "unplug": FaultKind("the adapter is pulled out; at the end it is back, perhaps under another name"),
+    "overload": FaultKind("the servo finds itself overloaded: error, shutdown"),
+    "overheat": FaultKind("the servo heats up", 2.0, "degC/s"),
+    "sag": FaultKind("the supply drops", 3.0, "V"),
+}
+_REPLY_FAULTS = ("drop", "delay", "late", "flip", "truncate", "noise")
+_KEYS = ("probability", "value", "after", "duration")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault.
+
+    Attributes:
+        kind: key of :data:`FAULTS`.
+        where: joints, buses or ``imu``; empty = everywhere.
+        probability: chance per packet, for faults that hit bytes.
+        value: see :data:`FAULTS`.
+        after: s from when it was asked for until it starts.
+        duration: s it lasts.
+    """
+
+    kind: str
+    where: tuple[str, ...] = ()
+    probability: float = 1.0
+    value: float = 0.0
+    after: float = 0.0
+    duration: float = math.inf
+
+    def __str__(self) -> str:
+        kind = FAULTS[self.kind]
+        parts = [self.kind, *self.where]
+        parts += [f"probability={self.probability:g}"] if self.probability < 1.0 else []
+        parts += [f"value={self.value:g}"] if kind.unit else []
+        parts += [f"after={self.after:g}"] if self.after > 0.0 else []
+        parts += [f"duration={self.duration:g}"] if math.isfinite(self.duration) else []
+        return " ".join(parts)
+
+
+def parse_fault(text: str, places: Collection[str]) -> Fault:
+    """Read a fault from a line of text.
+
+    Args:
+        text: see the module's head.
+        places: names that WHERE may be.
+
+    Raises:
+        InputError: unknown kind, place or key, or a value that is no number in range; names the nearest valid one.
+    """
+    kind, *words = text.split() or [""]
+    if kind not in FAULTS:
+        raise unknown_name("fault", kind, FAULTS)
+    where = tuple(word for word in words if "=" not in word)
+    for place in where:
+        if place not in places:
+            raise unknown_name("place", place, places, f"fault '{text}'")
+    numbers = {"value": FAULTS[kind].value, "duration": FAULTS[kind].duration}
+    for word in words:
+        if "=" in word:
+            key, _, number = word.partition("=")
+            numbers[key] = _number(key, number, text)
+    return Fault(kind, where, **numbers)
+
+
+def _number(key: str, text: str, where: str) -> float:
+    if key not in _KEYS:
+        raise unknown_name("key", key, _KEYS, f"fault '{where}'")
+    try:
+        value = float(text)
+    except ValueError:
+        raise InputError(f"fault '{where}': {key} = '{text}' is no number") from None
+    if not (value >= 0.0 and (key != "probability" or value <= 1.0)):
+        raise InputError(f"fault '{where}': {key} = {text}, expected 0 or more" + (" up to 1" if key == "probability" else ""))
+    return value
+
+
+class FaultBoard:
+    """Faults that were asked for, with the time they hold.
+
+    Args:
+        seed: of the random choices (which packets, which bits).
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        self._random = np.random.default_rng(seed)
+        self._faults: list[tuple[float, float, Fault]] = []
+
+    def add(self, fault: Fault, now: float) -> None:
+        """Take a fault asked for at ``now`` (s)."""
+        start = now + fault.after
+        self._faults.append((start, start + fault.duration, fault))
+
+    def clear(self, kind: str | None = None) -> None:
+        """Forget all faults, or those of one kind."""
+        self._faults = [entry for entry in self._faults if kind is not None and entry[2].kind != kind]
+
+    def active(self, now: float, kind: str, places: Sequence[str]) -> Fault | None:
+        """Return a fault of ``kind`` that holds at any of ``places`` now; None where there is none."""
+        for start, end, fault in self._faults:
+            hit = fault.kind == kind and start <= now < end
+            if hit and (not fault.where or any(place in fault.where for place in places)):
+                return fault
+        return None
+
+    @property
+    def any(self) -> bool:
+        """Whether there is anything to look after."""
+        return bool(self._faults)
+
+    def listing(self, now: float) -> list[str]:
+        """Return the faults that hold now or will."""
+        return [str(fault) for _, end, fault in self._faults if now < end]
+
+    def happens(self, now: float, kind: str, places: Sequence[str]) -> Fault | None:
+        """As :meth:`active`, but only with the fault's probability."""
+        if not self._faults:
+            return None
+        fault = self.active(now, kind, places)
+        return fault if fault is not None and self._random.random() < fault.probability else None
+
+    def mangle(self, now: float, raw: bytes, places: Sequence[str]) -> tuple[bytes, float]:
+        """Return what arrives of ``raw`` (perhaps nothing), and how much later (s)."""
+        if not self._faults:
+            return raw, 0.0
+        hits = {kind: fault for kind in _REPLY_FAULTS if (fault := self.happens(now, kind, places)) is not None}
+        if "drop" in hits:
+            return b"", 0.0
+        if "flip" in hits:
+            bit = int(self._random.integers(8 * len(raw)))
+            raw = bytes(byte ^ (1 << bit % 8 if k == bit // 8 else 0) for k, byte in enumerate(raw))
+        if "truncate" in hits:
+            raw = raw[: int(self._random.integers(1, len(raw)))]
+        if "noise" in hits:
+            raw = self._random.bytes(round(hits["noise"].value)) + raw
+        return raw, sum(hits[kind].value for kind in ("delay", "late") if kind in hits)

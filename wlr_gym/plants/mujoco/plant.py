@@ -1,0 +1,263 @@
+"""MuJoCo as a Plant: a second, independent simulator of the same robots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.errors import InputError
+from wlr_gym.model.dynamics import gravity_in_floor, rotation_matrix
+from wlr_gym.parameters import Parameters
+from wlr_gym.plants.base import (
+    SENSOR_LAYOUT,
+    TRUTH_LAYOUT,
+    Capabilities,
+    PlantOptions,
+    PlantState,
+    Sensors,
+    Truth,
+    check_goals,
+    hold_where_off,
+    standing_state,
+)
+from wlr_gym.plants.forces import COORDINATES, INPUTS, Force, compile_forces
+from wlr_gym.plants.gibbs_appell.plant import check_contact_resolution
+from wlr_gym.plants.goals import GoalHistory
+from wlr_gym.plants.mujoco import packing
+from wlr_gym.plants.mujoco.batch import RobotBatch
+from wlr_gym.plants.mujoco.kernel import load_kernel
+from wlr_gym.plants.mujoco.step import STATE, TICK_SUMS
+from wlr_gym.plants.sensors import RAW_LAYOUT, SensorModel
+from wlr_gym.robot import Robot
+
+Array = NDArray[np.float64]
+
+#: MuJoCo orders joints along the tree: leg, wheel, leg, wheel, ... In the order of ``JOINTS``:
+_JOINT = np.array([0, 2, 4, 6, 1, 3, 5, 7])
+_LANE = {name: index for index, name in enumerate(STATE)}
+_ROTOR_LEAD = np.array([_LANE[f"rotor_lead{j}"] for j in range(8)])
+_ROTOR_RATE = np.array([_LANE[f"rotor_rate{j}"] for j in range(8)])
+_SUMS = slice(_LANE[TICK_SUMS[0]], _LANE[TICK_SUMS[-1]] + 1)
+
+
+class MujocoPlant:
+    """Batch of robots in MuJoCo; see :class:`wlr_gym.plants.base.Plant` for the contract.
+
+    Same parameters, servo, gear and friction laws, sensors and truth as the Gibbs-Appell plant; rigid-body dynamics, contacts
+    and dry friction are MuJoCo's. float64 only.
+
+    Args:
+        robot: the robot; its nominal parameters are used until ``reset`` gets others.
+        count: number of robots.
+        options: step size, threads.
+        forces: formula forces that act on every robot.
+
+    Raises:
+        InputError: a physically impossible robot, bad options.
+    """
+
+    capabilities = Capabilities("mujoco", has_truth=True, can_set_state=True, real_time=False)
+
+    def __init__(self, robot: Robot, count: int = 1, options: PlantOptions | None = None, forces: Sequence[Force] = ()) -> None:
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+            raise InputError(f"number of robots is {count!r}, expected 1 or more")
+        self.robot = robot
+        self.options = options or PlantOptions()
+        if self.options.precision != "float64":
+            raise InputError(f"precision '{self.options.precision}': the MuJoCo plant has float64 only")
+        self._count = count
+        self.substeps = self.options.substeps
+        self._step = self.options.physics_step
+        self._batch = RobotBatch(robot, count, self._step, self.options.threads)
+        self._state = np.zeros((count, len(STATE)))
+        self._lanes = np.zeros((count, len(packing.PARAMETER_LANES)))
+        self._inputs = [np.zeros((count, 8)) for _ in range(4)]
+        self._truth = Truth(np.zeros((count, TRUTH_LAYOUT.width)))
+        self._raw = np.zeros((count, RAW_LAYOUT.width))
+        self._readings = Sensors(np.zeros((count, SENSOR_LAYOUT.width)))
+        self._goals = GoalHistory(count, self.options.control_period)
+        self._sensors = SensorModel(robot, self.options, count)
+        self._forces = compile_forces(forces) if forces else None
+        self._force_inputs = np.zeros((len(INPUTS), count if forces else 1))
+        self._force_values = np.repeat(self._forces.values[:, None], count, axis=1) if self._forces else np.zeros((0, 1))
+        self._generalised = np.zeros((len(COORDINATES), count))
+        self._kernel = load_kernel()
+        batch = self._batch
+        self._arrays = (
+            batch.qpos, batch.qvel, batch.constraint, batch.contact, self._state, self._lanes, *self._inputs, self._generalised,
+            batch.applied, batch.armature, batch.gear_bound, batch.pair_friction, batch.pair_margin,
+            batch.geom_size, batch.geom_pos, batch.geom_quat,
+        )  # fmt: skip
+        self._all = np.arange(count)
+        self.parameters = Parameters.nominal(robot, count)
+        self.reset(seeds=np.zeros(count, np.uint64), parameters=self.parameters)
+
+    @property
+    def count(self) -> int:
+        """Number of robots."""
+        return self._count
+
+    @property
+    def model(self) -> object:
+        """The ``mujoco.MjModel`` all robots share, with nominal numbers (for rendering)."""
+        return self._batch.model
+
+    # ---- parameters and state ----
+
+    def reset(
+        self,
+        seeds: NDArray[np.uint64] | None = None,
+        parameters: Parameters | None = None,
+        mask: NDArray[np.bool_] | None = None,
+        state: PlantState | None = None,
+    ) -> Sensors:
+        """Start robots anew; see :meth:`wlr_gym.plants.base.Plant.reset`."""
+        rows = self._rows(mask)
+        if parameters is not None:
+            self._take_parameters(parameters, rows)
+        start = standing_state(self.robot, self.parameters) if state is None else state
+        self._write_state(start, rows)
+        self._goals.reset(rows, start, self.parameters)
+        self._kernel.observe(*self._arrays, self._truth.values, self._raw, rows)
+        self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)
+        return self._readings
+
+    def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
+        """Change parameters in mid-run (interval randomisation, drifting friction); the state stays."""
+        rows = self._rows(mask)
+        self._take_parameters(parameters, rows)
+        self._goals.set_delays(rows, self.parameters)
+        self._sensors.set_errors(rows, self.parameters)
+
+    def _rows(self, mask: NDArray[np.bool_] | None) -> NDArray[np.intp]:
+        if mask is None:
+            return self._all
+        if np.shape(mask) != (self._count,):
+            raise InputError(f"mask has shape {np.shape(mask)}, expected ({self._count},)")
+        return np.flatnonzero(mask)
+
+    def _take_parameters(self, parameters: Parameters, rows: NDArray[np.intp]) -> None:
+        if len(parameters) != self._count:
+            raise InputError(f"parameters hold {len(parameters)} robots, the plant {self._count}")
+        chosen = Parameters(parameters.values[rows])
+        chosen.validate()
+        check_contact_resolution(chosen, self._step)
+        self._fit_rotors(rows, chosen)
+        self.parameters.values[rows] = chosen.values
+        self._lanes[rows] = packing.pack(chosen, self.robot, self._step)
+        self._batch.set_parameters(rows, chosen)
+
+    def _fit_rotors(self, rows: NDArray[np.intp], chosen: Parameters) -> None:
+        """Keep how far the teeth are pressed together where the gear's play changes; a new rotor turns with its joint."""
+        old, new = self.parameters["servo.backlash"][rows], chosen["servo.backlash"]
+        cells = np.ix_(rows, _ROTOR_LEAD)
+        lead = self._state[cells]
+        pressed = np.maximum(np.abs(lead) - 0.5 * old, 0.0)
+        kept = np.where(old > 0.0, np.minimum(np.abs(lead), 0.5 * new) + pressed, 0.0)
+        self._state[cells] = np.where(old == new, lead, np.where(new > 0.0, np.copysign(kept, lead), 0.0))
+        cells = np.ix_(rows, _ROTOR_RATE)
+        rates = self._batch.qvel[rows][:, 6 + _JOINT]
+        self._state[cells] = np.where((old == 0.0) & (new > 0.0), rates, self._state[cells])
+
+    def _write_state(self, state: PlantState, rows: NDArray[np.intp]) -> None:
+        quaternion = state.quaternion[rows] / np.linalg.norm(state.quaternion[rows], axis=1, keepdims=True)
+        rotation = rotation_matrix(quaternion)
+        velocity = np.einsum("nij,nj->ni", rotation, state.linear_velocity_in_body[rows])
+        w, rates = state.angular_velocity_in_body[rows], state.joint_velocity[rows]
+        reference = state.reference_position[rows].copy()
+        reference[:, :4] += self.parameters["joint.zero_offset"][rows]
+        still = -np.einsum("nji,nj->ni", rotation, gravity_in_floor(self.parameters)[rows])
+        values = np.zeros((rows.size, len(STATE)))
+        groups = {
+            "reference_position{}": (reference, range(8)),
+            "reference_velocity{}": (state.reference_velocity[rows], range(8)),
+            "rotor_rate{}": (rates if state.rotor_rate is None else state.rotor_rate[rows], range(8)),
+            "gyro_{}": (w, "xyz"),
+            "acceleration_{}": (still, "xyz"),
+        }
+        if state.rotor_lead is not None:
+            groups["rotor_lead{}"] = (state.rotor_lead[rows], range(8))
+        if state.supply_drop is not None:
+            groups["supply_drop{}"] = (state.supply_drop[rows, None], ("",))
+        for pattern, (columns, labels) in groups.items():
+            for k, label in enumerate(labels):
+                values[:, _LANE[pattern.format(label)]] = columns[:, k]
+        position = np.hstack([state.position[rows], quaternion, state.joint_position[rows][:, np.argsort(_JOINT)]])
+        speed = np.hstack([velocity, w, rates[:, np.argsort(_JOINT)]])
+        if not (np.isfinite(values).all() and np.isfinite(position).all() and np.isfinite(speed).all()):
+            raise InputError("state holds numbers that are not finite")
+        batch = self._batch
+        self._state[rows], batch.qpos[rows], batch.qvel[rows], batch.warmstart[rows] = values, position, speed, 0.0
+
+    def get_state(self) -> PlantState:
+        """Return a copy of the mechanical and servo state."""
+
+        def columns(name: str) -> Array:
+            return np.stack([self._state[:, _LANE[f"{name}{j}"]] for j in range(8)], axis=1)
+
+        truth = self._truth
+        reference = columns("reference_position")
+        reference[:, :4] -= self.parameters["joint.zero_offset"]
+        has_play = self.parameters["servo.backlash"] > 0.0
+        return PlantState(
+            position=truth.position.copy(),
+            quaternion=truth.quaternion.copy(),
+            linear_velocity_in_body=truth.linear_velocity_in_body.copy(),
+            angular_velocity_in_body=truth.angular_velocity_in_body.copy(),
+            joint_position=truth.joint_position.copy(),
+            joint_velocity=truth.joint_velocity.copy(),
+            reference_position=reference,
+            reference_velocity=columns("reference_velocity"),
+            rotor_lead=np.where(has_play, self._state[:, _ROTOR_LEAD], 0.0),
+            rotor_rate=np.where(has_play, self._state[:, _ROTOR_RATE], truth.joint_velocity),
+            supply_drop=self._state[:, _LANE["supply_drop"]].copy(),
+        )
+
+    # ---- stepping ----
+
+    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+        """Advance one control tick; see :meth:`wlr_gym.plants.base.Plant.step`.
+
+        Raises:
+            InputError: wrong shape or a non-finite goal of a motor that is on.
+        """
+        on = self._inputs[3]
+        if torque_on is None:
+            on.fill(1.0)
+        else:
+            goals = hold_where_off(goals, torque_on, self._present_goals())
+            on[...] = np.asarray(torque_on, dtype=bool)
+        for target, values in zip(self._inputs, self._goals.push(check_goals(goals, self._count)), strict=False):
+            target[...] = values
+        self._tick()
+        self._sensors.measure(self._raw, self._readings.values)
+        return self._readings
+
+    def _tick(self) -> None:
+        kernel, arrays, rows, step = self._kernel, self._arrays, self._all, self._step
+        self._state[:, _SUMS] = 0.0
+        kernel.drift(*arrays, rows, 0.5 * step)
+        for substep in range(self.substeps):
+            if self._forces:
+                kernel.features(*arrays, self._force_inputs, rows)
+                self._forces.evaluate(self._force_inputs, self._force_values, self._generalised)
+            kernel.before(*arrays, rows, step, (substep + 0.5) * step)
+            self._batch.step()
+            kernel.after(*arrays, rows, step)
+        kernel.drift(*arrays, rows, -0.5 * step)
+        kernel.observe(*arrays, self._truth.values, self._raw, rows)
+
+    def _present_goals(self) -> Array:
+        """Goals that keep every joint as it is: leg angles as the servo reads them, wheels at rest."""
+        present = np.zeros((self._count, 8))
+        present[:, :4] = self._truth.joint_position[:, :4] + self.parameters["joint.zero_offset"]
+        return present
+
+    def truth(self) -> Truth:
+        """Return the true state after the last step or reset; overwritten by the next step."""
+        return self._truth
+
+    def close(self) -> None:
+        """Nothing to release."""

@@ -1,0 +1,169 @@
+"""What is drawn besides the robot: areas of other friction, slip and force arrows. Nothing here needs OpenGL."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo fills its namespace when it is imported.)
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.parameters import PATCHES, Parameters
+from wlr_gym.plants.base import Truth
+from wlr_gym.render.colours import FORCE, Colour, friction_colour, slip_colour
+from wlr_gym.render.stage import Stage
+
+Array = NDArray[np.float64]
+
+#: Arrows: m of length per m/s of slip and per N of friction, and what is too little to draw.
+SLIP_SCALE, SLIP_FLOOR = 2.0, 0.003
+FORCE_SCALE, FORCE_FLOOR = 0.025, 0.2
+LONGEST_ARROW = 0.4
+SHAFT = 0.006
+#: m; slip and force arrows start this far outside the wheel's middle plane, beside the tyre, where they can be seen.
+BESIDE, BESIDE_SLIP_ARROWS = 0.022, 0.040
+#: m; areas are drawn on the floor this far around the robot.
+REACH = 15.0
+LAYER = 4e-4
+
+
+@dataclass(frozen=True)
+class Area:
+    """A rectangle of floor with a friction of its own: corners (x, y) in m, colour, height of its surface."""
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+    mu: float
+    height: float
+
+    def points(self, near: Array, reach: float = 0.9, count: int = 7) -> Array:
+        """Return a grid of points (count * count, 3) on what of it is near a place (x, y), the innermost first."""
+        low = np.maximum(np.minimum(near[:2] - reach, self.high), self.low)
+        high = np.minimum(np.maximum(near[:2] + reach, self.low), self.high)
+        share = (np.arange(count) + 0.5) / count
+        share = share[np.argsort(np.abs(share - 0.5), kind="stable")]
+        grid = np.stack(np.meshgrid(share, share, indexing="ij"), axis=-1).reshape(-1, 2)
+        order = np.argsort(np.abs(grid - 0.5).sum(axis=1), kind="stable")
+        return np.column_stack([low + grid[order] * (high - low), np.full(len(grid), self.height)])
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """An arrow in the floor frame, m."""
+
+    start: Array
+    end: Array
+    colour: Colour
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A round pad under a wheel that has a floor friction of its own."""
+
+    centre: Array
+    mu: float
+
+
+def areas(parameters: Parameters, row: int, around: Array) -> list[Area]:
+    """Return the non-empty friction patches, cut to what can be seen from ``around`` (x, y); later ones lie on top.
+
+    The colour is that of the friction along the heading and the axle on average (along the axle: times mu_y/mu_x).
+    """
+    found = []
+    mu_x, mu_y = parameters["ground.mu_x"][row].mean(), parameters["ground.mu_y"][row].mean()
+    share = 0.5 * (1.0 + (mu_y / mu_x if mu_x > 0 else 1.0))
+    for index in range(len(PATCHES)):
+        box = [parameters[f"patch.{side}"][row, index] for side in ("x_min", "x_max", "y_min", "y_max")]
+        if not (box[0] < box[1] and box[2] < box[3]):
+            continue
+        low = np.maximum([box[0], box[2]], around[:2] - REACH)
+        high = np.minimum([box[1], box[3]], around[:2] + REACH)
+        if (low < high).all():
+            mu = float(parameters["patch.mu"][row, index]) * float(share)
+            found.append(Area(_pair(low), _pair(high), mu, LAYER * (index + 1)))
+    return found
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def spots(stage: Stage, parameters: Parameters, row: int) -> list[Spot]:
+    """Return a pad under every wheel where the wheels have different floors, none where they share one."""
+    mu = 0.5 * (parameters["ground.mu_x"][row] + parameters["ground.mu_y"][row])
+    if np.ptp(mu) < 1e-9:
+        return []
+    points, _, _ = stage.contact_frames(parameters, row)
+    return [Spot(point, float(value)) for point, value in zip(points, mu, strict=True)]
+
+
+def slip_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) -> list[Arrow]:
+    """Return one arrow per slipping wheel: where its contact point skids to over the floor."""
+    slip = truth.slip_velocity[row].reshape(4, 2)
+    speed = np.hypot(slip[:, 0], slip[:, 1])
+    colours = [slip_colour(float(value)) for value in speed]
+    return _arrows(stage, parameters, row, SLIP_SCALE * slip, SLIP_SCALE * SLIP_FLOOR, BESIDE, colours)
+
+
+def force_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) -> list[Arrow]:
+    """Return one arrow per wheel: the floor's friction force on it."""
+    force = truth.contact_force[row].reshape(4, 3)[:, :2]
+    return _arrows(stage, parameters, row, FORCE_SCALE * force, FORCE_SCALE * FORCE_FLOOR, BESIDE_SLIP_ARROWS, [FORCE] * 4)
+
+
+def _arrows(
+    stage: Stage, parameters: Parameters, row: int, vectors: Array, shortest: float, beside: float, colours: list[Colour]
+) -> list[Arrow]:
+    points, heading, left = stage.contact_frames(parameters, row)
+    outwards = np.array([1.0, -1.0, 1.0, -1.0])[:, None] * left  # corners are lf, rf, lr, rr
+    starts = points + beside * outwards + [0.0, 0.0, SHAFT + LAYER * 5]
+    length = np.hypot(vectors[:, 0], vectors[:, 1])
+    scale = np.minimum(1.0, LONGEST_ARROW / np.maximum(length, 1e-12))[:, None]
+    ends = starts + scale * (vectors[:, :1] * heading + vectors[:, 1:] * left)
+    return [
+        Arrow(starts[wheel], ends[wheel], colours[wheel])
+        for wheel in range(4)
+        if length[wheel] >= shortest and np.isfinite(length[wheel])
+    ]
+
+
+# --- into MuJoCo's scene ----------------------------------------------------------------------------------------------
+
+
+def add_marks(scene: mujoco.MjvScene, marks: Iterable[Area | Arrow | Spot]) -> None:
+    """Append marks to a scene; what does not fit in is left out."""
+    for mark in marks:
+        if scene.ngeom >= scene.maxgeom:
+            return
+        _ADD[type(mark)](scene.geoms[scene.ngeom], mark)
+        scene.ngeom += 1
+
+
+def _add_area(geom: mujoco.MjvGeom, area: Area) -> None:
+    low, high = np.array(area.low), np.array(area.high)
+    _start(geom, "BOX", [*(0.5 * (high - low)), area.height], [*(0.5 * (low + high)), 0.0], friction_colour(area.mu))
+
+
+def _add_spot(geom: mujoco.MjvGeom, spot: Spot) -> None:
+    _start(geom, "CYLINDER", [0.06, LAYER * 5, 0.0], spot.centre * [1.0, 1.0, 0.0], friction_colour(spot.mu))
+
+
+def _add_arrow(geom: mujoco.MjvGeom, arrow: Arrow) -> None:
+    _start(geom, "ARROW", [SHAFT, SHAFT, SHAFT], arrow.start, arrow.colour)
+    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, SHAFT, arrow.start, arrow.end)
+    geom.emission = 0.5
+
+
+def _start(geom: mujoco.MjvGeom, kind: str, size: Iterable[float], position: Iterable[float], colour: Colour) -> None:
+    shape = getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")
+    place = np.fromiter(position, np.float64)
+    mujoco.mjv_initGeom(
+        geom, shape, np.fromiter(size, np.float64), place, np.eye(3).ravel(), np.array([*colour, 1.0], np.float32)
+    )
+    geom.category = mujoco.mjtCatBit.mjCAT_DECOR.value
+
+
+_ADD = {Area: _add_area, Spot: _add_spot, Arrow: _add_arrow}

@@ -1,0 +1,165 @@
+"""A window that shows a plant while it runs, in real time.
+
+All that needs a display is in :func:`open_window`; the rest can be driven by any object with the same few methods.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo fills its namespace when it is imported.)
+from __future__ import annotations
+
+import importlib
+import platform
+import time
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+
+from wlr_gym.errors import InputError
+from wlr_gym.parameters import Parameters
+from wlr_gym.plants.base import Truth
+from wlr_gym.render import marks
+from wlr_gym.render.camera import CAMERAS, LOOK_HEIGHT
+from wlr_gym.render.display import require_display
+from wlr_gym.render.scene import describe, marks_of
+from wlr_gym.render.stage import Stage
+from wlr_gym.render.view import View
+from wlr_gym.robot import Robot
+
+KeyCallback = Callable[[int], None]
+
+
+class Window(Protocol):
+    """What is used of ``mujoco.viewer``'s handle."""
+
+    cam: Any
+    user_scn: Any
+
+    def is_running(self) -> bool: ...
+    def lock(self) -> AbstractContextManager[Any]: ...
+    def sync(self) -> None: ...
+    def set_texts(self, texts: Any) -> None: ...
+    def close(self) -> None: ...
+
+
+OpenWindow = Callable[[mujoco.MjModel, mujoco.MjData, KeyCallback | None], Window]
+
+
+def open_window(model: mujoco.MjModel, data: mujoco.MjData, on_key: KeyCallback | None) -> Window:
+    """Open MuJoCo's viewer without its side panels.
+
+    Raises:
+        InputError: no display, or a Python that cannot have one.
+    """
+    require_display()
+    try:
+        viewer = importlib.import_module("mujoco.viewer")
+        return viewer.launch_passive(model, data, key_callback=on_key, show_left_ui=False, show_right_ui=False)
+    except (RuntimeError, ImportError, mujoco.FatalError) as error:
+        remedy = "start Python as mjpython (it comes with mujoco)" if platform.system() == "Darwin" else "check the display"
+        raise InputError(f"MuJoCo's viewer does not open ({error}): {remedy}, or make a video instead") from None
+
+
+class Viewer:
+    """Shows one robot, drawn like :class:`wlr_gym.render.scene.Scene`, no faster than real time.
+
+    The camera starts as ``view.camera`` says and goes along with the robot; the mouse turns it. On a slope gravity is
+    inclined in the window (MuJoCo's camera keeps the floor's normal upright); the text says how much.
+
+    Args:
+        robot: supplies the sizes that are no parameters.
+        view: what to show; the size is the window's own affair.
+        on_key: called with GLFW's key code, from the window's thread.
+        open: how the window is opened (tests).
+        clock, sleep: what time it is, and how to wait (tests).
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        view: View | None = None,
+        on_key: KeyCallback | None = None,
+        open: OpenWindow = open_window,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self.robot = robot
+        self.view = view or View()
+        self._on_key, self._open, self._clock, self._sleep = on_key, open, clock, sleep
+        self._stage: Stage | None = None
+        self._window: Window | None = None
+        self._next = -np.inf
+
+    @property
+    def is_open(self) -> bool:
+        """False before the first picture, and once the user has closed the window."""
+        return self._window is not None and self._window.is_running()
+
+    def show(
+        self,
+        truth: Truth,
+        parameters: Parameters,
+        row: int = 0,
+        *,
+        period: float,
+        time: float | None = None,
+        command: Mapping[str, float] | None = None,
+        title: str = "",
+    ) -> bool:
+        """Show one robot and wait until its control period is over.
+
+        Args:
+            truth, parameters, row, time, command, title: as in :meth:`wlr_gym.render.scene.Scene.draw`.
+            period: s that this picture stands for.
+
+        Returns:
+            Whether the window is open. Once the user has closed it, nothing is shown and nothing waits.
+
+        Raises:
+            InputError: no display.
+        """
+        if self._stage is None:
+            self._stage = Stage(self.robot, parameters, row, self.view.size)
+        stage = self._stage
+        stage.pose(truth, parameters, row)
+        if self._window is None:
+            self._window = self._open(stage.model, stage.data, self._on_key)
+            self._aim_first(stage)
+        if not self._window.is_running():
+            return False
+        with self._window.lock():
+            self._window.cam.lookat[:] = [*truth.position[row, :2], LOOK_HEIGHT]
+            scene = self._window.user_scn
+            scene.ngeom = 0
+            floor = marks.areas(parameters, row, truth.position[row]) if self.view.friction else []
+            marks.add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
+        if self.view.text:
+            lines = describe(truth, parameters, row, time, command, title, slip=self.view.slip)
+            self._window.set_texts([(None, mujoco.mjtGridPos.mjGRID_TOPLEFT, "\n".join(lines).replace("°", " deg"), "")])
+        self._window.sync()
+        self._pace(period)
+        return True
+
+    def close(self) -> None:
+        """Close the window; closing again does nothing."""
+        if self._window is not None:
+            self._window.close()
+        self._window = None
+
+    def _aim_first(self, stage: Stage) -> None:
+        assert self._window is not None
+        start, eye = CAMERAS[self.view.camera], self._window.cam
+        eye.type = mujoco.mjtCamera.mjCAMERA_FREE
+        eye.distance, eye.elevation = 1.2 * start.distance, np.degrees(start.elevation)
+        eye.azimuth = np.degrees(start.azimuth + (stage.yaw() if start.turns else 0.0))
+
+    def _pace(self, period: float) -> None:
+        """Wait for the next tick; after a hold-up of more than a few ticks go on from now instead of catching up."""
+        now = self._clock()
+        if now > self._next + 5 * period:
+            self._next = now
+        self._next += period
+        if self._next > now:
+            self._sleep(self._next - now)
