@@ -35,6 +35,7 @@ def random_parameters(count, seed):
     parameters["leg.inertia"] = body_inertia(rng, 1e-4, (count, 4)).reshape(count, 12)
     parameters["payload.mass"] = rng.uniform(0.0, 3.0, count)
     parameters["payload.position"] = rng.uniform(-0.2, 0.2, (count, 3))
+    parameters["payload.inertia"] = load_inertia(rng, 0.01, count)
     parameters["ground.slope"] = rng.uniform(-0.6, 0.6, (count, 2))
     parameters["servo.coulomb_friction"] = parameters["servo.viscous_friction"] = 0.0
     parameters.validate()
@@ -45,6 +46,14 @@ def body_inertia(rng, scale, shape):
     """Three different principal moments that a rigid body can have: sums of pairs of second moments."""
     second = scale * rng.uniform(0.2, 2.0, (*shape, 3))
     return second.sum(axis=-1, keepdims=True) - second
+
+
+def load_inertia(rng, scale, count):
+    """Inertias (N, 6) of bodies with second moments of mass S about their centre: trace(S) - S, xy = -S_xy."""
+    spread = rng.normal(size=(count, 3, 3))
+    second = scale * spread @ spread.transpose(0, 2, 1)
+    xx, yy, zz = (second[:, k, k] for k in range(3))
+    return np.stack([yy + zz, xx + zz, xx + yy, -second[:, 0, 1], -second[:, 0, 2], -second[:, 1, 2]], axis=1)
 
 
 @dataclass

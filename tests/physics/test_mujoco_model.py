@@ -26,6 +26,8 @@ def random_parameters(count):
     parameters["body.com_offset"] = rng.uniform(-0.02, 0.02, (count, 3))
     parameters["payload.mass"] = rng.uniform(0.0, 1.0, count)
     parameters["payload.position"] = rng.uniform(-0.05, 0.05, (count, 3))
+    parameters["payload.inertia"][0] = 0.01, 0.02, 0.025, 0.003, -0.002, 0.001
+    parameters["payload.inertia"][1] = 0.0, 0.01, 0.01, 0.0, 0.0, 0.0  # two point masses on a line
     parameters["ground.slope"] = rng.uniform(-0.2, 0.2, (count, 2))
     return parameters
 

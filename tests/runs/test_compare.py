@@ -56,7 +56,7 @@ def changed(traces: Traces, layout: str, element: str, change: float, start: int
 
 def test_equal_plants_do_not_differ():
     found = compare([MOTION, excite("turns", 0, ROBOT, seconds=1.0)], (ENGINE, ENGINE), ROBOT, halve=True)
-    for case in (*found.cases, *found.half):
+    for case in (*found.cases, *(found.half or ())):
         assert case.first is None
         assert case.agreement.broken == ()
         assert all(difference.largest == 0.0 for difference in case.differences.values())

@@ -22,8 +22,7 @@ COMMANDS = {
     "compare": "drive two plants with the same goals and report where they part, in noise units",
     "vision": "measure pose and slip from a video of the robot with ring markers",
     "calibrate": "calibrate a camera, or write the marker sheets to print",
-    "compare": "drive two plants with the same goals and report where they part, in noise units",
-    "emulate": "emulate the robot's servos on pseudo-terminals, for any Dynamixel tool; faults on command",
+    "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults on command",
     "bench": "measure the speed of the engine, the environments and training on this machine",
     "demo": "train, evaluate and plot in about three minutes",
 }

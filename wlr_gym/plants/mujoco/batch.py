@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.model.dynamics import gravity_in_floor
 from wlr_gym.parameters import SPECS, Parameters
-from wlr_gym.plants.mujoco.mjcf import build_model
+from wlr_gym.plants.mujoco.mjcf import build_model, principal_inertia
 from wlr_gym.plants.mujoco.step import CAPSULE_HALF_LENGTH
 from wlr_gym.robot import CORNER_SIGNS, LEGS, WHEELS, Robot
 
@@ -86,6 +86,7 @@ class RobotBatch:
         self._solref = batch.expand("pair_solref")
         self._gravity = batch.expand("opt.gravity")
         self._mass, self._inertia = batch.expand("body_mass"), batch.expand("body_inertia")
+        self._axes = batch.expand("body_iquat")
         self._centre, self._place = batch.expand("body_ipos"), batch.expand("body_pos")
         self._size, self._pos, self._quat = (batch.expand(f"geom_{name}") for name in ("size", "pos", "quat"))
         self._bound = batch.expand("geom_rbound")
@@ -113,6 +114,9 @@ class RobotBatch:
         self._set_body(rows, body["body"], parameters["body.mass"], parameters["body.com_offset"], parameters["body.inertia"])
         self._mass[rows, body["payload"]] = parameters["payload.mass"]
         self._place[rows, body["payload"]] = parameters["payload.position"]
+        self._inertia[rows, body["payload"]], self._axes[rows, body["payload"]] = principal_inertia(
+            parameters["payload.inertia"]
+        )
         leg_inertia = parameters["leg.inertia"].reshape(-1, 4, 3)[:, :, [2, 1, 0]]  # the leg's frame has x along the leg
         zero = np.zeros(len(rows))
         for corner, (leg, wheel) in enumerate(zip(LEGS, WHEELS, strict=True)):

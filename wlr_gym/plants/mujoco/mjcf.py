@@ -6,7 +6,7 @@ Choices, and why:
 
 - Joint angles are those of :mod:`wlr_gym.robot`; ``qpos0`` is the home pose, standing on the floor. ``qvel[:3]`` is the
   velocity of the body origin in the floor frame, ``qvel[3:6]`` the angular velocity in the body frame.
-- A slope turns gravity, not the floor. The payload is a body of its own, welded to the platform, without inertia of its own.
+- A slope turns gravity, not the floor. The payload is a body of its own, welded to the platform.
 - There are no servos: apply torques with ``qfrc_applied``. Rotors are joint armatures; gear friction is joint damping and
   friction loss.
 - A wheel on the floor is an explicit contact pair, so its coefficients are its own and no combination rule (MuJoCo takes the
@@ -28,6 +28,7 @@ from typing import Any, Literal
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from wlr_gym.errors import InputError
 from wlr_gym.parameters import Parameters
@@ -88,6 +89,8 @@ def build_model(
     if extend is not None:
         extend(spec)
     model = spec.compile()
+    if row["payload.inertia"].any():
+        _set_payload_inertia(model, row)
     if contacts:
         _set_contact_springs(model, row)
     return model
@@ -127,6 +130,27 @@ def _add_platform(spec: mujoco.MjSpec, robot: Robot, row: Parameters) -> mujoco.
     payload = body.add_body(name="payload", pos=row["payload.position"][0])
     _set_inertia(payload, row["payload.mass"][0], np.zeros(3), np.zeros(3))
     return body
+
+
+def principal_inertia(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return principal moments (N, 3) and their axes as quaternions (N, 4), w first, of inertias (N, 6).
+
+    Args:
+        inertia: xx, yy, zz, xy, xz, yz with xy = -integral of x y dm.
+    """
+    xx, yy, zz, xy, xz, yz = inertia.T
+    matrix = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+    moments, axes = np.linalg.eigh(matrix)
+    axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
+    return np.maximum(moments, 0.0), Rotation.from_matrix(axes).as_quat(scalar_first=True)
+
+
+def _set_payload_inertia(model: mujoco.MjModel, row: Parameters) -> None:
+    """After compiling: the compiler refuses, by rounding, loads that all lie in one plane."""
+    payload = model.body("payload").id
+    moments, axes = principal_inertia(row["payload.inertia"])
+    model.body_inertia[payload], model.body_iquat[payload] = moments[0], axes[0]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def _set_inertia(body: mujoco.MjsBody, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:

@@ -1,0 +1,152 @@
+"""From poses to clocks, slip and run columns: simulated drives, camera samples made from the truth, no pictures."""
+
+import math
+
+import numpy as np
+import pytest
+
+from wlr_gym.bench.vision import true_slip
+from wlr_gym.bench.vision_drives import paper_test, pose_at, skid_turn
+from wlr_gym.errors import InputError
+from wlr_gym.parameters import Parameters
+from wlr_gym.robot import load_robot
+from wlr_gym.runs import Run, read_run
+from wlr_gym.vision import Sample, align, measure_slip
+from wlr_gym.vision.analyse import Analysis, camera_columns, save
+from wlr_gym.vision.smooth import smooth
+from wlr_gym.vision.track import LOST, OK, angles
+
+STD = np.array([5e-5, 5e-5, 1.4e-4, 5e-5, 7e-4, 7e-4])  # of a pose from 2 m above
+OFFSET = 0.137
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot()
+
+
+@pytest.fixture(scope="module")
+def turn(robot):
+    return skid_turn(robot)
+
+
+def samples_of(drive, offset=OFFSET, seed=0, gap=()):
+    rng, result = np.random.default_rng(seed), []
+    for index in range(int((drive.time[-1] - 0.1) * 30)):
+        time = 0.011 + index / 30
+        pose = pose_at(drive, time)
+        values = np.concatenate([pose.position, angles(pose.rotation)]) + STD * rng.standard_normal(6)
+        seen = not any(start < time < stop for start, stop in gap)
+        values, covariance = (values, np.diag(STD**2)) if seen else (np.full(6, np.nan), np.full((6, 6), np.nan))
+        result.append(Sample(index, time - offset, OK if seen else LOST, values, covariance, 4 * seen, 0.02, np.zeros((4, 2))))
+    return result
+
+
+def aligned(drive, samples, around=0.0):
+    time, poses = np.array([s.time for s in samples]), np.stack([s.pose for s in samples])
+    return align(time, poses, drive.run, drive.robot, Parameters.nominal(drive.robot), around)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_clocks_are_aligned_within_2_ms(turn, seed):
+    found = aligned(turn, samples_of(turn, seed=seed))
+    assert found.offset == pytest.approx(OFFSET, abs=0.002)
+    assert found.std < 0.002
+    assert "yaw" in found.parts
+
+
+def test_slip_is_within_a_millimetre_and_its_error_as_expected(turn):
+    samples = samples_of(turn)
+    found = measure_slip(samples, aligned(turn, samples).offset, turn.run, turn.robot, Parameters.nominal(turn.robot))
+    error = found.slip - true_slip(turn, found.time)
+    assert np.abs(turn.slip[-1]).max() > 0.1  # there is slip to be found
+    assert np.abs(error).max() < 1e-3
+    normalised = error[-1] / found.slip_std[-1]
+    assert np.sqrt(np.mean(normalised**2)) < 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 2])
+def test_paper_tests_from_poses(number, robot):
+    drive = paper_test(number, robot)
+    samples = samples_of(drive)
+    found = aligned(drive, samples)
+    assert found.offset == pytest.approx(OFFSET, abs=0.004)
+    slip = measure_slip(samples, found.offset, drive.run, robot, Parameters.nominal(robot))
+    assert np.abs(slip.slip - true_slip(drive, slip.time)).max() < 1e-3
+
+
+def test_a_robot_that_stands_still_cannot_be_aligned(turn):
+    still = [s for s in samples_of(turn) if s.time + OFFSET < 0.95]
+    still = still * 3
+    time = np.arange(len(still)) / 30
+    poses = np.stack([s.pose for s in still])
+    rows = turn.run.table[turn.run.table["t"] < 0.95].reset_index(drop=True)
+    table = rows.loc[np.tile(np.arange(len(rows)), 3)].reset_index(drop=True).assign(t=np.arange(3 * len(rows)) * 0.02)
+    run = Run(table, turn.run.meta, turn.run.path)
+    with pytest.raises(InputError, match="clocks cannot be aligned"):
+        align(time, poses, run, turn.robot, Parameters.nominal(turn.robot))
+
+
+def test_a_video_of_something_else_is_refused(turn):
+    late = samples_of(turn, offset=-500.0)
+    with pytest.raises(InputError, match="does the video belong"):
+        aligned(turn, late)
+    with pytest.raises(InputError, match="does it belong to this run"):
+        measure_slip(late, 0.0, turn.run, turn.robot, Parameters.nominal(turn.robot))
+
+
+def test_gaps_are_flagged(turn):
+    samples = samples_of(turn, gap=[(4.0, 4.6)])
+    found = measure_slip(samples, OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+    gap = (found.time > 4.2) & (found.time < 4.4)
+    assert not found.covered[gap].any()
+    assert found.covered[found.time < 3.8].all()
+    assert found.pose_std[gap, 0].min() > 5 * np.median(found.pose_std[:, 0])
+
+
+def test_a_wild_sample_is_left_out(turn):
+    samples = samples_of(turn)
+    bad = samples[100]
+    wild = Sample(bad.index, bad.time, OK, bad.pose + np.array([0.05, 0, 0, 0, 0, 0]), bad.covariance, 4, 0.02, bad.centres)
+    found = measure_slip([*samples[:100], wild, *samples[101:]], OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+    assert np.flatnonzero(found.outliers).tolist() == [100]
+    assert np.abs(found.slip - true_slip(turn, found.time)).max() < 1e-3
+
+
+@pytest.mark.parametrize("origin", ["start", "floor"])
+def test_columns_are_the_pose_at_the_row(turn, origin):
+    table = camera_columns(samples_of(turn), OFFSET, turn.run, origin, np.zeros(len(samples_of(turn)), bool))
+    rows = np.flatnonzero(np.isfinite(table["cam_x"]))
+    assert len(rows) == len(samples_of(turn))
+    truth = np.array([[*pose_at(turn, t).position[:2], angles(pose_at(turn, t).rotation)[0]] for t in table["t"][rows]])
+    if origin == "start":
+        truth -= truth[0]  # it starts with heading 0
+    found = table.loc[rows, ["cam_x", "cam_y", "cam_yaw"]].to_numpy()
+    assert np.abs(found - truth).max() < 6e-4
+
+
+def test_results_are_written_and_the_run_reads_back(turn, tmp_path):
+    samples = samples_of(turn)
+    slip = measure_slip(samples, OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+    table = camera_columns(samples, OFFSET, turn.run, "start", slip.outliers)
+    run = Run(table, turn.run.meta, tmp_path / "run_01.parquet")
+    analysis = Analysis(run, tuple(samples), None, OFFSET, slip, turn.robot, "start", 0.0, ())
+    names = {path.name for path in save(analysis, tmp_path)}
+    assert names == {"run_01.parquet", "slip.csv", "frames.csv", "summary.json", "pose.png", "slip.png"}
+    again = read_run(tmp_path / "run_01.parquet")
+    assert np.isfinite(again["cam_x"]).sum() == len(samples)
+    assert analysis.summary()["body_lateral_slip_m"] == pytest.approx(float(slip.slip[-1, :, 1].mean()))
+
+
+def test_smoother_gives_value_rate_and_honest_deviations():
+    rng, t = np.random.default_rng(1), np.arange(0, 8, 1 / 30)
+    values = 0.1 * np.sin(1.5 * t) + 1e-3 * rng.standard_normal(len(t))
+    values[60:70] = np.nan
+    at = np.linspace(0.5, 7.5, 200)
+    found = smooth(t, values, 1e-3, at)
+    error, slope = found.value - 0.1 * np.sin(1.5 * at), found.rate - 0.15 * np.cos(1.5 * at)
+    assert np.sqrt(np.mean(error**2)) < 0.6e-3
+    assert 0.4 < np.sqrt(np.mean((error / found.value_std) ** 2)) < 2
+    assert 0.3 < np.sqrt(np.mean((slope / found.rate_std) ** 2)) < 2
+    assert math.isfinite(found.value[70])

@@ -1,0 +1,176 @@
+"""What is printed and configured: sheets to scale, calibration, target and camera files, frames, commands."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from wlr_gym.bench.vision_scene import Look, Patch, Pose, Renderer, rotation_of
+from wlr_gym.cli import main
+from wlr_gym.errors import InputError
+from wlr_gym.vision import Camera, calibrate, detect, load_camera, load_target, read_frames, save_camera
+from wlr_gym.vision.sheets import Board, Box, Disc, board_page, pdf, svg, target_pages
+
+TRUE = Camera(width=640, height=480, focal=(620.0, 615.0), centre=(325.0, 236.0), distortion=(-0.2, 0.05, 0.001, -0.002, 0.0))
+
+
+def raster(page, scale=4):
+    """Draw a page's shapes, ``scale`` px per mm, 8 samples a side."""
+    fine = 4 * scale
+    width, height = (int(side * fine) for side in page.size)
+    image = np.full((height, width), 255, np.uint8)
+    y, x = np.mgrid[0:height, 0:width] / fine + 0.5 / fine
+    for shape in page.shapes:
+        if isinstance(shape, Disc):
+            image[(x - shape.x) ** 2 + (y - shape.y) ** 2 < shape.radius**2] = round(255 * shape.shade)
+        elif isinstance(shape, Box):
+            inside = (x >= shape.x) & (x < shape.x + shape.width) & (y >= shape.y) & (y < shape.y + shape.height)
+            image[inside] = round(255 * shape.shade)
+    return image.reshape(height // 4, 4, width // 4, 4).mean(axis=(1, 3)).astype(np.uint8)
+
+
+def test_printed_sheet_shows_the_target_to_scale():
+    target = load_target("body")
+    image = raster(target_pages(target)[0], scale=2)
+    height, width = image.shape
+    camera = Camera(width=width, height=height, focal=(1e3, 1e3), centre=(width / 2, height / 2))
+    found = {d.code: d for d in detect(image, camera) if d.code == target.codes[target.key]}
+    markers = detect(image, camera)
+    assert sorted(d.code for d in markers) == sorted(target.codes)
+    centre = found[target.codes[target.key]].ellipse[:2]
+    others = np.array([d.ellipse[:2] for d in markers]) - centre
+    expected = (target.positions - target.positions[target.key])[:, :2] * [1, -1] * 2000  # 2 px per mm, y down
+    for place in expected:
+        assert np.abs(others - place).sum(axis=1).min() < 0.05
+    assert all(d.radius == pytest.approx(2000 * target.radii[0], abs=0.1) for d in markers)
+
+
+def test_svg_and_pdf_have_the_size_of_the_page():
+    pages = target_pages(load_target("floor"))
+    assert len(pages) == 4
+    assert 'width="297mm" height="210mm" viewBox="0 0 297 210"' in svg(pages[0])
+    boxes = re.findall(rb"MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf(pages))
+    assert len(boxes) == 4
+    assert float(boxes[0][0]) / 72 * 25.4 == pytest.approx(297, abs=1e-3)
+    file = pdf(pages)
+    start = int(file.rsplit(b"startxref\n", 1)[1].split()[0])
+    assert file[start : start + 4] == b"xref"
+
+
+def test_calibration_recovers_the_lens_from_the_printed_board():
+    board = Board()
+    cells = board.aruco().generateImage((20 * board.columns, 20 * board.rows), marginSize=0, borderBits=1)
+    bits = np.ones((180, 180), np.uint8)
+    bits[30:150] = cells > 127
+    side = board.columns * board.square
+    patch = Patch(np.zeros(3), np.eye(3)[:2], (side / 2 + 0.02, side / 3 + 0.02), 225.0, tags=((0.0, 0.0, side, bits),))
+    renderer = Renderer(TRUE, Pose(np.zeros(3), np.eye(3)), [], samples=5)
+    rng, views = np.random.default_rng(0), []
+    for k in range(14):
+        distance = rng.uniform(0.35, 0.55)
+        place = np.array([rng.uniform(-0.35, 0.35), rng.uniform(-0.25, 0.25), 1.0]) * distance
+        turn = rotation_of(rng.uniform(-0.4, 0.4), rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5))
+        patches = [patch.moved(place, turn @ np.diag([1.0, -1.0, -1.0]))]
+        views.append((f"view {k}", renderer.frame([patches], Look(noise=3.0), k)))
+    found = calibrate(views, board)
+    assert found.quality is not None
+    assert found.quality.rms < 0.3
+    assert found.focal == pytest.approx(TRUE.focal, rel=0.004)
+    assert found.centre == pytest.approx(TRUE.centre, abs=2.5)
+    assert found.distortion[0] == pytest.approx(TRUE.distortion[0], abs=0.02)
+    with pytest.raises(InputError, match=r"seen well in 2 of 2 images; at least 6"):
+        calibrate(views[:2], board)
+    with pytest.raises(InputError, match=r"view 1: 600 x 480 px, the images before it 640 x 480"):
+        calibrate([views[0], ("view 1", np.ascontiguousarray(views[1][1][:, :600]))], board)
+
+
+def test_camera_file_round_trip_and_faults(tmp_path):
+    path = tmp_path / "camera.yaml"
+    save_camera(path, TRUE)
+    assert load_camera(path) == TRUE
+    path.write_text(path.read_text().replace("focal", "foccal"))
+    with pytest.raises(InputError, match="foccal"):
+        load_camera(path)
+    with pytest.raises(InputError, match="no such camera file; make one with"):
+        load_camera(tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: text.replace("0.14, 0.10", "140, 0.10"), "look like millimetres"),
+        (lambda text: text.replace("body_key", "bodykey"), r"unknown marker code 'bodykey'.*did you mean 'body_key'"),
+        (lambda text: text.replace("body_key", "body"), "one marker with a code of its own"),
+        (lambda text: "\n".join(text.splitlines()[:-1]), "3 markers; a target needs at least 4"),
+        (lambda text: text.replace("[-0.14, -0.10, 0.04]", "[-0.14, -0.10, 0.05]"), "expected one plane"),
+        (lambda text: text.replace("[0.14, -0.10, 0.04]", "[0.14, 0.06, 0.04]"), "white margin"),
+    ],
+    ids=["millimetres", "code", "no key", "too few", "not flat", "too close"],
+)
+def test_wrong_targets_are_refused(change, message, tmp_path):
+    from wlr_gym.paths import find_config
+
+    path = tmp_path / "body.yaml"
+    path.write_text(change(find_config("vision", "body").read_text()))
+    with pytest.raises(InputError, match=message):
+        load_target(path)
+
+
+def test_frames_from_a_folder_a_video_and_times(tmp_path):
+    import cv2
+
+    images = [np.full((48, 64), 20 * k, np.uint8) for k in range(5)]
+    for k, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / f"f{k}.png"), image)
+    assert [int(f.image[0, 0]) for f in read_frames(str(tmp_path))] == [0, 20, 40, 60, 80]
+    assert [f.time for f in read_frames(str(tmp_path), rate=10)] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    video = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48), False)
+    for image in images:
+        video.write(image)
+    video.release()
+    assert [f.time for f in read_frames(str(tmp_path / "v.avi"))] == pytest.approx([0, 0.04, 0.08, 0.12, 0.16])
+    times = tmp_path / "times.csv"
+    times.write_text("frame,t\n0,1.0\n1,1.1\n2,1.3\n3,1.4\n4,1.5\n")
+    assert [f.time for f in read_frames(str(tmp_path / "v.avi"), times=times)] == [1.0, 1.1, 1.3, 1.4, 1.5]
+    times.write_text("t\n1.0\n0.9\n")
+    with pytest.raises(InputError, match="times must be finite and increase"):
+        list(read_frames(str(tmp_path / "v.avi"), times=times))
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(b"not a video")
+    with pytest.raises(InputError, match="cannot be read as a video"):
+        list(read_frames(str(broken)))
+    with pytest.raises(InputError, match="no such video, folder of images or camera number"):
+        list(read_frames(str(tmp_path / "nothing.mp4")))
+
+
+def test_command_writes_the_sheets(tmp_path, capsys):
+    assert main(["calibrate", "targets", "--out", str(tmp_path)]) == 0
+    assert "print at 100 %" in capsys.readouterr().out
+    assert {"body_markers.pdf", "floor_markers.pdf", "calibration_board.pdf"} <= {path.name for path in tmp_path.iterdir()}
+    assert board_page(Board()).size == (297.0, 210.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["vision", "v.avi", "--run", "none.csv", "--out", "o", "--camera", "c.yaml"], "none.csv: no such file"),
+        (["calibrate", "camera", "nothing", "--out", "camera.yaml"], "no such video"),
+        (["calibrate", "camera", ".", "--out", "camera.yaml", "--square", "28"], "expected metres"),
+        (["calibrate", "camera", ".", "--out", "camera.txt"], "expected a .yaml file"),
+    ],
+)
+def test_bad_input_is_named(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err.replace("\n", "")
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.slow
+def test_bench_reports_every_bar(tmp_path):
+    file = tmp_path / "bench.json"
+    assert main(["bench", "vision", "--quick", "--rounds", "1", "--json", str(file)]) == 0
+    rows = json.loads(file.read_text())["vision"]
+    assert {row["method"].split()[0] for row in rows} == {"ours", "paper's", "tags"}
+    assert all(row["met"] for row in rows if row["bar"] is not None and "frames per second" not in row["what"])

@@ -1,0 +1,105 @@
+"""Calibrate what measures. ``wlr calibrate camera``: lens from views of a board; ``wlr calibrate targets``: what to print."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from wlr_gym.cli import OK
+from wlr_gym.errors import InputError, require_package
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """Calibrate a camera from views of the printed board.
+
+    Attributes:
+        images: folder of images, or a video, of the board: 15 or more views, tilted, in every corner of the image, sharp.
+        out: camera file to write (YAML).
+        columns: squares of the board along its longer side.
+        rows: squares along its shorter side.
+        square: m, side of a square as measured on the print.
+        every: use every n-th frame of a video.
+    """
+
+    images: Annotated[str, tyro.conf.Positional]
+    out: Path
+    columns: int = 9
+    rows: int = 6
+    square: float = 0.028
+    every: int = 15
+
+
+@dataclass(frozen=True)
+class TargetsOptions:
+    """Write the sheets to print, as PDF and SVG to scale: markers on the robot, markers on the floor, calibration board.
+
+    Attributes:
+        out: folder; made if it is not there.
+        markers: markers on the robot: name in configs/vision/ or path.
+        floor: markers on the floor: name in configs/vision/ or path.
+    """
+
+    out: Path
+    markers: str = "body"
+    floor: str = "floor"
+
+
+Options = (
+    Annotated[CameraOptions, tyro.conf.subcommand("camera", description="lens of a camera, from views of a board")]
+    | Annotated[TargetsOptions, tyro.conf.subcommand("targets", description="sheets to print: markers and calibration board")]
+)
+
+
+def run(options: CameraOptions | TargetsOptions) -> int:
+    """Do what the sub-command says; 0 when done."""
+    require_package("cv2", "vision")
+    return _targets(options) if isinstance(options, TargetsOptions) else _camera(options)
+
+
+def _camera(options: CameraOptions) -> int:
+    from wlr_gym.vision.camera import calibrate, save_camera
+    from wlr_gym.vision.sheets import Board
+    from wlr_gym.vision.video import read_frames
+
+    if not 0.001 < options.square < 0.5:
+        raise InputError(f"--square {options.square:g}: expected metres, as measured on the print (28 mm = 0.028)")
+    if min(options.columns, options.rows) < 3 or options.every < 1:
+        raise InputError("--columns and --rows: expected 3 or more; --every: 1 or more")
+    if options.out.suffix not in {".yaml", ".yml"} or not options.out.parent.is_dir():
+        raise InputError(f"--out {options.out}: expected a .yaml file in a folder that exists")
+    step = 1 if Path(options.images).is_dir() else options.every
+    frames = read_frames(options.images)
+    views = ((f"{options.images}, frame {f.index}", f.image) for f in frames if f.index % step == 0)
+    camera = calibrate(views, Board(options.columns, options.rows, options.square))
+    save_camera(options.out, camera)
+    quality = camera.quality
+    assert quality is not None
+    print(
+        f"{camera.width} x {camera.height} px, {quality.views} views ({quality.rejected} left out), corners off by "
+        f"{quality.rms:.2f} px rms, {100 * quality.coverage:.0f} % of the image covered\n"
+        f"focal length {camera.focal[0]:.1f}, {camera.focal[1]:.1f} px (± {max(quality.focal_std):.1f}); centre "
+        f"{camera.centre[0]:.1f}, {camera.centre[1]:.1f} px (± {max(quality.centre_std):.1f})"
+    )
+    if quality.rms > 0.5:
+        print("corners off by more than 0.5 px: blurred views, a board that is not flat, or a lens this model does not fit")
+    print(f"written: {options.out}")
+    return OK
+
+
+def _targets(options: TargetsOptions) -> int:
+    from wlr_gym.files import make_output_folder
+    from wlr_gym.vision.sheets import Board, board_page, target_pages, write_pages
+    from wlr_gym.vision.targets import load_target
+
+    body, floor = load_target(options.markers), load_target(options.floor)
+    make_output_folder(options.out)
+    paths = write_pages(options.out, f"{body.name}_markers", target_pages(body))
+    paths += write_pages(options.out, f"{floor.name}_markers", target_pages(floor))
+    paths += write_pages(options.out, "calibration_board", [board_page(Board())])
+    print(f"in {options.out}: {', '.join(path.name for path in paths)}")
+    print("print at 100 %, then measure the ruler on every page")
+    return OK

@@ -1,0 +1,141 @@
+"""Measure pose and slip from a video of the robot with ring markers; writes run columns cam_*, a slip table, plots, a video.
+
+Writes the run with cam_* columns, slip.csv (per row), frames.csv (per frame), summary.json, pose.png, slip.png, annotated.mp4.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from wlr_gym.cli import OK
+from wlr_gym.errors import InputError, require_package
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from wlr_gym.runs import Run
+    from wlr_gym.vision import Analysis, Camera, Frame, Sample, Target
+
+
+@dataclass(frozen=True)
+class Options:
+    """Video to pose and slip.
+
+    Attributes:
+        video: video file, folder of images, or number of a live camera (Ctrl-C ends it).
+        run: what the robot logged meanwhile (CSV or Parquet).
+        out: folder for the results; made if it is not there.
+        camera: calibration file; make one with: wlr calibrate camera.
+        markers: markers on the robot: name in configs/vision/ or path.
+        floor: markers on the floor: name in configs/vision/ or path.
+        robot: robot file or config name; left out, the one meta.yaml names, else the nominal one.
+        offset: s, servo time minus camera time; left out, found from the motion.
+        origin: frame of cam_*: start (0, 0, 0 at the start, as in simulated runs) or floor.
+        rate: Hz, frames evenly spaced; left out, the times in the video.
+        times: CSV with one time (s) per frame, before --rate.
+        seconds: of the video to use; left out, all.
+        annotate: write annotated.mp4.
+    """
+
+    video: Annotated[str, tyro.conf.Positional]
+    run: Path
+    out: Path
+    camera: Path
+    markers: str = "body"
+    floor: str = "floor"
+    robot: str | None = None
+    offset: float | None = None
+    origin: str = "start"
+    rate: float | None = None
+    times: Path | None = None
+    seconds: float | None = None
+    annotate: bool = True
+
+
+def run(options: Options) -> int:
+    """Analyse, print, write; 0 when done.
+
+    Raises:
+        InputError: unreadable video, run, camera or target; wrong image size; no floor frame; nothing to align on.
+    """
+    require_package("cv2", "vision")
+    from rich.console import Console
+
+    from wlr_gym.files import make_output_folder
+    from wlr_gym.provenance import record_provenance
+    from wlr_gym.runs import read_run
+    from wlr_gym.vision import load_camera, load_target, save
+
+    if options.rate is not None and not options.rate > 0:
+        raise InputError(f"--rate {options.rate:g}: expected more than 0")
+    measured = read_run(options.run)
+    camera, body, floor = load_camera(options.camera), load_target(options.markers), load_target(options.floor)
+    if options.out.resolve() == options.run.resolve().parent:
+        raise InputError(f"--out {options.out}: is the run's own folder; the run would be overwritten")
+    fresh = not options.out.exists()
+    make_output_folder(options.out)
+    console = Console(highlight=False, soft_wrap=True)
+    try:
+        analysis = _analyse(options, measured, camera, body, floor, console)
+    except BaseException:
+        if fresh:  # a refusal leaves no folder behind
+            shutil.rmtree(options.out, ignore_errors=True)
+        raise
+    paths = save(analysis, options.out)
+    settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
+    record_provenance(options.out, settings | {"robot": analysis.robot.name})
+    _print(analysis, console)
+    console.print(f"in {options.out}: {', '.join(path.name for path in paths)}{', annotated.mp4' if options.annotate else ''}")
+    return OK
+
+
+def _analyse(options: Options, measured: Run, camera: Camera, body: Target, floor: Target, console: Console) -> Analysis:
+    from contextlib import nullcontext
+
+    from wlr_gym.vision import analyse, read_frames
+    from wlr_gym.vision.video import AnnotatedVideo
+
+    frames = read_frames(options.video, options.rate, options.times, options.seconds)
+    writer = AnnotatedVideo(options.out / "annotated.mp4", options.rate or 30.0) if options.annotate else nullcontext()
+    with writer as video, console.status("tracking") as status:
+
+        def watch(frame: Frame, sample: Sample) -> None:
+            if video is not None:
+                video.add(frame, sample)
+            if frame.index % 30 == 0:
+                status.update(f"tracking, frame {frame.index}: {sample.status}")
+
+        return analyse(frames, measured, camera, body, floor, options.robot, options.offset, options.origin, watch)
+
+
+def _print(analysis: Analysis, console: Console) -> None:
+    from rich import box
+    from rich.table import Table
+
+    found = analysis.summary()
+    for finding in found["findings"]:
+        console.print(finding, style="yellow")
+    status = ", ".join(f"{count} {name}" for name, count in found["status"].items() if count)
+    known = f" ± {1e3 * found['offset_std_s']:.1f}" if found["offset_std_s"] else " (given)"
+    console.print(f"{found['frames']} frames ({status}); clocks differ by {1e3 * found['offset_s']:.1f}{known} ms")
+    table = Table(
+        title=f"Slip over {found['seconds']:.1f} s, mm ± 1 sigma", title_justify="left", title_style="bold", box=box.SIMPLE
+    )
+    for heading in ("wheel", "longitudinal", "± from radius", "lateral"):
+        table.add_column(heading, justify="left" if heading == "wheel" else "right")
+    for wheel, w in found["wheels"].items():
+        table.add_row(
+            wheel, f"{1e3 * w['longitudinal_slip_m']:+.2f} ± {1e3 * w['longitudinal_std_m']:.2f}",
+            f"{1e3 * w['longitudinal_std_from_radius_m']:.2f}",
+            f"{1e3 * w['lateral_slip_m']:+.2f} ± {1e3 * w['lateral_std_m']:.2f}",
+        )  # fmt: skip
+    body = (f"{1e3 * found[f'body_{axis}_slip_m']:+.2f}" for axis in ("longitudinal", "lateral"))
+    longitudinal, lateral = body
+    table.add_row("body (mean)", longitudinal, "", lateral)
+    console.print(table)
+    console.print(f"share of the predicted path that ignoring slip gets wrong: {100 * found['no_slip_error']:.2f} %")

@@ -1,0 +1,48 @@
+"""Vision: pose and slip of the robot from ring markers in a video. How to use it: ``docs/vision.md``.
+
+``load_camera``, ``load_target``, ``read_frames`` and ``analyse`` take a video to run columns and a slip table; ``detect``,
+``find_target`` and ``Tracker`` are the steps in between.
+"""
+
+from wlr_gym.errors import require_package
+
+require_package("cv2", "vision")
+
+from wlr_gym.vision.align import Alignment, align  # noqa: E402
+from wlr_gym.vision.analyse import Analysis, analyse, save  # noqa: E402
+from wlr_gym.vision.camera import Camera, calibrate, load_camera, save_camera  # noqa: E402
+from wlr_gym.vision.detect import Detection, detect  # noqa: E402
+from wlr_gym.vision.paper import paper_pose  # noqa: E402
+from wlr_gym.vision.pose import TargetPose, find_target  # noqa: E402
+from wlr_gym.vision.slip import SlipResult, measure_slip  # noqa: E402
+from wlr_gym.vision.targets import Marker, Target, load_target  # noqa: E402
+from wlr_gym.vision.track import Frame, Sample, Tracker, locate_floor, track  # noqa: E402
+from wlr_gym.vision.video import read_frames  # noqa: E402
+
+__all__ = [
+    "Alignment",
+    "Analysis",
+    "Camera",
+    "Detection",
+    "Frame",
+    "Marker",
+    "Sample",
+    "SlipResult",
+    "Target",
+    "TargetPose",
+    "Tracker",
+    "align",
+    "analyse",
+    "calibrate",
+    "detect",
+    "find_target",
+    "load_camera",
+    "load_target",
+    "locate_floor",
+    "measure_slip",
+    "paper_pose",
+    "read_frames",
+    "save",
+    "save_camera",
+    "track",
+]
