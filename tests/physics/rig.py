@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import PlantOptions, PlantState, Truth, standing_state
@@ -110,3 +111,11 @@ def record(plant: GibbsAppellPlant, seconds: float, goals=HOME, torque_on=None) 
         plant.step(goals, torque_on)
         history.append(plant.truth().values.copy())
     return np.array(history)
+
+
+def gears(plant: GibbsAppellPlant) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how far the rotors lead their joints (rad) and their rates (rad/s), each (N, 8)."""
+    state = plant.get_state()
+    assert state.rotor_lead is not None
+    assert state.rotor_rate is not None
+    return state.rotor_lead, state.rotor_rate

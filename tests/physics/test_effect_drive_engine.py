@@ -78,7 +78,12 @@ def test_torque_ripple_is_a_potential():
         lift(state)
         state.joint_velocity[:, 4:] = start
 
-    plant = make_plant(2, lambda p: (float_in_space(p), _lock_legs(p), edit(p)), spin, step=5e-4, period=1e-3)
+    def prepare(parameters):
+        float_in_space(parameters)
+        _lock_legs(parameters)
+        edit(parameters)
+
+    plant = make_plant(2, prepare, spin, step=5e-4, period=1e-3)
     seen = [Truth(values) for values in record(plant, 2.5, np.concatenate([DOWN, np.zeros(4)]), wheels_off(2))]
     angle, rate = (np.array([getattr(t, name)[0, 4] for t in seen]) for name in ("joint_position", "joint_velocity"))
     inertia = WHEEL.armature + ROBOT.wheel.spin_inertia
@@ -150,8 +155,8 @@ def test_sagging_supply_settles_where_motors_run_partly_loaded():
         parameters["servo.coulomb_friction"][:, 4:] = coulomb
         parameters["servo.supply_resistance"] = resistance
 
-    sensors = None
     plant = bench(2, edit)
-    for _ in range(150):
-        sensors = plant.step(goals_for(np.full(2, 6.0)))
+    for _ in range(149):
+        plant.step(goals_for(np.full(2, 6.0)))
+    sensors = plant.step(goals_for(np.full(2, 6.0)))
     np.testing.assert_allclose(sensors.supply_voltage, V0 - resistance * 4.0 * coulomb / K, rtol=1e-6)

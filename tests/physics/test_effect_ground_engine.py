@@ -232,7 +232,7 @@ def test_tether_is_a_horizontal_spring_to_the_anchor():
     time = 0.01 * np.arange(1, len(seen) + 1)
     expected = anchor * (1.0 - np.cos(np.sqrt(stiffness / MASS) * time))[:, None]
     measured = np.array([Truth(values).position[0, :2] for values in seen])
-    np.testing.assert_allclose(measured, expected, atol=0.01 * np.linalg.norm(anchor))
+    np.testing.assert_allclose(measured, expected, atol=0.01 * float(np.linalg.norm(anchor)))
 
     def hold(parameters):
         lock(parameters)

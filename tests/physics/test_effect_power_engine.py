@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rig import LEGS_DOWN, ROBOT, drive, float_in_space, lift, lock, make_plant
+from rig import LEGS_DOWN, ROBOT, drive, float_in_space, gears, lift, lock, make_plant
 
 from wlr_gym.model import dynamics
 from wlr_gym.plants.base import Truth
@@ -71,13 +71,13 @@ def test_power_balance_closes(family):
     plant = make_plant(4, FAMILIES[family], step=STEP, period=STEP)
     parameters, count = plant.parameters, plant.count
     start, done, work, friction_work = stored(plant), np.zeros(count), np.zeros(count), np.zeros((2000, count))
-    old, old_rate = Truth(plant.truth().values.copy()), plant.get_state().rotor_rate
+    old, old_rate = Truth(plant.truth().values.copy()), gears(plant)[1]
     goals = np.zeros((count, 8))
     for tick in range(2000):
         if tick % 400 == 0:
             goals = np.hstack([rng.uniform(1.3, 1.8, (count, 4)), rng.uniform(-4.0, 4.0, (count, 4))])
         plant.step(goals)
-        truth, rate = Truth(plant.truth().values.copy()), plant.get_state().rotor_rate
+        truth, rate = Truth(plant.truth().values.copy()), gears(plant)[1]
         turned = 0.5 * STEP * (rate + old_rate)
         slid = 0.5 * STEP * (truth.slip_velocity + old.slip_velocity)
         force = truth.contact_force.reshape(count, 4, 3)

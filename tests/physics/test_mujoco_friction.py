@@ -147,6 +147,24 @@ def test_rolling_resistance_holds_on_a_gentle_slope():
     assert travel[1] > 1e-3
 
 
+def test_rolling_resistance_sticks_under_a_steady_load():
+    """A load below the bound does not creep: with true stiction the wheel ends still, and carries the load."""
+    share = np.array([0.3, 0.6, 0.9])
+
+    def edit(parameters):
+        free_wheels(parameters)
+        parameters["ground.rolling_resistance"] = 0.05
+        parameters["external_force"][:, 0] = share * 0.05 * MASS * G
+
+    plant = make("mujoco", 3, edit)
+    off = np.ones((3, 8), bool)
+    off[:, 4:] = False
+    drive(plant, 1.0, torque_on=off)
+    truth = plant.truth()
+    assert np.abs(truth.joint_velocity[:, 4:]).max() < 1e-5  # a viscous hold creeps at 1e-2; MuJoCo's soft contact at 1e-6
+    np.testing.assert_allclose(truth.rolling_torque.sum(axis=1), -share * 0.05 * MASS * G * RADIUS, rtol=2e-3)
+
+
 @pytest.mark.parametrize("step", [1e-3, 2.5e-4])
 def test_tyre_creep_under_a_steady_pull(step):
     """Locked wheels, pull F along or across: slip speed v_c atanh(F/(mu m g))."""

@@ -91,7 +91,7 @@ def simulated_run(effects: Sequence[dict], steps: Sequence[int], meta: RunMeta =
     names = ["t", *(f"cmd_{joint}" for joint in JOINTS), *(name for name in CHANNELS if not name.startswith("cam"))]
     table = pandas.DataFrame(np.array(rows), columns=names)
     pose = np.array(poses)
-    x, y, yaw = (np.interp(table["t"] - delay, pose[:, 0], pose[:, k]) for k in (1, 2, 3))
+    x, y, yaw = (np.asarray(np.interp(table["t"] - delay, pose[:, 0], pose[:, k])) for k in (1, 2, 3))
     mount, scale = float(parameters["camera.mount_yaw"][0]), float(parameters["camera.scale"][0])
     table["cam_x"], table["cam_y"] = scale * _turned(x, y, -mount)
     table["cam_yaw"] = yaw

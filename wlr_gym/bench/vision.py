@@ -371,7 +371,8 @@ def measure_rate(size: Size) -> list[Result]:
     rates = []
     for _ in range(size.rounds):
         tracker = Tracker(CAMERA, body, floor, *floor_pose)
-        tracker(frames[0]), tracker(frames[1])
+        for frame in frames[:2]:
+            tracker(frame)
         start = time.perf_counter()
         for frame in frames[2:]:
             tracker(frame)

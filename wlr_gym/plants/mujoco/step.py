@@ -63,6 +63,7 @@ STATE: tuple[str, ...] = (
     *(f"acceleration_{a}" for a in AXES),
     *(f"own_force_{a}{i}" for i in CORNERS for a in "xy"),
     *(f"rolling_torque{i}" for i in CORNERS),
+    *(f"old_spin{i}" for i in CORNERS),
     *(f"old_u{a}" for a in AXES),
     *(f"old_rate{j}" for j in range(8)),
     *(f"{name}{j}" for j in range(8) for name in ("voltage", "share", "rotor_free", "rotor_gain", "ripple", "rotor_friction")),
@@ -79,6 +80,10 @@ TICK_SUMS: tuple[str, ...] = STATE[-10:]
 #: Half the length (m) of the capsule that touches the floor with one end, and how far its axis leans up from the floor (rad).
 CAPSULE_HALF_LENGTH = 0.01
 CAPSULE_LEAN = math.pi / 6
+#: Gains of the integral hold of rolling resistance on the spin and on its change, in wheel inertia over the step.
+HOLD_SPIN, HOLD_CHANGE = 0.2, 0.8
+#: Above this many steps of braking by its bound, rolling resistance brakes fully.
+HOLD_REACH = 8.0
 #: MuJoCo's smallest friction coefficient.
 LEAST_MU = 1e-5
 #: Slip speed (m/s) below which a direction of slip means nothing.
@@ -215,7 +220,7 @@ def _push_wheel(
     normal = ops.where_positive(-gap, push, 0.0)
     spin_inertia = lanes[f"wheel_spin{i}"] + out[f"armature_joint_rate{4 + i}"]
     rolling = _rolling_torque(lanes, i, normal, lanes[f"wheel_spin{i}"] + lanes[f"joint_armature{4 + i}"], step)
-    out[f"rolling_torque{i}"] = rolling
+    out[f"rolling_torque{i}"], out[f"old_spin{i}"] = rolling, lanes[f"wheel_rate{i}"]
     creep = _creep_force(lanes, i, mu, normal, slip, speed, spin_inertia, step)
     for k, a in enumerate("xy"):
         out[f"own_force_{a}{i}"] = creep[k] = ops.where_positive(creeps, creep[k], 0.0)
@@ -278,11 +283,18 @@ def _relaxed(old: Value, target: Value, stiffness: Value) -> Value:
 
 
 def _rolling_torque(lanes: Lanes, i: int, normal: Value, inertia: Value, step: Value) -> Value:
-    """Rolling resistance: brakes the absolute spin with at most c N a; at rest it holds like a stiff damper."""
-    hold = -((4.0 * inertia) * lanes[f"wheel_rate{i}"]) * (1.0 / step)
-    torque = _relaxed(lanes[f"rolling_torque{i}"], hold, 4.0)
+    """Rolling resistance: brakes the absolute spin with at most c N a; at rest it holds.
+
+    Below the spin that the bound takes away in HOLD_REACH steps, the torque follows the spin, and its change, until there is
+    none (an integral hold): a load below the bound does not turn the wheel. Stable for every apparent inertia from the wheel's
+    own, k = 1, up: z^2 - (2 - k) z + 1 - HOLD_CHANGE k = 0 with k = own/apparent inertia.
+    """
+    spin, old = lanes[f"wheel_rate{i}"], lanes[f"old_spin{i}"]
     bound = lanes[f"rolling{i}"] * lanes[f"radius{i}"] * normal
-    return ops.clip(torque, -bound, bound)
+    change = HOLD_SPIN * spin + HOLD_CHANGE * (spin - old)
+    hold = ops.clip(lanes[f"rolling_torque{i}"] - (inertia * change) * (1.0 / step), -bound, bound)
+    turns = inertia * ops.absolute(spin) - HOLD_REACH * (step * bound)
+    return ops.where_positive(turns, -(bound * ops.sign(spin)), hold)
 
 
 def _creep_force(
