@@ -27,7 +27,18 @@ def make_output_folder(path: Path, option: str = "--out") -> None:
 
 
 def replace_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill a temporary file in the folder of ``path``, then move it there in one step."""
+    """Let ``write`` fill a temporary file in the folder of ``path``, then move it there in one step.
+
+    Raises:
+        InputError: it cannot be written: no such folder, no rights, no space, or a folder of that name.
+    """
+    try:
+        _replace(path, write)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _replace(path: Path, write: Callable[[Path], object]) -> None:
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
     os.close(handle)
     try:

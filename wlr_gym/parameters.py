@@ -526,8 +526,18 @@ class Parameters:
         row, column = np.argwhere(bad)[0]
         raise InputError(
             f"parameter {ELEMENTS[column]} = {self.values[row, column]:g} (robot {row} of the batch) is outside "
-            f"[{_LOW[column]:g}, {_HIGH[column]:g}] {spec_of(ELEMENTS[column]).unit}"
+            f"{range_in_words(_LOW[column], _HIGH[column], spec_of(ELEMENTS[column]).unit)}"
         )
+
+
+def unit_in_words(unit: str) -> str:
+    """Return a unit as messages name it: "-" is a pure number."""
+    return "a pure number" if unit == "-" else unit
+
+
+def range_in_words(low: float, high: float, unit: str) -> str:
+    """Return a range with its unit as messages name it."""
+    return f"[{low:g}, {high:g}] " + (f"({unit_in_words(unit)})" if unit == "-" else unit)
 
 
 def spec_of(name: str) -> ParameterSpec:

@@ -266,7 +266,18 @@ def read_yaml(path: str | Path) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads 1e-3 and 2.5e-4 as numbers (YAML 1.1 takes the former for text)."""
+    """SafeLoader that reads 1e-3 and 2.5e-4 as numbers (YAML 1.1 takes the former for text) and refuses a key given twice."""
+
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        """Read a mapping as it is written; merging by ``<<`` comes later."""
+        node = super().compose_mapping_node(anchor)
+        lines: dict[str, int] = {}
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in lines:
+                problem = f"key '{key.value}' occurs twice, first in line {lines[key.value]}"
+                raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
+            lines[key.value] = key.start_mark.line + 1
+        return node
 
 
 _Loader.add_implicit_resolver(

@@ -200,11 +200,6 @@ STICK = {"extra_static_torque": 0.1, "stribeck_speed": 0.2}
         ([("friction_patch", ICE)] * 5, ["effect 5 (friction_patch)", "holds 4 patches"]),
         ([("friction_patch", ICE | {"x_min": 3})], ["x_min = 3 m is above x_max = 2 m"]),
         ([("friction_patch", ICE | {"y_min": 1, "y_max": -1})], ["y_min = 1 m is above y_max = -1 m"]),
-        ([("slip_weakening", {"mu_k": 0.7, "slip_speed": 0.1})], ["mu_k = 0.7", "ground.mu_x = 0.6", "fall"]),
-        (
-            [("friction_level", {"mu": 0.3}), ("slip_weakening", {"mu_k": 0.4, "slip_speed": 0.1})],
-            ["effect 2 (slip_weakening)", "ground.mu_x = 0.3"],
-        ),
         (
             [("torque_ripple", RIPPLE), ("torque_ripple", RIPPLE | {"order": 3})],
             ["leg_lf has a ripple of another order already"],

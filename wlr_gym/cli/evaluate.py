@@ -34,6 +34,8 @@ class Options(EffectsOption):
     """Number of episodes."""
     seed: int = 0
     """Seed of the first episode; the others count up from it."""
+    backend: str = "gibbs_appell"
+    """Simulator: gibbs_appell or mujoco."""
     randomization: str | None = None
     """Name in configs/randomization/, path, or a gap result (.json); default: the task's."""
     robot: str | None = None
@@ -63,14 +65,14 @@ def run(options: Options) -> int:
             raise InputError(f"--video-seconds {options.video_seconds:g}: expected more than 0")
     if options.out is not None:
         make_output_folder(options.out)
-    keywords = {"randomization": options.randomization, "robot": options.robot, "effects": patch}
+    keywords = {"backend": options.backend, "randomization": options.randomization, "robot": options.robot, "effects": patch}
     subjects = list(dict.fromkeys([options.policy, *options.baselines]))
     rollouts = play(options.env, subjects, options.episodes, options.seed, keywords, options.progress)
     cards = {name: score(rollout) for name, rollout in rollouts.items()}
     print_cards(cards)
     if options.out is not None:
         conditions = {
-            "environment": options.env, "episodes": options.episodes, "first seed": options.seed,
+            "environment": options.env, "backend": options.backend, "episodes": options.episodes, "first seed": options.seed,
             "randomization": options.randomization or "the task's", "robot": options.robot or "the task's",
             "effects": patch.summary(),
         }  # fmt: skip

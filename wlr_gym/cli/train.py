@@ -31,6 +31,8 @@ class Options(EffectsOption):
     """Settings of the agent: name in configs/agent/ or path of a YAML file; default: the agent's own."""
     set: tuple[str, ...] = ()
     """Settings to change, as key=value: --set total_steps=20_000_000 environment.randomization=wide"""
+    backend: str | None = None
+    """Simulator: gibbs_appell or mujoco (with --set environment.precision=float64); default: that of the settings."""
     seed: int | None = None
     """Seed of everything random; default: that of the settings."""
     out: Path | None = None
@@ -59,6 +61,8 @@ def _new(options: Options) -> tuple[str, Training]:
     config = load_agent_config(options.config or options.agent, options.set)
     if options.seed is not None:
         config["seed"] = options.seed
+    if options.backend is not None:
+        config["environment"] = (config.get("environment") or {}) | {"backend": options.backend}
     add_effects(config, options.patch())
     folder = options.out or Path("runs_out") / f"{options.env.rpartition(':')[2]}_{options.agent}_{config.get('seed', 0)}"
     if folder.is_dir() and any(folder.iterdir()):
@@ -75,8 +79,11 @@ def add_effects(config: dict[str, Any], patch: Patch) -> None:
 def _resumed(options: Options) -> tuple[str, Training]:
     folder = options.resume
     assert folder is not None
-    if options.out is not None or options.config is not None or options.seed is not None or options.set or options.effects:
-        raise InputError("--resume uses the settings of the run folder; leave out --out, --config, --set, --seed and --effects")
+    own = (options.out, options.config, options.seed, options.backend)
+    if any(value is not None for value in own) or options.set or options.effects:
+        raise InputError(
+            "--resume uses the settings of the run folder; leave out --out, --config, --set, --seed, --backend and --effects"
+        )
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise InputError(f"{folder}: not a run folder: {CONFIG_FILE} is missing")

@@ -26,7 +26,7 @@ from wlr_gym.effects.formula import KEYS, PLACES, force_of, parse_formula
 from wlr_gym.effects.registry import EFFECTS, UNKNOWN_EFFECT, stage
 from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.files import replace_file
-from wlr_gym.parameters import Parameters
+from wlr_gym.parameters import Parameters, range_in_words, unit_in_words
 from wlr_gym.paths import find_config
 from wlr_gym.plants.forces import Force
 from wlr_gym.robot import read_yaml
@@ -79,6 +79,11 @@ def load_patch(source: Source) -> Patch:
         case None:
             return Patch()
         case str() | Path():
+            if str(source) in EFFECTS:
+                raise InputError(
+                    f"'{source}' is an effect, not a patch: write a file with its numbers (wlr effects {source}), "
+                    f"or in Python {{'name': '{source}', 'parameters': ...}}"
+                )
             path = find_config("effects", source)
             return _parse(read_yaml(path), str(path))
         case Mapping():
@@ -206,12 +211,12 @@ def _number(value: Any, name: str, spec: EffectParameter, place: str) -> float:
     if value is None and spec.optional:
         return float(spec.neutral)
     if value is None:
-        raise InputError(f"{place}: parameter '{name}' ({spec.unit}) is missing")
+        raise InputError(f"{place}: parameter '{name}' ({unit_in_words(spec.unit)}) is missing")
     number = finite_number(value)
     if number is None:
-        raise InputError(f"{place}: {name} = {value!r}: expected a finite number in {spec.unit}")
+        raise InputError(f"{place}: {name} = {value!r}: expected a finite number ({unit_in_words(spec.unit)})")
     if not spec.low <= number <= spec.high:
-        raise InputError(f"{place}: {name} = {number:g} is outside [{spec.low:g}, {spec.high:g}] {spec.unit}")
+        raise InputError(f"{place}: {name} = {number:g} is outside {range_in_words(spec.low, spec.high, spec.unit)}")
     return number
 
 

@@ -38,7 +38,7 @@ class Settings:
     """What ``gym.make("WLR-...", ...)`` accepts.
 
     Attributes:
-        backend: which plant: ``gibbs_appell``.
+        backend: which plant: ``gibbs_appell`` or ``mujoco``.
         robot: name in ``configs/robot/``, path of a YAML file, or a :class:`wlr_gym.robot.Robot`; None = the task's.
         randomization: name in ``configs/randomization/`` (none, nominal, wide, ice, split, patches), path of such a file or of
             a gap result (``.json``), or mapping; None = the task's.

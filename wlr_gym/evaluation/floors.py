@@ -53,7 +53,7 @@ def draw_floors(path: Path, randomizations: Sequence[Randomization], first_seed:
     for axes in panels[-1]:
         axes.set_xlabel("x (m)", fontsize=8)
     bar = figure.colorbar(ScalarMappable(norm, _COLOURS), ax=panels, pad=0.01, ticks=[0.05, 0.1, 0.2, 0.5, 1.0], format="%g")
-    bar.set_label("friction coefficient along the heading", fontsize=9)
+    bar.set_label("friction coefficient\nalong the heading", fontsize=9)
     bar.ax.minorticks_off()
     bar.ax.tick_params(labelsize=8)
     replace_file(path, lambda temporary: figure.savefig(temporary, dpi=100, format=path.suffix[1:] or "png"))

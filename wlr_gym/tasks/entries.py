@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from wlr_gym.errors import InputError
-from wlr_gym.parameters import ELEMENTS, SPECS, Parameters, spec_of
+from wlr_gym.parameters import ELEMENTS, SPECS, Parameters, range_in_words, spec_of
 from wlr_gym.robot import Robot
 from wlr_gym.tasks.draws import stream_numbers, uniforms
 from wlr_gym.tasks.terms.events import DISTRIBUTIONS, number_of, tolerance_of
@@ -19,6 +19,16 @@ from wlr_gym.tasks.terms.events import DISTRIBUTIONS, number_of, tolerance_of
 Array = NDArray[np.float64]
 Number = float | str
 Range = tuple[float, float]
+
+
+#: Distribution -> the keys of an event that it reads.
+DISTRIBUTION_KEYS = {
+    "uniform": ("operation", "low", "high"),
+    "loguniform": ("operation", "low", "high"),
+    "normal": ("operation", "mean", "sigma", "cut"),
+    "choice": ("operation", "values"),
+    "tolerance": ("sigmas", "cut"),
+}
 
 
 class Data(BaseModel):
@@ -113,20 +123,23 @@ class Sampler:
         return drawn
 
 
-def entries_of(name: str, event: EventConfig, robot: Robot) -> list[Entry]:
-    """Return what an event comes down to.
+def entries_of(name: str, event: EventConfig, robot: Robot, source: str = "randomization") -> list[Entry]:
+    """Return what an event comes down to; errors name ``source``, the file it stands in.
 
     Raises:
         InputError: unknown parameter, missing or impossible number, or a range to ``set`` that is not within the bounds.
     """
-    where = f"randomization event '{name}'"
+    where = f"{source}: event '{name}'"
     if (event.when in ("interval", "drift")) != (event.interval is not None):
         raise InputError(
             f"{where}: 'interval: [low, high]' (s) goes with 'when: interval' or 'when: drift', and only with them"
         )
     if event.interval is not None and not 0 < event.interval[0] <= event.interval[1]:
         raise InputError(f"{where}: interval = {list(event.interval)}: expected 0 < low <= high (s)")
-    elements = elements_of(event)
+    try:
+        elements = elements_of(event)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
     entries = [_entry(name, event, robot, element, where) for element in elements]
     return entries + ([] if event.area is None else _area_entries(name, event, event.area, elements, where))
 
@@ -156,7 +169,7 @@ def _entry(name: str, event: EventConfig, robot: Robot, element: str, where: str
         "cut": event.cut,
     }
     if event.distribution == "tolerance":
-        return _tolerance_entry(event, robot, element, common)
+        return _tolerance_entry(event, robot, element, common, where)
     if event.operation is None:
         raise InputError(f"{where}: 'operation' is missing; expected set, scale or add")
     common |= {"operation": event.operation, "distribution": event.distribution}
@@ -190,13 +203,16 @@ def _refuse_out_of_bounds(event: EventConfig, element: str, values: Sequence[flo
     if event.operation == "set" and not spec.low <= low <= high <= spec.high:
         raise InputError(
             f"{where}: sets {element} in [{low:g}, {high:g}], which is not within its bounds "
-            f"[{spec.low:g}, {spec.high:g}] {spec.unit}"
+            f"{range_in_words(spec.low, spec.high, spec.unit)}"
         )
 
 
-def _tolerance_entry(event: EventConfig, robot: Robot, element: str, common: dict[str, Any]) -> Entry:
+def _tolerance_entry(event: EventConfig, robot: Robot, element: str, common: dict[str, Any], where: str) -> Entry:
     """A quantity whose nominal value is its lower bound (no delay, no friction) can only be larger: half-normal."""
-    operation, sigma = tolerance_of(robot, element)
+    try:
+        operation, sigma = tolerance_of(robot, element)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
     spec = spec_of(element)
     nominal = float(Parameters.nominal(robot)[element][0])
     distribution = "half_normal" if operation == "add" and nominal == spec.low else "normal"

@@ -6,6 +6,7 @@ a robot gets the same values alone or in a batch.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from wlr_gym.errors import InputError
+from wlr_gym.errors import InputError, nearest
 from wlr_gym.parameters import ELEMENTS, TABLE, XYZ, Parameters
 from wlr_gym.paths import find_config
 from wlr_gym.plants.base import PlantState, standing_state
 from wlr_gym.robot import LEGS, Robot, parse_config, read_yaml
 from wlr_gym.tasks.draws import stream_numbers, uniforms
-from wlr_gym.tasks.entries import Data, Entry, EventConfig, Sampler, elements_of, entries_of
+from wlr_gym.tasks.entries import DISTRIBUTION_KEYS, Data, Entry, EventConfig, Sampler, elements_of, entries_of
 from wlr_gym.tasks.identified import identified_events
 from wlr_gym.tasks.task import overlay
 
@@ -28,6 +29,8 @@ Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 Seeds = NDArray[np.uint64]
 
+#: Keys of an event that say nothing with some of the distributions.
+IDLE_KEYS = {key for keys in DISTRIBUTION_KEYS.values() for key in keys}
 #: s between the updates of a drifting parameter.
 DRIFT_PERIOD = 0.2
 
@@ -35,10 +38,10 @@ DRIFT_PERIOD = 0.2
 class InitialStateConfig(Data):
     """Half-widths of the even spread around standing still at home: rad, rad, m/s, rad/s (body frame)."""
 
-    leg_angle: float = Field(default=0.0, ge=0)
-    yaw: float = Field(default=0.0, ge=0)
-    linear_velocity: float = Field(default=0.0, ge=0)
-    angular_velocity: float = Field(default=0.0, ge=0)
+    leg_angle: float = Field(default=0.0, ge=0, le=math.tau)
+    yaw: float = Field(default=0.0, ge=0, le=math.tau)
+    linear_velocity: float = Field(default=0.0, ge=0, le=10.0)
+    angular_velocity: float = Field(default=0.0, ge=0, le=100.0)
 
 
 class RandomizationConfig(Data):
@@ -75,7 +78,8 @@ def load_randomization(source: str | Path | Mapping[str, Any] | RandomizationCon
     if isinstance(source, RandomizationConfig):
         source = source.model_dump(mode="json", exclude_unset=True)
     data, where = _read(source)
-    return Randomization(parse_config(RandomizationConfig, _resolved(data, robot, where), where), robot)
+    resolved, places = _resolved(data, robot, where)
+    return Randomization(parse_config(RandomizationConfig, resolved, where), robot, places)
 
 
 def _read(source: str | Path | Mapping[str, Any] | None) -> tuple[Any, str]:
@@ -87,10 +91,10 @@ def _read(source: str | Path | Mapping[str, Any] | None) -> tuple[Any, str]:
     return read_yaml(path), str(path)
 
 
-def _resolved(data: Any, robot: Robot, where: str, above: tuple[str, ...] = ()) -> Any:
-    """Return ``data`` laid over its base and the events of its result; complete by itself."""
+def _resolved(data: Any, robot: Robot, where: str, above: tuple[str, ...] = ()) -> tuple[Any, dict[str, str]]:
+    """Return ``data`` laid over its base and the events of its result, complete by itself, and where each event stands."""
     if not isinstance(data, dict):
-        return data
+        return data, {}
     result = data.get("result")
     base = data.get("base", None if result is None else "nominal")
     if base is not None and not isinstance(base, str | Path):
@@ -98,14 +102,40 @@ def _resolved(data: Any, robot: Robot, where: str, above: tuple[str, ...] = ()) 
     if where in above:
         raise InputError(f"{where}: is its own base ({' -> '.join([*above, where])})")
     lower: Any = {}
+    places: dict[str, str] = {}
     if base is not None:
         below, place = _read(base)
-        lower = _resolved(below, robot, place, (*above, where))
+        lower, places = _resolved(below, robot, place, (*above, where))
+        parse_config(RandomizationConfig, lower, place)  # what is wrong in a base is said with its own name
     if result is not None:
         events = parse_config(RandomizationConfig, lower, where).events
-        lower = {**lower, "events": _with_result(events, identified_events(result, robot), robot)}
+        found = identified_events(result, robot)
+        lower = {**lower, "events": _with_result(events, found, robot)}
+        places |= dict.fromkeys(found, str(result))
     own = {key: value for key, value in data.items() if key not in ("base", "result")}
-    return overlay(lower, own) if lower else own
+    merged = overlay(lower, own) if lower else own
+    _refuse_idle_keys(own, lower, merged, where)
+    return merged, places | dict.fromkeys(_mapping(own.get("events")), where)
+
+
+def _refuse_idle_keys(own: Mapping[str, Any], lower: Mapping[str, Any], merged: Mapping[str, Any], where: str) -> None:
+    """Refuse what would change nothing: the removal of an event that is not there, a key of another distribution."""
+    below = lower.get("events") or {}
+    for name, event in _mapping(own.get("events")).items():
+        if event is None and name not in below:
+            raise InputError(f"{where}: events.{name} = null removes nothing: no such event{nearest(name, below)}")
+        if not isinstance(event, Mapping):
+            continue
+        distribution = _mapping(merged.get("events")).get(name, {}).get("distribution")
+        takes = DISTRIBUTION_KEYS.get(distribution, ())
+        given = [key for key, value in event.items() if key in IDLE_KEYS and value != EventConfig.model_fields[key].default]
+        idle = [key for key in given if takes and key not in takes]
+        if idle:
+            raise InputError(f"{where}: events.{name}: '{idle[0]}' does not go with '{distribution}', which takes {', '.join(takes)}")
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
 
 
 def _with_result(events: Mapping[str, EventConfig], found: Mapping[str, EventConfig], robot: Robot) -> dict[str, Any]:
@@ -129,13 +159,15 @@ class Randomization:
         intervals: names of the events that strike within an episode. drifts: of those that drift.
     """
 
-    def __init__(self, config: RandomizationConfig, robot: Robot) -> None:
+    def __init__(self, config: RandomizationConfig, robot: Robot, places: Mapping[str, str] | None = None) -> None:
+        """``places``: event -> file that it stands in, for messages."""
         self.config = config
         self.robot = robot
         self._nominal = Parameters.nominal(robot, 1)
         self._nominal.validate()
-        entries = [entry for name, event in config.events.items() for entry in entries_of(name, event, robot)]
-        _refuse_double_set(entries)
+        places = dict.fromkeys(config.events, "randomization") | dict(places or {})
+        entries = [entry for name, event in config.events.items() for entry in entries_of(name, event, robot, places[name])]
+        _refuse_double_set(entries, places)
         self._operations = {kind: [e for e in entries if e.operation == kind] for kind in ("set", "scale", "add")}
         entries = [entry for kind in self._operations.values() for entry in kind]
         self._sampler = Sampler(entries) if entries else None
@@ -247,13 +279,14 @@ def _limits(config: RandomizationConfig, events: Sequence[str]) -> Array:
     return np.array([config.events[name].interval for name in events], dtype=np.float64).reshape(-1, 2)
 
 
-def _refuse_double_set(entries: Sequence[Entry]) -> None:
+def _refuse_double_set(entries: Sequence[Entry], places: Mapping[str, str]) -> None:
     setters: dict[int, str] = {}
     for entry in entries:
         if entry.operation == "set" and setters.setdefault(entry.column, entry.event) != entry.event:
+            other = setters[entry.column]
+            where = " over ".join(dict.fromkeys([places[entry.event], places[other]]))
             raise InputError(
-                f"randomization events '{setters[entry.column]}' and '{entry.event}' both set {ELEMENTS[entry.column]}; "
-                "let one of them scale or add"
+                f"{where}: events '{other}' and '{entry.event}' both set {ELEMENTS[entry.column]}; let one of them scale or add"
             )
 
 

@@ -66,7 +66,7 @@ class MujocoPlant:
         self.robot = robot
         self.options = options or PlantOptions()
         if self.options.precision != "float64":
-            raise InputError(f"precision '{self.options.precision}': the MuJoCo plant has float64 only")
+            raise InputError(f"precision '{self.options.precision}': the MuJoCo plant has float64 only (precision='float64'; wlr train: --set environment.precision=float64)")
         self._count = count
         self.substeps = self.options.substeps
         self._step = self.options.physics_step
