@@ -87,7 +87,8 @@ def test_bounds_are_inclusive_and_enforced(spec):
     for bound, beyond in ((spec.low, -1), (spec.high, 1)):
         parameters = Parameters.nominal(ROBOT)
         parameters[spec.elements[-1]] = bound
-        parameters.validate()
+        if spec.name != "payload.inertia":  # no masses have a single product of inertia
+            parameters.validate()
         parameters[spec.elements[-1]] = np.nextafter(bound, beyond * np.inf)
         with pytest.raises(InputError, match="outside"):
             parameters.validate()
@@ -127,3 +128,13 @@ def test_values_of_the_wrong_shape_or_kind_are_refused(parameters, value):
 def test_a_matrix_of_the_wrong_shape_is_refused():
     with pytest.raises(InputError, match=r"parameter matrix has shape \(2, 3\), expected \(N, "):
         Parameters(np.zeros((2, 3)))
+
+
+@pytest.mark.parametrize("inertia", [(0, 0, 0, 0.1, 0, 0), (-0.02, 0, 0, 0, 0, 0), (0.1, 0.1, 0.3, 0, 0, 0)])
+def test_payload_inertia_is_one_that_masses_have(inertia):
+    parameters = Parameters.nominal(ROBOT, 2)
+    parameters["payload.inertia"][0] = 0.0, 0.01, 0.01, 0.0, 0.0, 0.0  # two point masses on a line
+    parameters.validate()
+    parameters["payload.inertia"][1] = inertia
+    with pytest.raises(InputError, match=r"payload.inertia \(robot 1 of the batch\)"):
+        parameters.validate()

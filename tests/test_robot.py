@@ -126,6 +126,28 @@ def test_broken_yaml_names_line_and_column(tmp_path):
         load_robot(path)
 
 
+def test_a_key_given_twice_is_refused_and_named(tmp_path):
+    path = tmp_path / "twice.yaml"
+    path.write_text("effects:\n- parameters:\n    mass: 0.5\n    mass: 0.7\n")
+    with pytest.raises(
+        InputError, match=r"twice\.yaml, line 4, column 5: broken YAML: key 'mass' occurs twice, first in line 3"
+    ):
+        read_yaml(path)
+
+
+def test_merged_keys_are_not_given_twice(tmp_path):
+    path = tmp_path / "merged.yaml"
+    path.write_text("a: &a {x: 1, y: 2}\nb: &b {<<: *a, x: 3}\nc: {<<: *b, y: 4}\n")
+    assert read_yaml(path) == {"a": {"x": 1, "y": 2}, "b": {"x": 3, "y": 2}, "c": {"x": 3, "y": 4}}
+
+
+def test_a_key_that_is_a_list_is_refused(tmp_path):
+    path = tmp_path / "list_key.yaml"
+    path.write_text("? [a, b]\n: 1\n")
+    with pytest.raises(InputError, match=r"list_key\.yaml, line 1"):
+        read_yaml(path)
+
+
 @pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "just text\n"])
 def test_a_file_that_is_no_mapping_is_refused(tmp_path, text):
     path = tmp_path / "list.yaml"

@@ -522,12 +522,29 @@ class Parameters:
         """Raise :class:`InputError` naming the first element that is not finite or outside its bounds."""
         bad = ~((self.values >= _LOW) & (self.values <= _HIGH))
         if not bad.any():
+            self._validate_payload()
             return
         row, column = np.argwhere(bad)[0]
         raise InputError(
             f"parameter {ELEMENTS[column]} = {self.values[row, column]:g} (robot {row} of the batch) is outside "
-            f"{range_in_words(_LOW[column], _HIGH[column], spec_of(ELEMENTS[column]).unit)}"
+            f"{range_in_words(float(_LOW[column]), float(_HIGH[column]), spec_of(ELEMENTS[column]).unit)}"
         )
+
+    def _validate_payload(self) -> None:
+        """Refuse an inertia that no masses have."""
+        inertia = self["payload.inertia"]
+        if not inertia.any():
+            return
+        xx, yy, zz, xy, xz, yz = inertia.T
+        moments = np.linalg.eigvalsh(np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3))
+        excess = 2.0 * moments.max(axis=1) - moments.sum(axis=1)
+        wrong = np.maximum(excess, -moments.min(axis=1)) > 1e-9 * np.abs(moments).max(axis=1)
+        if wrong.any():
+            robot = int(np.argmax(wrong))
+            raise InputError(
+                f"parameter payload.inertia (robot {robot} of the batch) has principal moments {moments[robot].tolist()} kg m2: "
+                "no masses have them (none may be negative, none above the sum of the other two)"
+            )
 
 
 def unit_in_words(unit: str) -> str:
@@ -537,7 +554,7 @@ def unit_in_words(unit: str) -> str:
 
 def range_in_words(low: float, high: float, unit: str) -> str:
     """Return a range with its unit as messages name it."""
-    return f"[{low:g}, {high:g}] " + (f"({unit_in_words(unit)})" if unit == "-" else unit)
+    return f"[{low:g}, {high:g}] {'(a pure number)' if unit == '-' else unit}"
 
 
 def spec_of(name: str) -> ParameterSpec:

@@ -26,7 +26,11 @@ def find_config(kind: str, name: str | Path) -> Path:
         if path.is_file():
             return path
         raise InputError(f"{kind} config: no file '{path}'")
-    shipped = {p.stem: p for p in (data_directory("configs") / kind).glob("*.yaml")}
-    if str(name) in shipped:
-        return shipped[str(name)]
-    raise unknown_name(f"{kind} config", str(name), shipped)
+    if str(name) in config_names(kind):
+        return data_directory("configs") / kind / f"{name}.yaml"
+    raise unknown_name(f"{kind} config", str(name), config_names(kind))
+
+
+def config_names(kind: str) -> list[str]:
+    """Return the names of the files in ``configs/<kind>/``."""
+    return sorted(path.stem for path in (data_directory("configs") / kind).glob("*.yaml"))

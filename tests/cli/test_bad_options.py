@@ -1,6 +1,9 @@
 """What the commands refuse before they do any work."""
 
+import json
+
 import pytest
+import yaml
 
 from wlr_gym.cli import main
 
@@ -27,3 +30,33 @@ def test_numbers_out_of_range(tmp_path, capsys, arguments, words):
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["train", "--backend", "mujoco"], "precision 'float32': the MuJoCo plant has float64 only"),
+        (["train", "--backend", "mujco"], "did you mean 'mujoco'"),
+        (["evaluate", "do_nothing", "--backend", "mujco"], "did you mean 'mujoco'"),
+    ],
+)
+def test_backends_that_do_not_do(tmp_path, capsys, arguments, words):
+    if arguments[0] == "train":
+        pytest.importorskip("torch")
+    assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
+    assert words in capsys.readouterr().err
+    assert not any((tmp_path / "out").glob("*"))
+
+
+def test_evaluate_on_mujoco_says_so(tmp_path):
+    words = ["evaluate", "do_nothing", "--baselines", "--episodes", "1", "--randomization", "none", "--no-progress"]
+    assert main([*words, "--backend", "mujoco", "--out", str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "card.json").read_text())["conditions"]["backend"] == "mujoco"
+
+
+def test_train_on_mujoco_with_its_precision(tmp_path):
+    pytest.importorskip("torch")
+    small = ["total_steps=16", "num_envs=2", "steps_per_env=8", "batch_size=16", "epochs=1", "environment.precision=float64"]
+    assert main(["train", "--backend", "mujoco", "--out", str(tmp_path), "--no-progress", "--set", *small]) == 0
+    settings = yaml.safe_load((tmp_path / "config.yaml").read_text())["settings"]
+    assert settings["environment"] == {"precision": "float64", "backend": "mujoco"}

@@ -59,7 +59,11 @@ def test_check_prints_what_changes(tmp_path, capsys):
     ("arguments", "words"),
     [
         (["backlsh"], ["unknown effect 'backlsh'", "did you mean 'backlash'"]),
+        (["icy_patch"], ["'icy_patch' is a patch, not an effect: wlr effects check icy_patch"]),
+        (["mine.yaml"], ["wlr effects check mine.yaml"]),
         (["check"], ["give the patch files"]),
+        (["check", "backlash"], ["'backlash' is an effect, not a patch", "wlr effects backlash"]),
+        (["check", "unknown_effect"], ["'unknown_effect' is an effect, not a patch"]),
         (["check", "nowhere.yaml"], ["nowhere.yaml"]),
         (["check", "icy_patch", "icy_patch", "icy_patch", "icy_patch", "icy_patch"], ["icy_patch.yaml: effect 1", "4 patches"]),
         (["check", "icy_patch", "--robot", "nominl"], ["nominl", "did you mean 'nominal'"]),

@@ -1,9 +1,14 @@
 """``wlr envs``."""
 
 import matplotlib.image
+import pytest
+from matplotlib.figure import Figure
 
 from wlr_gym.cli import main
 from wlr_gym.envs.registry import ENVIRONMENTS
+from wlr_gym.evaluation.floors import draw_floors
+from wlr_gym.robot import load_robot
+from wlr_gym.tasks import load_randomization
 
 
 def test_list_has_every_environment(capsys):
@@ -48,3 +53,15 @@ def test_picture_of_the_floors(tmp_path, capsys):
     assert picture.reshape(-1, picture.shape[2]).std(axis=0)[:3].min() > 0.05
     assert main(["envs", "WLR-Velocity-v0", "--picture", str(tmp_path / "floors.jpg.txt")]) == 2
     assert "ends in .png" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_the_label_of_the_colours_is_not_cut_off(tmp_path, monkeypatch, rows):
+    drawn = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *args, **keywords: drawn.append(self) or save(self, *args, **keywords))
+    draw_floors(tmp_path / "floors.png", [load_randomization("nominal", load_robot())] * rows, count=2)
+    figure = drawn[0]
+    label = figure.axes[-1].yaxis.label.get_window_extent()
+    assert label.height > 20
+    assert figure.bbox.y0 <= label.y0 < label.y1 <= figure.bbox.y1

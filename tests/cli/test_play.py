@@ -60,6 +60,8 @@ def test_evaluate_writes_policy_and_baseline_side_by_side(tmp_path, capsys, grap
         (["--video", "film.webp", "--camera", "topp"], "did you mean 'top'"),
         (["--video", "film.webp", "--size", "1", "1"], "64 to 4096 pixels"),
         (["--video", "film.webp", "--command", "1"], "--command '1': expected linear_velocity_x,yaw_rate"),
+        (["--video", "film.webp", "--command", "5,0"], "linear_velocity_x = 5 m/s: the wheels turn no faster than 0.2"),
+        (["--video", "film.webp", "--command", "0,0; 3:-1,0"], "linear_velocity_x = -1 m/s: the wheels"),
         (["--video", "film.webp", "--agent", "proportinal"], "did you mean 'proportional'"),
         (["--video", "film.webp", "--backend", "mujocoo"], "unknown backend 'mujocoo'"),
         (["--video", "film.webp", "--effects", "nothing.yaml"], "nothing.yaml"),
@@ -72,6 +74,19 @@ def test_what_is_refused(monkeypatch, tmp_path, capsys, headless, arguments, wor
     assert main(["play", *arguments]) == 2
     assert words in " ".join(capsys.readouterr().err.split())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_commands_beyond_the_tasks_are_taken_with_a_note(capsys):
+    core = make_core("WLR-Velocity-v0", 1, {"randomization": "none"})
+    for command, note in (
+        ("0.15,0", "linear_velocity_x = 0.15 m/s is outside what the task commands, [-0.1, 0.1]"),
+        ("0.1,0", ""),
+    ):
+        play_module._driver(play_module.Options(command=command), core)
+        shown = capsys.readouterr().err
+        assert note in shown
+        assert bool(note) == bool(shown)
+    core.close()
 
 
 def test_bad_films_of_other_commands_are_refused_first(tmp_path, capsys):

@@ -173,10 +173,13 @@ def test_saved_patch_reads_back_the_same(tmp_path):
         ("effects: [{name: coulomb_friction, parameters: {torque: 1}}]", ["where", "leg_lf"]),
         ("effects: [{name: joint_zero_offset, where: [wheel_lf], parameters: {angle: 0}}]", ["'wheel_lf'"]),
         ("effects: [{name: friction_level, parameters: {mux: 1}}]", ["unknown key 'mux'", "did you mean 'mu'"]),
-        ("effects: [{name: friction_level}]", ["parameter 'mu' (-) is missing"]),
-        ("effects: [{name: friction_level, parameters: {mu: high}}]", ["mu = 'high'", "finite number"]),
+        ("effects: [{name: friction_level}]", ["parameter 'mu' (a pure number) is missing"]),
+        (
+            "effects: [{name: friction_level, parameters: {mu: high}}]",
+            ["mu = 'high'", "expected a finite number (a pure number)"],
+        ),
         ("effects: [{name: friction_level, parameters: {mu: .nan}}]", ["mu = nan"]),
-        ("effects: [{name: friction_level, parameters: {mu: -0.1}}]", ["mu = -0.1", "[0, 5]"]),
+        ("effects: [{name: friction_level, parameters: {mu: -0.1}}]", ["mu = -0.1", "[0, 5] (a pure number)"]),
         ("effects: [{name: wheel_radius_error, where: [wheel_lf, wheel_lf], parameters: {scale: 1}}]", ["occurs twice"]),
     ],
 )
@@ -299,6 +302,15 @@ def test_slip_weakening_counts_from_each_wheels_own_friction():
     )
     np.testing.assert_allclose(result["ground.kinetic_ratio"][0] * result["ground.mu_x"][0], 0.2)
     np.testing.assert_allclose(result["ground.kinetic_ratio"][0], [1 / 3, 0.5, 1 / 3, 1 / 3])
+
+
+def test_a_floor_below_mu_k_keeps_its_friction():
+    """Randomisation may draw one at any reset: no reason to end a training."""
+    drawn = Parameters.nominal(ROBOT, 3)
+    drawn["ground.mu_x"] = np.array([0.2, 0.4, 0.8])[:, None]
+    result = apply_patch(load_patch({"name": "slip_weakening", "parameters": {"mu_k": 0.4, "slip_speed": 0.1}}), drawn)
+    np.testing.assert_allclose(result["ground.kinetic_ratio"], np.repeat([[1.0], [1.0], [0.5]], 4, axis=1), rtol=1e-15)
+    np.testing.assert_array_equal(result["ground.mu_x"], drawn["ground.mu_x"])
 
 
 # ---- composing -------------------------------------------------------------------------------------------------------

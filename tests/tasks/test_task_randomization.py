@@ -154,6 +154,7 @@ def test_initial_state_stands_on_the_floor(robot):
 
 
 MASS = {"parameters": ["body.mass"], "distribution": "uniform", "operation": "set", "low": 2.0, "high": 3.0}
+NO_RANGE = {"low": None, "high": None}
 
 
 @pytest.mark.parametrize(
@@ -166,10 +167,18 @@ MASS = {"parameters": ["body.mass"], "distribution": "uniform", "operation": "se
         ({**MASS, "operation": None}, "'operation' is missing"),
         ({**MASS, "operation": "multiply"}, "operation = 'multiply'"),
         ({**MASS, "distribution": "gamma"}, "distribution = 'gamma'"),
-        ({**MASS, "distribution": "choice"}, "needs 'values"),
+        ({**MASS, **NO_RANGE, "distribution": "choice"}, "needs 'values"),
         ({**MASS, "distribution": "loguniform", "low": 0.0}, "needs low > 0"),
-        ({**MASS, "distribution": "normal", "mean": 1.0, "sigma": "sensors.imu.gyro_bia"}, "neither a number nor the path"),
-        ({**MASS, "distribution": "tolerance", "parameters": ["gravity"]}, "no tolerance for parameter 'gravity'"),
+        (
+            {**MASS, **NO_RANGE, "distribution": "normal", "mean": 1.0, "sigma": "sensors.imu.gyro_bia"},
+            "neither a number nor the path",
+        ),
+        (
+            {"distribution": "tolerance", "parameters": ["gravity"]},
+            "event 'mass': robot 'wlr-nominal' states no tolerance for parameter",
+        ),
+        ({**MASS, "values": [1.0]}, "'values' does not go with 'uniform', which takes operation, low, high"),
+        ({**MASS, "distribution": "tolerance", **NO_RANGE}, "'operation' does not go with 'tolerance'"),
         ({**MASS, "when": "interval"}, "goes with 'when: interval'"),
         ({**MASS, "hihg": 3.0}, "did you mean 'high'"),
     ],
@@ -179,7 +188,8 @@ def test_bad_events_are_refused(robot, event, expected):
         load_randomization({"events": {"mass": {k: v for k, v in event.items() if v is not None}}}, robot)
 
 
-FRICTION = {"parameters": ["ground.mu_x"], "distribution": "uniform", "operation": "set", "low": 10.0, "high": 20.0}
+FLOOR = {"parameters": ["ground.mu_x"], "operation": "set"}
+FRICTION = {**FLOOR, "distribution": "uniform", "low": 10.0, "high": 20.0}
 
 
 @pytest.mark.parametrize(
@@ -189,17 +199,19 @@ FRICTION = {"parameters": ["ground.mu_x"], "distribution": "uniform", "operation
         {**FRICTION, "low": 0.5},
         {**FRICTION, "low": -1.0, "high": 0.5},
         {**FRICTION, "distribution": "loguniform"},
-        {**FRICTION, "distribution": "choice", "values": [0.5, 20.0]},
-        {**FRICTION, "distribution": "normal", "mean": 20.0, "sigma": 1.0},
+        {**FLOOR, "distribution": "choice", "values": [0.5, 20.0]},
+        {**FLOOR, "distribution": "normal", "mean": 20.0, "sigma": 1.0},
     ],
 )
 def test_a_range_to_set_lies_within_the_bounds(robot, event):
-    with pytest.raises(InputError, match=r"event 'floor': sets ground.mu_x\[wheel_lf\] in \[.*bounds \[0, 5\]"):
+    with pytest.raises(
+        InputError, match=r"event 'floor': sets ground.mu_x\[wheel_lf\] in \[.*bounds \[0, 5\] \(a pure number\)"
+    ):
         load_randomization({"events": {"floor": event}}, robot)
 
 
 def test_the_tail_of_a_normal_is_clipped_at_the_bounds(robot):
-    tail = {**FRICTION, "distribution": "normal", "mean": 0.2, "sigma": 0.2}
+    tail = {**FLOOR, "distribution": "normal", "mean": 0.2, "sigma": 0.2}
     friction = draw(robot, floor=tail)["ground.mu_x"]
     assert friction.min() == 0.0
 
@@ -207,6 +219,61 @@ def test_the_tail_of_a_normal_is_clipped_at_the_bounds(robot):
 def test_two_events_may_not_set_the_same_element(robot):
     with pytest.raises(InputError, match="'a' and 'b' both set body"):
         load_randomization({"events": {"a": MASS, "b": MASS}}, robot)
+
+
+def test_a_key_that_the_bases_distribution_does_not_read_is_refused(robot):
+    with pytest.raises(
+        InputError, match=r"events\.wheel_radius: 'sigma' does not go with 'tolerance', which takes sigmas, cut"
+    ):
+        load_randomization({"base": "nominal", "events": {"wheel_radius": {"sigma": 2.0}}}, robot)
+
+
+def test_another_distribution_leaves_nothing_of_the_bases(robot):
+    normal = {"distribution": "normal", "mean": 0.5, "sigma": 0.1}
+    event = load_randomization({"base": "nominal", "events": {"floor_friction": normal}}, robot).config.events["floor_friction"]
+    assert (event.mean, event.sigma, event.low, event.high) == (0.5, 0.1, None, None)
+    assert event.operation == "set"
+
+
+def test_a_complete_config_written_with_its_defaults_loads_again(robot):
+    config = load_randomization("wide", robot).config
+    assert load_randomization(config.model_dump(mode="json", exclude_none=True), robot).config == config
+
+
+def test_removing_an_event_that_is_not_there_is_refused(robot):
+    with pytest.raises(InputError, match=r"floor_frictoin = null removes nothing.*did you mean 'floor_friction'"):
+        load_randomization({"base": "ice", "events": {"floor_frictoin": None}}, robot)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("leg_angle", 99), ("yaw", 7), ("linear_velocity", 11), ("angular_velocity", 101), ("leg_angle", -0.1)]
+)
+def test_initial_states_out_of_reach_are_refused(robot, key, value):
+    with pytest.raises(InputError, match=rf"initial_state.{key} = {value}"):
+        load_randomization({"initial_state": {key: value}}, robot)
+
+
+def test_errors_name_event_and_file_it_stands_in(robot, tmp_path):
+    lower, upper = tmp_path / "lower.yaml", tmp_path / "upper.yaml"
+    bad = "{parameters: [ground.mu], distribution: uniform, operation: set, low: 0.1, high: 0.2}"
+    good = "{parameters: [body.mass], distribution: uniform, operation: set, low: 2.0, high: 3.0}"
+    lower.write_text(f"events: {{strip: {bad}}}\n")
+    upper.write_text(f"base: {lower}\nevents: {{other: {good}}}\n")
+    with pytest.raises(InputError, match=r"lower\.yaml: event 'strip': unknown parameter 'ground\.mu'"):
+        load_randomization(upper, robot)
+    upper.write_text(f"base: {lower}\nevents: {{strip: {bad}}}\n")
+    with pytest.raises(InputError, match=r"upper\.yaml: event 'strip': unknown parameter 'ground\.mu'"):
+        load_randomization(upper, robot)
+    lower.write_text(f"events: {{strip: {good}}}\n")
+    upper.write_text(f"base: {lower}\nevents: {{other: {good}}}\n")
+    with pytest.raises(InputError, match=r"upper\.yaml over .*lower\.yaml: events 'strip' and 'other' both set body\.mass"):
+        load_randomization(upper, robot)
+    lower.write_text("events: {strip: {distribution: uniform, lwo: 1}}\n")
+    with pytest.raises(InputError, match=r"lower\.yaml: 'events\.strip\.parameters' is missing.*did you mean 'low'"):
+        load_randomization(upper, robot)
+    lower.write_text("[1, 2]\n")
+    with pytest.raises(InputError, match=r"lower\.yaml: expected a mapping"):
+        load_randomization(upper, robot)
 
 
 def test_unknown_randomization_name(robot):

@@ -18,6 +18,7 @@ from wlr_gym.effects import EFFECTS, UNKNOWN_EFFECT, Effect, Patch, PatchEffect,
 from wlr_gym.effects.document import places
 from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.parameters import ELEMENTS, Parameters, spec_of
+from wlr_gym.paths import config_names
 from wlr_gym.plants.forces import COORDINATES, FEATURES
 from wlr_gym.robot import load_robot
 
@@ -81,6 +82,8 @@ def _explain(name: str) -> None:
         _explain_formulas()
     elif name in EFFECTS:
         _explain_effect(EFFECTS[name])
+    elif name.endswith((".yaml", ".yml")) or name in config_names("effects"):
+        raise InputError(f"'{name}' is a patch, not an effect: wlr effects check {name}")
     else:
         raise unknown_name("effect", name, [*EFFECTS, UNKNOWN_EFFECT])
 

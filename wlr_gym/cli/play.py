@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +19,9 @@ if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
     from wlr_gym.evaluation.film import Driver
     from wlr_gym.policy import Policy
+    from wlr_gym.render.teleop import Ranges, Script
     from wlr_gym.render.viewer import OpenWindow
+    from wlr_gym.robot import Robot
 
 #: s; length of a video unless asked otherwise.
 SECONDS = 10.0
@@ -98,13 +101,32 @@ def _driver(options: Options, core: Core) -> Driver | None:
     from wlr_gym.render.teleop import Gamepad, Keyboard, Script
 
     names = core.task.commands
-    if options.command is not None:
-        return Script(options.command, names)
-    if options.video is not None:
-        return None
     terms = core.task.config.commands.terms
     ranges = {name: (float(terms[name][0]), float(terms[name][1])) for name in names}
+    if options.command is not None:
+        script = Script(options.command, names)
+        _check_speed(script, ranges, core.task.robot)
+        return script
+    if options.video is not None:
+        return None
     return Gamepad(ranges) if options.gamepad else Keyboard(ranges)
+
+
+def _check_speed(script: Script, ranges: Ranges, robot: Robot) -> None:
+    """Refuse a forward speed that the wheels cannot turn at; warn of commands that policies were not trained on."""
+    from wlr_gym.tasks.terms import COMMANDS
+
+    fastest = robot.servo.wheel.no_load_speed * robot.wheel.radius
+    for name, value in script.outside(dict.fromkeys(ranges, (-fastest, fastest))).items():
+        if name == "linear_velocity_x":
+            raise InputError(f"--command: {name} = {value:g} m/s: the wheels turn no faster than {fastest:.3g} m/s")
+    for name, value in script.outside(ranges).items():
+        low, high = ranges[name]
+        print(
+            f"note: --command: {name} = {value:g} {COMMANDS[name].unit} is outside what the task commands, "
+            f"[{low:g}, {high:g}]; a policy may not follow it",
+            file=sys.stderr,
+        )
 
 
 def _film(options: Options, core: Core, policy: Policy, driver: Driver | None) -> None:

@@ -182,12 +182,14 @@ def emit(
         indent: leading white space.
         constant: prints a number in the kernel's precision.
         fused: print ``a * b + c`` as ``fma(a, b, c)`` (exactly one rounding, on every machine). Explicit fusion keeps
-            results equal for any vector width; compiler contraction does not.
+            results equal for any vector width; compiler contraction does not. Choices are printed as ``select(...)``, because
+            numba's compile time grows with the number of branches.
 
     Returns:
         Source lines. All loads precede all stores, so a block may overwrite what it reads.
     """
     absorbed = _absorbed_products(live_nodes(outputs.values())) if fused else {}
+    choice = "select({}, {}, {})" if fused else "{1} if {0} else {2}"
     names: dict[int, str] = {}
     lines: list[str] = []
 
@@ -196,7 +198,9 @@ def emit(
 
     for node in _needed(outputs.values(), absorbed):
         expression = (
-            load(node.operands[0]) if node.op == "input" else _expression(node, text, constant, absorbed.get(node.index))
+            load(node.operands[0])
+            if node.op == "input"
+            else _expression(node, text, constant, absorbed.get(node.index), choice)
         )
         names[node.index] = f"t{node.index}"
         lines.append(f"{indent}t{node.index} = {expression}")
@@ -231,7 +235,9 @@ def _needed(roots: Iterable[Operand], absorbed: Mapping[int, Node]) -> list[Node
     return _ordered(roots, children)
 
 
-def _expression(node: Node, text: Callable[[Operand], str], constant: Callable[[float], str], product: Node | None) -> str:
+def _expression(
+    node: Node, text: Callable[[Operand], str], constant: Callable[[float], str], product: Node | None, choice: str
+) -> str:
     if product is not None:
         return _fused(node, product, text)
     args = [text(x) for x in node.operands]
@@ -239,18 +245,17 @@ def _expression(node: Node, text: Callable[[Operand], str], constant: Callable[[
         return f"{args[0]} {_BINARY[node.op]} {args[1]}"
     if node.op in _CALLS:
         return f"{_CALLS[node.op]}({', '.join(args)})"
-    zero = constant(0.0)
     match node.op:
         case "rounded":
             return args[0]
         case "neg":
             return f"-{args[0]}"
         case "where":
-            return f"{args[1]} if {args[0]} > {zero} else {args[2]}"
+            return choice.format(f"{args[0]} > {constant(0.0)}", args[1], args[2])
         case "minimum":
-            return f"{args[0]} if {args[0]} < {args[1]} else {args[1]}"
+            return choice.format(f"{args[0]} < {args[1]}", *args)
         case "maximum":
-            return f"{args[0]} if {args[0]} > {args[1]} else {args[1]}"
+            return choice.format(f"{args[0]} > {args[1]}", *args)
         case "absolute":
             return f"abs({args[0]})"
     raise KeyError(node.op)

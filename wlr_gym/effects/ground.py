@@ -26,9 +26,10 @@ def _set_anisotropy(parameters: Parameters, where: Sequence[str], values: Values
 
 
 def _set_weakening(parameters: Parameters, where: Sequence[str], values: Values) -> None:
-    """Friction only falls: a wheel whose floor, drawn at random, grips less than mu_k at rest keeps it."""
-    at_rest = parameters["ground.mu_x"]
-    parameters["ground.kinetic_ratio"] = values["mu_k"] / np.maximum(np.maximum(at_rest, values["mu_k"]), 1e-9)
+    """Friction only falls: a floor that grips less than mu_k at rest, as randomisation may draw, stays as it is."""
+    mu_k = values["mu_k"]
+    highest = np.maximum(parameters["ground.mu_x"], mu_k)
+    parameters["ground.kinetic_ratio"] = mu_k / np.where(highest > 0.0, highest, 1.0)
     parameters["ground.weakening_speed"] = values["slip_speed"]
 
 
@@ -106,7 +107,7 @@ EFFECTS: tuple[Effect, ...] = (
         "mu(v) = mu_k + (mu_s - mu_k) exp(-v/slip_speed)",
         ("ground",),
         {
-            "mu_k": _mu("ground.mu_x", 0.3, "coefficient along the heading at fast slip, no more than at rest; a patch falls by the same factor"),
+            "mu_k": _mu("ground.mu_x", 0.3, "coefficient along the heading at fast slip; a patch falls by the same factor"),
             "slip_speed": EffectParameter("m/s", "slip speed over which it falls", 1e-3, 10, 0.1, (0.02, 1), 0.1),
         },
         _set_weakening,

@@ -79,10 +79,10 @@ def load_patch(source: Source) -> Patch:
         case None:
             return Patch()
         case str() | Path():
-            if str(source) in EFFECTS:
+            if source in (*EFFECTS, UNKNOWN_EFFECT):
                 raise InputError(
                     f"'{source}' is an effect, not a patch: write a file with its numbers (wlr effects {source}), "
-                    f"or in Python {{'name': '{source}', 'parameters': ...}}"
+                    f"or give it as a mapping in Python: {{'name': '{source}', 'parameters': {{...}}}}"
                 )
             path = find_config("effects", source)
             return _parse(read_yaml(path), str(path))

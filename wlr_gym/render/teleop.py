@@ -25,7 +25,7 @@ Ranges = Mapping[str, tuple[float, float]]
 
 
 class Script:
-    """A written schedule: ``0.2,0`` for good, or ``0:0.2,0; 3:0.1,0.5`` from the named times (s) on.
+    """A written schedule: ``0.1,0`` for good, or ``0:0.1,0; 3:0.05,0.3`` from the named times (s) on.
 
     Args:
         text: values in the order of ``names``.
@@ -48,6 +48,14 @@ class Script:
         """Return the commands of the last step that has begun."""
         return [values for start, values in self._steps if start <= time + 1e-9][-1]
 
+    def outside(self, ranges: Ranges) -> dict[str, float]:
+        """Return the first value of each command that is outside its range."""
+        found: dict[str, float] = {}
+        for name, value in [item for _, values in self._steps for item in values.items()]:
+            if not ranges[name][0] <= value <= ranges[name][1]:
+                found.setdefault(name, value)
+        return found
+
     def wants_reset(self) -> bool:
         """Return False: a schedule plays through."""
         return False
@@ -66,9 +74,7 @@ def _step(part: str, text: str, names: Sequence[str]) -> tuple[float, dict[str, 
 
 def _expected(text: str, names: Sequence[str]) -> str:
     form = ",".join(names)
-    return (
-        f"--command '{text}': expected {form} (such as 0.2,0), or a schedule TIME:{form}; TIME:... (such as 0:0.2,0; 3:0.1,0.5)"
-    )
+    return f"--command '{text}': expected {form} (such as 0.1,0), or TIME:{form}; TIME:... (such as 0:0.1,0; 3:0.05,0.3)"
 
 
 class Keyboard:

@@ -29,8 +29,6 @@ Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 Seeds = NDArray[np.uint64]
 
-#: Keys of an event that say nothing with some of the distributions.
-IDLE_KEYS = {key for keys in DISTRIBUTION_KEYS.values() for key in keys}
 #: s between the updates of a drifting parameter.
 DRIFT_PERIOD = 0.2
 
@@ -114,24 +112,39 @@ def _resolved(data: Any, robot: Robot, where: str, above: tuple[str, ...] = ()) 
         places |= dict.fromkeys(found, str(result))
     own = {key: value for key, value in data.items() if key not in ("base", "result")}
     merged = overlay(lower, own) if lower else own
-    _refuse_idle_keys(own, lower, merged, where)
+    events = _mapping(merged.get("events"))
+    _refuse_idle_keys(_mapping(own.get("events")), events, _mapping(_mapping(lower).get("events")), where)
+    if events:
+        merged = merged | {"events": {name: _without_idle_keys(event) for name, event in events.items()}}
     return merged, places | dict.fromkeys(_mapping(own.get("events")), where)
 
 
-def _refuse_idle_keys(own: Mapping[str, Any], lower: Mapping[str, Any], merged: Mapping[str, Any], where: str) -> None:
-    """Refuse what would change nothing: the removal of an event that is not there, a key of another distribution."""
-    below = lower.get("events") or {}
-    for name, event in _mapping(own.get("events")).items():
+def _refuse_idle_keys(own: Mapping[str, Any], merged: Mapping[str, Any], below: Mapping[str, Any], where: str) -> None:
+    """Refuse what changes nothing: to remove an event that is not there, to set a key that its distribution does not read."""
+    for name, event in own.items():
         if event is None and name not in below:
             raise InputError(f"{where}: events.{name} = null removes nothing: no such event{nearest(name, below)}")
-        if not isinstance(event, Mapping):
-            continue
-        distribution = _mapping(merged.get("events")).get(name, {}).get("distribution")
-        takes = DISTRIBUTION_KEYS.get(distribution, ())
-        given = [key for key, value in event.items() if key in IDLE_KEYS and value != EventConfig.model_fields[key].default]
-        idle = [key for key in given if takes and key not in takes]
+        given = [key for key, value in _mapping(event).items() if value not in (None, _default(key))]
+        idle = [key for key in given if key in _idle_keys(merged[name])]
         if idle:
-            raise InputError(f"{where}: events.{name}: '{idle[0]}' does not go with '{distribution}', which takes {', '.join(takes)}")
+            distribution = merged[name]["distribution"]
+            takes = ", ".join(DISTRIBUTION_KEYS[distribution])
+            raise InputError(f"{where}: events.{name}: '{idle[0]}' does not go with '{distribution}', which takes {takes}")
+
+
+def _default(key: str) -> Any:
+    """A complete config, written with the defaults of its events, can be read again."""
+    return EventConfig.model_fields[key].default if key in EventConfig.model_fields else None
+
+
+def _without_idle_keys(event: Any) -> Any:
+    """What is left of a base's event of another distribution goes."""
+    return {key: value for key, value in event.items() if key not in _idle_keys(event)} if isinstance(event, Mapping) else event
+
+
+def _idle_keys(event: Any) -> set[str]:
+    takes = DISTRIBUTION_KEYS.get(str(_mapping(event).get("distribution")))
+    return set() if takes is None else {key for keys in DISTRIBUTION_KEYS.values() for key in keys} - set(takes)
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:
@@ -152,6 +165,11 @@ def _with_result(events: Mapping[str, EventConfig], found: Mapping[str, EventCon
 class Randomization:
     """Draws parameters and initial states of robots.
 
+    Args:
+        config: events and the rest, complete.
+        robot: whose numbers they change.
+        places: event -> file it stands in, for messages.
+
     Attributes:
         config: the data, complete: laid over its base.
         elements, columns: elements of the parameter table that it changes, and their columns.
@@ -160,7 +178,6 @@ class Randomization:
     """
 
     def __init__(self, config: RandomizationConfig, robot: Robot, places: Mapping[str, str] | None = None) -> None:
-        """``places``: event -> file that it stands in, for messages."""
         self.config = config
         self.robot = robot
         self._nominal = Parameters.nominal(robot, 1)

@@ -97,7 +97,7 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
     start = _places(blocks, width)
 
     def load(name: str) -> str:
-        return name if name in _SCALARS else f"W[{start[name]} + k]"
+        return name if name in _SCALARS else f"w[{start[name]} + k]"
 
     def constant(value: float) -> str:
         return f"F({value!r})" if precision == "float32" else (repr(value) if value >= 0 else f"({value!r})")
@@ -106,8 +106,8 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
     for block, outputs in blocks.items():
         used = {node.operands[0] for node in live_nodes(outputs.values()) if node.op == "input"}
         arguments = ", ".join(["W", *(name for name in _SCALARS if name in used)])
-        body = emit(outputs, load, lambda name, text: f"W[{start[name]} + k] = {text}", " " * 8, constant, fused=True)
-        lines += [_DECORATOR, f"def {block}({arguments}):", f"    for k in range({width}):", *body, ""]
+        body = emit(outputs, load, lambda name, text: f"w[{start[name]} + k] = {text}", " " * 8, constant, fused=True)
+        lines += [_DECORATOR, f"def {block}({arguments}):", "    w = numbers_of(W)", f"    for k in range({width}):", *body, ""]
     return "\n".join(lines) + ("" if "forces" in features else _driver(start, width))
 
 
@@ -221,7 +221,7 @@ def load_kernel(features: frozenset[str], precision: str, width: int, formulas: 
     tag = "_".join(["gibbs_appell", precision, str(width), *sorted(features)])
     message = (
         f"wlr_gym: compiling the Gibbs-Appell engine ({precision}, {width} robots side by side); "
-        "about 20 s, once on this machine"
+        "about 15 s, once on this machine"
     )
     blocks = load_module(tag, lambda: kernel_source(features, precision, width), message, _SOURCE_KEY)
     if formulas is None:

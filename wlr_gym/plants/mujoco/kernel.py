@@ -12,6 +12,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from wlr_gym import servo
 from wlr_gym.codegen import Graph, emit, graph, live_nodes, load_module, ops
 from wlr_gym.plants import drive, forces, ground
@@ -22,16 +25,34 @@ from wlr_gym.plants.mujoco.packing import PARAMETER_LANES
 from wlr_gym.plants.mujoco.step import CORNERS, STATE
 from wlr_gym.plants.sensors import RAW_LAYOUT
 
-#: Arrays the kernels work on, one row per robot (``generalised``: one column), in this order: MuJoCo's positions, velocities,
-#: constraint forces and contact sensors; own state; parameter lanes; the tick's inputs; formula forces; what a step reads.
-ARRAYS = (
+Array = NDArray[np.float64]
+
+#: Arrays the kernels work on, in this order, one row per robot (:func:`addresses`): MuJoCo's positions, velocities, constraint
+#: forces and contact sensors; own state; parameter lanes; the tick's inputs; formula forces; what a step reads.
+_FLAT = (
     "qpos", "qvel", "constraint", "contact", "state", "parameters", "goals", "old_goals", "switch_time", "on", "generalised",
-    "applied", "armature", "gear_bound", "pair_friction", "pair_margin", "geom_size", "geom_pos", "geom_quat",
+    "applied", "armature", "gear_bound", "pair_margin",
 )  # fmt: skip
+#: These have four rows per robot, one per wheel.
+_PER_WHEEL = ("pair_friction", "geom_size", "geom_pos", "geom_quat")
 
 
-def _columns(array: str, names: Sequence[str], suffix: str = "") -> dict[str, str]:
-    return {name: f"{array}[i, {k}{suffix}]" for k, name in enumerate(names)}
+def addresses(flat: Sequence[Array], per_wheel: Sequence[Array]) -> NDArray[np.intp]:
+    """Return where every robot's rows lie in memory, (N, rows per robot).
+
+    Unpacking twenty array arguments takes numba longer than computing a robot's step, so the kernels get this one table. It
+    holds for as long as the arrays live.
+    """
+    return np.hstack([_row_addresses(array).reshape(len(array), -1) for array in (*flat, *per_wheel)])
+
+
+def _row_addresses(array: Array) -> NDArray[np.intp]:
+    offsets = np.tensordot(np.array(array.strides[:-1]), np.indices(array.shape[:-1]), 1)
+    return array.ctypes.data + offsets
+
+
+def _columns(array: str, names: Sequence[str]) -> dict[str, str]:
+    return {name: f"{array}[{k}]" for k, name in enumerate(names)}
 
 
 _PLACES: dict[str, str] = (
@@ -45,18 +66,18 @@ _PLACES: dict[str, str] = (
     | _columns("old_goals", [f"old_goal{j}" for j in range(8)])
     | _columns("switch_time", [f"switch_time{j}" for j in range(8)])
     | _columns("on", [f"on{j}" for j in range(8)])
-    | {name: f"generalised[{k}, i]" for k, name in enumerate(source.FORMULA)}
+    | {name: f"generalised[{k} * count]" for k, name in enumerate(source.FORMULA)}  # the formulas' kernel has robots in columns
     | _columns("applied", [f"applied_{name}" for name in source.VELOCITY])
     | _columns("armature", [f"armature_{name}" for name in source.VELOCITY])
     | _columns("gear_bound", [f"gear_bound_{name}" for name in source.VELOCITY])
-    # a capsule's first tangent runs along its axis: the axle
-    | _columns("pair_friction", [f"friction_y{i}" for i in CORNERS], ", 0")
-    | _columns("pair_friction", [f"friction_x{i}" for i in CORNERS], ", 1")
     | _columns("pair_margin", [f"margin{i}" for i in CORNERS])
-    | _columns("geom_size", [f"geom_radius{i}" for i in CORNERS], ", 0")
-    | {f"geom_{a}{i}": f"geom_pos[i, {i}, {k}]" for i in CORNERS for k, a in enumerate("xyz")}
-    | {f"geom_q{a}{i}": f"geom_quat[i, {i}, {k}]" for i in CORNERS for k, a in enumerate("wxy")}
+    # a capsule's first tangent runs along its axis: the axle
+    | {f"friction_{a}{i}": f"pair_friction{i}[{k}]" for i in CORNERS for k, a in enumerate("yx")}
+    | {f"geom_radius{i}": f"geom_size{i}[0]" for i in CORNERS}
+    | {f"geom_{a}{i}": f"geom_pos{i}[{k}]" for i in CORNERS for k, a in enumerate("xyz")}
+    | {f"geom_q{a}{i}": f"geom_quat{i}[{k}]" for i in CORNERS for k, a in enumerate("wxy")}
 )
+_ROWS = (*_FLAT, *(f"{name}{i}" for name in _PER_WHEEL for i in CORNERS))
 _SCALARS = ("step", "time", "duration")
 
 
@@ -117,27 +138,24 @@ def kernel_source() -> str:
         )
         if block == "observe":
             body.append(f"        raw[i, {RAW_LAYOUT.width - 1}] = math.atan2(heading_sine, heading_cosine)")
-        arguments = ", ".join([*ARRAYS, *own, "rows", *scalars])
+        arguments = ", ".join(["table", "rows", *own, *scalars])
         signature = "" if block == "features" else _signature(len(own), len(scalars))
         lines += [f"@njit({signature}cache=True, nogil=True, error_model='numpy')"]
-        lines += [f"def {block}({arguments}):", "    for i in rows:", *body, "", ""]
+        lines += [f"def {block}({arguments}):", "    count = len(table)", "    for i in rows:"]
+        lines += [f"        {name} = array_at(table[i, {k}])" for k, name in enumerate(_ROWS)]
+        lines += [*body, "", ""]
     return "\n".join(["from numba import types", "", *lines])
 
 
 def _signature(own: int, scalars: int) -> str:
-    """Types of a block's arguments: arrays of any strides, so that one compilation serves every batch size."""
-    kinds = [
-        f"types.Array(types.float64, {3 if name in ('pair_friction', 'geom_size', 'geom_pos', 'geom_quat') else 2}, 'A'"
-        + (", readonly=True)" if name in ("constraint", "contact") else ")")
-        for name in ARRAYS
-    ]
-    kinds += ["types.float64[:, :]"] * own + ["types.Array(types.intp, 1, 'A')"] + ["types.float64"] * scalars
+    """Types of a block's arguments, so that one compilation at import serves every batch size."""
+    kinds = ["types.intp[:, ::1]", "types.intp[::1]"] + ["types.float64[:, ::1]"] * own + ["types.float64"] * scalars
     return f"types.void({', '.join(kinds)}), "
 
 
 def load_kernel() -> ModuleType:
     """Load (first use: generate and compile) the kernel module."""
-    message = "wlr_gym: compiling the MuJoCo plant's kernel; about a minute, once on this machine"
+    message = "wlr_gym: compiling the MuJoCo plant's kernel; about 10 s, once on this machine"
     return load_module("mujoco_plant", kernel_source, message, _SOURCE_KEY)
 
 

@@ -27,7 +27,7 @@ from wlr_gym.plants.gibbs_appell.plant import check_contact_resolution
 from wlr_gym.plants.goals import GoalHistory
 from wlr_gym.plants.mujoco import packing
 from wlr_gym.plants.mujoco.batch import RobotBatch
-from wlr_gym.plants.mujoco.kernel import load_kernel
+from wlr_gym.plants.mujoco.kernel import addresses, load_kernel
 from wlr_gym.plants.mujoco.step import STATE, TICK_SUMS
 from wlr_gym.plants.sensors import RAW_LAYOUT, SensorModel
 from wlr_gym.robot import Robot
@@ -66,7 +66,10 @@ class MujocoPlant:
         self.robot = robot
         self.options = options or PlantOptions()
         if self.options.precision != "float64":
-            raise InputError(f"precision '{self.options.precision}': the MuJoCo plant has float64 only (precision='float64'; wlr train: --set environment.precision=float64)")
+            raise InputError(
+                f"precision '{self.options.precision}': the MuJoCo plant has float64 only "
+                "(in an agent's settings: environment.precision=float64)"
+            )
         self._count = count
         self.substeps = self.options.substeps
         self._step = self.options.physics_step
@@ -85,11 +88,11 @@ class MujocoPlant:
         self._generalised = np.zeros((len(COORDINATES), count))
         self._kernel = load_kernel()
         batch = self._batch
-        self._arrays = (
-            batch.qpos, batch.qvel, batch.constraint, batch.contact, self._state, self._lanes, *self._inputs, self._generalised,
-            batch.applied, batch.armature, batch.gear_bound, batch.pair_friction, batch.pair_margin,
-            batch.geom_size, batch.geom_pos, batch.geom_quat,
+        flat = (
+            batch.qpos, batch.qvel, batch.constraint, batch.contact, self._state, self._lanes, *self._inputs,
+            self._generalised.T, batch.applied, batch.armature, batch.gear_bound, batch.pair_margin,
         )  # fmt: skip
+        self._table = addresses(flat, (batch.pair_friction, batch.geom_size, batch.geom_pos, batch.geom_quat))
         self._all = np.arange(count)
         self.parameters = Parameters.nominal(robot, count)
         self.reset(seeds=np.zeros(count, np.uint64), parameters=self.parameters)
@@ -120,7 +123,7 @@ class MujocoPlant:
         start = standing_state(self.robot, self.parameters) if state is None else state
         self._write_state(start, rows)
         self._goals.reset(rows, start, self.parameters)
-        self._kernel.observe(*self._arrays, self._truth.values, self._raw, rows)
+        self._kernel.observe(self._table, rows, self._truth.values, self._raw)
         self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)
         return self._readings
 
@@ -236,18 +239,18 @@ class MujocoPlant:
         return self._readings
 
     def _tick(self) -> None:
-        kernel, arrays, rows, step = self._kernel, self._arrays, self._all, self._step
+        kernel, step, robots = self._kernel, self._step, (self._table, self._all)
         self._state[:, _SUMS] = 0.0
-        kernel.drift(*arrays, rows, 0.5 * step)
+        kernel.drift(*robots, 0.5 * step)
         for substep in range(self.substeps):
             if self._forces:
-                kernel.features(*arrays, self._force_inputs, rows)
+                kernel.features(*robots, self._force_inputs)
                 self._forces.evaluate(self._force_inputs, self._force_values, self._generalised)
-            kernel.before(*arrays, rows, step, (substep + 0.5) * step)
+            kernel.before(*robots, step, (substep + 0.5) * step)
             self._batch.step()
-            kernel.after(*arrays, rows, step)
-        kernel.drift(*arrays, rows, -0.5 * step)
-        kernel.observe(*arrays, self._truth.values, self._raw, rows)
+            kernel.after(*robots, step)
+        kernel.drift(*robots, -0.5 * step)
+        kernel.observe(*robots, self._truth.values, self._raw)
 
     def _present_goals(self) -> Array:
         """Goals that keep every joint as it is: leg angles as the servo reads them, wheels at rest."""
