@@ -542,8 +542,8 @@ class Parameters:
         if wrong.any():
             robot = int(np.argmax(wrong))
             raise InputError(
-                f"parameter payload.inertia (robot {robot} of the batch) has principal moments {moments[robot].tolist()} kg m2: "
-                "no masses have them (none may be negative, none above the sum of the other two)"
+                f"parameter payload.inertia (robot {robot} of the batch) has principal moments {moments[robot].tolist()} "
+                "kg m2: no masses have them (none may be negative, none above the sum of the other two)"
             )
 
 

@@ -16,7 +16,7 @@ import yaml
 from wlr_gym.files import replace_file
 from wlr_gym.paths import PACKAGE
 
-PACKAGES = ("wlr-gym", "numpy", "numba", "gymnasium", "mujoco", "torch", "stable-baselines3")
+PACKAGES = ("wlr-gym", "numpy", "numba", "gymnasium", "mujoco", "torch", "stable-baselines3", "opencv-python-headless")
 CONFIG_FILE = "config.yaml"
 PROVENANCE_FILE = "provenance.yaml"
 

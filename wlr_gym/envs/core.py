@@ -295,8 +295,9 @@ class Core:
             evaluation.numbers, self.terms, self.reward, self._over, self.sums,
         )  # fmt: skip
         if bad >= 0:
+            hint = "; a formula among its effects may have left its domain" if self.patch.forces else ""
             raise FloatingPointError(
-                f"robot {bad} of the batch left the finite numbers (episode seed {self.episode_seeds[bad]})"
+                f"robot {bad} of the batch left the finite numbers (episode seed {self.episode_seeds[bad]}){hint}"
             )
         any_done = kernels.advance(
             mask, self.limit, self.ticks, self._over, self.terminated, self.truncated, self.episode_seeds, self._command_stream,
