@@ -39,7 +39,7 @@ def test_every_direct_dependency_is_pinned_and_nothing_else():
     wanted = requirement_names(PROJECT["project"]["dependencies"] + PROJECT["build-system"]["requires"])
     for extra in PROJECT["project"]["optional-dependencies"].values():
         wanted |= requirement_names(extra)
-    assert requirement_names(pins) == wanted
+    assert requirement_names(pins) == wanted - {"wlr-gym"}  # the extra "all" names the others
 
 
 def test_wheel_takes_configs_and_agents():

@@ -34,7 +34,8 @@ def velocity(state):
 
 def assign(target, source):
     for name, value in vars(source).items():
-        getattr(target, name)[:] = value
+        if value is not None:
+            getattr(target, name)[:] = value
 
 
 def test_engine_accelerations_equal_the_equations():

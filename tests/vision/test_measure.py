@@ -12,7 +12,7 @@ from wlr_gym.parameters import Parameters
 from wlr_gym.robot import load_robot
 from wlr_gym.runs import Run, read_run
 from wlr_gym.vision import Sample, align, measure_slip
-from wlr_gym.vision.analyse import Analysis, camera_columns, save
+from wlr_gym.vision.analyse import Analysis, _findings, camera_columns, save
 from wlr_gym.vision.smooth import smooth
 from wlr_gym.vision.track import LOST, OK, angles
 
@@ -53,6 +53,14 @@ def test_clocks_are_aligned_within_2_ms(turn, seed):
     assert found.offset == pytest.approx(OFFSET, abs=0.002)
     assert found.std < 0.002
     assert "yaw" in found.parts
+
+
+@pytest.mark.parametrize("offset", [1.2, 2.0, 3.0, -2.5])
+def test_clocks_far_apart_are_refused_and_found_around_a_guess(turn, offset):
+    samples = samples_of(turn, offset=offset)
+    with pytest.raises(InputError, match="--around"):
+        aligned(turn, samples)
+    assert aligned(turn, samples, around=round(offset)).offset == pytest.approx(offset, abs=0.003)
 
 
 def test_slip_is_within_a_millimetre_and_its_error_as_expected(turn):
@@ -112,6 +120,13 @@ def test_a_wild_sample_is_left_out(turn):
     found = measure_slip([*samples[:100], wild, *samples[101:]], OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
     assert np.flatnonzero(found.outliers).tolist() == [100]
     assert np.abs(found.slip - true_slip(turn, found.time)).max() < 1e-3
+
+
+def test_a_video_that_starts_in_mid_drive_is_told(turn):
+    samples = samples_of(turn)
+    for first, told in ((0, False), (60, True)):
+        slip = measure_slip(samples[first:], OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+        assert any("already moves" in finding for finding in _findings(samples[first:], slip, 0.0)) == told
 
 
 @pytest.mark.parametrize("origin", ["start", "floor"])

@@ -2,6 +2,7 @@
 
 import json
 import re
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ import pytest
 from wlr_gym.bench.vision_scene import Look, Patch, Pose, Renderer, rotation_of
 from wlr_gym.cli import main
 from wlr_gym.errors import InputError
-from wlr_gym.vision import Camera, calibrate, detect, load_camera, load_target, read_frames, save_camera
+from wlr_gym.vision import Camera, Frame, Sample, calibrate, detect, load_camera, load_target, read_frames, save_camera
 from wlr_gym.vision.sheets import Board, Box, Disc, board_page, pdf, svg, target_pages
+from wlr_gym.vision.video import AnnotatedVideo
 
 TRUE = Camera(width=640, height=480, focal=(620.0, 615.0), centre=(325.0, 236.0), distortion=(-0.2, 0.05, 0.001, -0.002, 0.0))
 
@@ -85,12 +87,24 @@ def test_calibration_recovers_the_lens_from_the_printed_board():
         calibrate([views[0], ("view 1", np.ascontiguousarray(views[1][1][:, :600]))], board)
 
 
+def test_views_that_are_all_frontal_do_not_calibrate():
+    board = Board()
+    cells = board.aruco().generateImage((20 * board.columns, 20 * board.rows), marginSize=0, borderBits=1)
+    view = np.full((480, 640), 255, np.uint8)
+    view[60:420, 50:590] = np.kron(cells, np.ones((3, 3), np.uint8))
+    with pytest.raises(InputError, match="which does not tell the focal length"):
+        calibrate([(f"view {k}", view) for k in range(8)], board)
+
+
 def test_camera_file_round_trip_and_faults(tmp_path):
     path = tmp_path / "camera.yaml"
     save_camera(path, TRUE)
     assert load_camera(path) == TRUE
     path.write_text(path.read_text().replace("focal", "foccal"))
     with pytest.raises(InputError, match="foccal"):
+        load_camera(path)
+    save_camera(path, TRUE.model_copy(update={"focal": (16.0, 16.0)}))
+    with pytest.raises(InputError, match="look like millimetres"):
         load_camera(path)
     with pytest.raises(InputError, match="no such camera file; make one with"):
         load_camera(tmp_path / "none.yaml")
@@ -133,6 +147,11 @@ def test_frames_from_a_folder_a_video_and_times(tmp_path):
     times = tmp_path / "times.csv"
     times.write_text("frame,t\n0,1.0\n1,1.1\n2,1.3\n3,1.4\n4,1.5\n")
     assert [f.time for f in read_frames(str(tmp_path / "v.avi"), times=times)] == [1.0, 1.1, 1.3, 1.4, 1.5]
+    assert len(list(read_frames(str(tmp_path / "v.avi"), times=times, seconds=0.35))) == 3
+    for count in (4, 6):
+        times.write_text("\n".join(str(1 + 0.1 * k) for k in range(count)))
+        with pytest.raises(InputError, match=f"{count} times, but"):
+            list(read_frames(str(tmp_path / "v.avi"), times=times))
     times.write_text("t\n1.0\n0.9\n")
     with pytest.raises(InputError, match="times must be finite and increase"):
         list(read_frames(str(tmp_path / "v.avi"), times=times))
@@ -142,6 +161,20 @@ def test_frames_from_a_folder_a_video_and_times(tmp_path):
         list(read_frames(str(broken)))
     with pytest.raises(InputError, match="no such video, folder of images or camera number"):
         list(read_frames(str(tmp_path / "nothing.mp4")))
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_an_annotated_video_is_whole_or_what_it_was(fails, tmp_path):
+    nothing = np.full(6, np.nan)
+    sample = Sample(0, 0.0, "lost", nothing, np.full((6, 6), np.nan), 0, np.nan, np.full((4, 2), np.nan))
+    path = tmp_path / "annotated.avi"
+    path.write_bytes(b"earlier")
+    with pytest.raises(ZeroDivisionError) if fails else nullcontext(), AnnotatedVideo(path, 30.0) as video:
+        video.add(Frame(0, 0.0, np.zeros((48, 64), np.uint8)), sample)
+        assert path.read_bytes() == b"earlier"
+        assert 1 / (not fails)
+    assert (path.read_bytes() == b"earlier") == fails
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
 def test_command_writes_the_sheets(tmp_path, capsys):

@@ -97,12 +97,28 @@ def test_a_jump_is_followed_without_a_wrong_pose(studio, tracker):
     assert sample.status == LOST or np.hypot(*(sample.pose[:2] - far.position[:2])) < 1e-3
 
 
-def test_a_camera_that_moved_is_noticed(studio, tracker):
-    tracker(studio.frame(moving(0), 0))
-    image = np.roll(studio.frame(moving(1), 1).image, 5, axis=1)
-    samples = [tracker(Frame(index, index / 30, image)) for index in range(1, 6)]
-    assert samples[-1].status == MOVED
-    assert not np.isfinite(samples[-1].pose[0])
+@pytest.mark.parametrize("shift", [(0.5, 0), (5, 0), (40, 40), (100, 0), (0, 150)])
+def test_a_camera_that_moved_is_noticed_at_once(studio, tracker, shift):
+    """Also when it moved so far that no floor marker is near its place."""
+    import cv2
+
+    frames = [studio.frame(moving(index), index) for index in range(3)]
+    assert tracker(frames[0]).status == OK
+    matrix = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
+    for frame in frames[1:]:
+        image = cv2.warpAffine(frame.image, matrix, (1280, 720), borderMode=cv2.BORDER_REPLICATE)
+        sample = tracker(replace(frame, image=image))
+        assert sample.status == MOVED
+        assert not np.isfinite(sample.pose[0])
+
+
+def test_a_hidden_floor_marker_is_not_a_moved_camera(studio, tracker):
+    cover = tuple(hand(*(0.84 * place[:2]), size=0.12) for place in studio.floor.positions[1:])
+    assert [tracker(studio.frame(moving(index), index, extra=cover)).status for index in range(4)] == [OK] * 4
+
+
+def test_a_dark_image_is_lost(studio, tracker):
+    assert tracker(Frame(0, 0.0, np.zeros((720, 1280), np.uint8))).status == LOST
 
 
 def test_wrong_image_size_is_refused(studio):

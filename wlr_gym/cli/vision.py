@@ -34,7 +34,8 @@ class Options:
         markers: markers on the robot: name in configs/vision/ or path.
         floor: markers on the floor: name in configs/vision/ or path.
         robot: robot file or config name; left out, the one meta.yaml names, else the nominal one.
-        offset: s, servo time minus camera time; left out, found from the motion.
+        offset: s, servo time minus camera time, exactly; left out, found from the motion.
+        around: s, servo time minus camera time to 1 s: where the offset is looked for.
         origin: frame of cam_*: start (0, 0, 0 at the start, as in simulated runs) or floor.
         rate: Hz, frames evenly spaced; left out, the times in the video.
         times: CSV with one time (s) per frame, before --rate.
@@ -50,6 +51,7 @@ class Options:
     floor: str = "floor"
     robot: str | None = None
     offset: float | None = None
+    around: float = 0.0
     origin: str = "start"
     rate: float | None = None
     times: Path | None = None
@@ -110,7 +112,9 @@ def _analyse(options: Options, measured: Run, camera: Camera, body: Target, floo
             if frame.index % 30 == 0:
                 status.update(f"tracking, frame {frame.index}: {sample.status}")
 
-        return analyse(frames, measured, camera, body, floor, options.robot, options.offset, options.origin, watch)
+        return analyse(
+            frames, measured, camera, body, floor, options.robot, options.offset, options.origin, watch, options.around
+        )
 
 
 def _print(analysis: Analysis, console: Console) -> None:

@@ -36,7 +36,7 @@ _DISTANCE = "distance"
 _START_SLIP = 1e-4  # m; a wheel that starts later than the body looks like a clock that is late
 _ROLLS = 20.0  # a wheel that rolls explains the distance this many times better than nothing
 _DISTINCT = 0.1  # s; a second minimum this far off
-_AMBIGUOUS = 1.5  # its cost over the best one's
+_TURN, _SAME_TURN = 0.02, 10.0  # rad rms; a turn seen by the camera that the gyroscope must explain to a tenth of it
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,8 @@ def align(time: Array, poses: Array, run: Run, robot: Robot, parameters: Paramet
         around: s; the offset is looked for within :data:`SEARCH` of it.
 
     Raises:
-        InputError: too few poses in common, or no motion that fixes the offset to :data:`LARGEST_STD`.
+        InputError: too few poses in common, no motion that fixes the offset to :data:`LARGEST_STD`, or turns that camera and
+            gyroscope saw differently at every offset tried.
     """
     known = np.isfinite(poses).all(axis=1)
     time, poses = time[known], poses[known]
@@ -94,12 +95,23 @@ def align(time: Array, poses: Array, run: Run, robot: Robot, parameters: Paramet
     for pair in pairs:
         project = _without_slow(time, pair.slowest)
         curve = np.array([_cost(pair, time + offset, project) for offset in grid])
+        if pair.name == "yaw" and _contradicts(project(pair.seen), curve):
+            raise InputError(
+                f"{run.path}: camera and gyroscope do not see the same turns with clocks {grid[0]:+.1f} to {grid[-1]:+.1f} s "
+                "apart; does the video belong to the run? If the clocks differ by more, give --around"
+            )
         found = _weighted(pair, curve, time, grid, project)
         if found is not None and found[2] < 5 * LARGEST_STD:
             useful.append((pair.name, *found))
     useful = _agreeing(useful)
     costs = np.sum([cost for _, cost, _, _ in useful], axis=0) if useful else np.zeros(len(grid))
     return _combined(costs, grid, {name: (offset, std) for name, _, offset, std in useful}, run)
+
+
+def _contradicts(seen: Array, curve: Array) -> bool:
+    """Whether a plain turn (rad) is explained at no offset, or best at the edge of the search."""
+    plain = float(seen @ seen) > _TURN**2 * len(seen)
+    return plain and (curve.min() > seen @ seen / _SAME_TURN**2 or int(np.argmin(curve)) in (0, len(curve) - 1))
 
 
 def _agreeing(useful: list[tuple[str, Array, float, float]]) -> list[tuple[str, Array, float, float]]:
@@ -115,9 +127,9 @@ def _combined(costs: Array, grid: Array, parts: dict[str, tuple[float, float]], 
     refuse = f"{run.path}: the clocks cannot be aligned: "
     if not parts:
         raise InputError(refuse + "no motion that camera and servos both see (a start, a stop, a turn, a leg that moves); "
-                         "film one, or give --offset")  # fmt: skip
+                         "film one, or give --offset; clocks more than 1 s apart need --around")  # fmt: skip
     if not 0 < best < len(grid) - 1:
-        raise InputError(refuse + f"the best offset lies at the edge of the search, {grid[best]:+.2f} s; give --offset roughly")
+        raise InputError(refuse + f"the best offset lies at the edge of the search, {grid[best]:+.2f} s; give --around")
     offset, curvature = _vertex(grid, costs, best)
     std = math.sqrt(2 / max(curvature, 1e-12))
     far = np.abs(grid - offset) > _DISTINCT
@@ -140,6 +152,8 @@ def _weighted(
     moved = project(pair.seen)
     least = _ROLLS if pair.name == _DISTANCE else 2.0
     if spread <= 0 or moved @ moved < least**2 * (residual @ residual) or not 0 < best < len(grid) - 1:
+        return None
+    if moved @ project(pair.servo(time + grid[best])) <= 0:  # the free scale would be negative: another motion
         return None
     alike = _correlation_length(residual)
     cost = (curve - curve[best]) / (spread * alike)

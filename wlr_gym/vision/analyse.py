@@ -38,6 +38,8 @@ POOR_FIT = 0.3
 HEIGHT_TOLERANCE = 0.005
 #: s of the first poses that make the start pose.
 _START = 0.3
+#: m/s; a robot faster than this is not at rest.
+_AT_REST = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +104,7 @@ def analyse(
     offset: float | None = None,
     origin: str = "start",
     watch: Callable[[Frame, Sample], None] | None = None,
+    around: float = 0.0,
 ) -> Analysis:
     """Track the robot through a video and measure pose and slip.
 
@@ -111,6 +114,7 @@ def analyse(
         offset: s, servo time minus camera time; None = found from the motion.
         origin: frame of the ``cam_*`` columns: ``start`` (pose at the start is 0, 0, 0, as in simulated runs) or ``floor``.
         watch: called with every frame and its sample.
+        around: s, where ``offset`` is looked for, within 1 s.
 
     Raises:
         InputError: wrong image size, no floor frame, too few poses, no motion to align on, video and run apart.
@@ -127,7 +131,7 @@ def analyse(
     alignment = None
     if offset is None:
         time, poses = np.array([s.time for s in samples]), np.stack([s.pose for s in samples])
-        alignment = align(time, poses, run, found, parameters)
+        alignment = align(time, poses, run, found, parameters, around)
         offset = alignment.offset
     slip = measure_slip(samples, offset, run, found, parameters)
     table = camera_columns(samples, offset, run, origin, slip.outliers)
@@ -244,6 +248,9 @@ def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float) 
             f"the body stands {1e3 * height_error:+.0f} mm off what its legs say: print scale, marker height, calibration or "
             "leg zeros are wrong; a wrong scale also falsifies slip"
         )
+    first = slip.time <= slip.time[0] + _START
+    if np.hypot(*slip.rate[first, :2].T).min() > _AT_REST:
+        yield "the robot already moves when the video starts: with --origin start, cam_* are 0 there, not at the run's start"
     steps = np.diff([sample.time for sample in samples])
     dropped = int(np.sum(np.round(steps / np.median(steps)) - 1)) if len(steps) else 0
     if dropped > 0:

@@ -29,6 +29,10 @@ MINIMUM_VIEWS = 6
 MINIMUM_CORNERS = 12
 #: A view whose corners miss by more than this many times the median of all views is left out.
 _OUTLYING_VIEW = 3.0
+#: Of the longer side; the model does not fit lenses that see more than 136 degrees.
+_SHORTEST_FOCAL = 0.2
+#: rad rms, of the board's tilts about their mean. Parallel views do not tell the focal length, nor does its sigma tell that.
+_LEAST_TILT = math.radians(8)
 
 
 class Quality(BaseModel):
@@ -90,7 +94,7 @@ def load_camera(path: str | Path) -> Camera:
     if not path.is_file():
         raise InputError(f"{path}: no such camera file; make one with: wlr calibrate camera IMAGES --out {path}")
     camera = parse_config(Camera, read_yaml(path), str(path))
-    if min(camera.focal) < 10:
+    if min(camera.focal) < _SHORTEST_FOCAL * max(camera.width, camera.height):
         raise InputError(f"{path}: focal = {list(camera.focal)}: expected pixels; these look like millimetres")
     return camera
 
@@ -154,7 +158,8 @@ def calibrate(images: Iterable[tuple[str, NDArray[np.uint8]]], board: Board) -> 
         board: the board that was printed.
 
     Raises:
-        InputError: images of different sizes, too few views with enough corners, or corners only in part of the image.
+        InputError: images of different sizes, too few views with enough corners, corners only in part of the image, or tilts
+            too much alike to tell the focal length.
     """
     size, points, names = _find_corners(images, board)
     if len(points) < MINIMUM_VIEWS:
@@ -173,6 +178,12 @@ def calibrate(images: Iterable[tuple[str, NDArray[np.uint8]]], board: Board) -> 
     good = np.flatnonzero(keep)
     found = first if keep.all() else _solve([object_points[k] for k in good], [image_points[k] for k in good], size)
     matrix, deviations = found["matrix"], found["deviations"]
+    tilt = math.sqrt(2 * max(0.0, 1 - float(np.linalg.norm(found["normals"].mean(axis=0)))))
+    if tilt < _LEAST_TILT:
+        raise InputError(
+            f"the board's tilts differ by {math.degrees(tilt):.0f} degrees only (rms), which does not tell the focal length; "
+            "tilt it by up to 40 degrees, to every side"
+        )
     return Camera(
         width=size[0],
         height=size[1],
@@ -219,13 +230,14 @@ def _solve(object_points: list, image_points: list, size: tuple[int, int]) -> di
     # the default solver can end in a poor minimum without a first guess; k3 stays 0, as it trades off against k2
     guess = np.array([[size[0], 0, 0.5 * (size[0] - 1)], [0, size[0], 0.5 * (size[1] - 1)], [0, 0, 1.0]])
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
-    rms, matrix, distortion, _, _, deviations, _, view_errors = cv2.calibrateCameraExtended(
+    rms, matrix, distortion, turns, _, deviations, _, view_errors = cv2.calibrateCameraExtended(
         object_points, image_points, size, guess, np.zeros(5), flags=flags
     )
     return {
         "rms": float(rms),
         "matrix": matrix,
         "distortion": np.asarray(distortion).reshape(-1)[:5],
+        "normals": np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns]),
         "deviations": np.asarray(deviations).reshape(-1),
         "view_errors": np.asarray(view_errors).reshape(-1),
     }

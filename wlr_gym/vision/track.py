@@ -28,7 +28,7 @@ OK, PARTIAL, LOST, MOVED, IMPOSSIBLE = "ok", "partial", "lost", "moved", "imposs
 FLOOR_FRAMES = 20
 #: m; positions of floor markers may be off by this much (they were measured by hand).
 FLOOR_TOLERANCE = 0.01
-_MOVED_BY = 1.0  # px, median over the floor's markers
+_MOVED_BY = 0.4  # px, median over the floor's markers: 1 mm at 2 m with a focal length of 800 px
 _LEAST_COSINE = 0.7  # of the tilt of the body against the floor
 _HEIGHTS = (0.0, 0.6)  # m, of the body's origin
 
@@ -77,20 +77,20 @@ class Tracker:
         self._homes = homes
         self._values = camera.values
         self._track: list[tuple[float, TargetPose]] = []  # the last two poses
-        self._shifts = np.full(len(floor.markers), np.nan)
         self._watched = 0
 
     def __call__(self, frame: Frame) -> Sample:
         """Process one frame. Frames must come in order of time."""
         check_size(frame.image, self.camera, f"frame {frame.index}")
-        moved = self._camera_moved(frame.image)
+        shift = self._floor_shift(frame.image)
         found, seen = self._follow(frame)
         if found is None:
             found, seen = self._search(frame)
         centres = np.full((len(self.body.markers), 2), np.nan)
-        if found is None or moved:
+        if found is None or shift > _MOVED_BY:
             self._track = []
-            return _no_pose(frame, MOVED if moved else LOST, centres)
+            dark = found is None and math.isinf(shift)  # nothing at all is seen
+            return _no_pose(frame, MOVED if shift > _MOVED_BY and not dark else LOST, centres)
         for index, detection in seen.items():
             if found.used[index]:
                 centres[index] = detection.ellipse[:2]
@@ -152,33 +152,25 @@ class Tracker:
         (x0, y0), (x1, y1) = np.floor(low - margin).astype(int), np.ceil(high + margin).astype(int)
         return max(0, x0), max(0, y0), min(self.camera.width, x1), min(self.camera.height, y1)
 
-    def _camera_moved(self, image: Image) -> bool:
-        """Look at one floor marker per frame, in turn."""
-        self._watched = (self._watched + 1) % len(self.floor.markers)
+    def _floor_shift(self, image: Image) -> float:
+        """How far (px) the floor's markers are from their places; inf when none of them is to be seen there.
+
+        One marker is looked at per frame, in turn; when it is not in its place, all of them: it may just be hidden.
+        """
+        self._watched = (self._watched + 1) % len(self._homes)
+        shift = self._marker_shift(image, self._watched)
+        if shift < _MOVED_BY:
+            return shift
+        shifts = np.array([self._marker_shift(image, index) for index in range(len(self._homes))])
+        known = shifts[np.isfinite(shifts)]
+        return float(np.median(known)) if len(known) else math.inf
+
+    def _marker_shift(self, image: Image, index: int) -> float:
+        """Distance (px) of a floor marker from its place; NaN when it is not seen there."""
         pose = self.floor_pose
-        ellipse = expected_ellipse(self.floor, self._watched, self._values, pose.rotation, pose.position)
-        if ellipse is not None and np.isfinite(self._homes[self._watched, 0]):
-            seen = refine(image, self._values, ellipse, int(self.floor.codes[self._watched]))
-            if seen is not None:
-                self._shifts[self._watched] = math.hypot(*(seen.ellipse[:2] - self._homes[self._watched]))
-            elif self._visible(ellipse):  # hidden, or moved too far to be found there
-                self._shifts[self._watched] = self._far(image)
-        known = self._shifts[np.isfinite(self._shifts)]
-        return len(known) > 0 and bool(np.median(known) > _MOVED_BY)
-
-    def _visible(self, ellipse: Array) -> bool:
-        margin = 2 * np.abs(ellipse[2:]).max()
-        return margin < ellipse[0] < self.camera.width - margin and margin < ellipse[1] < self.camera.height - margin
-
-    def _far(self, image: Image) -> float:
-        """Distance (px) of the floor marker looked at from its place, searched nearby; NaN when it is not to be seen."""
-        home = self._homes[self._watched]
-        reach = 60
-        box = [int(home[0]) - reach, int(home[1]) - reach, int(home[0]) + reach, int(home[1]) + reach]
-        near = (max(0, box[0]), max(0, box[1]), min(self.camera.width, box[2]), min(self.camera.height, box[3]))
-        code = self.floor.codes[self._watched]
-        found = [d for d in detect(image, self.camera, near) if d.code == code]
-        return min((math.hypot(*(d.ellipse[:2] - home)) for d in found), default=math.nan)
+        ellipse = expected_ellipse(self.floor, index, self._values, pose.rotation, pose.position)
+        seen = None if ellipse is None else refine(image, self._values, ellipse, int(self.floor.codes[index]))
+        return math.nan if seen is None else math.hypot(*(seen.ellipse[:2] - self._homes[index]))
 
 
 def track(frames: Iterable[Frame], camera: Camera, body: Target, floor: Target) -> Iterator[Sample]:

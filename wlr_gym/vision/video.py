@@ -29,24 +29,28 @@ def read_frames(
         source: path, or a number for a live camera.
         rate: Hz; frames are evenly spaced by it. Default: the times in the video; 30 for images; the clock for a live camera.
         times: CSV with one time (s) per frame in its last column, which goes before ``rate``.
-        seconds: stop after this time.
+        seconds: stop this long after the first frame.
 
     Raises:
-        InputError: no such file, not a video, no frames, or more frames than times.
+        InputError: no such file, not a video, no frames, or another number of frames than of times.
     """
     require_package("cv2", "vision")
     stamps = None if times is None else _read_times(times)
-    count = 0
+    count, first, cut = 0, 0.0, False
     for index, (stamp, image) in enumerate(_images(source)):
         if stamps is not None and index >= len(stamps):
             raise InputError(f"{times}: {len(stamps)} times, but {source} has more frames")
         moment = stamps[index] if stamps is not None else index / rate if rate else stamp
-        if seconds is not None and moment > seconds:
+        first = moment if index == 0 else first
+        cut = seconds is not None and moment - first > seconds
+        if cut:
             break
         count += 1
         yield Frame(index, moment, image)
     if not count:
         raise InputError(f"{source}: no frames could be read")
+    if stamps is not None and not cut and count < len(stamps):
+        raise InputError(f"{times}: {len(stamps)} times, but {source} has {count} frames; which time is whose cannot be told")
 
 
 def _images(source: str) -> Iterator[tuple[float, Image]]:
@@ -156,15 +160,22 @@ class AnnotatedVideo:
 
     def __init__(self, path: Path, rate: float, scale: float = 1.0) -> None:
         self.path, self.rate, self.scale = path, rate, scale
+        self._unfinished = path.with_name(f".{path.stem}.unfinished{path.suffix}")
         self._writer = None
         self._trail: list[tuple[int, int]] = []
 
     def __enter__(self) -> AnnotatedVideo:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        if self._writer is not None:
-            self._writer.release()
+    def __exit__(self, fault: type[BaseException] | None, *_: object) -> None:
+        """Give the file its name; after an error, leave what was there before."""
+        if self._writer is None:
+            return
+        self._writer.release()
+        if fault is None:
+            self._unfinished.replace(self.path)
+        else:
+            self._unfinished.unlink(missing_ok=True)
 
     def add(self, frame: Frame, sample: Sample) -> None:
         """Append one frame."""
@@ -175,7 +186,7 @@ class AnnotatedVideo:
             image = cv2.resize(image, None, fx=self.scale, fy=self.scale, interpolation=cv2.INTER_AREA)
         if self._writer is None:
             code = cv2.VideoWriter.fourcc(*("mp4v" if self.path.suffix == ".mp4" else "MJPG"))
-            self._writer = cv2.VideoWriter(str(self.path), code, self.rate, (image.shape[1], image.shape[0]))
+            self._writer = cv2.VideoWriter(str(self._unfinished), code, self.rate, (image.shape[1], image.shape[0]))
             if not self._writer.isOpened():
                 raise InputError(f"{self.path}: cannot be written as a video")
         self._writer.write(image)

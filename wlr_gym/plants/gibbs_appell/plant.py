@@ -183,6 +183,8 @@ class GibbsAppellPlant:
             features.add("rolling_resistance")
         if self._formulas:
             features.add("forces")
+        if "creep" in features:  # its line search rounds otherwise beside rotors with play: the same bits with and without them
+            features.add("backlash")
         if self._features is None or not features <= self._features:
             self._features = frozenset(features | (self._features or frozenset()))
             formulas = self._formulas.module if self._formulas else None
