@@ -10,7 +10,7 @@ import yaml
 
 from wlr_gym.codegen.expression import UNITS
 from wlr_gym.effects import EFFECTS, load_patch
-from wlr_gym.effects.document import coordinate_table, feature_table, library_table
+from wlr_gym.effects.document import coordinate_table, feature_table, effect_table
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
@@ -18,7 +18,7 @@ TEXT = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
 
 @pytest.mark.parametrize(
     ("name", "table"),
-    [("library", library_table), ("coordinates", coordinate_table), ("features", feature_table)],
+    [("effects", effect_table), ("coordinates", coordinate_table), ("features", feature_table)],
 )
 def test_tables_are_those_of_the_code(name, table):
     block = TEXT.split(f"<!-- {name}: ")[1].split(f"<!-- end of {name} -->")[0]
@@ -26,7 +26,7 @@ def test_tables_are_those_of_the_code(name, table):
 
 
 def test_every_table_has_whole_rows():
-    for table in (library_table(), coordinate_table(), feature_table()):
+    for table in (effect_table(), coordinate_table(), feature_table()):
         assert len({line.count("|") for line in table}) == 1
 
 

@@ -29,7 +29,7 @@ def parameter_text(name: str, parameter: EffectParameter) -> str:
     return f"({text})" if parameter.optional else text
 
 
-def library_table() -> list[str]:
+def effect_table() -> list[str]:
     """Return the library as lines of a Markdown table."""
     rows = [
         (
