@@ -10,7 +10,7 @@ import yaml
 
 from wlr_gym.codegen.expression import UNITS
 from wlr_gym.effects import EFFECTS, load_patch
-from wlr_gym.effects.document import coordinate_table, feature_table, effect_table
+from wlr_gym.effects.document import coordinate_table, effect_table, feature_table
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")

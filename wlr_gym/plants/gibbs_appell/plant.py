@@ -14,22 +14,17 @@ from wlr_gym.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants import drive, ground
 from wlr_gym.plants.base import (
-    SENSOR_LAYOUT,
-    TRUTH_LAYOUT,
     Capabilities,
     PlantOptions,
     PlantState,
     Sensors,
-    Truth,
     check_goals,
     hold_where_off,
-    standing_state,
 )
 from wlr_gym.plants.forces import Force, compile_forces
 from wlr_gym.plants.gibbs_appell import kernel, packing
 from wlr_gym.plants.gibbs_appell.step import STORED
-from wlr_gym.plants.goals import GoalHistory
-from wlr_gym.plants.sensors import RAW_LAYOUT, SensorModel
+from wlr_gym.plants.simulator import Simulator, refitted_lead
 from wlr_gym.robot import Robot
 
 Array = NDArray[np.float64]
@@ -43,7 +38,7 @@ _ROTOR_LEAD = [_LANE[f"rotor_lead{j}"] for j in range(8)]
 _ROTOR_RATE = [_LANE[f"rotor_rate{j}"] for j in range(8)]
 
 
-class GibbsAppellPlant:
+class GibbsAppellPlant(Simulator):
     """Batch of robots on the Gibbs-Appell engine; see :class:`wlr_gym.plants.base.Plant` for the contract.
 
     Args:
@@ -68,13 +63,8 @@ class GibbsAppellPlant:
         *,
         sweeps: int = SWEEPS,
     ) -> None:
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-            raise InputError(f"number of robots is {count!r}, expected 1 or more")
-        self.robot = robot
-        self.options = options or PlantOptions()
+        super().__init__(robot, count, options)
         self.sweeps = sweeps
-        self._count = count
-        self.substeps = self.options.substeps
         if self.options.precision not in kernel.WIDTH:
             raise InputError(
                 f"precision '{self.options.precision}'{nearest(self.options.precision, kernel.WIDTH)}; "
@@ -86,24 +76,13 @@ class GibbsAppellPlant:
         self._tiles = -(-count // self._width)
         self._lanes = np.zeros((self._tiles, len(STORED) * self._width), self._float)
         self._constants = np.zeros((self._tiles, len(packing.PARAMETER_LANES) * self._width), self._float)
-        self._truth = Truth(np.zeros((count, TRUTH_LAYOUT.width)))
-        self._raw = np.zeros((count, RAW_LAYOUT.width))
-        self._readings = Sensors(np.zeros((count, SENSOR_LAYOUT.width)))
         self._torque_on = np.ones((count, 8))
-        self._goals = GoalHistory(count, self.options.control_period)
-        self._sensors = SensorModel(robot, self.options, count)
         self._pool = self._make_pool()
         self._formulas = compile_forces(forces, self.options.precision) if forces else None
         values = self._formulas.values if self._formulas else np.zeros(0)
         self._formula_values = np.repeat(values[:, None], self._width, axis=1).astype(self._float)
         self._features: frozenset[str] | None = None
-        self.parameters = Parameters.nominal(robot, count)
-        self.reset(seeds=np.zeros(count, np.uint64), parameters=self.parameters)
-
-    @property
-    def count(self) -> int:
-        """Number of robots."""
-        return self._count
+        self._start()
 
     def _make_pool(self) -> ThreadPoolExecutor | None:
         threads = min(self.options.threads, self._tiles // TILES_PER_THREAD)
@@ -116,65 +95,23 @@ class GibbsAppellPlant:
 
     # ---- parameters and state ----
 
-    def reset(
-        self,
-        seeds: NDArray[np.uint64] | None = None,
-        parameters: Parameters | None = None,
-        mask: NDArray[np.bool_] | None = None,
-        state: PlantState | None = None,
-    ) -> Sensors:
-        """Start robots anew; see :meth:`wlr_gym.plants.base.Plant.reset`."""
-        rows = self._rows(mask)
-        if parameters is not None:
-            self._take_parameters(parameters, rows)
-        start = standing_state(self.robot, self.parameters) if state is None else state
-        self._write_state(start, rows)
-        self._goals.reset(rows, start, self.parameters)
-        tiles = np.unique(rows // self._width)
-        self._kernel.look(self._lanes, self._constants, self._truth.values, self._raw, tiles, self._count, self._step)
-        self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)
-        return self._readings
-
-    def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
-        """Change parameters in mid-run (interval randomisation, drifting friction); the state stays."""
-        rows = self._rows(mask)
-        self._take_parameters(parameters, rows)
-        self._goals.set_delays(rows, self.parameters)
-        self._sensors.set_errors(rows, self.parameters)
-
-    def _rows(self, mask: NDArray[np.bool_] | None) -> NDArray[np.intp]:
-        if mask is None:
-            return np.arange(self._count)
-        if np.shape(mask) != (self._count,):
-            raise InputError(f"mask has shape {np.shape(mask)}, expected ({self._count},)")
-        return np.flatnonzero(mask)
-
-    def _take_parameters(self, parameters: Parameters, rows: NDArray[np.intp]) -> None:
-        if len(parameters) != self._count:
-            raise InputError(f"parameters hold {len(parameters)} robots, the plant {self._count}")
-        chosen = Parameters(parameters.values[rows])
-        chosen.validate()
-        step = self.options.physics_step
-        check_contact_resolution(chosen, step)
-        self._fit_rotors(rows, chosen)
-        self.parameters.values[rows] = chosen.values
-        _scatter(self._constants, self._width, rows, packing.pack(chosen, self.robot, step))
+    def _use_parameters(self, rows: NDArray[np.intp], chosen: Parameters) -> None:
+        _scatter(self._constants, self._width, rows, packing.pack(chosen, self.robot, self.options.physics_step))
         self._pad(self._constants)
         self._choose_kernel()
 
+    def _look(self, rows: NDArray[np.intp]) -> None:
+        tiles = np.unique(rows // self._width)
+        self._kernel.look(self._lanes, self._constants, self._truth.values, self._raw, tiles, self._count, self._step)
+
     def _fit_rotors(self, rows: NDArray[np.intp], chosen: Parameters) -> None:
-        """Keep how far the teeth are pressed together where the gear's play changes; a new rotor turns with its joint."""
         old, new = self.parameters["servo.backlash"][rows], chosen["servo.backlash"]
-        changed = old != new
-        if not changed.any():
+        if (old == new).all():
             return
         lanes = _gather(self._lanes, self._width, rows).astype(np.float64)
-        lead = lanes[:, _ROTOR_LEAD]
-        pressed = np.maximum(np.abs(lead) - 0.5 * old, 0.0)
-        kept = np.where(old > 0.0, np.minimum(np.abs(lead), 0.5 * new) + pressed, 0.0)
-        lanes[:, _ROTOR_LEAD] = np.where(changed, np.where(new > 0.0, np.copysign(kept, lead), 0.0), lead)
+        lanes[:, _ROTOR_LEAD] = refitted_lead(lanes[:, _ROTOR_LEAD], old, new)
         turning = self._truth.joint_velocity[rows]
-        lanes[:, _ROTOR_RATE] = np.where(changed & (old == 0.0), turning, lanes[:, _ROTOR_RATE])
+        lanes[:, _ROTOR_RATE] = np.where((old == 0.0) & (new > 0.0), turning, lanes[:, _ROTOR_RATE])
         _scatter(self._lanes, self._width, rows, lanes)
 
     def _choose_kernel(self) -> None:
@@ -287,19 +224,9 @@ class GibbsAppellPlant:
                 future.result()
         return self._readings
 
-    def _present_goals(self) -> Array:
-        """Goals that keep every joint as it is: leg angles as the servo reads them, wheels at rest."""
-        present = np.zeros((self._count, 8))
-        present[:, :4] = self._truth.joint_position[:, :4] + self.parameters["joint.zero_offset"]
-        return present
-
     def _run(self, arguments: tuple[Array, ...], first: int, last: int) -> None:
         self._kernel.tick(*arguments, first, last, self._count, self._step, self.substeps, self.sweeps)
         self._sensors.measure(self._raw, self._readings.values, first * self._width, min(last * self._width, self._count))
-
-    def truth(self) -> Truth:
-        """Return the true state after the last step or reset; overwritten by the next step."""
-        return self._truth
 
     def close(self) -> None:
         """Stop the worker threads."""
@@ -317,22 +244,3 @@ def _scatter(lanes: Array, width: int, rows: NDArray[np.intp], values: Array) ->
 def _gather(lanes: Array, width: int, rows: NDArray[np.intp]) -> Array:
     tiles, places = np.divmod(rows, width)
     return lanes.reshape(lanes.shape[0], -1, width)[tiles, :, places]
-
-
-def check_contact_resolution(parameters: Parameters, step: float) -> None:
-    """Refuse a contact spring that the step cannot resolve (explicit spring: step^2 k / m well below 4).
-
-    The mass that moves against one wheel's spring is at least about a twentieth of the platform (a light leg swinging up
-    against its own rotor inertia).
-    """
-    stiffness = parameters["ground.normal_stiffness"].max(axis=1)
-    damping = parameters["ground.normal_damping"].max(axis=1)
-    mass = 0.05 * parameters["body.mass"]
-    worst = np.maximum(step * step * stiffness / mass / 2.0, step * damping / mass / 2.0)
-    robot = int(np.argmax(worst))
-    if worst[robot] > 1.0:
-        raise InputError(
-            f"ground.normal_stiffness {stiffness[robot]:g} N/m and ground.normal_damping {damping[robot]:g} N s/m are too "
-            f"stiff for a physics step of {step:g} s and a body of {parameters['body.mass'][robot]:g} kg: shorten physics_step "
-            f"below {step / worst[robot] ** 0.5:.2g} s or soften the contact"
-        )

@@ -11,25 +11,19 @@ from wlr_gym.errors import InputError
 from wlr_gym.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import (
-    SENSOR_LAYOUT,
-    TRUTH_LAYOUT,
     Capabilities,
     PlantOptions,
     PlantState,
     Sensors,
-    Truth,
     check_goals,
     hold_where_off,
-    standing_state,
 )
 from wlr_gym.plants.forces import COORDINATES, INPUTS, Force, compile_forces
-from wlr_gym.plants.gibbs_appell.plant import check_contact_resolution
-from wlr_gym.plants.goals import GoalHistory
 from wlr_gym.plants.mujoco import packing
 from wlr_gym.plants.mujoco.batch import RobotBatch
 from wlr_gym.plants.mujoco.kernel import addresses, load_kernel
 from wlr_gym.plants.mujoco.step import STATE, TICK_SUMS
-from wlr_gym.plants.sensors import RAW_LAYOUT, SensorModel
+from wlr_gym.plants.simulator import Simulator, refitted_lead
 from wlr_gym.robot import Robot
 
 Array = NDArray[np.float64]
@@ -42,7 +36,7 @@ _ROTOR_RATE = np.array([_LANE[f"rotor_rate{j}"] for j in range(8)])
 _SUMS = slice(_LANE[TICK_SUMS[0]], _LANE[TICK_SUMS[-1]] + 1)
 
 
-class MujocoPlant:
+class MujocoPlant(Simulator):
     """Batch of robots in MuJoCo; see :class:`wlr_gym.plants.base.Plant` for the contract.
 
     Same parameters, servo, gear and friction laws, sensors and truth as the Gibbs-Appell plant; rigid-body dynamics, contacts
@@ -61,27 +55,17 @@ class MujocoPlant:
     capabilities = Capabilities("mujoco", has_truth=True, can_set_state=True, real_time=False)
 
     def __init__(self, robot: Robot, count: int = 1, options: PlantOptions | None = None, forces: Sequence[Force] = ()) -> None:
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-            raise InputError(f"number of robots is {count!r}, expected 1 or more")
-        self.robot = robot
-        self.options = options or PlantOptions()
+        super().__init__(robot, count, options)
         if self.options.precision != "float64":
             raise InputError(
                 f"precision '{self.options.precision}': the MuJoCo plant has float64 only "
                 "(in an agent's settings: environment.precision=float64)"
             )
-        self._count = count
-        self.substeps = self.options.substeps
         self._step = self.options.physics_step
         self._batch = RobotBatch(robot, count, self._step, self.options.threads)
         self._state = np.zeros((count, len(STATE)))
         self._lanes = np.zeros((count, len(packing.PARAMETER_LANES)))
         self._inputs = [np.zeros((count, 8)) for _ in range(4)]
-        self._truth = Truth(np.zeros((count, TRUTH_LAYOUT.width)))
-        self._raw = np.zeros((count, RAW_LAYOUT.width))
-        self._readings = Sensors(np.zeros((count, SENSOR_LAYOUT.width)))
-        self._goals = GoalHistory(count, self.options.control_period)
-        self._sensors = SensorModel(robot, self.options, count)
         self._forces = compile_forces(forces) if forces else None
         self._force_inputs = np.zeros((len(INPUTS), count if forces else 1))
         self._force_values = np.repeat(self._forces.values[:, None], count, axis=1) if self._forces else np.zeros((0, 1))
@@ -93,14 +77,7 @@ class MujocoPlant:
             self._generalised.T, batch.applied, batch.armature, batch.gear_bound, batch.pair_margin,
         )  # fmt: skip
         self._table = addresses(flat, (batch.pair_friction, batch.geom_size, batch.geom_pos, batch.geom_quat))
-        self._all = np.arange(count)
-        self.parameters = Parameters.nominal(robot, count)
-        self.reset(seeds=np.zeros(count, np.uint64), parameters=self.parameters)
-
-    @property
-    def count(self) -> int:
-        """Number of robots."""
-        return self._count
+        self._start()
 
     @property
     def model(self) -> object:
@@ -109,57 +86,17 @@ class MujocoPlant:
 
     # ---- parameters and state ----
 
-    def reset(
-        self,
-        seeds: NDArray[np.uint64] | None = None,
-        parameters: Parameters | None = None,
-        mask: NDArray[np.bool_] | None = None,
-        state: PlantState | None = None,
-    ) -> Sensors:
-        """Start robots anew; see :meth:`wlr_gym.plants.base.Plant.reset`."""
-        rows = self._rows(mask)
-        if parameters is not None:
-            self._take_parameters(parameters, rows)
-        start = standing_state(self.robot, self.parameters) if state is None else state
-        self._write_state(start, rows)
-        self._goals.reset(rows, start, self.parameters)
-        self._kernel.observe(self._table, rows, self._truth.values, self._raw)
-        self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)
-        return self._readings
-
-    def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
-        """Change parameters in mid-run (interval randomisation, drifting friction); the state stays."""
-        rows = self._rows(mask)
-        self._take_parameters(parameters, rows)
-        self._goals.set_delays(rows, self.parameters)
-        self._sensors.set_errors(rows, self.parameters)
-
-    def _rows(self, mask: NDArray[np.bool_] | None) -> NDArray[np.intp]:
-        if mask is None:
-            return self._all
-        if np.shape(mask) != (self._count,):
-            raise InputError(f"mask has shape {np.shape(mask)}, expected ({self._count},)")
-        return np.flatnonzero(mask)
-
-    def _take_parameters(self, parameters: Parameters, rows: NDArray[np.intp]) -> None:
-        if len(parameters) != self._count:
-            raise InputError(f"parameters hold {len(parameters)} robots, the plant {self._count}")
-        chosen = Parameters(parameters.values[rows])
-        chosen.validate()
-        check_contact_resolution(chosen, self._step)
-        self._fit_rotors(rows, chosen)
-        self.parameters.values[rows] = chosen.values
+    def _use_parameters(self, rows: NDArray[np.intp], chosen: Parameters) -> None:
         self._lanes[rows] = packing.pack(chosen, self.robot, self._step)
         self._batch.set_parameters(rows, chosen)
 
+    def _look(self, rows: NDArray[np.intp]) -> None:
+        self._kernel.observe(self._table, rows, self._truth.values, self._raw)
+
     def _fit_rotors(self, rows: NDArray[np.intp], chosen: Parameters) -> None:
-        """Keep how far the teeth are pressed together where the gear's play changes; a new rotor turns with its joint."""
         old, new = self.parameters["servo.backlash"][rows], chosen["servo.backlash"]
         cells = np.ix_(rows, _ROTOR_LEAD)
-        lead = self._state[cells]
-        pressed = np.maximum(np.abs(lead) - 0.5 * old, 0.0)
-        kept = np.where(old > 0.0, np.minimum(np.abs(lead), 0.5 * new) + pressed, 0.0)
-        self._state[cells] = np.where(old == new, lead, np.where(new > 0.0, np.copysign(kept, lead), 0.0))
+        self._state[cells] = refitted_lead(self._state[cells], old, new)
         cells = np.ix_(rows, _ROTOR_RATE)
         rates = self._batch.qvel[rows][:, 6 + _JOINT]
         self._state[cells] = np.where((old == 0.0) & (new > 0.0), rates, self._state[cells])
@@ -251,16 +188,6 @@ class MujocoPlant:
             kernel.after(*robots, step)
         kernel.drift(*robots, -0.5 * step)
         kernel.observe(*robots, self._truth.values, self._raw)
-
-    def _present_goals(self) -> Array:
-        """Goals that keep every joint as it is: leg angles as the servo reads them, wheels at rest."""
-        present = np.zeros((self._count, 8))
-        present[:, :4] = self._truth.joint_position[:, :4] + self.parameters["joint.zero_offset"]
-        return present
-
-    def truth(self) -> Truth:
-        """Return the true state after the last step or reset; overwritten by the next step."""
-        return self._truth
 
     def close(self) -> None:
         """Nothing to release."""
