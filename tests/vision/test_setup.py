@@ -1,7 +1,11 @@
 """What is printed and configured: sheets to scale, calibration, target and camera files, frames, commands."""
 
 import json
+import os
 import re
+import signal
+import threading
+import time
 from contextlib import nullcontext
 
 import numpy as np
@@ -10,9 +14,9 @@ import pytest
 from wlr_gym.bench.vision_scene import Look, Patch, Pose, Renderer, rotation_of
 from wlr_gym.cli import main
 from wlr_gym.errors import InputError
-from wlr_gym.vision import Camera, Frame, Sample, calibrate, detect, load_camera, load_target, read_frames, save_camera
+from wlr_gym.vision import Camera, Frame, Frames, Sample, calibrate, detect, film, load_camera, load_target, save_camera
 from wlr_gym.vision.sheets import Board, Box, Disc, board_page, pdf, svg, target_pages
-from wlr_gym.vision.video import AnnotatedVideo
+from wlr_gym.vision.video import AnnotatedVideo, annotate
 
 TRUE = Camera(width=640, height=480, focal=(620.0, 615.0), centre=(325.0, 236.0), distortion=(-0.2, 0.05, 0.001, -0.002, 0.0))
 
@@ -137,44 +141,178 @@ def test_frames_from_a_folder_a_video_and_times(tmp_path):
     images = [np.full((48, 64), 20 * k, np.uint8) for k in range(5)]
     for k, image in enumerate(images):
         cv2.imwrite(str(tmp_path / f"f{k}.png"), image)
-    assert [int(f.image[0, 0]) for f in read_frames(str(tmp_path))] == [0, 20, 40, 60, 80]
-    assert [f.time for f in read_frames(str(tmp_path), rate=10)] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    assert [int(f.image[0, 0]) for f in Frames(str(tmp_path))] == [0, 20, 40, 60, 80]
+    assert [f.time for f in Frames(str(tmp_path), rate=10)] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
     video = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48), False)
     for image in images:
         video.write(image)
     video.release()
-    assert [f.time for f in read_frames(str(tmp_path / "v.avi"))] == pytest.approx([0, 0.04, 0.08, 0.12, 0.16])
+    assert [f.time for f in Frames(str(tmp_path / "v.avi"))] == pytest.approx([0, 0.04, 0.08, 0.12, 0.16])
     times = tmp_path / "times.csv"
     times.write_text("frame,t\n0,1.0\n1,1.1\n2,1.3\n3,1.4\n4,1.5\n")
-    assert [f.time for f in read_frames(str(tmp_path / "v.avi"), times=times)] == [1.0, 1.1, 1.3, 1.4, 1.5]
-    assert len(list(read_frames(str(tmp_path / "v.avi"), times=times, seconds=0.35))) == 3
+    assert [f.time for f in Frames(str(tmp_path / "v.avi"), times=times)] == [1.0, 1.1, 1.3, 1.4, 1.5]
+    assert len(list(Frames(str(tmp_path / "v.avi"), times=times, seconds=0.35))) == 3
     for count in (4, 6):
         times.write_text("\n".join(str(1 + 0.1 * k) for k in range(count)))
         with pytest.raises(InputError, match=f"{count} times, but"):
-            list(read_frames(str(tmp_path / "v.avi"), times=times))
+            list(Frames(str(tmp_path / "v.avi"), times=times))
     times.write_text("t\n1.0\n0.9\n")
     with pytest.raises(InputError, match="times must be finite and increase"):
-        list(read_frames(str(tmp_path / "v.avi"), times=times))
+        list(Frames(str(tmp_path / "v.avi"), times=times))
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(b"not a video")
     with pytest.raises(InputError, match="cannot be read as a video"):
-        list(read_frames(str(broken)))
-    with pytest.raises(InputError, match="no such video, folder of images or camera number"):
-        list(read_frames(str(tmp_path / "nothing.mp4")))
+        list(Frames(str(broken)))
+    with pytest.raises(InputError, match="no such video or folder of images"):
+        list(Frames(str(tmp_path / "nothing.mp4")))
+
+
+@pytest.mark.parametrize(("share", "missing"), [(1.0, 0), (0.5, 20)])
+def test_a_video_that_is_cut_off_is_noticed(share, missing, tmp_path):
+    import cv2
+
+    path = tmp_path / "v.avi"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48), False)
+    for k in range(40):
+        video.write(np.random.default_rng(k).integers(0, 255, (48, 64), np.uint8))
+    video.release()
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    frames = Frames(str(path))
+    assert len(list(frames)) + frames.missing == 40
+    assert frames.missing == pytest.approx(missing, abs=2)
+    shorter = Frames(str(path), seconds=0.2)
+    assert len(list(shorter)) == 6
+    assert shorter.missing == 0
+
+
+NOWHERE = Sample(0, 0.0, "lost", np.full(6, np.nan), np.full((6, 6), np.nan), 0, np.nan, np.full((4, 2), np.nan))
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_an_annotated_video_is_whole_or_what_it_was(fails, tmp_path):
-    nothing = np.full(6, np.nan)
-    sample = Sample(0, 0.0, "lost", nothing, np.full((6, 6), np.nan), 0, np.nan, np.full((4, 2), np.nan))
+@pytest.mark.parametrize("count", [1, 30])
+def test_an_annotated_video_is_whole_or_what_it_was(fails, count, tmp_path):
     path = tmp_path / "annotated.avi"
     path.write_bytes(b"earlier")
-    with pytest.raises(ZeroDivisionError) if fails else nullcontext(), AnnotatedVideo(path, 30.0) as video:
-        video.add(Frame(0, 0.0, np.zeros((48, 64), np.uint8)), sample)
+    with pytest.raises(ZeroDivisionError) if fails else nullcontext(), AnnotatedVideo(path, load_target("body")) as video:
+        for k in range(count):
+            video.add(Frame(k, k / 30, np.zeros((48, 64), np.uint8)), NOWHERE)
         assert path.read_bytes() == b"earlier"
         assert 1 / (not fails)
     assert (path.read_bytes() == b"earlier") == fails
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("rate", [12.5, 29.97, 60.0, 200 / 3])
+@pytest.mark.parametrize("name", ["annotated.avi", "annotated.mp4"])
+def test_an_annotated_video_plays_at_the_cameras_rate(rate, name, tmp_path):
+    import cv2
+
+    with AnnotatedVideo(tmp_path / name, load_target("body")) as video:
+        for k in range(25):
+            video.add(Frame(k, 7.0 + (k + (k > 4)) / rate, np.zeros((48, 64), np.uint8)), NOWHERE)  # the fifth was dropped
+    written = cv2.VideoCapture(str(tmp_path / name))
+    assert written.get(cv2.CAP_PROP_FPS) == pytest.approx(rate, abs=0.01)
+    assert len(list(Frames(str(tmp_path / name)))) == 25
+
+
+@pytest.mark.parametrize("hidden", [None, 0, 3])
+def test_the_arrow_points_where_the_layout_says(hidden):
+    """With the markers in any order, and one hidden."""
+    target = load_target("body")
+    target = target.model_copy(update={"markers": tuple(target.markers[k] for k in (3, 0, 2, 1))})
+    turn = rotation_of(0.7)[:2, :2] * 800 / 2.0
+    centres = np.array([300.0, 240.0]) + target.positions[:, :2] @ turn.T * [1, -1]
+    if hidden is not None:
+        centres[hidden] = np.nan
+    trail: list = []
+    sample = Sample(0, 0.0, "ok", np.full(6, np.nan), np.full((6, 6), np.nan), 4, 0.02, centres)
+    picture = annotate(np.zeros((480, 640), np.uint8), sample, target, trail)
+    assert trail == [(300, 240)]
+    tip = np.array([300.0, 240.0]) + 0.2 * turn[:, 0] * [1, -1]
+    behind = np.array([300.0, 240.0]) - 0.1 * turn[:, 0] * [1, -1]
+    assert picture[round(tip[1]), round(tip[0])].any()
+    assert not picture[round(behind[1]), round(behind[0])].any()
+
+
+class StandIn:
+    """A camera that gives so many frames of a size, then none (or for ever)."""
+
+    def __init__(self, size, count):
+        self.size, self.left, self.released = size, count, False
+
+    def isOpened(self):  # noqa: N802 - OpenCV's names
+        return self.size is not None
+
+    def set(self, *_):
+        return False
+
+    def get(self, _):
+        return 0.0
+
+    def grab(self):
+        time.sleep(0.005)
+        self.left -= 1
+        return self.left >= 0
+
+    def retrieve(self):
+        return True, np.full((self.size[1], self.size[0], 3), self.left % 200, np.uint8)
+
+    def release(self):
+        self.released = True
+
+
+def stand_in(monkeypatch, size, count=10**9):
+    import cv2
+
+    real, device = cv2.VideoCapture, StandIn(size, count)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda source: device if isinstance(source, int) else real(source))
+    return device
+
+
+@pytest.mark.parametrize("ended", ["by time", "by Ctrl-C"])
+def test_a_live_camera_is_filmed_without_loss(ended, monkeypatch, tmp_path):
+    device = stand_in(monkeypatch, (640, 480))
+    if ended == "by Ctrl-C":
+        threading.Timer(0.4, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+    video, times = film(0, tmp_path, TRUE, 0.4 if ended == "by time" else None)
+    frames = list(Frames(str(video), times=times))
+    assert len(frames) > 5
+    shades = np.array([int(f.image.min()) for f in frames])
+    assert set(np.diff(shades) % 200) == {199}  # every frame, in order, as it was
+    assert all(np.ptp(f.image) == 0 for f in frames)
+    assert np.diff([f.time for f in frames]).min() > 0.004
+    assert device.released
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize(
+    ("size", "count", "message", "kept"),
+    [
+        (None, 0, "camera 0: cannot be opened", False),
+        ((640, 480), 0, "camera 0: gave no frame", False),
+        ((320, 240), 9, "320 x 240 px, but the camera was calibrated for 640 x 480", False),
+        ((640, 480), 9, "no more frames .was it unplugged.. after .* 9 frames are kept", True),
+    ],
+    ids=["none", "no frame", "size", "unplugged"],
+)
+def test_a_live_camera_that_fails_is_told(size, count, message, kept, monkeypatch, tmp_path):
+    stand_in(monkeypatch, size, count)
+    with pytest.raises(InputError, match=message):
+        film(0, tmp_path, TRUE)
+    assert {path.name for path in tmp_path.iterdir()} == ({"film.avi", "film.csv"} if kept else set())
+
+
+def test_command_films_before_it_reads_the_run(monkeypatch, tmp_path, capsys):
+    """The run may not be there yet when the film starts; when it never comes, the film is kept."""
+    monkeypatch.chdir(tmp_path)
+    save_camera(tmp_path / "camera.yaml", TRUE)
+    stand_in(monkeypatch, (640, 480))
+    arguments = ["--run", "log/run.csv", "--out", "out", "--camera", "camera.yaml", "--seconds", "0.1"]
+    assert main(["vision", "0", *arguments]) == 2
+    printed = capsys.readouterr()
+    assert "log/run.csv: no such file" in printed.err.replace("\n", "")
+    assert "with --times out/film.csv" in printed.out.replace("\n", "")
+    assert len(list(Frames("out/film.avi", times=tmp_path / "out" / "film.csv"))) > 2
 
 
 def test_command_writes_the_sheets(tmp_path, capsys):

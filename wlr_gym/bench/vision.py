@@ -400,7 +400,7 @@ def measure_drive(drive: Drive, tilt: float = 0.0, look: Look | None = None) -> 
     parameters = Parameters.nominal(drive.robot)
     poses = np.stack([sample.pose for sample in samples])
     found = align(np.array([sample.time for sample in samples]), poses, drive.run, drive.robot, parameters)
-    slip = measure_slip(samples, found.offset, drive.run, drive.robot, parameters)
+    slip = measure_slip(samples, found.offset, drive.run, drive.robot, parameters, found.std)
     error = 1e3 * np.abs(slip.slip - true_slip(drive, slip.time))
     final = 1e3 * (slip.slip[-1] - true_slip(drive, slip.time)[-1])
     largest = 1e3 * np.abs(drive.slip[-1]).max(axis=0)

@@ -28,6 +28,7 @@ TICK, ROW = 0.002, 10
 #: rad/s, rad/s2, rad/s: registers 80, 1 and 15 of the paper's servos; four turns of the driven wheels.
 PAPER_SPEED, PAPER_ACCELERATION, PAPER_LEG_SPEED = 1.918474, 0.374508, 0.359712
 _REST = 1.0
+_SETTLING = 1.0  # s before the log starts: legs and tyres take the weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +107,9 @@ def _drive(
 
     plant = make_plant("gibbs_appell", robot, 1, PlantOptions(control_period=TICK, physics_step=0.001))
     sensors = plant.reset(np.array([7], np.uint64), parameters, state=_start(robot, parameters, legs, x))
+    for _ in range(int(_SETTLING / TICK)):
+        leg_goals, wheel_goals = goals(0.0)
+        sensors = plant.step(np.array([[*leg_goals, *wheel_goals]]), torque_on[None])
     count = int(duration / TICK)
     rows: list[dict[str, float]] = []
     truths, slips = [], np.zeros((count + 1, 4, 2))

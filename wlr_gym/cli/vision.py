@@ -1,12 +1,13 @@
 """Measure pose and slip from a video of the robot with ring markers; writes run columns cam_*, a slip table, plots, a video.
 
 Writes the run with cam_* columns, slip.csv (per row), frames.csv (per frame), summary.json, pose.png, slip.png, annotated.mp4.
+A live camera (its number) is filmed first, to film.avi and film.csv, until Ctrl-C; the run is read after that.
 """
 
 from __future__ import annotations
 
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,8 +28,8 @@ class Options:
     """Video to pose and slip.
 
     Attributes:
-        video: video file, folder of images, or number of a live camera (Ctrl-C ends it).
-        run: what the robot logged meanwhile (CSV or Parquet).
+        video: video file, folder of images, or number of a live camera: filmed until Ctrl-C, or --seconds.
+        run: what the robot logged meanwhile (CSV or Parquet); with a live camera it may appear while it films.
         out: folder for the results; made if it is not there.
         camera: calibration file; make one with: wlr calibrate camera.
         markers: markers on the robot: name in configs/vision/ or path.
@@ -75,7 +76,8 @@ def run(options: Options) -> int:
 
     if options.rate is not None and not options.rate > 0:
         raise InputError(f"--rate {options.rate:g}: expected more than 0")
-    measured = read_run(options.run)
+    live = options.video.isdigit() and not Path(options.video).exists()
+    measured = None if live else read_run(options.run)
     camera, body, floor = load_camera(options.camera), load_target(options.markers), load_target(options.floor)
     if options.out.resolve() == options.run.resolve().parent:
         raise InputError(f"--out {options.out}: is the run's own folder; the run would be overwritten")
@@ -83,9 +85,12 @@ def run(options: Options) -> int:
     make_output_folder(options.out)
     console = Console(highlight=False, soft_wrap=True)
     try:
-        analysis = _analyse(options, measured, camera, body, floor, console)
+        if live:
+            options = _filmed(options, camera, console)
+            fresh = False  # the film stays, whatever comes
+        analysis = _analyse(options, measured or read_run(options.run), camera, body, floor, console)
     except BaseException:
-        if fresh:  # a refusal leaves no folder behind
+        if fresh and not (options.out / "film.avi").exists():  # a refusal leaves no folder behind
             shutil.rmtree(options.out, ignore_errors=True)
         raise
     paths = save(analysis, options.out)
@@ -96,14 +101,27 @@ def run(options: Options) -> int:
     return OK
 
 
+def _filmed(options: Options, camera: Camera, console: Console) -> Options:
+    """Film, and say how to analyse the film (again); returns the options for that."""
+    from wlr_gym.vision import film
+
+    if options.times is not None or options.rate is not None:
+        raise InputError("--times, --rate: a live camera's frames have the times at which they come")
+    end = "Ctrl-C ends it" if options.seconds is None else f"{options.seconds:g} s"
+    console.print(f"filming with camera {options.video}; {end}")
+    video, times = film(int(options.video), options.out, camera, options.seconds)
+    console.print(f"filmed: {video}; to analyse it again, give it in place of the camera's number, with --times {times}")
+    return replace(options, video=str(video), times=times)
+
+
 def _analyse(options: Options, measured: Run, camera: Camera, body: Target, floor: Target, console: Console) -> Analysis:
     from contextlib import nullcontext
 
-    from wlr_gym.vision import analyse, read_frames
+    from wlr_gym.vision import Frames, analyse
     from wlr_gym.vision.video import AnnotatedVideo
 
-    frames = read_frames(options.video, options.rate, options.times, options.seconds)
-    writer = AnnotatedVideo(options.out / "annotated.mp4", options.rate or 30.0) if options.annotate else nullcontext()
+    frames = Frames(options.video, options.rate, options.times, options.seconds)
+    writer = AnnotatedVideo(options.out / "annotated.mp4", body) if options.annotate else nullcontext()
     with writer as video, console.status("tracking") as status:
 
         def watch(frame: Frame, sample: Sample) -> None:
@@ -130,16 +148,16 @@ def _print(analysis: Analysis, console: Console) -> None:
     table = Table(
         title=f"Slip over {found['seconds']:.1f} s, mm ± 1 sigma", title_justify="left", title_style="bold", box=box.SIMPLE
     )
-    for heading in ("wheel", "longitudinal", "± from radius", "lateral"):
+    for heading in ("wheel", "longitudinal", "± from radius", "lateral", "both ± from layout"):
         table.add_column(heading, justify="left" if heading == "wheel" else "right")
     for wheel, w in found["wheels"].items():
         table.add_row(
             wheel, f"{1e3 * w['longitudinal_slip_m']:+.2f} ± {1e3 * w['longitudinal_std_m']:.2f}",
             f"{1e3 * w['longitudinal_std_from_radius_m']:.2f}",
-            f"{1e3 * w['lateral_slip_m']:+.2f} ± {1e3 * w['lateral_std_m']:.2f}",
+            f"{1e3 * w['lateral_slip_m']:+.2f} ± {1e3 * w['lateral_std_m']:.2f}", f"{1e3 * w['std_from_layout_m']:.2f}",
         )  # fmt: skip
     body = (f"{1e3 * found[f'body_{axis}_slip_m']:+.2f}" for axis in ("longitudinal", "lateral"))
     longitudinal, lateral = body
-    table.add_row("body (mean)", longitudinal, "", lateral)
+    table.add_row("body", longitudinal, "", lateral, "")
     console.print(table)
     console.print(f"share of the predicted path that ignoring slip gets wrong: {100 * found['no_slip_error']:.2f} %")

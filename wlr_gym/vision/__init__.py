@@ -1,6 +1,6 @@
 """Vision: pose and slip of the robot from ring markers in a video. How to use it: ``docs/vision.md``.
 
-``load_camera``, ``load_target``, ``read_frames`` and ``analyse`` take a video to run columns and a slip table; ``detect``,
+``load_camera``, ``load_target``, ``Frames`` and ``analyse`` take a video to run columns and a slip table; ``detect``,
 ``find_target`` and ``Tracker`` are the steps in between.
 """
 
@@ -12,12 +12,13 @@ from wlr_gym.vision.align import Alignment, align  # noqa: E402
 from wlr_gym.vision.analyse import Analysis, analyse, save  # noqa: E402
 from wlr_gym.vision.camera import Camera, calibrate, load_camera, save_camera  # noqa: E402
 from wlr_gym.vision.detect import Detection, detect  # noqa: E402
+from wlr_gym.vision.live import film  # noqa: E402
 from wlr_gym.vision.paper import paper_pose  # noqa: E402
 from wlr_gym.vision.pose import TargetPose, find_target  # noqa: E402
 from wlr_gym.vision.slip import SlipResult, measure_slip  # noqa: E402
 from wlr_gym.vision.targets import Marker, Target, load_target  # noqa: E402
 from wlr_gym.vision.track import Frame, Sample, Tracker, locate_floor, track  # noqa: E402
-from wlr_gym.vision.video import read_frames  # noqa: E402
+from wlr_gym.vision.video import Frames  # noqa: E402
 
 __all__ = [
     "Alignment",
@@ -25,6 +26,7 @@ __all__ = [
     "Camera",
     "Detection",
     "Frame",
+    "Frames",
     "Marker",
     "Sample",
     "SlipResult",
@@ -35,13 +37,13 @@ __all__ = [
     "analyse",
     "calibrate",
     "detect",
+    "film",
     "find_target",
     "load_camera",
     "load_target",
     "locate_floor",
     "measure_slip",
     "paper_pose",
-    "read_frames",
     "save",
     "save_camera",
     "track",

@@ -25,6 +25,7 @@ from wlr_gym.vision.camera import Camera
 from wlr_gym.vision.slip import SlipResult, measure_slip, smoothed_poses
 from wlr_gym.vision.targets import Target
 from wlr_gym.vision.track import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, Frame, Sample, track
+from wlr_gym.vision.video import Frames
 
 if TYPE_CHECKING:
     import pandas
@@ -50,7 +51,7 @@ class Analysis:
         run: with the columns ``cam_*``. samples: one per frame. alignment: None when the offset was given.
         offset: servo time = camera time + offset, s. slip: per row. robot: geometry used. origin: of the ``cam_*`` columns.
         height_error: m, body height by the camera minus that by the legs, median: shows a wrong print scale.
-        findings: what is odd, in words.
+        missing_frames: that the video announces but that could not be decoded. findings: what is odd, in words.
     """
 
     run: Run
@@ -61,6 +62,7 @@ class Analysis:
     robot: Robot
     origin: str
     height_error: float
+    missing_frames: int
     findings: tuple[str, ...]
 
     def summary(self) -> dict[str, Any]:
@@ -72,11 +74,13 @@ class Analysis:
                 "longitudinal_slip_m": float(slip.slip[-1, w, 0]), "longitudinal_std_m": float(slip.slip_std[-1, w, 0]),
                 "longitudinal_std_from_radius_m": float(slip.slip_radius_std[-1, w]),
                 "lateral_slip_m": float(slip.slip[-1, w, 1]), "lateral_std_m": float(slip.slip_std[-1, w, 1]),
+                "std_from_layout_m": float(slip.slip_layout_std[-1, w]),
             }
             for w, wheel in enumerate(WHEELS)
         }  # fmt: skip
         return {
             "frames": len(self.samples),
+            "missing_frames": self.missing_frames,
             "status": {name: counts.get(name, 0) for name in (OK, PARTIAL, LOST, MOVED, IMPOSSIBLE)},
             "outliers": int(slip.outliers.sum()),
             "median_residual_px": float(np.median(residuals)),
@@ -133,13 +137,15 @@ def analyse(
         time, poses = np.array([s.time for s in samples]), np.stack([s.pose for s in samples])
         alignment = align(time, poses, run, found, parameters, around)
         offset = alignment.offset
-    slip = measure_slip(samples, offset, run, found, parameters)
+    known = alignment.std if alignment else 0.0
+    slip = measure_slip(samples, offset, run, found, parameters, known, body.layout_std)
     table = camera_columns(samples, offset, run, origin, slip.outliers)
     measured = Run(table, run.meta, run.path, run.findings)
     legs = joint_signals(run, slip.time, found)[0][:, :4] - parameters["joint.zero_offset"]
     height_error = float(np.median(slip.pose[:, 2] - rest_pose(parameters, legs)[:, 0]))
-    findings = tuple(_findings(samples, slip, height_error))
-    return Analysis(measured, samples, alignment, offset, slip, found, origin, height_error, findings)
+    missing = frames.missing if isinstance(frames, Frames) else 0
+    findings = tuple(_findings(samples, slip, height_error, missing))
+    return Analysis(measured, samples, alignment, offset, slip, found, origin, height_error, missing, findings)
 
 
 def camera_columns(
@@ -156,7 +162,7 @@ def camera_columns(
     time = np.array([s.time for s in kept]) + offset
     poses = np.stack([s.pose for s in kept])
     poses[:, 3] = np.unwrap(poses[:, 3])
-    rates = smoothed_poses(kept, time, time)[1]
+    rates = np.stack([signal.rate for signal in smoothed_poses(kept, time, time)[0]], axis=1)
     marker = np.asarray(run.meta.marker_offset)
     place = poses[:, :3] + np.einsum("nij,j->ni", rotation(*poses[:, 3:].T), marker)
     columns = {name: np.full(len(t), np.nan) for name in ("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch")}
@@ -219,6 +225,14 @@ def _observed(
         yield sample
 
 
+def missing_frames(missing: int, decoded: int) -> str:
+    """Say that a video is not whole."""
+    return (
+        f"the video is cut off or damaged: it announces {missing + decoded} frames, of which {decoded} could be decoded; what "
+        "the others show is not in the results"
+    )
+
+
 def _from_start(values: Array, time: Array) -> Array:
     """x, y, yaw (F, 3) in the frame of the mean pose over the first moments."""
     x, y, yaw = values[time <= time[0] + _START].mean(axis=0)
@@ -227,8 +241,10 @@ def _from_start(values: Array, time: Array) -> Array:
     return np.column_stack([c * dx + s * dy, c * dy - s * dx, values[:, 2] - yaw])
 
 
-def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float) -> Iterator[str]:
+def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, missing: int = 0) -> Iterator[str]:
     counts = Counter(sample.status for sample in samples)
+    if missing:
+        yield missing_frames(missing, len(samples))
     if counts[MOVED]:
         first = next(sample for sample in samples if sample.status == MOVED)
         yield f"the camera moved: {counts[MOVED]} frames from {first.index} on ({first.time:.2f} s) have no pose"
@@ -301,14 +317,15 @@ def _draw_slip(analysis: Analysis) -> Any:
     slip = analysis.slip
     for w, (wheel, colour) in enumerate(zip(WHEELS, _WHEEL_COLOURS, strict=True)):
         for axes, a in ((panels[0], 0), (panels[1], 1)):
-            spread = np.hypot(slip.slip_std[:, w, a], slip.slip_radius_std[:, w] if a == 0 else 0.0)
+            spread = np.hypot(slip.slip_std[:, w, a], slip.slip_layout_std[:, w])
+            spread = np.hypot(spread, slip.slip_radius_std[:, w]) if a == 0 else spread
             axes.plot(slip.time, 1e3 * slip.slip[:, w, a], color=colour, linewidth=1.2, label=wheel)
             axes.fill_between(slip.time, 1e3 * (slip.slip[:, w, a] - 2 * spread), 1e3 * (slip.slip[:, w, a] + 2 * spread),
                               color=colour, alpha=0.12, linewidth=0)  # fmt: skip
         panels[2].plot(slip.time, slip.ratio[:, w], color=colour, linewidth=0.9)
     titles = (
-        ("accumulated longitudinal slip (+ skids forward, - spins); band: 2 sigma with the wheel radius' tolerance", "mm"),
-        ("accumulated lateral slip (+ to the left)", "mm"),
+        ("accumulated longitudinal slip (+ skids forward, - spins); band: 2 sigma with wheel radius and marker layout", "mm"),
+        ("accumulated lateral slip (+ to the left); band: 2 sigma with marker layout", "mm"),
         ("slip ratio (0 rolls freely, +1 spins on the spot, -1 locked)", "-"),
     )
     for axes, (title, unit) in zip(panels, titles, strict=True):

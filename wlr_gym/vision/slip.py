@@ -1,14 +1,18 @@
 """Slip of every wheel and of the body from the camera's poses and the encoders, with uncertainty.
 
 Poses and joint angles are smoothed onto the run's rows; their rates give each wheel's slip velocity by :mod:`wlr_gym.slip`.
-Two kinds of error are kept apart: random ones (camera, encoders), which the covariances give, and that of the wheels' radius
-(``tolerances`` of the robot file), which grows with the distance rolled and dominates long drives.
+
+Three kinds of error are kept apart. Random ones: motions that the frames allow as well are drawn (their noise with its
+covariance, the smoother's lag behind the motion, the offset of the clocks), and the spread of their slip is taken; so heading
+errors that turn the way driven sideways, and tilts that move the contacts, are in it. That of the wheels' radius
+(``tolerances`` of the robot file), and that of the layout of the markers on the body (its scale and heading): both grow with
+the distance driven and dominate long drives.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,12 +21,12 @@ from numpy.typing import NDArray
 
 from wlr_gym.errors import InputError
 from wlr_gym.parameters import Parameters
-from wlr_gym.robot import CORNER_SIGNS, WHEELS, Robot
+from wlr_gym.robot import WHEELS, Robot
 from wlr_gym.runs.anchor import quaternion, rotation
 from wlr_gym.runs.read import Run
 from wlr_gym.slip import accumulate, contact_slip_velocity, no_slip_error, rolling_speed, slip_angle, slip_ratio
 from wlr_gym.vision.align import joint_signals, repeated
-from wlr_gym.vision.smooth import smooth
+from wlr_gym.vision.smooth import Smoothed, draw_error, smooth
 from wlr_gym.vision.track import Sample
 
 if TYPE_CHECKING:
@@ -34,6 +38,8 @@ Array = NDArray[np.float64]
 LONGEST_GAP = 0.15
 #: Deviations from its neighbours (m, rad) from which on a pose can be an outlier.
 _JUMP = (0.01, 0.01, 0.01, 0.03, 0.05, 0.05)
+_DRAWS = 64  # of the motion: 1 sigma is known to 9 %
+_ENCODER_PACE = 10.0  # 1/s; an encoder's error changes over about five ticks
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +52,7 @@ class SlipResult:
         slip_velocity: (K, 4, 2) m/s of each wheel's contact along its heading and to its left; slip_velocity_std: 1 sigma.
         slip: (K, 4, 2) m, slip velocity accumulated from the first row. slip_std: 1 sigma, random errors.
         slip_radius_std: (K, 4) m, 1 sigma of the longitudinal slip from the wheel radius.
+        slip_layout_std: (K, 4) m, 1 sigma of either from the places of the markers on the body.
         ratio, angle: (K, 4) slip ratio and angle (rad).
         no_slip_error: share of the predicted path that ignoring slip gets wrong (the paper's measure).
         covered: (K,) False where no frame with a pose is near.
@@ -61,6 +68,7 @@ class SlipResult:
     slip: Array
     slip_std: Array
     slip_radius_std: Array
+    slip_layout_std: Array
     ratio: Array
     angle: Array
     no_slip_error: float
@@ -86,18 +94,28 @@ class SlipResult:
                 columns[f"slip_{axis}_{wheel}"] = self.slip[:, w, a]
                 columns[f"slip_{axis}_std_{wheel}"] = self.slip_std[:, w, a]
             columns[f"slip_longitudinal_radius_std_{wheel}"] = self.slip_radius_std[:, w]
+            columns[f"slip_layout_std_{wheel}"] = self.slip_layout_std[:, w]
             columns |= {f"slip_ratio_{wheel}": self.ratio[:, w], f"slip_angle_{wheel}": self.angle[:, w]}
         columns |= {"slip_longitudinal_body": self.body_slip[:, 0], "slip_lateral_body": self.body_slip[:, 1]}
         columns["covered"] = self.covered.astype(float)
         return pandas.DataFrame(columns)
 
 
-def measure_slip(samples: Sequence[Sample], offset: float, run: Run, robot: Robot, parameters: Parameters) -> SlipResult:
+def measure_slip(
+    samples: Sequence[Sample],
+    offset: float,
+    run: Run,
+    robot: Robot,
+    parameters: Parameters,
+    offset_std: float = 0.0,
+    layout_std: float = 0.0,
+) -> SlipResult:
     """Slip of a run from the samples of its video.
 
     Args:
-        samples: of :func:`wlr_gym.vision.track.track`. offset: servo time = camera time + offset, s.
+        samples: of :func:`wlr_gym.vision.track.track`. offset: servo time = camera time + offset, s; offset_std: 1 sigma.
         run: encoders. robot: encoder counts, radius tolerance. parameters: (1) geometry.
+        layout_std: 1 sigma of the body target's scale and heading (:attr:`wlr_gym.vision.targets.Target.layout_std`).
 
     Raises:
         InputError: fewer than 10 rows of the run lie within the video.
@@ -112,47 +130,90 @@ def measure_slip(samples: Sequence[Sample], offset: float, run: Run, robot: Robo
             f"{run.path}: {len(rows)} rows lie within the video, which covers {time[seen][0]:.2f} to {time[seen][-1]:.2f} s of "
             "the run's clock; does it belong to this run?"
         )
-    value, rate, value_std, rate_std, outliers = smoothed_poses(samples, time, rows)
+    signals, outliers = smoothed_poses(samples, time, rows)
+    value, rate, value_std = (np.stack([getattr(f, name) for f in signals], 1) for name in ("value", "rate", "value_std"))
     joints = joint_signals(run, rows, robot)
-    angle = joints[0].copy()
-    angle[:, :4] -= parameters["joint.zero_offset"]
+    joints[0][:, :4] -= parameters["joint.zero_offset"]
     batch = repeated(parameters, len(rows))
-    yaw, pitch, roll = value[:, 3], value[:, 4], value[:, 5]
-    turn = rotation(yaw, pitch, roll)
-    linear = np.einsum("nji,nj->ni", turn, rate[:, :3])
-    angular = _body_rates(pitch, roll, rate[:, 3:])
-    attitude = quaternion(yaw, pitch, roll)
-    velocity = contact_slip_velocity(batch, attitude, linear, angular, angle, joints[1])
-    rolling = rolling_speed(batch, angular, joints[1])
+    velocity, rolling, no_slip_speed = _contacts(value, rate, joints, batch)
     travel = velocity[:, :, 0] + rolling
-    predicted = contact_slip_velocity(batch, attitude, np.zeros_like(linear), angular, angle, joints[1])
-    no_slip_speed = -predicted[:, :, 0].mean(axis=1)
-    heading_speed = rate[:, 0] * np.cos(yaw) + rate[:, 1] * np.sin(yaw)
-    covered = np.abs(rows[:, None] - time[seen][None]).min(axis=1) < LONGEST_GAP
-    contact = _contact_offsets(batch, angle)
-    velocity_std, slip_std = _uncertainty(value_std, rate_std, contact, value, robot, parameters)
+    heading_speed = rate[:, 0] * np.cos(value[:, 3]) + rate[:, 1] * np.sin(value[:, 3])
+    slip = accumulate(velocity, rows)
+    encoder = _encoder_variance(joints[0], robot, parameters)
+    velocity_std, slip_std = np.zeros_like(velocity), np.zeros_like(slip)
+    for change, turn in _drawn_motions(samples, outliers, time, rows, signals, offset_std):
+        drawn = _contacts(value + change, rate + turn, joints, batch)[0]
+        velocity_std += (drawn - velocity) ** 2 / _DRAWS
+        slip_std += (accumulate(drawn, rows) - slip) ** 2 / _DRAWS
+    velocity_std[:, :, 0] += _ENCODER_PACE**2 * encoder
+    slip_std[:, :, 0] += encoder + encoder[0]
     tolerance = robot.tolerances.get("wheel.radius", 0.0)
     share = tolerance if isinstance(tolerance, float) else 0.0
+    side_speed = rate[:, 1] * np.cos(value[:, 3]) - rate[:, 0] * np.sin(value[:, 3])
+    way = np.hypot(accumulate(heading_speed, rows), accumulate(side_speed, rows))  # wrong scales err along it, headings across
     return SlipResult(
         time=rows,
         pose=value,
         pose_std=value_std,
         rate=rate,
         slip_velocity=velocity,
-        slip_velocity_std=velocity_std,
-        slip=accumulate(velocity, rows),
-        slip_std=slip_std,
+        slip_velocity_std=np.sqrt(velocity_std),
+        slip=slip,
+        slip_std=np.sqrt(slip_std),
         slip_radius_std=share * np.abs(accumulate(rolling, rows)),
+        slip_layout_std=np.repeat(layout_std * way[:, None], 4, axis=1),
         ratio=slip_ratio(travel, rolling),
         angle=slip_angle(travel, velocity[:, :, 1]),
         no_slip_error=float(no_slip_error(accumulate(heading_speed, rows)[-1], accumulate(no_slip_speed, rows)[-1])),
-        covered=covered,
+        covered=np.abs(rows[:, None] - time[seen][None]).min(axis=1) < LONGEST_GAP,
         outliers=outliers,
     )
 
 
-def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
-    """Poses, rates and 1 sigma of both, each (K, 6), at the times ``at``; and which samples are outliers (F,)."""
+def _contacts(value: Array, rate: Array, joints: tuple[Array, Array], batch: Parameters) -> tuple[Array, Array, Array]:
+    """Slip velocity (K, 4, 2) and rolling speed (K, 4) of the wheels; and the body's speed (K,) if none of them slipped."""
+    yaw, pitch, roll = value[:, 3:].T
+    linear = np.einsum("nji,nj->ni", rotation(yaw, pitch, roll), rate[:, :3])
+    angular = _body_rates(pitch, roll, rate[:, 3:])
+    attitude = quaternion(yaw, pitch, roll)
+    velocity = contact_slip_velocity(batch, attitude, linear, angular, *joints)
+    predicted = contact_slip_velocity(batch, attitude, np.zeros_like(linear), angular, *joints)
+    return velocity, rolling_speed(batch, angular, joints[1]), -predicted[:, :, 0].mean(axis=1)
+
+
+def _encoder_variance(angle: Array, robot: Robot, parameters: Parameters) -> Array:
+    """Variance (K, 4) in m2 of a contact's place along its heading: a wheel's count at its rim, a leg's at hip height."""
+    radius = parameters["wheel.radius"]
+    height = parameters["leg.length"] * np.sin(angle[:, :4]) + radius
+    return (radius**2 + height**2) * robot.sensors.encoder.position**2 / 12
+
+
+def _drawn_motions(
+    samples: Sequence[Sample],
+    outliers: NDArray[np.bool_],
+    time: Array,
+    rows: Array,
+    signals: Sequence[Smoothed],
+    offset_std: float,
+) -> Iterator[tuple[Array, Array]]:
+    """Yield errors of pose and rates, both (K, 6), as likely as the frames' noise and the clocks' offset make them."""
+    covariances = np.stack([sample.covariance for sample in samples])
+    covariances[outliers] = np.nan
+    known = np.isfinite(covariances[:, 0, 0])
+    roots, noise = np.linalg.cholesky(covariances[known]), np.full((len(samples), 6), np.nan)
+    std = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    rate = np.stack([signal.rate for signal in signals], axis=1)
+    acceleration = np.gradient(rate, rows, axis=0)
+    rng = np.random.default_rng(0)
+    for _ in range(_DRAWS):
+        noise[known] = np.einsum("nij,nj->ni", roots, rng.standard_normal((len(roots), 6)))
+        drawn = [draw_error(time, noise[:, k], std[:, k], rows, signals[k].density, rng) for k in range(6)]
+        late = offset_std * rng.standard_normal()
+        yield np.stack([d[0] for d in drawn], 1) + late * rate, np.stack([d[1] for d in drawn], 1) + late * acceleration
+
+
+def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> tuple[list[Smoothed], NDArray[np.bool_]]:
+    """Each of the six coordinates at the times ``at`` (K,), and which samples are outliers (F,)."""
     poses = np.stack([sample.pose for sample in samples])
     std = np.sqrt(np.stack([np.diag(sample.covariance) for sample in samples]))
     known = np.isfinite(poses[:, 3])
@@ -161,9 +222,7 @@ def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> tuple[A
     for k in range(6):
         outliers |= smooth(time, poses[:, k], std[:, k], time[:1], _JUMP[k]).outliers
     poses[outliers] = np.nan
-    found = [smooth(time, poses[:, k], std[:, k], at) for k in range(6)]
-    columns = (np.stack([getattr(f, name) for f in found], axis=1) for name in ("value", "rate", "value_std", "rate_std"))
-    return (*columns, outliers)  # type: ignore[return-value]
+    return [smooth(time, poses[:, k], std[:, k], at) for k in range(6)], outliers
 
 
 def _body_rates(pitch: Array, roll: Array, rates: Array) -> Array:
@@ -173,33 +232,3 @@ def _body_rates(pitch: Array, roll: Array, rates: Array) -> Array:
     y = pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll)
     z = yaw_rate * np.cos(pitch) * np.cos(roll) - pitch_rate * np.sin(roll)
     return np.stack([x, y, z], axis=1)
-
-
-def _contact_offsets(parameters: Parameters, angle: Array) -> Array:
-    """Places (K, 4, 2) of the wheels in the body frame, x and y."""
-    signs = np.array(CORNER_SIGNS)
-    hip = parameters["hip.position"][:, None, :2] * signs
-    reach = parameters["leg.length"] * np.cos(angle[:, :4])
-    return hip + np.stack([reach, np.zeros_like(reach)], axis=-1)
-
-
-def _uncertainty(
-    value_std: Array, rate_std: Array, contact: Array, value: Array, robot: Robot, parameters: Parameters
-) -> tuple[Array, Array]:
-    """1 sigma of slip velocity and of accumulated slip, both (K, 4, 2), from camera and encoders.
-
-    A contact at (x, y) moves by the body's shift and by (-y, x) times its turn; the encoder adds a count's error at the rim.
-    Accumulated slip has the error of the present and of the first pose; a heading error turns the way driven sideways.
-    """
-    arm = np.abs(contact[:, :, ::-1])
-    plane = np.hypot(value_std[:, 0], value_std[:, 1]) / math.sqrt(2)
-    speed = np.hypot(rate_std[:, 0], rate_std[:, 1]) / math.sqrt(2)
-    rim = parameters["wheel.radius"][0] * robot.sensors.encoder.position / math.sqrt(12)
-    encoder = np.stack([rim, np.zeros(4)], axis=-1)
-    pace = 10.0  # 1/s: an encoder's error changes over about five ticks
-    velocity = speed[:, None, None] ** 2 + (arm * rate_std[:, 3, None, None]) ** 2 + (pace * encoder) ** 2
-    now = plane[:, None, None] ** 2 + (arm * value_std[:, 3, None, None]) ** 2 + encoder**2
-    way = np.hypot(value[:, 0] - value[0, 0], value[:, 1] - value[0, 1])
-    sideways = np.zeros_like(now)
-    sideways[:, :, 1] = (way * value_std[:, 3])[:, None] ** 2
-    return np.sqrt(velocity), np.sqrt(now + now[:1] + sideways)

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 _DENSITIES = np.arange(-6.0, 8.1, 0.5)
 _GATE = 100.0  # squared deviations from the prediction, in its variance
 _MOST_REJECTED = 4  # in a row; then the signal has really jumped
+#: Root of the covariance of value, rate and acceleration after a unit step of unit white jerk.
+_JERK_ROOT = np.linalg.cholesky(np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +33,7 @@ class Smoothed:
     Attributes:
         value, rate: (K,). value_std, rate_std: 1 sigma.
         outliers: (T,) samples left out.
+        density: spectral density of the jerk that was found, unit^2/s^5.
     """
 
     value: Array
@@ -38,6 +41,7 @@ class Smoothed:
     value_std: Array
     rate_std: Array
     outliers: NDArray[np.bool_]
+    density: float
 
 
 def smooth(time: ArrayLike, values: ArrayLike, std: ArrayLike | float, at: ArrayLike, jump: float = math.inf) -> Smoothed:
@@ -58,24 +62,69 @@ def smooth(time: ArrayLike, values: ArrayLike, std: ArrayLike | float, at: Array
     t, z = time[known], values[known]
     variance = np.broadcast_to(np.asarray(std, np.float64), values.shape)[known] ** 2
     middle = z.mean()
-    merged = np.concatenate([t, at])
-    order = np.argsort(merged, kind="stable")
-    moments = merged[order]
-    inputs = np.concatenate([z - middle, np.full(len(at), np.nan)])[order]
-    noise = np.concatenate([variance, np.ones(len(at))])[order]
-    rejected = np.zeros(len(moments), np.bool_)
-    states, spreads = np.empty((len(moments), 3)), np.empty((len(moments), 3, 3))
-    none = np.empty((0, 3))
-    likelihood = [_filter(t, z - middle, variance, 10.0**q, jump, rejected[: len(t)], none, spreads[:0]) for q in _DENSITIES]
+    rejected, none, spreads = np.zeros(len(t), np.bool_), np.empty((0, 3)), np.empty((0, 3, 3))
+    likelihood = [_filter(t, z - middle, variance, 10.0**q, jump, rejected, none, spreads) for q in _DENSITIES]
     density = 10.0 ** _DENSITIES[int(np.argmax(likelihood))]
+    moments, order, places = _merged(t, at)
+    rejected = np.zeros(len(moments), np.bool_)
+    states, spreads = _smoothed(moments, order, z - middle, variance, density, jump, rejected)
+    rows, outliers = places[len(t) :], np.zeros(len(time), np.bool_)
+    outliers[np.flatnonzero(known)] = rejected[places[: len(t)]]
+    deviations = np.sqrt(np.maximum(spreads[rows][:, [0, 1], [0, 1]], 0.0))
+    return Smoothed(states[rows, 0] + middle, states[rows, 1], deviations[:, 0], deviations[:, 1], outliers, density)
+
+
+def draw_error(
+    time: Array, noise: Array, std: Array, at: Array, density: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Draw one error of value and rate, both (K,), as :func:`smooth` makes them: right from one moment to the next.
+
+    A motion of the model is drawn, seen through the noise, and smoothed; the error is what comes out minus what went in.
+
+    Args:
+        time: (T,) s. noise: (T,) one draw of the samples' noise, NaN = no sample. std: (T,) 1 sigma that the smoother assumes.
+        at: (K,) s. density: of the jerk, found by :func:`smooth`. rng: of the motion.
+    """
+    known = np.isfinite(noise)
+    count = int(known.sum())
+    moments, order, places = _merged(time[known], at)
+    motion = np.empty((len(moments), 3))
+    _move(moments, density, _JERK_ROOT, rng.standard_normal((len(moments), 3)), motion)
+    seen = motion[places[:count], 0] + noise[known]
+    states, _ = _smoothed(moments, order, seen, std[known] ** 2, density, math.inf, np.zeros(len(moments), np.bool_))
+    error = (states - motion)[places[count:]]
+    return error[:, 0], error[:, 1]
+
+
+def _merged(time: Array, at: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Times of samples and results in order; the order; and at which place in it each sample, then each result, is."""
+    merged = np.concatenate([time, at])
+    order = np.argsort(merged, kind="stable")
+    return merged[order], order, np.argsort(order, kind="stable")
+
+
+def _smoothed(
+    moments: Array, order: NDArray[np.int64], values: Array, variance: Array, density: float, jump: float, rejected: Any
+) -> tuple[Array, Array]:
+    """Smoothed states (., 3) and covariances at all moments; ``rejected`` is written."""
+    others = len(moments) - len(values)
+    inputs, noise = np.concatenate([values, np.full(others, np.nan)])[order], np.concatenate([variance, np.ones(others)])[order]
+    states, spreads = np.empty((len(moments), 3)), np.empty((len(moments), 3, 3))
     _filter(moments, inputs, noise, density, jump, rejected, states, spreads)
     _smooth_back(moments, density, states, spreads)
-    back = np.empty(len(order), np.int64)
-    back[order] = np.arange(len(order))
-    rows, outliers = back[len(t) :], np.zeros(len(time), np.bool_)
-    outliers[np.flatnonzero(known)] = rejected[back[: len(t)]]
-    deviations = np.sqrt(np.maximum(spreads[rows][:, [0, 1], [0, 1]], 0.0))
-    return Smoothed(states[rows, 0] + middle, states[rows, 1], deviations[:, 0], deviations[:, 1], outliers)
+    return states, spreads
+
+
+@njit(cache=True, nogil=True)
+def _move(time: Any, density: float, root: Any, normals: Any, states: Any) -> None:
+    """Draw a motion of the model from rest at 0: white jerk, integrated exactly from moment to moment."""
+    states[0] = 0.0
+    for i in range(1, time.shape[0]):
+        step = time[i] - time[i - 1]
+        kick = root @ normals[i] * math.sqrt(density * step)
+        states[i, 0] = states[i - 1, 0] + step * (states[i - 1, 1] + 0.5 * step * states[i - 1, 2]) + step * step * kick[0]
+        states[i, 1] = states[i - 1, 1] + step * states[i - 1, 2] + step * kick[1]
+        states[i, 2] = states[i - 1, 2] + kick[2]
 
 
 @njit(cache=True, nogil=True)

@@ -49,12 +49,14 @@ class Target(BaseModel):
         name: of the target.
         frame: what its frame is, in words.
         markers: four or more; exactly one has the code of its own that tells which way round the target is.
+        tolerance: m, 1 sigma of a marker's place, along each axis: print, glue, measurement.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: str
     frame: str = ""
     markers: tuple[Marker, ...]
+    tolerance: float = Field(default=0.0005, ge=0, lt=0.1, allow_inf_nan=False)
 
     @property
     def positions(self) -> Array:
@@ -70,6 +72,12 @@ class Target(BaseModel):
     def codes(self) -> NDArray[np.int64]:
         """Numbers of the codes (M,) in :data:`CODE_NAMES`."""
         return np.array([CODE_NAMES.index(marker.code) for marker in self.markers])
+
+    @property
+    def layout_std(self) -> float:
+        """1 sigma of the target's scale (-) and of its heading (rad) as a whole: least squares over the markers' places."""
+        places = self.positions - self.positions.mean(axis=0)
+        return self.tolerance / float(np.linalg.norm(places))
 
     @property
     def key(self) -> int:
