@@ -162,6 +162,14 @@ def supply_voltage(lanes: Lanes, features: frozenset[str]) -> Value:
     return ops.maximum(lanes["supply"] - lanes["supply_drop"], 0.0)
 
 
+def _goal(lanes: Lanes, j: int, time: Value, step: Value) -> Value:
+    """Goal of a substep: in the one in which a new goal arrives, both in proportion, so that no time is lost to the step."""
+    old, new = lanes[f"old_goal{j}"], lanes[f"goal{j}"]
+    after = time + 0.5 * step - lanes[f"switch_time{j}"]
+    partly = ops.where_positive(after - 1e-6 * step, old + after * (1.0 / step) * (new - old), old)
+    return ops.where_positive(after - (1.0 - 1e-6) * step, new, partly)
+
+
 def command(
     lanes: Lanes, joints: Sequence[Joint], time: Value, step: Value, features: frozenset[str]
 ) -> tuple[Out, list[Value]]:
@@ -180,7 +188,7 @@ def command(
     voltages: list[Value] = []
     supply = supply_voltage(lanes, features)
     for j, joint in enumerate(joints):
-        goal = ops.where_positive(time - lanes[f"switch_time{j}"], lanes[f"goal{j}"], lanes[f"old_goal{j}"])
+        goal = _goal(lanes, j, time, step)
         old = (lanes[f"reference_position{j}"], lanes[f"reference_velocity{j}"])
         if j < 4:
             new = servo.leg_profile_step(*old, goal, lanes[f"velocity_limit{j}"], lanes[f"acceleration_limit{j}"], step)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,16 @@ from wlr_gym.parameters import SPECS, Parameters
 from wlr_gym.plants.base import PlantState
 
 Array = NDArray[np.float64]
+
+
+class Goals(Protocol):
+    """Where a simulator gets the goals of a tick from; see :class:`GoalHistory`."""
+
+    def reset(self, rows: NDArray[np.intp], state: PlantState, parameters: Parameters) -> None: ...
+
+    def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None: ...
+
+    def push(self, goals: Array) -> tuple[Array, Array, Array]: ...
 
 
 class GoalHistory:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from wlr_gym.errors import InputError
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, PlantState, Sensors, Truth, standing_state
-from wlr_gym.plants.goals import GoalHistory
+from wlr_gym.plants.goals import GoalHistory, Goals
 from wlr_gym.plants.sensors import RAW_LAYOUT, SensorModel
 from wlr_gym.robot import Robot
 
@@ -34,7 +34,7 @@ class Simulator:
         self._truth = Truth(np.zeros((count, TRUTH_LAYOUT.width)))
         self._raw = np.zeros((count, RAW_LAYOUT.width))
         self._readings = Sensors(np.zeros((count, SENSOR_LAYOUT.width)))
-        self._goals = GoalHistory(count, self.options.control_period)
+        self._goals: Goals = GoalHistory(count, self.options.control_period)
         self._sensors = SensorModel(robot, self.options, count)
 
     def _start(self) -> None:
@@ -54,6 +54,10 @@ class Simulator:
 
     def _look(self, rows: Rows) -> None:
         """Fill truth and raw sensor signals of robots ``rows``."""
+        raise NotImplementedError
+
+    def set_force_values(self, values: Array) -> None:
+        """Take the constants of the formula forces per robot: (N, constants of all forces one after the other)."""
         raise NotImplementedError
 
     @property
@@ -85,6 +89,10 @@ class Simulator:
         self._take_parameters(parameters, rows)
         self._goals.set_delays(rows, self.parameters)
         self._sensors.set_errors(rows, self.parameters)
+
+    def use_goals(self, goals: Goals) -> None:
+        """Take the goals from a schedule of one's own instead of the history of those written."""
+        self._goals = goals
 
     def _rows(self, mask: NDArray[np.bool_] | None) -> Rows:
         if mask is None:

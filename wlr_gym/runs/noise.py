@@ -14,6 +14,11 @@ def channel_noise(robot: Robot) -> dict[str, float]:
 
     Constant biases are not part of it.
     """
+    return {name: math.sqrt(sigma**2 + count**2 / 12) for name, (sigma, count) in noise_parts(robot).items()}
+
+
+def noise_parts(robot: Robot) -> dict[str, tuple[float, float]]:
+    """Return one sigma of the analogue noise of every channel, and its register count (0 = not rounded), in its unit."""
     sensors = robot.sensors
     effort = dict(zip(JOINTS, effort_counts(robot), strict=True))
     by_group = {
@@ -25,7 +30,7 @@ def channel_noise(robot: Robot) -> dict[str, float]:
         "cam_pitch": (sensors.camera.yaw_noise, 0.0),
         "volt": (sensors.volt_noise, REGISTER_UNITS["XM540-W150-R"]["voltage"].per_count),
     }
-    noise = {}
+    parts = {}
     for name in CHANNELS:
         kind, _, joint = name.partition("_")
         if joint not in JOINTS:
@@ -34,5 +39,5 @@ def channel_noise(robot: Robot) -> dict[str, float]:
             sigma, count = (sensors.effort.leg_noise if joint in LEGS else sensors.effort.wheel_noise), effort[joint]
         else:
             sigma, count = 0.0, sensors.encoder.position if kind == "pos" else sensors.encoder.velocity
-        noise[name] = math.sqrt(sigma**2 + count**2 / 12)
-    return noise
+        parts[name] = (sigma, count)
+    return parts

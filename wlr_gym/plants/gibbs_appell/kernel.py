@@ -155,7 +155,7 @@ _APPLY_FORMULAS = """
             sense(W)
             seen = W[{sensed} : {sensed} + {sensed_count} * {width}].reshape({sensed_count}, {width})
             pushes = W[{formula} : {formula} + {formula_count} * {width}].reshape({formula_count}, {width})
-            evaluate(seen, formula_values, pushes)"""
+            evaluate(seen, formula_values[tile], pushes)"""
 _DRIVER = """
 {decorator}
 def scatter(W, TRUTH, RAW, tile, count):

@@ -80,7 +80,7 @@ class GibbsAppellPlant(Simulator):
         self._pool = self._make_pool()
         self._formulas = compile_forces(forces, self.options.precision) if forces else None
         values = self._formulas.values if self._formulas else np.zeros(0)
-        self._formula_values = np.repeat(values[:, None], self._width, axis=1).astype(self._float)
+        self._formula_values = np.tile(values[:, None], (self._tiles, 1, self._width)).astype(self._float)
         self._features: frozenset[str] | None = None
         self._start()
 
@@ -197,6 +197,12 @@ class GibbsAppellPlant(Simulator):
             rotor_rate=np.where(has_play, columns("rotor_rate{}", range(8)), self._truth.joint_velocity),
             supply_drop=values[:, _LANE["supply_drop"]],
         )
+
+    def set_force_values(self, values: Array) -> None:
+        """Take the constants of the formula forces per robot; see :class:`wlr_gym.plants.simulator.Simulator`."""
+        padded = np.vstack([values, np.repeat(values[:1], self._tiles * self._width - self._count, axis=0)])
+        shape = (self._tiles, self._width, values.shape[1])
+        self._formula_values = np.ascontiguousarray(padded.reshape(shape).transpose(0, 2, 1), self._float)
 
     # ---- stepping ----
 

@@ -738,7 +738,8 @@ def kick_finish(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
         out[f"acceleration_{a}"] = lanes[f"acceleration_{a}"] + lanes["low_pass"] * (
             specific_force - lanes[f"acceleration_{a}"]
         )
-        out[f"gyro_{a}"] = lanes[f"gyro_{a}"] + lanes["low_pass"] * (u[3 + k] - lanes[f"gyro_{a}"])
+        mean_rate = 0.5 * (lanes[f"w{a}"] + u[3 + k])  # over the step: the rate at its end would come half a step early
+        out[f"gyro_{a}"] = lanes[f"gyro_{a}"] + lanes["low_pass"] * (mean_rate - lanes[f"gyro_{a}"])
     return out
 
 

@@ -157,6 +157,10 @@ class MujocoPlant(Simulator):
 
     # ---- stepping ----
 
+    def set_force_values(self, values: Array) -> None:
+        """Take the constants of the formula forces per robot; see :class:`wlr_gym.plants.simulator.Simulator`."""
+        self._force_values = np.ascontiguousarray(values.T)
+
     def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick; see :meth:`wlr_gym.plants.base.Plant.step`.
 

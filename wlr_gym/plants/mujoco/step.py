@@ -64,7 +64,7 @@ STATE: tuple[str, ...] = (
     *(f"own_force_{a}{i}" for i in CORNERS for a in "xy"),
     *(f"rolling_torque{i}" for i in CORNERS),
     *(f"old_spin{i}" for i in CORNERS),
-    *(f"old_u{a}" for a in AXES),
+    *(f"old_{v}{a}" for v in "uw" for a in AXES),
     *(f"old_rate{j}" for j in range(8)),
     *(f"{name}{j}" for j in range(8) for name in ("voltage", "share", "rotor_free", "rotor_gain", "ripple", "rotor_friction")),
     *(f"heading_{a}{i}" for i in CORNERS for a in "xy"),
@@ -141,7 +141,7 @@ def before(lanes: Lanes, time: Value, step: Value) -> Out:
     lanes = with_engine_rates(lanes)
     rows = rotation_rows(lanes)
     axes = floor_axes(rows)
-    out: Out = {f"old_u{a}": lanes[f"u{a}"] for a in AXES}
+    out: Out = {f"old_{v}{a}": lanes[f"{v}{a}"] for v in "uw" for a in AXES}
     applied = _loads(lanes, rows)
     joints = [_joint(lanes, j) for j in range(8)]
     commanded, voltages = drive.command(lanes, joints, time, step, FEATURES)
@@ -338,7 +338,8 @@ def after(lanes: Lanes, step: Value) -> Out:
     push = [(lanes[f"u{a}"] - lanes[f"old_u{a}"]) * (1.0 / step) - lanes[f"gravity_{a}"] for a in AXES]
     specific_force = to_body(rotation_rows(lanes), push)
     for k, a in enumerate(AXES):
-        for name, value in ((f"acceleration_{a}", specific_force[k]), (f"gyro_{a}", lanes[f"w{a}"])):
+        mean_rate = 0.5 * (lanes[f"old_w{a}"] + lanes[f"w{a}"])
+        for name, value in ((f"acceleration_{a}", specific_force[k]), (f"gyro_{a}", mean_rate)):
             out[name] = lanes[name] + lanes["low_pass"] * (value - lanes[name])
     return out
 
