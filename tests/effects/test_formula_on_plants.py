@@ -9,12 +9,11 @@ import pytest
 import wlr_gym  # noqa: F401  (registers the environments)
 from wlr_gym.effects import apply_patch, load_patch
 from wlr_gym.parameters import Parameters
-from wlr_gym.plants import BACKENDS, make_plant
+from wlr_gym.plants import SIMULATORS, make_plant
 from wlr_gym.plants.base import PlantOptions
 from wlr_gym.robot import load_robot
 
 ROBOT = load_robot()
-SIMULATORS = [name for name in BACKENDS if name != "dynamixel"]
 
 
 def formula(where: str, text: str, units: dict[str, str], **values: float) -> dict:

@@ -1,5 +1,7 @@
 """Bus groups on the emulator: each defect of dynamixel-sdk shown in the SDK and guarded here, faults, clocks, blocks."""
 
+import os
+import threading
 import time
 
 import pytest
@@ -395,3 +397,31 @@ def test_stale_readings_are_dropped_and_counted(server, group):
     line.receive = receive
     server.advance(0.02)
     assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+
+
+def test_defect_12_waits_without_end_for_a_device_that_takes_no_bytes():
+    import tty
+
+    def fill(port):
+        for _ in range(1000):
+            port.writePort(b"x" * 100)
+
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    theirs = sdk.PortHandler(os.ttyname(slave))
+    theirs.openPort()
+    filling = threading.Thread(target=fill, args=(theirs,), daemon=True)
+    filling.start()
+    filling.join(0.3)
+    assert filling.is_alive()
+    ours = GuardedPort(os.ttyname(slave), 1_000_000, 0.01)
+    ours.openPort()
+    with pytest.raises(BusGoneError):
+        fill(ours)
+    while filling.is_alive():  # let go of the thread
+        os.read(master, 65536)
+        filling.join(0.001)
+    theirs.closePort()
+    ours.closePort()
+    os.close(master)
+    os.close(slave)

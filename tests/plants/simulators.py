@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants import make_plant
-from wlr_gym.plants.base import Plant, PlantOptions, Sensors
+from wlr_gym.plants.base import Plant, PlantOptions, RobotOptions, Sensors
 from wlr_gym.robot import load_robot
 
 ROBOT = load_robot()
@@ -24,19 +25,29 @@ class Entry:
     Attributes:
         make: count, options -> plant.
         has_truth, can_set_state: simulators; a real robot or its emulator has neither, and skips the tests that need them.
+        most: robots it can hold; None = any number.
     """
 
     make: Callable[[int, PlantOptions], Plant]
     has_truth: bool = True
     can_set_state: bool = True
+    most: int | None = None
 
 
 def _backend(name: str) -> Entry:
     return Entry(lambda count, options: make_plant(name, ROBOT, count, options))
 
 
+def _emulated_robot() -> Entry:
+    """The real robot's plant on the emulated robot, in emulated time."""
+    hardware = RobotOptions(emulated=True)
+    return Entry(lambda count, options: make_plant("dynamixel", ROBOT, count, options, hardware=hardware), False, False, most=1)
+
+
 #: Every plant the conformance suite runs on. A new plant joins by one entry.
 PLANTS = {name: _backend(name) for name in ("gibbs_appell", "mujoco")}
+if importlib.util.find_spec("dynamixel_sdk") and importlib.util.find_spec("serial"):
+    PLANTS["dynamixel"] = _emulated_robot()
 SIMULATORS = [name for name, entry in PLANTS.items() if entry.has_truth and entry.can_set_state]
 
 

@@ -66,13 +66,14 @@ def test_capabilities_are_those_of_its_entry(plant_name):
 
 
 def test_standing_robots_read_what_they_should(plant_name):
-    plant = PLANTS[plant_name].make(2, PlantOptions())
-    assert plant.reset().values.shape == (2, SENSOR_LAYOUT.width)
-    sensors = hold(plant, home(2), ticks=50)
+    count = PLANTS[plant_name].most or 2
+    plant = PLANTS[plant_name].make(count, PlantOptions())
+    assert plant.reset().values.shape == (count, SENSOR_LAYOUT.width)
+    sensors = hold(plant, home(count), ticks=50)
     assert np.isfinite(sensors.values).all()
     np.testing.assert_allclose(sensors.joint_position[:, :4], np.pi / 2, atol=0.01)
     np.testing.assert_allclose(sensors.joint_velocity, 0.0, atol=0.05)
-    np.testing.assert_allclose(sensors.accelerometer, np.tile([0, 0, 9.81], (2, 1)), atol=0.3)
+    np.testing.assert_allclose(sensors.accelerometer, np.tile([0, 0, 9.81], (count, 1)), atol=0.3)
     np.testing.assert_allclose(sensors.gyro, 0.0, atol=0.02)
     np.testing.assert_allclose(sensors.supply_voltage, 12.0, atol=0.3)
     np.testing.assert_allclose(sensors.camera_pose, 0.0, atol=0.02)

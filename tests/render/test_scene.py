@@ -10,7 +10,7 @@ from standing import PLAIN, truth_of
 
 from wlr_gym.errors import InputError
 from wlr_gym.parameters import Parameters
-from wlr_gym.plants import BACKENDS, PlantOptions, make_plant
+from wlr_gym.plants import SIMULATORS, PlantOptions, make_plant
 from wlr_gym.render import camera, gl, marks
 from wlr_gym.render.stage import Stage
 from wlr_gym.render.view import View, read_view
@@ -113,7 +113,7 @@ def test_payload_is_drawn_where_it_is(new_scene, parameters):
     assert np.abs(at(bare, scene, place) - at(with_it, scene, place)).max() > 50
 
 
-@pytest.mark.parametrize("backend", sorted(BACKENDS))
+@pytest.mark.parametrize("backend", SIMULATORS)
 def test_every_plant_looks_like_its_truth(new_scene, robot, parameters, backend):
     """The scene knows no plant: the engine's truth, and the same numbers in a bare matrix."""
     plant = make_plant(backend, robot, 1, PlantOptions())
@@ -130,7 +130,7 @@ def test_every_plant_looks_like_its_truth(new_scene, robot, parameters, backend)
 
 def test_all_plants_start_with_the_same_picture(new_scene, robot, parameters):
     scene, pictures = new_scene(), []
-    for backend in sorted(BACKENDS):
+    for backend in SIMULATORS:
         plant = make_plant(backend, robot, 1, PlantOptions())
         plant.reset(parameters=parameters)
         pictures.append(scene.draw(plant.truth(), plant.parameters))

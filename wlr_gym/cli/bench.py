@@ -32,11 +32,14 @@ MEASUREMENTS = {
     "batch": "wlr_gym.bench.speed:measure_batch",
     "convergence": "wlr_gym.bench.convergence:measure_convergence",
     "vision": "wlr_gym.bench.vision:measure_vision",
+    "bus": "wlr_gym.bench.bus:measure_bus",
 }
 #: Measurements with rows of their own kind; each has its list in the report.
 _OWN_ROWS = ("convergence", "vision")
-#: Takes a quarter of an hour: only made when it is asked for.
-_ON_REQUEST = ("vision",)
+#: Takes a quarter of an hour, needs the robot's packages: only made when they are asked for.
+_ON_REQUEST = ("vision", "bus")
+#: Its own kind: hours, resumable, with a folder of results. See docs/gap_benchmark.md.
+BLIND_TEST = "gap"
 SCHEMA = 1
 
 
@@ -45,25 +48,34 @@ class Options:
     what: tyro.conf.Positional[tuple[str, ...]] = ()
     """Measurements to make, as with --only."""
     only: tuple[str, ...] = ()
-    """engine, mujoco, env_step, ppo, import, start, batch, convergence, vision; default: all but the last"""
+    """engine, mujoco, env_step, ppo, import, start, batch, bus, convergence, vision; default: all but the last.
+    gap (the blind test of the gap workflow): alone, with --out"""
     json: Path | None = None
     """File for all numbers."""
     rounds: int = 5
     """Rounds of every pair."""
     quick: bool = False
     """Tiny sizes: shows that it runs; the numbers mean nothing."""
+    out: Path | None = None
+    """gap: folder for results, truths and the score; an interrupted test goes on from it."""
+    sets: int = 240
+    """gap: data sets."""
+    processes: int = 2
+    """gap: data sets at a time."""
 
 
 def run(options: Options) -> int:
     """Measure, print, write."""
     asked = (*options.what, *options.only)
     for name in asked:
-        if name not in MEASUREMENTS:
-            raise unknown_name("measurement", name, MEASUREMENTS)
+        if name not in (*MEASUREMENTS, BLIND_TEST):
+            raise unknown_name("measurement", name, (*MEASUREMENTS, BLIND_TEST))
     if options.rounds < 1:
         raise InputError(f"--rounds {options.rounds}: expected 1 or more")
     if options.json is not None and not options.json.parent.is_dir():
         raise InputError(f"--json {options.json}: folder {options.json.parent} does not exist")
+    if BLIND_TEST in asked:
+        return _blind_test(options, asked)
     console, size = Console(), Size(options.rounds, options.quick)
     report: dict[str, Any] = {"schema": SCHEMA, "machine": machine(), "rounds": options.rounds, "quick": options.quick}
     report |= {"measurements": [], "convergence": [], "vision": []}
@@ -76,6 +88,25 @@ def run(options: Options) -> int:
     if options.json is not None:
         write_json(options.json, report)
         print(f"written: {options.json}")
+    return OK
+
+
+def _blind_test(options: Options, asked: tuple[str, ...]) -> int:
+    """Test the gap workflow on data sets with sealed truths; print and write its score."""
+    from wlr_gym.bench import gap
+
+    if len(asked) > 1:
+        raise InputError(f"{BLIND_TEST} takes hours and is run alone, not with {', '.join(set(asked) - {BLIND_TEST})}")
+    if options.out is None:
+        raise InputError(f"{BLIND_TEST} needs --out DIR: finished data sets are kept there, so that it can be interrupted")
+    console = Console(soft_wrap=True)
+    report = gap.run_blind_test(gap.Plan(options.out, options.sets, options.processes), say=console.print)
+    text = gap.markdown(report)
+    (options.out / "score.md").write_text(text, encoding="utf-8")
+    console.print(text, markup=False, highlight=False)
+    if options.json is not None:
+        write_json(options.json, report)
+    console.print(f"written: {options.out / 'score.json'}, {options.out / 'score.md'}")
     return OK
 
 

@@ -1,4 +1,4 @@
-"""Calibrate what measures. ``wlr calibrate camera``: lens from views of a board; ``wlr calibrate targets``: what to print."""
+"""Calibrate what measures: the robot's ``joints`` and ``imu``, a ``camera``; ``targets`` are the sheets to print for it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,14 @@ from typing import Annotated
 import tyro
 
 from wlr_gym.cli import OK
+from wlr_gym.cli.calibrate_robot import (
+    ImuOptions,
+    JointsOptions,
+    ServoOptions,
+    calibrate_imu,
+    calibrate_joints,
+    set_up_servo,
+)
 from wlr_gym.errors import InputError, require_package
 
 
@@ -51,11 +59,20 @@ class TargetsOptions:
 Options = (
     Annotated[CameraOptions, tyro.conf.subcommand("camera", description="lens of a camera, from views of a board")]
     | Annotated[TargetsOptions, tyro.conf.subcommand("targets", description="sheets to print: markers and calibration board")]
+    | Annotated[ServoOptions, tyro.conf.subcommand("servo", description="id and baud rate of a new servo")]
+    | Annotated[JointsOptions, tyro.conf.subcommand("joints", description="sign and zero of each servo, by hand")]
+    | Annotated[ImuOptions, tyro.conf.subcommand("imu", description="biases, scale and mounting of the IMU")]
 )
 
 
-def run(options: CameraOptions | TargetsOptions) -> int:
+def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions | ImuOptions) -> int:
     """Do what the sub-command says; 0 when done."""
+    if isinstance(options, ServoOptions):
+        return set_up_servo(options)
+    if isinstance(options, JointsOptions):
+        return calibrate_joints(options)
+    if isinstance(options, ImuOptions):
+        return calibrate_imu(options)
     require_package("cv2", "vision")
     return _targets(options) if isinstance(options, TargetsOptions) else _camera(options)
 
@@ -63,7 +80,7 @@ def run(options: CameraOptions | TargetsOptions) -> int:
 def _camera(options: CameraOptions) -> int:
     from wlr_gym.vision.camera import calibrate, save_camera
     from wlr_gym.vision.sheets import Board
-    from wlr_gym.vision.video import read_frames
+    from wlr_gym.vision.video import Frames
 
     if not 0.001 < options.square < 0.5:
         raise InputError(f"--square {options.square:g}: expected metres, as measured on the print (28 mm = 0.028)")
@@ -72,7 +89,7 @@ def _camera(options: CameraOptions) -> int:
     if options.out.suffix not in {".yaml", ".yml"} or not options.out.parent.is_dir():
         raise InputError(f"--out {options.out}: expected a .yaml file in a folder that exists")
     step = 1 if Path(options.images).is_dir() else options.every
-    frames = read_frames(options.images)
+    frames = Frames(options.images)
     views = ((f"{options.images}, frame {f.index}", f.image) for f in frames if f.index % step == 0)
     camera = calibrate(views, Board(options.columns, options.rows, options.square))
     save_camera(options.out, camera)
@@ -84,6 +101,8 @@ def _camera(options: CameraOptions) -> int:
         f"focal length {camera.focal[0]:.1f}, {camera.focal[1]:.1f} px (± {max(quality.focal_std):.1f}); centre "
         f"{camera.centre[0]:.1f}, {camera.centre[1]:.1f} px (± {max(quality.centre_std):.1f})"
     )
+    if frames.missing:
+        print(f"the video is cut off or damaged: its last {frames.missing} frames could not be decoded")
     if quality.rms > 0.5:
         print("corners off by more than 0.5 px: blurred views, a board that is not flat, or a lens this model does not fit")
     print(f"written: {options.out}")

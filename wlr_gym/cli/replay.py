@@ -1,4 +1,7 @@
-"""Drive a simulator with the commands of measured runs and report where the two part.
+"""Drive a simulator, or the robot, with the commands of measured runs and report where the two part.
+
+``--backend dynamixel`` is the robot (with ``--emulated`` an emulated one): goals go through the safety gate, and its log is
+compared with the run.
 
 Writes errors.json (run, channel: errors in units and in sensor noise), overlay plots, config.yaml and provenance.yaml.
 """
@@ -12,7 +15,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.robot_options import HardwareOption, confirm
 from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,18 +32,19 @@ ERRORS_FILE = "errors.json"
 
 
 @dataclass(frozen=True)
-class Options(EffectsOption):
+class Options(HardwareOption, EffectsOption):
     """Replay measured runs.
 
     Attributes:
         runs: a run (CSV or Parquet) or a folder of runs.
         out: folder for errors.json, plots and provenance; made if it is not there.
-        backend: simulator.
+        backend: simulator, or dynamixel for the robot.
         robot: robot file or config name; left out, the one meta.yaml names, else the nominal one.
         segment: s between the points at which a segment starts anew from the measured state.
         plots: write overlay plots.
         video: file (.webp, .gif, .png, .mp4) for a film of the run beside its simulation; with several runs, one film each,
             named FILE_<run>.
+        yes: do not ask before the robot moves.
     """
 
     runs: Annotated[Path, tyro.conf.Positional]
@@ -48,10 +54,11 @@ class Options(EffectsOption):
     segment: float = 1.0
     plots: bool = True
     video: Path | None = None
+    yes: bool = False
 
 
 def run(options: Options) -> int:
-    """Replay, print the tables, write the files; 0 when done.
+    """Replay, print the tables, write the files; 0 when done, 1 when something stopped the robot.
 
     Raises:
         InputError: unreadable runs, patch, robot or backend.
@@ -59,7 +66,7 @@ def run(options: Options) -> int:
     from rich.console import Console
 
     from wlr_gym.files import make_output_folder, write_json
-    from wlr_gym.plants import check_backend
+    from wlr_gym.plants import REAL, check_backend
     from wlr_gym.provenance import record_provenance
     from wlr_gym.render.video import check_video
     from wlr_gym.runs.plot import save_plots
@@ -67,6 +74,11 @@ def run(options: Options) -> int:
 
     console = Console()
     check_backend(options.backend)
+    on_robot = options.backend in REAL
+    if not on_robot and (options.emulated or options.port):
+        raise InputError("--emulated and --port are about the robot: add --backend dynamixel")
+    if on_robot and options.video is not None:
+        raise InputError("--video: a film needs a simulator; --backend dynamixel has none")
     if options.video is not None:
         check_video(options.video)
     runs = _read(options.runs)
@@ -75,18 +87,20 @@ def run(options: Options) -> int:
         prepare(measured, options.robot, effects=patch, segment=options.segment)
     make_output_folder(options.out)
     results = []
-    for result in _replay_all(options, runs, patch, console):
+    for result in (_repeat_all if on_robot else _replay_all)(options, runs, patch, console):
         results.append(result)
         if options.plots:
             save_plots(result, options.out)
-    _print(results, patch, console)
+    if not results:
+        return FAILED
+    _print(results, patch, console, "repeated" if on_robot else "simulated")
     errors = {result.run.name: {name: error.as_dict() for name, error in result.errors.items()} for result in results}
     write_json(options.out / ERRORS_FILE, errors)
     record_provenance(options.out, _resolved(options, results, patch))
     console.print(f"errors, plots and provenance: {options.out}")
     if options.video is not None:
         _film(options, options.video, results, patch, console)
-    return 0
+    return OK if len(results) == len(runs) else FAILED
 
 
 def _film(options: Options, path: Path, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
@@ -123,6 +137,34 @@ def _replay_all(options: Options, runs: Sequence[Run], patch: Patch, console: Co
         yield replay(measured, options.backend, options.robot, effects=patch, segment=options.segment)
 
 
+def _repeat_all(options: Options, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
+    """Drive the robot with each run's commands, log to ``out/robot``, compare; ends with the first run that is stopped."""
+    from wlr_gym.evaluation.driving import drive_robot
+    from wlr_gym.runs import read_run
+    from wlr_gym.runs.compare import motion_of
+    from wlr_gym.runs.record import meta_of
+    from wlr_gym.runs.repeat import compare_repeat
+    from wlr_gym.runs.replay import robot_of
+
+    motions = [motion_of(measured) for measured in runs]
+    if not options.emulated and not options.yes:
+        confirm(motions, console)
+    for measured, motion in zip(runs, motions, strict=True):
+        robot = robot_of(measured, options.robot)
+        plant = options.plant_of(robot, options.out / "robot" / measured.name, meta_of(motion, robot), patch)
+        try:
+            drive = drive_robot(plant, motion)
+        finally:
+            plant.close()
+        interventions = drive.statistics["interventions"]
+        changed = ", ".join(f"{rule} in {count} ticks" for rule, count in interventions.items()) or "nothing changed"
+        console.print(f"{measured.name}: {drive.ticks} of {len(motion.goals)} ticks driven; safety gate: {changed}")
+        if drive.reason or drive.run is None:
+            console.print(f"stopped: {drive.reason or 'nothing was logged'}", style="red")
+            return
+        yield compare_repeat(measured, read_run(drive.run), options.robot, options.segment)
+
+
 def _resolved(options: Options, results: Sequence[ReplayResult], patch: Patch) -> dict[str, object]:
     return {
         **{name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()},
@@ -137,14 +179,14 @@ def _resolved(options: Options, results: Sequence[ReplayResult], patch: Patch) -
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
-def _print(results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
+def _print(results: Sequence[ReplayResult], patch: Patch, console: Console, other: str) -> None:
     for result in results:
         for finding in result.run.findings:
             line = f"{result.run.name}: {finding.kind} in '{finding.column}': {finding.message}"
             console.print(line, style="yellow", highlight=False, soft_wrap=True)
     errors = [pair for result in results for pair in result.errors.items()]
     runs = f"{len(results)} run{'s' if len(results) > 1 else ''}"
-    console.print(_error_table(errors, f"{runs}, effects added: {patch.summary()}"))
+    console.print(_error_table(errors, f"Measured minus {other}, rms ({runs}, effects added: {patch.summary()})"))
     console.print(_joint_table(errors))
     if len(results) > 1:
         console.print(_run_table(results))
@@ -182,7 +224,7 @@ def _error_table(errors: Sequence[tuple[str, ChannelError]], title: str) -> Tabl
     from wlr_gym.runs.replay import pooled
 
     headings = ("channel", "unit", "noise", "segment", "full run", "segment\n/noise", "full run\n/noise")
-    table = _table(f"Measured minus simulated, rms ({title})", headings)
+    table = _table(title, headings)
     for group, members in _grouped(errors).items():
         noise, unit = members[0].noise, members[0].unit
         segment, full = pooled(members, lambda e: e.segment_rms), pooled(members, lambda e: e.full_run_rms)

@@ -18,10 +18,11 @@ from wlr_gym import plants
 from wlr_gym.effects import apply_patch, load_patch
 from wlr_gym.envs import kernels
 from wlr_gym.envs.evaluation import compile_evaluation
+from wlr_gym.envs.measured import measurable, measured_truth
 from wlr_gym.envs.settings import Settings
 from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, PlantState
+from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, PlantState, Sensors
 from wlr_gym.random import stream_number
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.tasks.describe import contract, describe
@@ -67,6 +68,7 @@ class Core:
         goals: (N, 8) last goals, rad and rad/s. torque_on: (N, 8) whether the motors are on; None = all.
         sensors: last readings, noise and all. state: where the robots of the present episodes started.
         changed: (N,) whether randomisation changed the robot's parameters at the end of the last step.
+        unmeasured: rewards and terminations of the task that are left out because a real robot cannot measure them.
     """
 
     def __init__(self, task_name: str, settings: Settings, count: int) -> None:
@@ -74,20 +76,22 @@ class Core:
             raise InputError(f"num_envs = {count!r}: expected a whole number of 1 or more")
         self.settings = settings
         self.count = int(count)
+        self.unmeasured: tuple[str, ...] = ()
         self.task = make_task(task_name, settings)
+        if settings.is_real:
+            self.task, self.unmeasured = measurable(self.task)
         config, robot = self.task.config, self.task.robot
-        self.randomization = load_randomization(
-            config.randomization if settings.randomization is None else settings.randomization, robot
-        )
+        chosen = config.randomization if settings.randomization is None else settings.randomization
+        self.randomization = load_randomization("none" if settings.is_real else chosen, robot)
         self.patch = load_patch(settings.effects)
         options = PlantOptions(
             control_period=config.control_period,
             physics_step=settings.physics_step,
             precision=settings.precision,
             threads=settings.threads,
-            sensor_noise=self.randomization.config.sensor_noise,
+            sensor_noise=settings.is_real or self.randomization.config.sensor_noise,
         )
-        self.plant = plants.make_plant(settings.backend, robot, self.count, options, self.patch.forces)
+        self.plant = plants.make_plant(settings.backend, robot, self.count, options, self.patch.forces, settings.robot_options)
         self.limit = self.task.episode_ticks
         self.dictionary = settings.observation == "dict"
         self._evaluation = compile_evaluation(self.task)
@@ -96,6 +100,8 @@ class Core:
         self._make_buffers()
         self.everyone: Mask = np.ones(self.count, dtype=bool)
         self.seeded: Mask = np.zeros(self.count, dtype=bool)
+        if settings.is_real:
+            self._load_kernels()
 
     # ---- set-up ----
 
@@ -179,6 +185,18 @@ class Core:
             self.torque_on = np.ones((count, actions), bool)
             self.torque_on[:, free] = False
 
+    def _load_kernels(self) -> None:
+        """Run everything compiled once: a robot that waits for a compiler in its first tick has been stopped by then."""
+        self.sensors = Sensors(np.zeros((self.count, SENSOR_LAYOUT.width)))
+        kernels.start_commands(
+            self.everyone, self.episode_seeds, self._command_stream, self._command_table, self._command_timing,
+            self.command, self._command_until, self._command_draws,
+        )  # fmt: skip
+        self._observe(self.everyone, self.sensors.values, True)
+        self._take_action(self.action, self.everyone)
+        self._finish_tick(self.everyone)
+        self._make_buffers()
+
     # ---- episodes ----
 
     def seed(self, row: int, seed: int) -> None:
@@ -245,7 +263,7 @@ class Core:
         """Latency and observation bias of an episode."""
         low, high = self._latency[:, 0], self._latency[:, 1]
         share = uniforms(seeds, self._latency_stream) if self.randomization.config.latency else 0.5
-        self._delays[rows, :-1] = low + (high - low) * share
+        self._delays[rows, :-1] = 0.0 if self.settings.is_real else low + (high - low) * share  # a robot has its own
         if self._bias_sigma.any():
             u = uniforms(seeds, self._bias_stream)
             self._bias[rows] = normal(u, np.zeros(1), self._bias_sigma, np.full(1, 4.0))
@@ -283,15 +301,22 @@ class Core:
         Raises:
             InputError: wrong shape, or an action that is not finite or out of [-1, 1]; names robot and joint.
         """
+        self._take_action(actions, mask)
+        self.sensors = self.plant.step(self.goals, self.torque_on)
+        return self._finish_tick(mask)
+
+    def _take_action(self, actions: ArrayLike, mask: Mask) -> None:
         given = read_actions(actions, self.action.shape)
         bad = kernels.take_action(mask, given, ACTION_LIMIT, self._action_table, self.action, self._previous_action, self.goals)
         if bad >= 0:
             raise self._bad_action(given, bad)
-        self.sensors = self.plant.step(self.goals, self.torque_on)
+
+    def _finish_tick(self, mask: Mask) -> bool:
+        """Rewards, ends, new commands and parameters, observation; returns whether an episode ended."""
         sensors = self.sensors.values
         evaluation = self._evaluation
         bad = evaluation.run(
-            mask, sensors, self.plant.truth().values, self.command, self.action, self._previous_action,
+            mask, sensors, self._truth(), self.command, self.action, self._previous_action,
             evaluation.numbers, self.terms, self.reward, self._over, self.sums,
         )  # fmt: skip
         if bad >= 0:
@@ -307,6 +332,10 @@ class Core:
             self._change_parameters(mask & ~(self.terminated | self.truncated) if any_done else mask)
         self._observe(mask, sensors, False)
         return any_done
+
+    def _truth(self) -> Array:
+        """The true state, or what a real robot measures of it."""
+        return self.plant.truth().values if self.plant.capabilities.has_truth else measured_truth(self.sensors)
 
     def _observe(self, mask: Mask, sensors: Array, first: bool) -> None:
         kernels.observe(
@@ -363,13 +392,15 @@ class Core:
 
     def step_info(self) -> dict[str, Any]:
         """Return the last step's ``reward_terms`` {name: (N,)}, ``slip_velocity`` (N, 4, 2) m/s along each wheel's heading
-        and axle, and ``effective_friction`` (N, 4, 2) along them."""
-        truth, terms = self.plant.truth(), self.terms.T.copy()
-        return {
-            "reward_terms": dict(zip(self.task.rewards, terms, strict=True)),
-            "slip_velocity": truth["slip_velocity"].reshape(self.count, 4, 2).copy(),
-            "effective_friction": truth["effective_friction"].reshape(self.count, 4, 2).copy(),
-        }
+        and axle, and ``effective_friction`` (N, 4, 2) along them. A real robot knows its measured reward terms only."""
+        return {"reward_terms": dict(zip(self.task.rewards, self.terms.T.copy(), strict=True)), **self.contact_info()}
+
+    def contact_info(self) -> dict[str, Any]:
+        """Return ``slip_velocity`` and ``effective_friction`` (N, 4, 2); nothing on a real robot."""
+        if not self.plant.capabilities.has_truth:
+            return {}
+        truth, shape = self.plant.truth(), (self.count, 4, 2)
+        return {name: truth[name].reshape(shape).copy() for name in ("slip_velocity", "effective_friction")}
 
     def episode_info(self) -> dict[str, Any]:
         """Return ``episode_reward_terms`` {name: (N,)}: sums over the episode so far."""

@@ -52,6 +52,8 @@ class Pictures:
     """
 
     def __init__(self, core: Core, render_mode: str | None) -> None:
+        if render_mode is not None and not core.plant.capabilities.has_truth:
+            raise InputError(f"render_mode = {render_mode!r}: where a real robot stands is not known; look at it")
         self.core = core
         self.render_mode = render_mode
         self._scene: Scene | None = None

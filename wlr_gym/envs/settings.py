@@ -10,6 +10,8 @@ from typing import Any
 
 from wlr_gym.effects import Patch, Source
 from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.plants import REAL
+from wlr_gym.plants.base import RobotOptions, read_robot_options
 from wlr_gym.render.view import View, read_view
 from wlr_gym.robot import WHEELS, Robot
 from wlr_gym.tasks.randomization import RandomizationConfig
@@ -30,6 +32,7 @@ _TYPES: dict[str, tuple[tuple[type, ...], str]] = {
     "precision": ((str,), "a name"),
     "threads": ((Integral,), "a whole number of 1 or more"),
     "view": ((Mapping, View, type(None)), "a mapping"),
+    "hardware": ((str, Path, Mapping, RobotOptions, type(None)), "a name, a path or a mapping"),
 }
 
 
@@ -38,7 +41,7 @@ class Settings:
     """What ``gym.make("WLR-...", ...)`` accepts.
 
     Attributes:
-        backend: which plant: ``gibbs_appell`` or ``mujoco``.
+        backend: which plant: ``gibbs_appell`` or ``mujoco``, or ``dynamixel``: the real robot, see ``docs/robot.md``.
         robot: name in ``configs/robot/``, path of a YAML file, or a :class:`wlr_gym.robot.Robot`; None = the task's.
         randomization: name in ``configs/randomization/`` (none, nominal, wide, ice, split, patches), path of such a file or of
             a gap result (``.json``), or mapping; None = the task's.
@@ -54,6 +57,8 @@ class Settings:
         threads: worker threads of the plant for large batches; results do not depend on it.
         view: what pictures show (with ``render_mode``): mapping of ``size`` (width, height), ``camera`` (follow, chase, side,
             top), ``friction``, ``slip``, ``forces``, ``text`` (True or False), see :class:`wlr_gym.render.View`.
+        hardware: of the real robot: name in ``configs/hardware/``, path of such a file, or mapping of the fields of
+            :class:`wlr_gym.plants.base.RobotOptions` (``{"emulated": True}``).
     """
 
     backend: str = "gibbs_appell"
@@ -68,6 +73,7 @@ class Settings:
     precision: str = "float64"
     threads: int = 1
     view: Mapping[str, Any] | View | None = None
+    hardware: str | Path | Mapping[str, Any] | RobotOptions | None = None
 
     def __post_init__(self) -> None:
         for keyword, (types, expected) in _TYPES.items():
@@ -84,6 +90,31 @@ class Settings:
         if self.episode_length is not None and not 0 < self.episode_length < float("inf"):
             raise InputError(f"episode_length = {self.episode_length!r}: expected a time above 0 s")
         read_view(self.view)
+        if self.is_real:
+            self._check_real()
+        elif self.hardware is not None:
+            raise InputError(f"hardware = {self.hardware!r}: only for backend 'dynamixel', not '{self.backend}'")
+
+    def _check_real(self) -> None:
+        """Refuse what only a simulator can do."""
+        read_robot_options(self.hardware)
+        if self.observation == "dict":
+            raise InputError("observation = 'dict': a real robot has no privileged observation")
+        for keyword, harmless in (("randomization", "none"), ("effects", None)):
+            if getattr(self, keyword) not in (None, harmless):
+                raise InputError(
+                    f"{keyword} = {getattr(self, keyword)!r}: a real robot is what it is; only a simulator takes that"
+                )
+
+    @property
+    def is_real(self) -> bool:
+        """Whether the plant is a real robot."""
+        return self.backend in REAL
+
+    @property
+    def robot_options(self) -> RobotOptions | None:
+        """Which real robot; None for simulators."""
+        return read_robot_options(self.hardware) if self.is_real else None
 
     @property
     def picture_view(self) -> View:

@@ -61,12 +61,8 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
             raise ResetNeeded("call reset() before step()")
         core = self.core
         done = core.step(read_actions(action, self._shape)[None], self._everyone)
-        truth = core.plant.truth()
-        info = {
-            "reward_terms": dict(zip(self._rewards, core.terms[0].tolist(), strict=True)),
-            "slip_velocity": truth.slip_velocity.reshape(4, 2).copy(),
-            "effective_friction": truth.effective_friction.reshape(4, 2).copy(),
-        }
+        info: dict[str, Any] = {"reward_terms": dict(zip(self._rewards, core.terms[0].tolist(), strict=True))}
+        info |= {name: value[0] for name, value in core.contact_info().items()}
         if core.changed[0]:
             info |= _first_rows(core.change_info())
         if done:

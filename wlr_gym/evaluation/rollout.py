@@ -101,7 +101,12 @@ def roll_out(
         first_seed: seed of the first episode.
         on_tick: called after every control tick (progress bars, logs).
         on_start: called once when the episodes have begun.
+
+    Raises:
+        InputError: a real robot.
     """
+    if not core.plant.capabilities.has_truth:
+        raise InputError(f"backend '{core.settings.backend}' has no truth to score by; to drive the robot: wlr deploy")
     seeds = first_seed + np.arange(core.count)
     for row, seed in enumerate(seeds.tolist()):
         core.seed(row, seed)

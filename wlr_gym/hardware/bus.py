@@ -146,6 +146,7 @@ class BusGroup:
         servos: id -> control table.
         patience: s an answer may take beyond its bytes' time on the wire.
         clock: s; what the servos' own clocks are compared with.
+        make_port: (path, bit/s, patience) -> port; None = a serial port.
 
     Attributes:
         fast: sync reads use the fast instruction; cleared for good when servos turn out not to know it.
@@ -160,6 +161,7 @@ class BusGroup:
         servos: Mapping[int, ControlTable],
         patience: float = PATIENCE,
         clock: Callable[[], float] = time.monotonic,
+        make_port: Callable[[str, int, float], GuardedPort] | None = None,
     ) -> None:
         require_package("dynamixel_sdk", "robot")
         require_package("serial", "robot")
@@ -169,7 +171,7 @@ class BusGroup:
         self.servos = dict(servos)
         self.fast = True
         self.statistics = Statistics()
-        self._port: GuardedPort = GuardedPort(port, baud_rate, patience)
+        self._port: GuardedPort = (make_port or GuardedPort)(port, baud_rate, patience)
         self._handler: GuardedHandler = GuardedHandler()
         self._clock = clock
         self._clocks = {id: TickClock() for id in servos}
@@ -188,6 +190,20 @@ class BusGroup:
     def close(self) -> None:
         """Close the port; servos stay as they are."""
         self._port.closePort()
+
+    @property
+    def patience(self) -> float:
+        """Time (s) an answer may take beyond its bytes' time on the wire."""
+        return self._port.patience
+
+    @patience.setter
+    def patience(self, seconds: float) -> None:
+        self._port.patience = seconds
+
+    @property
+    def gone(self) -> bool:
+        """Whether the port has failed since it was opened."""
+        return self._port.gone
 
     def __enter__(self) -> BusGroup:
         self.open()

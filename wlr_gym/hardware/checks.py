@@ -1,26 +1,37 @@
-"""What must be true of servos and buses before anything moves: a list of checks, each with its remedy. Reads only."""
+"""What must be true of ports, servos and IMU before anything moves: a list of checks, each with its remedy. Reads only."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from wlr_gym.errors import InputError
 from wlr_gym.hardware.bus import NoAnswerError, RefusedError
-from wlr_gym.hardware.config import Hardware
+from wlr_gym.hardware.calibration import ACCEL_REST, GYRO_REST, motion
+from wlr_gym.hardware.config import Hardware, ImuPort
+from wlr_gym.hardware.imu import STANDARD_GRAVITY
+from wlr_gym.hardware.imu_driver import Imu, ImuGoneError
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.hardware.tables import ControlTable, load_table
 from wlr_gym.robot import JOINTS, Robot
+
+if TYPE_CHECKING:
+    from wlr_gym.hardware.link import Clock
 
 FIRST_FIRMWARE, FAST_READ_FIRMWARE = 42, 45
 #: degC at which a servo is too warm to start with: below the XL430's shutdown at 72 by enough for a run.
 WARM = 60
 #: Reads of all joints that are timed, and how long 99 of 100 may take at 50 Hz (s): a control period must hold a retry.
 READS, BUDGET = 200, 0.010
+#: s an IMU is looked at; rad/s it may be off at rest once calibrated; rad and part that gravity may be off.
+LOOK, LARGEST_RATE, LARGEST_TILT, LARGEST_SCALE = 1.0, 0.02, math.radians(10.0), 0.05
 
 
 class Check(NamedTuple):
@@ -77,20 +88,49 @@ _RULES = (
 )
 
 
-def check_servos(servos: Servos, robot: Robot, hardware: Hardware) -> list[Check]:
+def open_ports(servos: Servos, imu: Imu, hardware: Hardware) -> list[Check]:
+    """Open every port that can be opened, and say which could not: a check per port. Who called closes them."""
+    checks = []
+    ports = {name: (group.open, hardware.buses[name].port) for name, group in servos.groups.items()}
+    for name, (open_port, path) in {**ports, "imu": (imu.open, hardware.imu.port)}.items():
+        try:
+            open_port()
+            checks.append(Check(name, "port", True, path, "", ""))
+        except InputError as error:
+            if Path(path).exists():
+                found, remedy = str(error), "Join the group it belongs to (ls -l), often dialout, and log in again."
+            else:
+                found, remedy = "not there", f"Plug the adapter in, or name its port with --port {name}=PATH; {_ports_here()}."
+            checks.append(Check(name, "port", False, found, path, remedy))
+    return checks
+
+
+def _ports_here(devices: Path = Path("/dev")) -> str:
+    """Serial ports of this computer, those with stable names first."""
+    named = sorted((devices / "serial" / "by-id").glob("*")) if (devices / "serial" / "by-id").is_dir() else []
+    found = named or sorted([*devices.glob("ttyUSB*"), *devices.glob("ttyACM*")])
+    return f"here are {', '.join(map(str, found))}" if found else "no USB serial port is here now"
+
+
+def check_servos(servos: Servos, robot: Robot, hardware: Hardware, joints: Sequence[str] = JOINTS) -> list[Check]:
     """Look at every servo and return all checks, good and bad, in joint order.
+
+    Args:
+        servos: with the ports of ``joints`` open.
+        robot, hardware: what they should be.
+        joints: which to look at.
 
     Raises:
         BusGoneError: a port is gone.
     """
-    return [check for joint in JOINTS for check in _check_servo(servos, robot, hardware, joint)]
+    return [check for joint in joints for check in _check_servo(servos, robot, hardware, joint)]
 
 
 def _check_servo(servos: Servos, robot: Robot, hardware: Hardware, joint: str) -> Iterator[Check]:
     bus_name, bus = next((name, bus) for name, bus in hardware.buses.items() if joint in bus.joints)
     id, table = robot.dynamixel_ids[joint], load_table(bus.model)
     try:
-        number, firmware = servos.groups[bus_name].ping(id)
+        number, firmware = servos.ping(joint)
     except NoAnswerError:
         remedy = f"Check power, cable and adapter of bus {bus_name} ({bus.port}), and the servo's id and baud rate with a scan."
         yield Check(joint, "answer", False, "none", f"one from id {id} at {bus.baud_rate} bit/s", remedy)
@@ -129,6 +169,14 @@ def _check_items(servos: Servos, eeprom: dict[str, int], joint: str, table: Cont
 
 
 def _check_state(servos: Servos, joint: str) -> Iterator[Check]:
+    voltage = servos.get(joint, "present_input_voltage")
+    low, high = servos.get(joint, "min_voltage_limit"), servos.get(joint, "max_voltage_limit")
+    remedy = "Charge the battery, or check supply and cables; power should be fed in on both sides of a long chain."
+    yield Check(
+        joint, "supply", low <= voltage <= high, f"{voltage / 10:.1f} V", f"{low / 10:.1f} to {high / 10:.1f} V", remedy
+    )
+    temperature = servos.get(joint, "present_temperature")
+    yield Check(joint, "temperature", temperature < WARM, f"{temperature} degC", f"below {WARM} degC", "Let it cool down.")
     errors = servos.hardware_errors(joint)
     remedy = "Find the cause, let the servo cool, then reboot it; the latch is there for a reason."
     yield Check(joint, "hardware error", not errors, ", ".join(errors) or "none", "none", remedy)
@@ -138,18 +186,12 @@ def _check_state(servos: Servos, joint: str) -> Iterator[Check]:
     on = bool(servos.get(joint, "torque_enable"))
     remedy = "Something else drives the robot, or a run ended badly. Switching off may drop it: hold it first."
     yield Check(joint, "torque", not on, "on" if on else "off", "off", remedy)
-    voltage = servos.get(joint, "present_input_voltage")
-    low, high = servos.get(joint, "min_voltage_limit"), servos.get(joint, "max_voltage_limit")
-    remedy = "Charge the battery, or check supply and cables; power should be fed in on both sides of a long chain."
-    yield Check(
-        joint, "supply", low <= voltage <= high, f"{voltage / 10:.1f} V", f"{low / 10:.1f} to {high / 10:.1f} V", remedy
-    )
-    temperature = servos.get(joint, "present_temperature")
-    yield Check(joint, "temperature", temperature < WARM, f"{temperature} degC", f"below {WARM} degC", "Let it cool down.")
 
 
-def check_bus_speed(servos: Servos, reads: int = READS, budget: float = BUDGET) -> Check:
-    """Time reads of all joints and compare the 99th percentile with the budget (s).
+def check_bus_speed(
+    servos: Servos, reads: int = READS, budget: float = BUDGET, now: Callable[[], float] = time.perf_counter
+) -> Check:
+    """Time reads of all joints and compare the 99th percentile with the budget (s); ``now`` is the clock.
 
     Raises:
         BusGoneError: a port is gone.
@@ -157,10 +199,10 @@ def check_bus_speed(servos: Servos, reads: int = READS, budget: float = BUDGET) 
     times = np.empty(reads)
     lost = 0
     for k in range(reads):
-        start = time.perf_counter()
+        start = now()
         lost += int(8 - servos.read().answered.sum())
-        times[k] = time.perf_counter() - start
-    median, slow = np.percentile(times, [50, 99]) * 1e3
+        times[k] = now() - start
+    median, slow = (1e3 * np.percentile(times, [50, 99])).tolist()
     found = f"median {median:.2f} ms, p99 {slow:.2f} ms, {lost} of {8 * reads} answers lost"
     remedy = "Set the adapters' latency timer to 1 ms, raise the baud rate, set return_delay_time = 0, check the cables."
     ok = slow <= budget * 1e3 and lost <= 0.01 * 8 * reads
@@ -183,6 +225,97 @@ def check_latency_timers(hardware: Hardware, system: Path = Path("/sys")) -> lis
             remedy = f"echo 1 | sudo tee {setting}, or a udev rule with ATTR{{latency_timer}}=1."
             checks.append(Check(name, "latency timer", found == "1", f"{found} ms", "1 ms", remedy, is_fatal=False))
     return checks
+
+
+class ImuSamples(NamedTuple):
+    """What an IMU said over a while.
+
+    Attributes:
+        gyro, accelerometer: (T, 3) rad/s and m/s2.
+        temperature: degC, mean; NaN without a sample.
+        seconds: how long was listened.
+    """
+
+    gyro: NDArray[np.float64]
+    accelerometer: NDArray[np.float64]
+    temperature: float
+    seconds: float
+
+
+def sample_imu(imu: Imu, clock: Clock, seconds: float = LOOK, period: float = 0.005) -> ImuSamples:
+    """Listen to an IMU and return each new reading once.
+
+    Raises:
+        ImuGoneError: its port is gone.
+    """
+    imu.read()  # what came before does not count
+    seen, start = imu.statistics.readings, clock.now()
+    rows: list[NDArray[np.float64]] = []
+    for tick in range(1, round(seconds / period) + 1):
+        clock.wait_until(start + tick * period)
+        reading = imu.read()
+        if reading is not None and imu.statistics.readings > seen:
+            seen = imu.statistics.readings
+            rows.append(np.concatenate([reading.gyro, reading.accelerometer, [reading.temperature]]))
+    table = np.array(rows).reshape(-1, 7)
+    temperature = float(table[:, 6].mean()) if rows else float("nan")
+    return ImuSamples(table[:, :3], table[:, 3:6], temperature, clock.now() - start)
+
+
+def check_imu(imu: Imu, port: ImuPort, clock: Clock, seconds: float = LOOK) -> list[Check]:
+    """Listen to the IMU of a robot that stands still on a level floor.
+
+    Args:
+        imu: open.
+        port: what it should be.
+        clock: what it is timed by.
+        seconds: for how long.
+    """
+    try:
+        imu.read()
+        before = imu.statistics.readings, imu.statistics.lost, imu.statistics.errors
+        samples = sample_imu(imu, clock, seconds)
+    except ImuGoneError as error:
+        return [Check("imu", "readings", False, str(error), "some", "Plug it in again, check its cable.")]
+    if not len(samples.gyro):
+        remedy = "Check its supply, its port and baud rate; a microcontroller must run the firmware that sends the frames."
+        return [Check("imu", "readings", False, "none", f"{port.rate:g} a second", remedy)]
+    count, lost, errors = (
+        now - then
+        for now, then in zip((imu.statistics.readings, imu.statistics.lost, imu.statistics.errors), before, strict=True)
+    )
+    checks = [Check("imu", "readings", True, f"{count}, at {samples.temperature:.0f} degC", "", "")]
+    if port.driver == "stream":
+        rate = (count + lost) / samples.seconds
+        remedy = "Write the rate the microcontroller sends at into the hardware file, or raise its baud rate."
+        near = abs(rate - port.rate) <= 0.1 * port.rate
+        checks.append(Check("imu", "rate", near, f"{rate:.0f} Hz", f"{port.rate:g} Hz within 10 %", remedy, False))
+    remedy = "Shorten the cable, keep it away from the motors' supply, check ground."
+    found = f"{lost} lost, {errors} broken of {count + lost}"
+    checks.append(Check("imu", "losses", lost + errors <= 0.01 * (count + lost), found, "1 % or less", remedy, False))
+    return checks + _check_rest(samples)
+
+
+def _check_rest(samples: ImuSamples) -> list[Check]:
+    moved = motion(samples.gyro) / GYRO_REST, motion(samples.accelerometer) / ACCEL_REST
+    if len(samples.gyro) < 2 or max(moved) > 1.0:
+        remedy = "Keep the robot still and look again."
+        return [Check("imu", "rest", False, "it moves", "a robot that stands still", remedy, False)]
+    bias = float(np.linalg.norm(samples.gyro.mean(axis=0)))
+    force = samples.accelerometer.mean(axis=0)
+    length = float(np.linalg.norm(force))
+    tilt = math.acos(min(1.0, max(-1.0, float(force[2]) / length))) if length > 0.0 else math.pi
+    calibrate = "Run wlr calibrate imu"
+    right, level = abs(length / STANDARD_GRAVITY - 1.0) < LARGEST_SCALE, f"{math.degrees(LARGEST_TILT):g} deg"
+    gravity = f"{STANDARD_GRAVITY:.2f} within {LARGEST_SCALE:.0%}"
+    scale = f"{calibrate} --poses 6; is accel_range the sensor's?"
+    stand = "Stand the robot on a level floor; if it does, the sensor is mounted otherwise: wlr calibrate imu --mounting."
+    return [
+        Check("imu", "rest", True, "still", "", ""),
+        Check("imu", "gyroscope", bias < LARGEST_RATE, f"{bias:.3f} rad/s", f"below {LARGEST_RATE:g}", f"{calibrate}.", False),
+        Check("imu", "gravity", right, f"{length:.2f} m/s2", gravity, scale, False),
+        Check("imu", "level", tilt < LARGEST_TILT, f"{math.degrees(tilt):.1f} deg", f"below {level}", stand),
+    ]
 
 
 def mend(servos: Servos, checks: Iterable[Check]) -> list[Check]:

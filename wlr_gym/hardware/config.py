@@ -8,9 +8,10 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from wlr_gym.errors import InputError
+from wlr_gym.hardware.limits import Safety
 from wlr_gym.hardware.tables import BAUD_RATES, load_table
 from wlr_gym.paths import find_config
-from wlr_gym.robot import JOINTS, parse_config, read_yaml
+from wlr_gym.robot import JOINTS, Vector3, parse_config, read_yaml
 
 
 class _Model(BaseModel):
@@ -37,14 +38,51 @@ class Bus(_Model):
         return self
 
 
+class ImuCalibration(_Model):
+    """Errors of an IMU and how it is mounted: mounting * scale * (measured - offset). ``wlr calibrate imu`` writes it.
+
+    Attributes:
+        gyro_bias, accel_offset: rad/s, m/s2, sensor axes.
+        accel_scale: per sensor axis.
+        mounting: roll, pitch, yaw (rad) that turn sensor axes into body axes: Rz(yaw) Ry(pitch) Rx(roll).
+        temperature, date: degC of the chip, and day it was made.
+    """
+
+    gyro_bias: Vector3 = (0.0, 0.0, 0.0)
+    accel_offset: Vector3 = (0.0, 0.0, 0.0)
+    accel_scale: Vector3 = (1.0, 1.0, 1.0)
+    mounting: Vector3 = (0.0, 0.0, 0.0)
+    temperature: float | None = None
+    date: str | None = None
+
+
 class ImuPort(_Model):
-    """Serial stream of the IMU: port, frames per second, ranges (deg/s, g)."""
+    """The IMU: frames from a microcontroller's serial port (``stream``), or the chip on this computer's I2C bus (``i2c``).
+
+    Attributes:
+        port: serial device, or I2C bus (``/dev/i2c-1``).
+        baud_rate: of the stream, bit/s.
+        rate: readings per second.
+        gyro_range, accel_range: full scale, deg/s and g.
+        address, bandwidth: of the chip on I2C: address, filter (Hz). The microcontroller sets up its own.
+    """
 
     port: str
-    baud_rate: int = 115200
+    driver: Literal["stream", "i2c"] = "stream"
+    baud_rate: int = Field(115200, gt=0)
     rate: float = Field(gt=0, le=1000)
     gyro_range: Literal[250, 500, 1000, 2000] = 500
     accel_range: Literal[2, 4, 8, 16] = 4
+    address: Literal[0x68, 0x69] = 0x68
+    bandwidth: Literal[184, 94, 44, 21, 10, 5] = 44
+    calibration: ImuCalibration = ImuCalibration()
+
+    @model_validator(mode="after")
+    def _divides_the_sampling(self) -> ImuPort:
+        divider = round(1000 / self.rate)
+        if self.driver == "i2c" and not (divider <= 256 and abs(1000 / divider - self.rate) < 1e-3 * self.rate):
+            raise ValueError(f"rate {self.rate:g}: on I2C expected 1000 Hz over a whole number up to 256, such as 200 or 100")
+        return self
 
 
 class Mounting(_Model):
@@ -61,6 +99,7 @@ class Hardware(_Model):
     buses: dict[str, Bus]
     imu: ImuPort
     joints: dict[str, Mounting]
+    safety: Safety = Safety()
 
     @model_validator(mode="after")
     def _every_joint_is_wired_once(self) -> Hardware:

@@ -6,6 +6,7 @@ defect in the SDK and its absence here. Import only behind ``require_package``: 
 
 from __future__ import annotations
 
+import os
 import select
 import time
 from collections.abc import Mapping, Sequence
@@ -25,6 +26,7 @@ try:
 except ImportError:  # not on Windows
     _GONE = (OSError, serial.SerialException)
 
+_UNANSWERED = (Instruction.SYNC_WRITE, Instruction.BULK_WRITE)
 SUCCESS, TIMEOUT, CORRUPT = sdk.COMM_SUCCESS, sdk.COMM_RX_TIMEOUT, sdk.COMM_RX_CORRUPT
 
 
@@ -42,6 +44,7 @@ class GuardedPort(sdk.PortHandler):
 
     Attributes:
         suspect: the last exchange did not end well; what still comes in belongs to it.
+        gone: it has failed since it was opened.
     """
 
     def __init__(self, path: str, baud_rate: int, patience: float) -> None:
@@ -51,7 +54,12 @@ class GuardedPort(sdk.PortHandler):
         self.parser = Parser()
         self.queue: list[Packet] = []
         self.suspect = False
+        self.gone = False
         self.discarded = 0
+
+    def _lost(self, error: Exception) -> BusGoneError:
+        self.gone = True
+        return BusGoneError(f"port {self.port_name} is gone: {error}")
 
     # Defect 8: an exception between sending and receiving left the port marked as in use, and every later call, torque-off
     # included, returned "busy" and did nothing. One thread owns a bus here; the mark is never set.
@@ -72,6 +80,7 @@ class GuardedPort(sdk.PortHandler):
             raise InputError(f"port {self.port_name}: cannot be opened: {error}") from None
         if not opened:
             raise InputError(f"port {self.port_name}: baud rate {self.baudrate} is not one dynamixel-sdk knows")
+        self.gone = False
         return True
 
     def closePort(self) -> None:  # noqa: N802
@@ -87,8 +96,8 @@ class GuardedPort(sdk.PortHandler):
             self.discarded += len(data)
         try:
             super().clearPort()
-        except _GONE as error:
-            raise BusGoneError(f"port {self.port_name} is gone: {error}") from None
+        except (*_GONE, AttributeError) as error:
+            raise self._lost(error) from None
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
         """Return bytes as soon as there are some. Defect 7: the SDK spins at full load until they come."""
@@ -98,17 +107,25 @@ class GuardedPort(sdk.PortHandler):
         # Defect 10: an unplugged adapter shows as a time-out, then as one of three kinds of exception.
         device: Any = self.ser
         try:
-            ready = select.select([device.fileno()], [], [], seconds)[0]
-            return device.read(length) if ready else b""
-        except (*_GONE, ValueError, TypeError) as error:  # pyserial's, on a port that closed meanwhile
-            raise BusGoneError(f"port {self.port_name} is gone: {error}") from None
+            number = device.fileno()
+            if not select.select([number], [], [], seconds)[0]:
+                return b""
+            if data := os.read(number, length):
+                return data
+            raise OSError("it is ready and has nothing: disconnected, or another program reads it")
+        except (*_GONE, ValueError, TypeError, AttributeError) as error:  # pyserial's, on a port that closed meanwhile
+            raise self._lost(error) from None
 
     def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
-        """Send bytes."""
+        """Send bytes. Defect 12: pyserial then waits, without end, until the device would take more."""
         try:
-            return super().writePort(packet) or 0
-        except _GONE as error:
-            raise BusGoneError(f"port {self.port_name} is gone: {error}") from None
+            return self._write(bytes(packet))
+        except (*_GONE, TypeError, AttributeError) as error:  # the last: a port that was never opened
+            raise self._lost(error) from None
+
+    def _write(self, data: bytes) -> int:
+        device: Any = self.ser
+        return os.write(device.fileno(), data)  # does not block: a full buffer is an OSError
 
     def getCurrentTime(self) -> float:  # noqa: N802
         """Return ms. Defect 7: the SDK's time-outs followed the wall clock, which may be set."""
@@ -126,8 +143,10 @@ class GuardedHandler(sdk.Protocol2PacketHandler):
         """Send a packet. Defect 1: the SDK works out the stuffed packet and sends the other one."""
         length = txpacket[5] | txpacket[6] << 8
         raw = protocol.encode(txpacket[4], txpacket[7], bytes(txpacket[8 : 8 + length - 3]))
-        port.clearPort()
-        port.suspect = txpacket[4] != BROADCAST or txpacket[7] not in (Instruction.SYNC_WRITE, Instruction.BULK_WRITE)
+        is_answered = txpacket[4] != BROADCAST or txpacket[7] not in _UNANSWERED
+        if is_answered or port.suspect:
+            port.clearPort()
+        port.suspect = is_answered
         return SUCCESS if port.writePort(raw) == len(raw) else sdk.COMM_TX_FAIL
 
     def rxPacket(self, port: GuardedPort, fast_option: bool) -> tuple[list[int], Any]:  # noqa: N802

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.errors import InputError
-from wlr_gym.hardware.bus import PATIENCE, Block, BusGroup, Reading, open_all
+from wlr_gym.hardware.bus import PATIENCE, Block, BusGroup, NoAnswerError, Reading, open_all
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.tables import HARDWARE_ERRORS, load_table
+from wlr_gym.hardware.tables import HARDWARE_ERRORS, ControlTable, load_table
 from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.servo import effort_counts
+
+if TYPE_CHECKING:
+    from wlr_gym.hardware.sdk import GuardedPort
 
 Array = NDArray[np.float64]
 
 #: Read every tick, and read now and then.
 _MOTION = ("realtime_tick", "present_position")
 _HEALTH = ("present_input_voltage", "present_temperature")
+#: Times that a single item is asked for again.
+RETRIES = 2
 
 
 class JointMap:
@@ -99,7 +106,7 @@ class Servos:
     Args:
         robot: its ``dynamixel_ids``.
         hardware: ports, models, mounting.
-        patience, clock: see :class:`wlr_gym.hardware.bus.BusGroup`.
+        patience, clock, make_port: see :class:`wlr_gym.hardware.bus.BusGroup`.
 
     Attributes:
         groups: bus name -> bus group.
@@ -112,6 +119,7 @@ class Servos:
         hardware: Hardware,
         patience: float = PATIENCE,
         clock: Callable[[], float] = time.monotonic,
+        make_port: Callable[[str, int, float], GuardedPort] | None = None,
     ) -> None:
         self.joint_map = JointMap(robot, hardware)
         self._ids = [robot.dynamixel_ids[joint] for joint in JOINTS]
@@ -122,7 +130,7 @@ class Servos:
         for name, bus in hardware.buses.items():
             table = load_table(bus.model)
             servos = {robot.dynamixel_ids[joint]: table for joint in bus.joints}
-            self.groups[name] = BusGroup(name, bus.port, bus.baud_rate, servos, patience, clock)
+            self.groups[name] = BusGroup(name, bus.port, bus.baud_rate, servos, patience, clock, make_port)
             self._motion[name] = Block(table, *_MOTION)
             self._health[name] = Block(table, *_HEALTH)
 
@@ -203,13 +211,24 @@ class Servos:
 
     # ---- single items, by joint ----
 
+    def ping(self, joint: str) -> tuple[int, int]:
+        """Return a joint's model number and firmware version; see :meth:`BusGroup.ping`."""
+        return _persist(self._group(joint).ping, self._id(joint))
+
     def get(self, joint: str, item: str) -> int:
-        """Return the count of a joint's control table item; see :meth:`BusGroup.read`."""
-        return self._group(joint).read(self._ids[JOINTS.index(joint)], item)
+        """Return the count of a joint's control table item; see :meth:`BusGroup.read`. A lost answer is asked for again."""
+        return _persist(self._group(joint).read, self._id(joint), item)
 
     def set(self, joint: str, item: str, count: int) -> None:
-        """Write a count into a joint's control table item; see :meth:`BusGroup.write`."""
-        self._group(joint).write(self._ids[JOINTS.index(joint)], item, count)
+        """Write a count into a joint's control table item; see :meth:`BusGroup.write`. A lost answer is asked for again."""
+        _persist(self._group(joint).write, self._id(joint), item, count)
+
+    def _id(self, joint: str) -> int:
+        return self._ids[JOINTS.index(joint)]
+
+    def table(self, joint: str) -> ControlTable:
+        """Return a joint's control table."""
+        return self._group(joint).servos[self._id(joint)]
 
     def _group(self, joint: str) -> BusGroup:
         if joint not in self._bus_of:
@@ -227,10 +246,34 @@ class Servos:
         """
         counts = dict(zip(JOINTS, self.joint_map.goals(goals).tolist(), strict=True))
         for item, joints in (("goal_position", LEGS), ("goal_velocity", JOINTS[len(LEGS) :])):
-            for name, group in self.groups.items():
-                here = {self._ids[JOINTS.index(joint)]: counts[joint] for joint in joints if self._bus_of[joint] == name}
-                if here:
-                    group.write_all(item, here)
+            self.write_item(item, {joint: counts[joint] for joint in joints})
+
+    def write_item(self, item: str, counts: Mapping[str, int]) -> None:
+        """Write joint -> count of one item, all joints of a bus in one packet. Not acknowledged.
+
+        Raises:
+            BusGoneError: a port is gone.
+        """
+        for name, group in self.groups.items():
+            here = {self._ids[JOINTS.index(joint)]: count for joint, count in counts.items() if self._bus_of[joint] == name}
+            if here:
+                group.write_all(item, here)
+
+    def shout_off(self) -> None:
+        """Tell every motor to switch off, without waiting for anybody; a bus that is gone does not keep the others."""
+        from wlr_gym.hardware.sdk import BusGoneError
+
+        for group in self.groups.values():
+            with contextlib.suppress(BusGoneError):
+                group.write_all("torque_enable", dict.fromkeys(group.servos, 0))
+
+    def reopen_gone(self) -> None:
+        """Open the ports again that are gone, where they are back."""
+        for group in self.groups.values():
+            if group.gone:
+                with contextlib.suppress(InputError):
+                    group.close()
+                    group.open()
 
     def torque_off(self, retries: int = 5) -> list[str]:
         """Switch every motor off, whatever happened before; return the joints that did not confirm it.
@@ -246,3 +289,11 @@ class Servos:
             except BusGoneError:
                 left |= set(group.servos)
         return [joint for joint, id in zip(JOINTS, self._ids, strict=True) if id in left]
+
+
+def _persist(ask: Callable[..., Any], *arguments: Any) -> Any:
+    """Ask up to three times: reading and writing an item twice does no harm."""
+    for _ in range(RETRIES):
+        with contextlib.suppress(NoAnswerError):
+            return ask(*arguments)
+    return ask(*arguments)

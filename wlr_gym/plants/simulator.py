@@ -56,6 +56,9 @@ class Simulator:
         """Fill truth and raw sensor signals of robots ``rows``."""
         raise NotImplementedError
 
+    def expect_all_effects(self) -> None:
+        """Get ready for every effect at once, where each would otherwise need a kernel of its own; the bits do not change."""
+
     def set_force_values(self, values: Array) -> None:
         """Take the constants of the formula forces per robot: (N, constants of all forces one after the other)."""
         raise NotImplementedError

@@ -265,7 +265,7 @@ def drive(
     plant = make_plant(contender.backend, robot, len(motions), options, patch.forces)
     sensors, truth = [], []
     try:
-        readings = plant.reset(np.arange(len(motions), dtype=np.uint64), batch, state=_start(goals[0], robot, batch))
+        readings = plant.reset(np.arange(len(motions), dtype=np.uint64), batch, state=standing_at(goals[0], robot, batch))
         for _ in range(round(SETTLE / motions[0].period)):
             readings = plant.step(goals[0], torque_on[0])
         for tick in range(len(goals) + 1):
@@ -295,8 +295,8 @@ def _goals(motions: Sequence[Motion]) -> tuple[Array, NDArray[np.bool_]]:
     return np.nan_to_num(goals), torque_on
 
 
-def _start(goals: Array, robot: Robot, parameters: Parameters) -> PlantState:
-    """Every robot standing on the floor at its first leg goals, level where its parameters let it."""
+def standing_at(goals: Array, robot: Robot, parameters: Parameters) -> PlantState:
+    """Return every robot standing on the floor at its first leg goals, level where its parameters let it."""
     state = standing_state(robot, parameters)
     level = rest_pose(parameters, state.joint_position[:, :4])
     state.joint_position[:, :4] = goals[:, :4] - parameters["joint.zero_offset"]

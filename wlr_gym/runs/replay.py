@@ -145,7 +145,7 @@ def replay(
     patch = load_patch(effects)
     robot, parameters = prepare(run, robot, parameters, patch, segment)
     t = run["t"]
-    starts = _segment_starts(t, segment)
+    starts = segment_starts(t, segment)
     options = PlantOptions(control_period=clock, physics_step=physics_step, sensor_noise=False)
 
     first = start_state(run, robot, parameters)
@@ -160,7 +160,7 @@ def replay(
     pieces, _ = _simulate(run, plant, many, anchors, t[starts], duration)
     full_rows = {name: full.at(0, name, t) for name in CHANNELS if name in run}
     segment_rows = {name: _join(pieces, name, t, starts, ends) for name in full_rows}
-    errors = _compare(run, full_rows, segment_rows, channel_noise(robot))
+    errors = channel_errors(run, full_rows, segment_rows, channel_noise(robot))
     return ReplayResult(run, full_rows, segment_rows, tuple(map(int, starts)), errors, robot, clock, physics_step)
 
 
@@ -187,8 +187,8 @@ def prepare(
     return robot, parameters
 
 
-def _segment_starts(t: Array, segment: float) -> NDArray[np.intp]:
-    """Rows nearest to whole multiples of ``segment``; a rest shorter than half of one joins the last."""
+def segment_starts(t: Array, segment: float) -> NDArray[np.intp]:
+    """Return the rows nearest to whole multiples of ``segment``; a rest shorter than half of one joins the last."""
     count = max(1, int((t[-1] - t[0]) / segment + 0.5))
     return np.unique(np.searchsorted(t, t[0] + segment * np.arange(count) - 1e-9))
 
@@ -329,9 +329,10 @@ def _join(pieces: _Traces, name: str, t: Array, starts: NDArray[np.intp], ends: 
     return joined
 
 
-def _compare(
+def channel_errors(
     run: Run, full: Mapping[str, Array], segments: Mapping[str, Array], noise: Mapping[str, float]
 ) -> dict[str, ChannelError]:
+    """Return how far both comparisons are from each channel of the run; a channel without a row in common is left out."""
     errors = {}
     for name in full:
         if np.isfinite(run[name] + segments[name]).any():

@@ -36,6 +36,7 @@ from wlr_gym.hardware.emulator.servo import (
     Drive,
     EmulatedServo,
 )
+from wlr_gym.hardware.imu_driver import Conversion
 from wlr_gym.hardware.tables import BAUD_RATES, HARDWARE_ERRORS, ControlTable, load_table
 from wlr_gym.parameters import SPECS, Parameters
 from wlr_gym.plants import make_plant
@@ -124,6 +125,7 @@ class Machine:
         self.ticks = 0
         self.faults = FaultBoard(self.options.seed)
         self._imu_output: list[Emission] = []
+        self._imu = Conversion(hardware.imu)
         self._frames = 0
         self._sign = np.array([hardware.joints[joint].sign for joint in JOINTS], np.float64)
         self._zero = np.array(
@@ -149,6 +151,7 @@ class Machine:
         self._own_law = np.zeros(len(JOINTS), bool)
         self._reference = np.zeros((2, len(JOINTS)))
         self._references_of: tuple[int, Array] = (-1, self._reference)
+        self._turned = np.zeros(len(JOINTS))  # rad by which wheels were turned beyond what the plant's encoders count
         self._tuning: list[tuple[float, ...]] = [(-1.0,)] * len(JOINTS)
         self._supply = self._nominal_supply
         self._goals = np.zeros((1, len(JOINTS)))
@@ -284,7 +287,7 @@ class Machine:
     def _show_sensors(self) -> None:
         sensors = self._sensors
         effort = self._sign * sensors.joint_effort[0]
-        position = self._zero + self._sign * sensors.joint_position[0]
+        position = self._zero + self._sign * (sensors.joint_position[0] + self._turned)
         velocity = self._sign * sensors.joint_velocity[0]
         counts = np.rint(effort / self._effort_count)
         volt = float(sensors.supply_voltage[0])
@@ -304,23 +307,46 @@ class Machine:
             state = self.plant.get_state()
             position = state.reference_position[0].copy()
             position[: len(LEGS)] += self.plant.parameters["joint.zero_offset"][0]
+            position += self._turned
             both = np.stack([self._zero + self._sign * position, self._sign * state.reference_velocity[0]])
             self._references_of = (self.ticks, both)
         return self._references_of[1][0, k], self._references_of[1][1, k]
 
+    # ---- a hand ----
+
+    def turn(self, joint: str, angle: float) -> None:
+        """Turn a limp joint by hand.
+
+        Args:
+            joint: name.
+            angle: rad, in the joint's positive direction.
+
+        Raises:
+            InputError: unknown joint, motors that are on, or a plant whose state cannot be set.
+        """
+        if joint not in JOINTS:
+            raise unknown_name("joint", joint, JOINTS)
+        if not self.plant.capabilities.can_set_state or any(servo["torque_enable"] for servo in self.servos.values()):
+            raise InputError(f"turn {joint}: motors are on, or this plant's state cannot be set")
+        k = JOINTS.index(joint)
+        wheels = self._sensors.joint_position[0, len(LEGS) :].copy()
+        if k < len(LEGS):
+            state = self.plant.get_state()
+            state.joint_position[0, k] += angle
+            self._sensors = self.plant.reset(state=state)
+            self._turned[len(LEGS) :] += wheels  # a reset plant counts its wheels from zero
+        else:
+            self._turned[k] += angle
+        self._show_sensors()
+
     # ---- IMU ----
 
     def _read_imu(self) -> None:
-        port, sensors = self.hardware.imu, self._sensors
+        sensors = self._sensors
         self._frames += 1
-        stamp = self._frames / port.rate
-        frame = imu.Frame(
-            self._frames % 65536,
-            round(stamp * 1e6) % 2**32,
-            imu.to_counts(sensors.accelerometer[0], imu.accel_per_count(port.accel_range)),
-            _IMU_TEMPERATURE,
-            imu.to_counts(sensors.gyro[0], imu.gyro_per_count(port.gyro_range)),
-        )
+        stamp = self._frames / self.hardware.imu.rate
+        force, rate = self._imu.counts(sensors.accelerometer[0], sensors.gyro[0])
+        frame = imu.Frame(self._frames % 65536, round(stamp * 1e6) % 2**32, force, _IMU_TEMPERATURE, rate)
         raw, delay = self.faults.mangle(self.time, imu.encode_frame(frame), ["imu"])
         if raw and not self.faults.happens(self.time, "dead", ["imu"]):
             self._imu_output.append(Emission(self.time + delay, raw))
@@ -369,7 +395,7 @@ class Machine:
                     servo.raise_error(OVERLOADED)
 
     def command(self, text: str) -> str:
-        """Carry out one line of text and return the answer: a fault, ``clear``, ``faults``, ``status``, ``step S``, ``help``.
+        """Carry out one line of text and return the answer: a fault, ``clear``, ``faults``, ``status``, ``turn``, ``help``.
 
         Raises:
             InputError: it cannot be understood.
@@ -382,10 +408,21 @@ class Machine:
                 raise unknown_name("fault", rest[0], FAULTS)
             self.clear(rest[0] if rest else None)
             return "cleared"
+        if word == "turn":
+            return self._turn_by_command(text, rest)
         actions = {"faults": self._list_faults, "status": self.status, "help": help_text}
         if word not in actions:
-            raise unknown_name("command", word, [*actions, "clear", *FAULTS])
+            raise unknown_name("command", word, [*actions, "clear", "turn", *FAULTS])
         return actions[word]()
+
+    def _turn_by_command(self, text: str, words: list[str]) -> str:
+        try:
+            joint, degrees = words
+            angle = float(np.deg2rad(float(degrees)))
+        except ValueError:
+            raise InputError(f"'{text}': expected turn JOINT DEGREES") from None
+        self.turn(joint, angle)
+        return f"{joint} turned by {degrees} deg"
 
     def _list_faults(self) -> str:
         return "\n".join(self.faults.listing(self.time)) or "no faults"
@@ -411,7 +448,10 @@ class Machine:
 
 def help_text() -> str:
     """Return what :meth:`Machine.command` understands."""
-    lines = ["status | faults | clear [KIND] | help | KIND [WHERE ...] [probability=] [value=] [after=] [duration=]"]
+    lines = [
+        "status | faults | clear [KIND] | turn JOINT DEGREES | help",
+        "KIND [WHERE ...] [probability=] [value=] [after=] [duration=]",
+    ]
     for name, kind in FAULTS.items():
         value = f" (value: {kind.unit}, default {kind.value:g})" if kind.unit else ""
         lines.append(f"  {name:9} {kind.doc}{value}")

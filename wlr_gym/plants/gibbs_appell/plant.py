@@ -198,6 +198,12 @@ class GibbsAppellPlant(Simulator):
             supply_drop=values[:, _LANE["supply_drop"]],
         )
 
+    def expect_all_effects(self) -> None:
+        """Compile for every family of effects; see :class:`wlr_gym.plants.simulator.Simulator`."""
+        self._features = frozenset({"rolling_resistance", "drive", "backlash", "ground", "creep"}) | (self._features or set())
+        formulas = self._formulas.module if self._formulas else None
+        self._kernel = kernel.load_kernel(self._features, self.options.precision, self._width, formulas)
+
     def set_force_values(self, values: Array) -> None:
         """Take the constants of the formula forces per robot; see :class:`wlr_gym.plants.simulator.Simulator`."""
         padded = np.vstack([values, np.repeat(values[:1], self._tiles * self._width - self._count, axis=0)])

@@ -1,0 +1,67 @@
+"""An emulated robot behind the real control loop, in emulated time: what the tests of loop, gate and faults share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlr_gym.hardware import loop as loop_module
+from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.emulator import Machine, MachineOptions
+from wlr_gym.hardware.emulator.line import NO_TIME
+from wlr_gym.hardware.link import emulated_link
+from wlr_gym.hardware.loop import ControlLoop, Phase, StoppedError
+from wlr_gym.robot import JOINTS, load_robot
+
+loop_module.TIMED_READS = 20  # in emulated time they all take the same
+
+ROBOT = load_robot()
+HARDWARE = load_hardware()
+PERIOD = 0.02
+DRIVE = np.array([1.5, 1.6, 1.5, 1.6, 3.0, 3.0, 3.0, 3.0])
+
+
+def hardware_with(**safety):
+    """The nominal hardware with other safety limits."""
+    return HARDWARE.model_copy(update={"safety": HARDWARE.safety.model_copy(update=safety)})
+
+
+def machine_of(core: Any) -> Any:
+    """The emulated robot that a core drives."""
+    return core.plant.loop.clock.machine
+
+
+class Rig:
+    """A robot and its loop.
+
+    Attributes:
+        machine: the emulated robot. loop: drives it.
+    """
+
+    def __init__(self, log: Path | None = None, options=None, machine=None, dry_run: bool = False, **safety: Any) -> None:
+        hardware = hardware_with(**safety)
+        self.machine = machine or Machine(ROBOT, hardware, options or MachineOptions(timing=NO_TIME))
+        self.link = emulated_link(self.machine)
+        self.loop = ControlLoop(ROBOT, hardware, self.link, PERIOD, log=log, dry_run=dry_run)
+
+    def drive(self, seconds, goals=DRIVE):
+        for _ in range(round(seconds / PERIOD)):
+            self.loop.tick(goals)
+
+    def torque(self):
+        """(8,) which motors are on."""
+        return np.array([bool(servo["torque_enable"]) and not servo.dead for servo in self.machine.servos.values()])
+
+    def goal_counts(self):
+        """(8,) goals the servos hold."""
+        return np.array(
+            [self.machine.servos[joint]["goal_position" if k < 4 else "goal_velocity"] for k, joint in enumerate(JOINTS)]
+        )
+
+    def inject(self, text):
+        self.machine.inject(text)
+
+
+__all__ = ["DRIVE", "HARDWARE", "JOINTS", "PERIOD", "ROBOT", "Phase", "Rig", "StoppedError", "hardware_with", "machine_of"]

@@ -1,0 +1,254 @@
+"""``wlr deploy`` and what is under it: a policy on the emulated robot, its log, and the same actions again from the log."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("dynamixel_sdk")
+pytest.importorskip("serial")
+
+from robot_rig import Phase, hardware_with, machine_of
+
+from wlr_gym.cli import FAILED, OK, run_command
+from wlr_gym.errors import InputError
+from wlr_gym.evaluation import make_core, roll_out
+from wlr_gym.evaluation.card import per_episode
+from wlr_gym.evaluation.deployment import act_again, loop_of, read_policy_log
+from wlr_gym.evaluation.deployment import deploy as drive
+from wlr_gym.hardware.log import read_events
+from wlr_gym.policy import make_policy
+from wlr_gym.runs.read import read_run
+
+ID = "WLR-Velocity-v0"
+COMMAND = {"linear_velocity_x": 0.08, "yaw_rate": 0.15}
+
+
+def robot_core(folder, seconds=4.0):
+    return make_core(ID, 1, {"backend": "dynamixel", "hardware": {"emulated": True, "log": folder}, "episode_length": seconds})
+
+
+class Wobble:
+    """A policy that uses its whole observation and its own past, in float32."""
+
+    def __init__(self, width):
+        self.weights = np.random.default_rng(0).normal(0.0, 0.05, (width, 8)).astype(np.float32)
+        self.state = np.zeros(8, np.float32)
+
+    def act(self, observations):
+        self.state = np.float32(0.9) * self.state + np.float32(0.1) * np.tanh(observations @ self.weights)[0]
+        return np.clip(self.state, -1, 1)[None]
+
+    def reset(self, mask):
+        self.state = np.zeros(8, np.float32)
+
+
+# ---- deploying ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "make", [lambda core: Wobble(core.observation.shape[1]), lambda core: make_policy("proportional", core.contract())]
+)
+def test_the_log_shown_to_the_policy_again_gives_the_same_actions(tmp_path, make):
+    core = robot_core(tmp_path)
+    result = drive(core, make(core), seed=2)
+    assert result.run is not None
+    assert result.well
+    assert result.ticks == 200
+    log = read_policy_log(result.run)
+    assert len(np.unique(log["command_yaw_rate"])) >= 1
+    given, answered = act_again(core, make(core), result.run)
+    assert given.shape == (200, 8)
+    assert np.abs(np.diff(given, axis=0)).max() > 0.001
+    np.testing.assert_array_equal(answered, given)
+    core.close()
+
+
+def test_commands_that_change_on_the_way_are_seen_again(tmp_path):
+    core = robot_core(tmp_path, 9.0)
+    policy = make_policy("proportional", core.contract())
+    result = drive(core, policy, seed=5)
+    assert result.run is not None
+    commands = read_policy_log(result.run)["command_yaw_rate"]
+    assert len(np.unique(commands)) == 2
+    given, answered = act_again(core, policy, result.run)
+    np.testing.assert_array_equal(answered, given)
+    core.close()
+
+
+def test_a_policy_tracks_on_the_robot_as_in_simulation(tmp_path):
+    """Errors on the emulated robot lie where those of randomised simulated robots lie, with the same command."""
+    core = robot_core(tmp_path, 8.0)
+    machine, seen = machine_of(core), []
+    loop_of(core).spare = lambda: seen.append(machine.plant.truth().values[0].copy())
+    result = drive(core, make_policy("proportional", core.contract()), command=COMMAND)
+    assert result.reason == "time is over"
+    columns = machine.plant.truth().layout.slices
+    truth = np.array(seen)[-100 - 30 :][:100]  # the last 2 s before the wheels stop
+    speed = truth[:, columns["linear_velocity_in_body"].start].mean()
+    turn = truth[:, columns["angular_velocity_in_body"].stop - 1].mean()
+    core.close()
+    simulated = make_core(
+        ID, 32, {"episode_length": 8.0, "task": {"commands": {"terms": held(COMMAND), "zero_probability": 0.0}}}
+    )
+    rollout = roll_out(simulated, make_policy("proportional", simulated.contract()))
+    assert per_episode(rollout)["falls"][0].sum() == 0
+    for value, series in ((speed, rollout.forward_velocity), (turn, rollout.yaw_rate)):
+        low, high = np.percentile(series[-100:].mean(axis=0), [2.5, 97.5])
+        assert low <= value <= high
+
+
+def held(command):
+    return {name: [value, value + 1e-9] for name, value in command.items()}
+
+
+def test_a_stop_by_the_gate_is_reported_and_logged(tmp_path):
+    core = robot_core(tmp_path)
+    loop = loop_of(core)
+    machine_of(core).inject("drop wheels after=1.5")
+    result = drive(core, make_policy("proportional", core.contract()))
+    assert result.run is not None
+    assert not result.well
+    assert result.reason.startswith("silence: no answer from wheel_lf")
+    assert loop.phase is Phase.FAULT
+    assert len(read_run(result.run).table) == result.ticks
+    rules = [event["rule"] for event in read_events(result.run) if event["event"] == "intervention"]
+    assert "silence" in rules
+    core.close()
+
+
+def test_a_failing_policy_leaves_no_torque(tmp_path):
+    core = robot_core(tmp_path)
+
+    class Broken(Wobble):
+        def act(self, observations):
+            if np.abs(observations).max() > 0.5 and self.state.any():
+                raise ZeroDivisionError
+            return super().act(observations)
+
+    with pytest.raises(ZeroDivisionError):
+        drive(core, Broken(core.observation.shape[1]))
+    assert not any(servo["torque_enable"] for servo in machine_of(core).servos.values())
+    core.close()
+
+
+def test_actions_that_are_no_numbers_are_refused_and_torque_goes_off(tmp_path):
+    core = robot_core(tmp_path)
+
+    class Nan(Wobble):
+        def act(self, observations):
+            return np.full((1, 8), np.nan, np.float32)
+
+    with pytest.raises(InputError, match="expected a finite number"):
+        drive(core, Nan(core.observation.shape[1]))
+    assert not any(servo["torque_enable"] for servo in machine_of(core).servos.values())
+    core.close()
+
+
+def test_simulators_are_no_robots():
+    core = make_core(ID, 1, {})
+    with pytest.raises(InputError, match="'gibbs_appell' is no robot"):
+        drive(core, make_policy("do_nothing", core.contract()))
+    core.close()
+
+
+# ---- command line ------------------------------------------------------------------------------------------------------
+
+
+def words(folder, *more):
+    return ["proportional", "--emulated", "--stepped", "--seconds", "1", "--out", str(folder), *more]
+
+
+def test_command_line_in_emulated_time(tmp_path, capsys):
+    assert run_command("deploy", words(tmp_path, "--command", "linear_velocity_x=0.05", "yaw_rate=0")) == OK
+    said = capsys.readouterr().out
+    assert "ended: time is over" in said
+    assert "track_linear_velocity" in said
+    log = read_policy_log(tmp_path / "run_01.csv")
+    assert (log["command_linear_velocity_x"] == 0.05).all()
+
+
+def test_command_line_says_why_it_stopped(tmp_path, capsys):
+    assert run_command("deploy", words(tmp_path, "--fault", "overload wheel_rr after=0.8")) == FAILED
+    assert "alert: wheel_rr has a hardware error" in capsys.readouterr().out
+
+
+def test_command_line_dry_run(tmp_path):
+    assert run_command("deploy", words(tmp_path, "--dry-run")) == OK
+    assert read_run(tmp_path / "run_01.csv").meta.notes == "dry run"
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--seconds", "0"], "--seconds 0"),
+        (["--seed", "-1"], "--seed -1"),
+        (["--deadman", "0"], "--deadman 0"),
+        (["--command", "speed"], "--command speed: expected name=value"),
+        (["--command", "yaw_rate=fast"], "expected name=number"),
+        (["--command", "yaw=1"], "unknown command 'yaw'"),
+        (["--port", "legs=/dev/x"], "brings its own ports"),
+        (["--fault", "dorp"], "unknown fault 'dorp'"),
+        (["--hardware", "nominl"], "nominal"),
+    ],
+)
+def test_command_line_bad_options(tmp_path, more, message):
+    with pytest.raises(InputError, match=message):
+        run_command("deploy", words(tmp_path, *more))
+
+
+def test_faults_are_for_the_emulated_robot(tmp_path):
+    with pytest.raises(InputError, match="add --emulated"):
+        run_command("deploy", ["proportional", "--fault", "drop"])
+    with pytest.raises(InputError, match="cannot be opened"):
+        run_command("deploy", ["proportional", "--yes", "--port", f"legs={tmp_path}/none", "--out", str(tmp_path)])
+
+
+@pytest.mark.parametrize("stop", ["signal", "key"])
+def test_command_line_on_real_terminals(tmp_path, stop):
+    """The whole way in real time: emulator process, ports, guard, a stop from outside. No claim about time."""
+    pytest.importorskip("termios")
+    import yaml
+
+    patient = hardware_with(
+        patience=0.3, read_time=5.0, late=10000, late_share=1.0, silence=9.0, coast=8.0, imu_silence=9.0, watchdog=2.5
+    )
+    (tmp_path / "hardware.yaml").write_text(yaml.safe_dump(patient.model_dump(mode="json")), encoding="utf-8")
+    arguments = ["deploy", "proportional", "--emulated", "--seconds", "120", "--out", str(tmp_path / "log")]
+    code = "import sys; from wlr_gym.cli import run_command; sys.exit(run_command(sys.argv[1], sys.argv[2:]))"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments, "--hardware", str(tmp_path / "hardware.yaml")],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    end = time.monotonic() + 120
+    run = tmp_path / "log" / "partial_run_01.csv"
+    while time.monotonic() < end and not (run.is_file() and len(run.read_bytes()) > 5000) and process.poll() is None:
+        time.sleep(0.05)
+    if stop == "signal":
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=60)
+    else:
+        output, _ = process.communicate(input="q", timeout=60)
+    assert process.returncode == OK, output
+    assert ("SIGINT" if stop == "signal" else "stop key") in output
+    assert len(read_run(tmp_path / "log" / "run_01.csv").table) > 5
+    assert json.loads((tmp_path / "log" / "run_01.events.jsonl").read_text().splitlines()[-1])["event"] == "end"
+
+
+# ---- real time ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_fifty_times_a_second_for_a_minute(tmp_path):
+    """On a computer that has time: no tick is missed, and 99 of 100 start less than 3 ms after their deadline."""
+    arguments = ["deploy", "proportional", "--emulated", "--seconds", "60", "--out", str(tmp_path)]
+    code = "import sys; from wlr_gym.cli import run_command; sys.exit(run_command(sys.argv[1], sys.argv[2:]))"
+    subprocess.run([sys.executable, "-c", code, *arguments], stdin=subprocess.DEVNULL, check=True, timeout=180)
+    statistics = read_events(tmp_path / "run_01.csv")[-1]["statistics"]
+    assert statistics["ticks"] > 3000
+    assert statistics["missed"] == 0
+    assert statistics["jitter"]["p99"] < 3.0

@@ -1,0 +1,154 @@
+"""``wlr doctor`` on the emulated robot: a good one passes; each fault is named first, with its remedy and exit code."""
+
+import json
+from functools import partial
+
+import pytest
+
+from wlr_gym.cli import doctor
+from wlr_gym.cli.robot_options import RobotOption
+from wlr_gym.errors import InputError
+from wlr_gym.hardware.config import load_hardware
+from wlr_gym.robot import load_robot
+
+pytest.importorskip("dynamixel_sdk")
+pytest.importorskip("serial")
+pytest.importorskip("termios")
+
+from wlr_gym.hardware import checks, setup
+from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
+from wlr_gym.hardware.emulator.line import NO_TIME
+from wlr_gym.hardware.link import emulated_link
+
+ROBOT, HARDWARE = load_robot(), load_hardware()
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    machine = Machine(ROBOT, HARDWARE)
+    monkeypatch.setattr(RobotOption, "link", lambda self: emulated_link(machine))
+    return machine
+
+
+def look(capsys, **options):
+    code = doctor.run(doctor.Options(emulated=True, **options))
+    return code, capsys.readouterr().out
+
+
+def test_a_good_robot_passes(machine, capsys, tmp_path):
+    code, text = look(capsys, json=tmp_path / "checks.json")
+    assert (code, text.splitlines()[-1]) == (0, "All 147 checks passed.")
+    assert "8 of 8     supply" in text
+    assert "bus speed: median 3.00 ms" in text
+    assert "All 8" not in text
+    found = json.loads((tmp_path / "checks.json").read_text())
+    assert len(found) == 147
+    assert {entry["where"] for entry in found} >= {"legs", "imu", "wheel_rr", "robot"}
+
+
+@pytest.mark.parametrize(
+    ("fault", "first", "remedy"),
+    [
+        ("unplug wheels", "wheels, port: not there", "--port wheels=PATH"),
+        ("unplug imu", "imu, port: not there", "--port imu=PATH"),
+        ("dead leg_rr", "leg_rr, answer: none", "cable and adapter of bus legs"),
+        ("overload leg_lf", "leg_lf, hardware error: overload", "reboot it"),
+        ("sag value=3", "leg_lf, supply: 9.0 V", "Charge the battery"),
+        ("dead imu", "imu, readings: none", "baud rate"),
+    ],
+)
+def test_each_fault_is_named_first_with_its_remedy(machine, capsys, fault, first, remedy):
+    machine.inject(fault)
+    machine.step()
+    code, text = look(capsys)
+    assert code == 1
+    summary = text[text.index("First: ") :]
+    assert summary.startswith(f"First: {first}")
+    assert remedy in summary
+
+
+def test_a_tilted_robot_and_a_lossy_imu(machine, capsys):
+    machine.inject("drop imu probability=0.1")
+    code, text = look(capsys)
+    assert (code, "imu, losses" in text) == (0, True)
+    assert "0 faults, 1 warning in" in text
+    machine.clear()
+    machine._sensors.accelerometer[0] = [3.0, 0.0, 9.3]
+    machine.plant.step = lambda goals, torque: machine._sensors
+    code, text = look(capsys)
+    assert (code, "First: imu, level: 17" in text) == (1, True)
+    assert "wlr calibrate imu --mounting" in text
+
+
+def test_mending_writes_registers_and_looks_again(machine, capsys):
+    machine.servos["leg_lr"].set("return_delay_time", 250)
+    machine.servos["wheel_rf"].set("drive_mode", 1)
+    code, text = look(capsys)
+    assert (code, "1 fault, 1 warning in" in text) == (1, True)
+    assert "First: wheel_rf, drive_mode: 1, expected 0" in text
+    code, text = look(capsys, mend=True)
+    assert (code, text.splitlines()[0]) == (0, "mended: 2, left: 0")
+    assert machine.servos["leg_lr"]["return_delay_time"] == 0
+
+
+def test_verbose_lists_every_joint(machine, capsys):
+    assert len(look(capsys, verbose=True)[1].splitlines()) == 148
+
+
+def test_on_ports_with_a_scan(capsys, monkeypatch):
+    machine = Machine(ROBOT, HARDWARE, MachineOptions(timing=NO_TIME, sensor_noise=False))
+    machine.servos["wheel_lf"].set("id", 42)
+    rates = (1_000_000, 4_500_000)  # each takes a second; the SDK does not know the last
+    monkeypatch.setattr(setup, "find_servos", partial(setup.find_servos, baud_rates=rates))
+    with Server(machine, real_time=False) as server:
+        ports = tuple(f"{name}={path}" for name, path in server.ports.items())
+        code = doctor.run(doctor.Options(port=ports, scan=True))
+    text = capsys.readouterr().out
+    assert (code, "First: wheel_lf, answer: none" in text) == (1, True)
+    assert "wheels: id 42 at 1000000 bit/s: model 1060, firmware 45" in text
+    assert text.count(" at 1000000 bit/s: model") == 8
+
+
+def test_what_cannot_be_asked_for(tmp_path):
+    with pytest.raises(InputError, match="--scan: the emulated robot"):
+        doctor.run(doctor.Options(emulated=True, scan=True))
+    with pytest.raises(InputError, match="expected NAME=PATH"):
+        doctor.run(doctor.Options(port=("legs",)))
+    with pytest.raises(InputError, match="one or the other"):
+        doctor.run(doctor.Options(port=("legs=/dev/x",), emulated=True))
+    with pytest.raises(InputError, match="no bus 'leg'"):
+        doctor.run(doctor.Options(port=("leg=/dev/x",)))
+    with pytest.raises(InputError, match="does not exist"):
+        doctor.run(doctor.Options(json=tmp_path / "no" / "checks.json"))
+
+
+def test_ports_that_are_there_are_named(tmp_path):
+    assert "no USB serial port" in checks._ports_here(tmp_path)
+    (tmp_path / "ttyUSB3").touch()
+    assert checks._ports_here(tmp_path).endswith("ttyUSB3")
+    (tmp_path / "serial/by-id").mkdir(parents=True)
+    (tmp_path / "serial/by-id/usb-U2D2").touch()
+    assert checks._ports_here(tmp_path).endswith("by-id/usb-U2D2")
+
+
+def write_policy(folder, **changes):
+    from wlr_gym.evaluation.rollout import make_core
+    from wlr_gym.policy.file import write_contract
+
+    core = make_core("WLR-Velocity-v0", 1, {})
+    contract = core.contract() | changes
+    core.close()
+    write_contract(folder, "proportional", {}, contract, {"environment": "WLR-Velocity-v0"})
+
+
+def test_a_policy_that_fits_and_one_that_does_not(machine, capsys, tmp_path):
+    write_policy(tmp_path)
+    code, text = look(capsys, policy=tmp_path)
+    assert (code, "policy     contract: proportional, velocity" in text) == (0, True)
+    write_policy(tmp_path, control_period=0.01)
+    code, text = look(capsys, policy=tmp_path)
+    assert code == 1
+    assert "First: policy, contract" in text
+    assert "control_period is 0.01 in the policy, 0.02" in text
+    code, text = look(capsys, policy=tmp_path / "nowhere")
+    assert (code, "no policy in" in text) == (1, True)

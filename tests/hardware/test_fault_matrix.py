@@ -1,0 +1,255 @@
+"""Every fault in every phase, in emulated time: the robot ends in the documented safe state within its bound.
+
+Bounds from when the fault acts: torque off 0.6 s after the last answer; standing 0.25 s after the last packet (the servos'
+watchdog, where they cannot be told). Everywhere: no uncaught exception, no goal that jumps, a log complete to the end.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("dynamixel_sdk")
+pytest.importorskip("serial")
+
+from robot_rig import DRIVE, HARDWARE, JOINTS, PERIOD, Phase, Rig, StoppedError
+
+from wlr_gym.errors import InputError
+from wlr_gym.hardware.emulator import FAULTS, MachineOptions
+from wlr_gym.hardware.emulator.line import NO_TIME
+from wlr_gym.hardware.log import read_events
+from wlr_gym.runs.read import read_run
+from wlr_gym.servo import REGISTER_UNITS
+
+_COUNTS = (REGISTER_UNITS["XM540-W150-R"]["position"].per_count, REGISTER_UNITS["XL430-W250-T"]["velocity"].per_count)
+#: (8,) counts that a goal may change by in a tick, and one for rounding.
+LARGEST_STEP = (
+    PERIOD * np.repeat([HARDWARE.safety.leg_speed, HARDWARE.safety.wheel_acceleration], 4) / np.repeat(_COUNTS, 4) + 1
+)
+PHASES = ("start-up", "ramp", "running", "stopping")
+SHORT: dict[str, Any] = {"start_speed": 3.0, "stop_time": 0.4, "off_time": 0.3}
+OFF_BOUND, STAND_BOUND = 0.6, 0.25
+#: Fault -> as it is injected, and what it leads to: "runs" (nothing happens), "off" (torque off at every servo that has power),
+#: "unreachable" (nobody hears: the watchdog stops the motors; torque off when the line is back).
+MATRIX = {
+    "drop": ("drop legs wheels", "off"),
+    "delay": ("delay value=0.002", "runs"),
+    "late": ("late value=0.05", "off"),
+    "flip": ("flip", "off"),
+    "truncate": ("truncate", "off"),
+    "noise": ("noise", "runs"),
+    "echo": ("echo", "runs"),
+    "deaf": ("deaf", "unreachable"),
+    "dead": ("dead wheel_lf", "off"),
+    "brownout": ("brownout", "off"),
+    "unplug": ("unplug legs", "unreachable"),
+    "overload": ("overload leg_rf", "off"),
+    "overheat": ("overheat wheel_rr value=60", "off"),
+    "sag": ("sag value=2.5", "off"),
+    "imu dead": ("dead imu", "off"),
+    "imu unplugged": ("unplug imu", "off"),
+    "imu silent": ("drop imu", "off"),
+    "one bus silent": ("drop wheels", "off"),
+}
+#: s that an overheating or a sagging supply takes until its limit, and a stop in good order after that.
+SLOW = {"overheat": 1.4, "sag": 1.1, "overload": 0.6, "imu dead": 0.6, "imu unplugged": 0.6, "imu silent": 0.6}
+
+
+class Watch:
+    """Looks at the emulated servos at every tick of emulated time.
+
+    Attributes:
+        off_at: s from which on all motors were off. jump: largest change of a goal from tick to tick, over what is allowed.
+    """
+
+    def __init__(self, rig):
+        self.rig, self.jump = rig, 0.0
+        self.off_at: float | None = None
+        self.goals, self.driven = rig.goal_counts(), np.zeros(8, bool)
+        step = rig.machine.step
+
+        def watched():
+            step()
+            self.look()
+
+        rig.machine.step = watched
+
+    def look(self):
+        rig = self.rig
+        goals = rig.goal_counts()
+        # goals of a servo that is off mean nothing, and its watchdog sets its own
+        driven = rig.torque() & [servo["bus_watchdog"] >= 0 for servo in rig.machine.servos.values()]
+        both = driven & self.driven
+        self.jump = max(self.jump, float((np.abs(goals - self.goals) / LARGEST_STEP)[both].max(initial=0.0)))
+        self.goals, self.driven = goals, driven
+        if rig.torque().any():
+            self.off_at = None
+        elif self.off_at is None:
+            self.off_at = rig.machine.time
+
+
+def play(rig, phase, fault, seconds, struck):
+    """Drive from start to stop with a fault that begins in a phase; ``struck`` gets the time (s) at which it does."""
+    loop, machine = rig.loop, rig.machine
+
+    def strike():
+        struck.append(machine.time)
+        machine.inject(fault)
+
+    if phase == "start-up":
+        strike()
+    elif phase == "ramp":
+        ticks = iter(range(1000))
+        loop.spare = lambda: strike() if next(ticks) == 5 else None
+    loop.start([1.4] * 4)
+    loop.spare = None
+    rig.drive(0.3)
+    if phase == "running":
+        strike()
+    rig.drive(seconds)
+    if phase == "stopping":
+        strike()
+    loop.stop()
+
+
+@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize("name", MATRIX)
+def test_matrix(tmp_path, name, phase):
+    fault, outcome = MATRIX[name]
+    rig = Rig(tmp_path, **SHORT)
+    watch = Watch(rig)
+    struck, reason = [], ""
+    try:
+        play(rig, phase, fault, 2.2 if name in ("overheat", "sag") else 0.9, struck)
+    except (StoppedError, InputError) as error:
+        reason = str(error)
+    ended = rig.machine.time
+    watch.look()
+    time_to_off = np.inf if watch.off_at is None else watch.off_at - struck[0]
+    assert watch.jump <= 1.0
+    assert rig.loop.phase in (Phase.LIMP, Phase.FAULT)
+    if outcome == "runs":
+        assert reason == ""
+        assert rig.loop.phase is Phase.LIMP
+    elif phase == "start-up":
+        assert rig.torque().sum() == 0
+        assert reason or name in ("overheat", "sag", "brownout", "overload")
+    elif phase == "stopping":
+        assert time_to_off <= max(OFF_BOUND, SHORT["stop_time"] + 0.2) or outcome == "unreachable"
+    elif outcome == "off":
+        assert reason
+        assert time_to_off <= OFF_BOUND + SLOW.get(name, 0.0) + 1e-9, reason
+    if outcome == "unreachable" and phase != "start-up":
+        assert reason or phase == "stopping"
+        assert "CUT THE POWER" in rig.loop.reason
+        stands_from_now(rig, struck[0])
+        rig.machine.clear()
+        rig.loop._gate.off()  # as the guard process does it, once the line is back
+    assert not any(servo["torque_enable"] for servo in rig.machine.servos.values() if not servo.dead)
+    rig.loop.close()
+    check_log(tmp_path, rig, phase, ended)
+
+
+def stands_from_now(rig, struck):
+    """The motors that could not be told stand, and refuse goals, ``STAND_BOUND`` after they heard the last packet."""
+    assert rig.machine.time > struck + STAND_BOUND
+    for joint, servo in rig.machine.servos.items():
+        if servo["torque_enable"]:
+            assert servo["bus_watchdog"] == -1, joint
+            assert abs(servo["goal_velocity"]) == 0, joint
+
+
+def check_log(folder, rig, phase, ended):
+    """All rows up to the end are there, in the run format, evenly spaced; and what the gate did."""
+    if rig.loop.log is None:
+        assert phase == "start-up"
+        return
+    assert not list(folder.glob("partial*"))
+    events = read_events(rig.loop.log.run)
+    assert events[-1]["event"] == "end"
+    if phase == "start-up" and not rig.loop.log.run.is_file():
+        return
+    path = rig.loop.log.run if rig.loop.log.run.is_file() else folder / "ramp_01.csv"
+    run = read_run(path)
+    assert ended - run["t"][-1] < 1.0
+    assert np.diff(run["t"]).max() < 0.1
+    if rig.loop.phase is Phase.FAULT and phase in ("ramp", "running"):
+        assert any(event["event"] == "intervention" for event in events)
+
+
+def test_the_matrix_has_every_fault():
+    assert {fault.split()[0] for fault, _ in MATRIX.values()} == set(FAULTS)
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+def test_one_percent_of_packets_lost_stops_nothing(tmp_path, seed):
+    rig = Rig(tmp_path, MachineOptions(timing=NO_TIME, seed=seed))
+    rig.inject("drop legs wheels probability=0.01")
+    watch = Watch(rig)
+    rig.loop.start()
+    for tick in range(400):
+        rig.loop.tick(np.r_[DRIVE[:4], [4.0 * np.sin(0.05 * tick)] * 4])
+    rig.loop.stop()
+    assert rig.loop.phase is Phase.LIMP
+    assert watch.jump <= 1.0
+    assert rig.loop.interventions["silence"] < 15
+    assert sum(group.statistics.fallbacks for group in rig.link.servos.groups.values()) > 20
+    assert len(read_run(tmp_path / "run_01.csv").table) > 400
+
+
+def test_torque_goes_off_in_time_after_total_loss():
+    """The bound of the ladder, to the tick: from the last answer until the last motor is off."""
+    rig = Rig()
+    watch = Watch(rig)
+    rig.loop.start()
+    rig.drive(0.5)
+    rig.inject("drop legs wheels")
+    lost = rig.machine.time
+    with pytest.raises(StoppedError, match="silence: no answer from leg_lf"):
+        rig.drive(2.0)
+    watch.look()
+    assert watch.off_at is not None
+    assert watch.off_at - lost <= OFF_BOUND
+    assert HARDWARE.safety.silence <= watch.off_at - lost
+    rig.loop.close()
+
+
+def test_wheels_stop_before_torque_goes_off():
+    """Coast for three ticks, then hold, then off."""
+    rig = Rig()
+    rig.loop.start()
+    rig.drive(0.5)
+    rig.inject("drop legs wheels")
+    lost, goals = rig.machine.time, {}
+    rig.loop.spare = lambda: goals.__setitem__(round(rig.machine.time - lost, 3), rig.loop.goals[4])
+    with pytest.raises(StoppedError):
+        rig.drive(2.0)
+    assert all(goal == 3.0 for time, goal in goals.items() if time < 0.06)
+    assert all(goal == 0.0 for time, goal in goals.items() if time > 0.16)
+    rig.loop.close()
+
+
+def test_an_adapter_that_comes_back_is_told_to_switch_off():
+    rig = Rig(off_time=2.0)
+    rig.loop.start()
+    rig.drive(0.3)
+    rig.inject("unplug wheels duration=0.8")
+    with pytest.raises(StoppedError, match="port") as stop:
+        rig.drive(2.0)
+    assert "CUT THE POWER" not in str(stop.value)
+    assert not rig.torque().any()
+    rig.loop.close()
+
+
+def test_servos_that_cannot_be_reached_are_named():
+    rig = Rig(off_time=0.2)
+    rig.loop.start()
+    rig.drive(0.3)
+    rig.inject("unplug wheels")
+    with pytest.raises(
+        StoppedError, match="CUT THE POWER: torque is not confirmed off at wheel_lf, wheel_rf, wheel_lr, wheel_rr"
+    ):
+        rig.drive(2.0)
+    assert rig.torque().tolist() == [False] * 4 + [True] * 4
+    assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS[4:]] == [-1] * 4
+    rig.loop.close()

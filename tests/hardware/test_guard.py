@@ -1,0 +1,175 @@
+"""Real processes on real (pseudo-)terminals: kill -9, signals, and the guard. Few and short; times are bounds, not claims."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+pytest.importorskip("dynamixel_sdk")
+pytest.importorskip("serial")
+pytest.importorskip("termios")
+
+from wlr_gym.hardware.bus import BusGroup
+from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
+from wlr_gym.hardware.emulator.line import NO_TIME
+from wlr_gym.hardware.guard import Guard, switch_off
+from wlr_gym.hardware.tables import load_table
+from wlr_gym.robot import load_robot
+from wlr_gym.runs.read import read_run
+
+ROBOT = load_robot()
+#: A busy computer must not fail these tests: they are about who switches off, not about deadlines.
+PATIENT = {
+    "patience": 0.2,
+    "read_time": 2.0,
+    "late": 10000,
+    "late_share": 1.0,
+    "silence": 5.0,
+    "coast": 2.0,
+    "imu_silence": 5.0,
+}
+DRIVER = """
+import sys, numpy as np
+from pathlib import Path
+from wlr_gym.plants import make_plant
+from wlr_gym.plants.base import PlantOptions, RobotOptions
+from wlr_gym.hardware.loop import StoppedError, stop_on_signals
+from wlr_gym.robot import load_robot
+
+options = RobotOptions(hardware=sys.argv[1], log=Path(sys.argv[2]))
+plant = make_plant("dynamixel", load_robot(), 1, PlantOptions(), hardware=options)
+try:
+    with stop_on_signals(plant.loop):
+        plant.reset()
+        goals = np.array([[1.5, 1.6, 1.5, 1.6, 2.0, 2.0, 2.0, 2.0]])
+        for tick in range(100000):
+            plant.step(goals)
+            if tick == 10:
+                print("driving", plant.loop._guard.process.pid, flush=True)
+except StoppedError as stop:
+    print("stopped:", stop)
+finally:
+    plant.close()
+"""
+
+
+@pytest.fixture
+def server():
+    machine = Machine(ROBOT, load_hardware(), MachineOptions(timing=NO_TIME, tick=0.002))
+    with Server(machine) as server:
+        yield server
+
+
+def hardware_file(folder, server, **safety):
+    description = load_hardware().model_dump(mode="json")
+    for name, port in server.ports.items():
+        (description["imu"] if name == "imu" else description["buses"][name])["port"] = port
+    description["safety"] |= PATIENT | safety
+    path = folder / "hardware.yaml"
+    path.write_text(yaml.safe_dump(description), encoding="utf-8")
+    return path
+
+
+def start_driver(folder, server, **safety):
+    """Return the driving process, once it drives, and its guard's process id."""
+    words = [sys.executable, "-c", DRIVER, str(hardware_file(folder, server, **safety)), str(folder / "log")]
+    driver = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert driver.stdout is not None
+    line = driver.stdout.readline()
+    assert line.startswith("driving"), line
+    return driver, int(line.split()[1])
+
+
+def torque(server) -> list[bool]:
+    return server.call(lambda: [bool(servo["torque_enable"]) for servo in server.machine.servos.values()])
+
+
+def latched(server):
+    return server.call(lambda: all(servo["bus_watchdog"] == -1 for servo in server.machine.servos.values()))
+
+
+def wait_until(condition, seconds):
+    """Return how long it took (s)."""
+    start = time.monotonic()
+    while not condition():
+        assert time.monotonic() - start < seconds
+        time.sleep(0.005)
+    return time.monotonic() - start
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_kill_9_is_no_way_past_torque_off(tmp_path, server):
+    driver, guard = start_driver(tmp_path, server, watchdog=0.4)
+    assert all(torque(server))
+    driver.kill()
+    driver.wait()
+    wait_until(lambda: not any(torque(server)), 10.0)
+    wait_until(lambda: not alive(guard), 10.0)
+    assert (tmp_path / "log" / "guard.jsonl").read_text().count("torque off") == 1
+    run = read_run(tmp_path / "log" / "partial_run_01.csv")  # all that was seen, readable as it is
+    assert len(run.table) >= 10
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_signals_end_a_driving_process_in_good_order(tmp_path, server, name):
+    driver, guard = start_driver(tmp_path, server, watchdog=2.0)
+    driver.send_signal(getattr(signal, name))
+    output, _ = driver.communicate(timeout=20)
+    assert driver.returncode == 0
+    assert f"stopped: stop: {name}" in output
+    assert not any(torque(server))
+    wait_until(lambda: not alive(guard), 10.0)
+    assert len(read_run(tmp_path / "log" / "run_01.csv").table) > 10
+    assert not (tmp_path / "log" / "guard.jsonl").exists()  # nothing was left for it
+
+
+def test_the_guard_ends_when_it_is_told(server):
+    hardware = load_hardware()
+    guard = Guard(ROBOT, hardware)
+    guard.process.send_signal(signal.SIGINT)  # the terminal's Ctrl-C is not for it
+    guard.process.send_signal(signal.SIGTERM)
+    assert guard.process.poll() is None
+    guard.release()
+    assert guard.process.wait(5.0) == 0
+
+
+def test_the_guard_waits_for_an_adapter_that_is_gone(server):
+    groups = [
+        BusGroup(
+            name, server.ports[name], bus.baud_rate, {ROBOT.dynamixel_ids[j]: load_table(bus.model) for j in bus.joints}, 0.1
+        )
+        for name, bus in load_hardware().buses.items()
+    ]
+    for servo in server.machine.servos.values():
+        servo.write(64, b"\x01")
+    groups[0]._port.port_name = "/dev/none"
+    assert switch_off(groups, 0.3) == {"legs": {1, 2, 3, 4}}
+    assert torque(server) == [True] * 4 + [False] * 4
+    groups[0]._port.port_name = server.ports["legs"]
+    assert switch_off(groups, 3.0) == {}
+    assert not any(torque(server))
+
+
+@pytest.mark.slow
+def test_the_bounds_after_kill_9(tmp_path):
+    """On a computer that has time: wheels stand 0.25 s after the last packet, torque is off within 1 s."""
+    machine = Machine(ROBOT, load_hardware(), MachineOptions(timing=NO_TIME))
+    with Server(machine) as server:
+        driver, _ = start_driver(tmp_path, server)
+        driver.kill()
+        start = time.monotonic()
+        wait_until(lambda: latched(server) or not any(torque(server)), 0.25)
+        wait_until(lambda: not any(torque(server)), 1.0 - (time.monotonic() - start))
+        driver.wait()

@@ -1,0 +1,399 @@
+"""The control loop on the emulated robot, in emulated time: phases, start-up, deadlines, stops, logs."""
+
+import os
+import signal
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("dynamixel_sdk")
+pytest.importorskip("serial")
+
+from robot_rig import DRIVE, JOINTS, PERIOD, Phase, Rig, StoppedError
+
+from wlr_gym.errors import InputError
+from wlr_gym.hardware.log import read_events
+from wlr_gym.hardware.loop import stop_on_signals
+from wlr_gym.hardware.operator import Keys
+from wlr_gym.hardware.timing import Pacer
+from wlr_gym.runs.read import read_dataset, read_run
+
+
+@pytest.fixture
+def rig(tmp_path):
+    rig = Rig(tmp_path / "log")
+    yield rig
+    rig.loop.close()
+
+
+# ---- from limp to limp -------------------------------------------------------------------------------------------------
+
+
+def test_making_a_loop_moves_and_opens_nothing(rig):
+    assert rig.loop.phase is Phase.LIMP
+    assert not rig.torque().any()
+    with pytest.raises(StoppedError, match="has not been started"):
+        rig.loop.tick(DRIVE)
+
+
+def test_a_run_from_start_to_end(rig):
+    view = rig.loop.start([1.3, 1.3, 1.8, 1.8])
+    assert rig.loop.phase is Phase.RUNNING
+    assert rig.torque().all()
+    np.testing.assert_allclose(view.position[:4], [1.3, 1.3, 1.8, 1.8], atol=0.05)
+    assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS] == [10] * 8
+    rig.drive(1.0)
+    np.testing.assert_allclose(rig.loop.view.velocity[4:], 3.0, atol=0.1)
+    rig.loop.stop()
+    assert rig.loop.phase is Phase.LIMP
+    assert not rig.torque().any()
+    assert np.abs(rig.loop.view.velocity[4:]).max() < 0.4  # of 3: wheels all but stood before torque went off
+    assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS] == [0] * 8
+    with pytest.raises(StoppedError, match="end"):
+        rig.loop.tick(DRIVE)
+
+
+def test_torque_comes_on_without_a_jerk(rig):
+    """Whatever goals the registers held before, the robot stays as it stands."""
+    for joint in JOINTS[:4]:
+        rig.machine.servos[joint].set("goal_position", 1500)
+    start = rig.machine.plant.truth().joint_position[0, :4].copy()
+    far = []
+    rig.loop.spare = lambda: far.append(np.abs(rig.machine.plant.truth().joint_position[0, :4] - start).max())
+    rig.loop.start()
+    assert max(far) < 0.02
+
+
+def test_registers_a_run_depends_on_are_set_before(rig):
+    rig.machine.servos["leg_lf"].set("position_p_gain", 100)
+    rig.machine.servos["wheel_rr"].set("profile_acceleration", 1)
+    rig.loop.start()
+    assert rig.machine.servos["leg_lf"]["position_p_gain"] == 800
+    assert rig.machine.servos["wheel_rr"]["profile_acceleration"] == 0
+
+
+def test_the_ramp_is_slow_and_smooth(tmp_path):
+    rig = Rig(tmp_path)
+    rig.loop.start([1.0, 1.0, 2.1, 2.1])
+    rig.loop.close()
+    ramp = read_run(tmp_path / "ramp_01.csv")
+    steps = np.diff([ramp[f"cmd_{joint}"] for joint in JOINTS[:4]], axis=1)
+    assert np.abs(steps).max() < 2.0 * PERIOD  # peak of a minimum-jerk path is 1.9 times its mean speed of 1 rad/s
+    assert np.abs(np.diff(steps, axis=1)).max() < 0.004
+
+
+def test_start_again_after_an_end(rig):
+    for _ in range(2):
+        rig.loop.start()
+        rig.drive(0.2)
+        rig.loop.stop()
+    rig.loop.start()
+    rig.drive(0.2)
+    rig.loop.start([1.4] * 4)  # a new episode, from standing
+    rig.drive(0.2)
+    rig.loop.close()
+    runs = read_dataset(rig.loop.log.folder).runs
+    assert [run.name for run in runs] == ["run_01", "run_02", "run_03", "run_04"]
+    np.testing.assert_allclose([run["pos_wheel_lf"][0] for run in runs], 0.0, atol=1e-12)
+
+
+def test_a_dry_run_writes_nothing(tmp_path):
+    rig = Rig(tmp_path, dry_run=True)
+    before = {joint: bytes(servo._memory) for joint, servo in rig.machine.servos.items()}
+    rig.loop.start()
+    rig.drive(0.3)
+    rig.loop.close()
+    for joint, servo in rig.machine.servos.items():
+        assert servo._memory[64:120] == before[joint][64:120], joint  # all goals, gains, torque and the watchdog
+    assert rig.loop.reason == "end"
+    assert read_run(tmp_path / "run_01.csv")["cmd_wheel_lf"][-1] == 0.0
+
+
+class Flat:
+    """An IMU that says nothing but zero."""
+
+    def counts(self, accelerometer, gyro):
+        return (0, 0, 0), (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("break_it", "words"),
+    [
+        (lambda m: m.servos["leg_lf"].set("operating_mode", 4), "operating_mode"),
+        (lambda m: m.servos["wheel_lf"].set("torque_enable", 1), "torque: on"),
+        (lambda m: m.inject("dead leg_rr"), "leg_rr.*answer"),
+        (lambda m: m.inject("unplug legs"), "unplugged"),
+        (lambda m: m.inject("dead imu"), "imu: no reading"),
+        (lambda m: setattr(m, "_imu", Flat()), "imu: the accelerometer reads 0.0"),
+        (lambda m: m.inject("overload wheel_lf"), "hardware error: overload"),
+    ],
+)
+def test_a_robot_that_is_not_right_does_not_start(tmp_path, break_it, words):
+    rig = Rig(tmp_path)
+    break_it(rig.machine)
+    rig.machine.advance(0.01)
+    before = rig.torque()
+    with pytest.raises((StoppedError, InputError), match=f"(?s){words}"):
+        rig.loop.start()
+    rig.loop.close()
+    np.testing.assert_array_equal(rig.torque(), before)  # and a robot that something else holds up is not dropped
+
+
+def test_a_watchdog_left_latched_is_cleared(rig):
+    rig.loop.start()
+    rig.machine.advance(0.5)  # the program hangs
+    assert rig.machine.servos["leg_lf"]["bus_watchdog"] == -1
+    with pytest.raises(StoppedError, match="idle: nothing was sent"):
+        rig.loop.tick(DRIVE)
+    assert not rig.torque().any()
+    for servo in rig.machine.servos.values():
+        servo.set("bus_watchdog", -1)
+    again = Rig(machine=rig.machine)
+    again.loop.start()
+    again.drive(0.1)
+    again.loop.close()
+
+
+def test_servo_limits_are_kept(rig):
+    """Goals beyond a servo's registers would be ignored without a word; the gate reads the registers and stays inside."""
+    for joint in JOINTS[4:]:
+        rig.machine.servos[joint].set("velocity_limit", 100)  # 2.4 rad/s
+    rig.loop.start()
+    rig.drive(1.0)
+    assert np.abs(rig.goal_counts()[4:]).max() == 100
+    assert rig.loop.interventions["limit"] > 40
+
+
+# ---- requests ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_signals_stop_in_good_order(rig, name):
+    rig.loop.start()
+    with stop_on_signals(rig.loop):
+        rig.drive(0.2)
+        os.kill(os.getpid(), getattr(signal, name))
+        with pytest.raises(StoppedError, match=name):
+            rig.drive(0.2)
+    assert rig.loop.phase is Phase.LIMP
+    assert not rig.torque().any()
+    assert signal.getsignal(getattr(signal, name)) is not None
+
+
+def test_a_stop_that_is_asked_for_before_anything_moves(rig):
+    with stop_on_signals(rig.loop):
+        os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(StoppedError, match="SIGTERM"):
+            rig.loop.start()
+    assert not rig.torque().any()
+    assert rig.machine.time < 0.1
+    assert rig.loop.phase is Phase.LIMP
+    rig.loop.start()  # the next one is a new one
+    rig.drive(0.1)
+
+
+def test_a_second_signal_interrupts_at_once(rig):
+    rig.loop.start()
+    with stop_on_signals(rig.loop):
+        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_emergency_key_switches_off_in_the_same_tick(rig):
+    read, write = os.pipe()
+    with Keys(read) as keys:
+        rig.loop.spare = lambda: keys.serve(rig.loop)
+        rig.loop.start()
+        rig.drive(0.2)
+        os.write(write, b" ")
+        before = rig.machine.time
+        with pytest.raises(StoppedError, match="emergency stop key"):
+            rig.drive(1.0)
+    assert rig.machine.time - before < 1.5 * PERIOD
+    assert not rig.torque().any()
+    assert rig.loop.phase is Phase.LIMP
+    os.close(write)
+    assert keys.pressed() == ""  # a closed pipe is no key
+    os.close(read)
+
+
+def test_stop_key(rig):
+    read, write = os.pipe()
+    os.write(write, b"xq")
+    with Keys(read) as keys:
+        rig.loop.start()
+        rig.loop.spare = lambda: keys.serve(rig.loop)
+        with pytest.raises(StoppedError, match="stop key"):
+            rig.drive(1.0)
+    os.close(read)
+    os.close(write)
+
+
+def test_deadman_holds_and_lets_go(tmp_path):
+    rig = Rig(tmp_path, deadman=0.3)
+    rig.loop.start()
+    rig.loop.operator_is_there()
+    rig.drive(0.2)
+    assert rig.loop.goals[4] == 3.0
+    rig.drive(0.3)
+    assert rig.loop.goals[4] == 0.0
+    assert rig.torque().all()
+    rig.loop.operator_is_there()
+    rig.drive(0.1)
+    assert rig.loop.goals[4] == 3.0
+    rig.loop.close()
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("where", ["ramp", "running", "spare"])
+def test_any_exception_ends_with_torque_off(tmp_path, error, where):
+    rig = Rig(tmp_path)
+
+    def fail():
+        raise error("broken")
+
+    def play():
+        with rig.loop:
+            if where == "ramp":
+                rig.loop.spare = fail
+            rig.loop.start()
+            rig.drive(0.1)
+            if where == "spare":
+                rig.loop.spare = fail
+                rig.drive(0.1)
+            fail()
+
+    with pytest.raises(error):
+        play()
+    assert not rig.torque().any()
+    assert rig.loop.phase is not Phase.RUNNING
+    assert len(read_events(tmp_path / "run_01.csv")) > 2
+    if where != "ramp":
+        assert len(read_run(tmp_path / "run_01.csv").table) > 5
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (np.full(8, np.nan), "finite: goal of leg_lf is nan"),
+        (np.r_[DRIVE[:7], np.inf], "finite: goal of wheel_rr is inf"),
+        (np.zeros(7), "shape"),
+        ("fast", "no numbers"),
+        (None, "finite|no numbers|shape"),
+    ],
+)
+def test_goals_that_are_none_stop_the_robot(rig, bad, words):
+    rig.loop.start()
+    rig.drive(0.2)
+    before = rig.goal_counts()
+    with pytest.raises(StoppedError, match=words):
+        rig.loop.tick(bad)
+    assert not rig.torque().any()
+    np.testing.assert_array_equal(rig.goal_counts()[:4], before[:4])
+    assert rig.loop.phase is Phase.FAULT
+    with pytest.raises(InputError, match="stopped with a fault"):
+        rig.loop.start()
+
+
+def test_single_motors_off_and_on_again(rig):
+    rig.loop.start()
+    free = np.ones(8, bool)
+    free[4:] = False
+    goals = np.r_[DRIVE[:4], [np.nan] * 4]
+    for _ in range(10):
+        rig.loop.tick(goals, free)
+    np.testing.assert_array_equal(rig.torque(), free)
+    rig.drive(1.0)
+    assert rig.torque().all()
+    np.testing.assert_allclose(rig.loop.view.velocity[4:], 3.0, atol=0.2)
+    rig.loop.stop()
+    run = read_run(rig.loop.log.run)
+    assert np.isnan(run["cmd_wheel_lf"][:10]).all()
+    assert np.isfinite(run["cmd_wheel_lf"][10:]).all()
+
+
+# ---- log ---------------------------------------------------------------------------------------------------------------
+
+
+def test_the_log_has_what_was_sent_and_read(rig):
+    rig.loop.start()
+    seen, sent = [], []
+    for k in range(50):
+        seen.append(rig.loop.view)
+        rig.loop.tick(np.r_[DRIVE[:4], [0.05 * k] * 4])
+        sent.append(rig.loop.goals)
+    partial = rig.loop.log.folder / "partial_run_01.csv"
+    assert len(read_run(partial).table) == 50  # while it is running, and after kill -9
+    assert not read_run(partial).path.name.startswith("run_")
+    rig.loop.stop()
+    run = read_run(rig.loop.log.run)
+    assert len(run.table) == 50 + 30
+    for k, joint in enumerate(JOINTS):
+        np.testing.assert_array_equal(run[f"cmd_{joint}"][:50], np.array(sent)[:, k])
+        np.testing.assert_array_equal(run[f"vel_{joint}"][:50], [view.velocity[k] for view in seen])
+    np.testing.assert_array_equal(run["gyro_z"][:50], [view.gyro[2] for view in seen])
+    np.testing.assert_allclose(np.diff(run["t"]), PERIOD, atol=1e-9)
+    assert {finding.kind for finding in run.findings} <= {"constant"}
+    events = read_events(rig.loop.log.run)
+    phases = [event["phase"] for event in events if event["event"] == "phase"]
+    assert phases == ["ramp", "running", "stopping", "limp"]
+    assert events[-1]["statistics"]["ticks"] == rig.loop.statistics()["ticks"]
+    assert not list(rig.loop.log.folder.glob("partial*"))
+
+
+def test_interventions_are_counted_and_logged_where_they_begin(rig):
+    rig.loop.start()
+    rig.drive(0.2, np.r_[DRIVE[:4], [0.0] * 4])
+    for _ in range(3):
+        rig.drive(0.1, np.r_[DRIVE[:4], [6.0] * 4])
+        rig.drive(0.1, np.r_[DRIVE[:4], [0.0] * 4])
+    rig.loop.stop()
+    events = [event for event in read_events(rig.loop.log.run) if event.get("rule") == "slew"]
+    assert len(events) == 6
+    assert rig.loop.interventions["slew"] >= 6
+    assert events[-1]["joints"] == list(JOINTS[4:])
+
+
+# ---- deadlines ---------------------------------------------------------------------------------------------------------
+
+
+class FakeClock:
+    def __init__(self):
+        self.time = 0.0
+
+    def now(self):
+        return self.time
+
+    def wait_until(self, moment):
+        self.time = max(self.time, moment) + 1e-4  # wakes a little late
+
+
+def test_deadlines_do_not_drift_and_are_not_caught_up():
+    clock = FakeClock()
+    pacer = Pacer(clock, 0.02)
+    pacer.start()
+    for tick in range(1000):
+        clock.time += 0.005 + 0.03 * (tick == 500)
+        pacer.wait()
+        late = clock.time - 0.02 * (tick + 1)
+        assert late == pytest.approx(1e-4) or tick in (500, 501)
+    assert pacer.missed == 0  # 35 ms of work: one tick starts late, the next is on the grid again
+    clock.time += 0.1
+    pacer.wait()
+    assert pacer.missed == 4
+    assert pacer.late_ticks == 1
+    pacer.wait()
+    assert pacer.late_ticks == 0
+    statistics: dict[str, Any] = pacer.statistics()
+    assert statistics["jitter"]["p50"] == pytest.approx(0.1)
+    assert statistics["period"]["p50"] == pytest.approx(20.0, abs=1e-6)
+
+
+def test_a_computer_that_does_not_keep_up_stops_the_robot(rig):
+    rig.loop.start()
+    rig.loop.spare = lambda: rig.link.clock.wait_until(rig.machine.time + 0.045)
+    with pytest.raises(StoppedError, match="deadlines: 5 ticks in a row late"):
+        rig.drive(1.0)
+    assert not rig.torque().any()

@@ -1,0 +1,194 @@
+"""``wlr record``: runs from the emulated robot and from simulators, motions as files, what is refused."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wlr_gym.cli import record
+from wlr_gym.cli.robot_options import HardwareOption
+from wlr_gym.effects import load_patch
+from wlr_gym.errors import InputError
+from wlr_gym.robot import JOINTS, load_robot
+from wlr_gym.runs import read_dataset, read_run, simulate_again
+from wlr_gym.runs.compare import motion_of
+from wlr_gym.runs.excitations import EXCITATIONS, GENTLE, excite
+from wlr_gym.runs.format import COMMANDS, Profile
+from wlr_gym.runs.record import next_run, read_commands, record_simulation
+from wlr_gym.runs.simulation import SENSED
+
+pytest.importorskip("dynamixel_sdk")
+pytest.importorskip("serial")
+
+from wlr_gym.hardware.emulator import Machine, MachineOptions
+from wlr_gym.hardware.emulator.line import NO_TIME
+from wlr_gym.hardware.link import emulated_link
+from wlr_gym.hardware.log import read_events
+
+ROBOT = load_robot()
+
+
+def recorded(out, **options):
+    return record.run(record.Options(out=out, **{"emulated": True, "seconds": 2.0, **options}))
+
+
+def test_the_emulated_robot_is_driven_and_logged(tmp_path, capsys):
+    assert recorded(tmp_path, excitation=("straight", "rear_legs"), ground="cork", seed=3) == 0
+    data = read_dataset(tmp_path)
+    assert [run.path.name for run in data.runs] == ["run_01.csv", "run_02.csv"]
+    assert (data.meta.robot, data.meta.profile, data.meta.ground) == (ROBOT.name, GENTLE, "cork")
+    for run, name in zip(data.runs, ("straight", "rear_legs"), strict=True):
+        motion = excite(name, 3, ROBOT, seconds=2.0)
+        logged = np.stack([run[name] for name in COMMANDS], axis=1)
+        near = motion.goals[: len(logged)]
+        assert len(near) == 100
+        np.testing.assert_array_equal(np.isnan(logged[:100]), np.isnan(near))
+        np.testing.assert_allclose(logged[:100, :4], near[:, :4], atol=1e-12)  # the gate has nothing against them
+        assert np.diff(run["t"]) == pytest.approx(0.02, abs=1e-9)
+        assert {finding.kind for finding in run.findings} <= {"constant"}
+        assert read_events(run.path)[-1]["event"] == "end"
+    straight = data.runs[0]
+    assert np.ptp(straight["pos_wheel_lf"]) > 0.5
+    assert straight["pos_wheel_lf"][0] == 0.0
+    text = capsys.readouterr().out
+    assert "straight: 100 of 100 ticks driven; to its end" in text
+
+
+def test_the_profile_reaches_the_servos(tmp_path, monkeypatch):
+    machine = Machine(ROBOT, HardwareOption().load_hardware(), MachineOptions(timing=NO_TIME))
+    monkeypatch.setattr(HardwareOption, "link_to", lambda *args: emulated_link(machine))
+    seen = []
+    step = machine.step
+    machine.step = lambda: (seen.append([servo["profile_acceleration"] for servo in machine.servos.values()]), step())
+    recorded(tmp_path, excitation=("straight",), seconds=0.2)
+    assert seen[-1] == [40] * 4 + [30] * 4
+    assert machine.servos["leg_lf"]["profile_velocity"] == 60
+    assert not any(servo["torque_enable"] for servo in machine.servos.values())
+
+
+def test_a_robot_that_stops_leaves_its_log_and_code_1(tmp_path, monkeypatch, capsys):
+    machine = Machine(ROBOT, HardwareOption().load_hardware(), MachineOptions(timing=NO_TIME))
+    machine.inject("dead leg_rf after=2.5")
+    monkeypatch.setattr(HardwareOption, "link_to", lambda *args: emulated_link(machine))
+    assert recorded(tmp_path, excitation=("straight", "turns"), seconds=6.0) == 1
+    (run,) = read_dataset(tmp_path).runs
+    assert 20 < len(run.table) < 300
+    text = capsys.readouterr().out
+    assert "of 300 ticks driven" in text
+    assert "turns" not in text
+    assert not any(servo["torque_enable"] for servo in machine.servos.values() if not servo.dead)
+
+
+def test_effects_make_an_emulated_robot_another_one(tmp_path):
+    plain, other = tmp_path / "plain", tmp_path / "other"
+    for out, effects in ((plain, ()), (other, ("tired_battery",))):
+        recorded(out, excitation=("straight",), effects=effects)
+    first, second = (read_run(out / "run_01.csv") for out in (plain, other))
+    assert second["volt"].mean() < first["volt"].mean() - 0.3
+    with pytest.raises(InputError, match="--effects: a real robot has its own"):
+        recorded(tmp_path / "real", excitation=("straight",), effects=("tired_battery",), emulated=False, yes=True)
+
+
+# ---- simulators ----
+
+
+@pytest.mark.parametrize(("backend", "effects"), [("gibbs_appell", None), ("mujoco", "tired_battery")])
+def test_a_simulated_run_repeats_bit_for_bit(tmp_path, backend, effects):
+    motion = excite("all_legs", 5, ROBOT, seconds=2.0)
+    path = record_simulation(tmp_path / "run_01.parquet", motion, ROBOT, backend, 7, load_patch(effects))
+    run = read_run(path)
+    again = simulate_again(run, ROBOT)
+    for name in SENSED:
+        np.testing.assert_array_equal(again[name], run[name], err_msg=name)
+    for joint, goals in zip(JOINTS, motion.goals.T, strict=True):
+        np.testing.assert_array_equal(run[f"cmd_{joint}"], goals)
+    assert run.meta.profile == GENTLE
+    assert np.ptp(run["pos_leg_lr"]) > 0.05
+    assert all(np.abs(run[f"vel_{joint}"][0]) < 0.05 for joint in JOINTS)  # it starts settled
+
+
+def test_runs_are_numbered_on(tmp_path, capsys):
+    assert recorded(tmp_path, excitation=("straight",), backend="gibbs_appell", emulated=False, seconds=0.5) == 0
+    assert recorded(tmp_path, excitation=("turns",), backend="gibbs_appell", emulated=False, seconds=0.5) == 0
+    assert [run.path.name for run in read_dataset(tmp_path).runs] == ["run_01.parquet", "run_02.parquet"]
+    assert next_run(tmp_path).name == "run_03.parquet"
+    assert "straight: 0.5 s on gibbs_appell" in capsys.readouterr().out
+
+
+# ---- motions as files ----
+
+
+def test_commands_go_through_a_file(tmp_path, capsys):
+    assert recorded(tmp_path, excitation=("rear_legs", "turns"), commands_only=True, seconds=None) == 0
+    for name in ("rear_legs", "turns"):
+        motion, read = excite(name, 0, ROBOT), read_commands(tmp_path / f"{name}.csv")
+        np.testing.assert_array_equal(read.goals, motion.goals)
+        assert (read.period, read.profile, read.name) == (motion.period, GENTLE, name)
+    driven = tmp_path / "driven"
+    assert recorded(driven, commands=(tmp_path / "turns.csv",), backend="gibbs_appell", emulated=False, seconds=2.0) == 0
+    np.testing.assert_array_equal(motion_of(read_run(driven / "run_01.parquet")).goals, excite("turns", 0, ROBOT).goals[:100])
+    assert "written:" in capsys.readouterr().out
+
+
+def test_a_whole_run_is_a_motion_too(tmp_path):
+    motion = excite("steps", 1, ROBOT, seconds=2.0)
+    run = record_simulation(tmp_path / "run_01.parquet", motion, ROBOT, "gibbs_appell")
+    read = read_commands(run)
+    np.testing.assert_array_equal(read.goals, motion.goals)
+    assert read.profile == Profile()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t,cmd_leg_lf\n0,1\n", "column 'cmd_leg_rf' is missing"),
+        ("HEADER\n0,1,1,1,1,0,0,0,0\n", "two rows or more"),
+        ("HEADER\n0,1,1,1,1,0,0,0,0\n0,1,1,1,1,0,0,0,0\n", "increasing"),
+        ("HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,90,1,1,0,0,0,0\n", "row 1, column 'cmd_leg_rf': 90: expected rad"),
+        ("HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,1,1,1,0,inf,0,0\n", "row 1, column 'cmd_wheel_rf': inf"),
+        ("HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,1,1,x,0,0,0,0\n", "cannot be read"),
+    ],
+)
+def test_command_files_that_are_none(tmp_path, text, words):
+    path = tmp_path / "commands.csv"
+    path.write_text(text.replace("HEADER", ",".join(["t", *COMMANDS])))
+    with pytest.raises(InputError, match=words):
+        read_commands(path)
+
+
+# ---- the command line ----
+
+
+def test_list_shows_every_excitation(capsys):
+    assert record.run(record.Options(list=True)) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in EXCITATIONS)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "nothing to drive"),
+        ({"excitation": ("strait",)}, "did you mean 'straight'"),
+        ({"excitation": ("straight", "steps")}, "straight and steps are driven with different servo profiles"),
+        ({"excitation": ("straight",), "seconds": -1.0}, "--seconds -1"),
+        ({"excitation": ("straight",), "backend": "mujoco"}, "leave --backend mujoco out"),
+        ({"excitation": ("straight",), "backend": "mujocoo", "emulated": False}, "did you mean 'mujoco'"),
+        ({"excitation": ("straight",), "out": None}, "--out: expected a folder"),
+        ({"commands": ("nowhere.csv",)}, "nowhere.csv: expected a .csv"),
+    ],
+)
+def test_refusals(tmp_path, options, words):
+    options = {"out": tmp_path / "runs", **options}
+    options["commands"] = tuple(map(Path, options.get("commands", ())))
+    with pytest.raises(InputError, match=words):
+        recorded(**options)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_real_robot_is_asked_for_first(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    with pytest.raises(InputError, match="nobody there to start the robot"):
+        recorded(tmp_path, excitation=("straight",), emulated=False)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,387 @@
+"""What the safety gate decides: pure functions, tried with anything; and that nothing gets past it."""
+
+import ast
+import itertools
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from wlr_gym.hardware import safety
+from wlr_gym.hardware.limits import Safety
+from wlr_gym.hardware.safety import Level, Memory, View
+from wlr_gym.robot import JOINTS, load_robot
+
+ROOT = Path(__file__).resolve().parents[2]
+ROBOT = load_robot()
+LIMITS = Safety()
+FRAME = safety.make_frame(ROBOT, 0.02)
+HOME = np.r_[[np.pi / 2] * 4, [0.0] * 4]
+STEP = 0.02 * np.r_[[LIMITS.leg_speed] * 4, [LIMITS.wheel_acceleration] * 4]
+
+
+def view(**changes):
+    """A robot that stands well."""
+    plain = View(
+        time=1.0,
+        position=HOME.copy(),
+        velocity=np.zeros(8),
+        effort=np.zeros(8),
+        silence=np.zeros(8),
+        alert=np.zeros(8, bool),
+        restarted=np.zeros(8, bool),
+        voltage=np.full(8, 12.0),
+        temperature=np.full(8, 30.0),
+        gyro=np.zeros(3),
+        accelerometer=np.array([0.0, 0.0, 9.81]),
+        imu_silence=0.0,
+        up=np.array([0.0, 0.0, 1.0]),
+    )
+    return replace(plain, **changes)
+
+
+def decide(wanted=HOME, previous=HOME, memory=None, torque_on=None, **changes):
+    return safety.decide(LIMITS, FRAME, view(**changes), memory or Memory(), previous, wanted, torque_on)
+
+
+def last_for(seconds, limits=LIMITS, **changes):
+    """The decision after a view has lasted, and s until the level rose."""
+    memory, seen, decision = Memory(), view(**changes), decide()
+    for tick in range(round(seconds / 0.02)):
+        decision = safety.decide(limits, FRAME, seen, memory, HOME, HOME)
+        memory = decision.memory
+        if decision.level > Level.DRIVE:
+            return decision, tick * 0.02
+    return decision, np.inf
+
+
+def at(values, k, base=0.0, size=8, dtype=float):
+    found = np.full(size, base, dtype)
+    found[k] = values
+    return found
+
+
+# ---- whatever is asked for ---------------------------------------------------------------------------------------------
+
+anything = arrays(np.float64, 8, elements=st.floats(allow_nan=True, allow_infinity=True))
+sane = arrays(np.float64, 8, elements=st.floats(-20.0, 20.0))
+legal = st.tuples(
+    arrays(np.float64, 4, elements=st.floats(0.4, 2.74)), arrays(np.float64, 4, elements=st.floats(-6.4, 6.4))
+).map(np.concatenate)
+levels = st.sampled_from(
+    [{}, {"asked_to_stop": "x"}, {"alert": np.ones(8, bool)}, {"silence": np.full(8, 0.02)}, {"silence": np.full(8, 0.2)}]
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(wanted=anything, previous=sane, position=sane, changes=levels, heat=st.floats(20.0, 90.0))
+def test_no_goal_ever_jumps_and_all_are_finite(wanted, previous, position, changes, heat):
+    decision = decide(wanted, previous, position=position, temperature=np.full(8, heat), **changes)
+    assert np.isfinite(decision.goals).all()
+    assert (np.abs(decision.goals - previous) <= STEP + 1e-9).all()
+
+
+@settings(max_examples=300, deadline=None)
+@given(wanted=anything, previous=legal, position=sane)
+def test_goals_within_limits_stay_within(wanted, previous, position):
+    goals = decide(wanted, previous, position=position).goals
+    low, high = ROBOT.leg_limits
+    assert (goals[:4] >= low + LIMITS.leg_margin - 1e-9).all()
+    assert (goals[:4] <= high - LIMITS.leg_margin + 1e-9).all()
+    assert (np.abs(goals[4:]) <= LIMITS.wheel_speed + 1e-9).all()
+
+
+@settings(max_examples=15, deadline=None)
+@given(wanted=legal, previous=sane)
+def test_from_outside_the_limits_goals_come_back_and_arrive(wanted, previous):
+    goals = previous
+    for _ in range(250):
+        goals = decide(wanted, goals, position=np.where(np.arange(8) < 4, goals, 0.0)).goals
+    np.testing.assert_allclose(goals, wanted, atol=0.02)
+
+
+@settings(max_examples=100, deadline=None)
+@given(wanted=legal)
+def test_small_steps_of_a_robot_that_is_well_pass_untouched(wanted):
+    inner = np.clip(wanted, np.r_[[0.6] * 4, [-6.0] * 4], np.r_[[2.5] * 4, [6.0] * 4])
+    previous = inner + 0.3 * STEP
+    decision = decide(inner, previous, position=np.where(np.arange(8) < 4, inner, 0.0))
+    np.testing.assert_array_equal(decision.goals, inner)
+    assert decision.level == Level.DRIVE
+    assert not decision.limited
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    wanted=anything,
+    changes=st.fixed_dictionaries(
+        {},
+        optional={
+            "silence": st.floats(0.0, 1.0).map(lambda s: np.full(8, s)),
+            "alert": arrays(bool, 8),
+            "restarted": arrays(bool, 8),
+            "imu_silence": st.floats(0.0, 1.0),
+            "temperature": arrays(np.float64, 8, elements=st.floats(0, 100) | st.just(np.nan)),
+            "voltage": arrays(np.float64, 8, elements=st.floats(0, 20) | st.just(np.nan)),
+            "effort": arrays(np.float64, 8, elements=st.floats(-10, 10)),
+            "gyro": arrays(np.float64, 3, elements=st.floats(-10, 10)),
+            "late_ticks": st.integers(0, 10),
+            "idle": st.floats(0.0, 1.0),
+            "asked_off": st.sampled_from(["", "key"]),
+            "lost": st.sampled_from(["", "port"]),
+        },
+    ),
+)
+def test_wheels_are_never_driven_when_anything_is_found(wanted, changes):
+    """Above COAST the wheels' goals go towards zero and the legs' stay, whatever is asked for."""
+    previous = np.r_[[1.5] * 4, [2.0, -2.0, 0.5, 0.0]]
+    decision = decide(wanted, previous, **changes)
+    assert decision.level == max((verdict.level for verdict in decision.verdicts), default=Level.DRIVE)
+    if decision.level >= Level.HOLD:
+        assert (np.abs(decision.goals[4:]) <= np.abs(previous[4:])).all()
+        np.testing.assert_array_equal(decision.goals[:4], previous[:4])
+    if decision.level == Level.COAST:
+        np.testing.assert_array_equal(decision.goals[:4], previous[:4])
+        assert (np.abs(decision.goals[4:]) <= np.abs(previous[4:])).all()  # a hot motor slows down all the same
+
+
+def test_goals_brake_before_the_leg_limit():
+    goals, steps = HOME.copy(), []
+    for _ in range(60):
+        new = decide(np.full(8, 3.0), goals, position=goals).goals
+        steps.append(new[0] - goals[0])
+        goals = new
+    assert goals[0] == pytest.approx(ROBOT.leg_limits[1] - LIMITS.leg_margin, abs=1e-3)
+    assert steps[0] == pytest.approx(0.16)
+    assert all(later <= earlier + 1e-12 for earlier, later in itertools.pairwise(steps))
+
+
+def test_a_blocked_leg_winds_up_no_goal():
+    goals = HOME.copy()
+    for _ in range(50):
+        goals = decide(np.r_[[2.5] * 4, [0.0] * 4], goals, position=HOME).goals
+    np.testing.assert_allclose(goals[:4], np.pi / 2 + LIMITS.leg_lead)
+
+
+def test_goals_of_motors_that_are_off_are_not_looked_at():
+    on = np.r_[[True] * 4, [False] * 4]
+    decision = decide(np.r_[HOME[:4], [np.nan] * 4], torque_on=on)
+    assert decision.level == Level.DRIVE
+    np.testing.assert_array_equal(decision.goals, HOME)
+    np.testing.assert_array_equal(decision.torque_on, on)
+
+
+def test_register_limits_are_kept_too():
+    frame = safety.make_frame(ROBOT, 0.02, np.r_[[1.5] * 4, [-1.0] * 4], np.r_[[1.6] * 4, [1.0] * 4])
+    goals = HOME.copy()
+    for _ in range(100):
+        goals = safety.decide(LIMITS, frame, view(), Memory(), goals, np.r_[[2.5] * 4, [5.0] * 4]).goals
+    np.testing.assert_allclose(goals, [1.6] * 4 + [1.0] * 4, atol=1e-3)
+
+
+# ---- supervision -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "rule", "level"),
+    [
+        ({"silence": at(0.02, 2)}, "silence", Level.COAST),
+        ({"silence": at(0.10, 2)}, "silence", Level.HOLD),
+        ({"silence": at(0.45, 2)}, "silence", Level.OFF),
+        ({"imu_silence": 0.15}, "imu", Level.STOP),
+        ({"alert": at(True, 5, False, dtype=bool)}, "alert", Level.STOP),
+        ({"restarted": at(True, 5, False, dtype=bool)}, "restart", Level.OFF),
+        ({"temperature": at(70.0, 1, 30.0)}, "temperature", Level.STOP),
+        ({"late_ticks": 5}, "deadlines", Level.STOP),
+        ({"late_share": 0.2}, "deadlines", Level.STOP),
+        ({"idle": 0.25}, "idle", Level.OFF),
+        ({"lost": "port gone"}, "port", Level.OFF),
+        ({"asked_to_stop": "SIGINT"}, "stop", Level.STOP),
+        ({"asked_off": "key"}, "emergency stop", Level.OFF),
+    ],
+)
+def test_what_acts_at_once(changes, rule, level):
+    decision = decide(**changes)
+    assert decision.level == level
+    assert [verdict.rule for verdict in decision.verdicts] == [rule]
+
+
+@pytest.mark.parametrize(
+    ("changes", "rule", "level", "after"),
+    [
+        ({"effort": at(-0.75 * 7.3, 0)}, "load", Level.STOP, LIMITS.load_time),
+        ({"effort": at(0.75 * 1.5, 6)}, "load", Level.STOP, LIMITS.load_time),
+        ({"effort": np.r_[[4.9] * 4, [1.0] * 4]}, "current", Level.STOP, LIMITS.current_time),
+        ({"voltage": at(9.9, 3, 12.0)}, "voltage", Level.STOP, LIMITS.low_voltage_time),
+        ({"up": np.array([np.sin(0.75), 0.0, np.cos(0.75)])}, "tilt", Level.OFF, LIMITS.tilt_time),
+        ({"gyro": np.array([4.5, 0.0, 0.0])}, "tilt ahead", Level.STOP, LIMITS.tilt_time),
+    ],
+)
+def test_what_must_last(changes, rule, level, after):
+    decision, waited = last_for(3.0, **changes)
+    assert [verdict.rule for verdict in decision.verdicts] == [rule]
+    assert decision.level == level
+    assert waited == pytest.approx(after, abs=0.021)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"effort": at(0.65 * 7.3, 0)},
+        {"effort": np.r_[[4.0] * 4, [0.2] * 4]},
+        {"voltage": np.full(8, 10.3)},
+        {"voltage": np.full(8, np.nan), "temperature": np.full(8, np.nan)},
+        {"up": np.array([np.sin(0.35), 0.0, np.cos(0.35)])},
+        {"gyro": np.array([0.0, 0.0, 6.0])},
+        {"temperature": np.full(8, 60.0)},
+        {"imu_silence": 0.05},
+        {"idle": 0.1},
+        {"late_ticks": 4},
+    ],
+)
+def test_what_is_still_well(changes):
+    decision, _ = last_for(3.0, **changes)
+    assert decision.level == Level.DRIVE
+
+
+def test_loads_that_come_and_go_are_forgiven():
+    memory = Memory()
+    for tick in range(500):
+        high = tick % 100 < 40
+        decision = safety.decide(LIMITS, FRAME, view(effort=at(6.0 * high, 0)), memory, HOME, HOME)
+        memory = decision.memory
+        assert decision.level == Level.DRIVE
+
+
+def test_hot_motors_slow_the_wheels_down_before_they_stop_the_robot():
+    speeds = []
+    for heat in (55.0, 62.0, 65.0, 67.9):
+        goals = HOME.copy()
+        for _ in range(10):
+            goals = decide(np.r_[HOME[:4], [5.0] * 4], goals, temperature=at(heat, 7, 30.0)).goals
+        speeds.append(goals[4])
+    np.testing.assert_allclose(speeds, [5.0, 5.0, 6.4 * 0.5, 6.4 * 0.1 / 6.0], atol=1e-9)
+
+
+def test_deadman_is_off_unless_asked_for():
+    assert decide(operator_silence=1e9).level == Level.DRIVE
+    limits = LIMITS.model_copy(update={"deadman": 0.5})
+    assert safety.decide(limits, FRAME, view(operator_silence=0.6), Memory(), HOME, HOME).level == Level.HOLD
+
+
+def test_late_ticks_are_not_blamed_while_answers_are_missing():
+    assert decide(late_ticks=9, silence=np.full(8, 0.02)).level == Level.COAST
+
+
+# ---- the vertical ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_vertical_follows_a_turn_and_forgets_a_wrong_start(axis):
+    rate, angle = np.zeros(3), 0.0
+    rate[axis] = 0.5
+    up = np.array([0.0, 0.0, 1.0])
+    for _ in range(50):
+        angle += 0.5 * 0.02
+        up = safety.next_up(up, rate, np.array([99.0, 0.0, 0.0]), 0.02)  # no gravity to be seen: gyroscope only
+    assert safety.tilt_of(up) == pytest.approx(angle, abs=0.003)
+    still = np.array([0.0, 0.0, 9.81])
+    for _ in range(200):
+        up = safety.next_up(up, np.zeros(3), still, 0.02)
+    assert safety.tilt_of(up) < 0.001
+
+
+def test_tilt_is_seen_before_it_is_there():
+    """Falling over the side at 3 rad/s: stopped before the body has passed the limit."""
+    memory, up, rate, tilt = Memory(), np.array([0.0, 0.0, 1.0]), np.array([3.0, 0.0, 0.0]), 0.0
+    decision = decide()
+    for _ in range(40):
+        tilt += 0.06
+        up = safety.next_up(up, rate, np.zeros(3), 0.02)
+        decision = safety.decide(LIMITS, FRAME, view(up=up, gyro=rate), memory, HOME, HOME)
+        memory = decision.memory
+        if decision.level >= Level.STOP:
+            break
+    assert decision.verdicts[0].rule == "tilt ahead"
+    assert tilt < LIMITS.tilt
+
+
+# ---- readings ----------------------------------------------------------------------------------------------------------
+
+
+def test_positions_no_joint_can_reach_are_none():
+    before = view()
+    moved = HOME + np.r_[[0.2, 0.3, np.nan, 0.0], [0.25, 0.3, -0.3, 40.0]]
+    good = safety.plausible(FRAME, before, moved, 1.02)
+    assert good.tolist() == [True, False, False, True, True, False, False, False]
+    assert safety.plausible(FRAME, replace(before, silence=np.full(8, 0.1)), moved, 1.02)[1]  # it had more time
+
+
+# ---- limits are data ---------------------------------------------------------------------------------------------------
+
+
+def test_every_limit_stands_in_the_file_with_its_reason():
+    text = (ROOT / "configs/hardware/nominal.yaml").read_text(encoding="utf-8")
+    section = text.split("\nsafety:", 1)[1]
+    assert set(yaml.safe_load(text)["safety"]) == set(Safety.model_fields)
+    assert Safety(**yaml.safe_load(text)["safety"]) == Safety()
+    for name in Safety.model_fields:
+        assert re.search(rf"^  {name}: \S+ +# .{{15,}}$", section, re.MULTILINE), name
+
+
+def test_every_limit_is_in_the_documentation():
+    page = (ROOT / "docs/robot.md").read_text(encoding="utf-8")
+    section = page.split("### Limits", 1)[1].split("\n#", 1)[0]
+    for name in Safety.model_fields:
+        assert f"`{name}`" in section, name
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"coast": 0.5}, {"warm": 70.0}, {"watchdog": 3.0}, {"tilt": 0.0}, {"speed": 1.0}, {"load": np.inf}]
+)
+def test_limits_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Safety(**wrong)
+
+
+def test_every_limit_does_something():
+    """Each attribute of Safety is read somewhere in the hardware package."""
+    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "wlr_gym/hardware").glob("*.py"))
+    for name in Safety.model_fields:
+        assert re.search(rf"(limits|safety)\.{name}\b", sources), name
+
+
+# ---- nothing gets past it ----------------------------------------------------------------------------------------------
+
+#: Functions that can move servos, and the modules that may call them (the benchmark of the bus: on the emulator only).
+WRITERS = {"write_goals", "write_item", "write_all", "syncWriteTxOnly"}
+ALLOWED = {"hardware/gate.py", "hardware/servos.py", "hardware/bus.py", "hardware/guard.py", "bench/bus.py"}
+
+
+def test_only_the_gate_and_the_guard_write_goals_and_torque():
+    found = set()
+    for path in (ROOT / "wlr_gym").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in WRITERS:
+                found.add(path.relative_to(ROOT / "wlr_gym").as_posix())
+    assert "hardware/gate.py" in found
+    assert found <= ALLOWED, found - ALLOWED
+
+
+def test_the_gate_does_not_hand_out_the_servos():
+    from wlr_gym.hardware import gate
+
+    assert not [name for name in dir(gate.Gate) if "servos" in name.lower() and not name.startswith("_Gate__")]
+    assert "dry_run" in gate.Gate.__init__.__code__.co_varnames
+    assert not {"enabled", "off_switch", "bypass"} & set(gate.Gate.__init__.__code__.co_varnames)
+
+
+def test_view_and_joints_agree():
+    assert len(JOINTS) == 8
+    assert {field.name for field in fields(View)} >= {"silence", "idle", "up", "lost"}

@@ -1,0 +1,199 @@
+"""Speed of a bus cycle: read all eight servos and write all goals, ours against dynamixel-sdk's own group classes.
+
+The other side is a process of its own that answers on pseudo-terminals with what the emulator answered to the same bytes the
+first time, so that little but the host's side is measured: no wire time, no USB latency, no emulator at work.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from wlr_gym.bench.measure import Measurement, Size, interleave
+from wlr_gym.errors import require_package
+from wlr_gym.hardware.config import Hardware, load_hardware, with_ports
+from wlr_gym.hardware.tables import Item, load_table
+from wlr_gym.robot import JOINTS, LEGS, Robot, load_robot
+
+if TYPE_CHECKING:
+    from wlr_gym.hardware.emulator import Machine
+
+_PEER = "dynamixel-sdk, GroupSyncRead (fast) and GroupSyncWrite"
+_FIRST, _LAST = "realtime_tick", "present_position"
+Cycle = Callable[[], None]
+
+
+def measure_bus(size: Size) -> list[Measurement]:
+    """Cycles per second, processor time of a cycle, and the time from the readings' arrival to the goals' departure."""
+    require_package("dynamixel_sdk", "robot")
+    require_package("serial", "robot")
+    cycles = size(1000, 20)
+    robot, hardware = load_robot(), load_hardware()
+    with _answering(robot, hardware) as ports, contextlib.ExitStack() as stack:
+        wired = with_ports(hardware, ports)
+        ours, delay = stack.enter_context(_our_cycle(robot, wired))
+        peer = stack.enter_context(_sdk_cycle(robot, wired))
+        clocks = {"wall": time.perf_counter, "processor": time.process_time}
+        rates = {
+            name: interleave({"ours": _rate(ours, cycles, clock), "peer": _rate(peer, cycles, clock)}, size.rounds)
+            for name, clock in clocks.items()
+        }
+        latency = [_latency(delay, cycles) for _ in range(size.rounds)]
+    what = "bus cycle, 8 servos, 2 buses, SI values"
+    per_cycle = tuple(1e6 / rate for rate in rates["wall"]["ours"])
+    return [
+        Measurement("bus", what, "1/s", rates["wall"]["ours"], rates["wall"]["peer"], _PEER),
+        Measurement("bus", f"{what}, processor time", "1/s", rates["processor"]["ours"], rates["processor"]["peer"], _PEER),
+        Measurement("bus", "whole cycle without wire time", "us", per_cycle, bar=1000.0),
+        Measurement("bus", "read to write, median", "us", tuple(float(np.median(times)) for times in latency)),
+        Measurement("bus", "read to write, p99", "us", tuple(float(np.percentile(times, 99)) for times in latency)),
+    ]
+
+
+def _rate(cycle: Cycle, count: int, clock: Callable[[], float]) -> Callable[[], float]:
+    def run() -> float:
+        start = clock()
+        for _ in range(count):
+            cycle()
+        return count / max(clock() - start, 1e-9)
+
+    return run
+
+
+def _latency(delay: Callable[[], float], count: int) -> list[float]:
+    return [1e6 * delay() for _ in range(count)]
+
+
+# ---- the contenders --------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _our_cycle(robot: Robot, hardware: Hardware) -> Iterator[tuple[Cycle, Callable[[], float]]]:
+    """A cycle of :class:`Servos`, and one that returns the s from its readings to its goals on their way."""
+    from wlr_gym.hardware.servos import Servos
+
+    goals = np.array([np.pi / 2] * 4 + [1.0] * 4)
+    with Servos(robot, hardware, 1.0, lambda: 0.0) as servos:  # recorded answers: the servos' clocks stand still
+
+        def cycle() -> None:
+            if not servos.read().answered.all():
+                raise RuntimeError("an answer was lost on a pseudo-terminal")
+            servos.write_goals(goals)
+
+        def delay() -> float:
+            servos.read()
+            start = time.perf_counter()
+            servos.write_goals(goals)
+            return time.perf_counter() - start
+
+        yield cycle, delay
+
+
+@contextlib.contextmanager
+def _sdk_cycle(robot: Robot, hardware: Hardware) -> Iterator[Cycle]:
+    """The same cycle as a user of the SDK writes it: read, values in SI units, goals in counts, write, bus after bus."""
+    buses = [_SdkBus(robot, hardware, name) for name in hardware.buses]
+
+    def cycle() -> None:
+        for bus in buses:
+            bus.read()
+        for bus in buses:
+            bus.write(1.57 if bus.is_legs else 1.0)
+
+    try:
+        yield cycle
+    finally:
+        for bus in buses:
+            bus.port.closePort()
+
+
+class _SdkBus:
+    def __init__(self, robot: Robot, hardware: Hardware, name: str) -> None:
+        import dynamixel_sdk as sdk
+
+        bus = hardware.buses[name]
+        table = load_table(bus.model)
+        self.is_legs = bus.joints[0] in LEGS
+        self.ids = [robot.dynamixel_ids[joint] for joint in bus.joints]
+        self.port, handler = sdk.PortHandler(bus.port), sdk.PacketHandler(2.0)
+        if not (self.port.openPort() and self.port.setBaudRate(bus.baud_rate)):
+            raise RuntimeError(f"dynamixel-sdk cannot open {bus.port}")
+        address, length = table.block(_FIRST, _LAST)
+        effort = "present_current" if "present_current" in table.items else "present_load"
+        self.wanted = [(table[item], table.per_count(item)) for item in (effort, "present_velocity", _LAST)]
+        self.reader = sdk.GroupSyncRead(self.port, handler, address, length)
+        goal = table["goal_position" if self.is_legs else "goal_velocity"]
+        self.goal_count = table.per_count(goal.name)
+        self.writer = sdk.GroupSyncWrite(self.port, handler, goal.address, goal.size)
+        for id in self.ids:
+            self.reader.addParam(id)
+
+    def read(self) -> list[list[float]]:
+        """Return effort, velocity and position of each servo in SI units."""
+        while self.reader.fastSyncRead() != 0:  # 34 ms are over: this computer has much else to do
+            pass
+        return [[self._value(id, item) * unit for item, unit in self.wanted] for id in self.ids]
+
+    def _value(self, id: int, item: Item) -> int:
+        value = self.reader.getData(id, item.address, item.size)
+        return value - (1 << 8 * item.size) if item.signed and value >> (8 * item.size - 1) else value
+
+    def write(self, goal: float) -> None:
+        """Write the same goal (rad, rad/s) to each servo."""
+        count = round(goal / self.goal_count)
+        for id in self.ids:
+            self.writer.addParam(id, list(count.to_bytes(4, "little")))
+        self.writer.txPacket()
+        self.writer.clearParam()
+
+
+# ---- the other side --------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _answering(robot: Robot, hardware: Hardware) -> Iterator[dict[str, str]]:
+    """Bus name -> pseudo-terminal on which a process of its own answers."""
+    import tty
+
+    from wlr_gym.hardware.emulator import Machine, MachineOptions
+    from wlr_gym.hardware.emulator.line import NO_TIME
+
+    machine = Machine(robot, hardware, MachineOptions(timing=NO_TIME, sensor_noise=False))
+    for joint in JOINTS:
+        machine.servos[joint].set("torque_enable", 1)
+    pairs = {name: os.openpty() for name in hardware.buses}
+    for _, slave in pairs.values():
+        tty.setraw(slave)
+    process = os.fork()
+    if process == 0:
+        with contextlib.suppress(BaseException):
+            _answer(machine, {master: name for name, (master, _) in pairs.items()})
+        os._exit(0)
+    try:
+        yield {name: os.ttyname(slave) for name, (_, slave) in pairs.items()}
+    finally:
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+        for master, slave in pairs.values():
+            os.close(master)
+            os.close(slave)
+        machine.close()
+
+
+def _answer(machine: Machine, names: Mapping[int, str]) -> None:
+    known: dict[tuple[int, bytes], bytes] = {}
+    while True:
+        for master in select.select(list(names), [], [])[0]:
+            key = master, os.read(master, 4096)
+            if key not in known:
+                emissions = machine.lines[names[master]].receive(key[1], machine.time)
+                known[key] = b"".join(emission.data for emission in emissions)
+            if known[key]:
+                os.write(master, known[key])

@@ -1,0 +1,250 @@
+"""Drive the robot with a policy: check, ramp to the start pose, run at 50 Hz behind the safety gate, stop, torque off.
+
+Space switches the motors off at once, q stops, and so do Ctrl-C, SIGTERM and SIGHUP. Try it without a robot: --emulated. Wheels
+off the ground the first time; see docs/robot.md.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tyro
+from rich.console import Console
+
+from wlr_gym.cli import FAILED, OK
+from wlr_gym.errors import InputError
+
+if TYPE_CHECKING:
+    from wlr_gym.envs.core import Core
+    from wlr_gym.evaluation.deployment import Deployment
+    from wlr_gym.hardware.loop import ControlLoop
+
+#: Ticks between two looks of the live status.
+_STATUS_TICKS = 10
+
+
+@dataclass(frozen=True)
+class Options:
+    policy: tyro.conf.Positional[str]
+    """Policy folder, run folder, or name of an agent."""
+    env: str = "WLR-Velocity-v0"
+    """Environment id; see: wlr envs."""
+    hardware: str = "nominal"
+    """Hardware file, or name in configs/hardware/: ports, mounting, safety limits."""
+    port: tuple[str, ...] = ()
+    """Other ports than the file's: legs=/dev/ttyUSB0 wheels=/dev/ttyUSB1 imu=/dev/ttyACM0."""
+    emulated: bool = False
+    """Drive an emulated robot, which is started for the purpose."""
+    stepped: bool = False
+    """With --emulated: in emulated time, without ports: faster, and the same bits each time."""
+    dry_run: bool = False
+    """Do everything but write to the servos: nothing moves."""
+    fault: tuple[str, ...] = ()
+    """With --emulated: what goes wrong, as in wlr emulate: "drop legs after=3"."""
+    seconds: float = 10.0
+    """How long to drive."""
+    command: tuple[str, ...] = ()
+    """What to follow: linear_velocity_x=0.1 yaw_rate=0; default: drawn anew every few seconds, as in training."""
+    seed: int = 0
+    """Seed of the drawn commands."""
+    deadman: float | None = None
+    """Stop the wheels when no key was pressed for so many seconds."""
+    out: Path = Path("robot_runs")
+    """Folder for the logs."""
+    yes: bool = False
+    """Do not ask before the robot moves."""
+    status: bool = True
+    """Show a live status."""
+
+
+def run(options: Options) -> int:
+    """Deploy; 0 = ended as it was asked to, 1 = something stopped the robot.
+
+    Raises:
+        InputError: bad options, a policy that does not fit, ports that cannot be opened.
+    """
+    from wlr_gym.evaluation import make_core
+    from wlr_gym.evaluation.deployment import deploy, loop_of
+    from wlr_gym.hardware.operator import Keys
+    from wlr_gym.policy import make_policy
+
+    command = _check(options)
+    console = Console()
+    with contextlib.ExitStack() as stack:
+        ports = _pairs("--port", options.port)
+        if options.emulated and not options.stepped:
+            ports |= stack.enter_context(_emulator(options, console))
+        robot_options = {
+            "hardware": options.hardware,
+            "ports": ports,
+            "emulated": options.emulated and options.stepped,
+            "dry_run": options.dry_run,
+            "log": options.out,
+            "deadman": options.deadman,
+        }
+        keywords = {"backend": "dynamixel", "hardware": robot_options, "episode_length": options.seconds}
+        core = make_core(options.env, 1, keywords)
+        stack.callback(core.close)
+        policy = make_policy(options.policy, core.contract())
+        _say_what_is_not_known(core, console)
+        if not (options.yes or options.emulated or options.dry_run):
+            console.input(
+                "[bold]The robot will move. Wheels off the ground? Hand on the switch? Enter to start, Ctrl-C not to."
+            )
+        loop = loop_of(core)
+        if options.stepped:
+            for fault in options.fault:
+                _machine_of(loop).inject(fault)
+        keys = stack.enter_context(Keys())
+        stack.enter_context(_signals(loop))
+        stack.enter_context(_status(loop, core, keys, options.status and console.is_terminal, console))
+        result = deploy(core, policy, options.seed, command)
+    _report(result, loop, console)
+    return OK if result.well else FAILED
+
+
+def _check(options: Options) -> dict[str, float]:
+    """Return the held command, from options that make sense."""
+    if not 0.0 < options.seconds < float("inf"):
+        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: expected 0 or more")
+    if options.deadman is not None and options.deadman <= 0.0:
+        raise InputError(f"--deadman {options.deadman:g}: expected more than 0")
+    if not options.emulated and (options.stepped or options.fault):
+        raise InputError("--stepped and --fault are for the emulated robot: add --emulated")
+    if options.emulated and options.port:
+        raise InputError("--port: the emulated robot brings its own ports")
+    commands = _pairs("--command", options.command)
+    try:
+        return {name: float(text) for name, text in commands.items()}
+    except ValueError:
+        raise InputError(f"--command {' '.join(options.command)}: expected name=number") from None
+
+
+def _pairs(option: str, words: tuple[str, ...]) -> dict[str, str]:
+    pairs = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (name and equals and value):
+            raise InputError(f"{option} {word}: expected name=value")
+        pairs[name] = value
+    return pairs
+
+
+def _machine_of(loop: ControlLoop) -> Any:
+    return loop.clock.machine  # type: ignore[attr-defined]
+
+
+@contextlib.contextmanager
+def _emulator(options: Options, console: Console) -> Iterator[dict[str, str]]:
+    """Start ``wlr emulate`` as a process of its own; yield its ports."""
+    import subprocess
+    import tempfile
+
+    with tempfile.TemporaryDirectory(prefix="wlr-robot-") as folder:
+        links = Path(folder) / "ports"
+        words = ["--links", str(links), "--hardware", options.hardware]
+        for fault in options.fault:
+            words += ["--fault", fault]
+        command = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "emulate", *words]
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        )
+        assert process.stdout is not None
+        assert process.stderr is not None
+        try:
+            console.print("starting the emulated robot ...", style="dim")
+            ports = {line.split()[0]: line.split()[1] for line in (process.stdout.readline() for _ in range(3)) if line}
+            if len(ports) < 3:
+                raise InputError(f"the emulated robot does not start: {process.stderr.read().strip()}")
+            yield ports
+        finally:
+            process.terminate()
+            process.communicate()
+
+
+def _signals(loop: ControlLoop) -> contextlib.AbstractContextManager[None]:
+    from wlr_gym.hardware.loop import stop_on_signals
+
+    return stop_on_signals(loop)
+
+
+def _say_what_is_not_known(core: Core, console: Console) -> None:
+    console.print(f"not measured on a robot, and left out: {', '.join(core.unmeasured)}", style="dim")
+
+
+@contextlib.contextmanager
+def _status(loop: ControlLoop, core: Core, keys: Any, show: bool, console: Console) -> Iterator[None]:
+    """Serve the keys, and show the status, in the time that is left in each tick."""
+    from rich.live import Live
+
+    from wlr_gym.hardware.operator import HELP
+
+    console.print(HELP, style="dim")
+    live = Live(console=console, auto_refresh=False, transient=True) if show else None
+    count = 0
+
+    def spare() -> None:
+        nonlocal count
+        keys.serve(loop)
+        count += 1
+        if live is not None and count % _STATUS_TICKS == 0:
+            live.update(status_table(loop, core), refresh=True)
+
+    loop.spare = spare
+    with live or contextlib.nullcontext():
+        try:
+            yield
+        finally:
+            loop.spare = None
+
+
+def status_table(loop: ControlLoop, core: Core) -> Any:
+    """Return what a driver wants to see now."""
+    from rich.table import Table
+
+    from wlr_gym.hardware.safety import tilt_of
+    from wlr_gym.robot import JOINTS
+
+    table = Table(
+        box=None, title=f"{loop.phase.value}  {core.ticks[0] * core.task.config.control_period:.1f} s", title_justify="left"
+    )
+    for name in ("joint", "angle rad", "goal", "speed rad/s", "effort N m", "degC", "V"):
+        table.add_column(name, justify="left" if name == "joint" else "right")
+    view = loop.view
+    if view is None:
+        return table
+    for k, joint in enumerate(JOINTS):
+        numbers = (view.position[k], loop.goals[k], view.velocity[k], view.effort[k], view.temperature[k], view.voltage[k])
+        table.add_row(joint, *(f"{number:.2f}" for number in numbers), style="red" if view.silence[k] > 0 else "")
+    command = "  ".join(f"{name} {value:+.2f}" for name, value in zip(core.task.commands, core.command[0], strict=True))
+    limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
+    table.caption = f"{command}\ntilt {tilt_of(view.up):.2f} rad  ticks missed {loop.pacer.missed}\nsafety gate: {limited}"
+    table.caption_justify = "left"
+    return table
+
+
+def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    colour = "green" if result.well else "red"
+    console.print(Text.assemble(("ended: ", "bold"), (result.reason, colour)))
+    statistics = result.statistics
+    table = Table(box=None, title=f"{statistics['ticks']} ticks, {statistics['missed']} missed; ms", title_justify="left")
+    for name in ("", "p50", "p95", "p99", "max"):
+        table.add_column(name, justify="right")
+    for name, values in statistics.items():
+        if isinstance(values, dict) and "p50" in values:
+            table.add_row(name, *(f"{value:.2f}" for value in values.values()))
+    console.print(table)
+    limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
+    console.print(f"safety gate, ticks: {limited}")
+    if result.run is not None:
+        console.print(f"written: {result.run}", soft_wrap=True)

@@ -1,0 +1,173 @@
+"""Look at a robot before it drives: ports, adapters, every servo, bus speed, IMU, and whether a policy fits. Moves nothing.
+
+Names the first thing that is wrong and what to do about it. Exit code 0: nothing stands against driving; 1: something does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.robot_options import RobotOption
+from wlr_gym.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from wlr_gym.hardware.checks import Check
+    from wlr_gym.hardware.config import Hardware
+    from wlr_gym.hardware.link import Link
+    from wlr_gym.robot import Robot
+
+
+@dataclass(frozen=True)
+class Options(RobotOption):
+    """Look at a robot.
+
+    Attributes:
+        policy: policy or run folder that is to drive it: does it fit this robot?
+        mend: write the register values that mend what is wrong (servos' torque must be off).
+        scan: search every bus at every baud rate for servos, whatever their ids.
+        json: file for all checks.
+        verbose: show every check of every joint.
+    """
+
+    policy: Annotated[Path | None, tyro.conf.Positional] = None
+    mend: bool = False
+    scan: bool = False
+    json: Path | None = None
+    verbose: bool = False
+
+
+def run(options: Options) -> int:
+    """Look and print; 0 when nothing stands against driving.
+
+    Raises:
+        InputError: unknown robot or hardware, ``--json`` in a folder that does not exist, nothing to scan.
+    """
+    from rich.console import Console
+
+    from wlr_gym.files import write_json
+
+    if options.json is not None and not options.json.parent.is_dir():
+        raise InputError(f"--json {options.json}: folder {options.json.parent} does not exist")
+    if options.scan and options.emulated:
+        raise InputError("--scan: the emulated robot of this process has no ports; name those of wlr emulate")
+    console = Console(soft_wrap=True, highlight=False)
+    robot, hardware = options.load()
+    link = options.link()
+    try:
+        checks = examine(link, robot, hardware, options, console)
+    finally:
+        link.close()
+    if options.policy is not None:
+        checks.append(check_policy(options.policy, options.robot))
+    _print(checks, console, options.verbose)
+    if options.json is not None:
+        write_json(options.json, [check._asdict() for check in checks])
+    return FAILED if any(check.is_fatal and not check.ok for check in checks) else OK
+
+
+def examine(link: Link, robot: Robot, hardware: Hardware, options: Options, console: Console) -> list[Check]:
+    """Return all checks of ports, adapters, servos, buses and IMU; mends and scans on the way, where that was asked for."""
+    from wlr_gym.hardware import checks
+    from wlr_gym.hardware.sdk import BusGoneError
+
+    ports = checks.open_ports(link.servos, link.imu, hardware)
+    found = ports if options.emulated else ports + checks.check_latency_timers(hardware)
+    open_here = {check.where for check in ports if check.ok}
+    buses = [name for name in hardware.buses if name in open_here]
+    joints = [joint for name in buses for joint in hardware.buses[name].joints]
+    if options.scan:
+        _scan(link, hardware, buses, console)
+    try:
+        servos = checks.check_servos(link.servos, robot, hardware, joints)
+        if options.mend:
+            left = checks.mend(link.servos, servos)
+            console.print(f"mended: {sum(not check.ok for check in servos) - len(left)}, left: {len(left)}")
+            servos = checks.check_servos(link.servos, robot, hardware, joints)
+        found += servos
+        if len(buses) == len(hardware.buses) and all(check.ok for check in servos if check.what == "answer"):
+            found.append(checks.check_bus_speed(link.servos, now=link.clock.now))
+    except BusGoneError as error:
+        found.append(checks.Check("robot", "bus", False, str(error), "a bus that stays", "Check plugs and supply."))
+    if "imu" in open_here:
+        found += checks.check_imu(link.imu, hardware.imu, link.clock)
+    return found
+
+
+def check_policy(source: Path, robot: str) -> Check:
+    """Return whether a policy was made for this robot, its observations and its control period."""
+    from wlr_gym.evaluation.rollout import make_core
+    from wlr_gym.hardware.checks import Check
+    from wlr_gym.policy.file import check_contract, policy_folder, read_contract
+
+    remedy = "Choose another policy, train it for this robot, or name the robot file it was trained with (--robot)."
+    try:
+        folder = policy_folder(source)
+        if folder is None:
+            raise InputError(f"no policy in {source}")
+        policy = read_contract(folder)
+        core = make_core(policy.get("training", {}).get("environment", "WLR-Velocity-v0"), 1, {"robot": robot})
+        try:
+            check_contract(policy["environment"], core.contract(), str(folder))
+        finally:
+            core.close()
+    except InputError as error:
+        return Check("policy", "contract", False, str(error), "one that fits", remedy)
+    return Check("policy", "contract", True, f"{policy['agent']}, {policy['environment']['task']}", "", "")
+
+
+def _scan(link: Link, hardware: Hardware, buses: Sequence[str], console: Console) -> None:
+    from wlr_gym.hardware.setup import find_servos
+
+    for name in buses:
+        link.servos.groups[name].close()
+        for servo in find_servos(name, hardware.buses[name].port):
+            console.print(f"{name}: {servo}")
+        link.servos.groups[name].open()
+
+
+# ---- the report ------------------------------------------------------------------------------------------------------
+
+
+def _print(checks: Sequence[Check], console: Console, verbose: bool) -> None:
+    from rich.text import Text
+
+    for line, style in _lines(checks, verbose):
+        console.print(Text(line, style))
+    wrong = sorted((check for check in checks if not check.ok), key=lambda check: not check.is_fatal)
+    if not wrong:
+        console.print(Text(f"All {len(checks)} checks passed.", "bold green"))
+        return
+    faults = sum(check.is_fatal for check in wrong)
+    counts = f"{_plural(faults, 'fault')}, {_plural(len(wrong) - faults, 'warning')} in {len(checks)} checks."
+    console.print(Text(counts, "bold red" if faults else "bold yellow"))
+    first = wrong[0]
+    summary = f"First: {first.where}, {first.what}: {first.found}, expected {first.expected}."
+    console.print(Text(f"{summary}\n{first.remedy}", "bold"))
+
+
+def _plural(count: int, word: str) -> str:
+    return f"{count} {word}{'' if count == 1 else 's'}"
+
+
+def _lines(checks: Sequence[Check], verbose: bool) -> list[tuple[str, str]]:
+    """One line per kind of check that all joints pass, one per joint that fails it, in the order they were made."""
+    lines: list[tuple[str, str]] = []
+    told: set[str] = set()
+    for check in checks:
+        alike = [other for other in checks if other.what == check.what]
+        if verbose or not check.ok or len(alike) == 1:
+            lines.append((str(check), "" if check.ok else "red" if check.is_fatal else "yellow"))
+        elif check.what not in told:
+            told.add(check.what)
+            passed = [other for other in alike if other.ok]
+            found = list(dict.fromkeys(other.found for other in passed))
+            lines.append((f"ok      {len(passed)} of {len(alike):<5} {check.what}: {', '.join(found)}", ""))
+    return lines

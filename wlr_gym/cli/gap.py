@@ -1,0 +1,173 @@
+"""Find what the model lacks: compare it with measured runs, name the missing effect, prove it on runs kept aside.
+
+Writes report.html, result.json, patch.yaml (the effects found, for --effects), plots, config.yaml and provenance.yaml.
+docs/gap.md says how to read the report.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.options import EffectsOption
+from wlr_gym.errors import InputError, unknown_name
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from wlr_gym.gap.analysis import Analysis
+
+#: Share of the work that must be done before the remaining time is shown.
+LEAST_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class Options(EffectsOption):
+    data: tyro.conf.Positional[Path]
+    """Folder of measured runs; with --rig, of recordings of the rig."""
+    out: Path
+    """Folder for the results; made if it is not there. Results of an earlier analysis are replaced."""
+    rig: str | None = None
+    """Recordings of a test rig instead of runs of the robot: pendulum (one servo that swings a weight)."""
+    backend: str = "gibbs_appell"
+    """Simulator of the robot: gibbs_appell or mujoco."""
+    heldout: tuple[str, ...] = ()
+    """Runs to keep aside for the proof; default: chosen by what they can tell."""
+    threads: int | None = None
+    """Worker threads; default: one per core."""
+
+
+def run(options: Options) -> int:
+    """Analyse, print, write; 0 for every verdict but ``bad_data``, which is 1.
+
+    Raises:
+        InputError: no such data, unknown effect, rig, backend or run, an output folder that cannot be used.
+    """
+    from rich.console import Console
+
+    from wlr_gym.gap.analyse import analyse
+    from wlr_gym.gap.analysis import BAD_DATA
+    from wlr_gym.gap.report import check_folder
+    from wlr_gym.provenance import record_provenance
+
+    _check(options)
+    known = options.patch()
+    check_folder(options.out)
+    console = Console(soft_wrap=True, highlight=False)
+    with _progress(console) as tell:
+        analysis = analyse(
+            options.data,
+            options.out,
+            known=known,
+            rig=options.rig,
+            backend=options.backend,
+            heldout=options.heldout,
+            threads=options.threads or os.cpu_count() or 1,
+            tell=tell,
+        )
+    settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
+    record_provenance(options.out, settings | {"heldout": list(options.heldout), "effects": known.content()["effects"]})
+    _print(analysis, options.out, console)
+    return FAILED if analysis.verdict == BAD_DATA else OK
+
+
+def _check(options: Options) -> None:
+    from wlr_gym.gap.analyse import RIGS
+    from wlr_gym.plants import check_backend
+
+    if not options.data.is_dir():
+        what = "is a file" if options.data.exists() else "no such folder"
+        raise InputError(f"{options.data}: {what}; expected a folder of runs")
+    check_backend(options.backend)
+    if options.rig is not None and options.rig not in RIGS:
+        raise unknown_name("rig", options.rig, RIGS)
+    if options.rig is not None and options.backend != Options.backend:
+        raise InputError(f"--rig {options.rig}: the rig has a simulator of its own: leave --backend out")
+    if options.threads is not None and options.threads < 1:
+        raise InputError(f"--threads {options.threads}: expected 1 or more")
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Callable[[str, float], None]]:
+    """Show the stage, the share done and the remaining time; without a terminal, a line per stage."""
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
+    )  # fmt: skip
+    begin, last = time.monotonic(), [""]
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("reading", total=1.0, left="")
+
+        def tell(text: str, share: float) -> None:
+            left = _left(time.monotonic() - begin, share)
+            bar.update(task, description=text, completed=share, left=left)
+            stage = text.partition(":")[0]
+            if not console.is_terminal and stage != last[0]:
+                console.print(f"{100.0 * share:3.0f} %  {stage}{left and '; '}{left}", markup=False)
+            last[0] = stage
+
+        yield tell
+
+
+def _left(passed: float, share: float) -> str:
+    """Return the remaining time in words; empty while nobody can know."""
+    from wlr_gym.gap.words import duration
+
+    return f"about {duration(passed * (1.0 - share) / share)} left" if share >= LEAST_SHARE and passed > 1.0 else ""
+
+
+# ---- the summary -----------------------------------------------------------------------------------------------------
+
+
+def _print(analysis: Analysis, out: Path, console: Console) -> None:
+    from wlr_gym.gap.report import REPORT_FILE
+    from wlr_gym.gap.result import PATCH_FILE, RESULT_FILE
+    from wlr_gym.gap.words import TITLES, sentence
+
+    colours = {"bad_data": "red", "not_excited": "yellow", "nothing_missing": "green"}
+    console.print(TITLES[analysis.verdict], style=f"bold {colours.get(analysis.verdict, 'blue')}")
+    for line in (sentence(analysis), *_findings(analysis), *_numbers(analysis), *_advice(analysis)):
+        console.print(line, markup=False)
+    for label, name in (("report", REPORT_FILE), ("result", RESULT_FILE), ("patch", PATCH_FILE)):
+        console.print(f"{label}: {out / name}", markup=False)
+
+
+def _findings(analysis: Analysis) -> Iterator[str]:
+    for finding in analysis.intake:
+        place = " ".join(filter(None, [finding.run, finding.channel]))
+        yield f"  {'data' if not finding.fatal else 'FATAL'}: {f'{place}: ' if place else ''}{finding.text}"
+
+
+def _numbers(analysis: Analysis) -> Iterator[str]:
+    from wlr_gym.gap.words import error, estimate, interval, percent, places, plain
+
+    for effect in analysis.effects:
+        values = ", ".join(f"{name} {estimate(found)}" for name, found in effect.parameters.items())
+        formula = f"{effect.formula}; " if effect.formula else ""
+        yield f"  {plain(effect.name)} at {places(effect.where)}: {formula}{values}; confidence {percent(effect.confidence)}"
+    gap = analysis.gap
+    if gap is not None:
+        steps = [f"{error(gap.heldout_before)} as given", f"{error(gap.heldout_calibrated)} calibrated"]
+        steps += [f"{error(gap.heldout_after)} with the effects"] if analysis.effects else []
+        yield f"  error of the runs kept aside, 1 = sensor noise: {', '.join(steps)}; noise floor {error(gap.noise_floor)}"
+        if analysis.effects:
+            yield f"  removed: {percent(gap.reduction)} of the avoidable error; {interval(*gap.reduction_ci95)}"
+
+
+def _advice(analysis: Analysis) -> Iterator[str]:
+    from wlr_gym.gap.words import listed, plain
+
+    for group in analysis.equivalent:
+        yield f"  cannot tell {listed([plain(name) for name in group.names], 'from')}; this run would: {group.separating_run}"
+    for one in analysis.recommendations:
+        yield f"  record next: {one.excitation}: {one.why}"

@@ -1,0 +1,130 @@
+"""Repeat the paper: its two tests on every model, its equations as printed and corrected, its claims, its open question.
+
+Writes report.md, claims.json, search.json, agreement.json, the paper's figures 7-11 and 13-17 (figure_NN.png), slip and loads
+(test_N_slip.png), open_question.png, config.yaml and provenance.yaml. docs/paper.md explains them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wlr_gym.errors import InputError, unknown_name
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from wlr_gym.paper.experiments import Record
+    from wlr_gym.paper.open_question import Finding
+    from wlr_gym.robot import Robot
+
+
+@dataclass(frozen=True)
+class Options:
+    out: Path
+    """Folder for the report; made if it is not there."""
+    plant: tuple[str, ...] = ("reduced", "gibbs_appell", "mujoco")
+    """Models to run the tests on: reduced (the nine-velocity model), gibbs_appell, mujoco, dynamixel (a robot)."""
+    hardware: str = "nominal"
+    """Of a robot: its hardware file, or a name in configs/hardware/."""
+    emulated: bool = False
+    """Of a robot: an emulated one, in this process and in emulated time."""
+    robot: str | None = None
+    """Robot file or config name; default: the nominal one."""
+    draws: int = 8
+    """Of the search for what could explain the paper's slip: draws per combination at first; 0 = no search."""
+    levels: int = 2
+    """Most departures from the nominal robot at once in the search: 1 to 3."""
+    seed: int = 0
+    """Of the search."""
+    threads: int = 2
+    """Worker threads of the engine."""
+    plots: bool = True
+    """Write figures."""
+
+
+def run(options: Options) -> int:
+    """Drive, check, search, write; 0 when done.
+
+    Raises:
+        InputError: unknown model or robot, numbers out of range.
+    """
+    from rich.console import Console
+
+    from wlr_gym.cli import OK
+    from wlr_gym.files import make_output_folder
+    from wlr_gym.paper import report
+    from wlr_gym.paper.claims import check_all, gather
+    from wlr_gym.provenance import record_provenance
+    from wlr_gym.robot import load_robot
+
+    _check(options)
+    robot = load_robot(options.robot) if options.robot else load_robot()
+    make_output_folder(options.out)
+    console = Console()
+    records = {model: _drive(model, robot, options, console) for model in options.plant}
+    reference = records.get("gibbs_appell") or _drive("gibbs_appell", robot, options, console)
+    console.print("claims")
+    evidence = gather(robot, reference, options.threads)
+    claims = check_all(evidence)
+    findings = _search(robot, options, console)
+    decisive = report.what_would_decide(robot, findings, options.threads)
+    if options.plots:
+        console.print("figures")
+        report.write_figures(options.out, records, evidence, findings)
+    report.write_report(options.out, robot, records, claims, findings, decisive)
+    given = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
+    record_provenance(options.out, given | {"plant": list(options.plant), "robot": robot.name}, options.seed)
+    _show(console, claims)
+    console.print(f"report: {options.out / 'report.md'}", soft_wrap=True)
+    return OK
+
+
+def _check(options: Options) -> None:
+    from wlr_gym.paper.experiments import MODELS
+
+    if not options.plant:
+        raise InputError("--plant: expected at least one model")
+    for model in options.plant:
+        if model not in MODELS:
+            raise unknown_name("model", model, MODELS)
+    for name, low, high in (("draws", 0, 10_000), ("levels", 1, 3), ("threads", 1, 256), ("seed", 0, 2**63)):
+        value = getattr(options, name)
+        if not low <= value <= high:
+            raise InputError(f"--{name} {value}: expected {low} to {high}")
+
+
+def _drive(model: str, robot: Robot, options: Options, console: Console) -> dict[str, Record]:
+    from wlr_gym.paper.experiments import drive_both
+    from wlr_gym.plants.base import RobotOptions
+
+    console.print(f"both tests: {model}")
+    return drive_both(model, robot, hardware=RobotOptions(hardware=options.hardware, emulated=options.emulated, guard=False))
+
+
+def _search(robot: Robot, options: Options, console: Console) -> list[Finding]:
+    from wlr_gym.paper.open_question import search
+
+    if options.draws == 0:
+        return []
+    console.print("open question: what slips as the paper's robot did?")
+    return search(robot, options.draws, options.levels, options.seed, threads=options.threads)
+
+
+def _show(console: Console, claims: Sequence[object]) -> None:
+    from rich import box
+    from rich.table import Table
+
+    from wlr_gym.paper.claims import FAILS, CheckedClaim
+
+    table = Table(title="The paper's claims", title_justify="left", title_style="bold", box=box.SIMPLE)
+    for heading in ("#", "claim", "paper", "here", "verdict"):
+        table.add_column(heading, overflow="fold")
+    for claim in claims:
+        assert isinstance(claim, CheckedClaim)
+        style = "red" if claim.verdict == FAILS else None
+        table.add_row(str(claim.number), claim.text, claim.paper, claim.ours, claim.verdict, style=style)
+    console.width = max(console.width, 120)
+    console.print(table)

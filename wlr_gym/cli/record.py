@@ -1,0 +1,178 @@
+"""Record measured runs: drive the robot, an emulated one or a simulator through a motion, and log it in the run format.
+
+``--list`` shows the excitations: motions that bring out what a robot is made of. A motion may also come from a file
+(``--commands``), and be written into one (``--commands-only``). On a robot everything goes through the safety gate; Ctrl-C
+stops it in good order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.robot_options import RobotOption, confirm
+from wlr_gym.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from wlr_gym.evaluation.driving import Drive
+    from wlr_gym.robot import Robot
+    from wlr_gym.runs.excitations import Motion
+    from wlr_gym.runs.format import RunMeta
+
+
+@dataclass(frozen=True)
+class Options(RobotOption, EffectsOption):
+    """Record runs.
+
+    Attributes:
+        excitation: motions to drive, by name; several make a data set.
+        commands: files with goals to drive: of --commands-only, or of whole runs.
+        out: folder for the runs; made if it is not there.
+        backend: dynamixel = the robot (with --emulated an emulated one), or a simulator: gibbs_appell, mujoco.
+        seed: of the motions, and of a simulator's noise.
+        seconds: cut each motion off after this long.
+        commands_only: write the goals only, one file per motion.
+        list: show the excitations.
+        ground: what the floor is like, for meta.yaml.
+        notes: free text for meta.yaml.
+        yes: do not ask before the robot moves.
+    """
+
+    excitation: tuple[str, ...] = ()
+    commands: tuple[Path, ...] = ()
+    out: Path | None = None
+    backend: str = "dynamixel"
+    seed: int = 0
+    seconds: float | None = None
+    commands_only: bool = False
+    list: bool = False
+    ground: str | None = None
+    notes: str | None = None
+    yes: bool = False
+
+
+def run(options: Options) -> int:
+    """Record; 0 when every motion was driven to its end or stopped by the operator, 1 when something stopped the robot.
+
+    Raises:
+        InputError: unknown motion, backend, robot or patch, options that make no sense, ports that cannot be opened.
+    """
+    from rich.console import Console
+
+    from wlr_gym.plants import REAL, check_backend
+    from wlr_gym.robot import load_robot
+    from wlr_gym.runs.format import RunMeta
+    from wlr_gym.runs.record import meta_of, same_profile, write_commands
+
+    console = Console(soft_wrap=True, highlight=False)
+    robot = load_robot(options.robot)
+    if options.list:
+        _list(console, robot)
+        return OK
+    check_backend(options.backend)
+    if options.backend not in REAL and (options.emulated or options.port):
+        raise InputError(f"--emulated and --port are about the robot: leave --backend {options.backend} out")
+    if options.out is None:
+        raise InputError("--out: expected a folder for the runs")
+    motions = read_motions(options, robot)
+    same_profile(motions)
+    if options.commands_only:
+        for motion in motions:
+            console.print(f"written: {write_commands(options.out, motion)}")
+        return OK
+    meta = meta_of(motions[0], robot, RunMeta(ground=options.ground, notes=options.notes))
+    if options.backend in REAL:
+        return _record_robot(options, motions, meta, console)
+    return _record_simulations(options, motions, robot, meta, console)
+
+
+def read_motions(options: Options, robot: Robot) -> Sequence[Motion]:
+    """Return the motions that were asked for.
+
+    Raises:
+        InputError: none, or one that cannot be read.
+    """
+    from wlr_gym.runs.excitations import excite
+    from wlr_gym.runs.record import read_commands
+
+    if options.seconds is not None and not options.seconds > 0.0:
+        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
+    motions = [excite(name, options.seed, robot, seconds=options.seconds) for name in options.excitation]
+    motions += [read_commands(path).cut(options.seconds) for path in options.commands]
+    if not motions:
+        raise InputError("nothing to drive: name excitations (--excitation straight turns; see --list) or files (--commands)")
+    return motions
+
+
+# ---- the robot -------------------------------------------------------------------------------------------------------
+
+
+def _record_robot(options: Options, motions: Sequence[Motion], meta: RunMeta, console: Console) -> int:
+    from wlr_gym.evaluation.driving import drive_robot
+
+    assert options.out is not None
+    if not options.emulated and not options.yes:
+        confirm(motions, console)
+    well = True
+    for motion in motions:
+        plant = options.plant(options.out, meta, options.patch())
+        try:
+            drive = drive_robot(plant, motion)
+        finally:
+            plant.close()
+        _report(motion, drive, console)
+        well = well and drive.well
+        if drive.reason:
+            break
+    return OK if well else FAILED
+
+
+def _report(motion: Motion, drive: Drive, console: Console) -> None:
+    from wlr_gym.runs import read_run
+
+    ended = drive.reason or "to its end"
+    console.print(
+        f"{motion.name}: {drive.ticks} of {len(motion.goals)} ticks driven; {ended}", style="" if not drive.reason else "red"
+    )
+    changed = drive.statistics["interventions"]
+    if changed:
+        console.print(f"  safety gate: {', '.join(f'{rule} in {count} ticks' for rule, count in changed.items())}")
+    if drive.run is not None:
+        console.print(f"  written: {drive.run}")
+        for finding in read_run(drive.run).findings if drive.ticks > 1 else ():
+            console.print(f"  {finding.kind} in '{finding.column}': {finding.message}", style="yellow")
+
+
+# ---- simulators ------------------------------------------------------------------------------------------------------
+
+
+def _record_simulations(options: Options, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
+    from wlr_gym.files import make_output_folder
+    from wlr_gym.runs.record import next_run, record_simulation
+
+    assert options.out is not None
+    make_output_folder(options.out)
+    patch = options.patch()
+    for motion in motions:
+        path = next_run(options.out)
+        record_simulation(path, motion, robot, options.backend, options.seed, patch, meta)
+        console.print(f"{motion.name}: {motion.duration:.1f} s on {options.backend}; written: {path}")
+    return OK
+
+
+def _list(console: Console, robot: Robot) -> None:
+    from rich import box
+    from rich.table import Table
+
+    from wlr_gym.runs.excitations import EXCITATIONS, excite
+
+    table = Table("excitation", "seconds", "what the robot does", "what it shows", box=box.SIMPLE)
+    for name, excitation in EXCITATIONS.items():
+        table.add_row(name, f"{excite(name, robot=robot).duration:.0f}", excitation.doc, excitation.shows)
+    console.print(table)

@@ -1,0 +1,133 @@
+"""Options of every command that connects to the robot, real or emulated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wlr_gym.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from wlr_gym.effects import Patch
+    from wlr_gym.hardware.config import Hardware
+    from wlr_gym.hardware.link import Link
+    from wlr_gym.hardware.plant import RobotPlant
+    from wlr_gym.robot import Robot
+    from wlr_gym.runs.excitations import Motion
+    from wlr_gym.runs.format import RunMeta
+
+
+@dataclass(frozen=True, kw_only=True)
+class HardwareOption:
+    """How the robot is wired, and whether it is a real one."""
+
+    hardware: str = "nominal"
+    """Wiring and mounting: file or config name."""
+    port: tuple[str, ...] = ()
+    """Another port than the hardware file's, such as legs=/dev/ttyUSB1 or imu=/dev/ttyACM0."""
+    emulated: bool = False
+    """An emulated robot in this process and in emulated time, instead of the ports."""
+
+    def load_hardware(self) -> Hardware:
+        """Return the hardware, with the ports asked for.
+
+        Raises:
+            InputError: unknown or broken file, a port that is not NAME=PATH, or a name that is no bus.
+        """
+        from wlr_gym.hardware.config import load_hardware, with_ports
+
+        ports = dict(_pair(text) for text in self.port)
+        if ports and self.emulated:
+            raise InputError("--port and --emulated: one or the other; the emulated robot of this process has no ports")
+        return with_ports(load_hardware(self.hardware), ports)
+
+    def link_to(self, robot: Robot, hardware: Hardware, patch: Patch | None = None) -> Link:
+        """Return connections to a robot, closed; ``patch`` is what an emulated one has that the nominal one lacks.
+
+        Raises:
+            InputError: a patch for a real robot.
+        """
+        from wlr_gym.hardware.link import emulated_link, serial_link
+
+        if not self.emulated:
+            if patch is not None and patch.effects:
+                raise InputError("--effects: a real robot has its own; they are for simulators and the emulated robot")
+            return serial_link(robot, hardware)
+        from wlr_gym.effects import apply_patch
+        from wlr_gym.hardware.emulator import Machine, MachineOptions
+        from wlr_gym.hardware.emulator.line import NO_TIME
+        from wlr_gym.parameters import Parameters
+
+        parameters = Parameters.nominal(robot)
+        if patch is None:
+            return emulated_link(Machine(robot, hardware))
+        options = MachineOptions(timing=NO_TIME)
+        machine = Machine(robot, hardware, options, parameters=apply_patch(patch, parameters), forces=patch.forces)
+        return emulated_link(machine)
+
+    def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
+        """Return the robot as a plant, limp; every start is logged in a new run of ``log``."""
+        from wlr_gym.hardware.plant import RobotPlant
+        from wlr_gym.plants.base import PlantOptions, RobotOptions
+
+        hardware = self.load_hardware()
+        options = RobotOptions(hardware=self.hardware, ports=dict(_pair(text) for text in self.port), log=log)
+        return RobotPlant(robot, 1, PlantOptions(), options, link=self.link_to(robot, hardware, patch), meta=meta)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotOption(HardwareOption):
+    """Which robot, how it is wired, and whether it is a real one."""
+
+    robot: str = "nominal"
+    """Robot file or config name."""
+
+    def load(self) -> tuple[Robot, Hardware]:
+        """Return the robot and its hardware, with the ports asked for; see :meth:`load_hardware`."""
+        from wlr_gym.robot import load_robot
+
+        return load_robot(self.robot), self.load_hardware()
+
+    def link(self, changed: Hardware | None = None) -> Link:
+        """Return connections to a robot that does not move, closed; a slow computer is no dead servo then.
+
+        Args:
+            changed: hardware instead of the one of :meth:`load`.
+        """
+        from wlr_gym.hardware.gate import CALM_PATIENCE
+
+        robot, hardware = self.load()
+        link = self.link_to(robot, changed or hardware)
+        for group in link.servos.groups.values():
+            group.patience = CALM_PATIENCE
+        return link
+
+    def plant(self, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
+        """Return the robot as a plant; see :meth:`plant_of`."""
+        return self.plant_of(self.load()[0], log, meta, patch)
+
+
+def confirm(motions: Sequence[Motion], console: Console) -> None:
+    """Say what the robot is about to do, and wait for Enter.
+
+    Raises:
+        InputError: nobody there.
+    """
+    seconds = sum(motion.duration for motion in motions)
+    names = ", ".join(motion.name for motion in motions)
+    console.print(f"The robot will drive {names}: {seconds:.0f} s in all, on about 2 m of free floor in front of it.")
+    try:
+        console.input("[bold]Hand on the switch? Enter to start, Ctrl-C not to. ")
+    except EOFError:
+        raise InputError("nobody there to start the robot: run it on a terminal, or say --yes") from None
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, path = text.partition("=")
+    if not (name and equals and path):
+        raise InputError(f"--port {text}: expected NAME=PATH, such as legs=/dev/ttyUSB1")
+    return name, path

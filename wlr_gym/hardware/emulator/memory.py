@@ -1,0 +1,181 @@
+"""The emulated robot without ports, in emulated time: for tests and trials that must not depend on a clock.
+
+Bytes go straight to the emulated lines, and waiting for an answer, or for the next control tick, is what lets emulated time
+pass. Everything above the serial device is the code that drives a real robot; the same run gives the same bits.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import Any
+
+from wlr_gym.errors import InputError
+from wlr_gym.hardware.config import ImuPort
+from wlr_gym.hardware.emulator.line import Emission
+from wlr_gym.hardware.emulator.machine import Machine
+from wlr_gym.hardware.imu_driver import ImuGoneError
+from wlr_gym.hardware.imu_stream import ImuStream
+from wlr_gym.hardware.sdk import GuardedPort
+
+
+class World:
+    """A machine, the bytes on their way, and the clock that passes when somebody waits.
+
+    Args:
+        machine: the robot.
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        self.machine = machine
+        self._plugged = dict.fromkeys([*machine.hardware.buses, "imu"], True)
+        self._sockets = dict.fromkeys(self._plugged, 0)
+        self._due: dict[str, list[tuple[float, int, bytes]]] = {name: [] for name in self._plugged}
+        self._sent = 0
+
+    def now(self) -> float:
+        """Return emulated time, s."""
+        return self.machine.time
+
+    def wait_until(self, moment: float) -> None:
+        """Let emulated time pass until ``moment`` (s)."""
+        while self.machine.time < moment - 1e-9:
+            self.step()
+
+    def step(self) -> None:
+        """Let one tick pass."""
+        self.machine.step()
+        self.queue("imu", self.machine.take_imu_output())
+        for name, was in self._plugged.items():
+            self._plugged[name] = self.machine.plugged(name)
+            if was and not self._plugged[name]:
+                self._sockets[name] += 1
+                self._due[name].clear()
+                if name in self.machine.lines:
+                    self.machine.lines[name].forget()
+
+    def queue(self, name: str, emissions: list[Emission]) -> None:
+        """Send bytes on their way to the host."""
+        for emission in emissions:
+            self._sent += 1  # keeps bytes of one moment in order
+            heapq.heappush(self._due[name], (emission.time, self._sent, emission.data))
+
+    def connect(self, name: str) -> int:
+        """Return a connection to the adapter of a bus, or of the IMU.
+
+        Raises:
+            InputError: it is unplugged.
+        """
+        if not self.machine.plugged(name):
+            raise InputError(f"port of {name}: cannot be opened: the emulated adapter is unplugged")
+        return self._sockets[name]
+
+    def require(self, name: str, connection: int) -> None:
+        """Raise :class:`OSError` when the adapter was pulled out since it was connected."""
+        if self._sockets[name] != connection or not self._plugged[name]:
+            raise OSError("the emulated adapter is unplugged")
+
+    def arrived(self, name: str) -> bytes:
+        """Take the bytes that have reached the host."""
+        queue, data = self._due[name], b""
+        while queue and queue[0][0] <= self.machine.time + 1e-9:
+            data += heapq.heappop(queue)[2]
+        return data
+
+
+class _Device:
+    """What :class:`GuardedPort` uses of ``serial.Serial``."""
+
+    def __init__(self, world: World, name: str, baud_rate: int) -> None:
+        self._world, self._name, self._baud_rate = world, name, baud_rate
+        self._connection = world.connect(name)
+
+    def write(self, packet: Any) -> int:
+        self._world.require(self._name, self._connection)
+        data = bytes(packet)
+        machine = self._world.machine
+        self._world.queue(self._name, machine.lines[self._name].receive(data, machine.time, self._baud_rate))
+        return len(data)
+
+    def wait_and_read(self, seconds: float) -> bytes:
+        """Return what came in, waiting up to ``seconds``, and a tick at least when there is nothing."""
+        world = self._world
+        end = world.now() + seconds
+        while True:
+            world.require(self._name, self._connection)
+            if data := world.arrived(self._name):
+                return data
+            world.step()
+            if world.now() > end - 1e-9:
+                world.require(self._name, self._connection)
+                return world.arrived(self._name)
+
+    def reset_input_buffer(self) -> None:
+        self._world.require(self._name, self._connection)
+        self._world.arrived(self._name)
+
+    def close(self) -> None:
+        pass
+
+
+class MemoryPort(GuardedPort):
+    """The port of one emulated bus.
+
+    Args:
+        world: the robot.
+        name: of its bus.
+        baud_rate: bit/s.
+        patience: s of emulated time; see :class:`GuardedPort`.
+    """
+
+    def __init__(self, world: World, name: str, baud_rate: int, patience: float) -> None:
+        super().__init__(name, baud_rate, patience)
+        self._world = world
+
+    def openPort(self) -> bool:  # noqa: N802
+        """Connect."""
+        self.ser: Any = _Device(self._world, self.port_name, self.baudrate)
+        self.tx_time_per_byte = 1000.0 / self.baudrate * 10.0
+        self.is_open, self.gone = True, False
+        return True
+
+    def getCurrentTime(self) -> float:  # noqa: N802
+        """Return emulated ms."""
+        return self._world.now() * 1e3
+
+    def _write(self, data: bytes) -> int:
+        return self.ser.write(data)
+
+    def _wait_and_read(self, length: int, seconds: float) -> bytes:
+        try:
+            return self.ser.wait_and_read(seconds)
+        except (OSError, AttributeError) as error:
+            raise self._lost(error) from None
+
+
+class MemoryImu(ImuStream):
+    """The emulated IMU's stream.
+
+    Args:
+        world: the robot.
+        port: ranges and calibration.
+    """
+
+    def __init__(self, world: World, port: ImuPort) -> None:
+        super().__init__(port, world.now)
+        self._world = world
+        self._connection = 0
+
+    def open(self) -> None:
+        """Connect."""
+        self._reset()
+        self._connection = self._world.connect("imu")
+
+    def close(self) -> None:
+        """Disconnect."""
+
+    def _received(self) -> bytes:
+        try:
+            self._world.require("imu", self._connection)
+        except OSError as error:
+            raise ImuGoneError(f"IMU port is gone: {error}") from None
+        return self._world.arrived("imu")

@@ -1,0 +1,71 @@
+"""What the safety gate holds the robot to: the ``safety`` section of ``configs/hardware/*.yaml``."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+
+class Safety(BaseModel):
+    """Limits of the safety gate. SI units; the reasons stand in ``configs/hardware/nominal.yaml``.
+
+    Attributes:
+        leg_margin, leg_taper: rad that leg goals stay inside the robot file's limits, and over which they slow down before.
+        leg_speed: rad/s that leg goals may change by.
+        leg_lead: rad that a leg's goal may be ahead of the leg.
+        wheel_speed, wheel_acceleration: rad/s and rad/s2 of wheel goals.
+        load, load_time: share of stall torque, and for how long (s) a motor may be above it.
+        current, current_time: A of all motors together, and for how long (s) they may be above it.
+        tilt, tilt_time, tilt_horizon: rad the body may lean, s it must last, s that the tilt is predicted ahead.
+        warm, hot: degC from which wheels are slowed down, and at which the robot stops.
+        low_voltage, low_voltage_time: V, and for how long (s) the supply may be below.
+        coast, silence: s without an answer for which old goals hold, and after which torque goes off.
+        imu_silence: s without a reading of the IMU.
+        late, late_share: ticks in a row, and share of the last second's, that may start more than a period late.
+        deadman: s that the operator may be silent; None = no operator needed.
+        watchdog: s of silence on the line after which servos stop by themselves.
+        patience: s an answer may take beyond its time on the wire.
+        read_time: s that 99 of 100 reads of all joints may take at the start.
+        start_speed: rad/s of the legs on the way to the start pose, on average.
+        stop_time: s from wheels ordered to stop until torque goes off.
+        off_time: s to go on trying to switch torque off where servos do not confirm it.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    leg_margin: float = Field(default=0.05, ge=0.0)
+    leg_taper: float = Field(default=0.1, gt=0.0)
+    leg_speed: float = Field(default=8.0, gt=0.0)
+    leg_lead: float = Field(default=0.45, gt=0.0)
+    wheel_speed: float = Field(default=6.4, gt=0.0)
+    wheel_acceleration: float = Field(default=200.0, gt=0.0)
+    load: float = Field(default=0.7, gt=0.0, le=1.0)
+    load_time: float = Field(default=1.0, gt=0.0)
+    current: float = Field(default=10.0, gt=0.0)
+    current_time: float = Field(default=0.5, gt=0.0)
+    tilt: float = Field(default=0.7, gt=0.0, le=1.6)
+    tilt_time: float = Field(default=0.1, ge=0.0)
+    tilt_horizon: float = Field(default=0.2, ge=0.0)
+    warm: float = 62.0
+    hot: float = 68.0
+    low_voltage: float = Field(default=10.2, gt=0.0)
+    low_voltage_time: float = Field(default=0.5, ge=0.0)
+    coast: float = Field(default=0.06, ge=0.0)
+    silence: float = Field(default=0.4, gt=0.0)
+    imu_silence: float = Field(default=0.1, gt=0.0)
+    late: int = Field(default=5, ge=1)
+    late_share: float = Field(default=0.1, gt=0.0, le=1.0)
+    deadman: float | None = Field(default=None, gt=0.0)
+    watchdog: float = Field(default=0.2, ge=0.02, le=2.54)
+    patience: float = Field(default=0.004, gt=0.0)
+    read_time: float = Field(default=0.014, gt=0.0)
+    start_speed: float = Field(default=1.0, gt=0.0)
+    stop_time: float = Field(default=0.6, ge=0.0)
+    off_time: float = Field(default=2.0, ge=0.0)
+
+    @model_validator(mode="after")
+    def _limits_are_in_order(self) -> Safety:
+        if not self.coast < self.silence:
+            raise ValueError(f"coast {self.coast:g} s must be shorter than silence {self.silence:g} s")
+        if not self.warm < self.hot:
+            raise ValueError(f"warm {self.warm:g} degC must be below hot {self.hot:g} degC")
+        return self

@@ -1,0 +1,167 @@
+"""The robot as a Plant: ``backend="dynamixel"``. One robot, in real time, without truth."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.errors import InputError
+from wlr_gym.hardware.config import load_hardware, with_ports
+from wlr_gym.hardware.link import Link, emulated_link, serial_link
+from wlr_gym.hardware.log import sensors_of
+from wlr_gym.hardware.loop import ControlLoop
+from wlr_gym.parameters import Parameters
+from wlr_gym.plants.base import Capabilities, PlantOptions, PlantState, RobotOptions, Sensors, Truth
+from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.runs.format import RunMeta
+
+Array = NDArray[np.float64]
+
+
+class RobotPlant:
+    """One robot behind the safety gate; see :class:`wlr_gym.plants.base.Plant`.
+
+    Making it moves nothing. ``reset`` (or the first ``step``) makes the start-up checks, switches torque on and brings the
+    robot to its start pose; ``close`` stops it and switches torque off. A robot that the safety gate has stopped raises
+    :class:`wlr_gym.hardware.loop.StoppedError`.
+
+    Args:
+        robot: the robot.
+        count: 1.
+        options: ``control_period``; the rest is for simulators.
+        hardware: which robot, how it is connected.
+        link: connections to use instead of those ``hardware`` names.
+        meta: of the log; its profile is the servos'. None = robot's name, no profile.
+
+    Attributes:
+        loop: the control loop.
+
+    Raises:
+        InputError: more than one robot, or a bad hardware file.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        count: int,
+        options: PlantOptions | None = None,
+        hardware: RobotOptions | None = None,
+        link: Link | None = None,
+        meta: RunMeta | None = None,
+    ) -> None:
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count != 1:
+            raise InputError(f"number of robots is {count!r}, expected 1: there is one robot on the ports")
+        self.robot = robot
+        self.options = options or PlantOptions()
+        self.parameters = Parameters.nominal(robot, 1)
+        chosen = hardware or RobotOptions()
+        self.capabilities = Capabilities("dynamixel", has_truth=False, can_set_state=False, real_time=True)
+        description = with_ports(load_hardware(chosen.hardware), dict(chosen.ports))
+        if chosen.deadman is not None:
+            safety = description.safety.model_copy(update={"deadman": chosen.deadman})
+            description = description.model_copy(update={"safety": safety})
+        if link is None:
+            link = _emulate(robot, description, self.options) if chosen.emulated else serial_link(robot, description)
+        self.loop = ControlLoop(
+            robot,
+            description,
+            link,
+            self.options.control_period,
+            dry_run=chosen.dry_run,
+            log=chosen.log,
+            guard=chosen.guard,
+            meta=meta,
+        )
+        self._wheel_zero = np.zeros(4)
+        self._started = 0.0
+
+    @property
+    def count(self) -> int:
+        """One robot."""
+        return 1
+
+    def reset(
+        self,
+        seeds: NDArray[np.uint64] | None = None,
+        parameters: Parameters | None = None,
+        mask: NDArray[np.bool_] | None = None,
+        state: PlantState | None = None,
+    ) -> Sensors:
+        """Bring the robot to its start pose and return what it reads there; wheel angles count from here.
+
+        Args:
+            seeds: not used: the world draws.
+            parameters: must be the robot file's: nothing can be set about a robot.
+            mask: (1,) False leaves the robot alone.
+            state: its leg angles are the start pose; where the robot stands is where it stands. None = home.
+
+        Raises:
+            StoppedError: a start-up check failed, or the robot had to stop.
+            InputError: parameters that differ, ports that cannot be opened.
+        """
+        if parameters is not None:
+            self.set_parameters(parameters)
+        if mask is None or np.asarray(mask).all():
+            view = self.loop.start(None if state is None else state.joint_position[0, :4])
+            self._wheel_zero, self._started = view.position[4:].copy(), view.time
+        return self._readings()
+
+    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+        """Send goals through the safety gate, wait for the deadline, read; see :meth:`wlr_gym.plants.base.Plant.step`.
+
+        Goals that are no numbers are the gate's business: they stop the robot.
+
+        Raises:
+            StoppedError: the robot has stopped, and torque is off.
+        """
+        if self.loop.view is None:
+            self.reset()
+        shape = np.shape(goals)
+        if shape != (1, len(JOINTS)) or (torque_on is not None and np.shape(torque_on) != shape):
+            raise InputError(f"goals have shape {shape}, expected (1, {len(JOINTS)}), and torque_on the same")
+        self.loop.tick(np.asarray(goals)[0], None if torque_on is None else np.asarray(torque_on)[0])
+        return self._readings()
+
+    def _readings(self) -> Sensors:
+        view = self.loop.view
+        if view is None:
+            raise InputError("the robot has not been started")
+        return sensors_of(view, self._wheel_zero, self._started)
+
+    def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
+        """Refuse whatever differs from the robot file.
+
+        Raises:
+            InputError: parameters that differ; names the first.
+        """
+        if len(parameters) != 1:
+            raise InputError(f"parameters hold {len(parameters)} robots, the plant 1")
+        different = np.flatnonzero(parameters.values[0] != self.parameters.values[0])
+        if len(different):
+            from wlr_gym.parameters import ELEMENTS
+
+            raise InputError(
+                f"{ELEMENTS[different[0]]}: parameters of a real robot cannot be set (no randomisation, no effects)"
+            )
+
+    def truth(self) -> Truth:
+        """Refuse: a robot knows its sensors only."""
+        raise InputError("backend 'dynamixel': a real robot has no truth, only sensors")
+
+    def get_state(self) -> PlantState:
+        """Refuse: a robot knows its sensors only."""
+        raise InputError("backend 'dynamixel': the state of a real robot is not known")
+
+    def close(self) -> None:
+        """Stop the robot, switch torque off, close the ports."""
+        self.loop.close()
+
+
+def _emulate(robot: Robot, hardware: object, options: PlantOptions) -> Link:
+    from wlr_gym.hardware.config import Hardware
+    from wlr_gym.hardware.emulator import Machine, MachineOptions
+    from wlr_gym.hardware.emulator.line import NO_TIME
+
+    assert isinstance(hardware, Hardware)
+    machine = Machine(robot, hardware, MachineOptions(timing=NO_TIME, sensor_noise=options.sensor_noise))
+    return emulated_link(machine)

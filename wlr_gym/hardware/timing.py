@@ -1,0 +1,94 @@
+"""Control ticks against absolute deadlines, and statistics of what they took."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from wlr_gym.hardware.link import Clock
+
+#: Parts of a tick that are timed.
+PARTS = ("read", "think", "write", "slack")
+_PERCENTILES = (50, 95, 99, 100)
+
+
+class Pacer:
+    """Starts ticks at ``origin + k * period``: lateness never adds up, and ticks that were missed are left out, not caught up.
+
+    Args:
+        clock: of the run.
+        period: s.
+
+    Attributes:
+        missed: ticks left out because the ones before took too long.
+        late_ticks: ticks in a row, up to now, with some left out before them.
+    """
+
+    def __init__(self, clock: Clock, period: float) -> None:
+        self._clock, self.period = clock, period
+        self.missed = 0
+        self.late_ticks = 0
+        self._deadline = clock.now()
+        self._recent: deque[int] = deque(maxlen=max(1, round(1.0 / period)))
+        self._times: dict[str, list[float]] = {name: [] for name in ("jitter", "period", *PARTS)}
+        self._woke = math.nan
+
+    @property
+    def late_share(self) -> float:
+        """Share of the last second's ticks that were left out; 0 in the first second."""
+        recent = self._recent
+        return sum(recent) / (len(recent) + sum(recent)) if len(recent) == recent.maxlen else 0.0
+
+    def start(self) -> None:
+        """Count from now; statistics go on."""
+        self._deadline = self._woke = self._clock.now()
+        self._recent.clear()
+        self.late_ticks = 0
+
+    def wait(self) -> None:
+        """Return at the next deadline; at once when it has passed, and with the ticks in between left out."""
+        self._deadline += self.period
+        slack = self._deadline - self._clock.now()
+        left_out = math.floor(-slack / self.period + 1e-9) if slack < 0.0 else 0
+        self._deadline += left_out * self.period
+        self._clock.wait_until(self._deadline)
+        now = self._clock.now()
+        self._times["slack"].append(slack)
+        self._times["jitter"].append(now - self._deadline)
+        self._times["period"].append(now - self._woke)
+        self._woke = now
+        self.missed += left_out
+        self._recent.append(left_out)
+        self.late_ticks = self.late_ticks + 1 if left_out else 0
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Time a part of a tick."""
+        start = self._clock.now()
+        try:
+            yield
+        finally:
+            self.note(part, self._clock.now() - start)
+
+    def note(self, part: str, seconds: float) -> None:
+        """Take the time of a part of a tick (s)."""
+        self._times[part].append(seconds)
+
+    def statistics(self) -> dict[str, float | dict[str, float]]:
+        """Return ticks, missed ones, and percentiles (ms) of period, jitter (start after the deadline) and parts of a tick.
+
+        ``latency`` is the time from reading the sensors to the goals that answer them.
+        """
+        times = {name: np.array(values) * 1e3 for name, values in self._times.items()}
+        size = min(len(times[name]) for name in ("think", "write"))
+        times["latency"] = times["think"][:size] + times["write"][:size]
+        found: dict[str, float | dict[str, float]] = {"ticks": len(times["jitter"]), "missed": self.missed}
+        for name, values in times.items():
+            if len(values):
+                points = np.percentile(values, _PERCENTILES).round(3).tolist()
+                found[name] = dict(zip(("p50", "p95", "p99", "max"), points, strict=True))
+        return found
