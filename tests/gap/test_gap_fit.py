@@ -1,0 +1,187 @@
+"""Fit and likelihood against closed forms: weighted least squares with priors, AR(1) memory, Monte Carlo."""
+
+import numpy as np
+import pytest
+from toy_problem import NOMINAL, QUANTITIES, REACH, SIGMA, STRENGTH, Toy, candidate, coloured, sized
+
+from wlr_gym.gap.fit import Model, fit, linearise, moved, nominal_model, on_bounds, prior_cost, scaled_numbers, total_cost
+from wlr_gym.gap.likelihood import LONGEST, estimate_noise, minus_two_log_likelihood
+
+
+def all_runs(problem):
+    return range(len(problem.runs))
+
+
+def test_memory_of_white_noise_is_one_and_of_ar1_the_closed_form():
+    rng = np.random.default_rng(3)
+    white = [rng.standard_normal((4000, 2)) for _ in range(3)]
+    assert estimate_noise(white).memory == pytest.approx([1.0, 1.0], abs=0.15)
+    for rho in (0.5, 0.8, 0.9):
+        series = [coloured(rng, (2000, 20), rho) for _ in range(2)]
+        assert np.mean(estimate_noise(series).memory) == pytest.approx((1 + rho) / (1 - rho), rel=0.15)
+
+
+def test_memory_counts_measured_rows_only_and_ends_somewhere():
+    rng = np.random.default_rng(4)
+    sparse = rng.standard_normal((900, 2))
+    sparse[:, 1] = np.nan
+    sparse[::3, 1] = coloured(rng, (300, 1), 0.5)[:, 0]
+    noise = estimate_noise([sparse])
+    assert noise.rows.tolist() == [900, 300]
+    assert noise.memory[1] == pytest.approx(3.0, rel=0.35)
+    stuck = estimate_noise([np.ones((5000, 1))])
+    assert 1.0 < stuck.memory[0] < 2 * LONGEST
+
+
+def test_level_is_the_root_mean_square_and_never_below_the_sensor():
+    rng = np.random.default_rng(5)
+    residuals = [rng.standard_normal((500, 3)) * np.array([0.2, 1.0, 4.0]) for _ in range(2)]
+    noise = estimate_noise(residuals, np.array([1.0, 2.0, 5.0]))
+    assert noise.level[0] == 1.0
+    assert noise.level[2] == pytest.approx(np.sqrt(np.mean(np.concatenate(residuals)[:, 2] ** 2)))
+    assert noise.weight[2] == pytest.approx(1 / (noise.level[2] ** 2 * 5.0))
+
+
+def test_channel_that_was_not_measured_weighs_nothing():
+    residual = np.full((50, 2), np.nan)
+    residual[:, 0] = 2.0
+    noise = estimate_noise([residual])
+    assert noise.weight[1] == 0.0
+    assert noise.weight[0] > 0.0
+    assert np.isfinite(minus_two_log_likelihood([residual], noise.memory))
+
+
+def test_likelihood_is_rows_over_memory_times_log_level():
+    rng = np.random.default_rng(6)
+    residuals = [3.0 * rng.standard_normal((400, 1)), 3.0 * rng.standard_normal((100, 1))]
+    square = np.mean(np.concatenate(residuals) ** 2)
+    assert minus_two_log_likelihood(residuals, np.array([4.0])) == pytest.approx(500 / 4.0 * np.log(square))
+
+
+def test_columns_are_the_responses():
+    problem = Toy()
+    model = nominal_model(problem).with_effect(candidate(problem, "drag", ["left"]), (0.3,))
+    residuals, columns = linearise(problem, model, all_runs(problem))
+    step = model.effects[0][0].unknowns[0].step
+    for r in all_runs(problem):
+        for row, name in zip(columns[r], QUANTITIES, strict=False):
+            assert row.reshape(residuals[r].shape) == pytest.approx(-STRENGTH * problem.shape(name)[r], abs=1e-5)
+        assert columns[r][3].reshape(residuals[r].shape) == pytest.approx(-step * problem.shape("drag left")[r], abs=1e-5)
+
+
+def test_columns_at_a_bound_are_taken_inwards():
+    problem = Toy()
+    high = Model(NOMINAL + REACH * SIGMA)
+    _, columns = linearise(problem, high, [0])
+    assert columns[0][0] == pytest.approx(-STRENGTH * problem.shape("gain")[0].ravel(), abs=1e-5)
+
+
+def exact(problem, weight, columns):
+    """Weighted least squares with unit priors: scaled numbers away from nominal."""
+    matrix, vector = np.eye(columns[0].shape[0]), np.zeros(columns[0].shape[0])
+    residuals = problem.residuals([nominal_model(problem).setting], all_runs(problem))
+    for column, residual in zip(columns, residuals, strict=True):
+        weights = np.broadcast_to(weight, residual[0].shape).ravel()
+        matrix += (column * weights) @ column.T
+        vector += (column * weights) @ residual[0].ravel()
+    return np.linalg.solve(matrix, vector), matrix
+
+
+def shape_columns(problem, names=QUANTITIES):
+    return [np.stack([STRENGTH * problem.shape(n)[r].ravel() for n in names]) for r in all_runs(problem)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_linear_fit_is_weighted_least_squares_with_priors(seed):
+    problem = Toy({"gain": 1.2, "offset": -0.7, "mass": 0.3}, seed=seed, white=2.0, error=1.5)
+    found = fit(problem, all_runs(problem), nominal_model(problem), steps=4)
+    # weights depend on the level: the closed form with those of the fit must come back
+    best, matrix = exact(problem, found.noise.weight, shape_columns(problem))
+    assert (found.model.quantities - NOMINAL) / SIGMA == pytest.approx(best, abs=0.01)
+    assert found.covariance() == pytest.approx(np.linalg.inv(matrix), rel=1e-3, abs=1e-7)
+
+
+def test_weak_data_leave_a_number_where_its_file_says():
+    problem = Toy({"gain": 1.0}, runs=1, rows=40, white=8.0)
+    found = fit(problem, [0], nominal_model(problem))
+    best, _ = exact(problem, found.noise.weight, shape_columns(problem))
+    assert (found.model.quantities - NOMINAL) / SIGMA == pytest.approx(best, abs=0.1)
+    assert np.sqrt(np.diag(found.covariance())).max() <= 1.0  # never less sure than the tolerance
+
+
+def test_cost_is_minus_two_log_posterior_and_falls():
+    problem = Toy({"gain": 1.5}, white=1.5)
+    start = nominal_model(problem)
+    found = fit(problem, all_runs(problem), start)
+    residuals = [r[0] for r in problem.residuals([found.model.setting], all_runs(problem))]
+    assert found.cost == pytest.approx(minus_two_log_likelihood(residuals, found.noise.memory) + prior_cost(problem, found.model))
+    before = [r[0] for r in problem.residuals([start.setting], all_runs(problem))]
+    assert found.cost < total_cost(problem, start, before, found.noise.memory) - 100.0
+    assert prior_cost(problem, found.model) == pytest.approx(np.sum(((found.model.quantities - NOMINAL) / SIGMA) ** 2))
+
+
+def test_number_beyond_reach_stops_there_and_the_others_take_no_blame():
+    problem = Toy({"gain": 5.0, "offset": 1.0}, white=1.5)
+    found = fit(problem, all_runs(problem), nominal_model(problem))
+    scaled = (found.model.quantities - NOMINAL) / SIGMA
+    assert scaled[0] == pytest.approx(REACH)
+    assert on_bounds(problem, found.model).tolist() == [True, False, False]
+    assert scaled[1] == pytest.approx(1.0, abs=0.3)
+    assert found.covariance()[0, 0] < 1e-6  # pinned
+
+
+def test_moved_keeps_numbers_in_their_ranges():
+    problem = Toy()
+    model = nominal_model(problem).with_effect(candidate(problem, "weak"), (0.3,))
+    far = moved(problem, model, np.array([99.0, -99.0, 0.0, 99.0]))
+    assert far.quantities == pytest.approx(NOMINAL + SIGMA * np.array([REACH, -REACH, 0.0]))
+    assert far.effects[0][1] == (0.5,)
+    assert scaled_numbers(problem, far) == pytest.approx([*(far.quantities / SIGMA), 0.5 / 0.025])
+
+
+@pytest.mark.parametrize(("name", "values"), [("drag", (0.8,)), ("play", (1.1,)), ("ripple", (0.9, 0.7))])
+def test_effect_is_fitted_beside_the_quantities(name, values):
+    toy = Toy()
+    chosen = candidate(toy, name)
+    problem = Toy({"gain": -1.0}, [chosen.effect(values)], white=1.2)
+    start = tuple(0.6 * v for v in values)
+    found = fit(problem, all_runs(problem), nominal_model(problem).with_effect(chosen, start), steps=6)
+    assert found.model.effects[0][1] == pytest.approx(values, abs=0.06)
+    assert (found.model.quantities[0] - NOMINAL[0]) / SIGMA[0] == pytest.approx(-1.0, abs=0.1)
+    assert found.noise.level == pytest.approx([1.2] * 3, rel=0.06)
+
+
+def test_quiet_sensor_does_not_hide_a_wrong_number():
+    """A sensor better than its data sheet leaves room below one noise unit: a wrong number must not hide in it."""
+    problem = Toy({"gain": 0.8}, white=0.3)
+    found = fit(problem, all_runs(problem), nominal_model(problem))
+    best, _ = exact(problem, found.noise.weight, shape_columns(problem))
+    assert (found.model.quantities - NOMINAL) / SIGMA == pytest.approx(best, abs=0.02)
+
+
+def test_missing_values_count_nothing():
+    problem = Toy({"gain": 1.0}, white=1.5)
+    whole = fit(problem, all_runs(problem), nominal_model(problem))
+    for measured in problem._measured:
+        measured[::2, 1] = np.nan
+        measured[:, 2] = np.nan
+    found = fit(problem, all_runs(problem), nominal_model(problem))
+    assert found.noise.rows.tolist() == [1000, 500, 0]
+    assert found.model.quantities[0] == pytest.approx(whole.model.quantities[0], abs=0.2 * SIGMA[0])
+    assert found.covariance()[0, 0] > whole.covariance()[0, 0]
+
+
+def test_same_data_same_bits():
+    problem = Toy({"gain": 1.0, "mass": -1.0}, error=1.0)
+    one, two = (fit(problem, all_runs(problem), nominal_model(problem)) for _ in range(2))
+    assert np.array_equal(one.model.quantities, two.model.quantities)
+    assert np.array_equal(one.hessian, two.hessian)
+    assert one.cost == two.cost
+
+
+def test_fit_tells_of_its_steps():
+    told = []
+    problem = Toy({"gain": 1.0}, white=1.5)
+    fit(problem, all_runs(problem), nominal_model(problem), steps=3, tell=told.append)
+    assert told
+    assert told[0].startswith("step 1 of 3")

@@ -1,0 +1,204 @@
+"""Naming on a system whose truth is known: the right name, no name for noise, pairs, equals, idle effects."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toy_problem import NOMINAL, REACH, SIGMA, Toy, candidate, sized
+
+from wlr_gym.gap.fit import fit, nominal_model
+from wlr_gym.gap.name import EQUIVALENT, MOST_EFFECTS, PER_NAME, drop_idle, name_effects, refit, shortlist
+from wlr_gym.gap.problem import Candidate
+from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
+from wlr_gym.gap.sure import equivalents
+
+RUNS = range(5)
+
+
+def named(problem, runs=RUNS):
+    return name_effects(problem, runs, fit(problem, runs, nominal_model(problem), steps=problem.steps))
+
+
+def labels(naming):
+    return [found.label for found, _ in naming.fit.model.effects]
+
+
+@pytest.mark.parametrize(
+    ("effect", "label"),
+    [
+        (sized("drag", 0.7, "left"), "drag left"),
+        (sized("drag", -0.6, "right"), "drag right"),
+        (sized("drag", 0.6, "left", "right"), "drag left right"),
+        (sized("decoy_2", 0.8), "decoy_2 body"),
+        (sized("play", 1.3), "play body"),
+        (candidate(Toy(), "ripple").effect((0.9, -1.0)), "ripple body"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_right_name_place_and_size(effect, label):
+    problem = Toy({"gain": 1.0, "offset": -1.0}, [effect], error=1.0)
+    naming = named(problem)
+    chosen, values = naming.fit.model.effects[0]
+    if label == "drag left":  # half as much of its twin is the same
+        assert chosen.label in (label, "twin body")
+    else:
+        assert labels(naming) == [label]
+        assert values == pytest.approx(list(effect.parameters.values()), abs=0.15)
+    assert naming.rounds[0].taken is not None
+    assert naming.rounds[-1].taken is None
+
+
+@pytest.mark.parametrize("error", [0.0, 1.0, 3.0])
+def test_noise_gets_no_name(error):
+    found = []
+    for seed in range(8):
+        problem = Toy({"gain": 1.0, "mass": -1.5}, seed=seed, error=error, memory=0.9)
+        found += labels(named(problem))
+    assert found == []
+
+
+def test_scores_of_pure_noise_are_those_of_chance():
+    gains = []
+    for seed in range(20):
+        problem = Toy(seed=seed, white=1.5, error=1.0, memory=0.8)
+        current = fit(problem, RUNS, nominal_model(problem))
+        probes, candidates = problem.candidates(None, [], [])
+        found = screen(candidates, responses(problem, current, RUNS, probes))
+        gains += [score.gain for score in found if score.candidate.name.startswith("decoy")]
+    # chi-square of one degree of freedom; memory is estimated, so the scale may be a little off
+    assert 0.6 < np.mean(gains) < 1.7
+    assert max(gains) < 0.5 * LEAST_GAIN
+
+
+def test_number_beyond_calibrations_reach_becomes_an_effect():
+    problem = Toy({"gain": REACH + 3.0}, white=1.0)
+    naming = named(problem)
+    assert labels(naming) == ["copy body"]
+    total = (naming.fit.model.quantities[0] - NOMINAL[0]) / SIGMA[0] + naming.fit.model.effects[0][1][0]
+    assert total == pytest.approx(REACH + 3.0, abs=0.1)
+
+
+def test_number_within_tolerance_stays_a_number():
+    assert labels(named(Toy({"gain": 2.0, "offset": -2.0}, white=1.0))) == []
+
+
+def test_two_effects_are_both_named():
+    problem = Toy({"mass": 1.0}, [sized("drag", 0.8, "right"), sized("decoy_4", -0.7)], error=0.5)
+    naming = named(problem)
+    assert sorted(labels(naming)) == ["decoy_4 body", "drag right"]
+    assert [r.taken is None for r in naming.rounds] == [False, False, True]
+
+
+def test_no_more_effects_than_an_analysis_may_have():
+    problem = Toy({}, [sized(f"decoy_{k}", 0.9) for k in range(5)], runs=6, rows=600)
+    naming = named(problem, range(6))
+    taken = [r.taken.candidate.label for r in naming.rounds if r.taken]
+    assert len(labels(naming)) == MOST_EFFECTS
+    assert sorted(taken) == sorted(labels(naming))  # what the evidence calls taken is in the model
+
+
+def test_identical_responses_are_equivalent():
+    problem = Toy({}, [sized("drag", 0.8, "left")], error=0.5)
+    look = named(problem).rounds[0]
+    names = {look.taken.candidate.name, *(other.candidate.name for other in equivalents(look.taken, look.hypotheses))}
+    assert names == {"drag", "twin"}
+    gains = {h.candidate.label: h.gain for h in look.hypotheses}
+    assert gains["twin body"] == pytest.approx(gains["drag left"], rel=0.02)
+    assert gains["twin body"] > EQUIVALENT * look.taken.gain
+
+
+def test_implausible_size_is_not_accepted():
+    problem = Toy({}, [sized("weak", 1.2)], rows=400)
+    naming = named(problem)
+    assert labels(naming) == []
+    assert naming.rounds[0].taken is None
+    first = naming.rounds[0].hypotheses[0]
+    assert first.candidate.name == "weak"
+    assert first.at_bound
+    assert first.values == (0.5,)
+    assert first.gain > LEAST_GAIN
+
+
+def test_neutral_edge_of_a_range_is_no_bound():
+    problem = Toy({}, [sized("weak", 0.3)])
+    hypotheses = named(problem).rounds[0].hypotheses
+    weak = next(h for h in hypotheses if h.candidate.name == "weak")
+    zero = replace(weak, model=replace(weak.model, effects=((weak.candidate, (0.0,)),)))
+    assert not weak.at_bound
+    assert not zero.at_bound
+
+
+def test_idle_effect_is_dropped():
+    problem = Toy({}, [sized("drag", 0.8, "right")])
+    model = nominal_model(problem)
+    for name, place, value in (("decoy_0", None, 0.2), ("drag", ["right"], 0.5), ("decoy_3", None, -0.1)):
+        model = model.with_effect(candidate(problem, name, place), (value,))
+    told = []
+    left = drop_idle(problem, RUNS, fit(problem, RUNS, model), told.append)
+    assert [c.label for c, _ in left.model.effects] == ["drag right"]
+    assert sorted(told[k] for k in range(len(told)) if told[k].startswith("dropped")) == [
+        "dropped: decoy_0 body",
+        "dropped: decoy_3 body",
+    ]
+    assert left.model.effects[0][1][0] == pytest.approx(0.8, abs=0.1)
+
+
+def test_needed_effects_are_kept():
+    problem = Toy({}, [sized("drag", 0.8, "right"), sized("decoy_0", 0.8)])
+    model = nominal_model(problem)
+    for name, place in (("decoy_0", None), ("drag", ["right"])):
+        model = model.with_effect(candidate(problem, name, place), (0.8,))
+    assert len(drop_idle(problem, RUNS, fit(problem, RUNS, model)).model.effects) == 2
+
+
+def test_gain_after_refit_is_the_fall_of_the_cost():
+    problem = Toy({"gain": 1.0}, [sized("decoy_1", 0.5)], error=1.0)
+    current = fit(problem, RUNS, nominal_model(problem))
+    probes, candidates = problem.candidates(None, [], [])
+    scores = screen(candidates, responses(problem, current, RUNS, probes))
+    best = refit(problem, RUNS, current, shortlist(scores))[0]
+    memory = fit(problem, RUNS, best.model).noise.memory
+    with_it, without = (fit(problem, RUNS, m, memory=memory).cost for m in (best.model, current.model))
+    assert best.candidate.name == "decoy_1"
+    assert best.gain == pytest.approx(without - with_it, rel=0.03)
+    assert best.by_run.sum() == pytest.approx(best.gain, rel=0.5)
+    assert (best.by_run > 0).all()
+
+
+def test_formula_wins_only_over_worse_names():
+    toy = Toy({}, [sized("drag", 0.8, "left")])
+    ordinary = toy.candidates
+
+    def with_formula(setting, residuals, runs):
+        probes, candidates = ordinary(setting, residuals, runs)
+        same = candidate(Toy(), "twin")
+        kept = [c for c in candidates if c.name not in ("twin", "drag")] if hidden else candidates
+        kept = [c for c in kept if c.name != "twin"]
+        formula = Candidate("twin", ("body",), same.unknowns, same.starts, "k * rate")
+        return probes, [formula, *kept]
+
+    toy.candidates = with_formula
+    hidden = False
+    assert labels(named(toy)) == ["drag left"]
+    hidden = True
+    assert labels(named(toy)) == ["twin body k * rate"]
+
+
+def test_shortlist_keeps_some_of_every_name():
+    problem = Toy({}, [sized("drag", 2.0, "left", "right")])
+    current = fit(problem, RUNS, nominal_model(problem))
+    probes, candidates = problem.candidates(None, [], [])
+    scores = screen(candidates, responses(problem, current, RUNS, probes))
+    many = [replace(score, gain=100.0) for score in scores for _ in range(4)]
+    chosen = shortlist(many, size=9)
+    assert len(chosen) == 9
+    names = [score.candidate.name for score in chosen]
+    assert max(names.count(name) for name in names) == PER_NAME
+    assert shortlist([replace(score, gain=0.1) for score in scores]) == []
+
+
+def test_same_data_same_bits():
+    problem = Toy({"gain": 1.0}, [sized("decoy_2", 0.8)], error=1.0)
+    one, two = named(problem), named(problem)
+    assert one.fit.model.effects[0][1] == two.fit.model.effects[0][1]
+    assert [h.gain for h in one.rounds[0].hypotheses] == [h.gain for h in two.rounds[0].hypotheses]

@@ -1,0 +1,103 @@
+"""Proof on sealed runs: bars, reduction and its interval, channels."""
+
+import numpy as np
+import pytest
+from toy_problem import CHANNELS, NOISE, Toy, candidate, sized
+
+from wlr_gym.gap.analysis import Place
+from wlr_gym.gap.fit import fit, nominal_model
+from wlr_gym.gap.prove import level, mean_squares, prove, reduction
+from wlr_gym.gap.traces import MOST, telling_traces
+
+FITTED, SEALED = [0, 1, 2, 4], [3, 5]
+
+
+def models(problem, size=0.8):
+    nominal = nominal_model(problem)
+    calibrated = fit(problem, FITTED, nominal).model
+    return nominal, calibrated, fit(problem, FITTED, nominal.with_effect(candidate(problem, "drag", ["right"]), (size,))).model
+
+
+def test_mean_squares_skip_what_was_not_measured_and_cap_what_is_lost():
+    residual = np.array([[1.0, np.nan, 200.0], [3.0, np.nan, 0.0]])
+    squares = mean_squares([residual, np.full((2, 3), 2.0)], 10.0)
+    assert squares[0][[0, 2]] == pytest.approx([5.0, 50.0])
+    assert np.isnan(squares[0, 1])
+    assert squares[1] == pytest.approx(4.0)
+    assert level(np.array([[5.0, np.nan], [4.0, 3.0]])) == pytest.approx(2.0)
+
+
+def test_reduction_is_the_closed_share_of_the_room_above_the_floor():
+    square = np.array([[9.0]])
+    assert reduction(square, np.array([[4.0]]), 1.0) == pytest.approx(0.5)
+    assert reduction(square, np.array([[0.5]]), 1.0) == 1.0
+    assert reduction(square, np.array([[16.0]]), 1.0) == 0.0
+    assert reduction(np.array([[1.0]]), np.array([[1.0]]), 1.0) == 0.0
+
+
+def test_true_effect_closes_the_gap_on_sealed_runs():
+    problem = Toy({"gain": 1.5}, [sized("drag", 1.5, "right")], runs=6)
+    gap, runs, channels = prove(problem, FITTED, SEALED, models(problem), 1.0)
+    assert gap.heldout_before > gap.heldout_calibrated > gap.heldout_after
+    assert gap.heldout_after == pytest.approx(1.0, abs=0.06)
+    assert gap.fit_before > gap.fit_after
+    assert gap.reduction > 0.9
+    low, high = gap.reduction_ci95
+    assert 0.0 <= low <= gap.reduction <= high <= 1.0
+    assert [(r.run, r.heldout) for r in runs] == [(f"run_{k + 1}", k in SEALED) for k in (*FITTED, *SEALED)]
+    assert [c.channel for c in channels] == list(CHANNELS)
+    assert [c.noise for c in channels] == list(NOISE)
+    assert gap.metric == problem.metric
+
+
+def test_bars_of_runs_add_up_to_the_whole():
+    problem = Toy({"gain": 1.5}, [sized("drag", 1.0, "right")], runs=6)
+    gap, runs, channels = prove(problem, FITTED, SEALED, models(problem), 1.0)
+    sealed = [r.after for r in runs if r.heldout]
+    assert np.sqrt(np.mean(np.square(sealed))) == pytest.approx(gap.heldout_after)
+    assert np.sqrt(np.mean([c.after**2 for c in channels])) == pytest.approx(gap.heldout_after)
+    assert np.sqrt(np.mean([r.before**2 for r in runs if not r.heldout])) == pytest.approx(gap.fit_before)
+
+
+def test_effect_that_is_not_there_buys_nothing():
+    problem = Toy({"gain": 1.0}, runs=6)
+    nominal, calibrated, _ = models(problem)
+    wrong = calibrated.with_effect(candidate(problem, "drag", ["right"]), (1.0,))
+    gap, _, _ = prove(problem, FITTED, SEALED, (nominal, calibrated, wrong), 1.0)
+    assert gap.heldout_after > gap.heldout_calibrated
+    assert gap.reduction == 0.0
+
+
+def test_effect_of_one_run_only_has_a_wide_interval():
+    problem = Toy(runs=8)
+    sealed = [3, 4, 5, 6, 7]
+    response = problem.effect_response(sized("drag", 2.0, "right"), 3)
+    problem._measured[3] = problem._measured[3] + response * NOISE
+    nominal = nominal_model(problem)
+    whole = nominal.with_effect(candidate(problem, "drag", ["right"]), (0.9,))
+    low, high = prove(problem, [0, 1, 2], sealed, (nominal, nominal, whole), 0.9)[0].reduction_ci95
+    assert low == 0.0
+    assert high > 0.1
+
+
+def test_channel_without_values_is_left_out():
+    problem = Toy(runs=6)
+    for measured in problem._measured:
+        measured[:, 1] = np.nan
+    gap, runs, channels = prove(problem, FITTED, SEALED, models(problem), 1.0)
+    assert [c.channel for c in channels] == ["speed", "place"]
+    assert np.isfinite([gap.heldout_after, *(r.after for r in runs)]).all()
+
+
+def test_traces_show_sealed_runs_where_the_gap_is():
+    problem = Toy({}, [sized("drag", 1.5, "right")], runs=6)
+    traces = telling_traces(problem, FITTED, SEALED, models(problem), (Place("place", 0.7, ""), Place("speed", 0.3, "")))
+    assert [t.channel for t in traces] == ["place", "speed"]
+    assert len(traces) <= MOST
+    for trace in traces:
+        assert trace.run in ("run_4", "run_6")
+        assert trace.heldout
+        c = CHANNELS.index(trace.channel)
+        assert trace.measured == pytest.approx(problem.measured(int(trace.run[-1]) - 1)[:, c])
+        assert np.std(trace.measured - trace.after) == pytest.approx(NOISE[c], rel=0.15)
+        assert np.std(trace.measured - trace.calibrated) > 1.2 * NOISE[c]

@@ -1,0 +1,155 @@
+"""Standard errors against Monte Carlo and the jackknife's definition; confidence; equals; what would have been seen."""
+
+import numpy as np
+import pytest
+from toy_problem import NOMINAL, REACH, SIGMA, Toy, candidate, sized
+
+from wlr_gym.gap.fit import fit, nominal_model, normal_equations, on_bounds
+from wlr_gym.gap.name import name_effects
+from wlr_gym.gap.problem import Candidate, Probe, Start
+from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
+from wlr_gym.gap.sure import TWO_SIDED_95, confidence, detectable, estimates, standard_errors
+
+RUNS = range(5)
+TRUTH = {"gain": 0.8, "offset": -1.2, "mass": 0.4}
+
+
+def fitted(problem, size=0.7):
+    model = nominal_model(problem).with_effect(candidate(problem, "drag", ["right"]), (size,))
+    return fit(problem, range(len(problem.runs)), model, steps=problem.steps)
+
+
+@pytest.mark.parametrize(("white", "error", "memory"), [(1.5, 0.0, 0.0), (1.0, 1.5, 0.6)], ids=["white", "ar1"])
+def test_intervals_cover_the_truth_as_often_as_they_say(white, error, memory):
+    inside, draws = [], 120
+    for seed in range(draws):
+        problem = Toy(TRUTH, [sized("drag", 0.7, "right")], seed=seed, white=white, error=error, memory=memory, runs=6, rows=120)
+        found = fitted(problem, 0.5)
+        error_of = standard_errors(problem, found)[-1]
+        inside.append(abs(found.model.effects[0][1][0] - 0.7) < TWO_SIDED_95 * error_of)
+    assert 0.88 <= np.mean(inside) <= 0.995
+
+
+def test_curvature_is_the_spread_of_repeated_fits():
+    values, errors = [], []
+    for seed in range(80):
+        problem = Toy(TRUTH, [sized("drag", 0.7, "right")], seed=seed, white=1.5, runs=6, rows=120)
+        found = fitted(problem, 0.5)
+        values.append(found.model.effects[0][1][0])
+        step = found.model.effects[0][0].unknowns[0].step
+        errors.append(np.sqrt(found.covariance()[-1, -1]) * step)
+    assert np.mean(errors) == pytest.approx(np.std(values), rel=0.25)
+    assert np.mean(values) == pytest.approx(0.7, abs=4 * np.mean(errors) / np.sqrt(80))
+
+
+def test_differences_from_run_to_run_widen_the_interval():
+    problem = Toy(white=1.5, runs=6)
+    steady = Toy(white=1.5, runs=6)
+    for r, size in enumerate((0.2, 1.2, 0.4, 1.0, 0.3, 1.1)):
+        for toy, own in ((problem, size), (steady, 0.7)):
+            toy._measured[r] = toy._measured[r] + toy.effect_response(sized("drag", own, "right"), r) * np.array([0.1, 2, 0.001])
+    wide, narrow = (standard_errors(toy, fitted(toy))[-1] for toy in (problem, steady))
+    # six sizes with a spread of 0.42: the error of their mean is 0.19
+    assert wide == pytest.approx(0.19, rel=0.5)
+    assert wide > 2 * narrow
+
+
+def test_jackknife_is_leaving_one_run_out():
+    problem = Toy({"gain": 1.0}, [sized("drag", 0.7, "right")], error=2.0, memory=0.95, runs=6)
+    found = fitted(problem)
+    scale = found.model.effects[0][0].unknowns[0].step
+    left_out = []
+    for r in range(6):
+        kept = [k for k in range(6) if k != r]
+        parts = [normal_equations([found.columns[k]], [found.residuals[k]], found.noise) for k in kept]
+        tight = np.diag([1.0, 1.0, 1.0, 4 * (1 / 20) ** 2])
+        away = np.append((found.model.quantities - NOMINAL) / SIGMA, found.model.effects[0][1][0] / scale)
+        step = -np.linalg.solve(sum(m for m, _ in parts) + tight, sum(v for _, v in parts) + tight @ away)
+        left_out.append(step)
+    jackknife = np.sqrt(5 / 6 * ((left_out - np.mean(left_out, axis=0)) ** 2).sum(axis=0))
+    curvature = np.sqrt(np.diag(found.covariance()))
+    expected = np.maximum(jackknife, curvature) * np.append(SIGMA, scale)
+    assert standard_errors(problem, found) == pytest.approx(expected, rel=0.01)
+
+
+def test_number_on_its_bound_does_not_widen_the_others():
+    beyond = Toy({"gain": REACH + 2.0}, white=1.0, runs=6)
+    found = fit(beyond, range(6), nominal_model(beyond))
+    assert on_bounds(beyond, found.model)[0]
+    errors = standard_errors(beyond, found) / SIGMA
+    assert errors[0] < 0.01
+    # pinned means pinned: the jackknife of the others is that of a model without the number
+    tight = np.eye(2)
+    away = (found.model.quantities[1:] - NOMINAL[1:]) / SIGMA[1:]
+    left_out = []
+    for r in range(6):
+        kept = [k for k in range(6) if k != r]
+        parts = [normal_equations([found.columns[k][1:]], [found.residuals[k]], found.noise) for k in kept]
+        left_out.append(-np.linalg.solve(sum(m for m, _ in parts) + tight, sum(v for _, v in parts) + away))
+    jackknife = np.sqrt(5 / 6 * ((left_out - np.mean(left_out, axis=0)) ** 2).sum(axis=0))
+    curvature = np.sqrt(np.diag(found.covariance()))[1:]
+    assert errors[1:] == pytest.approx(np.maximum(jackknife, curvature), rel=0.02)
+
+
+def test_estimates_are_values_with_two_sided_intervals():
+    problem = Toy({}, [sized("drag", 0.7, "right")], white=1.5)
+    found = fitted(problem)
+    own = estimates(problem, found)[0]["size"]
+    half = TWO_SIDED_95 * standard_errors(problem, found)[-1]
+    assert own.value == found.model.effects[0][1][0]
+    assert (own.low, own.high) == pytest.approx((own.value - half, own.value + half), rel=1e-3)
+    assert own.unit == "1"
+    assert own.low < 0.7 < own.high
+
+
+def test_confidence_counts_the_samples_in_which_the_effect_wins():
+    problem = Toy({}, [sized("drag", 0.8, "right")], error=0.5)
+    look = name_effects(problem, RUNS, fit(problem, RUNS, nominal_model(problem))).rounds[0]
+    assert confidence(look.taken, look.hypotheses) > 0.95
+    twin = Toy({}, [sized("drag", 0.8, "left")], error=0.5)
+    look = name_effects(twin, RUNS, fit(twin, RUNS, nominal_model(twin))).rounds[0]
+    assert confidence(look.taken, look.hypotheses) == confidence(look.taken, look.hypotheses)
+
+
+def screened(problem):
+    found = fit(problem, RUNS, nominal_model(problem))
+    probes, candidates = problem.candidates(None, [], [])
+    return found, responses(problem, found, RUNS, probes), candidates
+
+
+def test_detectable_severity_is_where_the_gain_is_just_enough():
+    problem = Toy(white=1.5)
+    _, responded, candidates = screened(problem)
+    smallest = detectable(screen(candidates, responded))["decoy_2"]
+    assert (smallest.parameter, smallest.unit) == ("size", "1")
+    shown = Toy({}, [sized("decoy_2", smallest.value)], seed=11, white=1.5)
+    found, with_it, candidates = screened(shown)
+    gain = next(s.gain for s in screen(candidates, with_it) if s.candidate.name == "decoy_2")
+    assert gain == pytest.approx(LEAST_GAIN, rel=0.5)
+
+
+def test_detectable_severity_does_not_depend_on_the_probe():
+    """Two probes of one linear effect, of different sizes: the answer is the same whichever fits best."""
+    problem = Toy(white=1.5)
+    ordinary = problem.candidates
+
+    def more(setting, residuals, runs):
+        probes, candidates = ordinary(setting, residuals, runs)
+        decoy = candidate(Toy(), "decoy_2")
+        large = Start((("large",),), lambda a: (1.5 * float(a[0]),))
+        for order in ((large, *decoy.starts), (*decoy.starts, large)):
+            candidates.append(Candidate(f"both_{len(candidates)}", ("body",), decoy.unknowns, order))
+        return [*probes, Probe("large", (sized("decoy_2", 1.5),))], candidates
+
+    problem.candidates = more
+    _, responded, candidates = screened(problem)
+    told = detectable(screen(candidates, responded))
+    sizes = [abs(entry.value) for name, entry in told.items() if name.startswith("both")]
+    assert len(sizes) == 2
+    assert sizes == pytest.approx([abs(told["decoy_2"].value)] * 2, rel=0.05)
+
+
+def test_noisier_data_show_less():
+    quiet, loud = (detectable(screen(*reversed(screened(Toy(white=w))[1:]))) for w in (1.0, 4.0))
+    assert set(quiet) == set(loud) >= {"drag", "twin", "play", "decoy_0"}
+    assert loud["decoy_0"].value > 2.5 * quiet["decoy_0"].value

@@ -1,0 +1,367 @@
+"""The report: one whole page, every number as analysed, nothing from outside; pictures inside their frames; the folder."""
+
+import json
+import re
+from dataclasses import replace
+from html import unescape
+from html.parser import HTMLParser
+
+import gap_examples as examples
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from wlr_gym.errors import InputError
+from wlr_gym.gap import report as module
+from wlr_gym.gap.analysis import Estimate, Evidence, FoundEffect, HeatMap, IntakeFinding, Place
+from wlr_gym.gap.plots import draw, figures
+from wlr_gym.gap.report import check_folder, report, save_analysis
+from wlr_gym.gap.words import channel, error, estimate, number, percent, places, plain, sentence
+
+EVERY = pytest.mark.parametrize("analysis", examples.ALL.values(), ids=list(examples.ALL))
+PICTURE = {"gap": b"\x89PNG"}
+
+
+class Page(HTMLParser):
+    """Checks that tags close in order, and collects text, attributes and rows of tables."""
+
+    EMPTY = ("meta", "img", "br")
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.open, self.attributes, self.texts, self.rows, self.headings = [], [], [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.attributes += [(tag, *attribute) for attribute in attrs]
+        if tag not in self.EMPTY:
+            self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" in self.open:
+            return
+        self.texts.append(data)
+        if self.open and self.open[-1] in ("td", "th"):
+            self.rows[-1][-1] += data
+        if self.open and self.open[-1] == "h2":
+            self.headings.append(data)
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.texts).split())
+
+
+def page_of(analysis, tmp_path, pictures=None):
+    return Page(report(analysis, pictures or {}, tmp_path))
+
+
+@EVERY
+def test_page_is_whole_and_its_own(analysis, tmp_path):
+    text = report(analysis, PICTURE, tmp_path)
+    page = Page(text)
+    assert text.startswith("<!DOCTYPE html>")
+    assert not {"script", "link", "iframe"} & {tag for tag, _, _ in page.attributes}
+    outside = [value for _, name, value in page.attributes if name in ("src", "href") and not value.startswith("data:")]
+    assert not outside
+    assert "http" not in text
+    assert "url(" not in text
+    assert "@import" not in text
+    assert "nan" not in page.text.split()
+
+
+@EVERY
+def test_verdict_comes_first_in_one_sentence(analysis, tmp_path):
+    page = page_of(analysis, tmp_path)
+    line = sentence(analysis)
+    assert line.endswith(".")
+    assert "\n" not in line
+    body = page.text.partition(analysis.data)[2]  # after the title
+    assert body.index(line) < body.index("Data:")
+
+
+def test_order_of_the_sections(tmp_path):
+    page = page_of(examples.EFFECT_FOUND, tmp_path)
+    assert page.headings == [
+        "Where", "What", "How much", "How sure", "What to run next", "Calibration", "The data", "How to use the result"
+    ]  # fmt: skip
+    assert page_of(examples.BAD_DATA, tmp_path).headings == ["The data"]
+    assert page_of(examples.NOT_EXCITED, tmp_path).headings == ["How sure", "What to run next", "Calibration", "The data"]
+
+
+def test_numbers_are_those_of_the_analysis(tmp_path):
+    analysis = examples.EFFECT_FOUND
+    page = page_of(analysis, tmp_path)
+    rows = {tuple(row) for row in page.rows}
+    assert ("coefficient", "0.0412 (0.0383 to 0.0447)") in rows
+    assert ("eff_wheel_lf", "motor torque, left front wheel", "44 %", "opposes the motion, the same at every speed") in rows
+    assert ("ground.mu", "-", "0.6", "0.652", "0.016", "0.09", "+0.6") in rows
+    assert ("command.delay", "s", "0.012", "0.0153", "0.00039", "0.003", "+1.1") in rows
+    assert ("run_03", "kept aside", "7.60", "5.20", "1.14") in rows
+    assert ("run_01", "fitted", "7.00", "5.00", "1.10") in rows
+    for one in analysis.channel_gaps:
+        cells = next(row for row in page.rows if row[:2] == [one.channel, channel(one.channel)] and len(row) == 6)
+        assert cells[3:] == [error(one.before), error(one.calibrated), error(one.after)]
+    assert ("viscous friction", "coefficient", "0.0081 N m s/rad") in rows
+    assert ("rolling resistance", "both front wheels", "97 %") in rows
+    assert "Most is left of acc_z (1.31), eff_leg_lf (1.12) and pos_leg_lf (1.02)." in page.text
+    moved = [row[0] for row in page.rows if len(row) == 7 and row[1] in ("s", "-", "kg", "V/rad")]
+    assert moved == ["command.delay", "ground.mu", "servo.kp[leg_lf]", "body.mass", "servo.kp[leg_rf]"]
+    for value in ("7.91", "5.24", "1.21", "7.42", "1.13", "95 %"):
+        assert value in page.text
+    assert "95 % interval 91 to 97 %" in page.text
+
+
+def test_every_candidate_is_shown_with_why_it_lost(tmp_path):
+    page = page_of(examples.EFFECT_FOUND, tmp_path)
+    for one in examples.EFFECT_FOUND.evidence:
+        mine = [row for row in page.rows if len(row) == 7 and row[0] == plain(one.name) and row[5] == one.outcome]
+        assert mine
+        assert all(row[6] == one.reason for row in mine)
+        if one.outcome != "screened out":
+            assert [number(one.gain), number(one.screened)] in [row[3:5] for row in mine if row[1] == places(one.where)]
+    backlash = next(row for row in page.rows if row[0] == "backlash")
+    assert backlash[1] == "left front leg; less at 7 other places"
+    assert [row[5] for row in page.rows if "5312" in row] == ["taken"]
+    taken = [value for tag, name, value in page.attributes if (tag, name) == ("tr", "class") and value == "taken"]
+    assert len(taken) == 1
+
+
+def test_without_effects_nothing_is_said_of_effects(tmp_path):
+    page = page_of(examples.NOTHING_MISSING, tmp_path)
+    assert "with the effects added" not in page.text
+    assert "with effects" not in page.text
+    assert ["run_03", "kept aside", "7.60", "5.20"] in page.rows
+    assert "the patch is empty" in page.text
+    assert ["backlash", "angle", "0.0087 rad"] in page.rows
+    assert "What these runs would have shown" in page.text
+
+
+def test_fatal_findings_come_first(tmp_path):
+    page = page_of(examples.BAD_DATA, tmp_path)
+    assert [row[0] for row in page.rows] == ["", "fatal", "fatal", "noted"]
+    assert "pos_leg_lf reaches 87: degrees, not rad? Convert and try again" in page.text
+
+
+def test_commands_can_be_typed(tmp_path):
+    folder = tmp_path / "my results"
+    lines = report(examples.EFFECT_FOUND, {}, folder)
+    text = "\n".join(unescape(block) for block in re.findall("<pre>(.*?)</pre>", lines, re.DOTALL))
+    assert f"wlr effects check '{folder}/patch.yaml'" in text
+    assert f"wlr train WLR-Velocity-v0 --effects '{folder}/patch.yaml'" in text
+    assert f"--set environment.randomization='{folder}/result.json'" in text
+    assert "wlr record --excitation straight --out new_runs" in text
+    known = replace(examples.EFFECT_FOUND, known_effects=({"name": "payload"},))
+    assert "--effects FILES-GIVEN-AS-KNOWN " in report(known, {}, folder)
+    assert "known from the start: payload" in report(known, {}, folder)
+
+
+def test_a_patch_that_cannot_be_loaded_is_not_advertised(tmp_path):
+    rig = FoundEffect("torque_saturation", ("servo",), {}, 0.9, 400.0)
+    page = page_of(replace(examples.EFFECT_FOUND, effects=(rig,)), tmp_path)
+    assert "The robot's simulators cannot load it: " in page.text
+    assert "wlr train" not in page.text
+
+
+def test_texts_are_escaped(tmp_path):
+    evil = '<script>alert("1")</script> & Prüfstand 机器人'
+    analysis = replace(
+        examples.EFFECT_FOUND,
+        data=evil,
+        summary=evil,
+        intake=(IntakeFinding(evil, evil, evil, evil),),
+        evidence=(Evidence(1, evil, (evil,), {evil: 1.0}, 1.0, 1.0, "taken", evil),),
+        localisation=(Place(evil, 0.5, evil),),
+        effects=(FoundEffect(evil, (evil,), {evil: Estimate(1.0, 0.0, 2.0, evil)}, 0.5, 1.0, evil),),
+        gap=replace(examples.GAP, metric=evil),
+        provenance={evil: evil},
+        seconds={evil: 3.0},
+        adequacy={evil: 1.0},
+    )  # fmt: skip
+    text = report(analysis, {}, tmp_path)
+    page = Page(text)
+    assert "<script" not in text
+    assert evil in page.text
+    assert [row for row in page.rows if row[0] == evil and row[2:3] == ["50 %"]]
+
+
+# ---- words -----------------------------------------------------------------------------------------------------------
+
+
+def test_sentences_say_what_was_found():
+    found = sentence(examples.EFFECT_FOUND)
+    assert found == (
+        "The model lacks rolling resistance (both front wheels); added, it removes 95 % (95 % interval 91 to 97 %) of the "
+        "avoidable error of runs kept aside; these data cannot tell it from coulomb friction."
+    )
+    assert "to within 1.04 times the sensor noise once its known numbers are calibrated" in sentence(examples.NOTHING_MISSING)
+    assert "something (left rear leg) that no effect of the library explains; a formula describes it" in sentence(
+        examples.UNKNOWN_EFFECT
+    )
+    assert "degrees, not rad?" in sentence(examples.BAD_DATA)
+    assert sentence(examples.NOT_EXCITED).endswith("record turns and posture.")
+    assert sentence(replace(examples.BAD_DATA, summary="So.")) == "So."
+    unsure = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction_ci95=(float("nan"), 1.0)))
+    assert "95 % (interval unknown) of the" in sentence(unsure)
+    two = (*examples.EFFECT_FOUND.effects, FoundEffect("payload", ("body",), {}, 0.9, 300.0))
+    assert sentence(replace(examples.EFFECT_FOUND, effects=two, equivalent=())).startswith(
+        "The model lacks 2 effects: rolling resistance (both front wheels) and payload (body); added, they remove 95 %"
+    )
+
+
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [
+        (("wheel_lf", "wheel_rf", "wheel_lr", "wheel_rr"), "all four wheels"),
+        (("leg_rr", "leg_lr"), "both rear legs"),
+        (("leg_lf",), "left front leg"),
+        (("wheel_lf", "wheel_rr"), "left front wheel and right rear wheel"),
+        (("leg_lf", "wheel_lf"), "left front leg and left front wheel"),
+        (("ground",), "floor"),
+        (("body_force_x",), "body force x"),
+        ((), ""),
+    ],
+)
+def test_places_in_words(where, words):
+    assert places(where) == words
+
+
+def test_numbers_in_words():
+    assert [number(value) for value in (0.041249, 5312.4, 12.0, 1e-7, -0.5, float("nan"))] == [
+        "0.0412", "5312", "12", "1e-07", "-0.5", "-"
+    ]  # fmt: skip
+    assert [error(value) for value in (1.0, 12.34, 456.0, float("nan"))] == ["1.00", "12.3", "456", "-"]
+    assert percent(0.951) == "95 %"
+    angle = examples.UNKNOWN_EFFECT.effects[0].parameters["a0"]
+    assert estimate(angle) == "1.21 (1.17 to 1.25) rad = 69.3°"
+    assert estimate(replace(angle, low=float("nan"))) == "1.21 rad = 69.3°"
+
+
+# ---- pictures --------------------------------------------------------------------------------------------------------
+
+
+def small(analysis):
+    """Fewer channels and one heat map: drawing takes its time."""
+    (heat_map, *_) = analysis.heat_maps or (examples.heat_map(),)
+    few = HeatMap(heat_map.channels[:6], heat_map.bins, heat_map.values[:6])
+    return replace(analysis, heat_maps=(few,), channel_gaps=analysis.channel_gaps[:6], traces=analysis.traces[1:3])
+
+
+def test_nothing_runs_out_of_a_picture():
+    long = "an effect of quite an unreasonable length, at all four wheels and both rear legs, that goes on and on"
+    analysis = small(examples.EFFECT_FOUND)
+    evidence = (*analysis.evidence[:6], Evidence(1, long, (long,), {}, 7000.0, 1.0, "equivalent", long))
+    analysis = replace(analysis, evidence=evidence, localisation=(Place(long[:40], 1.0, long), *analysis.localisation))
+    for name, figure in figures(analysis).items():
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        frame = figure.bbox
+        for axes in figure.axes:
+            box = axes.get_tightbbox()
+            assert box is not None
+            assert box.x0 >= -2, name
+            assert box.y0 >= -2, name
+            assert box.x1 <= frame.x1 + 2, name
+            assert box.y1 <= frame.y1 + 2, name
+
+
+def widths(figure):
+    return [bar.get_width() for bar in figure.axes[0].patches]
+
+
+def test_pictures_show_the_numbers():
+    found = figures(small(examples.EFFECT_FOUND))
+    assert widths(found["gap"]) == [7.91, 5.24, 1.21]
+    (whisker,) = [line for line in found["gap"].axes[0].lines if line.get_marker() == "|"]
+    assert np.asarray(whisker.get_xdata()) == pytest.approx([5.24 - 0.973 * 4.24, 5.24 - 0.912 * 4.24])
+    first = found["evidence"].axes[0]
+    assert max(widths(found["evidence"])) == 5312.4
+    shown = {text.get_text().split("  ")[1] for text in first.texts}
+    assert shown == {"taken", "weaker", "implausible", "screened out"}
+    assert np.max(np.asarray(found["where_1"].axes[0].images[0].get_array())) == pytest.approx(
+        examples.heat_map().values[:6].max()
+    )
+    left, below = found["overlays_1"].axes[:2]
+    assert [line.get_label() for line in left.lines] == ["measured", "model as given", "calibrated", "effects added"]
+    trace = small(examples.EFFECT_FOUND).traces[0]
+    assert np.array_equal(below.lines[1].get_ydata(), trace.measured - trace.after)
+    assert left.get_ylabel() == "rad/s"
+    bare = figures(replace(small(examples.NOTHING_MISSING), evidence=()))
+    assert widths(bare["gap"]) == [2.31, 1.04]
+    assert "effects added" not in [line.get_label() for line in bare["overlays_1"].axes[0].lines]
+
+
+def test_headings_err_by_the_shorter_way_round():
+    trace = replace(examples.trace("run_03", "cam_yaw", True), measured=np.full(1000, 3.1), after=np.full(1000, -3.1))
+    (figure,) = figures(replace(examples.BAD_DATA, effects=examples.EFFECT_FOUND.effects, traces=(trace,))).values()
+    assert np.asarray(figure.axes[1].lines[1].get_ydata()) == pytest.approx(6.2 - 2 * np.pi)
+
+
+def test_what_has_no_numbers_is_not_drawn():
+    assert draw(examples.BAD_DATA) == {}
+    empty = HeatMap((), (), np.zeros((0, 0)))
+    blank = HeatMap(("volt",), ("all",), np.full((1, 1), np.nan))
+    drawn = draw(replace(examples.BAD_DATA, heat_maps=(empty, blank)))
+    assert list(drawn) == ["where_2"]
+    assert drawn["where_2"].startswith(b"\x89PNG")
+
+
+# ---- the folder ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(module, "draw", lambda analysis: dict(PICTURE))
+
+
+def test_files_are_written(tmp_path, quick):
+    out = tmp_path / "deep" / "out"
+    assert save_analysis(examples.EFFECT_FOUND, out) == out / "result.json"
+    files = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
+    assert files == ["patch.yaml", "plots/gap.png", "report.html", "result.json"]
+    assert json.loads((out / "result.json").read_text())["patch"] == str((out / "patch.yaml").resolve())
+    assert "data:image/png;base64,iVBORw==" in (out / "report.html").read_text()
+
+
+def test_an_earlier_analysis_is_replaced(tmp_path, quick):
+    save_analysis(examples.EFFECT_FOUND, tmp_path)
+    (tmp_path / "plots" / "overlays_9.png").write_bytes(b"stale")
+    (tmp_path / "config.yaml").write_text("")
+    save_analysis(examples.BAD_DATA, tmp_path)
+    assert json.loads((tmp_path / "result.json").read_text())["verdict"] == "bad_data"
+    assert not (tmp_path / "plots" / "overlays_9.png").exists()
+
+
+@pytest.mark.parametrize("name", ["run_01.parquet", "notes.txt", "result.json"])
+def test_a_foreign_folder_is_refused(tmp_path, name, quick):
+    (tmp_path / name).write_text("{}")
+    with pytest.raises(InputError, match=rf"--out .*: '{name}' in it is not of an analysis"):
+        save_analysis(examples.EFFECT_FOUND, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_folders_that_cannot_be_are_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "deeper"):
+        with pytest.raises(InputError, match="file is a file; expected a folder"):
+            check_folder(folder)
+    check_folder(tmp_path / "new" / "deep")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_failure_leaves_the_earlier_results_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "draw", lambda analysis: dict(PICTURE))
+    save_analysis(examples.EFFECT_FOUND, tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    monkeypatch.setattr(module, "draw", lambda analysis: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        save_analysis(examples.NOTHING_MISSING, tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

@@ -1,0 +1,213 @@
+"""Recordings of the test rig: decoding, refusals, what intake notices, what is held out."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig_bench import Bench, contents, write
+
+from wlr_gym.errors import InputError
+from wlr_gym.gap.rig import RigProblem, findings, open_rig, read_recordings
+from wlr_gym.gap.rig.recording import decode_load, read_recording
+from wlr_gym.gap.rig.replay import GOAL_LEAD, STEP, Replay, smoothed_state
+
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "xl330_pendulum"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("rig"), Bench(), gains=(100, 400), duration=3.0)
+
+
+def kinds(recordings, run=None):
+    return {f.kind for f in findings(recordings) if run is None or f.run == run}
+
+
+def test_unsigned_readings_of_a_signed_register_are_decoded():
+    np.testing.assert_allclose(decode_load(np.array([0.0, 885.0, 65535.0, 64651.0])), [0.0, 1.0, -1 / 885, -1.0])
+
+
+def test_decoded_duty_is_what_the_gain_asks_for(made):
+    for recording in read_recordings(made):
+        wish = recording.gain * 4096 / (2 * np.pi) / (256 * 885) * (recording.goal - recording.angle)
+        assert np.abs(recording.duty - np.clip(wish, -1, 1)).max() < 0.01 + 0.5 * np.ptp(wish) / 885
+
+
+def test_states_come_from_the_rows_around(made):
+    recording = read_recordings(made)[0]
+    angle, rate = smoothed_state(recording.time, np.sin(3.0 * recording.time))
+    np.testing.assert_allclose(angle, np.sin(3.0 * recording.time), atol=1e-6)
+    np.testing.assert_allclose(rate[4:-4], 3.0 * np.cos(3.0 * recording.time[4:-4]), atol=1e-4)
+
+
+def test_goals_hold_from_row_to_row_and_keep_their_area(made):
+    recording = read_recordings(made)[0]
+    replay = Replay(recording)
+    middle = recording.time[0] + STEP * (np.arange(len(replay._goals)) + 0.5)
+    row = np.clip(np.searchsorted(recording.time - GOAL_LEAD, middle, side="right") - 1, 0, None)
+    inside = np.abs(replay._goals - recording.goal[row]) < 1e-12
+    assert inside.mean() > 0.55  # the others hold the change of a goal
+    assert replay._goals.sum() == pytest.approx(recording.goal[row].sum(), rel=2e-3)
+
+
+# --- refusals
+
+
+def broken(folder, **changes):
+    one = contents(Bench(), [100], ["sin_sin"], duration=0.5)[0]
+    entries = [dict(entry) for entry in one["entries"]]
+    changes.pop("edit", lambda e: None)(entries) if "edit" in changes else None
+    path = folder / "broken.json"
+    path.write_text(json.dumps(one | {"entries": entries} | changes))
+    return path
+
+
+def put(row, key, value):
+    def edit(entries):
+        entries[row][key] = value
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"edit": put(7, "position", None)}, "entry 7: position is None"),
+        ({"edit": put(7, "position", float("nan"))}, "entry 7: position is nan"),
+        ({"edit": put(9, "timestamp", 0.0)}, "entry 9: timestamp 0 s is not after"),
+        ({"edit": put(3, "input_volts", 0)}, "entry 3: input_volts 0 V"),
+        ({"edit": lambda entries: entries[5].pop("goal_position")}, "entry 5 has no 'goal_position'"),
+        ({"edit": lambda entries: entries.__delitem__(slice(20, None))}, "20 entries; a run needs 50"),
+        ({"mass": -1}, "mass -1: expected a positive number"),
+        ({"kp": "high"}, "kp is 'high'"),
+        ({"entries": 3}, "a list 'entries'"),
+    ],
+)
+def test_what_is_no_recording_is_refused_with_its_place(tmp_path, changes, message):
+    with pytest.raises(InputError, match=message):
+        read_recording(broken(tmp_path, **changes))
+
+
+def test_missing_header_key_is_named(tmp_path):
+    one = contents(Bench(), [100], ["sin_sin"], duration=0.5)[0]
+    del one["length"]
+    (tmp_path / "a.json").write_text(json.dumps(one | {"lenght": 0.1}))
+    with pytest.raises(InputError, match=r"has no 'length' \(did you mean 'lenght'"):
+        read_recordings(tmp_path)
+
+
+def test_folders_without_recordings_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such folder"):
+        read_recordings(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"holds no \*\.json"):
+        read_recordings(tmp_path)
+    (tmp_path / "a.json").write_text("{")
+    with pytest.raises(InputError, match="cannot be read as JSON"):
+        read_recordings(tmp_path)
+
+
+# --- intake
+
+
+def test_a_clean_set_is_told_only_what_is_true(made):
+    recordings = read_recordings(made)
+    found = kinds(recordings)
+    assert "wrap" in found
+    assert "missing" in found
+    assert not found & {"supply", "gap", "dead", "units", "few_runs", "control_law", "off"}
+
+
+def test_intake_notices_what_is_odd(made):
+    recordings = read_recordings(made)
+    one = recordings[0]
+    rest = recordings[1:]
+
+    def with_one(**changes):
+        return kinds([dataclasses.replace(one, **changes), *rest], one.name)
+
+    supply = one.supply.copy()
+    supply[100] = 5.7
+    assert "supply" in with_one(supply=supply)
+    late = one.time + 0.1 * (np.arange(len(one.time)) > 200)
+    assert "gap" in with_one(time=late)
+    assert "dead" in with_one(angle=np.zeros_like(one.angle))
+    assert "off" in with_one(enabled=one.time < 2.0)
+    assert "control_law" in with_one(gain=200.0)
+    assert "wrap" not in with_one(raw_load=np.abs(one.duty) * 885)
+
+
+def test_wrong_units_and_signs_are_fatal(made):
+    recordings = read_recordings(made)
+    one = recordings[0]
+    for changes in (
+        {"angle": np.degrees(one.angle), "goal": np.degrees(one.goal)},
+        {"speed": -one.speed},
+        {"speed": 9.5 * one.speed},
+    ):
+        fatal = [f for f in findings([dataclasses.replace(one, **changes), *recordings[1:]]) if f.fatal]
+        assert [f.kind for f in fatal] == ["units"] * len(fatal)
+        assert fatal
+        assert {f.run for f in fatal} == {one.name}
+
+
+def test_what_goes_together_over_the_runs_is_said(made):
+    recordings = read_recordings(made)
+    warming = [dataclasses.replace(r, temperature=r.temperature + k) for k, r in enumerate(recordings)]
+    texts = [f.text for f in findings(warming) if f.kind == "confounded"]
+    assert any("temperature and order of recording" in text for text in texts)
+    assert not any("temperature" in f.text for f in findings(recordings) if f.kind == "confounded")
+
+
+# --- opening a folder
+
+
+def test_held_out_runs_cover_gains_and_trajectories(made):
+    recordings = read_recordings(made)
+    sealed = RigProblem(recordings).sealed
+    held = [recording for recording in recordings if recording.name in sealed]
+    assert len(held) == len(sealed) == 2
+    assert len({recording.gain for recording in held}) == 2
+    assert len({recording.trajectory for recording in held}) == 2
+
+
+def test_opening_leaves_out_what_cannot_be_used(made, tmp_path):
+    problem, found = open_rig(made)
+    assert problem is not None
+    assert len(problem.runs) == 6
+    assert not any(f.fatal for f in found)
+    runs = contents(Bench(), [100] * 4, ["sin_sin"] * 4, duration=1.0)
+    for entry in runs[0]["entries"]:
+        entry["position"] = 57.3 * entry["position"]
+        entry["goal_position"] = 57.3 * entry["goal_position"]
+    for k, one in enumerate(runs):
+        (tmp_path / f"run_{k}.json").write_text(json.dumps(one))
+    problem, found = open_rig(tmp_path)
+    assert problem is not None
+    assert problem.runs == ("run_1", "run_2", "run_3")
+    assert {f.run for f in found if f.fatal} == {"run_0"}
+    (tmp_path / "run_3.json").unlink()
+    problem, found = open_rig(tmp_path)
+    assert problem is None
+    assert found[-1].kind == "few_runs"
+    assert found[-1].fatal
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real recordings are not beside the repository")
+def test_real_recordings_are_read_and_flagged():
+    recordings = read_recordings(REAL)
+    assert len(recordings) == 12
+    found = findings(recordings)
+    assert not any(f.fatal for f in found)
+    per_kind = {kind: {f.run for f in found if f.kind == kind} for kind in ("wrap", "supply", "off")}
+    assert len(per_kind["wrap"]) == 9
+    assert len(per_kind["supply"]) == 12
+    assert len(per_kind["off"]) == 3
+    assert min(r.supply.min() for r in recordings) == 5.7
+    assert max(r.supply.max() for r in recordings) == 9.2
+    assert any(f.kind == "missing" and f.channel == "arm_mass" for f in found)
+    confounded = " ".join(f.text for f in found if f.kind == "confounded")
+    for pair in ("P gain and temperature", "P gain and order", "temperature and order"):
+        assert pair in confounded
+    assert all(np.abs(r.duty).max() <= 1.0 for r in recordings)

@@ -1,0 +1,69 @@
+"""The claims table: every claim is checked, and the verdicts are what the physics says."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from wlr_gym.paper.claims import CLAIMS, FAILS, HOLDS, OPEN, PARTLY, check_all, claims_table, gather
+from wlr_gym.paper.experiments import drive_both
+from wlr_gym.paper.verdicts import CONDITIONAL, CORRECT, EQUATIONS, INCOMPLETE, MISPRINT, WRONG, verdict_table
+from wlr_gym.robot import load_robot
+
+DOCS = Path(__file__).parents[2] / "docs" / "paper.md"
+VERDICTS = {
+    1: OPEN, 2: OPEN, 3: FAILS, 4: OPEN, 5: PARTLY, 6: HOLDS, 7: HOLDS, 8: FAILS, 9: FAILS, 10: PARTLY, 11: PARTLY, 12: FAILS,
+    13: HOLDS, 14: PARTLY, 15: HOLDS, 16: HOLDS, 17: HOLDS, 18: HOLDS, 19: PARTLY, 20: FAILS, 21: PARTLY, 22: HOLDS, 23: HOLDS,
+    24: HOLDS, 25: FAILS,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def claims():
+    robot = load_robot()
+    return check_all(gather(robot, drive_both("gibbs_appell", robot)))
+
+
+def test_every_claim_of_the_audit_is_there():
+    assert [claim.number for claim in CLAIMS] == list(range(1, 26))
+
+
+def test_verdicts(claims):
+    assert {claim.number: claim.verdict for claim in claims} == VERDICTS
+
+
+def test_numbers_behind_the_verdicts(claims):
+    """First numbers of some rows, against the audit's section 5."""
+    found = {claim.number: [float(x) for x in re.findall(r"-?\d+\.\d+", claim.ours)] for claim in claims}
+    assert found[1][0] == pytest.approx(0.0, abs=0.1)
+    assert found[2][0] == pytest.approx(0.0, abs=0.1)
+    assert found[7][:2] == pytest.approx([2.61, 7.36], abs=0.01)
+    assert found[13][0] == pytest.approx(5.82, abs=0.1)
+    assert found[14] == pytest.approx([0.28, 0.83, 1.39, -0.83], abs=0.01)
+    assert found[17][:2] == pytest.approx([4.19, 6.75], abs=0.01)
+    assert found[18][:2] == pytest.approx([8.40, 0.0], abs=0.01)
+    assert found[20][0] == pytest.approx(7.1, abs=0.3)
+
+
+def test_every_equation_has_its_verdict_and_functions():
+    assert list(EQUATIONS) == list(range(1, 31))
+    words = {CORRECT, CONDITIONAL, MISPRINT, INCOMPLETE, WRONG}
+    for number, equation in EQUATIONS.items():
+        assert equation.verdicts
+        assert set(equation.verdicts) <= words
+        assert f"({number})" in (equation.printed.__doc__ or "")
+        assert callable(equation.corrected)
+        assert (equation.repaired is not None) == (MISPRINT in equation.verdicts and number not in range(21, 25))
+        if CORRECT in equation.verdicts:
+            assert equation.verdicts == (CORRECT,)
+
+
+def test_docs_carry_the_tables(claims):
+    text = DOCS.read_text(encoding="utf-8")
+    for line in verdict_table():
+        assert line in text
+    for claim in claims:
+        row = next(line for line in text.splitlines() if line.startswith(f"| {claim.number} | "))
+        assert claim.text in row
+        assert row.endswith(f"**{claim.verdict}** |")
+    assert len(claims_table(claims)) == 27

@@ -1,0 +1,268 @@
+"""The whole workflow, step by step: intake, split, calibrate, name, prove; see docs/gap.md."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.effects import Source, load_patch
+from wlr_gym.errors import unknown_name
+from wlr_gym.gap import analysis as words
+from wlr_gym.gap.analysis import Analysis, Calibrated, Equivalent, Evidence, FoundEffect, IntakeFinding
+from wlr_gym.gap.fit import Fit, fit, nominal_model
+from wlr_gym.gap.localise import localise
+from wlr_gym.gap.name import Hypothesis, Naming, Round, name_effects
+from wlr_gym.gap.problem import Problem
+from wlr_gym.gap.prove import mean_squares, prove
+from wlr_gym.gap.recommend import recommend, separating_run
+from wlr_gym.gap.split import informative_split, named_split
+from wlr_gym.gap.sure import confidence, detectable, equivalents, estimates, standard_errors
+from wlr_gym.gap.traces import telling_traces
+from wlr_gym.provenance import provenance
+
+Array = NDArray[np.float64]
+#: Told of the present stage and of the share of the whole work that is done.
+Tell = Callable[[str, float], None]
+
+#: Stages and the share of the work that is done when they begin (measured on eight runs of 20 s).
+STAGES = {"reading": 0.0, "choosing runs": 0.02, "calibrating": 0.1, "naming": 0.35, "proving": 0.85, "drawing": 0.97}
+#: Kinds of rigs.
+RIGS = ("pendulum",)
+#: Share of the effects that must be visible within their plausible range for "nothing missing" to mean anything.
+LEAST_VISIBLE = 0.5
+
+
+def analyse(
+    data: str | Path,
+    out: str | Path | None = None,
+    *,
+    known: Source = None,
+    rig: str | None = None,
+    backend: str = "gibbs_appell",
+    heldout: Sequence[str] = (),
+    threads: int = 1,
+    tell: Tell = lambda stage, share: None,
+) -> Analysis:
+    """Find what the model of a robot lacks, from measured runs.
+
+    Args:
+        data: folder of runs in the measured-run format (with ``rig``: recordings of the rig).
+        out: where result, patch, pictures and report are written; None = nowhere.
+        known: effects that are known already.
+        rig: None = the robot; ``pendulum`` = one servo that swings a pendulum.
+        backend: simulator.
+        heldout: names of the runs to keep sealed; empty = chosen by what they can tell.
+        threads: worker threads; the result does not depend on it.
+        tell: told of progress.
+
+    Raises:
+        InputError: data that cannot be read, a run, rig or backend that does not exist.
+    """
+    tell("reading", STAGES["reading"])
+    if rig is None:
+        from wlr_gym.gap.robot.open import open_robot
+
+        opened = open_robot(data, known, backend, threads)
+    elif rig in RIGS:
+        from wlr_gym.gap.rig.open import open_rig
+
+        opened = open_rig(data, load_patch(known))
+    else:
+        raise unknown_name("rig", rig, RIGS)
+    problem, findings = opened
+    done = (
+        _bad_data(str(data), findings)
+        if problem is None
+        else analyse_problem(problem, str(data), findings, heldout=heldout, tell=tell, known=known)
+    )
+    if out is not None:
+        from wlr_gym.gap.report import save_analysis
+
+        tell("drawing", STAGES["drawing"])
+        save_analysis(done, Path(out))
+    return done
+
+
+def _bad_data(data: str, findings: Sequence[IntakeFinding]) -> Analysis:
+    return Analysis(data, words.BAD_DATA, "", tuple(findings), provenance=provenance())
+
+
+def analyse_problem(
+    problem: Problem,
+    data: str,
+    findings: Sequence[IntakeFinding] = (),
+    *,
+    heldout: Sequence[str] = (),
+    known: Source = None,
+    tell: Tell = lambda stage, share: None,
+) -> Analysis:
+    """Analyse a problem that is open already; see :func:`analyse`."""
+    clock = _Clock(tell)
+    clock.start("choosing runs")
+    fitted, sealed, columns = _choose_runs(problem, heldout)
+    clock.start("calibrating")
+    base = fit(problem, fitted, nominal_model(problem), columns=columns, steps=problem.steps, tell=clock.detail)
+    clock.start("naming")
+    naming = name_effects(problem, fitted, base, clock.detail)
+    clock.start("proving")
+    models = (nominal_model(problem), base.model, naming.fit.model)
+    floor = problem.floor(naming.fit.model.setting, sealed)
+    gap, run_gaps, channel_gaps = prove(problem, fitted, sealed, models, floor)
+    places, maps = localise(
+        problem,
+        base.residuals,
+        np.nanmean(mean_squares(naming.fit.residuals, problem.cap), axis=0),
+        naming.fit.noise,
+        problem.features(base.model.setting, fitted),
+    )
+    shown = detectable(naming.rounds[-1].scores)
+    verdict, groups = _verdict(naming), _equivalent(naming)
+    clock.stop()
+    return Analysis(
+        data,
+        verdict,
+        "",
+        tuple(findings),
+        tuple(problem.runs[k] for k in fitted),
+        tuple(problem.runs[k] for k in sealed),
+        _effects(problem, naming),
+        groups,
+        _calibration(problem, naming.fit),
+        tuple(entry for number, look in enumerate(naming.rounds, 1) for entry in _evidence(problem, number, look, fitted)),
+        places,
+        maps,
+        telling_traces(problem, fitted, sealed, models, places),
+        gap,
+        run_gaps,
+        channel_gaps,
+        shown,
+        recommend(naming, [group.names for group in groups], verdict),
+        {signal.name: float(level) for signal, level in zip(problem.signals, naming.fit.noise.level, strict=True)},
+        tuple(effect.content() for effect in load_patch(known).effects),
+        clock.seconds,
+        provenance(),
+    )
+
+
+def _choose_runs(problem: Problem, heldout: Sequence[str]) -> tuple[list[int], list[int], list[NDArray[np.float32]] | None]:
+    """Runs to fit, runs to seal, and the columns of the first where they had to be simulated for the choice."""
+    return (*named_split(problem.runs, heldout), None) if heldout else informative_split(problem)
+
+
+class _Clock:
+    """Times the stages and tells of them."""
+
+    def __init__(self, tell: Tell) -> None:
+        self.seconds: dict[str, float] = {}
+        self._tell, self._stage, self._since = tell, "", time.perf_counter()
+
+    def start(self, stage: str) -> None:
+        self.stop()
+        self._stage, self._since = stage, time.perf_counter()
+        self._tell(stage, STAGES[stage])
+
+    def detail(self, text: str) -> None:
+        """Tell of a step within a stage: the share creeps towards the next stage's."""
+        ends = [share for share in STAGES.values() if share > STAGES[self._stage]]
+        spent = time.perf_counter() - self._since
+        self._tell(f"{self._stage}: {text}", STAGES[self._stage] + (min(ends) - STAGES[self._stage]) * spent / (spent + 60.0))
+
+    def stop(self) -> None:
+        if self._stage:
+            self.seconds[self._stage] = time.perf_counter() - self._since
+
+
+def _verdict(naming: Naming) -> str:
+    names = [candidate.name for candidate, _ in naming.fit.model.effects]
+    if names:
+        return words.UNKNOWN if all(name == words.UNKNOWN for name in names) else words.EFFECT_FOUND
+    scores = naming.rounds[-1].scores
+    visible = {score.candidate.name: False for score in scores}
+    for score in scores:
+        visible[score.candidate.name] |= score.visible
+    return words.NOTHING_MISSING if sum(visible.values()) >= LEAST_VISIBLE * len(visible) else words.NOT_EXCITED
+
+
+def _effects(problem: Problem, naming: Naming) -> tuple[FoundEffect, ...]:
+    intervals = estimates(problem, naming.fit)
+    found = []
+    for (candidate, values), own in zip(naming.fit.model.effects, intervals, strict=True):
+        look = next(r for r in naming.rounds if r.taken is not None and r.taken.candidate.label == candidate.label)
+        assert look.taken is not None
+        effect = candidate.effect(values)
+        sure = confidence(look.taken, look.hypotheses)
+        found.append(
+            FoundEffect(candidate.name, candidate.where, own, sure, look.taken.gain, effect.formula, dict(effect.units))
+        )
+    return tuple(sorted(found, key=lambda effect: -effect.gain))
+
+
+def _equivalent(naming: Naming) -> tuple[Equivalent, ...]:
+    groups = []
+    kept = {candidate.label for candidate, _ in naming.fit.model.effects}
+    for look in naming.rounds:
+        if look.taken is None or look.taken.candidate.label not in kept:
+            continue
+        others = equivalents(look.taken, look.hypotheses)
+        if others:
+            names = (look.taken.candidate.name, *(other.candidate.name for other in others))
+            groups.append(Equivalent(names, separating_run(names)))
+    return tuple(groups)
+
+
+def _calibration(problem: Problem, found: Fit) -> dict[str, Calibrated]:
+    errors = standard_errors(problem, found)
+    return {
+        quantity.name: Calibrated(quantity.nominal, float(value), quantity.unit, quantity.sigma, float(error))
+        for quantity, value, error in zip(problem.quantities, found.model.quantities, errors, strict=False)
+    }
+
+
+def _evidence(problem: Problem, number: int, look: Round, fitted: Sequence[int]) -> list[Evidence]:
+    """Every candidate's fate in one round: the refitted ones, then the best place of every other name."""
+    equal = {h.candidate.label for h in equivalents(look.taken, look.hypotheses)} if look.taken else set()
+    entries = [
+        Evidence(
+            number,
+            h.candidate.name,
+            h.candidate.where,
+            h.candidate.parameters(h.values),
+            h.gain,
+            h.screened,
+            *_fate(h, look, equal),
+            {problem.runs[k]: float(gain) for k, gain in zip(fitted, h.by_run, strict=True)},
+        )
+        for h in look.hypotheses
+    ]
+    seen = {entry.name for entry in entries}
+    for score in look.scores:
+        if score.candidate.name in seen:
+            continue
+        seen.add(score.candidate.name)
+        values = score.candidate.parameters(score.values)
+        reason = "the known numbers imitate it" if score.own < 0.05 else "its response does not fit what is left"
+        entries.append(
+            Evidence(
+                number, score.candidate.name, score.candidate.where, values, score.gain, score.gain, "screened out", reason
+            )
+        )
+    return entries
+
+
+def _fate(hypothesis: Hypothesis, look: Round, equal: set[str]) -> tuple[str, str]:
+    best = look.taken
+    if best is not None and hypothesis.candidate.label == best.candidate.label:
+        return "taken", "buys most"
+    if hypothesis.candidate.label in equal and best is not None:
+        return "equivalent", f"buys {hypothesis.gain / best.gain:.0%} of what the taken one buys"
+    if hypothesis.at_bound:
+        return "implausible", "needs a value outside its plausible range"
+    if not hypothesis.consistent:
+        return "inconsistent", "helps some runs and harms others"
+    if best is None:
+        return "too little", "buys less than chance and an imperfect simulator can"
+    return "weaker", f"buys {max(hypothesis.gain, 0.0) / best.gain:.0%} of what the taken one buys"

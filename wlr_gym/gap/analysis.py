@@ -1,0 +1,224 @@
+"""What one analysis found: everything the result file, the pictures and the report are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Verdicts, as in the result file.
+BAD_DATA, NOT_EXCITED, NOTHING_MISSING = "bad_data", "not_excited", "nothing_missing"
+EFFECT_FOUND, UNKNOWN = "effect_found", "unknown_effect"
+
+
+@dataclass(frozen=True)
+class IntakeFinding:
+    """Something noticed about the data before any model was asked.
+
+    Attributes:
+        run, channel: where; "" for all.
+        kind: short word (``gap``, ``wrap``, ``dead``, ``clipped``, ``units``, ``few_runs`` ...).
+        text: what was seen and what to do.
+        fatal: the analysis cannot go on.
+    """
+
+    run: str
+    channel: str
+    kind: str
+    text: str
+    fatal: bool = False
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fitted number with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """One effect that was added, strongest first in an analysis.
+
+    Attributes:
+        confidence: 0..1: share of bootstrap samples of the runs in which it is accepted and ranked first.
+        gain: fall of minus two log posterior on the fit runs when it is taken out last.
+        formula, units: of an unknown effect; empty otherwise.
+    """
+
+    name: str
+    where: tuple[str, ...]
+    parameters: Mapping[str, Estimate]
+    confidence: float
+    gain: float
+    formula: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One candidate in one round, and what became of it.
+
+    Attributes:
+        round: 1 for the first effect.
+        gain: what adding it bought after a refit; ``screened`` what the first-order score had promised.
+        outcome: ``taken``, ``equivalent``, ``weaker``, ``too little``, ``inconsistent``, ``implausible`` or ``screened out``.
+        reason: one sentence: why it won or lost.
+        by_run: fall of the weighted squares per fit run; empty where it was only screened.
+    """
+
+    round: int
+    name: str
+    where: tuple[str, ...]
+    values: Mapping[str, float]
+    gain: float
+    screened: float
+    outcome: str
+    reason: str
+    by_run: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Equivalent:
+    """Explanations that these data cannot tell apart, and the run that would."""
+
+    names: tuple[str, ...]
+    separating_run: str
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the gap is: share of the avoidable misfit, and how it depends on the state."""
+
+    name: str
+    share: float
+    dependence: str
+
+
+@dataclass(frozen=True, eq=False)
+class HeatMap:
+    """Root mean square residual (noise units) of the calibrated model per channel and state bin: (channels, bins).
+
+    ``feature`` says what the bins are of, with its unit; NaN where a bin holds no rows.
+    """
+
+    channels: tuple[str, ...]
+    bins: tuple[str, ...]
+    values: Array
+    feature: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """One channel of one run: measured, and as three models replay it; SI."""
+
+    run: str
+    channel: str
+    unit: str
+    heldout: bool
+    t: Array
+    measured: Array
+    before: Array
+    calibrated: Array
+    after: Array
+
+
+@dataclass(frozen=True)
+class GapFigures:
+    """Noise-normalised RMS error of replayed runs, 1.0 = sensor noise; see the result file."""
+
+    metric: str
+    fit_before: float
+    fit_after: float
+    heldout_before: float
+    heldout_calibrated: float
+    heldout_after: float
+    noise_floor: float
+    reduction: float
+    reduction_ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class RunGap:
+    """The same for one run."""
+
+    run: str
+    heldout: bool
+    before: float
+    calibrated: float
+    after: float
+
+
+@dataclass(frozen=True)
+class ChannelGap:
+    """RMS residual of one channel over the held-out runs, in noise units."""
+
+    channel: str
+    unit: str
+    noise: float
+    before: float
+    calibrated: float
+    after: float
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A number that calibration moved."""
+
+    nominal: float
+    fitted: float
+    unit: str
+    sigma: float
+    uncertainty: float
+
+
+@dataclass(frozen=True)
+class Detectable:
+    """Smallest severity of an effect that these data would have shown."""
+
+    parameter: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """A run to record next: name of an excitation, and why."""
+
+    excitation: str
+    why: str
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """Everything one analysis found."""
+
+    data: str
+    verdict: str
+    summary: str
+    intake: tuple[IntakeFinding, ...] = ()
+    fit_runs: tuple[str, ...] = ()
+    heldout_runs: tuple[str, ...] = ()
+    effects: tuple[FoundEffect, ...] = ()
+    equivalent: tuple[Equivalent, ...] = ()
+    calibration: Mapping[str, Calibrated] = field(default_factory=dict)
+    evidence: tuple[Evidence, ...] = ()
+    localisation: tuple[Place, ...] = ()
+    heat_maps: tuple[HeatMap, ...] = ()
+    traces: tuple[Trace, ...] = ()
+    gap: GapFigures | None = None
+    run_gaps: tuple[RunGap, ...] = ()
+    channel_gaps: tuple[ChannelGap, ...] = ()
+    detectable: Mapping[str, Detectable] = field(default_factory=dict)
+    recommendations: tuple[Recommendation, ...] = ()
+    adequacy: Mapping[str, float] = field(default_factory=dict)
+    known_effects: tuple[Mapping[str, object], ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    provenance: Mapping[str, object] = field(default_factory=dict)

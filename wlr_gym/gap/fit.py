@@ -1,0 +1,295 @@
+"""Fit a model to runs: quantities within their tolerances, and the unknowns of the effects it has.
+
+Maximum a posteriori by Gauss-Newton steps: residuals weighted by level and memory (:mod:`wlr_gym.gap.likelihood`), quantities
+drawn to their nominal values by their tolerances, unknowns of effects free within their plausible range. All columns of a step
+are simulated as one batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.effects import PatchEffect
+from wlr_gym.gap.likelihood import Noise, estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.problem import Candidate, Problem, Setting
+
+Array = NDArray[np.float64]
+
+#: Step of finite differences in a quantity, in tolerances.
+STEP = 0.5
+#: Share of a step that is tried in turn until the fit gets better.
+SHARES = (1.0, 0.5, 0.2, 0.05)
+#: Steps that are taken with the same columns before they are simulated anew.
+CHORDS = 4
+#: Stiffness, in tolerances, that holds a number on its bound.
+PINNED = 1e9
+#: A full step that gains less than this (in minus two log likelihood) ends a fit.
+SETTLED = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Quantities, and effects with the values of their unknowns."""
+
+    quantities: Array
+    effects: tuple[tuple[Candidate, tuple[float, ...]], ...] = ()
+
+    @property
+    def setting(self) -> Setting:
+        """What the simulator is asked for."""
+        return Setting(self.quantities, self.patch)
+
+    @property
+    def patch(self) -> tuple[PatchEffect, ...]:
+        """The effects as a patch's."""
+        return tuple(candidate.effect(values) for candidate, values in self.effects)
+
+    @property
+    def size(self) -> int:
+        """Number of fitted numbers."""
+        return len(self.quantities) + sum(len(values) for _, values in self.effects)
+
+    def with_effect(self, candidate: Candidate, values: Sequence[float]) -> Model:
+        """Return the model with one effect more."""
+        return replace(self, effects=(*self.effects, (candidate, tuple(values))))
+
+    def without_effect(self, index: int) -> Model:
+        """Return the model with one effect less."""
+        return replace(self, effects=self.effects[:index] + self.effects[index + 1 :])
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted model.
+
+    Attributes:
+        model: the best found.
+        residuals: of it, one (rows, channels) per run.
+        noise: of these residuals.
+        cost: minus two log posterior, up to a constant that is the same for all models with the same ``memory``.
+        columns: one (numbers, rows x channels) array per run: change of the residuals per scaled number (quantities in
+            tolerances, unknowns in their steps), at or near the best model; unweighted, NaN as 0.
+        hessian: (numbers, numbers) of half the cost, scaled numbers, tolerances included; numbers on their bounds are pinned.
+    """
+
+    model: Model
+    residuals: list[Array]
+    noise: Noise
+    cost: float
+    columns: list[NDArray[np.float32]] = field(repr=False)
+    hessian: Array = field(repr=False)
+
+    def covariance(self) -> Array:
+        """Covariance (numbers, numbers) of the scaled numbers."""
+        return np.linalg.inv(self.hessian)
+
+
+def scales(problem: Problem, model: Model) -> Array:
+    """Return what one scaled number is worth (numbers): tolerances, then steps of the unknowns."""
+    steps = [unknown.step for candidate, _ in model.effects for unknown in candidate.unknowns]
+    return np.array([*(quantity.sigma for quantity in problem.quantities), *steps])
+
+
+def nominal_model(problem: Problem) -> Model:
+    """Return the model as its file says."""
+    return Model(np.array([quantity.nominal for quantity in problem.quantities]))
+
+
+def prior_cost(problem: Problem, model: Model) -> float:
+    """Return the squared distance of all numbers from nominal or neutral, in what is known beforehand."""
+    away = scaled_numbers(problem, model) - scaled_nominal(problem, model)
+    return float(prior_tightness(problem, model) @ away**2)
+
+
+def total_cost(problem: Problem, model: Model, residuals: Sequence[Array], memory: Array) -> float:
+    """Return minus two log posterior."""
+    return minus_two_log_likelihood(residuals, memory) + prior_cost(problem, model)
+
+
+def moved(problem: Problem, model: Model, change: Array) -> Model:
+    """Return the model moved by scaled numbers, kept within bounds and plausible ranges."""
+    count = len(problem.quantities)
+    sigma, low, high = (np.array([getattr(q, name) for q in problem.quantities]) for name in ("sigma", "low", "high"))
+    quantities = np.clip(model.quantities + sigma * change[:count], low, high)
+    effects, at = [], count
+    for candidate, values in model.effects:
+        new = []
+        for unknown, value in zip(candidate.unknowns, values, strict=True):
+            new.append(float(np.clip(value + unknown.step * change[at], unknown.low, unknown.high)))
+            at += 1
+        effects.append((candidate, tuple(new)))
+    return Model(quantities, tuple(effects))
+
+
+def linearise(problem: Problem, model: Model, runs: Sequence[int]) -> tuple[list[Array], list[NDArray[np.float32]]]:
+    """Return the residuals of ``model`` and their columns, one per run; see :class:`Fit`."""
+    count = len(problem.quantities)
+    steps = np.where(np.arange(model.size) < count, STEP, 1.0)
+    models, taken = [model], np.zeros(model.size)
+    here = scaled_numbers(problem, model)
+    for k in range(model.size):
+        for direction in (1.0, -1.0):  # at a bound the other way
+            change = np.zeros(model.size)
+            change[k] = direction * steps[k]
+            other = moved(problem, model, change)
+            taken[k] = (scaled_numbers(problem, other) - here)[k]
+            if abs(taken[k]) > 0.5 * steps[k]:
+                break
+        models.append(other)
+    found = problem.residuals([m.setting for m in models], runs)
+    columns = []
+    for r in found:
+        change = (r[1:] - r[0]) / np.where(taken == 0.0, np.inf, taken)[:, None, None]
+        columns.append(np.nan_to_num(change).reshape(model.size, -1).astype(np.float32))
+    return [r[0] for r in found], columns
+
+
+def scaled_numbers(problem: Problem, model: Model) -> Array:
+    values = np.array([*model.quantities, *(v for _, values in model.effects for v in values)])
+    return values / scales(problem, model)
+
+
+def normal_equations(columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise) -> tuple[Array, Array]:
+    """Return ``C W C^T`` (numbers, numbers) and ``C W r`` (numbers) over all runs."""
+    size = len(columns[0])
+    matrix, vector = np.zeros((size, size)), np.zeros(size)
+    root = np.sqrt(noise.weight)
+    for column, residual in zip(columns, residuals, strict=True):
+        weights = np.broadcast_to(root, residual.shape).ravel()
+        weighted = column * weights
+        matrix += weighted @ weighted.T
+        vector += weighted @ (np.nan_to_num(residual).ravel() * weights)
+    return matrix, vector
+
+
+def cross_products(columns: Sequence[NDArray[np.float32]], others: Sequence[Array], noise: Noise) -> Array:
+    """Return ``C W D^T`` of known columns with a few others (D: per run (k, rows, channels)), over all runs."""
+    total = 0.0
+    for column, other in zip(columns, others, strict=True):
+        weighted = (np.nan_to_num(other) * noise.weight).reshape(len(other), -1).astype(np.float32)
+        total = total + column.astype(np.float32) @ weighted.T
+    return np.asarray(total, np.float64)
+
+
+def fit(
+    problem: Problem,
+    runs: Sequence[int],
+    model: Model,
+    *,
+    memory: Array | None = None,
+    columns: list[NDArray[np.float32]] | None = None,
+    steps: int = 4,
+    renew: bool = True,
+    tell: Callable[[str], None] = lambda text: None,
+) -> Fit:
+    """Fit ``model`` to ``runs``.
+
+    Args:
+        problem: the system.
+        runs: which of its runs.
+        model: where to start, with the effects to be fitted.
+        memory: of the residuals where it is known already, and must be the same; None = estimated at every step.
+        columns: responses near ``model`` where they are known.
+        steps: at most this many Gauss-Newton steps.
+        renew: simulate the columns anew at every step; otherwise only once, where ``columns`` are missing.
+        tell: told of progress.
+    """
+    if columns is None:
+        residuals, columns = linearise(problem, model, runs)
+    else:
+        residuals = [r[0] for r in problem.residuals([model.setting], runs)]
+    for step in range(steps):
+        gained = 0.0
+        for _ in range(CHORDS):
+            noise = estimate_noise(residuals, memory)
+            cost = total_cost(problem, model, residuals, noise.memory)
+            change = gauss_newton_step(problem, model, columns, residuals, noise)
+            tries = [moved(problem, model, share * change) for share in SHARES]
+            found = problem.residuals([m.setting for m in tries], runs)
+            costs = [total_cost(problem, m, [r[k] for r in found], noise.memory) for k, m in enumerate(tries)]
+            best = int(np.argmin(costs))
+            if not costs[best] < cost:
+                break
+            model, residuals = tries[best], [r[best] for r in found]
+            gained += cost - costs[best]
+            if cost - costs[best] < SETTLED:
+                break
+        tell(f"step {step + 1} of {steps}: {gained:.0f} better")
+        if gained < SETTLED or not renew or step == steps - 1:
+            break
+        residuals, columns = linearise(problem, model, runs)
+    noise = estimate_noise(residuals, memory)
+    matrix, _ = normal_equations(columns, residuals, noise)
+    hessian = matrix + np.diag(prior_tightness(problem, model) + PINNED * on_bounds(problem, model))
+    return Fit(model, residuals, noise, total_cost(problem, model, residuals, noise.memory), columns, hessian)
+
+
+def prior_tightness(problem: Problem, model: Model) -> Array:
+    """Weight (numbers) of what is known beforehand, scaled: tolerances; unknowns lie within half their range of neutral."""
+    unknowns = [4.0 * (u.step / (u.high - u.low)) ** 2 for candidate, _ in model.effects for u in candidate.unknowns]
+    return np.array([1.0] * len(problem.quantities) + unknowns)
+
+
+def gauss_newton_step(
+    problem: Problem, model: Model, columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise
+) -> Array:
+    """Step (numbers), scaled; numbers that would leave their bounds stay on them and the rest is solved anew."""
+    return constrained_step(problem, model, *normal_equations(columns, residuals, noise))
+
+
+def constrained_step(problem: Problem, model: Model, matrix: Array, vector: Array) -> Array:
+    """Return the step that solves these normal equations, tolerances added, within bounds; see :func:`gauss_newton_step`."""
+    tight = prior_tightness(problem, model)
+    nominal = scaled_nominal(problem, model)
+    here = scaled_numbers(problem, model)
+    gradient = vector + tight * (here - nominal)
+    return bounded_minimum(matrix + np.diag(tight), gradient, *room(problem, model))
+
+
+def bounded_minimum(matrix: Array, gradient: Array, low: Array, high: Array) -> Array:
+    """Return the x within bounds that minimises ``x matrix x / 2 + gradient x``: what leaves them is held there, one by one."""
+    free = np.ones(len(gradient), bool)
+    x = np.zeros(len(gradient))
+    for _ in range(8):
+        held = gradient + matrix @ np.where(free, 0.0, x)
+        x[free] = -np.linalg.solve(matrix[np.ix_(free, free)], held[free])
+        out = free & ((x < low - 1e-12) | (x > high + 1e-12))
+        if not out.any():
+            break
+        x[out] = np.clip(x, low, high)[out]
+        free &= ~out
+    return np.clip(x, low, high)
+
+
+def scaled_nominal(problem: Problem, model: Model) -> Array:
+    """Nominal values of all numbers, scaled; effects' unknowns at neutral."""
+    neutral = [u.neutral for candidate, _ in model.effects for u in candidate.unknowns]
+    return np.array([*(q.nominal for q in problem.quantities), *neutral]) / scales(problem, model)
+
+
+def room(problem: Problem, model: Model) -> tuple[Array, Array]:
+    """Return how far each scaled number may still move down and up (numbers)."""
+    low, high = _bounds(problem, model)
+    here = scaled_numbers(problem, model)
+    return low - here, high - here
+
+
+def on_bounds(problem: Problem, model: Model) -> NDArray[np.bool_]:
+    """Which quantities (numbers) calibration has moved as far as it may; unknowns of effects do not count."""
+    low, high = _bounds(problem, model)
+    here = scaled_numbers(problem, model)
+    known = np.arange(model.size) < len(problem.quantities)
+    nominal = scaled_nominal(problem, model)
+    return known & (((here <= low + 1e-9) & (low != nominal)) | ((here >= high - 1e-9) & (high != nominal)))
+
+
+def _bounds(problem: Problem, model: Model) -> tuple[Array, Array]:
+    unknowns = [u for candidate, _ in model.effects for u in candidate.unknowns]
+    scale = scales(problem, model)
+    low = np.array([*(q.low for q in problem.quantities), *(u.low for u in unknowns)]) / scale
+    high = np.array([*(q.high for q in problem.quantities), *(u.high for u in unknowns)]) / scale
+    return low, high

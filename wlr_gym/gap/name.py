@@ -1,0 +1,361 @@
+"""Name what is missing: screen all candidates, refit the best of them, take the one that buys most, and look again.
+
+A candidate is accepted if it lowers minus two log posterior by more than its share of chance (:data:`LEAST_GAIN` per unknown,
+and :data:`LEAST_SHARE` of what is left), in most runs, with a value inside its plausible range. Pairs of the best are tried
+where no single one is accepted. In the end every effect must still be worth its place without the help of the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.gap.fit import (
+    SHARES,
+    Fit,
+    Model,
+    constrained_step,
+    cross_products,
+    fit,
+    moved,
+    normal_equations,
+    total_cost,
+)
+from wlr_gym.gap.likelihood import Noise, estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.problem import Candidate, Problem, Setting
+from wlr_gym.gap.screen import LEAST_GAIN, Responses, Score, responses, screen
+
+Array = NDArray[np.float64]
+Tell = Callable[[str], None]
+
+#: Hypotheses that are refitted in one round, at most so many per name, and rounds of refitting.
+SHORTLIST, PER_NAME, ROUNDS = 8, 3, 3
+#: The best of every name that buys at least this share of what the best buys is fitted in full before one is taken; so many.
+FINALIST, FINALISTS = 0.75, 3
+#: What an effect must buy more for every unknown beyond the first.
+PER_UNKNOWN = 10.0
+#: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
+MOST_HARM = 0.2
+#: Also at least this share of minus two log posterior.
+LEAST_SHARE = 0.01
+#: Effects in one analysis.
+MOST_EFFECTS = 4
+#: A named effect is preferred to a formula if it buys at least this share of what the formula buys.
+NAMED_FIRST = 0.9
+#: Two explanations are equivalent if the second buys at least this share of what the first buys.
+EQUIVALENT = 0.93
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One candidate after its refit.
+
+    Attributes:
+        candidate: the effect.
+        model: with the effect.
+        gain: fall of minus two log posterior.
+        by_run: (runs) fall of the weighted squares in each run.
+        screened: what the first-order score had promised.
+        residuals: of the model.
+        base, base_residuals: the model without the effect, refitted as long.
+    """
+
+    candidate: Candidate
+    model: Model
+    gain: float
+    by_run: Array
+    screened: float
+    residuals: list[Array] = field(repr=False)
+    base: Model = field(repr=False)
+    base_residuals: list[Array] = field(repr=False)
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Values of the candidate's unknowns."""
+        return self.model.effects[-1][1]
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether an unknown ended at the edge of its plausible range (other than its neutral value)."""
+        return any(
+            (value >= u.high - 1e-9 * abs(u.high) and u.high != u.neutral)
+            or (value <= u.low + 1e-9 * abs(u.low) and u.low != u.neutral)
+            for u, value in zip(self.candidate.unknowns, self.values, strict=True)
+        )
+
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the runs agree that it is there."""
+        help_, harm = self.by_run.clip(min=0.0).sum(), -self.by_run.clip(max=0.0).sum()
+        return bool(harm <= MOST_HARM * help_)
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One look for an effect: what was screened, what was refitted (best first), and which was taken."""
+
+    scores: list[Score]
+    hypotheses: list[Hypothesis]
+    taken: Hypothesis | None
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class Naming:
+    """Outcome: the final fit, and every round."""
+
+    fit: Fit
+    rounds: list[Round]
+    found: Responses
+
+
+def shortlist(scores: Sequence[Score], size: int = SHORTLIST) -> list[Score]:
+    """Return the best scores, at most :data:`PER_NAME` of one effect, and only those that promise something."""
+    chosen: list[Score] = []
+    for score in scores:
+        if len(chosen) == size:
+            break
+        same = [other for other in chosen if other.candidate.name == score.candidate.name]
+        if len(same) < PER_NAME and score.gain > 0.25 * LEAST_GAIN:
+            chosen.append(score)
+    return chosen
+
+
+def name_effects(problem: Problem, runs: Sequence[int], start: Fit, tell: Tell = lambda text: None) -> Naming:
+    """Look for missing effects in ``runs``, beginning with the calibrated model ``start``."""
+    current, rounds = start, []
+    models = [start.model]
+    while True:
+        probes, candidates = problem.candidates(current.model.setting, current.residuals, runs)
+        tell(f"screening {len(candidates)} candidates")
+        found = responses(problem, current, runs, probes)
+        scores = screen(candidates, found)
+        chosen = scores if problem.thorough else shortlist(scores)
+        tell(f"refitting {len(chosen)} hypotheses")
+        hypotheses = (refit_thoroughly if problem.thorough else refit)(problem, runs, current, chosen)
+        finals = finalists(problem, runs, current, hypotheses, tell)
+        chosen_final = _accepted(current, finals)
+        taken = None if chosen_final is None else chosen_final.hypothesis
+        rounds.append(Round(scores, _merged(finals, hypotheses), taken, current.cost))
+        if chosen_final is None:
+            break
+        tell(f"taken: {chosen_final.hypothesis.candidate.label}")
+        current = drop_idle(problem, runs, chosen_final.fit, tell)
+        if len(current.model.effects) >= MOST_EFFECTS or any(_same(current.model, earlier) for earlier in models):
+            break
+        models.append(current.model)
+    return Naming(current, rounds, found)
+
+
+def _same(one: Model, other: Model) -> bool:
+    return [candidate.label for candidate, _ in one.effects] == [candidate.label for candidate, _ in other.effects]
+
+
+def drop_idle(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = lambda text: None) -> Fit:
+    """Take out effects that the others have made needless, one after the other, the least useful first."""
+    while len(current.model.effects) > 1:
+        memory = current.noise.memory
+        kept = len(problem.quantities)
+        trials = []
+        for index in range(len(current.model.effects)):
+            sizes = [len(values) for _, values in current.model.effects]
+            own = slice(kept + sum(sizes[:index]), kept + sum(sizes[: index + 1]))
+            columns = [np.delete(column, own, axis=0) for column in current.columns]
+            model = current.model.without_effect(index)
+            trials.append(fit(problem, runs, model, memory=memory, columns=columns, steps=problem.steps, renew=False))
+        losses = [trial.cost - current.cost for trial in trials]
+        least = int(np.argmin(losses))
+        unknowns = len(current.model.effects[least][1])
+        if losses[least] > LEAST_GAIN + PER_UNKNOWN * (unknowns - 1):
+            return current
+        tell(f"dropped: {current.model.effects[least][0].label}")
+        current = fit(problem, runs, trials[least].model, steps=1, tell=tell)
+    return current
+
+
+@dataclass(frozen=True, eq=False)
+class Final:
+    """A hypothesis fitted in full."""
+
+    hypothesis: Hypothesis
+    fit: Fit
+
+
+def finalists(
+    problem: Problem, runs: Sequence[int], current: Fit, hypotheses: Sequence[Hypothesis], tell: Tell = lambda text: None
+) -> list[Final]:
+    """Fit the best hypotheses in full, with responses simulated anew; best first."""
+    best: dict[str, Hypothesis] = {}
+    for hypothesis in hypotheses:
+        enough = hypothesis.gain >= max(FINALIST * hypotheses[0].gain, 0.5 * LEAST_GAIN)
+        if enough and len(best) < FINALISTS:
+            best.setdefault(hypothesis.candidate.name + hypothesis.candidate.formula, hypothesis)
+    wholes = []
+    for hypothesis in best.values():
+        tell(f"fitting {hypothesis.candidate.label} in full")
+        wholes.append(fit(problem, runs, hypothesis.model, steps=2, tell=tell))
+    if not wholes:
+        return []
+    memory = min(wholes, key=lambda whole: whole.cost).noise.memory
+    found = []
+    for hypothesis, whole in zip(best.values(), wholes, strict=True):
+        # what its fit gained beyond the refit counts for it; what it would have gained without the effect was counted there
+        base = total_cost(problem, hypothesis.base, hypothesis.base_residuals, memory)
+        gain = base - total_cost(problem, whole.model, whole.residuals, memory)
+        by_run = _by_run(hypothesis.base_residuals, whole.residuals, estimate_noise(whole.residuals, memory))
+        found.append(Final(replace(hypothesis, model=whole.model, gain=gain, by_run=by_run, residuals=whole.residuals), whole))
+    return sorted(found, key=lambda final: -final.hypothesis.gain)
+
+
+def _merged(finals: Sequence[Final], hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """All hypotheses, those fitted in full in their final form."""
+    final = {f.hypothesis.candidate.label: f.hypothesis for f in finals}
+    merged = [final.get(h.candidate.label, h) for h in hypotheses]
+    return sorted(merged, key=lambda hypothesis: -hypothesis.gain)
+
+
+def _accepted(current: Fit, finals: Sequence[Final]) -> Final | None:
+    """The best that buys enough at a plausible value; a formula only where no named effect buys nearly as much."""
+    good = []
+    for final in finals:
+        least = max(LEAST_GAIN + PER_UNKNOWN * (len(final.hypothesis.values) - 1), LEAST_SHARE * current.cost)
+        if final.hypothesis.gain >= least and not final.hypothesis.at_bound and final.hypothesis.consistent:
+            good.append(final)
+    if not good:
+        return None
+    named = [final for final in good if not final.hypothesis.candidate.formula]
+    return named[0] if named and named[0].hypothesis.gain >= NAMED_FIRST * good[0].hypothesis.gain else good[0]
+
+
+def _by_run(before: Sequence[Array], after: Sequence[Array], noise: Noise) -> Array:
+    """Fall of the weighted squares in each run."""
+    return np.array([np.nansum((b * b - a * a) * noise.weight) for b, a in zip(before, after, strict=True)])
+
+
+def refit(
+    problem: Problem, runs: Sequence[int], current: Fit, scores: Sequence[Score], rounds: int = ROUNDS
+) -> list[Hypothesis]:
+    """Refit every hypothesis together with all known numbers; best first.
+
+    The responses of the known numbers are those of ``current``; those of each hypothesis' own unknowns are simulated anew.
+    """
+    if not scores:
+        return []
+    models = [current.model.with_effect(score.candidate, score.values) for score in scores]
+    models.append(current.model)  # without an effect more: what the others must beat, refitted as they are
+    residuals = _residuals(problem, models, runs)
+    for _ in range(rounds):
+        memory = _best_memory(problem, current, models, residuals)
+        noise = estimate_noise(min(residuals, key=lambda r: minus_two_log_likelihood(r, memory)), memory)
+        known, _ = normal_equations(current.columns, current.residuals, noise)
+        columns = _own_columns(problem, models, residuals, runs)
+        tries, owner = [], []
+        for k, model in enumerate(models):
+            change = constrained_step(problem, model, *_bordered(known, current, columns[k], residuals[k], noise))
+            tries += [moved(problem, model, share * change) for share in SHARES[:3]]
+            owner += [k] * 3
+        found = _residuals(problem, tries, runs)
+        costs = [total_cost(problem, model, residual, memory) for model, residual in zip(tries, found, strict=True)]
+        for k in range(len(models)):
+            mine = [i for i, who in enumerate(owner) if who == k]
+            best = min(mine, key=lambda i: costs[i])
+            if costs[best] < total_cost(problem, models[k], residuals[k], memory):
+                models[k], residuals[k] = tries[best], found[best]
+    return _ranked(problem, current, scores, models, residuals)
+
+
+def refit_thoroughly(problem: Problem, runs: Sequence[int], current: Fit, scores: Sequence[Score]) -> list[Hypothesis]:
+    """Fit every hypothesis in full, from its first guess and from its probes; best first."""
+    memory = current.noise.memory
+    fits = [
+        min(
+            (
+                fit(problem, runs, current.model.with_effect(score.candidate, values), memory=memory, steps=problem.steps)
+                for values in _starting_values(score)
+            ),
+            key=lambda found: found.cost,
+        )
+        for score in scores
+    ]
+    fits.append(fit(problem, runs, current.model, memory=memory, steps=problem.steps))
+    return _ranked(problem, current, scores, [f.model for f in fits], [f.residuals for f in fits])
+
+
+def _starting_values(score: Score) -> list[tuple[float, ...]]:
+    probes = (start.values(np.ones(len(start.directions))) for start in score.candidate.starts[:2])
+    low, high = ([getattr(unknown, side) for unknown in score.candidate.unknowns] for side in ("low", "high"))
+    return list(dict.fromkeys(tuple(np.clip(values, low, high).tolist()) for values in (score.values, *probes)))
+
+
+def _bordered(
+    known: Array, current: Fit, own: Sequence[Array], residuals: Sequence[Array], noise: Noise
+) -> tuple[Array, Array]:
+    """Normal equations of the known numbers, whose matrix is given, and a candidate's own unknowns."""
+    both = [np.concatenate([columns, residual[None]]) for columns, residual in zip(own, residuals, strict=True)]
+    across = cross_products(current.columns, both, noise)
+    root = np.sqrt(noise.weight)
+    flat = [np.nan_to_num(part * root).reshape(len(part), -1) for part in both]
+    inner = np.sum([part @ part.T for part in flat], axis=0)
+    matrix = np.block([[known, across[:, :-1]], [across[:, :-1].T, inner[:-1, :-1]]])
+    return matrix, np.concatenate([across[:, -1], inner[:-1, -1]])
+
+
+def _ranked(
+    problem: Problem, current: Fit, scores: Sequence[Score], models: Sequence[Model], residuals: Sequence[list[Array]]
+) -> list[Hypothesis]:
+    memory = _best_memory(problem, current, models, residuals)
+    base = total_cost(problem, models[-1], residuals[-1], memory)
+    found = []
+    for score, model, residual in zip(scores, models[:-1], residuals[:-1], strict=True):
+        by_run = _by_run(residuals[-1], residual, estimate_noise(residual, memory))
+        gain = base - total_cost(problem, model, residual, memory)
+        found.append(Hypothesis(score.candidate, model, gain, by_run, score.gain, residual, models[-1], residuals[-1]))
+    return sorted(found, key=lambda hypothesis: -hypothesis.gain)
+
+
+def _best_memory(problem: Problem, current: Fit, models: Sequence[Model], residuals: Sequence[list[Array]]) -> Array:
+    """Memory of the residuals of the best model so far: the same for all that are compared."""
+    costs = [total_cost(problem, m, r, current.noise.memory) for m, r in zip(models, residuals, strict=True)]
+    best = int(np.argmin(costs))
+    if costs[best] >= total_cost(problem, current.model, current.residuals, current.noise.memory):
+        return current.noise.memory
+    return estimate_noise(residuals[best]).memory
+
+
+def _residuals(problem: Problem, models: Sequence[Model], runs: Sequence[int]) -> list[list[Array]]:
+    """Residuals per model, per run."""
+    found = problem.residuals([model.setting for model in models], runs)
+    return [[r[k] for r in found] for k in range(len(models))]
+
+
+def _own_columns(
+    problem: Problem, models: Sequence[Model], residuals: Sequence[list[Array]], runs: Sequence[int]
+) -> list[list[Array]]:
+    """Responses of each model's last effect's unknowns, scaled by their steps: per model, per run, (unknowns, rows, channels).
+
+    Only those of the last effect are simulated anew: the others' are among the known columns. The last model has none.
+    """
+    settings: list[Setting] = []
+    taken: list[list[float]] = []
+    for model in models[:-1]:
+        candidate, values = model.effects[-1]
+        steps = []
+        for k, unknown in enumerate(candidate.unknowns):
+            step = unknown.step if values[k] + unknown.step <= unknown.high else -unknown.step
+            changed = tuple(v + step * (i == k) for i, v in enumerate(values))
+            settings.append(Model(model.quantities, (*model.effects[:-1], (candidate, changed))).setting)
+            steps.append(step / unknown.step)
+        taken.append(steps)
+    found = problem.residuals(settings, runs)
+    columns, at = [], 0
+    for residual, steps in zip(residuals[:-1], taken, strict=True):
+        mine = [r[at : at + len(steps)] for r in found]
+        columns.append(
+            [np.nan_to_num((r - base) / np.array(steps)[:, None, None]) for r, base in zip(mine, residual, strict=True)]
+        )
+        at += len(steps)
+    return [*columns, [np.zeros((0, *residual.shape)) for residual in residuals[-1]]]

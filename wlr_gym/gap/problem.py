@@ -1,0 +1,216 @@
+"""What the workflow knows of a system: numbers that calibration may move, effects that may be missing, and a simulator.
+
+The steps of the workflow (calibrate, test, localise, name, prove) speak only to a :class:`Problem`. The robot is one
+(:mod:`wlr_gym.gap.robot`), a servo on a test rig another (:mod:`wlr_gym.gap.rig`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.effects import PatchEffect
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A known number of the model that calibration may move within its tolerance.
+
+    Attributes:
+        name: of the parameter, ``servo.kp[leg_lf]``.
+        unit: SI unit.
+        nominal: value in the model.
+        sigma: tolerance, one standard deviation, in ``unit``.
+        low, high: how far calibration may move it: a few tolerances, within what the simulator accepts.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    sigma: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One parameter of a candidate effect.
+
+    Attributes:
+        name: as in the effect vocabulary, ``coefficient``.
+        unit: SI unit.
+        neutral: value at which the effect vanishes.
+        low, high: physically plausible range; a fit that leaves it rules the candidate out.
+        step: for finite differences.
+    """
+
+    name: str
+    unit: str
+    neutral: float
+    low: float
+    high: float
+    step: float
+
+
+@dataclass(frozen=True)
+class Probe:
+    """An elementary change of the model, whose response is simulated once and serves many candidates.
+
+    Attributes:
+        key: unique name, ``coulomb_friction leg_rf``.
+        effects: what is added to the calibrated model.
+    """
+
+    key: str
+    effects: tuple[PatchEffect, ...]
+
+
+@dataclass(frozen=True)
+class Start:
+    """One way to a first guess of a candidate: the measured gap is projected on the responses to probes.
+
+    Attributes:
+        directions: one tuple of probe keys, or of names of quantities, per direction; the responses in a tuple are added up.
+            The response to a quantity is that to one tolerance.
+        values: from the amplitudes found (1 = the probe itself) to values of the candidate's unknowns.
+    """
+
+    directions: tuple[tuple[str, ...], ...]
+    values: Callable[[Array], tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that may be missing, at one place or set of places.
+
+    Attributes:
+        name: of the effect vocabulary.
+        where: joints, wheels, ``body``, ``ground`` or ``sensor``.
+        unknowns: its parameters, in the order of all value tuples.
+        starts: ways to a first guess; the best one is taken.
+        formula, units: of an effect that the library does not hold; empty otherwise.
+        fixed: parameters of the effect that are not fitted.
+        convert: from fitted values to the effect's parameters, where the data are more nearly linear in other numbers (mass and
+            moments of a load, not its place); None = they are the same.
+    """
+
+    name: str
+    where: tuple[str, ...]
+    unknowns: tuple[Unknown, ...]
+    starts: tuple[Start, ...]
+    formula: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    convert: Callable[[Sequence[float]], Mapping[str, float]] | None = None
+
+    @property
+    def label(self) -> str:
+        """Short text: ``coulomb_friction leg_rf``."""
+        return " ".join([self.name, *self.where, self.formula]).strip()
+
+    def parameters(self, values: Sequence[float]) -> dict[str, float]:
+        """Return the effect's fitted parameters by name."""
+        if self.convert is not None:
+            return dict(self.convert(values))
+        return {unknown.name: float(value) for unknown, value in zip(self.unknowns, values, strict=True)}
+
+    def effect(self, values: Sequence[float]) -> PatchEffect:
+        """Return the effect with these values of its unknowns."""
+        return PatchEffect(self.name, self.where, {**self.parameters(values), **self.fixed}, self.formula, self.units)
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """One model to simulate: values of the problem's quantities, and effects added to it."""
+
+    quantities: Array
+    effects: tuple[PatchEffect, ...] = ()
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One measured channel.
+
+    Attributes:
+        name: column of the run.
+        unit: SI unit.
+        noise: one sigma of the sensor, quantisation included.
+        group: channels of one kind share it, for tables and pictures.
+    """
+
+    name: str
+    unit: str
+    noise: float
+    group: str
+
+
+class Problem(Protocol):
+    """A system, its measured runs, and a simulator of it.
+
+    Attributes:
+        runs: names.
+        signals: measured channels.
+        quantities: what calibration may move.
+        metric: what the gap's numbers are, in words.
+        cap: noise units beyond which a residual counts no more in the gap's numbers.
+        steps: Gauss-Newton steps of a fit, at most.
+        thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
+        sealed: names of the runs to keep for the proof, where the problem knows better than a general rule; else empty.
+    """
+
+    metric: str
+    cap: float
+    steps: int
+    thorough: bool
+    sealed: tuple[str, ...]
+    runs: tuple[str, ...]
+    signals: tuple[Signal, ...]
+    quantities: tuple[Quantity, ...]
+
+    def times(self, run: int) -> Array:
+        """Return the times (rows,) of the rows of a run, s."""
+        ...
+
+    def measured(self, run: int) -> Array:
+        """Return what was measured (rows, signals), SI; NaN where not."""
+        ...
+
+    def simulate(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
+        """Return what the sensors would have read: (len(settings), rows, signals) per run, SI."""
+        ...
+
+    def floor(self, setting: Setting, runs: Sequence[int]) -> float:
+        """Return the level (root mean square residual over signals) of data that the model itself made with these sensors."""
+        ...
+
+    def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
+        """Replay runs under every setting.
+
+        Returns:
+            One array (len(settings), rows, len(signals)) per run: (measured - simulated) / noise, NaN where not measured. What
+            no model can be asked to reproduce (the pose a window starts from) is taken out.
+        """
+        ...
+
+    def candidates(
+        self, setting: Setting, residuals: Sequence[Array], runs: Sequence[int]
+    ) -> tuple[list[Probe], list[Candidate]]:
+        """Return the effects to try beyond ``setting``, and the probes their first guesses need.
+
+        Args:
+            setting: the calibrated model, with the effects found so far.
+            residuals: of it, one (rows, signals) per run of ``runs``: where a candidate's shape is read off the data (period of
+                a ripple, edges of a patch).
+            runs: which runs those are.
+        """
+        ...
+
+    def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
+        """Return simulated quantities (rows,) that residuals are mapped over: speeds, loads, slip, place."""
+        ...

@@ -1,0 +1,141 @@
+"""What to record next: the excitation that shows what these data could not, or separates what they could not tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from wlr_gym.gap.analysis import EFFECT_FOUND, Recommendation
+from wlr_gym.gap.name import Naming
+from wlr_gym.runs.excitations import EXCITATIONS
+
+#: Motion of :data:`wlr_gym.runs.excitations.EXCITATIONS` that shows an effect best.
+SHOWN_BY: Mapping[str, str] = {
+    "coulomb_friction": "random",
+    "viscous_friction": "straight",
+    "stribeck_friction": "stop_and_go",
+    "load_dependent_friction": "rear_legs",
+    "backlash": "stop_and_go",
+    "torque_ripple": "straight",
+    "weak_motor": "rear_legs",
+    "supply_sag": "steps",
+    "command_delay": "chirp",
+    "joint_zero_offset": "all_legs",
+    "friction_level": "turns",
+    "friction_asymmetry": "turns",
+    "friction_anisotropy": "turns",
+    "friction_patch": "straight",
+    "slip_weakening": "turns",
+    "tyre_creep": "straight",
+    "rolling_resistance": "straight",
+    "wheel_radius_error": "straight",
+    "payload": "all_legs",
+    "com_offset": "all_legs",
+    "floor_slope": "turns",
+    "external_force": "turns",
+    "tether": "straight",
+    "gyro_bias": "random",
+    "imu_misalignment": "random",
+    "camera_misalignment": "s_curve",
+    "camera_delay": "chirp",
+}
+
+_FRICTION = frozenset({"coulomb_friction", "viscous_friction", "stribeck_friction", "load_dependent_friction"})
+_PULL = frozenset({"floor_slope", "external_force", "tether"})
+#: One of the first and one of the second -> excitation that separates them, and why it does.
+_SEPARATED_BY: Sequence[tuple[frozenset[str], frozenset[str], str, str]] = (
+    (
+        frozenset({"rolling_resistance"}),
+        _FRICTION,
+        "straight",
+        "repeat it with extra weight on the body: rolling resistance grows with the load on a wheel, gear friction does not",
+    ),
+    (
+        frozenset({"rolling_resistance"}),
+        _PULL,
+        "turns",
+        "turn round and drive back: a pull keeps its direction on the floor, resistance turns with the robot",
+    ),
+    (
+        _PULL,
+        frozenset({"com_offset", "payload", "imu_misalignment"}),
+        "turns",
+        "a full turn on the spot: what belongs to the floor changes sign with the heading, what belongs to the body does not",
+    ),
+    (
+        frozenset({"com_offset"}),
+        frozenset({"payload"}),
+        "chirp",
+        "an extra mass also slows every acceleration down, a displaced centre does not",
+    ),
+    (
+        frozenset({"command_delay"}),
+        frozenset({"camera_delay", "backlash", "viscous_friction"}),
+        "chirp",
+        "the phase of a delay grows with frequency at full amplitude; friction and play lose amplitude",
+    ),
+    (
+        frozenset({"backlash"}),
+        frozenset({"stribeck_friction", "coulomb_friction"}),
+        "stop_and_go",
+        "reversals at two loads: play is constant in angle and vanishes under a steady load, friction is constant in torque",
+    ),
+    (
+        frozenset({"weak_motor"}),
+        frozenset({"supply_sag", "load_dependent_friction"}),
+        "rear_legs",
+        "drive and be driven: friction changes its sign with the speed, a weak motor does not; sag needs a high total current",
+    ),
+    (
+        frozenset({"wheel_radius_error"}),
+        frozenset({"camera_misalignment", "tyre_creep"}),
+        "turns",
+        "a wrong radius turns the robot where wheels differ; a wrong camera scale does not",
+    ),
+    (
+        frozenset({"friction_anisotropy", "slip_weakening"}),
+        frozenset({"friction_level", "friction_asymmetry", "tyre_creep"}),
+        "turns",
+        "spins in place at several speeds beside straight braking: lateral and longitudinal grip are used apart",
+    ),
+    (
+        frozenset({"coulomb_friction"}),
+        frozenset({"viscous_friction", "stribeck_friction"}),
+        "straight",
+        "several steady speeds, one of them near zero",
+    ),
+)
+
+
+def separating_run(names: Iterable[str]) -> str:
+    """Return, in words, the run that would tell these explanations apart; the first is the chosen one."""
+    chosen, *others = names
+    texts = []
+    for other in others:
+        for one, two, excitation, why in _SEPARATED_BY:
+            if (chosen in one and other in two) or (chosen in two and other in one):
+                texts.append(f"{excitation} ({EXCITATIONS[excitation].doc}): {why}")
+                break
+        else:
+            if chosen in SHOWN_BY:
+                texts.append(f"{SHOWN_BY[chosen]}: the motion in which {chosen} shows best")
+    return "; ".join(dict.fromkeys(texts)) or "more runs of other kinds"
+
+
+def recommend(naming: Naming, equivalent: Sequence[Sequence[str]], verdict: str) -> tuple[Recommendation, ...]:
+    """Return runs worth recording: to separate equivalents, then to show effects that these data would have missed."""
+    found: dict[str, str] = {}
+    for names in equivalent:
+        for other in names[1:]:
+            excitation = SHOWN_BY.get(names[0], "random")
+            found.setdefault(excitation, f"separates {names[0]} from {other}: {separating_run((names[0], other))}")
+    if verdict != EFFECT_FOUND:
+        blind: dict[str, list[str]] = {}
+        visible = {s.candidate.name: False for s in naming.rounds[-1].scores}
+        for score in naming.rounds[-1].scores:
+            visible[score.candidate.name] |= score.visible
+        for name, shown in visible.items():
+            if not shown and name in SHOWN_BY:
+                blind.setdefault(SHOWN_BY[name], []).append(name)
+        for excitation, names in blind.items():
+            found.setdefault(excitation, f"would show {', '.join(sorted(names))}, of which these data show nothing")
+    return tuple(Recommendation(excitation, why) for excitation, why in found.items())

@@ -1,0 +1,214 @@
+"""The rig's known numbers, the effects that may act in it, and what the compiled law reads of both.
+
+Servo: XL330-M288-T by its data sheet (ROBOTIS e-manual: stall torque 0.52 N m, no load 103 rev/min, both at 5 V). That its gear
+has dry and viscous friction is known; how much, the runs must say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym import servo
+from wlr_gym.effects.effect import EffectParameter, PatchEffect
+from wlr_gym.effects.registry import EFFECTS, UNKNOWN_EFFECT
+from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.gap.problem import Quantity, Setting, Unknown
+from wlr_gym.gap.rig import law
+from wlr_gym.gap.rig.formula import rig_force
+from wlr_gym.gap.rig.recording import FULL_DUTY, Recording
+from wlr_gym.plants import drive
+from wlr_gym.plants.forces import Force
+
+Array = NDArray[np.float64]
+Numbers = dict[str, float]
+
+#: The rig's one joint, where its effects act.
+JOINT = "servo"
+STALL_TORQUE, NO_LOAD_SPEED, DATA_SHEET_VOLTAGE = 0.52, 103 * 2 * math.pi / 60, 5.0
+#: m/s2.
+GRAVITY = 9.81
+#: Duty per rad and unit of the Position P Gain register: counts of 2 pi/4096, /256 to PWM counts (the data confirm it).
+DUTY_PER_GAIN = 4096 / (2 * math.pi) / (256 * FULL_DUTY)
+#: deg C at which the winding has its nominal resistance.
+REFERENCE_TEMPERATURE = 25.0
+#: Of the gear's teeth where it has play, N m/rad.
+TEETH_STIFFNESS = 50.0
+#: N m; a limit that no torque reaches.
+NO_TORQUE_LIMIT = 10.0
+
+#: What calibration may move. The motor is given as in its data sheet (:func:`wlr_gym.servo.motor_constants` makes torque
+#: constant and resistance of it), which says nothing of friction, rotor and delay: wide tolerances about a small servo's.
+QUANTITIES: tuple[Quantity, ...] = (
+    Quantity("stall_torque", "N m", STALL_TORQUE, 0.25 * STALL_TORQUE, 0.1, 2.0),
+    Quantity("no_load_speed", "rad/s", NO_LOAD_SPEED, 0.15 * NO_LOAD_SPEED, 3.0, 40.0),
+    Quantity("armature", "kg m2", 0.001, 0.001, 1e-5, 0.01),
+    Quantity("length_error", "m", 0.0, 0.002, -0.02, 0.02),
+    Quantity("arm_mass", "kg", 0.02, 0.02, 0.0, 0.2),
+    Quantity("delay", "s", 0.002, 0.003, -0.003, 0.05),
+    Quantity("zero", "rad", 0.0, 0.02, -0.2, 0.2),
+    Quantity("coulomb_friction", "N m", 0.03, 0.03, 0.0, 0.5),
+    Quantity("viscous_friction", "N m s/rad", 0.005, 0.01, 0.0, 0.2),
+)
+
+
+def _add(target: str, parameter: str) -> Callable[[Numbers, Mapping[str, float]], None]:
+    def apply(numbers: Numbers, values: Mapping[str, float]) -> None:
+        numbers[target] += values[parameter]
+
+    return apply
+
+
+def _multiply(target: str, parameter: str) -> Callable[[Numbers, Mapping[str, float]], None]:
+    def apply(numbers: Numbers, values: Mapping[str, float]) -> None:
+        numbers[target] *= values[parameter]
+
+    return apply
+
+
+def _put(**targets: str) -> Callable[[Numbers, Mapping[str, float]], None]:
+    def apply(numbers: Numbers, values: Mapping[str, float]) -> None:
+        numbers.update({target: values[parameter] for target, parameter in targets.items()})
+
+    return apply
+
+
+@dataclass(frozen=True)
+class RigEffect:
+    """An effect as the rig knows it.
+
+    Attributes:
+        doc: what is missing without it, and its law.
+        parameters: as in the effect library, ``prior`` being the plausible range.
+        apply: writes it into the numbers of a model.
+    """
+
+    doc: str
+    parameters: Mapping[str, EffectParameter]
+    apply: Callable[[Numbers, Mapping[str, float]], None]
+
+
+def _library(name: str, apply: Callable[[Numbers, Mapping[str, float]], None]) -> RigEffect:
+    return RigEffect(EFFECTS[name].doc, EFFECTS[name].parameters, apply)
+
+
+#: Effects by name. Those of the library have its law and parameters; the last four are the rig's own.
+RIG_EFFECTS: dict[str, RigEffect] = {
+    "coulomb_friction": _library("coulomb_friction", _add("coulomb_friction", "torque")),
+    "viscous_friction": _library("viscous_friction", _add("viscous_friction", "coefficient")),
+    "stribeck_friction": _library(
+        "stribeck_friction", _put(stribeck_torque="extra_static_torque", stribeck_speed="stribeck_speed")
+    ),
+    "load_dependent_friction": _library("load_dependent_friction", _add("load_friction", "ratio")),
+    "backlash": _library("backlash", _add("play", "angle")),
+    "torque_ripple": _library("torque_ripple", _put(ripple_amplitude="amplitude", ripple_order="order", ripple_phase="phase")),
+    "weak_motor": _library("weak_motor", _multiply("torque_scale", "scale")),
+    "command_delay": _library("command_delay", _add("delay", "delay")),
+    "torque_saturation": RigEffect(
+        "torque falls behind the current: K I / (1 + coefficient |I|)",
+        {"coefficient": EffectParameter("1/A", "loss per current", 0, 10, 0.0, (0, 2), 0.3)},
+        _add("saturation", "coefficient"),
+    ),
+    "torque_limit": RigEffect(
+        "motor torque stays below a limit: |motor torque| <= torque; the data sheet's stall torque is reached, within 15 %",
+        {"torque": EffectParameter("N m", "the limit", 0.01, NO_TORQUE_LIMIT, NO_TORQUE_LIMIT, (0.45, NO_TORQUE_LIMIT), 0.6)},
+        _put(torque_limit="torque"),
+    ),
+    "quadratic_load_friction": RigEffect(
+        "gear friction growing with the square of the motor torque: -coefficient torque^2 sign(rate)",
+        {"coefficient": EffectParameter("1/(N m)", "friction per torque squared", 0, 20, 0.0, (0, 2), 0.3)},
+        _add("quadratic_friction", "coefficient"),
+    ),
+    "warm_winding": RigEffect(
+        "resistance grows with the temperature the servo reports: R (1 + coefficient (T - 25 deg C)); copper: 0.0039/K",
+        {"coefficient": EffectParameter("1/K", "relative, per degree", -0.01, 1, 0.0, (0, 0.0045), 0.0039)},
+        _add("thermal", "coefficient"),
+    ),
+}
+_NEUTRAL: Numbers = {
+    "coulomb_friction": 0.0, "viscous_friction": 0.0, "stribeck_torque": 0.0, "stribeck_speed": 0.1, "load_friction": 0.0,
+    "play": 0.0, "ripple_amplitude": 0.0, "ripple_order": 1.0, "ripple_phase": 0.0, "torque_scale": 1.0,
+    "saturation": 0.0, "torque_limit": NO_TORQUE_LIMIT, "quadratic_friction": 0.0, "thermal": 0.0,
+}  # fmt: skip
+
+
+def unknowns(name: str) -> tuple[Unknown, ...]:
+    """Return the parameters of an effect as unknowns; their plausible range is the effect's prior."""
+    found = []
+    for key, parameter in RIG_EFFECTS[name].parameters.items():
+        low, high = parameter.prior
+        assert isinstance(parameter.neutral, float | int)
+        found.append(Unknown(key, parameter.unit, float(parameter.neutral), low, high, 0.02 * (min(high, 2.0) - low)))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class Model:
+    """Numbers of a model by name, SI, and the formula forces on its joint."""
+
+    numbers: Numbers
+    forces: tuple[Force, ...] = ()
+
+
+def model_of(setting: Setting, quantities: Sequence[Quantity], known: Sequence[PatchEffect] = ()) -> Model:
+    """Return the model of a setting: its quantities, then the effects that are known, then its own.
+
+    Raises:
+        InputError: an effect the rig does not know, a parameter missing, or a broken formula.
+    """
+    numbers = dict(_NEUTRAL)
+    numbers.update({q.name: float(value) for q, value in zip(quantities, setting.quantities, strict=True)})
+    forces = []
+    for effect in (*known, *setting.effects):
+        if effect.name == UNKNOWN_EFFECT:
+            forces.append(rig_force(effect))
+        elif effect.name in RIG_EFFECTS:
+            apply_effect(numbers, effect)
+        else:
+            raise unknown_name("effect of the test rig", effect.name, RIG_EFFECTS)
+    return Model(numbers, tuple(forces))
+
+
+def apply_effect(numbers: Numbers, effect: PatchEffect) -> None:
+    """Write one effect into ``numbers``."""
+    law_of = RIG_EFFECTS[effect.name]
+    values = {}
+    for key, parameter in law_of.parameters.items():
+        if key not in effect.parameters and not parameter.optional:
+            raise InputError(f"{effect.name}: has no '{key}' ({parameter.unit})")
+        assert isinstance(parameter.neutral, float | int)
+        values[key] = float(effect.parameters.get(key, parameter.neutral))
+    law_of.apply(numbers, values)
+
+
+def pack(models: Sequence[Model], recording: Recording, step: float) -> Array:
+    """Return what the compiled law reads (models, len(law.PARAMETERS)) for one recording's load and gain."""
+    table = {name: np.array([model.numbers[name] for model in models]) for name in models[0].numbers}
+    arm, length = table["arm_mass"], recording.length + table["length_error"]
+    armature, play = table["armature"], table["play"]
+    constant, resistance = servo.motor_constants(table["stall_torque"], table["no_load_speed"], DATA_SHEET_VOLTAGE)
+    link = (recording.mass + arm / 3.0) * length**2
+    with_rotor = link + armature
+    back_emf_damping = constant**2 / resistance
+    moved = np.where(play > 0.0, armature, with_rotor)
+    lanes = {
+        "volt_gain": constant / resistance,
+        "back_emf_damping": back_emf_damping,
+        "inverse_constant": 1.0 / constant,
+        "viscous": table["viscous_friction"],
+        "weight": drive.fitted_weight(step * (back_emf_damping * table["torque_scale"] + table["viscous_friction"]) / moved),
+        "inverse_stribeck_speed": 1.0 / table["stribeck_speed"],
+        "half_play": 0.5 * play,
+        "rotor_inertia": armature,
+        "teeth_stiffness": np.full(len(models), TEETH_STIFFNESS),
+        "teeth_damping": drive.TEETH_DAMPING * np.sqrt(TEETH_STIFFNESS * armature),
+        "gain": np.full(len(models), recording.gain * DUTY_PER_GAIN),
+        "gravity": GRAVITY * length * (recording.mass + arm / 2.0),
+        "inertia": np.where(play > 0.0, link, with_rotor),
+        "coulomb": table["coulomb_friction"],
+    }
+    return np.stack([lanes[name] if name in lanes else table[name] for name in law.PARAMETERS], axis=1)

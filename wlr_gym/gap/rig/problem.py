@@ -1,0 +1,152 @@
+"""Recordings of the test rig as a :class:`wlr_gym.gap.problem.Problem`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.effects.effect import PatchEffect
+from wlr_gym.errors import InputError
+from wlr_gym.gap.problem import Candidate, Probe, Quantity, Setting, Signal
+from wlr_gym.gap.rig.candidates import rig_candidates
+from wlr_gym.gap.rig.kernel import OUTPUTS
+from wlr_gym.gap.rig.model import QUANTITIES, model_of
+from wlr_gym.gap.rig.recording import Recording
+from wlr_gym.gap.rig.replay import Replay
+
+Array = NDArray[np.float64]
+
+#: One sigma of the encoder, rad: one of 4096 counts per turn, for rounding and for what a magnetic encoder adds to it.
+ENCODER_NOISE = 2 * math.pi / 4096
+#: Signal -> s of free simulation before it starts again from the measured state; None = the whole run.
+HORIZONS: Mapping[str, float | None] = {"position": None, "position_within_0.2s": 0.2}
+_ANGLE = OUTPUTS.index("angle")
+#: Share of the runs that is held out.
+SEALED_SHARE = 0.3
+
+
+class RigProblem:
+    """Recordings of one servo with a pendulum, and a simulator of it; see :class:`wlr_gym.gap.problem.Problem`.
+
+    Args:
+        recordings: of one servo.
+        known: effects that are in the model from the start.
+        friction_is_known: dry and viscous friction are numbers of the model. Otherwise it has none, and they are candidates.
+
+    Attributes:
+        sealed: names of the runs to hold out where the user names none.
+    """
+
+    metric = "RMS over whole runs and over windows of 0.2 s of measured-minus-replayed angle, in encoder counts"
+    #: A servo that sticks elsewhere is off by hundreds of counts, and that is the gap.
+    cap = 1e4
+    steps = 20
+    #: A replay costs milliseconds, and a joint that sticks answers far from linearly: every hypothesis is worth a whole fit.
+    thorough = True
+
+    def __init__(
+        self, recordings: Sequence[Recording], known: Sequence[PatchEffect] = (), friction_is_known: bool = True
+    ) -> None:
+        if not recordings:
+            raise InputError("no recordings to analyse")
+        self.recordings = tuple(recordings)
+        self.known = tuple(known)
+        self.runs = tuple(recording.name for recording in recordings)
+        self.signals = tuple(Signal(name, "rad", ENCODER_NOISE, "position") for name in HORIZONS)
+        self.quantities: tuple[Quantity, ...] = tuple(
+            quantity for quantity in QUANTITIES if friction_is_known or not quantity.name.endswith("friction")
+        )
+        self.sealed = spread_over_conditions(self.recordings)
+        self._replays = [Replay(recording) for recording in recordings]
+
+    def times(self, run: int) -> Array:
+        """Return the times (rows,) of a run, s."""
+        return self.recordings[run].time
+
+    def measured(self, run: int) -> Array:
+        """Return the measured angle (rows, signals), rad: the same for every horizon."""
+        return np.repeat(self.recordings[run].angle[:, None], len(self.signals), axis=1)
+
+    def simulate(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
+        """Return what the encoder would have read: (settings, rows, signals) per run, rad."""
+        models = [model_of(setting, self.quantities, self.known) for setting in settings]
+        zero = np.array([model.numbers["zero"] for model in models])[:, None]
+        found = []
+        for run in runs:
+            replay = self._replays[run]
+            found.append(
+                np.stack([replay.simulate(models, horizon)[:, :, _ANGLE] + zero for horizon in HORIZONS.values()], axis=2)
+            )
+        return found
+
+    def floor(self, setting: Setting, runs: Sequence[int]) -> float:
+        """Return the level that the model reaches on recordings it made itself, rounded to counts."""
+        made = [
+            replace(self.recordings[run], angle=np.round(angles[0, :, 0] / ENCODER_NOISE) * ENCODER_NOISE)
+            for run, angles in zip(runs, self.simulate([setting], runs), strict=True)
+        ]
+        twin = RigProblem(made, self.known, len(self.quantities) == len(QUANTITIES))
+        squares = [np.mean(r[0] ** 2) for r in twin.residuals([setting], range(len(made)))]
+        return float(np.sqrt(np.mean(squares)))
+
+    def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
+        """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`."""
+        simulated = self.simulate(settings, runs)
+        return [(self.measured(run) - angles) / ENCODER_NOISE for run, angles in zip(runs, simulated, strict=True)]
+
+    def candidates(
+        self, setting: Setting, residuals: Sequence[Array], runs: Sequence[int]
+    ) -> tuple[list[Probe], list[Candidate]]:
+        """Return the effects to try beyond ``setting``, and the probes of their first guesses."""
+        present = {effect.name for effect in (*self.known, *setting.effects)}
+        present |= {quantity.name for quantity in self.quantities}
+        return rig_candidates(present)
+
+    def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
+        """Return what residuals are mapped over, (rows,) each, units in the names."""
+        model = model_of(setting, self.quantities, self.known)
+        found: list[Mapping[str, Array]] = []
+        for run in runs:
+            recording, replay = self.recordings[run], self._replays[run]
+            values = replay.simulate([model])[0]
+            columns = {name: values[:, k] for k, name in enumerate(OUTPUTS)}
+            found.append(
+                {
+                    "angle [rad]": columns["angle"],
+                    "rate [rad/s]": columns["rate"],
+                    "motor torque [N m]": columns["motor_torque"],
+                    "voltage [V]": columns["voltage"],
+                    "time since reversal [s]": _since_reversal(recording.time, columns["rate"]),
+                    "time [s]": recording.time,
+                    "supply [V]": recording.supply,
+                    "temperature [deg C]": recording.temperature,
+                    "P gain [register]": np.full(len(recording.time), recording.gain),
+                }
+            )
+        return found
+
+    def position_errors(self, setting: Setting, runs: Sequence[int]) -> Array:
+        """Return the mean absolute error of the angle (runs,) over whole runs, rad."""
+        return np.array([float(np.abs(r[0, :, 0]).mean()) * ENCODER_NOISE for r in self.residuals([setting], runs)])
+
+
+def spread_over_conditions(recordings: Sequence[Recording], share: float = SEALED_SHARE) -> tuple[str, ...]:
+    """Return the names of runs to hold out: in turn one of every gain, each of the trajectory that is held out least so far."""
+    gains = sorted({recording.gain for recording in recordings})
+    chosen: list[Recording] = []
+    for turn in range(math.ceil(share * len(recordings))):
+        left = [recording for recording in recordings if recording not in chosen]
+        left = [recording for recording in left if recording.gain == gains[turn % len(gains)]] or left
+        held = [recording.trajectory for recording in chosen]
+        chosen.append(min(left, key=lambda recording: held.count(recording.trajectory)))
+    return tuple(recording.name for recording in recordings if recording in chosen)
+
+
+def _since_reversal(time: Array, rate: Array) -> Array:
+    """Seconds since the rate last changed its sign, or since the start."""
+    turned = np.concatenate([[True], np.diff(np.sign(rate)) != 0])
+    return time - np.maximum.accumulate(np.where(turned, time, -np.inf))

@@ -1,0 +1,364 @@
+"""The effects that may be missing in the robot: every effect of the library at every place and set of places worth a name.
+
+First guesses come from projecting the measured gap on simulated responses. A place's response serves every set that holds it,
+so all sets cost no more than the single places. Effects that add to a number which calibration may move too (dry friction,
+wheel radius, ...) need no probe of their own: they are the same response without the tolerance.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.effects import EFFECTS, PatchEffect
+from wlr_gym.gap.problem import Candidate, Probe, Start, Unknown
+from wlr_gym.parameters import Parameters
+from wlr_gym.robot import JOINTS, LEGS, WHEELS
+from wlr_gym.runs.format import CHANNELS
+
+Array = NDArray[np.float64]
+
+#: Sets of places that have a common cause, and how likely they are beside a single one.
+_LEG_SETS = tuple(tuple(LEGS[k] for k in pick) for pick in ((0, 1), (2, 3), (0, 2), (1, 3), (0, 1, 2, 3)))
+_WHEEL_SETS = tuple(tuple(WHEELS[k] for k in pick) for pick in ((0, 1), (2, 3), (0, 2), (1, 3), (0, 1, 2, 3)))
+_OF_LEGS = (*((leg,) for leg in LEGS), *_LEG_SETS)
+_OF_WHEELS = (*((wheel,) for wheel in WHEELS), *_WHEEL_SETS)
+_OF_JOINTS = (*_OF_LEGS, *_OF_WHEELS, tuple(JOINTS))
+#: Periods per turn at which a ripple is looked for.
+ORDERS = range(1, 65)
+#: m; width of the strips of floor in which another friction is looked for.
+STRIP = 0.15
+#: Across, a patch has no end.
+UNBOUNDED = {
+    "y_min": EFFECTS["friction_patch"].parameters["y_min"].low,
+    "y_max": EFFECTS["friction_patch"].parameters["y_max"].high,
+}
+#: Most strips; a longer floor gets wider ones.
+MOST_STRIPS = 24
+
+
+@dataclass
+class _Lists:
+    probes: list[Probe]
+    candidates: list[Candidate]
+
+    def probe(self, name: str, where: Sequence[str], parameters: dict[str, float], note: str = "") -> str:
+        key = " ".join([name, *where, note]).strip()
+        self.probes.append(Probe(key, (PatchEffect(name, tuple(where), parameters),)))
+        return key
+
+    def add(self, name: str, where: Sequence[str], starts: Iterable[Start], robot_mu: float = 0.6) -> None:
+        self.candidates.append(Candidate(name, tuple(where), unknowns(name, robot_mu), tuple(starts)))
+
+
+def unknowns(name: str, mu: float) -> tuple[Unknown, ...]:
+    """Return the parameters of a library effect as unknowns; their plausible range is the effect's prior."""
+    found = []
+    for key, spec in EFFECTS[name].parameters.items():
+        neutral = spec.neutral if isinstance(spec.neutral, float | int) else mu
+        low, high = spec.prior
+        step = 0.05 * (high - low)
+        found.append(Unknown(key, spec.unit, float(neutral), low, high, step))
+    return tuple(found)
+
+
+def robot_candidates(
+    parameters: Parameters, measured: Sequence[Array], residuals: Sequence[Array]
+) -> tuple[list[Probe], list[Candidate]]:
+    """Return probes and candidates beyond a calibrated model.
+
+    Args:
+        parameters: (1) of the model.
+        measured: (rows, signals) per run.
+        residuals: of the model, (rows, signals) per run.
+    """
+    lists = _Lists([], [])
+    mu = float(parameters["ground.mu_x"].mean())
+    _friction_and_motors(lists)
+    _backlash(lists)
+    _ripple(lists, measured, residuals)
+    _ground(lists, mu)
+    _patch(lists, mu, measured)
+    _loads(lists)
+    _sensors(lists)
+    return lists.probes, lists.candidates
+
+
+def _scaled(amount: float, neutral: float = 0.0) -> Callable[[Array], tuple[float, ...]]:
+    return lambda amplitude: (neutral + amount * float(amplitude[0]),)
+
+
+def _per_place(
+    lists: _Lists,
+    name: str,
+    sets: Sequence[tuple[str, ...]],
+    parameter: str,
+    sizes: Sequence[float],
+    neutral: float = 0.0,
+    fixed: dict[str, float] | None = None,
+    note: str = "",
+) -> dict[tuple[str, ...], list[Start]]:
+    """Probe every single place at every size; return the starts of every set."""
+    singles = [places[0] for places in sets if len(places) == 1]
+    starts: dict[tuple[str, ...], list[Start]] = {places: [] for places in sets}
+    for size in sizes:
+        label = f"{note} {size:g}".strip()
+        keys = {s: lists.probe(name, (s,), {parameter: neutral + size, **(fixed or {})}, label) for s in singles}
+        for places in sets:
+            own = tuple(keys[place] for place in places if place in keys)
+            starts[places].append(Start((own,), _scaled(size, neutral)))
+    return starts
+
+
+def _friction_and_motors(lists: _Lists) -> None:
+    for name, _parameter, quantity, sigma in (
+        ("coulomb_friction", "torque", "servo.coulomb_friction", {"leg": 0.025, "wheel": 0.0075}),
+        ("viscous_friction", "coefficient", "servo.viscous_friction", {"leg": 0.01, "wheel": 0.002}),
+    ):
+        for places in _OF_LEGS + _OF_WHEELS:
+            amount = sigma["leg" if places[0] in LEGS else "wheel"]
+            direction = tuple(f"{quantity}[{place}]" for place in places)
+            lists.add(name, places, [Start((direction,), _scaled(amount))])
+    for places, starts in _per_place(lists, "load_dependent_friction", _OF_JOINTS, "ratio", [0.1]).items():
+        lists.add("load_dependent_friction", places, starts)
+    for places, starts in _per_place(lists, "weak_motor", _OF_JOINTS[:-1], "scale", [-0.1], 1.0).items():
+        lists.add("weak_motor", places, starts)
+    for places, starts in _per_place(lists, "command_delay", _OF_JOINTS, "delay", [0.015]).items():
+        lists.add("command_delay", places, starts)
+    for kind in (_OF_LEGS, _OF_WHEELS):
+        found: dict[tuple[str, ...], list[Start]] = {places: [] for places in kind}
+        for speed in (0.1, 1.0):
+            amount = 0.1 if kind is _OF_LEGS else 0.02
+            more = _per_place(
+                lists,
+                "stribeck_friction",
+                kind,
+                "extra_static_torque",
+                [amount],
+                0.0,
+                {"stribeck_speed": speed},
+                f"at {speed:g}",
+            )
+            for places in kind:
+                found[places].append(Start(more[places][0].directions, lambda a, s=speed, t=amount: (t * float(a[0]), s)))
+        for places in kind:
+            lists.add("stribeck_friction", places, found[places])
+    sag = lists.probe("supply_sag", ("body",), {"resistance": 0.2})
+    lists.add("supply_sag", ("body",), [Start(((sag,),), _scaled(0.2))])
+
+
+def _backlash(lists: _Lists) -> None:
+    for places, starts in _per_place(lists, "backlash", _OF_LEGS + _OF_WHEELS, "angle", [0.01, 0.03]).items():
+        lists.add("backlash", places, starts)
+
+
+def _ripple(lists: _Lists, measured: Sequence[Array], residuals: Sequence[Array]) -> None:
+    """One candidate per joint, at the period that its own residuals show best."""
+    for joint in JOINTS:
+        order = ripple_order(joint, measured, residuals)
+        amount = 0.05 if joint in LEGS else 0.02
+        keys = [
+            lists.probe(
+                "torque_ripple", (joint,), {"amplitude": amount, "order": order, "phase": phase}, f"{order:g} {phase:.2f}"
+            )
+            for phase in (0.0, math.pi / 2)
+        ]
+
+        def values(a: Array, amount: float = amount, order: float = order) -> tuple[float, ...]:
+            return amount * float(a[0]), amount * float(a[1]), order
+
+        bound = EFFECTS["torque_ripple"].parameters["amplitude"].prior[1]
+        waves = tuple(Unknown(name, "N m", 0.0, -bound, bound, amount) for name in ("sine", "cosine"))
+        period = Unknown("order", "-", order, order - 0.5, order + 0.5, 0.02)
+        start = Start(((keys[0],), (keys[1],)), values)
+        lists.candidates.append(Candidate("torque_ripple", (joint,), (*waves, period), (start,), convert=_ripple_parameters))
+
+
+def ripple_order(joint: str, measured: Sequence[Array], residuals: Sequence[Array]) -> float:
+    """Return the number of periods per turn that explains most of a joint's residuals of speed and effort."""
+    angle = CHANNELS.index(f"pos_{joint}")
+    power = np.zeros(len(ORDERS))
+    for name in (f"vel_{joint}", f"eff_{joint}"):
+        column = CHANNELS.index(name)
+        for seen, residual in zip(measured, residuals, strict=True):
+            known = np.isfinite(residual[:, column]) & np.isfinite(seen[:, angle])
+            if known.sum() < 20:
+                continue
+            waves = np.exp(1j * np.outer(list(ORDERS), seen[known, angle]))
+            waves -= waves.mean(axis=1, keepdims=True)
+            left = residual[known, column] - residual[known, column].mean()
+            power += np.abs(waves @ left) ** 2 / np.maximum((np.abs(waves) ** 2).sum(axis=1), 1e-9)
+    return float(list(ORDERS)[int(np.argmax(power))])
+
+
+def _ground(lists: _Lists, mu: float) -> None:
+    lists.add("friction_level", ("ground",), [Start((("ground.mu",),), lambda a: (mu + 0.06 * float(a[0]),))], mu)
+    less = -0.25 * mu
+    singles = {w: lists.probe("friction_asymmetry", (w,), {"mu": mu + less}) for w in WHEELS}
+    for places in _OF_WHEELS[:-1]:
+        keys = tuple(singles[place] for place in places)
+        lists.add("friction_asymmetry", places, [Start((keys,), _scaled(less, mu))], mu)
+    ratio = lists.probe("friction_anisotropy", ("ground",), {"ratio": 0.8})
+    lists.add("friction_anisotropy", ("ground",), [Start(((ratio,),), _scaled(-0.2, 1.0))])
+    starts = []
+    for speed in (0.05, 0.3):
+        key = lists.probe("slip_weakening", ("ground",), {"mu_k": 0.8 * mu, "slip_speed": speed}, f"{speed:g}")
+        starts.append(Start(((key,),), lambda a, s=speed: (mu * (1 - 0.2 * float(a[0])), s)))
+    lists.add("slip_weakening", ("ground",), starts, mu)
+    for name, parameter, size in (("rolling_resistance", "coefficient", 0.02), ("tyre_creep", "creep_speed", 0.02)):
+        for places, found in _per_place(lists, name, _OF_WHEELS, parameter, [size]).items():
+            lists.add(name, places, found)
+    for places in _OF_WHEELS:
+        direction = tuple(f"wheel.radius[{place}]" for place in places)
+        lists.add("wheel_radius_error", places, [Start((direction,), _scaled(0.005, 1.0))])
+    slope = math.radians(0.2)
+    lists.add(
+        "floor_slope",
+        ("ground",),
+        [Start((("ground.slope[pitch]",), ("ground.slope[roll]",)), lambda a: (slope * float(a[0]), slope * float(a[1])))],
+    )
+
+
+def _patch(lists: _Lists, mu: float, measured: Sequence[Array]) -> None:
+    """Strips of floor across x: a patch starts as the best run of neighbouring strips."""
+    x = CHANNELS.index("cam_x")
+    reached = np.concatenate([seen[np.isfinite(seen[:, x]), x] for seen in measured])
+    if reached.size == 0 or np.ptp(reached) < STRIP:
+        return
+    low, high = reached.min() - 0.2, reached.max() + 0.2
+    edges = np.linspace(low, high, min(MOST_STRIPS, math.ceil((high - low) / STRIP)) + 1)
+    less = -0.25 * mu
+    keys = [
+        lists.probe("friction_patch", ("ground",), {"mu": mu + less, "x_min": a, "x_max": b, **UNBOUNDED}, f"{a:.2f}")
+        for a, b in itertools.pairwise(edges)
+    ]
+    found = []
+    for first in range(len(keys)):
+        for last in range(first, min(len(keys), first + 12)):
+            a, b = float(edges[first]), float(edges[last + 1])
+            found.append(Start((tuple(keys[first : last + 1]),), lambda w, a=a, b=b: (mu + less * float(w[0]), a, b)))
+    level = next(unknown for unknown in unknowns("friction_patch", mu) if unknown.name == "mu")
+    edges_of_patch = tuple(Unknown(name, "m", 0.0, low - 10.0, high + 10.0, 0.02) for name in ("x_min", "x_max"))
+    lists.candidates.append(Candidate("friction_patch", ("ground",), (level, *edges_of_patch), tuple(found), fixed=UNBOUNDED))
+
+
+def _loads(lists: _Lists) -> None:
+    mass = 0.15
+    keys = [lists.probe("payload", ("body",), {"mass": mass, "x": 0.0, "y": 0.0, "z": 0.0}, "centre")]
+    for axis in "xyz":
+        place = {"x": 0.0, "y": 0.0, "z": 0.0, axis: 0.1}
+        keys.append(lists.probe("payload", ("body",), {"mass": mass, **place}, axis))
+
+    arm = 0.1 * mass
+    lists.candidates.append(
+        Candidate(
+            "payload",
+            ("body",),
+            (
+                Unknown("mass", "kg", 0.0, 0.0, 2.0, 0.1),
+                *(Unknown(f"moment_{axis}", "kg m", 0.0, -0.2, 0.2, 0.01) for axis in "xyz"),
+            ),
+            (
+                Start(
+                    tuple((key,) for key in keys),
+                    lambda a: (max(mass * float(a.sum()), 0.0), *(float(v) for v in arm * a[1:])),
+                ),
+            ),
+            convert=_load,
+        )
+    )
+    offset = 0.003
+    lists.add(
+        "com_offset",
+        ("body",),
+        [Start(tuple((f"body.com_offset[{axis}]",) for axis in "xyz"), lambda a: tuple(float(v) for v in offset * a))],
+    )
+    force = 0.5
+    pulls = [
+        lists.probe("external_force", ("body",), {"fx": fx, "fy": fy}, f"{fx:g} {fy:g}")
+        for fx, fy in ((force, 0.0), (0.0, force))
+    ]
+    lists.add(
+        "external_force", ("body",), [Start(tuple((key,) for key in pulls), lambda a: tuple(float(v) for v in force * a))]
+    )
+    spring = lists.probe("tether", ("body",), {"stiffness": 1.0, "x": 0.0, "y": 0.0})
+
+    lists.candidates.append(
+        Candidate(
+            "tether",
+            ("body",),
+            (
+                Unknown("stiffness", "N/m", 0.0, 0.0, 20.0, 0.5),
+                *(Unknown(f"pull_{axis}", "N", 0.0, -20.0, 20.0, 0.2) for axis in "xy"),
+            ),
+            (
+                Start(
+                    ((spring,), *((key,) for key in pulls)),
+                    lambda a: (max(float(a[0]), 0.0), *(float(v) for v in force * a[1:])),
+                ),
+            ),
+            convert=_tether,
+        )
+    )
+
+
+def _load(values: Sequence[float]) -> dict[str, float]:
+    """Mass and place of a load from its mass and moments; a load of no mass is nowhere."""
+    mass = max(float(values[0]), 1e-6)
+    places = {axis: float(np.clip(moment / mass, -0.5, 0.5)) for axis, moment in zip("xyz", values[1:], strict=True)}
+    return {"mass": mass, **places}
+
+
+def _tether(values: Sequence[float]) -> dict[str, float]:
+    """Stiffness and anchor from stiffness and the pull at the floor's origin."""
+    stiffness = max(float(values[0]), 1e-6)
+    return {
+        "stiffness": stiffness,
+        **{axis: float(np.clip(pull / stiffness, -1e3, 1e3)) for axis, pull in zip("xy", values[1:], strict=True)},
+    }
+
+
+def _ripple_parameters(values: Sequence[float]) -> dict[str, float]:
+    """Amplitude and phase from the two waves a ripple is made of."""
+    sine, cosine, order = map(float, values)
+    return {"amplitude": math.hypot(sine, cosine), "order": order, "phase": math.atan2(cosine, sine)}
+
+
+def _sensors(lists: _Lists) -> None:
+    zero = math.radians(0.5)
+    for places in _OF_LEGS:
+        direction = tuple(f"joint.zero_offset[{place}]" for place in places)
+        lists.add("joint_zero_offset", places, [Start((direction,), _scaled(zero))])
+    bias = 0.0009
+    lists.add(
+        "gyro_bias",
+        ("sensor",),
+        [Start(tuple((f"imu.gyro_bias[{axis}]",) for axis in "xyz"), lambda a: tuple(float(v) for v in bias * a))],
+    )
+    turn = 0.03
+    keys = [
+        lists.probe("imu_misalignment", ("sensor",), {**dict.fromkeys(("roll", "pitch", "yaw"), 0.0), axis: turn}, axis)
+        for axis in ("roll", "pitch", "yaw")
+    ]
+    lists.add(
+        "imu_misalignment",
+        ("sensor",),
+        [Start(tuple((key,) for key in keys), lambda a: tuple(float(v) for v in turn * a))],
+    )
+    scale = lists.probe("camera_misalignment", ("sensor",), {"yaw": 0.0, "scale": 1.02})
+    lists.add(
+        "camera_misalignment",
+        ("sensor",),
+        [
+            Start(
+                (("camera.mount_yaw",), (scale,)),
+                lambda a: (math.radians(0.5) * float(a[0]), 1.0 + 0.02 * float(a[1])),
+            )
+        ],
+    )
+    lists.add("camera_delay", ("sensor",), [Start((("camera.delay",),), _scaled(0.01))])

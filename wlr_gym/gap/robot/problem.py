@@ -1,0 +1,208 @@
+"""The robot's measured runs as a :class:`wlr_gym.gap.problem.Problem`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.effects import Patch, Source, apply_patch, load_patch
+from wlr_gym.errors import InputError
+from wlr_gym.gap.problem import Candidate, Probe, Quantity, Setting, Signal
+from wlr_gym.gap.prove import level, mean_squares
+from wlr_gym.gap.robot.candidates import robot_candidates
+from wlr_gym.gap.robot.formulas import formula_candidates
+from wlr_gym.gap.robot.quantities import Knob, knobs, write
+from wlr_gym.gap.robot.simulate import TRUTH, Replays, RunClock, replay_batch
+from wlr_gym.gap.robot.windows import WINDOW, anchored_residuals
+from wlr_gym.parameters import Parameters
+from wlr_gym.plants.base import TRUTH_LAYOUT
+from wlr_gym.plants.forces import Force
+from wlr_gym.random import generator
+from wlr_gym.robot import JOINTS, WHEELS, Robot
+from wlr_gym.runs.format import CHANNELS, COLUMNS
+from wlr_gym.runs.noise import channel_noise, noise_parts
+from wlr_gym.runs.read import Run
+from wlr_gym.runs.replay import profile_parameters, robot_of
+
+Array = NDArray[np.float64]
+
+
+#: Noise units beyond which a residual counts no more in the gap's numbers, and Gauss-Newton steps of a fit.
+CAP, STEPS = 50.0, 4
+
+
+class RobotProblem:
+    """Measured runs of the robot, and a simulator of it; see :class:`wlr_gym.gap.problem.Problem`.
+
+    Args:
+        runs: of one robot, with one servo profile.
+        robot: None = the one the runs' meta data name.
+        known: effects that are known already, part of the model from the start.
+        backend: the simulator.
+        window: s between two anchors.
+        threads: worker threads.
+
+    Raises:
+        InputError: no runs, or runs with different servo profiles.
+    """
+
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        robot: Robot | None = None,
+        known: Source = None,
+        backend: str = "gibbs_appell",
+        window: float = WINDOW,
+        threads: int = 1,
+    ) -> None:
+        if not runs:
+            raise InputError("no runs to analyse")
+        self.metric = f"RMS over channels of measured minus replayed, in units of sensor noise, windows of {window:g} s"
+        profiles = {run.meta.profile for run in runs}
+        if len(profiles) > 1:
+            raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
+        self.cap, self.steps = CAP, STEPS
+        self.thorough, self.sealed = False, ()
+        self.robot = robot or robot_of(runs[0])
+        self.known = load_patch(known)
+        self.backend, self.threads = backend, threads
+        self.clocks = [RunClock(run, window) for run in runs]
+        self.runs = tuple(run.name for run in runs)
+        self._knobs: tuple[Knob, ...] = knobs(self.robot)
+        self.quantities: tuple[Quantity, ...] = tuple(knob.quantity for knob in self._knobs)
+        noise = channel_noise(self.robot)
+        self.signals = tuple(Signal(name, COLUMNS[name].unit, noise[name], COLUMNS[name].group) for name in CHANNELS)
+        self._noise = np.array([signal.noise for signal in self.signals])
+        split = noise_parts(self.robot)
+        self._analogue, self._count = (np.array([split[name][k] for name in CHANNELS]) for k in (0, 1))
+        self._window = window
+        self._base = profile_parameters(Parameters.nominal(self.robot), runs[0].meta.profile)
+        self._measured = [
+            np.stack([run[name] if name in run else np.full(len(run["t"]), np.nan) for name in CHANNELS], axis=1)
+            for run in runs
+        ]
+
+    def times(self, run: int) -> Array:
+        """Return the times (rows,) of a run, s."""
+        return self.clocks[run].t
+
+    def measured(self, run: int) -> Array:
+        """Return what was measured (rows, signals), SI; NaN where not."""
+        return self._measured[run]
+
+    def parameters(self, settings: Sequence[Setting]) -> Parameters:
+        """Return the parameter table of every setting."""
+        table = Parameters(np.repeat(self._base.values, len(settings), axis=0))
+        write(self._knobs, np.stack([setting.quantities for setting in settings]), table)
+        for row, setting in enumerate(settings):
+            effects = (*self.known.effects, *setting.effects)
+            if effects:
+                one = apply_patch(Patch(effects), Parameters(table.values[row : row + 1]))
+                table.values[row] = one.values[0]
+        return table
+
+    def simulate(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
+        """Return what the sensors would have read: (settings, rows, signals) per run, SI."""
+        plain = [k for k, setting in enumerate(settings) if not Patch((*self.known.effects, *setting.effects)).forces]
+        formulas = [k for k in range(len(settings)) if k not in set(plain)]
+        results = [np.zeros((len(settings), len(self.times(r)), len(CHANNELS))) for r in runs]
+        for members in (plain, formulas):
+            if members:
+                chosen = [settings[k] for k in members]
+                for result, replays in zip(results, self._replay(chosen, runs), strict=True):
+                    result[members] = replays.values
+        return results
+
+    def _replay(self, settings: Sequence[Setting], runs: Sequence[int], with_truth: bool = False) -> list[Replays]:
+        forces, constants = self._forces(settings)
+        clocks = [self.clocks[r] for r in runs]
+        table = self.parameters(settings)
+        return replay_batch(self.robot, clocks, table, self.backend, forces, constants, with_truth, self.threads)
+
+    def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
+        """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`."""
+        return [
+            anchored_residuals(self._measured[r], simulated, self._noise, self.clocks[r].windows)
+            for r, simulated in zip(runs, self.simulate(settings, runs), strict=True)
+        ]
+
+    def floor(self, setting: Setting, runs: Sequence[int]) -> float:
+        """Return the level that the model reaches on data it made itself, with the robot's sensors."""
+        made = [self._made(setting, r) for r in runs]
+        twin = RobotProblem(made, self.robot, self.known, self.backend, self._window, self.threads)
+        return level(mean_squares([r[0] for r in twin.residuals([setting], range(len(made)))], CAP))
+
+    def _made(self, setting: Setting, r: int) -> Run:
+        """Return run ``r`` as the model would have recorded it: whole, without anchors, noisy and rounded."""
+        clock = RunClock(self.clocks[r].run, window=math.inf)
+        forces, constants = self._forces([setting])
+        values = replay_batch(self.robot, [clock], self.parameters([setting]), self.backend, forces, constants)[0].values[0]
+        rng = generator(r, "gap", "floor")
+        table = clock.run.table.copy()
+        for c, signal in enumerate(self.signals):
+            if signal.name not in clock.run:
+                continue
+            noisy = values[:, c] + self._analogue[c] * rng.standard_normal(len(values))
+            count = self._count[c]
+            rounded = np.round(noisy / count) * count if count > 0.0 else noisy
+            table[signal.name] = np.where(np.isfinite(self._measured[r][:, c]), rounded, np.nan)
+        return replace(clock.run, table=table)
+
+    def candidates(
+        self, setting: Setting, residuals: Sequence[Array], runs: Sequence[int]
+    ) -> tuple[list[Probe], list[Candidate]]:
+        """Return the effects of the library and the formulas to try, and their probes."""
+        parameters = self.parameters([setting])
+        measured = [self._measured[r] for r in runs]
+        probes, candidates = robot_candidates(parameters, measured, residuals)
+        more, formulas = formula_candidates()
+        return [*probes, *more], [*candidates, *formulas]
+
+    def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
+        """Return joint speeds, loads, slip and place over the rows of each run."""
+        found = self._replay([setting], runs, with_truth=True)
+        return [_features(replays.truth[0]) for replays in found if replays.truth is not None]
+
+    def _forces(self, settings: Sequence[Setting]) -> tuple[tuple[Force, ...], Array]:
+        """Every formula force that some setting has, and its constants per setting: zero, hence no force, where one lacks it.
+
+        The same formula twice at one place is one with the sum of the constants: the formulas tried are linear in them.
+        """
+        own = [Patch((*self.known.effects, *setting.effects)).forces for setting in settings]
+        samples = {(force.where, repr(force.formula)): force for forces in own for force in forces}
+        start = dict(zip(samples, np.cumsum([0, *(len(f.parameters) for f in samples.values())]).tolist(), strict=False))
+        constants = np.zeros((len(settings), sum(len(f.parameters) for f in samples.values())))
+        for row, forces in zip(constants, own, strict=True):
+            for force in forces:
+                first = start[force.where, repr(force.formula)]
+                row[first : first + len(force.parameters)] += list(force.parameters.values())
+        return tuple(samples.values()), constants
+
+
+def _features(truth: Array) -> Mapping[str, Array]:
+    """Name the columns of :data:`TRUTH` by joint and wheel."""
+    features: dict[str, Array] = {}
+    at = 0
+    for name in TRUTH:
+        size = len(TRUTH_LAYOUT.channels[name].elements)
+        features |= {element: truth[:, at + k] for k, element in enumerate(TRUTH_LAYOUT.channels[name].elements)}
+        at += size
+    for joint in JOINTS:
+        rate = features[f"joint_velocity[{joint}]"]
+        features[f"time_since_reversal[{joint}]"] = _since_reversal(rate)
+    for wheel in WHEELS:
+        along, across = features[f"slip_velocity[{wheel},x]"], features[f"slip_velocity[{wheel},y]"]
+        features[f"slip_speed[{wheel}]"] = np.hypot(along, across)
+    return features
+
+
+def _since_reversal(rate: Array) -> Array:
+    """Rows since the sign of a rate last changed."""
+    changed = np.flatnonzero(np.diff(np.sign(rate)) != 0) + 1
+    last = np.zeros(len(rate))
+    last[changed] = changed
+    return np.arange(len(rate)) - np.maximum.accumulate(last)

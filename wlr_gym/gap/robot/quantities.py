@@ -1,0 +1,115 @@
+"""Which numbers of the robot calibration may move: those its file gives a tolerance, and the biases of its IMU."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.errors import InputError
+from wlr_gym.gap.problem import Quantity
+from wlr_gym.parameters import SPECS, TABLE, Parameters
+from wlr_gym.robot import LEGS, Robot
+
+Array = NDArray[np.float64]
+
+#: Tolerances that move several numbers as one: a floor is one floor, a host's latency one latency.
+SHARED = {"ground.mu": ("ground.mu_x", "ground.mu_y"), "command.delay": ("command.delay",)}
+#: Numbers of the contact spring, of which the robot's file has a guess and no tolerance: one sigma, relative, all wheels alike.
+GUESSED = {"ground.normal_stiffness": 0.2, "ground.normal_damping": 0.5}
+#: Tolerances by which calibration may move a number; what needs more is a missing effect. Biases of the IMU are drawn each time
+#: it is switched on, and from no one's workshop: they get more room.
+REACH, REACH_OF_BIAS = 2.5, 4.0
+#: m/s; one sigma of the creep that any tyre has, all wheels alike: an effect is what goes beyond.
+CREEP = 0.001
+#: A leg's own inertia is a hundredth of its rotor's: no run shows it.
+UNSEEN = ("leg.inertia",)
+_AMOUNT = re.compile(r"\s*(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|\.\d+)\s*([^(,\d]+?)\s*(?:\((legs|wheels)\))?\s*(?:,|$)")
+_UNITS = {
+    "m": 1.0,
+    "mm": 1e-3,
+    "s": 1.0,
+    "ms": 1e-3,
+    "rad": 1.0,
+    "deg": math.radians(1.0),
+    "kg": 1.0,
+    "N m": 1.0,
+    "N m s/rad": 1.0,
+    "V": 1.0,
+}
+
+
+@dataclass(frozen=True)
+class Knob:
+    """A quantity, and the elements of the parameter table that it sets."""
+
+    quantity: Quantity
+    elements: tuple[str, ...]
+
+
+def knobs(robot: Robot) -> tuple[Knob, ...]:
+    """Return what calibration may move, from the robot's tolerances.
+
+    Raises:
+        InputError: a tolerance that cannot be read.
+    """
+    nominal = Parameters.nominal(robot)
+    found: list[Knob] = []
+    for key, elements in SHARED.items():
+        if key in robot.tolerances:
+            targets = tuple(element for name in elements for element in SPECS[name].elements)
+            found.append(_knob(key, targets, nominal, robot))
+    for spec in TABLE:
+        if spec.tolerance in robot.tolerances and spec.tolerance not in (*UNSEEN, *SHARED):
+            found += [_knob(spec.tolerance, (element,), nominal, robot) for element in spec.elements]
+    for name, share in GUESSED.items():
+        spec, value = SPECS[name], float(nominal[name].mean())
+        found.append(Knob(_quantity(name, name, value, share * value), tuple(spec.elements)))
+    creep = SPECS["ground.creep_speed"]
+    found.append(Knob(_quantity(creep.name, creep.name, 0.0, CREEP), tuple(creep.elements)))
+    imu = robot.sensors.imu
+    for name, sigma in (("imu.gyro_bias", imu.gyro_bias), ("imu.accel_bias", imu.accel_bias)):
+        spec = SPECS[name]
+        found += [Knob(_quantity(e, name, 0.0, sigma, REACH_OF_BIAS), (e,)) for e in spec.elements]
+    return tuple(found)
+
+
+def _knob(key: str, elements: tuple[str, ...], nominal: Parameters, robot: Robot) -> Knob:
+    name = elements[0] if len(elements) == 1 else key
+    spec = SPECS[elements[0].partition("[")[0]]
+    value = float(nominal[elements[0]][0])
+    label = elements[0].partition("[")[2].rstrip("]")
+    sigma = tolerance(robot.tolerances[key], value, "legs" if label in LEGS else "wheels", f"tolerances.{key}")
+    return Knob(_quantity(name, spec.name, value, sigma), elements)
+
+
+def _quantity(name: str, parameter: str, nominal: float, sigma: float, reach: float = REACH) -> Quantity:
+    spec = SPECS[parameter]
+    return Quantity(
+        name, spec.unit, nominal, sigma, max(spec.low, nominal - reach * sigma), min(spec.high, nominal + reach * sigma)
+    )
+
+
+def tolerance(entry: float | str, nominal: float, kind: str, place: str) -> float:
+    """Return one sigma: a number is relative; a text has a unit, and may differ between legs and wheels.
+
+    Raises:
+        InputError: neither.
+    """
+    if not isinstance(entry, str):
+        return float(entry) * abs(nominal)
+    for amount, unit, group in _AMOUNT.findall(entry):
+        if group in ("", kind) and unit in _UNITS:
+            return float(amount) * _UNITS[unit]
+    raise InputError(f"{place} = {entry!r}: expected a number, or a number with its unit ({', '.join(_UNITS)})")
+
+
+def write(knobs: Sequence[Knob], values: Array, parameters: Parameters) -> None:
+    """Write quantities (settings, len(knobs)) into a batch of parameters."""
+    for knob, column in zip(knobs, values.T, strict=True):
+        for element in knob.elements:
+            parameters[element] = column

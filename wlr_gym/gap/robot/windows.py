@@ -1,0 +1,81 @@
+"""Residuals that do not depend on where a window starts.
+
+Pose and wheel angles are integrals: an error, once made, stays in them. The residuals of a run are therefore taken window by
+window, and each window's own pose (x, y, heading) and wheel angles are fitted and removed. What is left says what went wrong
+within the window.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.robot import JOINTS
+from wlr_gym.runs.format import CHANNELS
+
+Array = NDArray[np.float64]
+
+#: s.
+WINDOW = 2.0
+_X, _Y, _YAW, _PITCH = (CHANNELS.index(f"cam_{name}") for name in ("x", "y", "yaw", "pitch"))
+_WHEELS = [CHANNELS.index(f"pos_{joint}") for joint in JOINTS[4:]]
+
+
+def window_rows(t: Array, length: float = WINDOW) -> list[slice]:
+    """Cut a run into windows of equal length near ``length``."""
+    count = max(1, round(float(t[-1] - t[0]) / length))  # one window where the length is infinite
+    edges = np.searchsorted(t, np.linspace(t[0], t[-1] + 1e-9, count + 1))
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+
+
+def anchored_residuals(measured: Array, simulated: Array, noise: Array, windows: list[slice]) -> Array:
+    """Return (measured - simulated) / noise with every window's own pose and wheel angles taken out.
+
+    Args:
+        measured: (rows, len(CHANNELS)); NaN where not measured.
+        simulated: (settings, rows, len(CHANNELS)).
+        noise: (len(CHANNELS)) one sigma.
+        windows: rows of each window.
+    """
+    residual = measured - simulated
+    residual[:, :, _PITCH] = _wrapped(residual[:, :, _PITCH])
+    for window in windows:
+        residual[:, window, _WHEELS[0] : _WHEELS[-1] + 1] -= np.nanmean(
+            residual[:, window, _WHEELS[0] : _WHEELS[-1] + 1], axis=1, keepdims=True
+        )
+        _take_out_pose(measured[window], simulated[:, window], residual[:, window], noise)
+    return residual / noise
+
+
+def _take_out_pose(measured: Array, simulated: Array, residual: Array, noise: Array) -> None:
+    """Move each simulated window rigidly onto the measured one, and write what is left of x, y and heading."""
+    seen = np.flatnonzero(np.isfinite(measured[:, [_X, _Y, _YAW]]).all(axis=1))
+    residual[:, :, [_X, _Y, _YAW]] = np.nan
+    if seen.size < 2:
+        return
+    x, y = simulated[:, seen, _X], simulated[:, seen, _Y]
+    x, y = x - x.mean(axis=1, keepdims=True), y - y.mean(axis=1, keepdims=True)
+    mx, my = measured[seen, _X] - measured[seen, _X].mean(), measured[seen, _Y] - measured[seen, _Y].mean()
+    yaw = _wrapped(measured[seen, _YAW] - simulated[:, seen, _YAW])
+    yaw = np.unwrap(yaw, axis=1)
+    turn = yaw.mean(axis=1, keepdims=True)
+    path, heading = 1.0 / noise[_X] ** 2, 1.0 / noise[_YAW] ** 2
+    for _ in range(2):  # Gauss-Newton for one angle; the second pass is already exact to 1e-6
+        tx, ty = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
+        ex, ey, ew = mx - tx, my - ty, yaw - turn
+        slope = path * (ex * -ty + ey * tx).sum(axis=1) + heading * ew.sum(axis=1)
+        curve = path * (tx * tx + ty * ty).sum(axis=1) + heading * seen.size
+        turn = turn + (slope / curve)[:, None]
+    tx, ty = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
+    ex, ey = mx - tx, my - ty
+    # residuals in the window's own axes, along the heading it starts with: numbers that mean the same in every window
+    start = measured[seen[0], _YAW]
+    residual[:, seen, _X] = np.cos(start) * ex + np.sin(start) * ey
+    residual[:, seen, _Y] = -np.sin(start) * ex + np.cos(start) * ey
+    residual[:, seen, _YAW] = yaw - turn
+
+
+def _wrapped(angle: Array) -> Array:
+    return np.angle(np.exp(1j * angle))

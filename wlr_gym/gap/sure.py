@@ -1,0 +1,128 @@
+"""How sure: intervals of the fitted numbers, confidence in a name, what else would explain the data, what would have shown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.effects import EFFECTS
+from wlr_gym.gap.analysis import Detectable, Estimate
+from wlr_gym.gap.fit import PINNED, Fit, normal_equations, on_bounds, prior_tightness, scaled_nominal, scaled_numbers, scales
+from wlr_gym.gap.name import EQUIVALENT, Hypothesis
+from wlr_gym.gap.problem import Candidate, Problem
+from wlr_gym.gap.screen import LEAST_GAIN, Score
+
+Array = NDArray[np.float64]
+
+#: Bootstrap samples of the runs.
+SAMPLES = 500
+TWO_SIDED_95 = 1.96
+
+
+def covariance(problem: Problem, fit: Fit) -> Array:
+    """Return the covariance (numbers, numbers) of all numbers, in their units.
+
+    From the curvature of the likelihood; where leaving out one run after the other (jackknife, one Newton step each) shows more
+    spread, which is what differs from run to run, the number's row and column are widened to that.
+    """
+    curvature = fit.covariance()
+    parts = [
+        normal_equations([column], [residual], fit.noise) for column, residual in zip(fit.columns, fit.residuals, strict=True)
+    ]
+    tight = prior_tightness(problem, fit.model)
+    pull = tight * (scaled_numbers(problem, fit.model) - scaled_nominal(problem, fit.model))
+    stiff = np.diag(tight + PINNED * on_bounds(problem, fit.model))
+    whole, vector = sum(m for m, _ in parts), sum(v for _, v in parts)
+    shifts = [-np.linalg.solve(whole - matrix + stiff, vector - own + pull) for matrix, own in parts]
+    spread = np.stack(shifts) - np.mean(shifts, axis=0)
+    jackknife = (len(parts) - 1) / len(parts) * (spread**2).sum(axis=0)
+    wider = np.sqrt(np.maximum(jackknife / np.maximum(np.diag(curvature), 1e-300), 1.0))
+    scale = scales(problem, fit.model) * wider
+    return curvature * np.outer(scale, scale)
+
+
+def standard_errors(problem: Problem, fit: Fit) -> Array:
+    """Return one standard error of every number (numbers), in its unit; see :func:`covariance`."""
+    return np.sqrt(np.diag(covariance(problem, fit)))
+
+
+def estimates(problem: Problem, fit: Fit) -> list[dict[str, Estimate]]:
+    """Return the parameters of each of the model's effects with 95 % intervals."""
+    spread = covariance(problem, fit)
+    found, at = [], len(problem.quantities)
+    for candidate, values in fit.model.effects:
+        own = slice(at, at + len(values))
+        found.append(_with_intervals(candidate, np.array(values), spread[own, own]))
+        at += len(values)
+    return found
+
+
+def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[str, Estimate]:
+    """Parameters of one effect: their slopes in the fitted values carry the covariance over."""
+    here = candidate.parameters(values)
+    errors = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    slopes = {name: np.zeros(len(values)) for name in here}
+    for k, error in enumerate(errors):
+        step = 0.1 * error + 1e-9
+        beside = candidate.parameters(values + step * (np.arange(len(values)) == k))
+        for name in here:
+            slopes[name][k] = (beside[name] - here[name]) / step
+    units = {unknown.name: unknown.unit for unknown in candidate.unknowns}
+    if candidate.name in EFFECTS:
+        units |= {name: spec.unit for name, spec in EFFECTS[candidate.name].parameters.items()}
+    found = {}
+    for name, value in here.items():
+        half = TWO_SIDED_95 * float(np.sqrt(max(slopes[name] @ spread @ slopes[name], 0.0)))
+        found[name] = Estimate(value, value - half, value + half, units.get(name, "-"))
+    return found
+
+
+def confidence(taken: Hypothesis, others: Sequence[Hypothesis]) -> float:
+    """Return the share of bootstrap samples of the runs in which the taken effect is accepted and no other name is better."""
+    rng = np.random.default_rng(0)
+    rivals = [other for other in others if other.candidate.name != taken.candidate.name]
+    picks = rng.integers(0, len(taken.by_run), (SAMPLES, len(taken.by_run)))
+    gains = taken.by_run[picks].sum(axis=1)
+    wins = gains > LEAST_GAIN
+    for rival in rivals:
+        wins &= gains >= rival.by_run[picks].sum(axis=1)
+    return float(wins.mean())
+
+
+def equivalents(taken: Hypothesis, others: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the best hypothesis of every other name that buys nearly as much."""
+    found: dict[str, Hypothesis] = {}
+    for other in others:
+        name = other.candidate.name
+        near = other.gain > EQUIVALENT * taken.gain or taken.gain - other.gain < 0.25 * LEAST_GAIN
+        if name != taken.candidate.name and near and not other.at_bound and name not in found:
+            found[name] = other
+    return list(found.values())
+
+
+def detectable(scores: Sequence[Score]) -> dict[str, Detectable]:
+    """Return the smallest severity of every effect that would have been accepted, at the place where it is hardest to see.
+
+    First order: the gain of an effect grows with the square of its severity.
+    """
+    found: dict[str, tuple[float, Detectable]] = {}
+    for score in scores:
+        if len(score.candidate.where) > 1:
+            continue
+        amplitude = np.sqrt(LEAST_GAIN / max(float(np.diag(score.information).max()), 1e-12))
+        start = score.start
+        which = int(np.argmax(np.diag(score.information)))
+        steps = np.zeros(len(start.directions))
+        steps[min(which, len(steps) - 1)] = amplitude
+        values = start.values(steps)
+        unknowns = score.candidate.unknowns
+        sizes = [abs(v - u.neutral) / max(u.high - u.low, 1e-12) for v, u in zip(values, unknowns, strict=True)]
+        known = EFFECTS[score.candidate.name].parameters if score.candidate.name in EFFECTS else {u.name for u in unknowns}
+        sizes = [size if unknown.name in known else 0.0 for size, unknown in zip(sizes, unknowns, strict=True)]
+        k = 0 if len(start.directions) == 1 else int(np.argmax(sizes))
+        entry = Detectable(unknowns[k].name, float(values[k]), unknowns[k].unit)
+        if score.candidate.name not in found or amplitude > found[score.candidate.name][0]:
+            found[score.candidate.name] = (amplitude, entry)
+    return {name: entry for name, (_, entry) in sorted(found.items())}

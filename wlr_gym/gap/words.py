@@ -1,0 +1,194 @@
+"""What an analysis says in plain words: places, channels, effects, numbers, and the verdict as one sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from wlr_gym.effects import UNKNOWN_EFFECT
+from wlr_gym.gap.analysis import (
+    BAD_DATA,
+    EFFECT_FOUND,
+    NOT_EXCITED,
+    NOTHING_MISSING,
+    UNKNOWN,
+    Analysis,
+    Estimate,
+    FoundEffect,
+)
+from wlr_gym.robot import CORNERS, LEGS, WHEELS
+
+#: Verdict -> title of the report.
+TITLES = {
+    BAD_DATA: "Data cannot be used",
+    NOT_EXCITED: "Runs show too little",
+    NOTHING_MISSING: "Nothing missing",
+    EFFECT_FOUND: "Missing effect found",
+    UNKNOWN: "Something unknown is missing",
+}
+_CORNERS: dict[str, str] = dict(zip(CORNERS, ("left front", "right front", "left rear", "right rear"), strict=True))
+_SIDES = {
+    frozenset(CORNERS): "all four",
+    frozenset(("lf", "rf")): "both front",
+    frozenset(("lr", "rr")): "both rear",
+    frozenset(("lf", "lr")): "both left",
+    frozenset(("rf", "rr")): "both right",
+}
+_PLACES = {"ground": "floor", "sensor": "sensors"}
+_MEASURED = {
+    "pos_leg": "angle", "pos_wheel": "angle", "vel_leg": "speed", "vel_wheel": "speed",
+    "eff_leg": "motor torque", "eff_wheel": "motor torque", "cmd_leg": "goal angle", "cmd_wheel": "goal speed",
+}  # fmt: skip
+_CHANNELS = {
+    "cam_x": "camera: position x", "cam_y": "camera: position y", "cam_yaw": "camera: heading", "cam_z": "camera: height",
+    "cam_pitch": "camera: pitch", "volt": "supply voltage",
+    **{f"gyro_{axis}": f"turning rate about {axis}" for axis in "xyz"},
+    **{f"acc_{axis}": f"acceleration along {axis}" for axis in "xyz"},
+}  # fmt: skip
+
+
+def plain(name: str) -> str:
+    """Return an effect's name as words."""
+    return "an effect that has no name in the library" if name == UNKNOWN_EFFECT else name.replace("_", " ")
+
+
+def places(where: Sequence[str]) -> str:
+    """Return where an effect acts: ``both front wheels``, ``left rear leg``, ``floor``."""
+    for kind, members in (("leg", LEGS), ("wheel", WHEELS)):
+        if where and all(place in members for place in where):
+            corners = [place.removeprefix(f"{kind}_") for place in where]
+            group = _SIDES.get(frozenset(corners))
+            return f"{group} {kind}s" if group else listed([f"{_CORNERS[corner]} {kind}" for corner in corners])
+    if set(where) == {*LEGS, *WHEELS}:
+        return "all legs and wheels"
+    return listed([_place(name) for name in where])
+
+
+def _place(name: str) -> str:
+    kind, _, corner = name.rpartition("_")
+    return f"{_CORNERS[corner]} {kind}" if corner in _CORNERS else _PLACES.get(name, name.replace("_", " "))
+
+
+def channel(name: str) -> str:
+    """Return a measured channel in words: ``motor torque, left front leg``."""
+    kind, _, corner = name.rpartition("_")
+    if kind in _MEASURED and corner in _CORNERS:
+        return f"{_MEASURED[kind]}, {_CORNERS[corner]} {kind.partition('_')[2]}"
+    return _CHANNELS.get(name, name.replace("_", " "))
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """Return ``a, b and c``."""
+    return f" {last} ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+
+
+# ---- numbers ---------------------------------------------------------------------------------------------------------
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits; ``-`` if it is none."""
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.0f}" if 10**digits <= abs(value) < 1e7 else f"{value:.{digits}g}"
+
+
+def error(value: float) -> str:
+    """Return an error in units of noise, with as many decimals as one can care for."""
+    return f"{value:.{2 if value < 9.995 else 1 if value < 99.95 else 0}f}" if math.isfinite(value) else "-"
+
+
+def percent(share: float) -> str:
+    """Return a share as ``87 %``."""
+    return f"{100.0 * share:.0f} %" if math.isfinite(share) else "-"
+
+
+def interval(low: float, high: float) -> str:
+    """Return ``95 % interval 91 to 97 %`` of a share."""
+    known = math.isfinite(low) and math.isfinite(high)
+    return f"95 % interval {100.0 * low:.0f} to {100.0 * high:.0f} %" if known else "interval unknown"
+
+
+def unit_of(unit: str) -> str:
+    """Return a unit with the space before it; nothing for a pure number."""
+    return "" if unit in ("", "-") else f" {unit}"
+
+
+def estimate(found: Estimate) -> str:
+    """Return ``0.041 (0.038 to 0.045) N m``; angles in degrees, too."""
+    known = math.isfinite(found.low) and math.isfinite(found.high)
+    between = f" ({number(found.low)} to {number(found.high)})" if known else ""
+    degrees = f" = {number(math.degrees(found.value))}°" if found.unit == "rad" else ""
+    return f"{number(found.value)}{between}{unit_of(found.unit)}{degrees}"
+
+
+def duration(seconds: float) -> str:
+    """Return ``3 min 20 s``."""
+    whole = round(seconds)
+    return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
+
+
+# ---- the verdict -----------------------------------------------------------------------------------------------------
+
+
+def sentence(analysis: Analysis) -> str:
+    """Return the verdict in one sentence: the analysis' own, or one made from its numbers."""
+    return analysis.summary or _SENTENCES[analysis.verdict](analysis)
+
+
+def _bad_data(analysis: Analysis) -> str:
+    causes = [finding.text.rstrip(".") for finding in analysis.intake if finding.fatal]
+    more = f" (and {len(causes) - 1} more reason{'s' if len(causes) > 2 else ''})" if len(causes) > 1 else ""
+    return f"These data cannot be used: {causes[0]}{more}." if causes else "These data cannot be used."
+
+
+def _not_excited(analysis: Analysis) -> str:
+    wanted = listed([recommendation.excitation for recommendation in analysis.recommendations])
+    return f"These runs move too little to tell whether the model lacks anything{f'; record {wanted}' if wanted else ''}."
+
+
+def _nothing_missing(analysis: Analysis) -> str:
+    gap = analysis.gap
+    calibrated = " once its known numbers are calibrated" if analysis.calibration else ""
+    if gap is None:
+        return f"The model lacks nothing that these runs could show{calibrated}."
+    rest = f"it replays runs kept aside to within {error(gap.heldout_calibrated)} times the sensor noise"
+    return f"The model lacks nothing that these runs could show: {rest}{calibrated}."
+
+
+def _effect_found(analysis: Analysis) -> str:
+    names = [f"{plain(effect.name)} ({places(effect.where)})" for effect in analysis.effects]
+    lost = names[0] if len(names) == 1 else f"{len(names)} effects: {listed(names)}"
+    others = [_others(group.names, analysis.effects) for group in analysis.equivalent]
+    doubt = f"; these data cannot tell it from {listed([name for name in others if name], 'or')}" if any(others) else ""
+    return f"The model lacks {lost}{_bought(analysis)}{doubt}."
+
+
+def _unknown(analysis: Analysis) -> str:
+    named = [effect for effect in analysis.effects if effect.name != UNKNOWN_EFFECT]
+    unnamed = [effect for effect in analysis.effects if effect.name == UNKNOWN_EFFECT]
+    beside = f"{listed([f'{plain(effect.name)} ({places(effect.where)})' for effect in named])}, and " if named else ""
+    acts = f" ({places(unnamed[0].where)})" if unnamed else ""
+    formula = "a formula describes it" if any(effect.formula for effect in unnamed) else "no formula describes it, either"
+    return f"The model lacks {beside}something{acts} that no effect of the library explains; {formula}{_bought(analysis)}."
+
+
+def _bought(analysis: Analysis) -> str:
+    if analysis.gap is None or not analysis.effects:
+        return ""
+    between = interval(*analysis.gap.reduction_ci95)
+    it = "it removes" if len(analysis.effects) == 1 else "they remove"
+    return f"; added, {it} {percent(analysis.gap.reduction)} ({between}) of the avoidable error of runs kept aside"
+
+
+def _others(names: Sequence[str], effects: Sequence[FoundEffect]) -> str:
+    chosen = {effect.name for effect in effects}
+    return listed([plain(name) for name in names if name not in chosen], "or")
+
+
+_SENTENCES: dict[str, Callable[[Analysis], str]] = {
+    BAD_DATA: _bad_data,
+    NOT_EXCITED: _not_excited,
+    NOTHING_MISSING: _nothing_missing,
+    EFFECT_FOUND: _effect_found,
+    UNKNOWN: _unknown,
+}
