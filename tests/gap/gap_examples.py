@@ -41,7 +41,7 @@ def heat_map(seed=0):
         if name.endswith(("wheel_lf", "wheel_rf")):
             values[row] *= 1 + 5 * np.array([1, 0.9, 0.8, 0.1, 0.8, 0.9, 1])
     values[-3, :2] = np.nan
-    return HeatMap(CHANNELS, bins, values, "joint_velocity[wheel_lf] (rad/s)")
+    return HeatMap(CHANNELS, bins, values, "joint_velocity[wheel_lf]")
 
 
 def trace(run, channel, heldout, size=1.0, seed=0):

@@ -1,5 +1,7 @@
 """First-order scores against exact least squares."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from toy_problem import CHANNELS, DECOYS, NOMINAL, REACH, SIGMA, STRENGTH, Toy, candidate, sized
@@ -102,8 +104,19 @@ def test_first_guess_stays_plausible():
     problem = Toy({}, [sized("weak", 2.0)])
     _, _, scores = screened(problem)
     assert 0.0 <= score_of(scores, "weak").values[0] <= 0.5
+    assert share_of_promise(problem) == pytest.approx(1.0, abs=0.02)
     opposite = Toy({}, [sized("weak", -2.0)])
     assert score_of(screened(opposite)[2], "weak").values == (0.0,)
+
+
+def share_of_promise(problem):
+    """Gain of a shortened first guess over the fall of the cost along the way, known numbers at their best."""
+    found, responded, scores = screened(problem)
+    weak, wide = score_of(scores, "weak"), replace(candidate(problem, "weak"), unknowns=(Unknown("size", "1", 0.0, -99.0, 99.0, 1.0),))
+    free = screen([wide], responded)[0]
+    share = weak.values[0] / free.values[0]
+    assert 0.0 < share < 1.0
+    return weak.gain / (free.gain * (2 * share - share**2))
 
 
 def test_best_of_several_starts_is_taken():

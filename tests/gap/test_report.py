@@ -16,7 +16,7 @@ from wlr_gym.gap import report as module
 from wlr_gym.gap.analysis import Estimate, Evidence, FoundEffect, HeatMap, IntakeFinding, Place
 from wlr_gym.gap.plots import draw, figures
 from wlr_gym.gap.report import check_folder, report, save_analysis
-from wlr_gym.gap.words import channel, error, estimate, number, percent, places, plain, sentence
+from wlr_gym.gap.words import channel, error, estimate, feature, number, percent, places, plain, sentence
 
 EVERY = pytest.mark.parametrize("analysis", examples.ALL.values(), ids=list(examples.ALL))
 PICTURE = {"gap": b"\x89PNG"}
@@ -169,6 +169,17 @@ def test_a_patch_that_cannot_be_loaded_is_not_advertised(tmp_path):
     page = page_of(replace(examples.EFFECT_FOUND, effects=(rig,)), tmp_path)
     assert "The robot's simulators cannot load it: " in page.text
     assert "wlr train" not in page.text
+    assert "An effect of the test rig's own model." in page.text
+    assert "No formula" not in page.text
+
+
+def test_an_unknown_effect_has_a_formula_or_says_that_it_has_none(tmp_path):
+    assert "Law: -k * (leg_angle - a0)" in page_of(examples.UNKNOWN_EFFECT, tmp_path).text
+    bare = replace(examples.UNKNOWN_EFFECT, effects=(FoundEffect("unknown_effect", ("leg_lr",), {}, 0.8, 900.0),))
+    text = page_of(bare, tmp_path).text
+    assert "No formula was found that holds." in text
+    assert "no formula describes it, either" in text
+    assert "the patch is empty" in text
 
 
 def test_texts_are_escaped(tmp_path):
@@ -234,6 +245,13 @@ def test_places_in_words(where, words):
     assert places(where) == words
 
 
+def test_states_come_with_their_unit():
+    assert feature("joint_velocity[wheel_lf]") == "joint_velocity[wheel_lf] (rad/s)"
+    assert feature("motor_torque[leg_lf]") == "motor_torque[leg_lf] (N m)"
+    assert feature("slip_speed[wheel_lf]") == "slip_speed[wheel_lf] (m/s)"
+    assert feature("rate [rad/s]") == "rate [rad/s]"
+
+
 def test_numbers_in_words():
     assert [number(value) for value in (0.041249, 5312.4, 12.0, 1e-7, -0.5, float("nan"))] == [
         "0.0412", "5312", "12", "1e-07", "-0.5", "-"
@@ -251,7 +269,7 @@ def test_numbers_in_words():
 def small(analysis):
     """Fewer channels and one heat map: drawing takes its time."""
     (heat_map, *_) = analysis.heat_maps or (examples.heat_map(),)
-    few = HeatMap(heat_map.channels[:6], heat_map.bins, heat_map.values[:6])
+    few = HeatMap(heat_map.channels[:6], heat_map.bins, heat_map.values[:6], heat_map.feature)
     return replace(analysis, heat_maps=(few,), channel_gaps=analysis.channel_gaps[:6], traces=analysis.traces[1:3])
 
 
@@ -289,6 +307,7 @@ def test_pictures_show_the_numbers():
     assert np.max(np.asarray(found["where_1"].axes[0].images[0].get_array())) == pytest.approx(
         examples.heat_map().values[:6].max()
     )
+    assert found["where_1"].axes[0].get_xlabel() == "joint_velocity[wheel_lf] (rad/s)"
     left, below = found["overlays_1"].axes[:2]
     assert [line.get_label() for line in left.lines] == ["measured", "model as given", "calibrated", "effects added"]
     trace = small(examples.EFFECT_FOUND).traces[0]

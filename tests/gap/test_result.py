@@ -227,7 +227,7 @@ def test_every_number_that_calibration_moves_can_be_drawn_from(tmp_path):
     robot = load_robot()
     moved = {
         q.name: Calibrated(q.nominal, q.nominal, q.unit, q.sigma, 0.1 * q.sigma)
-        for q in (knob.quantity for knob in knobs(robot))
+        for q in (knob.quantity for knob in knobs(robot, 0.001))
     }
     events = identified_events(write_result(replace(examples.NOTHING_MISSING, calibration=moved), tmp_path), robot)
     assert len(events) == len(moved)

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.rig import kernel, law
+from wlr_gym.gap.rig.model import QUANTITIES, model_of, pack
+from wlr_gym.gap.rig.recording import Recording
 from wlr_gym.plants.drive import TEETH_DAMPING, fitted_weight
 from wlr_gym.servo import motor_constants, motor_torque
 
@@ -189,6 +192,32 @@ def test_beyond_its_play_the_rotor_goes_along():
     lost = run(1.0, goal=1e3, supply=1.0, half_play=0.05, coulomb=0.01, inertia=0.005, **FREE)
     rigid = run(1.0, goal=1e3, supply=1.0, coulomb=0.01, **FREE)
     assert lost[-1, RATE] == pytest.approx(rigid[-1, RATE], rel=2e-2)
+
+
+def test_a_link_rests_on_teeth_that_the_gears_friction_holds():
+    """Gravity presses the link against its play; the rotor's dry friction carries it, without creep."""
+    found = run(4.0, angle=0.5, on=0.0, half_play=0.01, coulomb=0.3, inertia=0.005)
+    rest = found[-500:]
+    assert np.abs(rest[:, RATE]).max() < 1e-9
+    assert 0.44 < rest[-1, ANGLE] < 0.49  # past the gap; the blow may push the rotor on by (load x gap)/(friction - load)
+    np.testing.assert_allclose(rest[:, FRICTION], 0.48 * np.sin(rest[:, ANGLE]), rtol=1e-6)
+
+
+def test_arm_and_load_give_gravity_and_inertia():
+    """A load at its end and a uniform arm: m l + m_arm l/2 and m l^2 + m_arm l^2/3."""
+    recording = read_recording_of(mass=0.49, length=0.098)
+    numbers = {quantity.name: quantity.nominal for quantity in QUANTITIES} | {"arm_mass": 0.06, "length_error": 0.002}
+    model = model_of(Setting(np.array(list(numbers.values()))), QUANTITIES)
+    lanes = dict(zip(law.PARAMETERS, pack([model], recording, STEP)[0], strict=True))
+    assert lanes["gravity"] == pytest.approx(9.81 * 0.1 * (0.49 + 0.03))
+    assert lanes["inertia"] == pytest.approx(0.01 * (0.49 + 0.02) + numbers["armature"])
+    assert lanes["volt_gain"] == pytest.approx(0.52 / 5.0)
+    assert lanes["gain"] == pytest.approx(200 * 4096 / (2 * math.pi) / (256 * 885))
+
+
+def read_recording_of(mass, length):
+    none = np.zeros(0)
+    return Recording("none", "none", mass, length, None, 200.0, 7.4, *([none] * 8), enabled=none.astype(bool))
 
 
 # --- the compiled law is the scalar one

@@ -170,6 +170,8 @@ def test_broken_formulas_are_refused(loaded, formula, message):
 
 
 def named(problem, runs):
+    """Name effects by the quick way: these benches answer smoothly."""
+    problem.thorough = False
     return name_effects(problem, runs, fit(problem, runs, nominal_model(problem), steps=12))
 
 
@@ -205,7 +207,9 @@ def real():
 
 def best_fit(problem, runs, effects, memory=None):
     """The better of two fits: from the data sheet, and from a stronger motor with less friction."""
-    candidates = {c.name: c for present in (("coulomb_friction",), ("load_dependent_friction",)) for c in rig_candidates(present)[1]}
+    candidates = {
+        c.name: c for present in (("coulomb_friction",), ("load_dependent_friction",)) for c in rig_candidates(present)[1]
+    }
     stronger = nominal(problem).copy()
     names = [quantity.name for quantity in problem.quantities]
     for name, value in {"stall_torque": 0.735, "armature": 0.0018, "coulomb_friction": 0.02}.items():
@@ -239,7 +243,10 @@ def test_real_servo_lacks_load_dependent_friction_and_a_torque_that_falls_behind
         )
     )
     assert both.cost < min(only_load.cost, only_behind.cost) - 60
-    assert stribeck.cost > base.cost - 60
+    bought = {
+        name: base.cost - found.cost for name, found in (("load", only_load), ("behind", only_behind), ("stribeck", stribeck))
+    }
+    assert bought["stribeck"] < 0.3 * min(bought["load"], bought["behind"])  # alone it takes the place of what is missing
     assert with_stribeck.cost > both.cost - 60
     assert warm.cost > both.cost + 60
     assert warm.model.effects[-1][1][0] == pytest.approx(0.0045)  # at the edge of what a winding can do

@@ -57,7 +57,7 @@ class Toy:
         memory: of that error, correlation of neighbouring rows.
     """
 
-    metric, cap, steps = "RMS in noise units", 50.0, 4
+    metric, cap, steps, thorough, sealed = "RMS in noise units", 50.0, 4, False, ()
 
     def __init__(self, truth=None, effects=(), seed=0, *, runs=5, rows=200, white=1.0, error=0.0, memory=0.9, reach=REACH):
         self.runs = tuple(f"run_{k + 1}" for k in range(runs))

@@ -1,5 +1,6 @@
 """``wlr deploy`` and what is under it: a policy on the emulated robot, its log, and the same actions again from the log."""
 
+import io
 import json
 import signal
 import subprocess
@@ -188,6 +189,8 @@ def test_command_line_dry_run(tmp_path):
         (["--seconds", "0"], "--seconds 0"),
         (["--seed", "-1"], "--seed -1"),
         (["--deadman", "0"], "--deadman 0"),
+        (["--deadman", "nan"], "--deadman nan"),
+        (["--command", "yaw_rate=nan"], "expected name=number"),
         (["--command", "speed"], "--command speed: expected name=value"),
         (["--command", "yaw_rate=fast"], "expected name=number"),
         (["--command", "yaw=1"], "unknown command 'yaw'"),
@@ -206,6 +209,12 @@ def test_faults_are_for_the_emulated_robot(tmp_path):
         run_command("deploy", ["proportional", "--fault", "drop"])
     with pytest.raises(InputError, match="cannot be opened"):
         run_command("deploy", ["proportional", "--yes", "--port", f"legs={tmp_path}/none", "--out", str(tmp_path)])
+
+
+def test_nobody_there_to_start_the_robot(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    with pytest.raises(InputError, match="nobody there to start the robot"):
+        run_command("deploy", ["proportional", "--out", str(tmp_path)])
 
 
 @pytest.mark.parametrize("stop", ["signal", "key"])

@@ -92,7 +92,7 @@ def test_mending_writes_registers_and_looks_again(machine, capsys):
 
 
 def test_verbose_lists_every_joint(machine, capsys):
-    assert len(look(capsys, verbose=True)[1].splitlines()) == 148
+    assert len(look(capsys, verbose=True)[1].splitlines()) == 152
 
 
 def test_on_ports_with_a_scan(capsys, monkeypatch):

@@ -253,3 +253,24 @@ def test_servos_that_cannot_be_reached_are_named():
     assert rig.torque().tolist() == [False] * 4 + [True] * 4
     assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS[4:]] == [-1] * 4
     rig.loop.close()
+
+
+def test_a_bus_that_does_not_answer_does_not_delay_the_other():
+    """Torque off is said to all before anybody is asked to confirm."""
+    rig, off_at = Rig(), {}
+    rig.loop.start()
+    rig.drive(0.3)
+    step = rig.machine.step
+
+    def watched():
+        step()
+        for bus, part in (("legs", slice(0, 4)), ("wheels", slice(4, 8))):
+            if not rig.torque()[part].any():
+                off_at.setdefault(bus, rig.machine.time)
+
+    rig.machine.step = watched
+    rig.inject("drop legs wheels")
+    with pytest.raises(StoppedError, match="silence"):
+        rig.drive(2.0)
+    assert abs(off_at["legs"] - off_at["wheels"]) < 0.012
+    rig.loop.close()

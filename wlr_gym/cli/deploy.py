@@ -7,6 +7,7 @@ off the ground the first time; see docs/robot.md.
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ import tyro
 from rich.console import Console
 
 from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.robot_options import wait_for_enter
 from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
@@ -93,9 +95,7 @@ def run(options: Options) -> int:
         policy = make_policy(options.policy, core.contract())
         _say_what_is_not_known(core, console)
         if not (options.yes or options.emulated or options.dry_run):
-            console.input(
-                "[bold]The robot will move. Wheels off the ground? Hand on the switch? Enter to start, Ctrl-C not to."
-            )
+            wait_for_enter(console, "The robot will move. Wheels off the ground? Hand on the switch?")
         loop = loop_of(core)
         if options.stepped:
             for fault in options.fault:
@@ -114,7 +114,7 @@ def _check(options: Options) -> dict[str, float]:
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
-    if options.deadman is not None and options.deadman <= 0.0:
+    if options.deadman is not None and not 0.0 < options.deadman < float("inf"):
         raise InputError(f"--deadman {options.deadman:g}: expected more than 0")
     if not options.emulated and (options.stepped or options.fault):
         raise InputError("--stepped and --fault are for the emulated robot: add --emulated")
@@ -122,9 +122,12 @@ def _check(options: Options) -> dict[str, float]:
         raise InputError("--port: the emulated robot brings its own ports")
     commands = _pairs("--command", options.command)
     try:
-        return {name: float(text) for name, text in commands.items()}
+        numbers = {name: float(text) for name, text in commands.items()}
     except ValueError:
-        raise InputError(f"--command {' '.join(options.command)}: expected name=number") from None
+        numbers = {"": float("nan")}
+    if not all(map(math.isfinite, numbers.values())):
+        raise InputError(f"--command {' '.join(options.command)}: expected name=number")
+    return numbers
 
 
 def _pairs(option: str, words: tuple[str, ...]) -> dict[str, str]:

@@ -120,8 +120,17 @@ def confirm(motions: Sequence[Motion], console: Console) -> None:
     seconds = sum(motion.duration for motion in motions)
     names = ", ".join(motion.name for motion in motions)
     console.print(f"The robot will drive {names}: {seconds:.0f} s in all, on about 2 m of free floor in front of it.")
+    wait_for_enter(console, "Hand on the switch?")
+
+
+def wait_for_enter(console: Console, question: str) -> None:
+    """Ask the operator, and wait for Enter.
+
+    Raises:
+        InputError: nobody there.
+    """
     try:
-        console.input("[bold]Hand on the switch? Enter to start, Ctrl-C not to. ")
+        console.input(f"[bold]{question} Enter to start, Ctrl-C not to. ")
     except EOFError:
         raise InputError("nobody there to start the robot: run it on a terminal, or say --yes") from None
 

@@ -120,7 +120,7 @@ def analyse_problem(
         problem.features(base.model.setting, fitted),
     )
     shown = detectable(naming.rounds[-1].scores)
-    verdict, groups = _verdict(naming), _equivalent(naming)
+    verdict, groups = _verdict(naming), _equivalent(problem, naming)
     clock.stop()
     return Analysis(
         data,
@@ -140,7 +140,7 @@ def analyse_problem(
         run_gaps,
         channel_gaps,
         shown,
-        recommend(naming, [group.names for group in groups], verdict),
+        recommend(naming, [group.names for group in groups], verdict, problem.motions),
         {signal.name: float(level) for signal, level in zip(problem.signals, naming.fit.noise.level, strict=True)},
         tuple(effect.content() for effect in load_patch(known).effects),
         clock.seconds,
@@ -201,16 +201,17 @@ def _effects(problem: Problem, naming: Naming) -> tuple[FoundEffect, ...]:
     return tuple(sorted(found, key=lambda effect: -effect.gain))
 
 
-def _equivalent(naming: Naming) -> tuple[Equivalent, ...]:
+def _equivalent(problem: Problem, naming: Naming) -> tuple[Equivalent, ...]:
     groups = []
     kept = {candidate.label for candidate, _ in naming.fit.model.effects}
     for look in naming.rounds:
         if look.taken is None or look.taken.candidate.label not in kept:
             continue
-        others = equivalents(look.taken, look.hypotheses)
+        swapped = naming.swaps.get(look.taken.candidate.label)
+        others = equivalents(*swapped) if swapped else equivalents(look.taken, look.hypotheses)
         if others:
             names = (look.taken.candidate.name, *(other.candidate.name for other in others))
-            groups.append(Equivalent(names, separating_run(names)))
+            groups.append(Equivalent(names, separating_run(names, problem.motions)))
     return tuple(groups)
 
 

@@ -1,8 +1,8 @@
 """Name what is missing: screen all candidates, refit the best of them, take the one that buys most, and look again.
 
-A candidate is accepted if it lowers minus two log posterior by more than its share of chance (:data:`LEAST_GAIN` per unknown,
-and :data:`LEAST_SHARE` of what is left), in most runs, with a value inside its plausible range. Pairs of the best are tried
-where no single one is accepted. In the end every effect must still be worth its place without the help of the others.
+A candidate is accepted if it lowers minus two log posterior by more than chance and an imperfect simulator can
+(:data:`LEAST_GAIN`, more for every further unknown, and :data:`LEAST_SHARE` of what is left), if the runs agree on it, and if
+its value lies inside its plausible range. In the end every effect must still be worth its place beside the others.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from wlr_gym.gap.fit import (
 )
 from wlr_gym.gap.likelihood import Noise, estimate_noise, minus_two_log_likelihood
 from wlr_gym.gap.problem import Candidate, Problem, Setting
-from wlr_gym.gap.screen import LEAST_GAIN, Responses, Score, responses, screen
+from wlr_gym.gap.screen import LEAST_GAIN, Score, responses, screen
 
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
@@ -86,7 +86,6 @@ class Hypothesis:
             for u, value in zip(self.candidate.unknowns, self.values, strict=True)
         )
 
-
     @property
     def consistent(self) -> bool:
         """Whether the runs agree that it is there."""
@@ -106,11 +105,15 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class Naming:
-    """Outcome: the final fit, and every round."""
+    """Outcome: the final fit, and every round.
+
+    ``swaps`` holds, per effect of a model of several, that effect and its rivals with the other effects kept (thorough
+    problems only).
+    """
 
     fit: Fit
     rounds: list[Round]
-    found: Responses
+    swaps: dict[str, tuple[Hypothesis, list[Hypothesis]]]
 
 
 def shortlist(scores: Sequence[Score], size: int = SHORTLIST) -> list[Score]:
@@ -148,7 +151,23 @@ def name_effects(problem: Problem, runs: Sequence[int], start: Fit, tell: Tell =
         if len(current.model.effects) >= MOST_EFFECTS or any(_same(current.model, earlier) for earlier in models):
             break
         models.append(current.model)
-    return Naming(current, rounds, found)
+    return Naming(current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
+
+
+def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tuple[Hypothesis, list[Hypothesis]]]:
+    """Put every candidate in the place of each effect of a model of several, and fit it there."""
+    swaps: dict[str, tuple[Hypothesis, list[Hypothesis]]] = {}
+    if len(final.model.effects) < 2:
+        return swaps
+    for index, (candidate, _) in enumerate(final.model.effects):
+        without = fit(problem, runs, final.model.without_effect(index), memory=final.noise.memory, steps=problem.steps)
+        probes, candidates = problem.candidates(without.model.setting, without.residuals, runs)
+        scores = screen(candidates, responses(problem, without, runs, probes))
+        rivals = refit_thoroughly(problem, runs, without, scores)
+        own = [rival for rival in rivals if rival.candidate.label == candidate.label]
+        if own:
+            swaps[candidate.label] = (own[0], rivals)
+    return swaps
 
 
 def _same(one: Model, other: Model) -> bool:
@@ -197,7 +216,7 @@ def finalists(
     wholes = []
     for hypothesis in best.values():
         tell(f"fitting {hypothesis.candidate.label} in full")
-        wholes.append(fit(problem, runs, hypothesis.model, steps=2, tell=tell))
+        wholes.append(fit(problem, runs, hypothesis.model, steps=2 if len(best) == 1 else 1, tell=tell))
     if not wholes:
         return []
     memory = min(wholes, key=lambda whole: whole.cost).noise.memory

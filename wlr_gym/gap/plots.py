@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import Analysis, ChannelGap, Evidence, GapFigures, HeatMap, RunGap, Trace
-from wlr_gym.gap.words import channel, error, percent, places, plain
+from wlr_gym.gap.words import channel, error, feature, percent, places, plain
 from wlr_gym.runs.format import ANGLES_OF_THE_BODY
 
 if TYPE_CHECKING:
@@ -31,11 +31,10 @@ MEASURED, BEFORE, CALIBRATED, AFTER = "#8c8c8c", "#b0b0b0", "#e06c00", "#1f4e9c"
 SCREENED_OUT = "screened out"
 _TAKEN, _EQUIVALENT, _LOST = "#1f4e9c", "#6d9bd1", "#c9c9c9"
 _DPI = 110
-#: Overlays in one figure, candidates in one round of the evidence figure.
-_PANELS, _BARS = 6, 36
+#: Overlays in one figure; effects shown in a round beside those that were fitted.
+_PANELS, _OTHERS = 6, 6
 #: Errors that the heat map tells apart, in noise units.
 _COLDEST, _HOTTEST = 0.7, 10.0
-_LABEL_LENGTH = 60
 
 
 def draw(analysis: Analysis) -> dict[str, bytes]:
@@ -95,12 +94,8 @@ def _localisation(analysis: Analysis) -> Figure:
     figure = _new(9.0, 0.9 + 0.42 * len(found))
     axes = figure.subplots()
     bars = axes.barh([place.name for place in found], [100.0 * place.share for place in found], color=CALIBRATED, height=0.6)
-    for bar, place in zip(bars, found, strict=True):
-        text = textwrap.shorten(f"{percent(place.share)}: {place.dependence}", _LABEL_LENGTH, placeholder=" …")
-        axes.annotate(text, (bar.get_width(), bar.get_y() + bar.get_height() / 2), (5, 0), textcoords="offset points",
-                      va="center", fontsize=8)  # fmt: skip
-    axes.set_xlim(0.0, 100.0 * max(place.share for place in found) * 2.6 + 1.0)
-    axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= 100.0])
+    axes.bar_label(bars, [percent(place.share) for place in found], padding=4, fontsize=8)
+    axes.set_xlim(0.0, 115.0 * max(place.share for place in found) + 1.0)
     axes.set_xlabel("share of the gap of the calibrated model (%)", fontsize=9)
     _calm(axes, "x")
     return figure
@@ -125,7 +120,7 @@ def _heat_map(heat_map: HeatMap) -> Figure:
     axes.tick_params(which="both", length=0)
     if rows * columns <= 800:
         _write_values(axes, heat_map.values, norm)
-    axes.set_xlabel(heat_map.feature, fontsize=9)
+    axes.set_xlabel(feature(heat_map.feature), fontsize=9)
     axes.set_title("rms error of the calibrated model; 1 = sensor noise", fontsize=9, loc="left")
     ticks = [tick for tick in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0) if tick <= hottest]
     bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02, ticks=ticks, format="%g")
@@ -155,7 +150,8 @@ def _evidence(evidence: Sequence[Evidence]) -> Figure:
     for axes, turn, members in zip(panels, rounds, shown, strict=True):
         _draw_round(axes, members)
         total = sum(one.round == turn for one in evidence)
-        axes.set_title(f"Round {turn}: {total} explanations weighed", fontsize=10, loc="left")
+        part = f": the strongest of {total} explanations" if total > len(members) else ""
+        axes.set_title(f"Round {turn}{part}", fontsize=10, loc="left")
     panels[-1].set_xlabel("gain: how much better the model explains the fitted runs (fall of -2 log posterior)", fontsize=9)
     labels = ((_TAKEN, "taken"), (_EQUIVALENT, "equivalent: cannot be told from it"), (_LOST, "lost after its fit"))
     handles = [panels[0].barh([0], [0], color=colour, label=label) for colour, label in labels]
@@ -165,15 +161,14 @@ def _evidence(evidence: Sequence[Evidence]) -> Figure:
 
 
 def _strongest(evidence: Sequence[Evidence]) -> list[Evidence]:
-    """Return all that were fitted, and of every other effect the place that promised most; weakest first."""
+    """Return all that were fitted, and of the best other effects the place that promised most; weakest first."""
     fitted = [one for one in evidence if one.outcome != SCREENED_OUT]
     named = {one.name for one in fitted}
     best: dict[str, Evidence] = {}
     for one in evidence:
         if one.name not in named and (one.name not in best or _size(one) > _size(best[one.name])):
             best[one.name] = one
-    ordered = sorted(best.values(), key=_size) + sorted(fitted, key=_size)
-    return ordered[-_BARS:]
+    return sorted(best.values(), key=_size)[-_OTHERS:] + sorted(fitted, key=_size)
 
 
 def _size(one: Evidence) -> float:
@@ -193,7 +188,8 @@ def _draw_round(axes: Axes, members: Sequence[Evidence]) -> None:
         axes.annotate(text, (max(size, 0.0), row), (5, 0), textcoords="offset points", va="center", fontsize=7.5, weight=weight)
     labels = [f"{plain(one.name)}, {places(one.where)}" for one in members]
     axes.set_yticks(rows, [textwrap.shorten(label, 48, placeholder=" …") for label in labels])
-    axes.set_xlim(min(0.0, 1.1 * sizes.min()), 1.25 * max(sizes.max(), 1.0))
+    low, high = min(sizes.min(), 0.0), max(sizes.max(), 1.0)
+    axes.set_xlim(low - (0.05 * (high - low) if low < 0.0 else 0.0), high + 0.25 * (high - low))
     axes.set_ylim(-0.6, len(members) - 0.4)
     _calm(axes, "x")
 

@@ -161,6 +161,7 @@ class Problem(Protocol):
         cap: noise units beyond which a residual counts no more in the gap's numbers.
         steps: Gauss-Newton steps of a fit, at most.
         thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
+        motions: effect -> name of the motion that shows it best, for advice on what to record; may be empty.
         sealed: names of the runs to keep for the proof, where the problem knows better than a general rule; else empty.
     """
 
@@ -168,6 +169,7 @@ class Problem(Protocol):
     cap: float
     steps: int
     thorough: bool
+    motions: Mapping[str, str]
     sealed: tuple[str, ...]
     runs: tuple[str, ...]
     signals: tuple[Signal, ...]

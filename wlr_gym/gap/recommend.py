@@ -106,36 +106,44 @@ _SEPARATED_BY: Sequence[tuple[frozenset[str], frozenset[str], str, str]] = (
 )
 
 
-def separating_run(names: Iterable[str]) -> str:
-    """Return, in words, the run that would tell these explanations apart; the first is the chosen one."""
+def separating_run(names: Iterable[str], motions: Mapping[str, str]) -> str:
+    """Return, in words, the run that would tell these explanations apart; the first is the chosen one.
+
+    Args:
+        names: of effects.
+        motions: effect -> motion of the system that shows it best; empty = it has no named motions.
+    """
     chosen, *others = names
     texts = []
-    for other in others:
+    for other in others if motions else []:
         for one, two, excitation, why in _SEPARATED_BY:
             if (chosen in one and other in two) or (chosen in two and other in one):
                 texts.append(f"{excitation} ({EXCITATIONS[excitation].doc}): {why}")
                 break
         else:
-            if chosen in SHOWN_BY:
-                texts.append(f"{SHOWN_BY[chosen]}: the motion in which {chosen} shows best")
-    return "; ".join(dict.fromkeys(texts)) or "more runs of other kinds"
+            if chosen in motions:
+                texts.append(f"{motions[chosen]}: the motion in which {chosen} shows best")
+    return "; ".join(dict.fromkeys(texts)) or "more runs, of other kinds and at other loads"
 
 
-def recommend(naming: Naming, equivalent: Sequence[Sequence[str]], verdict: str) -> tuple[Recommendation, ...]:
+def recommend(
+    naming: Naming, equivalent: Sequence[Sequence[str]], verdict: str, motions: Mapping[str, str]
+) -> tuple[Recommendation, ...]:
     """Return runs worth recording: to separate equivalents, then to show effects that these data would have missed."""
     found: dict[str, str] = {}
     for names in equivalent:
         for other in names[1:]:
-            excitation = SHOWN_BY.get(names[0], "random")
-            found.setdefault(excitation, f"separates {names[0]} from {other}: {separating_run((names[0], other))}")
+            if names[0] in motions:
+                why = separating_run((names[0], other), motions)
+                found.setdefault(motions[names[0]], f"separates {names[0]} from {other}: {why}")
     if verdict != EFFECT_FOUND:
-        blind: dict[str, list[str]] = {}
-        visible = {s.candidate.name: False for s in naming.rounds[-1].scores}
+        visible: dict[str, bool] = {}
         for score in naming.rounds[-1].scores:
-            visible[score.candidate.name] |= score.visible
+            visible[score.candidate.name] = visible.get(score.candidate.name, False) or score.visible
+        blind: dict[str, list[str]] = {}
         for name, shown in visible.items():
-            if not shown and name in SHOWN_BY:
-                blind.setdefault(SHOWN_BY[name], []).append(name)
+            if not shown and name in motions:
+                blind.setdefault(motions[name], []).append(name)
         for excitation, names in blind.items():
             found.setdefault(excitation, f"would show {', '.join(sorted(names))}, of which these data show nothing")
     return tuple(Recommendation(excitation, why) for excitation, why in found.items())

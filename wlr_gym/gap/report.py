@@ -70,7 +70,8 @@ _CAPTIONS = {
     "gap": "Error of replayed runs. Left: over the runs kept aside, with the 95 % interval of what the effects bought. Right: "
     "run by run.",
     "channels": "The same for each measured channel, over the runs kept aside.",
-    "evidence": "What each candidate would buy. Long bars are good explanations; the one that was taken is dark.",
+    "evidence": "What each candidate would buy: all that were fitted, and the best that were not. Long bars are good "
+    "explanations; the one that was taken is dark.",
 }
 
 
@@ -233,13 +234,14 @@ def _effect(effect: FoundEffect) -> str:
     else:
         meaning = f"What is missing: {known.doc}." if known else "An effect of the test rig's own model."
     law = effect.formula or (known.equation if known else "")
+    unlawful = "<p>No formula was found that holds.</p>" if effect.name == UNKNOWN_EFFECT else ""
     rows = [(name, estimate(found)) for name, found in effect.parameters.items()]
     return "\n".join(
         [
             heading(f"{plain(effect.name).capitalize()}: {places(effect.where)}"),
             f"<p>{escape(meaning)} In files: <code>{escape(effect.name)}</code>, where <code>{escape(', '.join(effect.where))}"
             f"</code>. Confidence {percent(effect.confidence)}.</p>",
-            f"<p>Law: <code>{escape(law)}</code></p>" if law else "<p>No formula was found that holds on other runs.</p>",
+            f"<p>Law: <code>{escape(law)}</code></p>" if law else unlawful,
             table(("parameter", "value (95 % interval)"), rows),
         ]
     )
@@ -254,7 +256,11 @@ def _evidence(evidence: Sequence[Evidence], turn: int) -> str:
     rows += [_screened_out(alike) for alike in _by_name([one for one in evidence if one.outcome == SCREENED_OUT])]
     classes = ["taken" if one.outcome == "taken" else "" for one in fitted] + [""] * (len(rows) - len(fitted))
     headings = ("candidate", "where", "values", "gain", "promised", "outcome", "why")
-    return heading(f"Round {turn}: {len(evidence)} explanations weighed") + "\n" + table(headings, rows, {3, 4}, classes)
+    return (
+        heading(f"Round {turn}: {len(evidence)} explanation{'s' if len(evidence) > 1 else ''} weighed")
+        + "\n"
+        + table(headings, rows, {3, 4}, classes)
+    )
 
 
 def _rank(one: Evidence) -> tuple[bool, float]:

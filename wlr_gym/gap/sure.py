@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 #: Bootstrap samples of the runs.
 SAMPLES = 500
 TWO_SIDED_95 = 1.96
+#: A rival that buys this share is as good unless the runs agree, by so many standard errors, that it is not.
+RIVAL, AGREED = 0.75, 2.0
 
 
 def covariance(problem: Problem, fit: Fit) -> Array:
@@ -61,12 +63,12 @@ def estimates(problem: Problem, fit: Fit) -> list[dict[str, Estimate]]:
 
 def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[str, Estimate]:
     """Parameters of one effect: their slopes in the fitted values carry the covariance over."""
-    here = candidate.parameters(values)
+    here = candidate.parameters(values.tolist())
     errors = np.sqrt(np.maximum(np.diag(spread), 0.0))
     slopes = {name: np.zeros(len(values)) for name in here}
     for k, error in enumerate(errors):
         step = 0.1 * error + 1e-9
-        beside = candidate.parameters(values + step * (np.arange(len(values)) == k))
+        beside = candidate.parameters((values + step * (np.arange(len(values)) == k)).tolist())
         for name in here:
             slopes[name][k] = (beside[name] - here[name]) / step
     units = {unknown.name: unknown.unit for unknown in candidate.unknowns}
@@ -96,10 +98,18 @@ def equivalents(taken: Hypothesis, others: Sequence[Hypothesis]) -> list[Hypothe
     found: dict[str, Hypothesis] = {}
     for other in others:
         name = other.candidate.name
-        near = other.gain > EQUIVALENT * taken.gain or taken.gain - other.gain < 0.25 * LEAST_GAIN
-        if name != taken.candidate.name and near and not other.at_bound and name not in found:
+        if name != taken.candidate.name and not other.at_bound and name not in found and _as_good(taken, other):
             found[name] = other
     return list(found.values())
+
+
+def _as_good(taken: Hypothesis, other: Hypothesis) -> bool:
+    """Whether another hypothesis buys nearly as much, or the runs do not agree that it buys less."""
+    if other.gain > EQUIVALENT * taken.gain or taken.gain - other.gain < 0.25 * LEAST_GAIN:
+        return True
+    ahead = taken.by_run - other.by_run
+    spread = float(ahead.std(ddof=1)) / np.sqrt(len(ahead)) if len(ahead) > 1 else 0.0
+    return bool(other.gain > RIVAL * taken.gain and ahead.mean() < AGREED * spread)
 
 
 def detectable(scores: Sequence[Score]) -> dict[str, Detectable]:

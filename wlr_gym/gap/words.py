@@ -16,6 +16,7 @@ from wlr_gym.gap.analysis import (
     Estimate,
     FoundEffect,
 )
+from wlr_gym.plants.base import TRUTH_LAYOUT
 from wlr_gym.robot import CORNERS, LEGS, WHEELS
 
 #: Verdict -> title of the report.
@@ -47,9 +48,13 @@ _CHANNELS = {
 }  # fmt: skip
 
 
+#: Units of states that the layout of the simulators' truth does not have.
+_FEATURES = {"slip_speed": "m/s", "time_since_reversal": "rows"}
+
+
 def plain(name: str) -> str:
     """Return an effect's name as words."""
-    return "an effect that has no name in the library" if name == UNKNOWN_EFFECT else name.replace("_", " ")
+    return name.replace("_", " ")
 
 
 def places(where: Sequence[str]) -> str:
@@ -75,6 +80,13 @@ def channel(name: str) -> str:
     if kind in _MEASURED and corner in _CORNERS:
         return f"{_MEASURED[kind]}, {_CORNERS[corner]} {kind.partition('_')[2]}"
     return _CHANNELS.get(name, name.replace("_", " "))
+
+
+def feature(name: str) -> str:
+    """Return the name of a state of the robot with its unit: ``motor_torque[leg_lf] (N m)``; others as they are."""
+    quantity = name.partition("[")[0]
+    unit = TRUTH_LAYOUT.channels[quantity].unit if quantity in TRUTH_LAYOUT.channels else _FEATURES.get(quantity, "")
+    return f"{name} ({unit})" if unit else name
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:
@@ -156,7 +168,10 @@ def _nothing_missing(analysis: Analysis) -> str:
 
 
 def _effect_found(analysis: Analysis) -> str:
-    names = [f"{plain(effect.name)} ({places(effect.where)})" for effect in analysis.effects]
+    names = [
+        f"{'an ' if effect.name == UNKNOWN_EFFECT else ''}{plain(effect.name)} ({places(effect.where)})"
+        for effect in analysis.effects
+    ]
     lost = names[0] if len(names) == 1 else f"{len(names)} effects: {listed(names)}"
     others = [_others(group.names, analysis.effects) for group in analysis.equivalent]
     doubt = f"; these data cannot tell it from {listed([name for name in others if name], 'or')}" if any(others) else ""

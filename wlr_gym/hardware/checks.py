@@ -20,7 +20,7 @@ from wlr_gym.hardware.imu import STANDARD_GRAVITY
 from wlr_gym.hardware.imu_driver import Imu, ImuGoneError
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.hardware.tables import ControlTable, load_table
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import JOINTS, LEGS, Robot
 
 if TYPE_CHECKING:
     from wlr_gym.hardware.link import Clock
@@ -177,6 +177,11 @@ def _check_state(servos: Servos, joint: str) -> Iterator[Check]:
     )
     temperature = servos.get(joint, "present_temperature")
     yield Check(joint, "temperature", temperature < WARM, f"{temperature} degC", f"below {WARM} degC", "Let it cool down.")
+    if joint in LEGS:
+        place = servos.get(joint, "present_position")
+        low, high = servos.get(joint, "min_position_limit"), servos.get(joint, "max_position_limit")
+        remedy = "Turn the leg back by hand, or correct the servo's position limits: it would jump to them."
+        yield Check(joint, "position", low <= place <= high, f"{place}", f"{low} to {high}", remedy)
     errors = servos.hardware_errors(joint)
     remedy = "Find the cause, let the servo cool, then reboot it; the latch is there for a reason."
     yield Check(joint, "hardware error", not errors, ", ".join(errors) or "none", "none", remedy)
@@ -321,17 +326,19 @@ def _check_rest(samples: ImuSamples) -> list[Check]:
 def mend(servos: Servos, checks: Iterable[Check]) -> list[Check]:
     """Write the fixes of the checks that failed; return the ones that could not be mended.
 
-    The EEPROM is locked while torque is on; switch it off first.
+    A servo whose torque is on is left alone: its EEPROM is locked, and what holds it might let go.
 
     Raises:
         BusGoneError: a port is gone.
     """
     left = []
+    checks = list(checks)
+    is_on = {check.where for check in checks if check.what == "torque" and not check.ok}
     for check in checks:
         if check.ok:
             continue
         try:
-            if check.fix is None:
+            if check.fix is None or check.where in is_on:
                 left.append(check)
             else:
                 servos.set(check.where, *check.fix)

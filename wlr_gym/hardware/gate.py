@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +25,23 @@ from wlr_gym.runs.format import Profile
 Array = NDArray[np.float64]
 
 #: Items in RAM that a run depends on; set to their defaults (profiles off) before torque comes on.
-_PREPARED = ("profile_velocity", "profile_acceleration", "velocity_p_gain", "velocity_i_gain", "position_p_gain")
+_PREPARED = (
+    "profile_velocity",
+    "profile_acceleration",
+    "velocity_p_gain",
+    "velocity_i_gain",
+    "position_p_gain",
+    "position_i_gain",
+    "position_d_gain",
+    "feedforward_1st_gain",
+    "feedforward_2nd_gain",
+)
 #: s of Bus Watchdog per count (e-manual).
 WATCHDOG_UNIT = 0.02
 #: s an answer may take while nothing moves: where no tick waits for it, a slow computer is no dead servo.
 CALM_PATIENCE = 0.05
+#: Fastest goals of legs on the way to the start pose, over ``start_speed``: a minimum-jerk path needs 1.9 of it.
+CALM_SPEED = 2.0
 #: Reads before the timed ones: the bus finds out whether its servos know fast reads.
 _UNTIMED_READS = 5
 #: s between tries to switch off servos that do not confirm it.
@@ -50,6 +63,7 @@ class Gate:
         interventions: rule -> ticks in which it changed or stopped something.
         goals: (8,) last goals. torque_on: (8,) motors that are on.
         frame: what the limits are about.
+        is_calm: legs may move no faster than on the way to the start pose, whatever is asked for.
     """
 
     def __init__(
@@ -73,6 +87,9 @@ class Gate:
         self.frame = safety.make_frame(robot, period)
         self._memory = Memory()
         self._armed = False
+        self.is_calm = False
+        speed = min(self.limits.leg_speed, CALM_SPEED * self.limits.start_speed)
+        self._calm_limits = self.limits.model_copy(update={"leg_speed": speed})
 
     # ---- reading: for everybody ----
 
@@ -91,6 +108,16 @@ class Gate:
             with contextlib.suppress(NoAnswerError, RefusedError, ConnectionError):
                 found[joint] = self.__servos.hardware_errors(joint)
         return {joint: errors for joint, errors in found.items() if errors}
+
+    def latched(self, joints: Iterable[str]) -> list[str]:
+        """Return those of the joints whose watchdog has stopped them, or that do not say."""
+        return [joint for joint in joints if not self._listens(joint)]
+
+    def _listens(self, joint: str) -> bool:
+        try:
+            return self.__servos.get(joint, "bus_watchdog") >= 0
+        except (NoAnswerError, RefusedError):
+            return False
 
     def check(self, reads: int) -> list[checks.Check]:
         """Return all start-up checks. A watchdog that an earlier run left latched is cleared first: torque is off."""
@@ -215,7 +242,8 @@ class Gate:
         """
         if not self._armed:
             raise InputError("the safety gate is not armed: nothing is written")
-        decision = safety.decide(self.limits, self.frame, view, self._memory, self.goals, wanted, torque_on)
+        limits = self._calm_limits if self.is_calm else self.limits
+        decision = safety.decide(limits, self.frame, view, self._memory, self.goals, wanted, torque_on)
         self._memory = decision.memory
         self.interventions.update({*decision.limited, *(verdict.rule for verdict in decision.verdicts)})
         if decision.level == safety.Level.OFF:

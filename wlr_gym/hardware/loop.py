@@ -34,7 +34,7 @@ from wlr_gym.hardware.guard import Guard
 from wlr_gym.hardware.imu_driver import ImuGoneError, ImuReading
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.log import RunLog, sensors_of
-from wlr_gym.hardware.safety import STANDARD_GRAVITY, VERTICAL_BAND, Level, View, next_up, plausible, resting
+from wlr_gym.hardware.safety import STANDARD_GRAVITY, VERTICAL_BAND, Level, View, next_up, plausible, resting, tilt_of
 from wlr_gym.hardware.timing import Pacer
 from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.runs.format import RunMeta
@@ -45,6 +45,8 @@ Array = NDArray[np.float64]
 TIMED_READS, HEALTH_TICKS, IMU_TIME = 200, 5, 0.5
 #: s the shortest ramp takes.
 SHORTEST_RAMP = 0.5
+#: Signals that stop the robot, where the system has them.
+STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
 #: What a servo, a bus or the IMU can raise while it is talked to.
 HARDWARE_TROUBLE = (NoAnswerError, RefusedError, ConnectionError)
 
@@ -118,11 +120,14 @@ class ControlLoop:
         self._wants_guard = guard and link.is_serial and not dry_run
         self._guard: Guard | None = None
         self._asked_to_stop = self._asked_off = ""
+        self._log_trouble = self._terminal_trouble = ""
+        self._is_switching_off = False
         self._operator_at = -np.inf
         self._rules: frozenset[str] = frozenset()
         self._ticks = 0
         self._started = 0.0
         self._read_at = 0.0
+        self._idle = 0.0
         self._imu_reading: ImuReading | None = None
         self._wheel_zero = np.zeros(4)
         self.view: View | None = None
@@ -200,6 +205,7 @@ class ControlLoop:
             self._fail(self._asked_off or self._asked_to_stop, is_fault=False)
         atexit.register(self.close)
         self._gate.arm()
+        self._idle = 0.0
         self.pacer.start()
         self.view = self._look()
 
@@ -208,6 +214,7 @@ class ControlLoop:
             return
         if self.log is not None:
             self.log.finish()
+        self._log_trouble = ""
         self.log = RunLog(self._log_folder, self._meta)
         self.log.event(self.clock.now(), "checks", found=[str(check) for check in self.checks])
 
@@ -248,6 +255,8 @@ class ControlLoop:
     def stop(self, reason: str = "end", is_fault: bool = False) -> None:
         """Stop the wheels, hold the legs, switch torque off. Does nothing when it has happened already.
 
+        Motors that are off stay off: somebody may hold them.
+
         Args:
             reason: for the log.
             is_fault: end in FAULT, not in LIMP.
@@ -255,10 +264,10 @@ class ControlLoop:
         if self.phase not in (Phase.RAMP, Phase.RUNNING):
             return
         self.reason = self.reason or reason
-        self._enter(Phase.STOPPING)
         try:
+            self._enter(Phase.STOPPING)
             for _ in range(round(self.limits.stop_time / self.pacer.period)):
-                if self._exchange(resting(self.goals)) == Level.OFF:
+                if self._exchange(resting(self.goals), self._gate.torque_on.copy()) == Level.OFF:
                     is_fault = is_fault or not self._asked_off
                     break
         except HARDWARE_TROUBLE as error:
@@ -273,6 +282,8 @@ class ControlLoop:
         try:
             self.stop(reason or "end")
         finally:
+            if self._gate.armed:  # a stop that was interrupted
+                self._off(is_fault=True)
             if not self._gate.armed and self.phase is not Phase.FAULT:
                 self._release_guard()
             if self._is_open:
@@ -282,9 +293,11 @@ class ControlLoop:
     def _off(self, is_fault: bool) -> None:
         """Torque off, logs closed."""
         left: list[str] = list(JOINTS)
+        self._is_switching_off = True
         try:
             left = self._gate.off()
         finally:
+            self._is_switching_off = False
             if left:
                 self.reason = f"{self.reason}; CUT THE POWER: torque is not confirmed off at {', '.join(left)}"
             self._enter(Phase.FAULT if is_fault or left else Phase.LIMP)
@@ -294,8 +307,18 @@ class ControlLoop:
 
     def _finish_log(self) -> None:
         if self.log is not None:
-            self.log.event(self.clock.now(), "end", reason=self.reason, statistics=self.statistics())
-            self.log.finish()
+            with self._logging():
+                self.log.event(self.clock.now(), "end", reason=self.reason, statistics=self.statistics())
+            with self._logging():
+                self.log.finish()
+
+    @contextlib.contextmanager
+    def _logging(self) -> Iterator[None]:
+        """Let a log that cannot be written (a full disk) stop the robot in good order, and keep nothing from being done."""
+        try:
+            yield
+        except OSError as error:
+            self._log_trouble = self._log_trouble or f"the log cannot be written: {error}"
 
     def _release_guard(self) -> None:
         if self._guard is not None:
@@ -331,7 +354,10 @@ class ControlLoop:
 
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
-        if self.log is not None:
+        self._gate.is_calm = phase is Phase.RAMP
+        if self.log is None or self._log_trouble:
+            return
+        with self._logging():
             self.log.event(self.clock.now(), "phase", phase=phase.value, reason=self.reason)
             if phase is Phase.RAMP:
                 self.log.begin("ramp")
@@ -361,36 +387,53 @@ class ControlLoop:
             late_ticks=self.pacer.late_ticks,
             late_share=self.pacer.late_share,
             operator_silence=self.clock.now() - self._operator_at,
-            idle=self.clock.now() - self._seen().time,
+            idle=max(self._idle, self.clock.now() - self._seen().time),
+            trouble=self._log_trouble or self._terminal_trouble,
             asked_to_stop=self._asked_to_stop,
             asked_off=self._asked_off,
         )
         with self.pacer.timed("write"):
             decision = self._gate.write(wanted, view, torque_on)
+        if self.phase is Phase.RUNNING:
+            self.pacer.note("latency", self.clock.now() - self._read_at)
         self._note(view, decision)
         if decision.level == Level.OFF:
             return decision.level
-        if self.spare is not None:
-            self.spare()
+        sent = self.clock.now()
+        self._serve_operator()
         self.pacer.wait()
+        self._idle = self.clock.now() - sent
         with self.pacer.timed("read"):
             self.view = self._look()
         self._read_at = self.clock.now()
         return decision.level
+
+    def _serve_operator(self) -> None:
+        if self.spare is None:
+            return
+        try:
+            self.spare()
+        except OSError as error:
+            self.spare = None
+            self._terminal_trouble = f"the operator's terminal is gone: {error}"
 
     def _note(self, view: View, decision: Any) -> None:
         """Log the row, and each rule that begins to act; remember why the worst stopped the robot."""
         worst = max(decision.verdicts, default=None)
         if worst is not None and worst.level >= Level.STOP and self.phase is not Phase.STOPPING:
             self.reason = f"{worst.rule}: {worst.text}"
-        if self.log is None:
+        if self.log is None or self._log_trouble:
             return
+        with self._logging():
+            self._write_row(self.log, view, decision)
+
+    def _write_row(self, log: RunLog, view: View, decision: Any) -> None:
         goals = np.where(self._gate.torque_on & (decision.level < Level.OFF), self._gate.goals, np.nan)
-        self.log.row(view.time, sensors_of(view, self._wheel_zero, self._started), goals)
+        log.row(view.time, sensors_of(view, self._wheel_zero, self._started), goals)
         rules = {verdict.rule: {"level": verdict.level.name, "text": verdict.text} for verdict in decision.verdicts}
         rules |= {rule: {"joints": [JOINTS[k] for k in np.flatnonzero(mask)]} for rule, mask in decision.limited.items()}
         for rule in rules.keys() - self._rules:
-            self.log.event(view.time, "intervention", rule=rule, row=self._ticks, **rules[rule])
+            log.event(view.time, "intervention", rule=rule, row=self._ticks, **rules[rule])
         self._rules = frozenset(rules)
 
     def _seen(self) -> View:
@@ -422,6 +465,9 @@ class ControlLoop:
             self._fail(
                 f"imu: the accelerometer reads {size:.1f} m/s2, expected {STANDARD_GRAVITY:.1f} at rest: no tilt would be seen"
             )
+        up = reading.accelerometer / size
+        if tilt_of(up) > self.limits.tilt:
+            self._fail(f"imu: the body leans by {tilt_of(up):.2f} rad, limit {self.limits.tilt:g}: it must stand, and be level")
         voltage, temperature = self._gate.read_health()
         self._ticks = 0
         self._imu_reading = reading
@@ -438,7 +484,7 @@ class ControlLoop:
             gyro=reading.gyro,
             accelerometer=reading.accelerometer,
             imu_silence=reading.age,
-            up=reading.accelerometer / size,
+            up=up,
         )
 
     def _look(self) -> View:
@@ -486,6 +532,8 @@ class ControlLoop:
                 restarted=readings.restarted | again.restarted,
             )
         good = readings.answered & plausible(self._gate.frame, before, np.nan_to_num(readings.position, nan=np.inf), now)
+        heard_nothing = good & (before.silence > 0.0) & (before.silence + now - before.time > self.limits.watchdog)
+        latched = self._gate.latched(JOINTS[k] for k in np.flatnonzero(heard_nothing))
         self._ticks += 1
         voltage, temperature = before.voltage, before.temperature
         if self._ticks % HEALTH_TICKS == 0 and good.all():
@@ -503,6 +551,7 @@ class ControlLoop:
             restarted=readings.restarted,
             voltage=voltage,
             temperature=temperature,
+            latched=", ".join(latched) or before.latched,
         )
 
     def statistics(self) -> dict[str, Any]:
@@ -512,18 +561,23 @@ class ControlLoop:
 
 @contextlib.contextmanager
 def stop_on_signals(loop: ControlLoop) -> Iterator[None]:
-    """Let SIGINT, SIGTERM and SIGHUP stop the robot in good order at the next tick; the second one interrupts at once."""
+    """Let signals stop the robot in good order at the next tick; the second one interrupts at once.
+
+    Nothing interrupts switching torque off. Ctrl-Z (SIGTSTP) and Ctrl-\\ (SIGQUIT) are stops like Ctrl-C: a program that sleeps
+    would leave torque on.
+    """
 
     def take(number: int, _: object) -> None:
         name = signal.Signals(number).name
-        if loop._asked_to_stop:
+        if loop._asked_to_stop and not loop._is_switching_off:
             raise KeyboardInterrupt(name)
         loop.ask_to_stop(name)
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, take) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    numbers = [getattr(signal, name) for name in STOP_SIGNALS if hasattr(signal, name)]
+    before = {number: signal.signal(number, take) for number in numbers}
     try:
         yield
     finally:

@@ -37,7 +37,7 @@ class RobotPlant:
         loop: the control loop.
 
     Raises:
-        InputError: more than one robot, or a bad hardware file.
+        InputError: more than one robot, a bad hardware file, or a deadman that would never act.
     """
 
     def __init__(
@@ -58,6 +58,8 @@ class RobotPlant:
         self.capabilities = Capabilities("dynamixel", has_truth=False, can_set_state=False, real_time=True)
         description = with_ports(load_hardware(chosen.hardware), dict(chosen.ports))
         if chosen.deadman is not None:
+            if not 0.0 < chosen.deadman < np.inf:
+                raise InputError(f"deadman {chosen.deadman:g}: expected seconds, more than 0")
             safety = description.safety.model_copy(update={"deadman": chosen.deadman})
             description = description.model_copy(update={"safety": safety})
         if link is None:

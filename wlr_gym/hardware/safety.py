@@ -61,8 +61,9 @@ class View:
         imu_silence: s since the IMU's last reading.
         up: (3,) the vertical in the body frame.
         late_ticks: ticks in a row that started a period late or more. late_share: of the last second's.
-        operator_silence: s since the operator's last sign. idle: s since anything was sent to the servos.
-        lost: ports that are gone, in words.
+        operator_silence: s since the operator's last sign. idle: s for which nothing was sent to the servos.
+        lost: ports that are gone, in words. latched: joints that their watchdog has stopped, in words.
+        trouble: why log or terminal failed.
         asked_to_stop: why a stop was asked for. asked_off: why torque is to go off at once.
     """
 
@@ -84,6 +85,8 @@ class View:
     operator_silence: float = 0.0
     idle: float = 0.0
     lost: str = ""
+    latched: str = ""
+    trouble: str = ""
     asked_to_stop: str = ""
     asked_off: str = ""
 
@@ -285,6 +288,11 @@ def judge(limits: Safety, view: View, memory: Memory) -> Iterator[Verdict]:
     if view.idle > limits.watchdog:
         text = f"nothing was sent for {view.idle:.2f} s: the servos' watchdog has stopped them, and they refuse goals"
         yield Verdict(Level.OFF, "idle", text)
+    if view.latched:
+        text = f"{view.latched} heard nothing for too long: the servos' watchdog has stopped them, and they refuse goals"
+        yield Verdict(Level.STOP, "watchdog", text)
+    if view.trouble:
+        yield Verdict(Level.STOP, "computer", view.trouble)
     yield from _judge_answers(limits, view)
     yield from _judge_servos(limits, view, memory)
     lean = f"{tilt_of(view.up):.2f} rad, turning at {np.linalg.norm(view.gyro[:2]):.1f} rad/s"

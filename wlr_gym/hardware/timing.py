@@ -11,8 +11,8 @@ import numpy as np
 
 from wlr_gym.hardware.link import Clock
 
-#: Parts of a tick that are timed.
-PARTS = ("read", "think", "write", "slack")
+#: Parts of a tick that are timed; latency is from the readings to the goals that answer them.
+PARTS = ("read", "think", "write", "slack", "latency")
 _PERCENTILES = (50, 95, 99, 100)
 
 
@@ -79,13 +79,8 @@ class Pacer:
         self._times[part].append(seconds)
 
     def statistics(self) -> dict[str, float | dict[str, float]]:
-        """Return ticks, missed ones, and percentiles (ms) of period, jitter (start after the deadline) and parts of a tick.
-
-        ``latency`` is the time from reading the sensors to the goals that answer them.
-        """
+        """Return ticks, missed ones, and percentiles (ms) of period, jitter (start after the deadline) and parts of a tick."""
         times = {name: np.array(values) * 1e3 for name, values in self._times.items()}
-        size = min(len(times[name]) for name in ("think", "write"))
-        times["latency"] = times["think"][:size] + times["write"][:size]
         found: dict[str, float | dict[str, float]] = {"ticks": len(times["jitter"]), "missed": self.missed}
         for name, values in times.items():
             if len(values):

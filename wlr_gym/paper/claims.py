@@ -36,7 +36,7 @@ _RPM = 60.0 / (2.0 * math.pi)
 #: N m; dry friction added to the gear of each free rear wheel, so that there is slip to speak of.
 DRAG = 0.07
 #: Straight on, in the posture the first test starts with: most of the weight on the rear wheels.
-_STRAIGHT = PaperTest("straight", "legs at 30 degrees", TESTS["test_1"].start, TESTS["test_1"].start, (0,) * 5, 0.0, 0.0)
+_STRAIGHT = PaperTest("straight", "legs at 30 degrees", TESTS["test_1"].start, TESTS["test_1"].start)
 
 
 def _drag(left: float = DRAG, right: float = DRAG) -> list[dict[str, object]]:

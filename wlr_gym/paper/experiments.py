@@ -63,9 +63,9 @@ class PaperTest:
     title: str
     start: tuple[float, float]
     end: tuple[float, float]
-    figures: tuple[int, int, int, int, int]
-    error: float
-    lateral: float
+    figures: tuple[int, ...] = ()
+    error: float = 0.0
+    lateral: float = 0.0
     rear_driven: bool = False
 
     def motion(self) -> Motion:
@@ -237,15 +237,19 @@ def drive_plant(plant: Plant, test: PaperTest, parameters: Parameters, every: in
     readings = plant.reset(seeds=seeds, parameters=parameters if plant.capabilities.can_set_state else None, state=state)
     look = _look_at_truth if plant.capabilities.has_truth else _look_at_sensors
     slip_path = np.zeros((count, 8))
-    rows = [look(plant, readings, slip_path)]
+    rows, seen = [look(plant, readings, slip_path)], readings.camera_is_new > 0.0
     for tick, (goal, on) in enumerate(zip(goals, torque_on, strict=True)):
         asked = np.where(on, goal, np.where(np.arange(8) < 4, np.pi / 2, 0.0))
         readings = plant.step(np.tile(asked, (count, 1)), np.tile(on, (count, 1)))
+        seen = seen | (readings.camera_is_new > 0.0)
         if plant.capabilities.has_truth:
             slip_path = slip_path + plant.truth().slip_displacement
         if (tick + 1) % every == 0:
             rows.append(look(plant, readings, slip_path))
-    return _record(plant.capabilities.name, test, rows, every)
+    record = _record(plant.capabilities.name, test, rows, every)
+    if not plant.capabilities.has_truth:  # a robot without a camera does not know where it is
+        record.position[:, ~seen], record.attitude[:, ~seen] = np.nan, np.nan
+    return record
 
 
 def starting_state(robot: Robot, parameters: Parameters, legs: Array) -> PlantState:
@@ -302,7 +306,7 @@ def _look_at_sensors(plant: Plant, readings: Sensors, slip_path: Array) -> Row:
 
 def _record(model: str, test: PaperTest, rows: list[Row], every: int) -> Record:
     found = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    time = PERIOD * every * np.arange(len(rows)) - SETTLE
+    time = np.asarray(PERIOD * every * np.arange(len(rows)) - SETTLE, dtype=np.float64)
     start = int(np.argmin(np.abs(time)))
     found["joint_position"][:, :, 4:] -= found["joint_position"][start, :, 4:]
     found["position"][:, :, :2] -= found["position"][start, :, :2]

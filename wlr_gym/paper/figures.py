@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,20 +24,22 @@ from wlr_gym.paper.open_question import READINGS, Finding
 
 Array = NDArray[np.float64]
 
-_STYLES: dict[str, dict[str, object]] = {
+_STYLES: dict[str, dict[str, Any]] = {
     REDUCED: {"color": "tab:orange", "linewidth": 2.4, "alpha": 0.7},
     "gibbs_appell": {"color": "tab:blue", "linewidth": 1.2},
     "mujoco": {"color": "black", "linewidth": 1.0, "linestyle": (0, (4, 3))},
 }
-_IDEAL: dict[str, object] = {"color": "0.6", "linewidth": 3.0, "alpha": 0.6}
+_IDEAL: dict[str, Any] = {"color": "0.6", "linewidth": 3.0, "alpha": 0.6}
 #: s; what is before, the robot settling on its legs, is not drawn.
 _FROM = -0.5
 _UNEVEN = ("tab:purple", "tab:green")
 _RPM = 60.0 / (2.0 * np.pi)
+#: A grid of axes.
+Panels = NDArray[Any]
 Series = Callable[[Record], Array]
 
 
-def _style(model: str) -> dict[str, object]:
+def _style(model: str) -> dict[str, Any]:
     return _STYLES.get(model, {"color": "tab:green", "linewidth": 1.0})
 
 
@@ -47,7 +50,7 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def _panels(title: str, rows: int, columns: int, height: float = 2.4) -> tuple[Figure, NDArray[np.object_]]:
+def _panels(title: str, rows: int, columns: int, height: float = 2.4) -> tuple[Figure, Panels]:
     figure = Figure(figsize=(5.0 * columns, height * rows + 0.8), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
     figure.suptitle(title, fontsize=12)
@@ -57,7 +60,7 @@ def _panels(title: str, rows: int, columns: int, height: float = 2.4) -> tuple[F
     return figure, axes
 
 
-def _over_time(figure: Figure, axes: NDArray[np.object_]) -> Figure:
+def _over_time(figure: Figure, axes: Panels) -> Figure:
     """Finish a figure whose panels share the time."""
     for panel in axes.flat:
         panel.set_xlim(_FROM, duration() + 0.5)
@@ -66,20 +69,22 @@ def _over_time(figure: Figure, axes: NDArray[np.object_]) -> Figure:
     return _finish(figure, axes)
 
 
-def _finish(figure: Figure, axes: NDArray[np.object_]) -> Figure:
-    handles: dict[str, object] = {}
+def _finish(figure: Figure, axes: Panels, columns: int = 4) -> Figure:
+    handles: dict[str, Any] = {}
     for panel in axes.flat:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     if handles:
-        figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+        figure.legend(
+            list(handles.values()), list(handles), loc="outside lower center", ncols=columns, frameon=False, fontsize=9
+        )
     return figure
 
 
 def _draw(axes: Axes, records: Sequence[Record], series: Series, title: str, unit: str) -> None:
     for record in records:
         shown = record.time > _FROM
-        axes.plot(record.time[shown], series(record)[shown], label=_label(record.model), **_style(record.model))  # type: ignore[arg-type]
+        axes.plot(record.time[shown], series(record)[shown], label=_label(record.model), **_style(record.model))
     axes.set_title(title, fontsize=9)
     axes.set_ylabel(unit, fontsize=9)
 
@@ -89,7 +94,7 @@ def _label(model: str) -> str:
 
 
 def _draw_ideal(axes: Axes, ideal: IdealMotion, values: Array) -> None:
-    axes.plot(ideal.time, values, label="no slip, as commanded", zorder=1, **_IDEAL)  # type: ignore[arg-type]
+    axes.plot(ideal.time, values, label="no slip, as commanded", zorder=1, **_IDEAL)
 
 
 def _heading(test: PaperTest, kind: int, what: str) -> str:
@@ -190,7 +195,7 @@ def path_figure(records: Sequence[Record], variants: Mapping[str, Array], test: 
     figure.set_size_inches(8.5, 4.2)
     panel = axes[0, 0]
     for record in records:
-        panel.plot(record.position[:, 0, 0], 100 * record.position[:, 0, 1], label=_label(record.model), **_style(record.model))  # type: ignore[arg-type]
+        panel.plot(record.position[:, 0, 0], 100 * record.position[:, 0, 1], label=_label(record.model), **_style(record.model))
     for (label, path), colour in zip(variants.items(), _UNEVEN, strict=True):
         panel.plot(path[:, 0], 100 * path[:, 1], linewidth=1.4, color=colour, label=f"Gibbs-Appell, {label}")
     for sign in (1, -1):
@@ -198,7 +203,7 @@ def path_figure(records: Sequence[Record], variants: Mapping[str, Array], test: 
             100 * sign * test.lateral, color="tab:red", linestyle=":", linewidth=1.0, label="paper's lateral displacement"
         )
     panel.set(xlabel="x (m)", ylabel="y (cm)")
-    return _finish(figure, axes)
+    return _finish(figure, axes, columns=3)
 
 
 def slip_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:

@@ -8,6 +8,7 @@ printed or from the right ones.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +68,7 @@ class IdealMotion:
             theta_dd={wheel: u_dot[:, k] for wheel, k in order.items()},
         )  # fmt: skip
 
-    def as_printed(self) -> dict[str, object]:
+    def as_printed(self) -> dict[str, Any]:
         """Return (19)-(28) as printed, evaluated on this motion."""
         return printed.forces_as_used(self.constants, self.state())
 

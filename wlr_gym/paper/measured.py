@@ -76,7 +76,7 @@ def inverse_from_record(robot: Robot, record: Record, index: int = 0, rear_drag:
     return FromMeasurement(
         right,
         np.column_stack([found["tau_alpha"], found["tau_beta"]]),
-        np.column_stack([wheels[wheel] for wheel in _ORDER]),  # type: ignore[index]
+        np.column_stack([wheels[wheel] for wheel in _ORDER]),
     )
 
 

@@ -11,7 +11,7 @@ How the paper's numbers are meant is open in two ways, so every result is given 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.effects import EFFECTS, apply_patch, load_patch
-from wlr_gym.paper.experiments import TESTS, PaperTest, Record, drive, no_slip_travel
+from wlr_gym.paper.experiments import TESTS, PaperTest, Record, drive, no_slip_travel, select
 from wlr_gym.parameters import Parameters
 from wlr_gym.random import generator
 from wlr_gym.robot import Robot
@@ -39,8 +39,9 @@ BEAM, ROUNDS = 4, 3
 _FAST, _EXACT = (0.002, "float32"), (0.001, "float64")
 #: In tolerances: what comes near a match.
 _NEAR = 1.5
+_DOWN = (np.pi / 2, np.pi / 2)
 #: Legs straight down, same wheels: a third drive that any of the candidates could be told by.
-CONTROL = PaperTest("control", "control: legs straight down", (np.pi / 2,) * 2, (np.pi / 2,) * 2, (0,) * 5, 0.0, 0.0)
+CONTROL = PaperTest("control", "control: legs straight down", _DOWN, _DOWN)
 
 
 @dataclass(frozen=True)
@@ -193,9 +194,14 @@ def outcomes(robot: Robot, parameters: Parameters, threads: int = 2, exact: bool
 
 
 def measure(robot: Robot, parameters: Parameters, test: PaperTest, threads: int = 2, exact: bool = True) -> dict[str, Array]:
-    """Drive one test on N robots; return the fields of :class:`Outcomes`, each (N,)."""
+    """Drive one test on N robots; return the fields of :class:`Outcomes`, each (N,).
+
+    One robot more goes with every batch, with something of every candidate: all batches then need the same compiled kernel.
+    """
     step, precision = _EXACT if exact else _FAST
-    record = drive("gibbs_appell", test, robot, parameters, (), step, every=50, threads=threads, precision=precision)
+    batch = Parameters(np.concatenate([parameters.values, _everything(robot).values]))
+    record = drive("gibbs_appell", test, robot, batch, (), step, every=50, threads=threads, precision=precision)
+    record = select(record, np.arange(len(parameters)))
     x, y = _seen_by_camera(record, parameters)
     turns = record.joint_position[-1, :, 6:].mean(axis=1) / (2 * np.pi)
     return {
@@ -206,6 +212,13 @@ def measure(robot: Robot, parameters: Parameters, test: PaperTest, threads: int 
         "rear_turns": turns,
         "front_effort": record.torque[record.time > 0.0][:, :, 4:6].mean(axis=(0, 2)),
     }
+
+
+def _everything(robot: Robot) -> Parameters:
+    """One robot with every dial of every candidate a tenth on its way."""
+    dials = [dial for candidate in CANDIDATES for dial in candidate.dials]
+    low, high = (np.array([[getattr(dial, end) for dial in dials]]) for end in ("low", "high"))
+    return make_parameters(robot, dials, low + 0.1 * (high - low))
 
 
 def _seen_by_camera(record: Record, parameters: Parameters) -> tuple[Array, Array]:
@@ -435,29 +448,40 @@ OBSERVABLES: Mapping[str, tuple[str, str]] = {
 }
 
 
-def observables(robot: Robot, finding: Finding, reading: Reading, most: int = 32, threads: int = 2) -> dict[str, Array]:
-    """Return what the matching robots of a finding would have shown elsewhere: :data:`OBSERVABLES`, each (matches,).
+def observables(
+    robot: Robot, findings: Sequence[Finding], reading: Reading, most: int = 32, threads: int = 2
+) -> list[dict[str, Array]]:
+    """Return what the matching robots of each finding would have shown elsewhere: :data:`OBSERVABLES`, each (matches,).
 
     Args:
-        robot: nominal. finding, reading: whose matches.
-        most: of the matches are driven again for the control drive, the first ones.
+        robot: nominal. findings: with matches. reading: whose matches.
+        most: of the matches of one finding are driven again for the control drive, the first ones.
         threads: of the engine.
     """
-    rows = finding.matches(reading)[:most]
-    shown = finding.outcomes.take(rows)
-    control = measure(robot, finding.parameters(robot, rows), CONTROL, threads)
-    return {
-        "control_error": 100 * control["error_encoder"],
-        "control_lateral": 100 * np.abs(control["lateral"]),
-        "rear_turns_1": shown.rear_turns[:, 0],
-        "rear_turns_2": shown.rear_turns[:, 1],
-        "front_effort_1": shown.front_effort[:, 0],
-        "front_effort_2": shown.front_effort[:, 1],
-        "yaw_2": np.degrees(np.abs(shown.yaw[:, 1])),
-    }
+    chosen = [finding.matches(reading)[:most] for finding in findings]
+    if not chosen:
+        return []
+    batch = [finding.parameters(robot, rows).values for finding, rows in zip(findings, chosen, strict=True)]
+    control = measure(robot, Parameters(np.concatenate(batch)), CONTROL, threads)
+    shown, end = [], 0
+    for finding, rows in zip(findings, chosen, strict=True):
+        start, end = end, end + len(rows)
+        own = finding.outcomes.take(rows)
+        shown.append(
+            {
+                "control_error": 100 * control["error_encoder"][start:end],
+                "control_lateral": 100 * np.abs(control["lateral"][start:end]),
+                "rear_turns_1": own.rear_turns[:, 0],
+                "rear_turns_2": own.rear_turns[:, 1],
+                "front_effort_1": own.front_effort[:, 0],
+                "front_effort_2": own.front_effort[:, 1],
+                "yaw_2": np.degrees(np.abs(own.yaw[:, 1])),
+            }
+        )
+    return shown
 
 
-def matching(findings: Sequence[Finding], reading: Reading) -> Iterator[Finding]:
+def matching(findings: Sequence[Finding], reading: Reading) -> list[Finding]:
     """Return the findings with a match, most matches first."""
     ordered = sorted(findings, key=lambda finding: -len(finding.matches(reading)))
-    return (finding for finding in ordered if len(finding.matches(reading)))
+    return [finding for finding in ordered if len(finding.matches(reading))]

@@ -6,10 +6,11 @@ z-parts of (19) and (20) count z downwards (wheels above the hips if z were up);
 
 from __future__ import annotations
 
+from typing import Any
+
 from wlr_gym.paper.quantities import (
     WHEELS,
     Constants,
-    PerWheel,
     State,
     Value,
     Vector,
@@ -282,7 +283,7 @@ def eq30_lateral_force_behind(c: Constants, s: State) -> Value:
     return 2 * c.mu_dy * rear_moment(c, s) / _misprinted_base(c, s)
 
 
-def forces_as_used(c: Constants, s: State) -> dict[str, PerWheel | Value]:
+def forces_as_used(c: Constants, s: State) -> dict[str, Any]:
     """Return (19)-(28) at one state, as the paper uses them: driven by measured motion and slip."""
     wheel_torques = (
         eq21_torque_of_the_right_front_wheel, eq22_torque_of_the_left_front_wheel,

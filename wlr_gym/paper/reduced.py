@@ -183,7 +183,7 @@ def normal_forces(residual: Array, j_n: Array) -> Array:
     """
     rows = np.stack([j_n[:, :2].sum(axis=1), j_n[:, 2:].sum(axis=1)], axis=2)[:, [VZ, PITCH]]
     loads = np.linalg.solve(rows, residual[:, [VZ, PITCH], None])[:, :, 0]
-    return np.repeat(loads, 2, axis=1)
+    return np.asarray(np.repeat(loads, 2, axis=1), dtype=np.float64)
 
 
 # ---- inverse dynamics ------------------------------------------------------------------------------------------------
@@ -227,7 +227,9 @@ def inverse_dynamics(
     along[:, :2] = ((needed[:, VX] - along[:, 2:].sum(axis=1)) / 2)[:, None]
     moment = needed[:, YAW] - np.einsum("nw,nw->n", j_x[:, :, YAW], along)
     axles = np.stack([np.ones((len(u), 2)), j_y[:, ::2, YAW]], axis=1)
-    lateral = np.linalg.solve(axles, np.stack([needed[:, VY], moment], axis=1)[:, :, None])[:, :, 0]
+    lateral = np.asarray(
+        np.linalg.solve(axles, np.stack([needed[:, VY], moment], axis=1)[:, :, None])[:, :, 0], dtype=np.float64
+    )
     rest = needed - np.einsum("nwk,nw->nk", j_x, along)
     normal = normal_forces(rest, j_n)
     rest -= np.einsum("nwk,nw->nk", j_n, normal)
@@ -310,7 +312,7 @@ class ReducedModel:
         p = posture(c, *state.legs.T)
         b, b_dot = reduction(c, p, state.u)
         u11 = np.einsum("nij,nj->ni", b, state.u)
-        mass, bias = mass_matrix_and_bias(c, *state.legs.T, p.pitch, u11)
+        mass, bias = mass_matrix_and_bias(c, state.legs[:, 0], state.legs[:, 1], p.pitch, u11)
         lag = np.einsum("nij,nj->ni", b_dot, state.u)
         small = b.transpose(0, 2, 1) @ mass @ b
         free = np.einsum("nki,nk->ni", b, bias + np.einsum("nij,nj->ni", mass, lag))

@@ -65,16 +65,15 @@ def _apart(a: Record, b: Record) -> dict[str, float]:
 
 def what_would_decide(robot: Robot, findings: Sequence[Finding], threads: int = 2) -> dict[str, Decisive]:
     """Return, per reading, what the matching robots of every finding would show in other measurements."""
-    return {
-        reading.name: {
-            finding.label: {
-                name: (float(values.min()), float(values.max()))
-                for name, values in open_question.observables(robot, finding, reading, threads=threads).items()
-            }
-            for finding in open_question.matching(findings, reading)
+    decisive = {}
+    for reading in READINGS:
+        found = open_question.matching(findings, reading)
+        shown = open_question.observables(robot, found, reading, threads=threads)
+        decisive[reading.name] = {
+            finding.label: {name: (float(values.min()), float(values.max())) for name, values in own.items()}
+            for finding, own in zip(found, shown, strict=True)
         }
-        for reading in READINGS
-    }
+    return decisive
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------

@@ -130,11 +130,12 @@ def _function(module: Any, number: int, own: bool = False) -> Callable[..., Any]
     return found[0] if found else None
 
 
-def _equation(number: int, *texts: Any) -> Equation:
+def _equation(number: int, title: str, section: str, verdicts: tuple[str, ...], remark: str, correction: str) -> Equation:
     as_printed, right = (_function(module, number) for module in (printed, corrected))
     assert as_printed is not None
     assert right is not None
-    return Equation(number, *texts, as_printed, right, _function(repaired, number, own=True))
+    misprint_undone = _function(repaired, number, own=True)
+    return Equation(number, title, section, verdicts, remark, correction, as_printed, right, misprint_undone)
 
 
 #: Every equation by its number.

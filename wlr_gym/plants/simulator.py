@@ -16,10 +16,14 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 
+#: Of the platform's mass: what moves at least against one wheel's spring.
+LIGHTEST_SHARE = 0.05
+
+
 class Simulator:
     """Base of the simulators; see :class:`wlr_gym.plants.base.Plant` for the contract.
 
-    A simulator ends its constructor with :meth:`_start`, and defines ``step`` and the four methods that raise here.
+    A simulator ends its constructor with :meth:`_start`, and defines ``step`` and the methods that raise here.
     """
 
     def __init__(self, robot: Robot, count: int, options: PlantOptions | None) -> None:
@@ -50,6 +54,10 @@ class Simulator:
 
     def _write_state(self, state: PlantState, rows: Rows) -> None:
         """Put robots ``rows`` where ``state`` (N) says."""
+        raise NotImplementedError
+
+    def get_state(self) -> PlantState:
+        """Return a copy of the mechanical and servo state."""
         raise NotImplementedError
 
     def _look(self, rows: Rows) -> None:
@@ -135,6 +143,11 @@ def refitted_lead(lead: Array, old: Array, new: Array) -> Array:
     return np.where(old == new, lead, np.where(new > 0.0, np.copysign(kept, lead), 0.0))
 
 
+def most_damping(parameters: Parameters, step: float) -> float:
+    """Return the contact damping (N s/m) that the step just resolves, for the lightest robot of the batch."""
+    return float(2.0 * LIGHTEST_SHARE * parameters["body.mass"].min() / step)
+
+
 def check_contact_resolution(parameters: Parameters, step: float) -> None:
     """Refuse a contact spring that the step cannot resolve (explicit spring: step^2 k / m well below 4).
 
@@ -143,7 +156,7 @@ def check_contact_resolution(parameters: Parameters, step: float) -> None:
     """
     stiffness = parameters["ground.normal_stiffness"].max(axis=1)
     damping = parameters["ground.normal_damping"].max(axis=1)
-    mass = 0.05 * parameters["body.mass"]
+    mass = LIGHTEST_SHARE * parameters["body.mass"]
     worst = np.maximum(step * step * stiffness / mass / 2.0, step * damping / mass / 2.0)
     robot = int(np.argmax(worst))
     if worst[robot] > 1.0:

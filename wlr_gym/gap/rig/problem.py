@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,7 @@ class RigProblem:
     steps = 20
     #: A replay costs milliseconds, and a joint that sticks answers far from linearly: every hypothesis is worth a whole fit.
     thorough = True
+    motions: Mapping[str, str] = MappingProxyType({})
 
     def __init__(
         self, recordings: Sequence[Recording], known: Sequence[PatchEffect] = (), friction_is_known: bool = True

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,8 @@ _WHEEL_SETS = tuple(tuple(WHEELS[k] for k in pick) for pick in ((0, 1), (2, 3), 
 _OF_LEGS = (*((leg,) for leg in LEGS), *_LEG_SETS)
 _OF_WHEELS = (*((wheel,) for wheel in WHEELS), *_WHEEL_SETS)
 _OF_JOINTS = (*_OF_LEGS, *_OF_WHEELS, tuple(JOINTS))
+#: Below this an effect is what any robot has; smaller values of it are calibration's.
+LEAST = {("tyre_creep", "creep_speed"): 0.003}
 #: Periods per turn at which a ripple is looked for.
 ORDERS = range(1, 65)
 #: m; width of the strips of floor in which another friction is looked for.
@@ -42,10 +44,47 @@ UNBOUNDED = {
 MOST_STRIPS = 24
 
 
+@dataclass(frozen=True)
+class _Part:
+    """One unknown of an effect that adds to a number which calibration may move too.
+
+    Attributes:
+        parameter: of the effect.
+        quantities: the numbers it adds to.
+        size: of a probe, where the robot's file gives those numbers no tolerance.
+        scale: of the parameter per unit of the quantity.
+    """
+
+    parameter: str
+    quantities: tuple[str, ...]
+    size: float
+    scale: float = 1.0
+
+
 @dataclass
 class _Lists:
+    tolerances: Mapping[str, float]
     probes: list[Probe]
     candidates: list[Candidate]
+
+    def add_known(self, name: str, where: Sequence[str], parts: Sequence[_Part], mu: float = 0.6) -> None:
+        """Add an effect of :class:`_Part` s: its first guess needs no probe where the numbers have tolerances."""
+        neutral = {unknown.name: unknown.neutral for unknown in unknowns(name, mu)}
+        directions, amounts = [], []
+        for part in parts:
+            if all(quantity in self.tolerances for quantity in part.quantities):
+                directions.append(part.quantities)
+                amounts.append(part.scale * self.tolerances[part.quantities[0]])
+            else:
+                changed = {**neutral, part.parameter: neutral[part.parameter] + part.size}
+                directions.append((self.probe(name, where, changed, part.parameter),))
+                amounts.append(part.size)
+        middle = [neutral[part.parameter] for part in parts]
+
+        def values(a: Array) -> tuple[float, ...]:
+            return tuple(float(n + size * k) for n, size, k in zip(middle, amounts, a, strict=True))
+
+        self.add(name, where, [Start(tuple(directions), values)], mu)
 
     def probe(self, name: str, where: Sequence[str], parameters: dict[str, float], note: str = "") -> str:
         key = " ".join([name, *where, note]).strip()
@@ -62,27 +101,29 @@ def unknowns(name: str, mu: float) -> tuple[Unknown, ...]:
     for key, spec in EFFECTS[name].parameters.items():
         neutral = spec.neutral if isinstance(spec.neutral, float | int) else mu
         low, high = spec.prior
+        low = max(low, LEAST.get((name, key), low))
         step = 0.05 * (high - low)
         found.append(Unknown(key, spec.unit, float(neutral), low, high, step))
     return tuple(found)
 
 
 def robot_candidates(
-    parameters: Parameters, measured: Sequence[Array], residuals: Sequence[Array]
+    parameters: Parameters, tolerances: Mapping[str, float], measured: Sequence[Array], residuals: Sequence[Array]
 ) -> tuple[list[Probe], list[Candidate]]:
     """Return probes and candidates beyond a calibrated model.
 
     Args:
         parameters: (1) of the model.
+        tolerances: of the quantities that calibration may move, by name.
         measured: (rows, signals) per run.
         residuals: of the model, (rows, signals) per run.
     """
-    lists = _Lists([], [])
+    lists = _Lists(tolerances, [], [])
     mu = float(parameters["ground.mu_x"].mean())
     _friction_and_motors(lists)
     _backlash(lists)
     _ripple(lists, measured, residuals)
-    _ground(lists, mu)
+    _ground(lists, mu, float(parameters["wheel.radius"].mean()))
     _patch(lists, mu, measured)
     _loads(lists)
     _sensors(lists)
@@ -116,14 +157,13 @@ def _per_place(
 
 
 def _friction_and_motors(lists: _Lists) -> None:
-    for name, _parameter, quantity, sigma in (
-        ("coulomb_friction", "torque", "servo.coulomb_friction", {"leg": 0.025, "wheel": 0.0075}),
-        ("viscous_friction", "coefficient", "servo.viscous_friction", {"leg": 0.01, "wheel": 0.002}),
-    ):
-        for places in _OF_LEGS + _OF_WHEELS:
-            amount = sigma["leg" if places[0] in LEGS else "wheel"]
-            direction = tuple(f"{quantity}[{place}]" for place in places)
-            lists.add(name, places, [Start((direction,), _scaled(amount))])
+    for places in _OF_LEGS + _OF_WHEELS:
+        leg = places[0] in LEGS
+        for name, parameter, quantity, size in (
+            ("coulomb_friction", "torque", "servo.coulomb_friction", 0.03 if leg else 0.01),
+            ("viscous_friction", "coefficient", "servo.viscous_friction", 0.02 if leg else 0.004),
+        ):
+            lists.add_known(name, places, [_Part(parameter, tuple(f"{quantity}[{place}]" for place in places), size)])
     for places, starts in _per_place(lists, "load_dependent_friction", _OF_JOINTS, "ratio", [0.1]).items():
         lists.add("load_dependent_friction", places, starts)
     for places, starts in _per_place(lists, "weak_motor", _OF_JOINTS[:-1], "scale", [-0.1], 1.0).items():
@@ -196,8 +236,8 @@ def ripple_order(joint: str, measured: Sequence[Array], residuals: Sequence[Arra
     return float(list(ORDERS)[int(np.argmax(power))])
 
 
-def _ground(lists: _Lists, mu: float) -> None:
-    lists.add("friction_level", ("ground",), [Start((("ground.mu",),), lambda a: (mu + 0.06 * float(a[0]),))], mu)
+def _ground(lists: _Lists, mu: float, radius: float) -> None:
+    lists.add_known("friction_level", ("ground",), [_Part("mu", ("ground.mu",), -0.1)], mu)
     less = -0.25 * mu
     singles = {w: lists.probe("friction_asymmetry", (w,), {"mu": mu + less}) for w in WHEELS}
     for places in _OF_WHEELS[:-1]:
@@ -214,14 +254,10 @@ def _ground(lists: _Lists, mu: float) -> None:
         for places, found in _per_place(lists, name, _OF_WHEELS, parameter, [size]).items():
             lists.add(name, places, found)
     for places in _OF_WHEELS:
-        direction = tuple(f"wheel.radius[{place}]" for place in places)
-        lists.add("wheel_radius_error", places, [Start((direction,), _scaled(0.005, 1.0))])
-    slope = math.radians(0.2)
-    lists.add(
-        "floor_slope",
-        ("ground",),
-        [Start((("ground.slope[pitch]",), ("ground.slope[roll]",)), lambda a: (slope * float(a[0]), slope * float(a[1])))],
-    )
+        quantities = tuple(f"wheel.radius[{place}]" for place in places)
+        lists.add_known("wheel_radius_error", places, [_Part("scale", quantities, 0.01, 1.0 / radius)])
+    slopes = [_Part(axis, (f"ground.slope[{axis}]",), 0.01) for axis in ("pitch", "roll")]
+    lists.add_known("floor_slope", ("ground",), slopes)
 
 
 def _patch(lists: _Lists, mu: float, measured: Sequence[Array]) -> None:
@@ -272,12 +308,7 @@ def _loads(lists: _Lists) -> None:
             convert=_load,
         )
     )
-    offset = 0.003
-    lists.add(
-        "com_offset",
-        ("body",),
-        [Start(tuple((f"body.com_offset[{axis}]",) for axis in "xyz"), lambda a: tuple(float(v) for v in offset * a))],
-    )
+    lists.add_known("com_offset", ("body",), [_Part(axis, (f"body.com_offset[{axis}]",), 0.005) for axis in "xyz"])
     force = 0.5
     pulls = [
         lists.probe("external_force", ("body",), {"fx": fx, "fy": fy}, f"{fx:g} {fy:g}")
@@ -330,16 +361,10 @@ def _ripple_parameters(values: Sequence[float]) -> dict[str, float]:
 
 
 def _sensors(lists: _Lists) -> None:
-    zero = math.radians(0.5)
     for places in _OF_LEGS:
-        direction = tuple(f"joint.zero_offset[{place}]" for place in places)
-        lists.add("joint_zero_offset", places, [Start((direction,), _scaled(zero))])
-    bias = 0.0009
-    lists.add(
-        "gyro_bias",
-        ("sensor",),
-        [Start(tuple((f"imu.gyro_bias[{axis}]",) for axis in "xyz"), lambda a: tuple(float(v) for v in bias * a))],
-    )
+        quantities = tuple(f"joint.zero_offset[{place}]" for place in places)
+        lists.add_known("joint_zero_offset", places, [_Part("angle", quantities, 0.01)])
+    lists.add_known("gyro_bias", ("sensor",), [_Part(axis, (f"imu.gyro_bias[{axis}]",), 0.005) for axis in "xyz"])
     turn = 0.03
     keys = [
         lists.probe("imu_misalignment", ("sensor",), {**dict.fromkeys(("roll", "pitch", "yaw"), 0.0), axis: turn}, axis)
@@ -350,15 +375,6 @@ def _sensors(lists: _Lists) -> None:
         ("sensor",),
         [Start(tuple((key,) for key in keys), lambda a: tuple(float(v) for v in turn * a))],
     )
-    scale = lists.probe("camera_misalignment", ("sensor",), {"yaw": 0.0, "scale": 1.02})
-    lists.add(
-        "camera_misalignment",
-        ("sensor",),
-        [
-            Start(
-                (("camera.mount_yaw",), (scale,)),
-                lambda a: (math.radians(0.5) * float(a[0]), 1.0 + 0.02 * float(a[1])),
-            )
-        ],
-    )
-    lists.add("camera_delay", ("sensor",), [Start((("camera.delay",),), _scaled(0.01))])
+    yaw = _Part("yaw", ("camera.mount_yaw",), 0.02)
+    lists.add_known("camera_misalignment", ("sensor",), [yaw, _Part("scale", ("camera.scale",), 0.02)])
+    lists.add_known("camera_delay", ("sensor",), [_Part("delay", ("camera.delay",), 0.01)])

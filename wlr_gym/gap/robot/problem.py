@@ -13,10 +13,11 @@ from wlr_gym.effects import Patch, Source, apply_patch, load_patch
 from wlr_gym.errors import InputError
 from wlr_gym.gap.problem import Candidate, Probe, Quantity, Setting, Signal
 from wlr_gym.gap.prove import level, mean_squares
+from wlr_gym.gap.recommend import SHOWN_BY
 from wlr_gym.gap.robot.candidates import robot_candidates
 from wlr_gym.gap.robot.formulas import formula_candidates
 from wlr_gym.gap.robot.quantities import Knob, knobs, write
-from wlr_gym.gap.robot.simulate import TRUTH, Replays, RunClock, replay_batch
+from wlr_gym.gap.robot.simulate import PHYSICS_STEP, TRUTH, Replays, RunClock, replay_batch
 from wlr_gym.gap.robot.windows import WINDOW, anchored_residuals
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import TRUTH_LAYOUT
@@ -32,7 +33,7 @@ Array = NDArray[np.float64]
 
 
 #: Noise units beyond which a residual counts no more in the gap's numbers, and Gauss-Newton steps of a fit.
-CAP, STEPS = 50.0, 4
+CAP, STEPS = 50.0, 3
 
 
 class RobotProblem:
@@ -62,17 +63,16 @@ class RobotProblem:
         if not runs:
             raise InputError("no runs to analyse")
         self.metric = f"RMS over channels of measured minus replayed, in units of sensor noise, windows of {window:g} s"
-        profiles = {run.meta.profile for run in runs}
-        if len(profiles) > 1:
+        if any(run.meta.profile != runs[0].meta.profile for run in runs):
             raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
         self.cap, self.steps = CAP, STEPS
-        self.thorough, self.sealed = False, ()
+        self.thorough, self.sealed, self.motions = False, (), SHOWN_BY
         self.robot = robot or robot_of(runs[0])
         self.known = load_patch(known)
         self.backend, self.threads = backend, threads
         self.clocks = [RunClock(run, window) for run in runs]
         self.runs = tuple(run.name for run in runs)
-        self._knobs: tuple[Knob, ...] = knobs(self.robot)
+        self._knobs: tuple[Knob, ...] = knobs(self.robot, PHYSICS_STEP)
         self.quantities: tuple[Quantity, ...] = tuple(knob.quantity for knob in self._knobs)
         noise = channel_noise(self.robot)
         self.signals = tuple(Signal(name, COLUMNS[name].unit, noise[name], COLUMNS[name].group) for name in CHANNELS)
@@ -126,7 +126,7 @@ class RobotProblem:
     def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
         """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`."""
         return [
-            anchored_residuals(self._measured[r], simulated, self._noise, self.clocks[r].windows)
+            anchored_residuals(self.times(r), self._measured[r], simulated, self._noise, self.clocks[r].windows)
             for r, simulated in zip(runs, self.simulate(settings, runs), strict=True)
         ]
 
@@ -157,8 +157,9 @@ class RobotProblem:
     ) -> tuple[list[Probe], list[Candidate]]:
         """Return the effects of the library and the formulas to try, and their probes."""
         parameters = self.parameters([setting])
+        tolerances = {quantity.name: quantity.sigma for quantity in self.quantities}
         measured = [self._measured[r] for r in runs]
-        probes, candidates = robot_candidates(parameters, measured, residuals)
+        probes, candidates = robot_candidates(parameters, tolerances, measured, residuals)
         more, formulas = formula_candidates()
         return [*probes, *more], [*candidates, *formulas]
 
@@ -205,4 +206,4 @@ def _since_reversal(rate: Array) -> Array:
     changed = np.flatnonzero(np.diff(np.sign(rate)) != 0) + 1
     last = np.zeros(len(rate))
     last[changed] = changed
-    return np.arange(len(rate)) - np.maximum.accumulate(last)
+    return np.arange(len(rate), dtype=np.float64) - np.maximum.accumulate(last)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from wlr_gym.errors import InputError
 from wlr_gym.gap.problem import Quantity
 from wlr_gym.parameters import SPECS, TABLE, Parameters
+from wlr_gym.plants.simulator import most_damping
 from wlr_gym.robot import LEGS, Robot
 
 Array = NDArray[np.float64]
@@ -51,8 +52,16 @@ class Knob:
     elements: tuple[str, ...]
 
 
-def knobs(robot: Robot) -> tuple[Knob, ...]:
+#: Share of the contact damping that the physics step still resolves to which calibration may go.
+RESOLVED = 0.8
+
+
+def knobs(robot: Robot, physics_step: float) -> tuple[Knob, ...]:
     """Return what calibration may move, from the robot's tolerances.
+
+    Args:
+        robot: the robot.
+        physics_step: s, with which it will be simulated.
 
     Raises:
         InputError: a tolerance that cannot be read.
@@ -66,9 +75,13 @@ def knobs(robot: Robot) -> tuple[Knob, ...]:
     for spec in TABLE:
         if spec.tolerance in robot.tolerances and spec.tolerance not in (*UNSEEN, *SHARED):
             found += [_knob(spec.tolerance, (element,), nominal, robot) for element in spec.elements]
+    resolved = RESOLVED * most_damping(nominal, physics_step)
     for name, share in GUESSED.items():
         spec, value = SPECS[name], float(nominal[name].mean())
-        found.append(Knob(_quantity(name, name, value, share * value), tuple(spec.elements)))
+        quantity = _quantity(name, name, value, share * value)
+        if name == "ground.normal_damping":
+            quantity = replace(quantity, high=max(min(quantity.high, resolved), value))
+        found.append(Knob(quantity, tuple(spec.elements)))
     creep = SPECS["ground.creep_speed"]
     found.append(Knob(_quantity(creep.name, creep.name, 0.0, CREEP), tuple(creep.elements)))
     imu = robot.sensors.imu

@@ -37,22 +37,24 @@ from wlr_gym.runs.anchor import (
 )
 from wlr_gym.runs.format import CHANNELS, COMMANDS
 from wlr_gym.runs.read import Run
-from wlr_gym.runs.replay import held_goals
+from wlr_gym.runs.replay import held_goals, profile_parameters
 from wlr_gym.servo import motor_constants
 
 Array = NDArray[np.float64]
 
 #: s; the plant's tick, and its physics step.
-CLOCK = 0.002
+CLOCK = 0.004
 PHYSICS_STEP = 0.001
 #: s; the robot stands this long before the first row.
 LEAD = 0.3
 #: Ticks between two stored poses, from which the camera's are interpolated.
-POSE_TICKS = 5
+POSE_TICKS = 3
 #: Robots simulated at once: more need more memory and are no faster.
 MOST_ROBOTS = 1024
 DIRECT = tuple(name for name in CHANNELS if not name.startswith("cam_"))
 CAMERA = tuple(name for name in CHANNELS if name.startswith("cam_"))
+#: Of DIRECT, the leading columns of joint positions and speeds.
+_MOVED = 16
 #: Truth channels that residuals are mapped over.
 TRUTH = ("joint_position", "joint_velocity", "motor_torque", "contact_force", "slip_velocity", "position")
 
@@ -114,7 +116,7 @@ class RunClock:
         if has_camera(run):
             fits = [local_fit(self.t, unwrapped(run[f"cam_{name}"]), times, CAMERA_WINDOW) for name in ("x", "y", "yaw")]
             pose = np.stack(fits, axis=1)
-        tick = np.rint((times - self.begin) / CLOCK).astype(int)
+        tick = np.floor((times - self.begin) / CLOCK + 1e-9).astype(int)
         return Anchors(tick, np.transpose(legs), effort.T, pose[0].T, pose[1].T)
 
 
@@ -219,17 +221,18 @@ def _replay_chunk(
     plant.use_goals(WrittenGoals(clocks, run_of, delay))
     first = _join([_start(clock.run, robot, parameters) for clock in clocks])
     try:
-        recorder = _Recorder(clocks, settings, first, with_truth)
+        recorder = _Recorder(clocks, settings, first, delay, with_truth)
         readings = plant.reset(parameters=lanes, state=first)
         recorder.start(readings, plant.truth())
-        for tick in range(max(clock.ticks for clock in clocks)):
-            recorder.see(tick, readings, plant.truth())
+        ticks = POSE_TICKS * -(-max(clock.ticks for clock in clocks) // POSE_TICKS)  # the last pose is stored too
+        for tick in range(ticks):
             for r, clock in enumerate(clocks):
                 for window in np.flatnonzero(clock.anchors.tick == tick):
                     readings = _anchor(plant, clock, int(window), run_of == r, lanes, readings)
-                    recorder.rezero(readings, plant.truth(), run_of == r)
+                    recorder.start_anew(r, tick, readings, plant.truth())
+            recorder.see(tick, readings, plant.truth())
             readings = plant.step(recorder.idle_goals, recorder.torque_on(tick))
-        recorder.see(tick + 1, readings, plant.truth())
+        recorder.see(ticks, readings, plant.truth())
     finally:
         plant.close()
     return [recorder.result(r, Parameters(lanes.values[run_of == r])) for r in range(runs)]
@@ -271,9 +274,10 @@ def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.boo
 
 
 class _Recorder:
-    """Readings at the rows' times: linear between two ticks; poses on a coarser clock, for the camera's delay."""
+    """Readings at the rows' times, on a straight line through two ticks; poses on a coarser clock, for the camera's delay."""
 
-    def __init__(self, clocks: Sequence[RunClock], settings: int, first: PlantState, with_truth: bool) -> None:
+    def __init__(self, clocks: Sequence[RunClock], settings: int, first: PlantState, delay: Array, with_truth: bool) -> None:
+        self._soonest = delay.min(axis=1)
         self.clocks, self.settings, self.with_truth = clocks, settings, with_truth
         count = settings * len(clocks)
         self.idle_goals = np.zeros((count, 8))
@@ -285,7 +289,8 @@ class _Recorder:
         ticks = max(clock.ticks for clock in clocks) + 2
         self._poses = np.zeros((ticks // POSE_TICKS + 2, count, len(CAMERA)))
         self._last: Array | None = None
-        self._last_truth: Array | None = None
+        self._before_last: Array | None = None
+        self._anchored = [-1] * len(clocks)
         self._switch_rows = [clock.t - clock.begin for clock in clocks]
         self._torque = [clock.torque_on for clock in clocks]
         self._always_on = all(on.all() for on in self._torque)
@@ -294,9 +299,11 @@ class _Recorder:
     def start(self, readings: Sensors, truth: Truth) -> None:
         self._shift = self._wheels - readings.joint_position[:, 4:]
 
-    def rezero(self, readings: Sensors, truth: Truth, mine: NDArray[np.bool_]) -> None:
-        """Count wheel angles and headings on after a reset."""
+    def start_anew(self, r: int, tick: int, readings: Sensors, truth: Truth) -> None:
+        """Count the wheel angles of one run on after an anchor; what was read before it says nothing about what follows."""
+        mine = slice(r * self.settings, (r + 1) * self.settings)
         self._shift[mine] = truth.joint_position[mine, 4:] - readings.joint_position[mine, 4:]
+        self._anchored[r] = tick
 
     def torque_on(self, tick: int) -> NDArray[np.bool_] | None:
         """Switching the torque is not delayed."""
@@ -312,35 +319,49 @@ class _Recorder:
         wanted = [
             r
             for r, place in enumerate(self._place)
-            if self._next[r] < len(place) and tick - 1 <= place[self._next[r]] <= tick + 1
+            if self._next[r] < len(place) and tick - 1 <= place[self._next[r]] <= tick + 2
         ]
         if not wanted:
-            self._last = None
+            self._last = self._before_last = None
             return
         present = _direct(readings, self._shift)
         seen = np.concatenate([truth[name] for name in TRUTH], axis=1) if self.with_truth else None
         for r in wanted:
             self._take(r, tick, present, seen)
-        self._last, self._last_truth = present, seen
+        self._before_last, self._last = self._last, present
 
     def _take(self, r: int, tick: int, present: Array, seen: Array | None) -> None:
         place, mine = self._place[r], slice(r * self.settings, (r + 1) * self.settings)
         while self._next[r] < len(place) and place[self._next[r]] <= tick:
             row = self._next[r]
-            late = tick - place[row]
-            values = present[mine] if self._last is None else (1 - late) * present[mine] + late * self._last[mine]
-            self._rows[r][:, row] = values
+            self._rows[r][:, row] = self._at(place[row] - (tick - 1), r, tick, mine, present)
             if seen is not None:
                 if not self._truths[r].shape[2]:
                     self._truths[r] = np.zeros((self.settings, len(place), seen.shape[1]))
                 self._truths[r][:, row] = seen[mine]
             self._next[r] += 1
 
+    def _at(self, share: float, r: int, tick: int, mine: slice, present: Array) -> Array:
+        """Readings between the last tick and this one.
+
+        A row's own goal acts after its reading: where it would act before this tick, the line is that of the two ticks before.
+        """
+        if self._last is None or share > 1.0 - 1e-9:
+            return present[mine]
+        last = self._last[mine]
+        between = last + share * (present[mine] - last)
+        if self._anchored[r] >= tick - 1:  # right after it motors and accelerometer read nothing yet
+            return np.hstack([between[:, :_MOVED], present[mine][:, _MOVED:]])
+        if self._before_last is None:
+            return between
+        in_time = self._soonest[mine] >= (1.0 - share) * CLOCK
+        return np.where(in_time[:, None], between, last + share * (last - self._before_last[mine]))
+
     def result(self, r: int, parameters: Parameters) -> Replays:
         mine = slice(r * self.settings, (r + 1) * self.settings)
         values = np.zeros((*self._rows[r].shape[:2], len(CHANNELS)))
         values[:, :, [CHANNELS.index(name) for name in DIRECT]] = self._rows[r]
-        poses = _at(self._poses[:, mine], self._place[r][None, :] - parameters["camera.delay"][:, None] / CLOCK)
+        poses = _interpolated(self._poses[:, mine], self._place[r][None, :] - parameters["camera.delay"][:, None] / CLOCK)
         _turn(poses, parameters)
         values[:, :, [CHANNELS.index(name) for name in CAMERA]] = poses
         return Replays(values, self._truths[r] if self.with_truth else None)
@@ -358,7 +379,7 @@ def _poses(truth: Truth, offsets: Array) -> Array:
     return np.column_stack([marker[:, 0], marker[:, 1], yaw, marker[:, 2], pitch])
 
 
-def _at(poses: Array, places: Array) -> Array:
+def _interpolated(poses: Array, places: Array) -> Array:
     """Interpolate stored poses (times, settings, 5) at ``places`` (settings, rows) in ticks."""
     poses[:, :, 2] = np.unwrap(poses[:, :, 2], axis=0)
     places = np.maximum(places / POSE_TICKS, 0.0)
@@ -378,8 +399,9 @@ def _turn(poses: Array, parameters: Parameters) -> None:
 
 def _start(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
     """State of every setting at the run's start: the measured one, moved by what a setting means for reading and height."""
+    base = profile_parameters(Parameters.nominal(robot), run.meta.profile)  # of no setting: results do not depend on company
+    parameters = Parameters(np.vstack([base.values, parameters.values]))
     count = len(parameters)
-    base = Parameters(parameters.values[:1])
     measured = start_state(run, robot, base)
     state = PlantState(**{name: np.repeat(value, count, axis=0) for name, value in vars(measured).items() if value is not None})
     legs = base["joint.zero_offset"] - parameters["joint.zero_offset"]
@@ -392,7 +414,7 @@ def _start(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
     tension = state.reference_position[:, 4:] - state.joint_position[:, 4:]
     kp = parameters["servo.kp"][:, 4:]
     state.reference_position[:, 4:] = state.joint_position[:, 4:] + tension * base["servo.kp"][:, 4:] / np.maximum(kp, 1e-9)
-    return state
+    return PlantState(**{name: value[1:] for name, value in vars(state).items() if value is not None})
 
 
 def _join(states: Sequence[PlantState]) -> PlantState:

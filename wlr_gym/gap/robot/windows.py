@@ -17,9 +17,10 @@ from wlr_gym.runs.format import CHANNELS
 
 Array = NDArray[np.float64]
 
-#: s.
-WINDOW = 2.0
+#: s; length of a window, and of its beginning in which the camera's frames are not compared.
+WINDOW, BLIND = 2.0, 0.05
 _X, _Y, _YAW, _PITCH = (CHANNELS.index(f"cam_{name}") for name in ("x", "y", "yaw", "pitch"))
+_CAMERA = [CHANNELS.index(name) for name in CHANNELS if name.startswith("cam_")]
 _WHEELS = [CHANNELS.index(f"pos_{joint}") for joint in JOINTS[4:]]
 
 
@@ -30,21 +31,25 @@ def window_rows(t: Array, length: float = WINDOW) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
 
-def anchored_residuals(measured: Array, simulated: Array, noise: Array, windows: list[slice]) -> Array:
+def anchored_residuals(t: Array, measured: Array, simulated: Array, noise: Array, windows: list[slice]) -> Array:
     """Return (measured - simulated) / noise with every window's own pose and wheel angles taken out.
 
     Args:
+        t: (rows,) s.
         measured: (rows, len(CHANNELS)); NaN where not measured.
         simulated: (settings, rows, len(CHANNELS)).
         noise: (len(CHANNELS)) one sigma.
         windows: rows of each window.
     """
+    measured = measured.copy()
+    for window in windows:  # frames shown in a window's first rows were exposed before it
+        early = np.flatnonzero(t[window] < t[window.start] + BLIND) + window.start
+        measured[np.ix_(early, _CAMERA)] = np.nan
     residual = measured - simulated
     residual[:, :, _PITCH] = _wrapped(residual[:, :, _PITCH])
     for window in windows:
-        residual[:, window, _WHEELS[0] : _WHEELS[-1] + 1] -= np.nanmean(
-            residual[:, window, _WHEELS[0] : _WHEELS[-1] + 1], axis=1, keepdims=True
-        )
+        wheels = np.ascontiguousarray(residual[:, window, _WHEELS[0] : _WHEELS[-1] + 1])
+        residual[:, window, _WHEELS[0] : _WHEELS[-1] + 1] = wheels - np.nanmean(wheels, axis=1, keepdims=True)
         _take_out_pose(measured[window], simulated[:, window], residual[:, window], noise)
     return residual / noise
 
@@ -55,11 +60,11 @@ def _take_out_pose(measured: Array, simulated: Array, residual: Array, noise: Ar
     residual[:, :, [_X, _Y, _YAW]] = np.nan
     if seen.size < 2:
         return
-    x, y = simulated[:, seen, _X], simulated[:, seen, _Y]
+    x, y = (np.ascontiguousarray(simulated[:, seen, c]) for c in (_X, _Y))
     x, y = x - x.mean(axis=1, keepdims=True), y - y.mean(axis=1, keepdims=True)
     mx, my = measured[seen, _X] - measured[seen, _X].mean(), measured[seen, _Y] - measured[seen, _Y].mean()
     yaw = _wrapped(measured[seen, _YAW] - simulated[:, seen, _YAW])
-    yaw = np.unwrap(yaw, axis=1)
+    yaw = np.ascontiguousarray(np.unwrap(yaw, axis=1))
     turn = yaw.mean(axis=1, keepdims=True)
     path, heading = 1.0 / noise[_X] ** 2, 1.0 / noise[_YAW] ** 2
     for _ in range(2):  # Gauss-Newton for one angle; the second pass is already exact to 1e-6

@@ -1,0 +1,219 @@
+"""Replays of runs that the engine itself made: what went in must come out."""
+
+import numpy as np
+import pytest
+from engine_runs import META, ROBOT, abrupt, free_rear_wheels, nominal, posture_and_turns, record, spaced
+
+from wlr_gym.gap.robot import simulate
+from wlr_gym.gap.robot.simulate import CLOCK, TRUTH, RunClock, WrittenGoals, replay_batch
+from wlr_gym.gap.robot.windows import anchored_residuals
+from wlr_gym.parameters import Parameters
+from wlr_gym.plants.base import TRUTH_LAYOUT
+from wlr_gym.robot import JOINTS
+from wlr_gym.runs import RunMeta
+from wlr_gym.runs.format import CHANNELS
+from wlr_gym.runs.noise import channel_noise
+
+NOISE = np.array([channel_noise(ROBOT)[name] for name in CHANNELS])
+RESISTANCE = {"name": "rolling_resistance", "where": ["wheel_lf", "wheel_lr"], "parameters": {"coefficient": 0.1}}
+
+
+def measured(run):
+    return np.stack([run[name] for name in CHANNELS], axis=1)
+
+
+def worst(run, replays, kinds=None, clock=None):
+    """Largest RMS residual of a channel, in noise units."""
+    clock = clock or RunClock(run)
+    found = anchored_residuals(run["t"], measured(run), replays.values, NOISE, clock.windows)[0]
+    rms = np.sqrt(np.nanmean(found**2, axis=0))
+    return max(rms[k] for k, name in enumerate(CHANNELS) if kinds is None or name.startswith(kinds))
+
+
+def replayed(run, parameters=None, **options):
+    return replay_batch(ROBOT, [RunClock(run)], nominal() if parameters is None else parameters, **options)[0]
+
+
+@pytest.fixture(scope="module")
+def run():
+    return record(posture_and_turns, spaced(4.0))
+
+
+@pytest.fixture(scope="module")
+def other():
+    return record(free_rear_wheels, spaced(3.0), [RESISTANCE])
+
+
+def several(count):
+    rng = np.random.default_rng(0)
+    table = Parameters(np.repeat(nominal().values, count, axis=0))
+    table["body.mass"] *= 1 + 0.05 * rng.standard_normal((count, 1)).reshape(np.shape(table["body.mass"]))
+    table["servo.kp"] *= 1 + 0.05 * rng.standard_normal((count, 8))
+    table["command.delay"] += 0.003 * np.arange(count)[:, None]
+    table["camera.delay"] += 0.004 * np.arange(count)
+    return table
+
+
+def test_own_run_comes_back_exactly(run):
+    assert worst(run, replayed(run)) < 0.5
+
+
+def test_own_run_comes_back_to_sensor_noise():
+    noisy = record(posture_and_turns, spaced(4.0), noise=5, tick=0.001)
+    found = anchored_residuals(noisy["t"], measured(noisy), replayed(noisy).values, NOISE, RunClock(noisy).windows)[0]
+    rms = np.sqrt(np.nanmean(found**2, axis=0))
+    assert np.sqrt(np.mean(rms**2)) < 1.25
+    assert rms.max() < 2.5
+
+
+def test_model_that_lacks_the_effect_does_not_come_back():
+    short = record(posture_and_turns, spaced(3.0), [RESISTANCE])
+    assert worst(short, replayed(short, nominal([RESISTANCE]))) < 0.5
+    assert worst(short, replayed(short), ("eff_wheel",)) > 3.0
+
+
+def test_torque_off_is_replayed():
+    free = record(free_rear_wheels, spaced(4.0))
+    assert worst(free, replayed(free)) < 0.5
+    kept_on = record(posture_and_turns, spaced(4.0))
+    assert worst(free, replayed(kept_on), ("vel_wheel",)) > 3.0
+
+
+def test_company_and_order_do_not_change_a_bit(run, other):
+    table = several(3)
+    clocks = [RunClock(run), RunClock(other)]
+    together = replay_batch(ROBOT, clocks, table)
+    turned = replay_batch(ROBOT, clocks[::-1], Parameters(table.values[::-1]))
+    alone = replay_batch(ROBOT, clocks[1:], Parameters(table.values[2:]))[0]
+    assert np.array_equal(together[0].values, turned[1].values[::-1])
+    assert np.array_equal(together[1].values, turned[0].values[::-1])
+    assert np.array_equal(together[1].values[2:], alone.values)
+    assert np.max(np.abs(together[0].values[0] - together[0].values[1]) / NOISE) > 1.0
+
+
+def test_chunks_and_threads_do_not_change_a_bit(other, monkeypatch):
+    table, clock = several(4), RunClock(other)
+    whole = replay_batch(ROBOT, [clock], table, with_truth=True)[0]
+    threaded = replay_batch(ROBOT, [clock], table, threads=2)[0]
+    monkeypatch.setattr(simulate, "MOST_ROBOTS", 3)
+    chunked = replay_batch(ROBOT, [clock], table, with_truth=True)[0]
+    assert np.array_equal(whole.values, threaded.values)
+    assert np.array_equal(whole.values, chunked.values)
+    assert np.array_equal(whole.truth, chunked.truth)
+
+
+def test_truth_comes_on_the_rows(run):
+    replays = replayed(run, with_truth=True)
+    columns = sum(len(TRUTH_LAYOUT.channels[name].elements) for name in TRUTH)
+    assert replays.truth.shape == (1, len(run["t"]), columns)
+    speed = replays.truth[0][:, 8 + 4]  # joint_velocity[wheel_lf]
+    assert speed == pytest.approx(run["vel_wheel_lf"], abs=0.1)
+
+
+@pytest.mark.parametrize("offset", [0.00125, 0.00275])
+def test_goals_off_the_grid_act_at_their_own_time(offset):
+    """Rows between two ticks, the run from a clock of 0.25 ms. Within a physics step a ramp may begin early, no more."""
+    fine = record(abrupt, spaced(0.8, offset=offset), tick=0.00025)
+    ahead = (replayed(fine).values[0] - measured(fine))[24:38] / META.profile.wheel_acceleration
+    for joint in JOINTS[4:]:
+        assert abs(ahead[:, CHANNELS.index(f"vel_{joint}")].mean()) < 0.65 * simulate.PHYSICS_STEP
+
+
+def test_goal_of_a_row_does_not_show_in_its_own_reading():
+    """Sensors are read before goals are written, whenever that falls between two ticks."""
+    step = RunMeta()
+    jumping = record(abrupt, spaced(0.9, offset=0.001), tick=0.00025, meta=step)
+    found = replayed(jumping, nominal(meta=step)).values[0]
+    jumps = np.flatnonzero(np.diff(jumping["cmd_wheel_lf"]) != 0.0) + 1
+    velocity = CHANNELS.index("vel_wheel_lf")
+    size = np.abs(np.diff(measured(jumping)[:, velocity])).max()
+    assert np.abs((found - measured(jumping))[jumps, velocity]).max() < 0.02 * size
+
+
+def test_command_delay_is_the_plants_own():
+    delayed = record(abrupt, spaced(2.0), command__delay=0.013)
+    table = nominal()
+    table["command.delay"] = 0.013
+    assert worst(delayed, replayed(delayed, table), ("pos", "vel", "eff")) < 1.0
+    assert worst(delayed, replayed(delayed), ("vel_wheel",)) > 3.0
+
+
+def test_camera_delay_turn_and_scale():
+    changes = {"camera__delay": 0.06, "camera__mount_yaw": 0.2, "camera__scale": 1.05}
+    shown = record(posture_and_turns, spaced(4.0), **changes)
+    table = nominal()
+    for key, value in changes.items():
+        table[key.replace("__", ".")] = value
+    assert worst(shown, replayed(shown, table), ("cam",)) < 0.5
+    assert worst(shown, replayed(shown), ("cam_x",)) > 1.0
+
+
+def test_windows_start_where_the_robot_was_measured():
+    """A model that drifts: legs and pose are put back at every window, in what the camera shows of it too."""
+    radius = {"name": "wheel_radius_error", "where": ["wheel_lf", "wheel_lr"], "parameters": {"scale": 1.05}}
+    drifting = record(posture_and_turns, spaced(6.0), [radius])
+    clock = RunClock(drifting)
+    replays = replay_batch(ROBOT, [clock], nominal())[0].values[0]
+    seen = measured(drifting)
+    x, y = CHANNELS.index("cam_x"), CHANNELS.index("cam_y")
+    gap = np.hypot(replays[:, x] - seen[:, x], replays[:, y] - seen[:, y])
+    assert len(clock.windows) == 3
+    for before, window in zip(clock.windows, clock.windows[1:], strict=False):
+        drift = gap[before][-5:].max()
+        settled = window.start + 5  # frames of the first tenth of a second are older than the window
+        assert gap[settled] < 0.4 * drift
+        leg = CHANNELS.index("pos_leg_lf")
+        assert abs(replays[window.start + 1, leg] - seen[window.start + 1, leg]) < 0.004
+
+
+def test_a_window_does_not_show_the_drift_before_it():
+    """Neither its first row nor frames that were exposed before it began."""
+    radius = {"name": "wheel_radius_error", "where": ["wheel_lf", "wheel_lr"], "parameters": {"scale": 1.05}}
+    drifting = record(posture_and_turns, spaced(6.0), [radius], camera__delay=0.05)
+    clock, table = RunClock(drifting), nominal()
+    table["camera.delay"] = 0.05
+    found = anchored_residuals(drifting["t"], measured(drifting), replay_batch(ROBOT, [clock], table)[0].values, NOISE, clock.windows)[0]
+    for name in ("cam_x", "cam_yaw"):
+        size = np.abs(found[:, CHANNELS.index(name)])
+        for window in clock.windows[1:]:
+            first, rest = size[window.start : window.start + 6], size[window.start + 6 : window.stop]
+            assert not (first > 2 * np.nanmax(rest)).any()
+
+
+def test_wheels_count_on_after_a_window(run):
+    values = replayed(run).values[0]
+    for joint in JOINTS[4:]:
+        column = CHANNELS.index(f"pos_{joint}")
+        jumps = np.diff(values[:, column]) - 0.02 * values[1:, CHANNELS.index(f"vel_{joint}")]
+        assert np.abs(jumps).max() < 0.05
+
+
+def test_other_simulator_replays_too():
+    short = record(posture_and_turns, spaced(2.5))
+    own, others = worst(short, replayed(short)), worst(short, replayed(short, backend="mujoco"), ("vel", "gyro", "cam"))
+    assert own < 0.5
+    assert others < 12.0
+
+
+def test_zero_offset_moves_the_reading_not_the_robot(run):
+    table = nominal()
+    table["joint.zero_offset"] = np.array([0.02, 0.0, 0.0, 0.0])
+    moved, plain = replayed(run, table).values[0], replayed(run).values[0]
+    leg = CHANNELS.index("pos_leg_lf")
+    assert moved[:20, leg] == pytest.approx(plain[:20, leg], abs=0.005)
+
+
+def test_written_goals_arrive_at_their_times(run):
+    clock = RunClock(run)
+    delay = np.zeros((2, 8))
+    delay[1] = 2.55 * CLOCK
+    clock.goals[1] += 1.0
+    goals = WrittenGoals([clock], np.array([0, 0]), delay)
+    arrived = np.full(2, np.nan)
+    for tick in range(round((clock.t[1] - clock.begin) / CLOCK) + 5):
+        newer, older, wait = goals.push(np.zeros((2, 8)))
+        for k in np.flatnonzero((newer != older).any(axis=1) & np.isnan(arrived)):
+            assert newer[k] == pytest.approx(clock.goals[1])
+            assert older[k] == pytest.approx(clock.goals[0])
+            arrived[k] = tick * CLOCK + wait[k, 0]
+    assert arrived == pytest.approx(clock.t[1] - clock.begin + delay[:, 0], abs=1e-9)

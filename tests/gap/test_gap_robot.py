@@ -1,0 +1,440 @@
+"""The robot's side of the workflow: what calibration may move, what may be missing, which data are refused."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+from engine_runs import META, ROBOT, posture_and_turns, record, spaced
+
+from wlr_gym.effects import EFFECTS, UNKNOWN_EFFECT, Patch, apply_patch, load_patch
+from wlr_gym.errors import InputError
+from wlr_gym.gap.fit import nominal_model
+from wlr_gym.gap.problem import Setting
+from wlr_gym.gap.robot.candidates import ripple_order, robot_candidates
+from wlr_gym.gap.robot.formulas import formula_candidates
+from wlr_gym.gap.robot.open import LEAST_RUNS, open_robot
+from wlr_gym.gap.robot.problem import RobotProblem
+from wlr_gym.gap.robot.quantities import knobs, tolerance, write
+from wlr_gym.gap.robot.simulate import PHYSICS_STEP
+from wlr_gym.parameters import Parameters
+from wlr_gym.robot import JOINTS, LEGS, WHEELS
+from wlr_gym.runs import Run
+from wlr_gym.runs.format import CHANNELS
+from wlr_gym.runs.write import write_run
+
+NOMINAL = Parameters.nominal(ROBOT)
+KNOBS = {knob.quantity.name: knob for knob in knobs(ROBOT, PHYSICS_STEP)}
+RESISTANCE = {"name": "rolling_resistance", "where": list(WHEELS), "parameters": {"coefficient": 0.1}}
+
+# ---- quantities ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "sigma", "unit"),
+    [
+        ("body.mass", 0.03 * 1.0, None),
+        ("wheel.radius[wheel_rr]", 0.005, None),
+        ("servo.kp[leg_lf]", 0.05, None),
+        ("servo.stall_torque[wheel_lr]", 0.05, None),
+    ],
+)
+def test_relative_tolerances(name, sigma, unit):
+    quantity = KNOBS[name].quantity
+    nominal = float(NOMINAL[KNOBS[name].elements[0]][0])
+    assert quantity.nominal == nominal
+    assert quantity.sigma == pytest.approx(sigma * abs(nominal))
+
+
+@pytest.mark.parametrize(
+    ("name", "sigma"),
+    [
+        ("servo.viscous_friction[leg_rf]", 0.01),
+        ("servo.viscous_friction[wheel_rf]", 0.002),
+        ("joint.zero_offset[leg_lr]", math.radians(0.5)),
+        ("camera.mount_yaw", math.radians(0.5)),
+        ("ground.slope[pitch]", math.radians(0.2)),
+        ("body.com_offset[z]", 0.003),
+        ("camera.delay", 0.010),
+        ("command.delay", 0.005),
+    ],
+)
+def test_absolute_tolerances_with_units(name, sigma):
+    assert KNOBS[name].quantity.sigma == pytest.approx(sigma)
+
+
+def test_floor_and_latency_are_one_number_for_all():
+    assert len(KNOBS["ground.mu"].elements) == 2 * len(WHEELS)
+    assert len(KNOBS["command.delay"].elements) == len(JOINTS)
+    assert not [name for name in KNOBS if name.startswith(("ground.mu_", "command.delay["))]
+    values = np.array([[knob.quantity.nominal for knob in KNOBS.values()]] * 2)
+    values[1, list(KNOBS).index("ground.mu")] = 0.31
+    table = Parameters(np.repeat(NOMINAL.values, 2, axis=0))
+    write(list(KNOBS.values()), values, table)
+    assert np.array_equal(table.values[0], NOMINAL.values[0])
+    assert (table["ground.mu_x"][1] == 0.31).all()
+    assert (table["ground.mu_y"][1] == 0.31).all()
+    assert (table["servo.kp"][1] == NOMINAL["servo.kp"][0]).all()
+
+
+def test_every_tolerance_of_the_file_is_used():
+    parameters = {element.partition("[")[0] for knob in KNOBS.values() for element in knob.elements}
+    for key in ROBOT.tolerances:
+        wanted = {"ground.mu": "ground.mu_x", "joint_zero": "joint.zero_offset"}.get(key, key)
+        assert wanted in parameters or key == "leg.inertia", key
+
+
+def test_ranges_are_a_few_tolerances_within_what_the_simulator_accepts():
+    from wlr_gym.parameters import SPECS
+
+    for knob in KNOBS.values():
+        quantity, spec = knob.quantity, SPECS[knob.elements[0].partition("[")[0]]
+        assert spec.low <= quantity.low <= quantity.nominal <= quantity.high <= spec.high
+        assert quantity.low < quantity.high
+        assert quantity.sigma > 0.0
+        assert quantity.high - quantity.nominal <= 4.01 * quantity.sigma
+        assert quantity.unit == spec.unit
+    assert KNOBS["command.delay"].quantity.low == 0.0
+
+
+@pytest.mark.parametrize(
+    ("entry", "kind", "expected"),
+    [
+        (0.05, "legs", 0.1),
+        ("0.5 deg", "legs", math.radians(0.5)),
+        ("0.01 N m s/rad (legs), 0.002 N m s/rad (wheels)", "legs", 0.01),
+        ("0.01 N m s/rad (legs), 0.002 N m s/rad (wheels)", "wheels", 0.002),
+        ("1e-3 s", "wheels", 1e-3),
+    ],
+)
+def test_tolerance_texts(entry, kind, expected):
+    assert tolerance(entry, -2.0, kind, "here") == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("entry", ["some", "", "0.1 N m (feet)", "0.01 N m (wheels)"])
+def test_tolerance_that_says_nothing_is_refused(entry):
+    with pytest.raises(InputError, match=r"tolerances\.x"):
+        tolerance(entry, 1.0, "legs", "tolerances.x")
+
+
+# ---- candidates ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tried():
+    """Probes and candidates beside a robot that drove half a metre."""
+    rng = np.random.default_rng(0)
+    measured = rng.standard_normal((300, len(CHANNELS)))
+    measured[:, CHANNELS.index("cam_x")] = np.linspace(0.0, 0.6, 300)
+    sigmas = {name: knob.quantity.sigma for name, knob in KNOBS.items()}
+    return robot_candidates(NOMINAL, sigmas, [measured], [rng.standard_normal(measured.shape)])
+
+
+def test_every_effect_of_the_library_is_tried(tried):
+    assert {candidate.name for candidate in tried[1]} == set(EFFECTS)
+
+
+def test_places_are_places_of_the_effect(tried):
+    for candidate in tried[1]:
+        assert candidate.where
+        load_patch([candidate.effect(neutral_values(candidate)).content()])
+    labels = [candidate.label for candidate in tried[1]]
+    assert len(labels) == len(set(labels))
+    for name in ("coulomb_friction", "weak_motor", "backlash"):
+        wheres = [c.where for c in tried[1] if c.name == name]
+        for single in (*LEGS, *WHEELS):
+            assert (single,) in wheres
+        for whole in (LEGS, WHEELS):
+            assert tuple(whole) in wheres
+
+
+def neutral_values(candidate):
+    return [float(np.clip(u.neutral, u.low, u.high)) for u in candidate.unknowns]
+
+
+def test_probe_keys_are_unique_and_known_to_the_starts(tried):
+    probes, candidates = tried
+    keys = [probe.key for probe in probes]
+    assert len(keys) == len(set(keys))
+    for candidate in candidates:
+        for start in candidate.starts:
+            for name in (name for direction in start.directions for name in direction):
+                assert name in keys or name in KNOBS, name
+
+
+def test_probes_are_effects_the_simulator_takes(tried):
+    for probe in tried[0]:
+        changed = apply_patch(Patch(probe.effects), NOMINAL)
+        assert np.isfinite(changed.values).all()
+        assert not np.array_equal(changed.values, NOMINAL.values), probe.key
+
+
+def test_starts_give_plausible_effects(tried):
+    """Small amplitudes of either sign: some first guess of every candidate lies in its range and is an effect."""
+    for candidate in tried[1]:
+        inside = 0
+        for start in candidate.starts:
+            for sign in (1.0, -1.0):
+                values = start.values(sign * 0.3 * np.ones(len(start.directions)))
+                assert len(values) == len(candidate.unknowns)
+                assert np.isfinite(values).all()
+                if all(u.low <= v <= u.high for u, v in zip(candidate.unknowns, values, strict=True)):
+                    inside += 1
+                    load_patch([candidate.effect(values).content()])
+        assert inside, candidate.label
+
+
+def test_one_probe_is_its_own_best_guess(tried):
+    """Amplitude 1 of a one-way start is the probe itself."""
+    probes = {probe.key: probe.effects[0] for probe in tried[0]}
+    checked = 0
+    for candidate in tried[1]:
+        for start in candidate.starts:
+            if len(start.directions) == 1 and len(candidate.where) == 1 and len(start.directions[0]) == 1:
+                key = start.directions[0][0]
+                if key in probes and probes[key].name == candidate.name:
+                    guess = candidate.effect(start.values(np.ones(1))).parameters
+                    for name, value in probes[key].parameters.items():
+                        assert guess[name] == pytest.approx(value), candidate.label
+                    checked += 1
+    assert checked > 40
+
+
+def test_one_tolerance_of_a_number_is_its_effect(tried):
+    """Where a start goes by a quantity, amplitude 1 must change the model by one tolerance of it."""
+    checked = 0
+    for candidate in tried[1]:
+        for start in candidate.starts:
+            names = [name for direction in start.directions for name in direction]
+            if len(start.directions) != 1 or not all(name in KNOBS for name in names):
+                continue
+            patched = apply_patch(Patch((candidate.effect(start.values(np.ones(1))),)), NOMINAL)
+            for name in names:
+                for element in KNOBS[name].elements:
+                    change = float(patched[element][0] - NOMINAL[element][0])
+                    assert change == pytest.approx(KNOBS[name].quantity.sigma, rel=1e-6), (candidate.label, name)
+                    checked += 1
+    assert checked > 30
+
+
+def test_ripple_is_looked_for_at_its_own_order():
+    angle, rng = np.linspace(0, 40, 800), np.random.default_rng(1)
+    measured, residual = np.zeros((2, 800, len(CHANNELS)))
+    measured[:, CHANNELS.index("pos_wheel_lf")] = angle
+    residual[:, CHANNELS.index("eff_wheel_lf")] = np.sin(12 * angle + 0.7) + 0.5 * rng.standard_normal(800)
+    residual[rng.random(800) < 0.2] = np.nan
+    assert ripple_order("wheel_lf", [measured], [residual]) == 12.0
+
+
+def test_patch_of_floor_needs_a_floor_that_was_driven():
+    still = np.zeros((100, len(CHANNELS)))
+    sigmas = {name: knob.quantity.sigma for name, knob in KNOBS.items()}
+    _, candidates = robot_candidates(NOMINAL, sigmas, [still], [still])
+    assert "friction_patch" not in {candidate.name for candidate in candidates}
+    blind = np.full_like(still, np.nan)
+    robot_candidates(NOMINAL, sigmas, [blind], [blind])
+
+
+# ---- formulas --------------------------------------------------------------------------------------------------------
+
+
+def test_formulas_parse_and_vanish_with_their_constants():
+    probes, candidates = formula_candidates()
+    assert {candidate.name for candidate in candidates} == {UNKNOWN_EFFECT}
+    state = {"angle": 0.7, "rate": -1.3, "abs": abs, "cos": math.cos, "sin": math.sin}
+    state |= {"velocity_x": 0.4, "velocity_y": -0.1, "yaw_rate": 0.8}
+    state |= {f"{kind}_rate_{side}": 0.5 for kind in ("leg", "wheel") for side in ("lf", "rf", "lr", "rr")}
+    for candidate in candidates:
+        patch = load_patch([candidate.effect([0.1] * len(candidate.unknowns)).content()])
+        assert len(patch.forces) == 1
+        assert set(candidate.units) == {unknown.name for unknown in candidate.unknowns}
+        constants = {unknown.name: 0.0 for unknown in candidate.unknowns}
+        assert eval(candidate.formula, {}, {**state, **constants}) == pytest.approx(0.0)
+        for unknown in candidate.unknowns:  # linear in each constant
+            one, two = (eval(candidate.formula, {}, {**state, **constants, unknown.name: size}) for size in (1.0, 2.0))
+            assert two == pytest.approx(2 * one)
+            assert abs(one) > 0.0
+            assert (unknown.low, unknown.neutral) == (-unknown.high, 0.0)
+    assert len({probe.key for probe in probes}) == len(probes) == sum(len(c.unknowns) for c in candidates)
+
+
+# ---- opening a folder ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def good():
+    return record(posture_and_turns, spaced(4.0), noise=3)
+
+
+def folder_of(path, run, count=3, change=None):
+    for k in range(count):
+        table = run.table.copy()
+        if change is not None:
+            table = change(table, k)
+        write_run(path / f"run_{k + 1:02d}.csv", table, META)
+    return path
+
+
+def kinds(found):
+    return {(f.run, f.kind) for f in found if f.fatal}
+
+
+def test_good_folder_opens(tmp_path, good):
+    problem, findings = open_robot(folder_of(tmp_path, good))
+    assert isinstance(problem, RobotProblem)
+    assert problem.runs == ("run_01", "run_02", "run_03")
+    assert kinds(findings) == set()
+    assert [s.name for s in problem.signals] == list(CHANNELS)
+
+
+def test_too_few_runs(tmp_path, good):
+    problem, findings = open_robot(folder_of(tmp_path, good, LEAST_RUNS - 1))
+    assert problem is None
+    assert ("", "few_runs") in kinds(findings)
+    assert "wlr record" in findings[-1].text
+
+
+def test_short_run_is_left_out(tmp_path, good):
+    def cut(table, k):
+        return table[:100] if k == 1 else table
+
+    problem, findings = open_robot(folder_of(tmp_path, good, 4, cut))
+    assert problem is not None
+    assert problem.runs == ("run_01", "run_03", "run_04")
+    assert kinds(findings) == {("run_02", "short")}
+
+
+def test_dead_encoder(tmp_path, good):
+    def die(table, k):
+        return table.assign(pos_leg_rf=table["pos_leg_rf"].iloc[0])
+
+    problem, findings = open_robot(folder_of(tmp_path, good, 3, die))
+    assert problem is None
+    assert {("run_01", "dead"), ("", "few_runs")} <= kinds(findings)
+    assert [f.channel for f in findings if f.kind == "dead"] == ["pos_leg_rf"] * 3
+
+
+@pytest.mark.parametrize("joint", ["leg_lr", "wheel_rf"])
+def test_mirrored_joint(tmp_path, good, joint):
+    def turn(table, k):
+        table[f"pos_{joint}"] = table[f"pos_{joint}"].iloc[0] - (table[f"pos_{joint}"] - table[f"pos_{joint}"].iloc[0])
+        table[f"vel_{joint}"] *= -1
+        return table
+
+    problem, findings = open_robot(folder_of(tmp_path, good, 3, turn))
+    assert problem is None
+    assert [f.channel for f in findings if f.kind == "mirrored"] == [f"pos_{joint}"] * 3
+
+
+def test_motors_that_were_never_on(tmp_path, good):
+    def off(table, k):
+        table[[c for c in table if c.startswith("cmd")]] = np.nan
+        return table
+
+    problem, findings = open_robot(folder_of(tmp_path, good, 3, off))
+    assert problem is None
+    assert any(f.kind == "missing" and "nothing to replay" in f.text for f in findings)
+
+
+def test_wrong_units_are_refused(tmp_path, good):
+    folder = folder_of(tmp_path, good)
+    table = pandas.read_csv(folder / "run_02.csv")
+    for leg in LEGS:
+        table[[f"pos_{leg}", f"cmd_{leg}"]] *= 180 / math.pi
+    table.to_csv(folder / "run_02.csv", index=False)
+    with pytest.raises(InputError, match="run_02.*degrees"):
+        open_robot(folder)
+
+
+def test_missing_encoder_readings_are_refused(tmp_path, good):
+    folder = folder_of(tmp_path, good)
+    table = pandas.read_csv(folder / "run_03.csv")
+    table.loc[7, "pos_wheel_lf"] = np.nan
+    table.to_csv(folder / "run_03.csv", index=False)
+    with pytest.raises(InputError, match="run_03.*row 7.*pos_wheel_lf"):
+        open_robot(folder)
+
+
+def test_rows_out_of_order_are_refused(tmp_path, good):
+    folder = folder_of(tmp_path, good)
+    table = pandas.read_csv(folder / "run_01.csv")
+    table.iloc[[20, 21]] = table.iloc[[21, 20]].to_numpy()
+    table.to_csv(folder / "run_01.csv", index=False)
+    with pytest.raises(InputError, match="run_01.*t must increase"):
+        open_robot(folder)
+
+
+def test_runs_of_different_profiles_are_refused(good):
+    other = Run(good.table, META.model_copy(update={"profile": META.profile.model_copy(update={"leg_velocity": 9.0})}), Path("x"))
+    with pytest.raises(InputError, match="different servo profiles"):
+        RobotProblem([good, other])
+
+
+def test_sensors_that_say_nothing_leave_finite_residuals(good):
+    table = good.table.copy()
+    table[["gyro_x", "eff_wheel_lf", "volt"]] = np.nan
+    table.loc[50:90, ["acc_x", "cam_x"]] = np.nan
+    problem = RobotProblem([Run(table.drop(columns=["vel_leg_lf"]), META, Path("run_01.parquet"))] * 1)
+    residual = problem.residuals([nominal_model(problem).setting], [0])[0][0]
+    quiet = [CHANNELS.index(name) for name in ("gyro_x", "eff_wheel_lf", "volt", "vel_leg_lf")]
+    assert np.isnan(residual[:, quiet]).all()
+    others = np.sqrt(np.nanmean(np.delete(residual, quiet, axis=1) ** 2, axis=0))
+    assert others.max() < 3.0
+
+
+# ---- the problem -----------------------------------------------------------------------------------------------------
+
+
+def test_known_effects_and_formulas_are_part_of_the_model(good):
+    problem = RobotProblem([good], known=[RESISTANCE])
+    plain = RobotProblem([good])
+    setting = nominal_model(plain).setting
+    added = replace(setting, effects=load_patch([RESISTANCE]).effects)
+    assert np.array_equal(problem.residuals([setting], [0])[0], plain.residuals([added], [0])[0], equal_nan=True)
+    _, formulas = formula_candidates()
+    drag = next(c for c in formulas if c.where == ("body_force_x",)).effect([5.0])
+    settings = [setting, Setting(setting.quantities, (drag,)), added]
+    mixed = plain.residuals(settings, [0])[0]
+    assert mixed[0] == pytest.approx(plain.residuals([setting], [0])[0][0], abs=1e-3, nan_ok=True)
+    assert np.nanmax(np.abs(mixed[1] - mixed[0])) > 1.0
+    assert np.nanmax(np.abs(mixed[2] - mixed[0])) > 1.0
+
+
+def test_floor_is_what_a_perfect_model_reaches(good):
+    problem = RobotProblem([good])
+    floor = problem.floor(nominal_model(problem).setting, [0])
+    assert 0.9 < floor < 1.25
+    assert problem.floor(nominal_model(problem).setting, [0]) == floor
+
+
+def test_features_are_rows_of_the_run(good):
+    problem = RobotProblem([good])
+    features = problem.features(nominal_model(problem).setting, [0])[0]
+    assert {"joint_velocity[wheel_lf]", "slip_speed[wheel_rr]", "time_since_reversal[leg_lf]"} <= set(features)
+    assert all(len(values) == len(good["t"]) and np.isfinite(values).all() for values in features.values())
+
+
+@pytest.mark.slow
+def test_rolling_resistance_is_found_in_four_runs(tmp_path):
+    from wlr_gym.gap.analyse import analyse
+    from wlr_gym.runs.excitations import excite
+
+    for k, kind in enumerate(("straight", "turns", "stop_and_go", "s_curve")):
+        motion = excite(kind, k, seconds=6.0)
+        meta = META.model_copy(update={"profile": motion.profile})
+
+        def commands(t, goals=motion.goals):
+            return goals[min(round(t / 0.02), len(goals) - 1)]
+
+        run = record(commands, spaced(5.9), [RESISTANCE], meta=meta, noise=k)
+        write_run(tmp_path / f"run_{k + 1:02d}.csv", run.table, meta)
+    found = analyse(tmp_path)
+    assert found.verdict == "effect_found"
+    assert found.effects[0].name == "rolling_resistance"
+    assert found.effects[0].where == tuple(WHEELS)
+    value = found.effects[0].parameters["coefficient"]
+    assert value.value == pytest.approx(0.1, rel=0.2)
+    assert value.low < 0.1 < value.high
+    assert found.gap.reduction > 0.5

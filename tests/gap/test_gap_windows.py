@@ -1,0 +1,178 @@
+"""Residuals by windows: where a window starts must not matter, what happens in it must."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from wlr_gym.gap.robot.windows import BLIND, anchored_residuals, window_rows
+from wlr_gym.robot import JOINTS, load_robot
+from wlr_gym.runs.format import CHANNELS
+from wlr_gym.runs.noise import channel_noise
+
+NOISE = np.array([channel_noise(load_robot())[name] for name in CHANNELS])
+T = 0.02 * np.arange(400)
+WINDOWS = window_rows(T)
+X, Y, YAW, Z, PITCH = (CHANNELS.index(f"cam_{name}") for name in ("x", "y", "yaw", "z", "pitch"))
+CAMERA = [CHANNELS.index(name) for name in CHANNELS if name.startswith("cam_")]
+#: Rows in which a window shows no frames: they were exposed before it.
+EARLY = np.concatenate([np.arange(w.start, w.stop)[T[w] < T[w.start] + BLIND] for w in WINDOWS])
+WHEELS = [CHANNELS.index(f"pos_{joint}") for joint in JOINTS[4:]]
+
+
+def drive(turn=0.8, bend=0.0):
+    """A run (rows, channels): an S-curve through more than half a turn, wheels that roll on."""
+    values = np.random.default_rng(0).standard_normal((len(T), len(CHANNELS))) * NOISE
+    yaw = turn * np.sin(0.7 * T) + 0.4 * T + bend * np.sin(3 * T)
+    values[:, X], values[:, Y] = 0.3 * np.cumsum(np.cos(yaw)) * 0.02, 0.3 * np.cumsum(np.sin(yaw)) * 0.02
+    values[:, YAW], values[:, PITCH] = yaw, 0.02 * np.sin(2 * T)
+    for k, column in enumerate(WHEELS):
+        values[:, column] = (4.0 + 0.1 * k) * T
+    return values
+
+
+def moved(values, windows, seed=1):
+    """Every window's pose moved rigidly, its wheel angles shifted."""
+    rng = np.random.default_rng(seed)
+    result = values.copy()
+    for window in windows:
+        turn, x, y = rng.uniform(-3, 3), *rng.uniform(-2, 2, 2)
+        c, s = np.cos(turn), np.sin(turn)
+        result[window, X] = x + c * values[window, X] - s * values[window, Y]
+        result[window, Y] = y + s * values[window, X] + c * values[window, Y]
+        result[window, YAW] = values[window, YAW] + turn
+        result[window, WHEELS[0] : WHEELS[-1] + 1] += rng.uniform(-9, 9, 4)
+    return result
+
+
+def residuals(measured, simulated, windows=None):
+    return anchored_residuals(T, measured, simulated, NOISE, windows or WINDOWS)
+
+
+def test_windows_cover_every_row_once():
+    for seconds, length, count in ((8.0, 2.0, 4), (6.9, 2.0, 3), (0.5, 2.0, 1), (8.0, np.inf, 1)):
+        t = 3.0 + 0.02 * np.arange(round(seconds / 0.02) + 1)
+        windows = window_rows(t, length)
+        assert len(windows) == count
+        assert np.concatenate([np.arange(len(t))[w] for w in windows]).tolist() == list(range(len(t)))
+        assert max(len(t[w]) for w in windows) <= min(len(t[w]) for w in windows) + 1
+
+
+def test_same_run_leaves_nothing():
+    assert np.nanmax(np.abs(residuals(drive(), drive()[None]))) < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_simulated_pose_and_wheel_angles_of_a_window_do_not_matter(seed):
+    measured, simulated = drive(), np.stack([drive(bend=0.02), drive(turn=0.82)])
+    plain = residuals(measured, simulated)
+    elsewhere = residuals(measured, np.stack([moved(s, WINDOWS, seed) for s in simulated]))
+    assert elsewhere == pytest.approx(plain, abs=1e-4, nan_ok=True)
+    assert np.nanmax(np.abs(plain[:, :, YAW])) > 1.0
+
+
+def test_measured_pose_and_wheel_angles_of_a_window_do_not_matter():
+    """The residual's axes turn with the measured robot."""
+    measured, simulated = drive(), drive(bend=0.03)[None]
+    plain = residuals(measured, simulated)
+    elsewhere = residuals(moved(measured, WINDOWS), simulated)
+    assert elsewhere == pytest.approx(plain, abs=1e-4, nan_ok=True)
+    assert np.nanmax(np.abs(plain[:, :, [X, Y]])) > 0.5
+
+
+def test_frames_from_before_a_window_are_not_compared():
+    found = residuals(drive(), drive(bend=0.02)[None])[0]
+    assert 4 <= len(EARLY) <= 16
+    assert np.isnan(found[np.ix_(EARLY, CAMERA)]).all()
+    assert np.isfinite(np.delete(found, EARLY, axis=0)).all()
+
+
+def test_whole_turns_do_not_matter():
+    measured, simulated = drive(), drive(bend=0.02)[None]
+    plain = residuals(measured, simulated)
+    measured[:, YAW] = np.angle(np.exp(1j * measured[:, YAW]))
+    simulated[:, :, YAW] += 4 * np.pi
+    simulated[:, :, PITCH] -= 2 * np.pi
+    assert residuals(measured, simulated) == pytest.approx(plain, abs=1e-4, nan_ok=True)
+
+
+def test_everything_else_is_plain_difference():
+    measured, simulated = drive(), drive()[None] + 0.01
+    found = residuals(measured, simulated)
+    others = [c for c in range(len(CHANNELS)) if c not in (*CAMERA, *WHEELS)]
+    assert found[0][:, others] == pytest.approx(np.broadcast_to(-0.01 / NOISE[others], (len(T), len(others))), rel=1e-6)
+    assert np.abs(found[0][:, WHEELS]).max() < 1e-6  # a constant is taken out of the wheels
+
+
+def test_drift_within_a_window_stays():
+    measured, simulated = drive(), drive()[None]
+    for column in WHEELS:
+        simulated[:, :, column] *= 1.01
+    found = residuals(measured, simulated)[0][:, WHEELS[0]]
+    for window in WINDOWS:
+        drift = -0.01 * drive()[window, WHEELS[0]]
+        assert found[window] == pytest.approx((drift - drift.mean()) / NOISE[WHEELS[0]], abs=1e-6)
+
+
+def test_pose_is_fitted_best():
+    """No rigid motion of the simulated window comes nearer than the one taken out."""
+    measured = drive() + 3 * NOISE * np.random.default_rng(2).standard_normal((len(T), len(CHANNELS)))
+    simulated = drive(bend=0.05)
+    window = slice(WINDOWS[1].start + 3, WINDOWS[1].stop)
+    best = np.nansum(residuals(measured, simulated[None])[0][window][:, [X, Y, YAW]] ** 2)
+    rng = np.random.default_rng(3)
+    centre = measured[window, X].mean(), measured[window, Y].mean()
+
+    def cost(turn, x, y):
+        c, s = np.cos(turn), np.sin(turn)
+        px, py = simulated[window, X] - simulated[window, X].mean(), simulated[window, Y] - simulated[window, Y].mean()
+        ex = measured[window, X] - centre[0] - x - c * px + s * py
+        ey = measured[window, Y] - centre[1] - y - s * px - c * py
+        ew = measured[window, YAW] - simulated[window, YAW] - turn
+        return np.sum((ex / NOISE[X]) ** 2 + (ey / NOISE[Y]) ** 2 + (ew / NOISE[YAW]) ** 2)
+
+    tried = min(cost(*rng.normal(0, [0.05, 0.002, 0.002])) for _ in range(500))
+    tried = min(tried, *(cost(a, 0.0, 0.0) for a in np.linspace(-0.1, 0.1, 4001)))
+    assert best <= tried * (1 + 1e-6)
+    assert best == pytest.approx(tried, rel=0.01)
+
+
+def test_missing_frames_are_nan_and_change_nothing_else():
+    measured, simulated = drive(), drive(bend=0.02)[None]
+    measured[::2, [X, Y, YAW]] = np.nan
+    measured[5:9, WHEELS[2]] = np.nan
+    measured[:, PITCH] = np.nan
+    found = residuals(measured, simulated)[0]
+    expected = np.isnan(measured)
+    expected[np.ix_(EARLY, CAMERA)] = True
+    assert np.array_equal(np.isnan(found), expected)
+    assert np.nanmax(np.abs(found[:, YAW])) > 1.0
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2, 3])
+def test_few_frames_in_a_window(frames):
+    measured, simulated = drive(), drive(bend=0.02)[None]
+    keep = np.arange(WINDOWS[0].start, WINDOWS[0].stop)[10::40][:frames]
+    lost = np.setdiff1d(np.arange(WINDOWS[0].start, WINDOWS[0].stop), keep)
+    measured[np.ix_(lost, [X, Y, YAW])] = np.nan
+    found = residuals(measured, simulated)[0]
+    seen = np.flatnonzero(np.isfinite(found[WINDOWS[0], X]))
+    assert len(seen) == (frames if frames > 1 else 0)  # one frame is used up by its own pose
+    assert np.isfinite(found[WINDOWS[1], X][3:]).all()
+
+
+def test_wheel_without_readings_in_a_window():
+    measured = drive()
+    measured[WINDOWS[2], WHEELS[1]] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        found = residuals(measured, drive()[None])[0]
+    assert np.isnan(found[WINDOWS[2], WHEELS[1]]).all()
+    assert np.isfinite(np.delete(np.delete(found, WHEELS[1], axis=1), EARLY, axis=0)).all()
+
+
+def test_settings_do_not_touch_each_other():
+    measured, simulated = drive(), np.stack([drive(bend=b) for b in (0.0, 0.02, 0.05)])
+    together = residuals(measured, simulated)
+    for k in range(3):
+        assert np.array_equal(together[k], residuals(measured, simulated[k : k + 1])[0], equal_nan=True)
