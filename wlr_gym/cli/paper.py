@@ -1,7 +1,8 @@
 """Repeat the paper: its two tests on every model, its equations as printed and corrected, its claims, its open question.
 
 Writes report.md, claims.json, search.json, agreement.json, the paper's figures 7-11 and 13-17 (figure_NN.png), slip and loads
-(test_N_slip.png), open_question.png, config.yaml and provenance.yaml. docs/paper.md explains them.
+(test_N_slip.png), open_question.png, commands/test_N.csv (for wlr record --commands), config.yaml and provenance.yaml; of a
+robot also its runs. docs/paper.md explains them.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wlr_gym.cli.robot_options import HardwareOption, confirm
 from wlr_gym.errors import InputError, unknown_name
 
 if TYPE_CHECKING:
@@ -22,15 +24,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(HardwareOption):
     out: Path
     """Folder for the report; made if it is not there."""
     plant: tuple[str, ...] = ("reduced", "gibbs_appell", "mujoco")
     """Models to run the tests on: reduced (the nine-velocity model), gibbs_appell, mujoco, dynamixel (a robot)."""
-    hardware: str = "nominal"
-    """Of a robot: its hardware file, or a name in configs/hardware/."""
-    emulated: bool = False
-    """Of a robot: an emulated one, in this process and in emulated time."""
+    yes: bool = False
+    """Do not ask before the robot moves."""
     robot: str | None = None
     """Robot file or config name; default: the nominal one."""
     draws: int = 8
@@ -46,25 +46,32 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """Drive, check, search, write; 0 when done.
+    """Drive, check, search, write; 0 when done, 1 when a robot had to stop.
 
     Raises:
-        InputError: unknown model or robot, numbers out of range.
+        InputError: unknown model or robot, numbers out of range, ports that cannot be opened, nobody there to start a robot.
     """
     from rich.console import Console
 
-    from wlr_gym.cli import OK
+    from wlr_gym.cli import FAILED, OK
     from wlr_gym.files import make_output_folder
+    from wlr_gym.hardware.loop import StoppedError
     from wlr_gym.paper import report
     from wlr_gym.paper.claims import check_all, gather
+    from wlr_gym.paper.experiments import write_tests
     from wlr_gym.provenance import record_provenance
     from wlr_gym.robot import load_robot
 
     _check(options)
     robot = load_robot(options.robot) if options.robot else load_robot()
     make_output_folder(options.out)
+    write_tests(options.out / "commands")
     console = Console()
-    records = {model: _drive(model, robot, options, console) for model in options.plant}
+    try:
+        records = {model: _drive(model, robot, options, console) for model in options.plant}
+    except StoppedError as error:
+        console.print(f"the robot has stopped: {error}", style="red")
+        return FAILED
     reference = records.get("gibbs_appell") or _drive("gibbs_appell", robot, options, console)
     console.print("claims")
     evidence = gather(robot, reference, options.threads)
@@ -84,12 +91,17 @@ def run(options: Options) -> int:
 
 def _check(options: Options) -> None:
     from wlr_gym.paper.experiments import MODELS
+    from wlr_gym.plants import REAL
 
     if not options.plant:
         raise InputError("--plant: expected at least one model")
     for model in options.plant:
         if model not in MODELS:
             raise unknown_name("model", model, MODELS)
+    if set(REAL) & set(options.plant):
+        options.load_hardware()
+    elif options.emulated or options.port:
+        raise InputError("--emulated and --port are about the robot: add dynamixel to --plant")
     for name, low, high in (("draws", 0, 10_000), ("levels", 1, 3), ("threads", 1, 256), ("seed", 0, 2**63)):
         value = getattr(options, name)
         if not low <= value <= high:
@@ -98,10 +110,31 @@ def _check(options: Options) -> None:
 
 def _drive(model: str, robot: Robot, options: Options, console: Console) -> dict[str, Record]:
     from wlr_gym.paper.experiments import drive_both
-    from wlr_gym.plants.base import RobotOptions
+    from wlr_gym.plants import REAL
 
     console.print(f"both tests: {model}")
-    return drive_both(model, robot, hardware=RobotOptions(hardware=options.hardware, emulated=options.emulated, guard=False))
+    return _drive_robot(robot, options, console) if model in REAL else drive_both(model, robot)
+
+
+def _drive_robot(robot: Robot, options: Options, console: Console) -> dict[str, Record]:
+    """Guarded and logged; between the tests the operator carries the robot back."""
+    from wlr_gym.effects import load_patch
+    from wlr_gym.hardware.loop import stop_on_signals
+    from wlr_gym.paper.experiments import PROFILE, TESTS, drive_plant
+    from wlr_gym.parameters import Parameters
+    from wlr_gym.runs.format import RunMeta
+
+    meta, records = RunMeta(robot=robot.name, profile=PROFILE, notes="the paper's tests"), {}
+    for name, test in TESTS.items():
+        if not (options.emulated or options.yes):
+            confirm([test.motion()], console)
+        plant = options.plant_of(robot, options.out / "runs", meta, load_patch(None))
+        try:
+            with stop_on_signals(plant.loop):
+                records[name] = drive_plant(plant, test, Parameters.nominal(robot))
+        finally:
+            plant.close()
+    return records
 
 
 def _search(robot: Robot, options: Options, console: Console) -> list[Finding]:

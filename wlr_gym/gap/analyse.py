@@ -107,7 +107,7 @@ def analyse_problem(
     clock.start("calibrating")
     base = fit(problem, fitted, nominal_model(problem), columns=columns, steps=problem.steps, tell=clock.detail)
     clock.start("naming")
-    naming = name_effects(problem, fitted, base, clock.detail)
+    naming = name_effects(problem, fitted, base, sealed, clock.detail)
     clock.start("proving")
     models = (nominal_model(problem), base.model, naming.fit.model)
     floor = problem.floor(naming.fit.model.setting, sealed)
@@ -262,6 +262,8 @@ def _fate(hypothesis: Hypothesis, look: Round, equal: set[str]) -> tuple[str, st
         return "equivalent", f"buys {hypothesis.gain / best.gain:.0%} of what the taken one buys"
     if hypothesis.at_bound:
         return "implausible", "needs a value outside its plausible range"
+    if not hypothesis.carries_over:
+        return "does not carry over", "runs that were not fitted do not get better by it"
     if not hypothesis.consistent:
         return "inconsistent", "helps some runs and harms others"
     if best is None:

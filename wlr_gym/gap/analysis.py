@@ -69,7 +69,8 @@ class Evidence:
     Attributes:
         round: 1 for the first effect.
         gain: what adding it bought after a refit; ``screened`` what the first-order score had promised.
-        outcome: ``taken``, ``equivalent``, ``weaker``, ``too little``, ``inconsistent``, ``implausible`` or ``screened out``.
+        outcome: ``taken``, ``equivalent``, ``weaker``, ``too little``, ``inconsistent``, ``does not carry over``,
+            ``implausible`` or ``screened out``.
         reason: one sentence: why it won or lost.
         by_run: fall of the weighted squares per fit run; empty where it was only screened.
     """

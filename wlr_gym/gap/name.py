@@ -35,12 +35,16 @@ Tell = Callable[[str], None]
 SHORTLIST, PER_NAME, ROUNDS = 8, 3, 3
 #: The best of every name that buys at least this share of what the best buys is fitted in full before one is taken; so many.
 FINALIST, FINALISTS = 0.75, 3
+#: Beside a set of places its best single place is fitted in full, if it buys at least this share.
+NARROWER = 0.4
 #: What an effect must buy more for every unknown beyond the first.
 PER_UNKNOWN = 10.0
 #: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
 MOST_HARM = 0.2
+#: Runs that were not fitted must gain at least this share of what those that were did, per run.
+LEAST_CARRIED = 0.2
 #: Also at least this share of minus two log posterior.
-LEAST_SHARE = 0.01
+LEAST_SHARE = 0.02
 #: Effects in one analysis.
 MOST_EFFECTS = 4
 #: A named effect is preferred to a formula if it buys at least this share of what the formula buys.
@@ -61,6 +65,7 @@ class Hypothesis:
         screened: what the first-order score had promised.
         residuals: of the model.
         base, base_residuals: the model without the effect, refitted as long.
+        carries_over: whether runs that were not fitted agree (checked for finalists only).
     """
 
     candidate: Candidate
@@ -71,6 +76,7 @@ class Hypothesis:
     residuals: list[Array] = field(repr=False)
     base: Model = field(repr=False)
     base_residuals: list[Array] = field(repr=False)
+    carries_over: bool = True
 
     @property
     def values(self) -> tuple[float, ...]:
@@ -128,8 +134,10 @@ def shortlist(scores: Sequence[Score], size: int = SHORTLIST) -> list[Score]:
     return chosen
 
 
-def name_effects(problem: Problem, runs: Sequence[int], start: Fit, tell: Tell = lambda text: None) -> Naming:
-    """Look for missing effects in ``runs``, beginning with the calibrated model ``start``."""
+def name_effects(
+    problem: Problem, runs: Sequence[int], start: Fit, others: Sequence[int] = (), tell: Tell = lambda text: None
+) -> Naming:
+    """Look for missing effects in ``runs``, beginning with the calibrated model ``start``; ``others`` must agree."""
     current, rounds = start, []
     models = [start.model]
     while True:
@@ -140,7 +148,7 @@ def name_effects(problem: Problem, runs: Sequence[int], start: Fit, tell: Tell =
         chosen = scores if problem.thorough else shortlist(scores)
         tell(f"refitting {len(chosen)} hypotheses")
         hypotheses = (refit_thoroughly if problem.thorough else refit)(problem, runs, current, chosen)
-        finals = finalists(problem, runs, current, hypotheses, tell)
+        finals = finalists(problem, runs, hypotheses, others, tell)
         chosen_final = _accepted(current, finals)
         taken = None if chosen_final is None else chosen_final.hypothesis
         rounds.append(Round(scores, _merged(finals, hypotheses), taken, current.cost))
@@ -205,14 +213,22 @@ class Final:
 
 
 def finalists(
-    problem: Problem, runs: Sequence[int], current: Fit, hypotheses: Sequence[Hypothesis], tell: Tell = lambda text: None
+    problem: Problem,
+    runs: Sequence[int],
+    hypotheses: Sequence[Hypothesis],
+    others: Sequence[int] = (),
+    tell: Tell = lambda text: None,
 ) -> list[Final]:
     """Fit the best hypotheses in full, with responses simulated anew; best first."""
     best: dict[str, Hypothesis] = {}
     for hypothesis in hypotheses:
-        enough = hypothesis.gain >= max(FINALIST * hypotheses[0].gain, 0.5 * LEAST_GAIN)
+        leading = hypotheses[0]
+        enough = hypothesis.gain >= max(FINALIST * leading.gain, 0.5 * LEAST_GAIN)
         if enough and len(best) < FINALISTS:
             best.setdefault(hypothesis.candidate.name + hypothesis.candidate.formula, hypothesis)
+        narrower = len(leading.candidate.where) > 1 and len(hypothesis.candidate.where) == 1
+        if narrower and hypothesis.candidate.name == leading.candidate.name and hypothesis.gain > NARROWER * leading.gain:
+            best.setdefault("narrower", hypothesis)
     wholes = []
     for hypothesis in best.values():
         tell(f"fitting {hypothesis.candidate.label} in full")
@@ -226,8 +242,21 @@ def finalists(
         base = total_cost(problem, hypothesis.base, hypothesis.base_residuals, memory)
         gain = base - total_cost(problem, whole.model, whole.residuals, memory)
         by_run = _by_run(hypothesis.base_residuals, whole.residuals, estimate_noise(whole.residuals, memory))
-        found.append(Final(replace(hypothesis, model=whole.model, gain=gain, by_run=by_run, residuals=whole.residuals), whole))
+        agreed = _carries_over(problem, hypothesis.base, whole.model, gain, runs, others, memory)
+        final = replace(hypothesis, model=whole.model, gain=gain, by_run=by_run, residuals=whole.residuals, carries_over=agreed)
+        found.append(Final(final, whole))
     return sorted(found, key=lambda final: -final.hypothesis.gain)
+
+
+def _carries_over(
+    problem: Problem, base: Model, whole: Model, gain: float, runs: Sequence[int], others: Sequence[int], memory: Array
+) -> bool:
+    """Whether runs that took no part in the fit get better too, by a share of what their number promises."""
+    if not others:
+        return True
+    found = problem.residuals([base.setting, whole.setting], others)
+    before, after = (minus_two_log_likelihood([r[k] for r in found], memory) for k in (0, 1))
+    return before - after > LEAST_CARRIED * gain * len(others) / len(runs)
 
 
 def _merged(finals: Sequence[Final], hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -242,7 +271,8 @@ def _accepted(current: Fit, finals: Sequence[Final]) -> Final | None:
     good = []
     for final in finals:
         least = max(LEAST_GAIN + PER_UNKNOWN * (len(final.hypothesis.values) - 1), LEAST_SHARE * current.cost)
-        if final.hypothesis.gain >= least and not final.hypothesis.at_bound and final.hypothesis.consistent:
+        hypothesis = final.hypothesis
+        if hypothesis.gain >= least and not hypothesis.at_bound and hypothesis.consistent and hypothesis.carries_over:
             good.append(final)
     if not good:
         return None

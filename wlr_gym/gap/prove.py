@@ -7,6 +7,7 @@ fitted model itself made, with the same sensors (:func:`noise_floor`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -81,7 +82,9 @@ def reduction(calibrated: Array, after: Array, floor: float) -> float:
 
 
 def _interval(calibrated: Array, after: Array, floor: float) -> tuple[float, float]:
-    """95 % interval of the reduction: runs drawn with replacement."""
+    """95 % interval of the reduction: runs drawn with replacement; one run tells none."""
+    if len(calibrated) < 2:
+        return math.nan, math.nan
     rng = np.random.default_rng(0)
     picks = rng.integers(0, len(calibrated), (SAMPLES, len(calibrated)))
     drawn = [reduction(calibrated[pick], after[pick], floor) for pick in picks]

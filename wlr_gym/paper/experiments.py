@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +98,17 @@ def paper_test(name: str) -> PaperTest:
     if name not in TESTS:
         raise unknown_name("test of the paper", name, TESTS)
     return TESTS[name]
+
+
+def write_tests(folder: Path) -> list[Path]:
+    """Write the goals of both tests as command files, for ``wlr record --commands``; its runs can be replayed and compared.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+    from wlr_gym.runs.record import write_commands
+
+    return [write_commands(folder, test.motion()) for test in TESTS.values()]
 
 
 def stop_time() -> float:

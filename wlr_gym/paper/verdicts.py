@@ -44,12 +44,15 @@ def _rows() -> list[tuple[int, str, str, tuple[str, ...], str, str]]:
         "called the wheel's velocity, it is (contact point) - (slip): 0 on every true motion; leg and pitch rates are missing"
     )
     true_slip = "x_s' = x' - y_i th' + X_i' - a (th_i' + leg' + psi'), y_s' = y' + th' X_i, z_s' = 0"
-    torque = "= dS/dth_i'' once its bracket is closed; the traction a F_x, which is nearly all of it, is missing"
+    torque = (
+        "= dS/dth_i'' once its bracket is closed; that bracket is 0 on a true motion, and the traction a F_x, most of the "
+        "torque, is missing"
+    )
     true_torque = "tau_i = I_o (th_i'' + leg'' + psi'') + J_w th_i'' + a F_x,i"
     force = "lost sgn(x_s'); = left side of (18), which is 0 on a true motion, not a force"
     true_force = "F_x,i = (tau_i - I_o (th_i'' + leg'' + psi'') - J_w th_i'')/a, at most mu N_i; -mu N_i sgn(x_s') when sliding"
     denominator = "denominator lost 'l(': adds metres to a pure number"
-    no_inertia = f"{denominator}; lateral inertia dropped"
+    no_inertia = f"{denominator}; lost sgn(y'); lateral inertia dropped; = left side of (18) again, not a force"
     lateral = "the rows of y and th give it: F_f + F_r = inertia of y, X_f F_f + X_r F_r = inertia of th - moment of the F_x,i"
     return [
         (1, "velocity of a wheel centre", "3.1", (CORRECT,), "relative velocity taken in the yaw frame", "as printed"),

@@ -42,7 +42,7 @@ class RigProblem:
         sealed: names of the runs to hold out where the user names none.
     """
 
-    metric = "RMS over whole runs and over windows of 0.2 s of measured-minus-replayed angle, in encoder counts"
+    metric = "RMS over whole runs and over windows of 0.2 s of measured-minus-replayed angle, in units of sensor noise"
     #: A servo that sticks elsewhere is off by hundreds of counts, and that is the gap.
     cap = 1e4
     steps = 20

@@ -277,10 +277,20 @@ def _patch(lists: _Lists, mu: float, measured: Sequence[Array]) -> None:
     for first in range(len(keys)):
         for last in range(first, min(len(keys), first + 12)):
             a, b = float(edges[first]), float(edges[last + 1])
-            found.append(Start((tuple(keys[first : last + 1]),), lambda w, a=a, b=b: (mu + less * float(w[0]), a, b)))
+            middle, width = 0.5 * (a + b), b - a
+            found.append(Start((tuple(keys[first : last + 1]),), lambda w, m=middle, d=width: (mu + less * float(w[0]), m, d)))
     level = next(unknown for unknown in unknowns("friction_patch", mu) if unknown.name == "mu")
-    edges_of_patch = tuple(Unknown(name, "m", 0.0, low - 10.0, high + 10.0, 0.02) for name in ("x_min", "x_max"))
-    lists.candidates.append(Candidate("friction_patch", ("ground",), (level, *edges_of_patch), tuple(found), fixed=UNBOUNDED))
+    middle = Unknown("x_middle", "m", 0.0, low - 10.0, high + 10.0, 0.02)
+    width = Unknown("x_width", "m", 0.0, 0.02, high - low + 10.0, 0.02)
+    lists.candidates.append(
+        Candidate("friction_patch", ("ground",), (level, middle, width), tuple(found), fixed=UNBOUNDED, convert=_area)
+    )
+
+
+def _area(values: Sequence[float]) -> dict[str, float]:
+    """Coefficient and edges of a patch from its coefficient, middle and width."""
+    mu, middle, width = map(float, values)
+    return {"mu": mu, "x_min": middle - 0.5 * width, "x_max": middle + 0.5 * width}
 
 
 def _loads(lists: _Lists) -> None:
