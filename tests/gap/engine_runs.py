@@ -51,7 +51,19 @@ def nominal(effects=(), meta=META):
     return apply_patch(load_patch(list(effects)), profile_parameters(Parameters.nominal(ROBOT), meta.profile))
 
 
-def record(commands, rows, effects=(), *, tick=CLOCK, step=None, meta=META, noise=None, backend="gibbs_appell", name="run_01", **changes):
+def record(
+    commands,
+    rows,
+    effects=(),
+    *,
+    tick=CLOCK,
+    step=None,
+    meta=META,
+    noise=None,
+    backend="gibbs_appell",
+    name="run_01",
+    **changes,
+):
     """Record a run.
 
     Args:
@@ -127,4 +139,3 @@ def spaced(seconds, period=0.02, offset=0.0):
     """Row times from 0, the later ones ``offset`` off the grid."""
     rows = period * np.arange(round(seconds / period) + 1)
     return np.append(rows[:1], rows[1:] + offset)
-

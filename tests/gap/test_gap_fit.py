@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from toy_problem import NOMINAL, QUANTITIES, REACH, SIGMA, STRENGTH, Toy, candidate, coloured, sized
+from toy_problem import NOMINAL, QUANTITIES, REACH, SIGMA, STRENGTH, Toy, candidate, coloured
 
 from wlr_gym.gap.fit import Model, fit, linearise, moved, nominal_model, on_bounds, prior_cost, scaled_numbers, total_cost
 from wlr_gym.gap.likelihood import LONGEST, estimate_noise, minus_two_log_likelihood
@@ -114,7 +114,9 @@ def test_cost_is_minus_two_log_posterior_and_falls():
     start = nominal_model(problem)
     found = fit(problem, all_runs(problem), start)
     residuals = [r[0] for r in problem.residuals([found.model.setting], all_runs(problem))]
-    assert found.cost == pytest.approx(minus_two_log_likelihood(residuals, found.noise.memory) + prior_cost(problem, found.model))
+    assert found.cost == pytest.approx(
+        minus_two_log_likelihood(residuals, found.noise.memory) + prior_cost(problem, found.model)
+    )
     before = [r[0] for r in problem.residuals([start.setting], all_runs(problem))]
     assert found.cost < total_cost(problem, start, before, found.noise.memory) - 100.0
     assert prior_cost(problem, found.model) == pytest.approx(np.sum(((found.model.quantities - NOMINAL) / SIGMA) ** 2))

@@ -106,7 +106,7 @@ def test_one_lost_reading_does_not_hide_the_rest():
         residual[:, 2] *= 6.0
     places, _ = localised(residuals, problem)
     assert places[0].name == "place"
-    assert set(p.name for p in places) <= set(CHANNELS)
+    assert {p.name for p in places} <= set(CHANNELS)
 
 
 def test_constant_state_is_no_reason():

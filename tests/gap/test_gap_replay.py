@@ -172,7 +172,9 @@ def test_a_window_does_not_show_the_drift_before_it():
     drifting = record(posture_and_turns, spaced(6.0), [radius], camera__delay=0.05)
     clock, table = RunClock(drifting), nominal()
     table["camera.delay"] = 0.05
-    found = anchored_residuals(drifting["t"], measured(drifting), replay_batch(ROBOT, [clock], table)[0].values, NOISE, clock.windows)[0]
+    found = anchored_residuals(
+        drifting["t"], measured(drifting), replay_batch(ROBOT, [clock], table)[0].values, NOISE, clock.windows
+    )[0]
     for name in ("cam_x", "cam_yaw"):
         size = np.abs(found[:, CHANNELS.index(name)])
         for window in clock.windows[1:]:

@@ -344,7 +344,7 @@ def test_wrong_units_are_refused(tmp_path, good):
     for leg in LEGS:
         table[[f"pos_{leg}", f"cmd_{leg}"]] *= 180 / math.pi
     table.to_csv(folder / "run_02.csv", index=False)
-    with pytest.raises(InputError, match="run_02.*degrees"):
+    with pytest.raises(InputError, match=r"run_02.*degrees"):
         open_robot(folder)
 
 
@@ -353,7 +353,7 @@ def test_missing_encoder_readings_are_refused(tmp_path, good):
     table = pandas.read_csv(folder / "run_03.csv")
     table.loc[7, "pos_wheel_lf"] = np.nan
     table.to_csv(folder / "run_03.csv", index=False)
-    with pytest.raises(InputError, match="run_03.*row 7.*pos_wheel_lf"):
+    with pytest.raises(InputError, match=r"run_03.*row 7.*pos_wheel_lf"):
         open_robot(folder)
 
 
@@ -362,12 +362,14 @@ def test_rows_out_of_order_are_refused(tmp_path, good):
     table = pandas.read_csv(folder / "run_01.csv")
     table.iloc[[20, 21]] = table.iloc[[21, 20]].to_numpy()
     table.to_csv(folder / "run_01.csv", index=False)
-    with pytest.raises(InputError, match="run_01.*t must increase"):
+    with pytest.raises(InputError, match=r"run_01.*t must increase"):
         open_robot(folder)
 
 
 def test_runs_of_different_profiles_are_refused(good):
-    other = Run(good.table, META.model_copy(update={"profile": META.profile.model_copy(update={"leg_velocity": 9.0})}), Path("x"))
+    other = Run(
+        good.table, META.model_copy(update={"profile": META.profile.model_copy(update={"leg_velocity": 9.0})}), Path("x")
+    )
     with pytest.raises(InputError, match="different servo profiles"):
         RobotProblem([good, other])
 

@@ -111,8 +111,11 @@ def test_first_guess_stays_plausible():
 
 def share_of_promise(problem):
     """Gain of a shortened first guess over the fall of the cost along the way, known numbers at their best."""
-    found, responded, scores = screened(problem)
-    weak, wide = score_of(scores, "weak"), replace(candidate(problem, "weak"), unknowns=(Unknown("size", "1", 0.0, -99.0, 99.0, 1.0),))
+    _found, responded, scores = screened(problem)
+    weak, wide = (
+        score_of(scores, "weak"),
+        replace(candidate(problem, "weak"), unknowns=(Unknown("size", "1", 0.0, -99.0, 99.0, 1.0),)),
+    )
     free = screen([wide], responded)[0]
     share = weak.values[0] / free.values[0]
     assert 0.0 < share < 1.0
@@ -121,7 +124,7 @@ def share_of_promise(problem):
 
 def test_best_of_several_starts_is_taken():
     problem = Toy({}, [sized("drag", 0.7, "right")], white=1.0)
-    found, responded, _ = screened(problem)
+    _found, responded, _ = screened(problem)
     wrong = Start((("drag left",),), lambda a: (9.0,))
     right = Start((("drag right",),), lambda a: (0.5 * float(a[0]),))
     both = Candidate("drag", ("right",), (Unknown("size", "1", 0.0, -10.0, 10.0, 1.0),), (wrong, right))

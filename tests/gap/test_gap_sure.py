@@ -23,7 +23,9 @@ def fitted(problem, size=0.7):
 def test_intervals_cover_the_truth_as_often_as_they_say(white, error, memory):
     inside, draws = [], 100
     for seed in range(draws):
-        problem = Toy(TRUTH, [sized("drag", 0.7, "right")], seed=seed, white=white, error=error, memory=memory, runs=6, rows=120)
+        problem = Toy(
+            TRUTH, [sized("drag", 0.7, "right")], seed=seed, white=white, error=error, memory=memory, runs=6, rows=120
+        )
         found = fitted(problem, 0.5)
         error_of = standard_errors(problem, found)[-1]
         inside.append(abs(found.model.effects[0][1][0] - 0.7) < TWO_SIDED_95 * error_of)
@@ -47,7 +49,9 @@ def test_differences_from_run_to_run_widen_the_interval():
     steady = Toy(white=1.5, runs=6)
     for r, size in enumerate((0.2, 1.2, 0.4, 1.0, 0.3, 1.1)):
         for toy, own in ((problem, size), (steady, 0.7)):
-            toy._measured[r] = toy._measured[r] + toy.effect_response(sized("drag", own, "right"), r) * np.array([0.1, 2, 0.001])
+            toy._measured[r] = toy._measured[r] + toy.effect_response(sized("drag", own, "right"), r) * np.array(
+                [0.1, 2, 0.001]
+            )
     wide, narrow = (standard_errors(toy, fitted(toy))[-1] for toy in (problem, steady))
     # six sizes with a spread of 0.42: the error of their mean is 0.19
     assert wide == pytest.approx(0.19, rel=0.5)
@@ -123,7 +127,7 @@ def test_detectable_severity_is_where_the_gain_is_just_enough():
     smallest = detectable(screen(candidates, responded))["decoy_2"]
     assert (smallest.parameter, smallest.unit) == ("size", "1")
     shown = Toy({}, [sized("decoy_2", smallest.value)], seed=11, white=1.5)
-    found, with_it, candidates = screened(shown)
+    _found, with_it, candidates = screened(shown)
     gain = next(s.gain for s in screen(candidates, with_it) if s.candidate.name == "decoy_2")
     assert gain == pytest.approx(LEAST_GAIN, rel=0.5)
 

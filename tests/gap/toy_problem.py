@@ -30,7 +30,9 @@ def shapes(name, runs, rows):
     """Smooth random shape (runs, rows, channels) of unit mean square, the same for the same name."""
     rng = np.random.default_rng([ord(letter) for letter in name])
     t = np.arange(rows)[None, :, None, None]
-    frequency, phase = rng.uniform(0.01, 0.2, (2, runs, 1, len(CHANNELS), 6)) * np.array([1.0, 100.0])[:, None, None, None, None]
+    frequency, phase = (
+        rng.uniform(0.01, 0.2, (2, runs, 1, len(CHANNELS), 6)) * np.array([1.0, 100.0])[:, None, None, None, None]
+    )
     waves = np.sin(frequency * t + phase).sum(axis=-1) * rng.uniform(0.3, 1.0, (1, 1, len(CHANNELS)))
     waves /= np.sqrt(np.mean(waves**2))
     waves.setflags(write=False)

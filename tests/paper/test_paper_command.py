@@ -2,10 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from wlr_gym.cli import run_command
 from wlr_gym.errors import InputError
+from wlr_gym.hardware.loop import StoppedError
+from wlr_gym.paper.experiments import PROFILE, TESTS
+from wlr_gym.runs.record import read_commands
 
 
 def test_report_is_written(tmp_path, capsys):
@@ -20,6 +24,39 @@ def test_report_is_written(tmp_path, capsys):
     assert "| gibbs_appell | test_2 |" in text
     assert "| (30) |" in text
     assert "does not hold" in capsys.readouterr().out
+    for name, test in TESTS.items():
+        motion = read_commands(out / "commands" / f"{name}.csv")
+        np.testing.assert_array_equal(motion.goals, test.motion().goals)
+        assert motion.profile == PROFILE
+
+
+def test_a_robot_is_asked_for_and_guarded(tmp_path, monkeypatch):
+    """Like every command that moves a robot: nothing is driven without somebody there."""
+    made = []
+    monkeypatch.setattr("wlr_gym.cli.paper.Options.plant_of", lambda *given: made.append(given))
+    monkeypatch.setattr("builtins.input", lambda *_: (_ for _ in ()).throw(EOFError))
+    with pytest.raises(InputError, match="nobody there to start the robot"):
+        run_command("paper", ["--out", str(tmp_path / "out"), "--plant", "dynamixel", "--draws", "0"])
+    assert not made
+
+
+def test_a_robot_that_had_to_stop_ends_the_command(tmp_path, monkeypatch, capsys):
+    def stop(*_):
+        raise StoppedError("a leg is too hot")
+
+    monkeypatch.setattr("wlr_gym.paper.experiments.drive_plant", stop)
+    arguments = ["--out", str(tmp_path / "out"), "--plant", "dynamixel", "--emulated", "--draws", "0"]
+    assert run_command("paper", arguments) == 1
+    assert "a leg is too hot" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_an_emulated_robot_drives_both_tests_and_keeps_its_runs(tmp_path):
+    out = tmp_path / "out"
+    arguments = ["--out", str(out), "--plant", "dynamixel", "--emulated", "--draws", "0", "--no-plots"]
+    assert run_command("paper", arguments) == 0
+    assert len(list((out / "runs").glob("run_*.csv"))) == 2
+    assert "| dynamixel | test_2 |" in (out / "report.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -30,6 +67,8 @@ def test_report_is_written(tmp_path, capsys):
         (["--levels", "4"], "--levels 4"),
         (["--threads", "0"], "--threads 0"),
         (["--robot", "nowhere"], "nowhere"),
+        (["--emulated"], "add dynamixel to --plant"),
+        (["--plant", "dynamixel", "--hardware", "nowhere"], "nowhere"),
     ],
 )
 def test_bad_input_is_named_and_leaves_no_folder(tmp_path, arguments, words):

@@ -108,3 +108,15 @@ def test_rotor_of_a_free_wheel_takes_little():
     """Audit: 3e-3 N m in a leg start of the first test; in the second, twice that."""
     peaks = [np.abs(m.u_dot[:, 9] * m.constants.I_o).max() for m in (ONE, TWO)]
     np.testing.assert_allclose(peaks, [3.1e-3, 6.5e-3], rtol=0.1)
+
+
+def test_the_traction_that_21_to_24_lack_is_most_of_a_front_wheels_torque():
+    """Cruising up: a F_x against I_o (theta'' + ...), which is all that the printed equations keep on a true motion."""
+    found = ONE.inverse_dynamics()
+    k = at(ONE, 3.0)
+    traction = abs(Constants().a * found.along[k, 0])
+    assert traction > 0.8 * abs(found.wheel_torque[k, 0])
+    s = ONE.state()
+    absolute = {wheel: s.theta_dd[wheel] + s.absolute_leg(wheel)[2] for wheel in s.theta_dd}
+    left = printed.eq21_torque_of_the_right_front_wheel(ONE.constants, replace(s, theta_dd=absolute))[k]
+    assert left == pytest.approx(Constants().I_o * absolute["rf"][k], rel=1e-3)

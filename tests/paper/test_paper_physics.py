@@ -242,6 +242,32 @@ def test_15_is_a_box_the_ellipse_fits_in():
     assert repaired.eq15_dissipation(c, straight, 5.0, 5.0) == pytest.approx(corrected.eq15_dissipation(c, straight, 5.0, 5.0))
 
 
+def test_18_takes_friction_off_on_the_left():
+    """dD/du' is minus the generalised force of sliding wheels, and D the power they lose; slip has no motor."""
+    c, s, p, u = random_motion(2)
+    c = replace(c, mu_dy=c.mu_dx)
+    loads = {"f": 3.0, "r": 7.0}
+    j_x, j_y, _ = (rows[0] for rows in reduced.contact_rows(c, p, np.full((1, 4), c.a)))
+
+    def lost(u):
+        slip = {w: (j_x[k] @ u, j_y[k] @ u) for k, w in enumerate(ORDER)}
+        now = replace(
+            s, x_s_d={w: v[0] for w, v in slip.items()}, y_f_d=slip["lf"][1], y_r_d=slip["lr"][1]
+        )  # fmt: skip
+        return corrected.eq15_dissipation(c, now, loads["f"], loads["r"]), slip
+
+    power, slip = lost(u[:11])
+    pull = np.zeros(11)
+    for k, wheel in enumerate(ORDER):
+        along, across = corrected.eq14_coulomb_friction(c.mu_dx, loads[wheel[1]], slip[wheel])
+        pull += along * j_x[k] + across * j_y[k]
+    step = 1e-6
+    slope = [(lost(u + step * e)[0] - lost(u - step * e)[0]) / (2 * step) for e in np.eye(11)]
+    assert power > 0.0
+    np.testing.assert_allclose(printed.eq18_generalised_force(pull, np.array(slope), 0.0), 0.0, atol=1e-7)
+    assert pull @ u == pytest.approx(-power)
+
+
 def test_16_and_17_balance_force_and_moment():
     """By hand: weights at their places along the floor, two loads at the axles; as printed, massless wheels, mid-leg."""
     front, rear = printed.eq16_normal_force_in_front(C, S), printed.eq17_normal_force_behind(C, S)

@@ -274,7 +274,7 @@ def _rear_stops(e: Evidence) -> tuple[str, str]:
 def _legs_stop(e: Evidence) -> tuple[str, str]:
     record = e.plant["test_1"]
     moving = np.abs(record.joint_velocity[:, 0, 2]) > 0.1 * LEG_SPEED
-    last = float(record.time[np.flatnonzero(moving)[-1]])
+    last = float(record.time[moving].max(initial=0.0))
     profile = math.radians(120) / LEG_SPEED
     return f"{last:.2f} s (120 degrees at 15 counts: {profile:.2f} s)", _graded(abs(last - profile) < 0.15)
 
@@ -399,7 +399,7 @@ CLAIMS: tuple[Claim, ...] = (
         _slip_error("test_1", 11.5),
     ),
     Claim(2, "the same, second test", "5 %", "the same", _slip_error("test_2", 5.0)),
-    Claim(3, "the error is that of neglecting slip", "-", "words", _wording),
+    Claim(3, "the error is that of neglecting slip", "-", "one of the two is meant", _wording),
     Claim(4, "lateral displacement", "1.1 and 5.2 cm", "both within 5 mm", _lateral),
     Claim(
         5,
@@ -423,7 +423,7 @@ CLAIMS: tuple[Claim, ...] = (
         _posture_and_slip,
     ),
     Claim(8, "equipment at the body's centre reduces slip", "-", "least error when centred", _centre_of_mass),
-    Claim(9, "leg angles reduce the friction coefficient", "-", "words", _coefficient),
+    Claim(9, "leg angles reduce the friction coefficient", "-", "mu depends on the legs", _coefficient),
     Claim(
         10,
         "four wheel turns; 18.32 rpm, 214.58 rev/min2, 3.44 rpm",
@@ -455,5 +455,5 @@ CLAIMS: tuple[Claim, ...] = (
         23, "free rear wheels prevent oversteer", "-", "less than half the yaw of driven ones; partly: for one axle", _oversteer
     ),
     Claim(24, "motors stay within Table II", "7.3 / 1.5 N m, 66 / 61 rpm", "below stall torque and 12 V speed", _limits),
-    Claim(25, "Gibbs-Appell needs fewer equations: twelve independent coordinates", "12", "counting", _fewer),
+    Claim(25, "Gibbs-Appell needs fewer equations: twelve independent coordinates", "12", "twelve are independent", _fewer),
 )

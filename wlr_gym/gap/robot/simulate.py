@@ -249,7 +249,11 @@ def _anchor(
     state.reference_position[mine, 4:] += missing * _tension_per_effort(plant.robot, lanes, mine)
     if np.isfinite(anchors.pose[window]).all():
         _place(state, clock, window, mine, lanes)
-    return plant.reset(state=state, mask=mine)
+    kept = {name: readings[name][mine].copy() for name in ("joint_effort", "gyro", "accelerometer", "supply_voltage")}
+    fresh = plant.reset(state=state, mask=mine)
+    for name, values in kept.items():  # a reset has no torque and no acceleration yet
+        fresh[name][mine] = values
+    return fresh
 
 
 def _tension_per_effort(robot: Robot, lanes: Parameters, mine: NDArray[np.bool_]) -> Array:
