@@ -63,7 +63,7 @@ def wheel_speeds_at_off(rig):
 def test_a_full_disk_stops_the_robot_in_good_order(rig, phase):
     if phase == "ramp":
         rig.loop.spare = lambda: fill_the_disk(rig.loop.log)
-        with pytest.raises(StoppedError, match="computer: the log cannot be written: .*No space left"):
+        with pytest.raises(StoppedError, match=r"computer: the log cannot be written: .*No space left"):
             rig.loop.start()
     else:
         rig.loop.start()
@@ -71,7 +71,7 @@ def test_a_full_disk_stops_the_robot_in_good_order(rig, phase):
         fill_the_disk(rig.loop.log)
     speeds = wheel_speeds_at_off(rig)
     if phase == "running":
-        with pytest.raises(StoppedError, match="computer: the log cannot be written: .*No space left"):
+        with pytest.raises(StoppedError, match=r"computer: the log cannot be written: .*No space left"):
             rig.drive(0.2)
     rig.loop.stop()
     assert rig.loop.phase in (Phase.LIMP, Phase.FAULT)
@@ -111,7 +111,7 @@ def test_no_signal_interrupts_switching_off(rig):
     rig.loop._gate.off = off_with_an_impatient_operator
     with stop_on_signals(rig.loop):
         os.kill(os.getpid(), signal.SIGINT)
-        with pytest.raises(StoppedError, match="SIGINT"):
+        with pytest.raises((StoppedError, KeyboardInterrupt), match="SIGINT"):
             rig.drive(0.2)
         assert not rig.torque().any()
         with pytest.raises(KeyboardInterrupt):
@@ -173,9 +173,13 @@ def test_a_display_that_hangs_is_noticed(rig, when):
     """Between sending and reading, in the first second too (where the share of late ticks is not known yet)."""
     ticks = iter(range(1000))
     rig.loop.spare = lambda: rig.link.clock.wait_until(rig.machine.time + 0.3 * (next(ticks) == when))
-    with pytest.raises(StoppedError, match="idle: nothing was sent for 0.3"):
+
+    def play():
         rig.loop.start()
         rig.drive(5.0)
+
+    with pytest.raises(StoppedError, match=r"idle: nothing was sent for 0\.3"):
+        play()
     assert not rig.torque().any()
 
 
@@ -208,7 +212,7 @@ def test_a_leg_outside_its_servos_limits_does_not_start(rig):
 
 def test_a_robot_that_lies_on_its_side_does_not_start(rig):
     rig.machine._imu = Lying()
-    with pytest.raises(StoppedError, match="imu: the body leans by 1.57 rad"):
+    with pytest.raises(StoppedError, match=r"imu: the body leans by 1\.57 rad"):
         rig.loop.start()
     assert rig.machine.servos["leg_lf"]["bus_watchdog"] == 0  # nothing was prepared
 

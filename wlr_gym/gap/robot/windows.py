@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 #: s; length of a window, and of its beginning in which the camera's frames are not compared.
 WINDOW, BLIND = 2.0, 0.05
 _X, _Y, _YAW, _PITCH = (CHANNELS.index(f"cam_{name}") for name in ("x", "y", "yaw", "pitch"))
+#: Rows (0.14 s) over which bouncing is averaged, and the channels that show it.
+BOUNCE = 7
+_BOUNCING = [CHANNELS.index(name) for name in ("gyro_x", "gyro_y", "acc_z")]
 _CAMERA = [CHANNELS.index(name) for name in CHANNELS if name.startswith("cam_")]
 _WHEELS = [CHANNELS.index(f"pos_{joint}") for joint in JOINTS[4:]]
 
@@ -50,8 +53,28 @@ def anchored_residuals(t: Array, measured: Array, simulated: Array, noise: Array
     for window in windows:
         wheels = np.ascontiguousarray(residual[:, window, _WHEELS[0] : _WHEELS[-1] + 1])
         residual[:, window, _WHEELS[0] : _WHEELS[-1] + 1] = wheels - np.nanmean(wheels, axis=1, keepdims=True)
+        _calm(residual[:, window])
         _take_out_pose(measured[window], simulated[:, window], residual[:, window], noise)
     return residual / noise
+
+
+def _calm(residual: Array) -> None:
+    """Average the channels in which a robot bounces on its tyres over a bounce, in place; white noise keeps its size.
+
+    How it bounces depends on tyre, chassis and floor in ways that no simulator here has; the slow part says what the masses do.
+    """
+    rows = residual.shape[1]
+    for c in _BOUNCING:
+        known = np.isfinite(residual[:, :, c])
+        total = np.concatenate(
+            [np.zeros((len(residual), 1)), np.cumsum(np.where(known, residual[:, :, c], 0.0), axis=1)], axis=1
+        )
+        count = np.concatenate([np.zeros((len(residual), 1)), np.cumsum(known, axis=1)], axis=1)
+        first = np.maximum(np.arange(rows) - BOUNCE // 2, 0)
+        last = np.minimum(np.arange(rows) + BOUNCE // 2 + 1, rows)
+        seen = count[:, last] - count[:, first]
+        mean = (total[:, last] - total[:, first]) / np.sqrt(np.maximum(seen, 1.0))
+        residual[:, :, c] = np.where(known, mean, np.nan)
 
 
 def _take_out_pose(measured: Array, simulated: Array, residual: Array, noise: Array) -> None:
