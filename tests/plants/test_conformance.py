@@ -167,6 +167,54 @@ def test_accelerometer_shows_gravity_at_rest_and_nothing_in_free_fall(simulator)
 # ---- state -------------------------------------------------------------------------------------------------------------
 
 
+def test_gyroscope_lags_by_its_whole_time_constant(simulator):
+    """Against the exact response of a first-order low-pass to the true rate, straight between physics steps."""
+    step = 0.001
+    plant = make(simulator, 1, options=PlantOptions(control_period=step, physics_step=step, sensor_noise=False))
+    turn = np.array([[1.2, 1.9, 1.7, 1.3, -3.0, 3.0, -3.0, 3.0]])
+    filtered = plant.truth().angular_velocity_in_body[0].copy()
+    rates, errors = [filtered], [np.zeros(3)]
+    time_constant = 1.0 / (2.0 * np.pi * ROBOT.sensors.imu.bandwidth)
+    fade = np.exp(-step / time_constant)
+    for _ in range(600):
+        sensors = plant.step(turn)
+        rates.append(plant.truth().angular_velocity_in_body[0].copy())
+        slope = (rates[-1] - rates[-2]) / step
+        behind = time_constant * slope
+        filtered = rates[-1] - behind + (filtered - rates[-2] + behind) * fade
+        errors.append(sensors.gyro[0] - filtered)
+    plant.close()
+    change = np.gradient(np.array(rates), step, axis=0)
+    lead = np.sum(np.array(errors) * change, axis=0) / np.sum(change**2, axis=0)
+    assert (np.abs(change).max(axis=0) > 1.0).all()
+    assert (np.abs(lead) < 4e-5).all(), lead  # s; a trapezoid per step is itself step^2/(12 time constants) = 23 us off
+
+
+def test_constants_of_formulas_are_per_robot(simulator):
+    force = make_force(("floor_force_x",), "push", {"push": 0.0}, {"push": "N"})
+    plant = make_plant(simulator, ROBOT, 3, QUIET, (force,))
+    plant.set_force_values(np.array([[0.0], [8.0], [-8.0]]))
+    wheels_off = np.ones((3, 8), bool)
+    wheels_off[:, 4:] = False
+    hold(plant, home(3), 30, wheels_off)
+    x = plant.truth().position[:, 0].copy()
+    plant.close()
+    assert abs(x[0]) < 1e-3
+    assert x[1] > 0.05
+    assert x[2] < -0.05
+
+
+def test_expecting_all_effects_does_not_change_a_bit(simulator):
+    results = []
+    for expect in (False, True):
+        plant = make(simulator)
+        if expect:
+            plant.expect_all_effects()
+        results.append(run(plant, 0, 20))
+        plant.close()
+    np.testing.assert_array_equal(*results)
+
+
 def test_state_survives_a_round_trip(simulator):
     plant = make(simulator, edit=lambda p: p["joint.zero_offset"].__setitem__(..., (0.02, -0.01, 0.0, 0.03)))
     run(plant, 0, 10)
