@@ -21,6 +21,7 @@ from wlr_gym.gap.fit import (
     cross_products,
     fit,
     moved,
+    nominal_model,
     normal_equations,
     total_cost,
 )
@@ -232,7 +233,11 @@ def finalists(
     wholes = []
     for hypothesis in best.values():
         tell(f"fitting {hypothesis.candidate.label} in full")
-        wholes.append(fit(problem, runs, hypothesis.model, steps=2 if len(best) == 1 else 1, tell=tell))
+        near = fit(problem, runs, hypothesis.model, steps=1, tell=tell)
+        # calibration may have taken on what the effect does, and not let go of it: begin once more from the model as given
+        fresh = fit(problem, runs, _afresh(problem, hypothesis), steps=problem.steps, tell=tell)
+        memory = min((near, fresh), key=lambda whole: whole.cost).noise.memory
+        wholes.append(min((near, fresh), key=lambda whole: total_cost(problem, whole.model, whole.residuals, memory)))
     if not wholes:
         return []
     memory = min(wholes, key=lambda whole: whole.cost).noise.memory
@@ -246,6 +251,15 @@ def finalists(
         final = replace(hypothesis, model=whole.model, gain=gain, by_run=by_run, residuals=whole.residuals, carries_over=agreed)
         found.append(Final(final, whole))
     return sorted(found, key=lambda final: -final.hypothesis.gain)
+
+
+def _afresh(problem: Problem, hypothesis: Hypothesis) -> Model:
+    """All numbers nominal, the effects found before as they are, the new one as it was probed."""
+    candidate = hypothesis.candidate
+    start = candidate.starts[0]
+    low, high = (np.array([getattr(unknown, side) for unknown in candidate.unknowns]) for side in ("low", "high"))
+    probed = np.clip(start.values(np.ones(len(start.directions))), low, high).tolist()
+    return Model(nominal_model(problem).quantities, (*hypothesis.model.effects[:-1], (candidate, tuple(probed))))
 
 
 def _carries_over(
