@@ -37,12 +37,12 @@ def look(capsys, **options):
 
 def test_a_good_robot_passes(machine, capsys, tmp_path):
     code, text = look(capsys, json=tmp_path / "checks.json")
-    assert (code, text.splitlines()[-1]) == (0, "All 147 checks passed.")
+    assert (code, text.splitlines()[-1]) == (0, "All 151 checks passed.")
     assert "8 of 8     supply" in text
     assert "bus speed: median 3.00 ms" in text
     assert "All 8" not in text
     found = json.loads((tmp_path / "checks.json").read_text())
-    assert len(found) == 147
+    assert len(found) == 151
     assert {entry["where"] for entry in found} >= {"legs", "imu", "wheel_rr", "robot"}
 
 

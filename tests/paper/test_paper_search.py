@@ -59,6 +59,7 @@ def test_nominal_robot_and_a_scaled_camera():
     np.testing.assert_allclose(found.lateral[1], -0.9 * np.sin(0.05) * np.array([0.8524, 1.1622]), atol=5e-4)
 
 
+@pytest.mark.slow
 def test_search_is_reproducible_covers_pairs_and_closes_in(tmp_path):
     first, again = (search(ROBOT, draws=3, levels=2, seed=5, candidates=CHOSEN) for _ in range(2))
     assert [finding.label for finding in first] == ["radius", "camera", "radius + camera"]

@@ -134,14 +134,14 @@ def _ends_table(robot: Robot, records: Records) -> list[str]:
             error = 100 * float(error_of_ignoring_slip(robot, record)[0])
             slipped = 1e3 * float(np.abs(record.slip_path[-1, 0, :, 0]).max())
             lines.append(
-                f"| {model} | {name} | {_number(x, 4)} | {_number(1e3 * y, 2)} | {_number(error, 2)} % | "
+                f"| {model} | {name} | {_number(x, 4)} | {_number(1e3 * y, 2)} | {_number(error, 2, ' %')} | "
                 f"{turns[0]:.3f}, {turns[1]:.3f} | {_number(slipped, 2)} |"
             )
     return lines
 
 
-def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if np.isfinite(value) else "not measured"
+def _number(value: float, digits: int, unit: str = "") -> str:
+    return f"{value:.{digits}f}{unit}" if np.isfinite(value) else "not measured"
 
 
 def _agreement_table(apart: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
