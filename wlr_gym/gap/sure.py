@@ -127,12 +127,22 @@ def detectable(scores: Sequence[Score]) -> dict[str, Detectable]:
         steps = np.zeros(len(start.directions))
         steps[min(which, len(steps) - 1)] = amplitude
         values = start.values(steps)
-        unknowns = score.candidate.unknowns
-        sizes = [abs(v - u.neutral) / max(u.high - u.low, 1e-12) for v, u in zip(values, unknowns, strict=True)]
-        known = EFFECTS[score.candidate.name].parameters if score.candidate.name in EFFECTS else {u.name for u in unknowns}
-        sizes = [size if unknown.name in known else 0.0 for size, unknown in zip(sizes, unknowns, strict=True)]
-        k = 0 if len(start.directions) == 1 else int(np.argmax(sizes))
-        entry = Detectable(unknowns[k].name, float(values[k]), unknowns[k].unit)
+        entry = _largest(score.candidate, values)
         if score.candidate.name not in found or amplitude > found[score.candidate.name][0]:
             found[score.candidate.name] = (amplitude, entry)
     return {name: entry for name, (_, entry) in sorted(found.items())}
+
+
+def _largest(candidate: Candidate, values: Sequence[float]) -> Detectable:
+    """The parameter that is farthest from neutral, in units of its range: an effect's own where the library knows it."""
+    parameters = candidate.parameters(values)
+    specs = {u.name: (u.neutral, u.high - u.low, u.unit) for u in candidate.unknowns}
+    if candidate.name in EFFECTS:
+        for name, spec in EFFECTS[candidate.name].parameters.items():
+            neutral = spec.neutral if isinstance(spec.neutral, float | int) else specs[name][0]
+            specs[name] = (neutral, spec.prior[1] - spec.prior[0], spec.unit)
+    if {"amplitude", "mass", "stiffness"} & set(parameters):  # an effect of one size, and of a shape or place
+        name = next(iter(parameters))
+    else:
+        name = max(parameters, key=lambda key: abs(parameters[key] - specs[key][0]) / max(specs[key][1], 1e-12))
+    return Detectable(name, parameters[name], specs[name][2])
