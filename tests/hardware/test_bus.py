@@ -119,7 +119,7 @@ def sdk_port(server):
     return port, sdk.Protocol2PacketHandler()
 
 
-def test_defect_1_stuffing_is_lost_on_sending(server, group):
+def test_defect_1_stuffing_is_lost_on_sending(server):
     port, handler = sdk_port(server)
     data = (-3).to_bytes(4, "little", signed=True)  # FD FF FF FF behind FF FF of the current
     both = TABLE["goal_current"].encode(-1) + data
@@ -278,6 +278,21 @@ def test_defect_10_unplugging_is_one_kind_of_error(server, group):
     for act in (lambda: group.ping(2), lambda: group.read_all(FAST_BLOCK), group.torque_off):
         with pytest.raises(BusGoneError, match="is gone"):
             act()
+
+
+def test_a_port_in_use_is_refused_until_it_is_closed():
+    ours, theirs = os.openpty()
+    try:
+        first, second = (GuardedPort(os.ttyname(theirs), 1000000, 0.005) for _ in range(2))
+        first.openPort()
+        with pytest.raises(InputError, match="in use by another program"):
+            second.openPort()
+        first.closePort()
+        second.openPort()
+        second.closePort()
+    finally:
+        os.close(ours)
+        os.close(theirs)
 
 
 def test_defect_11_missing_port_is_named(tmp_path):

@@ -6,6 +6,7 @@ defect in the SDK and its absence here. Import only behind ``require_package``: 
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import time
@@ -32,6 +33,19 @@ SUCCESS, TIMEOUT, CORRUPT = sdk.COMM_SUCCESS, sdk.COMM_RX_TIMEOUT, sdk.COMM_RX_C
 
 class BusGoneError(ConnectionError):
     """The port does not work any more: unplugged adapter, dead driver."""
+
+
+def _lock(descriptor: int) -> bool:
+    """Keep other programs of this library off a port until it is closed or its process ends; False if one has it already."""
+    try:
+        import fcntl
+    except ImportError:  # Windows opens a serial port for one program only
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)
+    return True
 
 
 class GuardedPort(sdk.PortHandler):
@@ -80,6 +94,11 @@ class GuardedPort(sdk.PortHandler):
             raise InputError(f"port {self.port_name}: cannot be opened: {error}") from None
         if not opened:
             raise InputError(f"port {self.port_name}: baud rate {self.baudrate} is not one dynamixel-sdk knows")
+        if not _lock(self.ser.fileno()):
+            self.closePort()
+            raise InputError(
+                f"port {self.port_name} is in use by another program: two readers would steal each other's answers"
+            )
         self.gone = False
         return True
 
