@@ -7,7 +7,7 @@ from wlr_gym.bench.blind.copies import read_robot
 from wlr_gym.bench.blind.dataset import simulate_runs, write
 from wlr_gym.bench.blind.spoil import SPOIL
 from wlr_gym.errors import InputError
-from wlr_gym.gap import analyse as workflow
+from wlr_gym.gap import workflow
 from wlr_gym.paths import data_directory
 
 ROBOT = read_robot(data_directory("configs") / "robot" / "nominal.yaml")

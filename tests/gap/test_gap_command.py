@@ -12,7 +12,7 @@ from wlr_gym.cli import main
 from wlr_gym.errors import InputError
 from wlr_gym.gap import report as module
 
-workflow = importlib.import_module("wlr_gym.gap.analyse")
+workflow = importlib.import_module("wlr_gym.gap.workflow")
 
 
 @pytest.fixture

@@ -420,7 +420,7 @@ def test_features_are_rows_of_the_run(good):
 
 @pytest.mark.slow
 def test_rolling_resistance_is_found_in_four_runs(tmp_path):
-    from wlr_gym.gap.analyse import analyse
+    from wlr_gym.gap.workflow import analyse
     from wlr_gym.runs.excitations import excite
 
     for k, kind in enumerate(("straight", "turns", "stop_and_go", "s_curve")):

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from wlr_gym.gap.robot.windows import BLIND, anchored_residuals, window_rows
+from wlr_gym.gap.robot.windows import BLIND, BOUNCE, anchored_residuals, window_rows
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.runs.format import CHANNELS
 from wlr_gym.runs.noise import channel_noise
@@ -17,6 +17,7 @@ X, Y, YAW, Z, PITCH = (CHANNELS.index(f"cam_{name}") for name in ("x", "y", "yaw
 CAMERA = [CHANNELS.index(name) for name in CHANNELS if name.startswith("cam_")]
 #: Rows in which a window shows no frames: they were exposed before it.
 EARLY = np.concatenate([np.arange(w.start, w.stop)[T[w] < T[w.start] + BLIND] for w in WINDOWS])
+BOUNCING = [CHANNELS.index(name) for name in ("gyro_x", "gyro_y", "acc_z")]
 WHEELS = [CHANNELS.index(f"pos_{joint}") for joint in JOINTS[4:]]
 
 
@@ -99,9 +100,23 @@ def test_whole_turns_do_not_matter():
 def test_everything_else_is_plain_difference():
     measured, simulated = drive(), drive()[None] + 0.01
     found = residuals(measured, simulated)
-    others = [c for c in range(len(CHANNELS)) if c not in (*CAMERA, *WHEELS)]
+    others = [c for c in range(len(CHANNELS)) if c not in (*CAMERA, *WHEELS, *BOUNCING)]
     assert found[0][:, others] == pytest.approx(np.broadcast_to(-0.01 / NOISE[others], (len(T), len(others))), rel=1e-6)
     assert np.abs(found[0][:, WHEELS]).max() < 1e-6  # a constant is taken out of the wheels
+
+
+def test_bouncing_is_averaged_and_its_noise_keeps_its_size():
+    measured = drive()[None].repeat(40, axis=0)[0]
+    rng = np.random.default_rng(5)
+    noisy = measured[None] + NOISE * rng.standard_normal((40, len(T), len(CHANNELS)))
+    steady, noise = residuals(measured, measured[None] + 0.01)[0], residuals(measured, noisy)
+    for c in BOUNCING:
+        inside = np.concatenate([np.arange(w.start + BOUNCE // 2, w.stop - BOUNCE // 2) for w in WINDOWS])
+        assert steady[inside, c] == pytest.approx(-0.01 / NOISE[c] * np.sqrt(BOUNCE), rel=1e-6)
+        assert noise[:, inside, c].std() == pytest.approx(1.0, rel=0.03)
+        tone = measured[None].copy()
+        tone[0, :, c] += np.sin(2 * np.pi * np.arange(len(T)) / BOUNCE)  # one bounce per average
+        assert np.abs(residuals(measured, tone)[0][inside, c]).max() < 0.02 / NOISE[c]
 
 
 def test_drift_within_a_window_stays():

@@ -71,7 +71,7 @@ class Plan:
 
 def analyse_folder(folder: Path, out: Path) -> Mapping[str, Any]:
     """Run the gap workflow on a folder; return its result file."""
-    from wlr_gym.gap.analyse import analyse
+    from wlr_gym.gap.workflow import analyse
 
     analyse(folder, out=out, threads=1)
     return json.loads((out / "result.json").read_text(encoding="utf-8"))

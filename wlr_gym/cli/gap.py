@@ -53,9 +53,9 @@ def run(options: Options) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.gap.analyse import analyse
     from wlr_gym.gap.analysis import BAD_DATA
     from wlr_gym.gap.report import check_folder
+    from wlr_gym.gap.workflow import analyse
     from wlr_gym.provenance import record_provenance
 
     _check(options)
@@ -80,7 +80,7 @@ def run(options: Options) -> int:
 
 
 def _check(options: Options) -> None:
-    from wlr_gym.gap.analyse import RIGS
+    from wlr_gym.gap.workflow import RIGS
     from wlr_gym.plants import check_backend
 
     if not options.data.is_dir():
