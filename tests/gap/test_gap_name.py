@@ -100,6 +100,7 @@ def test_no_more_effects_than_an_analysis_may_have():
 def test_identical_responses_are_equivalent():
     problem = Toy({}, [sized("drag", 0.8, "left")], error=0.5)
     look = named(problem).rounds[0]
+    assert look.taken is not None
     names = {look.taken.candidate.name, *(other.candidate.name for other in equivalents(look.taken, look.hypotheses))}
     assert names == {"drag", "twin"}
     gains = {h.candidate.label: h.gain for h in look.hypotheses}

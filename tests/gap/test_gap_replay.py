@@ -1,5 +1,7 @@
 """Replays of runs that the engine itself made: what went in must come out."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from engine_runs import META, ROBOT, abrupt, free_rear_wheels, nominal, posture_and_turns, record, spaced
@@ -99,12 +101,15 @@ def test_chunks_and_threads_do_not_change_a_bit(other, monkeypatch):
     chunked = replay_batch(ROBOT, [clock], table, with_truth=True)[0]
     assert np.array_equal(whole.values, threaded.values)
     assert np.array_equal(whole.values, chunked.values)
+    assert whole.truth is not None
+    assert chunked.truth is not None
     assert np.array_equal(whole.truth, chunked.truth)
 
 
 def test_truth_comes_on_the_rows(run):
     replays = replayed(run, with_truth=True)
     columns = sum(len(TRUTH_LAYOUT.channels[name].elements) for name in TRUTH)
+    assert replays.truth is not None
     assert replays.truth.shape == (1, len(run["t"]), columns)
     speed = replays.truth[0][:, 8 + 4]  # joint_velocity[wheel_lf]
     assert speed == pytest.approx(run["vel_wheel_lf"], abs=0.1)
@@ -139,7 +144,7 @@ def test_command_delay_is_the_plants_own():
 
 
 def test_camera_delay_turn_and_scale():
-    changes = {"camera__delay": 0.06, "camera__mount_yaw": 0.2, "camera__scale": 1.05}
+    changes: dict[str, Any] = {"camera__delay": 0.06, "camera__mount_yaw": 0.2, "camera__scale": 1.05}
     shown = record(posture_and_turns, spaced(4.0), **changes)
     table = nominal()
     for key, value in changes.items():

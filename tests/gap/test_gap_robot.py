@@ -439,4 +439,5 @@ def test_rolling_resistance_is_found_in_four_runs(tmp_path):
     value = found.effects[0].parameters["coefficient"]
     assert value.value == pytest.approx(0.1, rel=0.2)
     assert value.low < 0.1 < value.high
+    assert found.gap is not None
     assert found.gap.reduction > 0.5

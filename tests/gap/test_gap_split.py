@@ -34,6 +34,7 @@ def test_a_third_is_sealed_and_every_run_is_somewhere(runs, sealed):
     assert sorted([*fitted, *held]) == list(range(runs))
     assert len(held) == sealed
     assert len(fitted) >= LEAST_FITTED
+    assert columns is not None
     assert len(columns) == len(fitted)
 
 
@@ -52,6 +53,7 @@ def test_runs_left_tell_most():
         return np.linalg.slogdet(matrix)[1]
 
     assert volume(fitted) == pytest.approx(max(volume(kept) for kept in itertools.combinations(range(6), 4)))
+    assert columns is not None
     assert columns[0][0] == pytest.approx(-told[0][fitted[0]], abs=1e-5)
 
 

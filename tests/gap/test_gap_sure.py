@@ -109,9 +109,11 @@ def test_estimates_are_values_with_two_sided_intervals():
 def test_confidence_counts_the_samples_in_which_the_effect_wins():
     problem = Toy({}, [sized("drag", 0.8, "right")], error=0.5)
     look = name_effects(problem, RUNS, fit(problem, RUNS, nominal_model(problem))).rounds[0]
+    assert look.taken is not None
     assert confidence(look.taken, look.hypotheses) > 0.95
     twin = Toy({}, [sized("drag", 0.8, "left")], error=0.5)
     look = name_effects(twin, RUNS, fit(twin, RUNS, nominal_model(twin))).rounds[0]
+    assert look.taken is not None
     assert confidence(look.taken, look.hypotheses) == confidence(look.taken, look.hypotheses)
 
 
@@ -143,6 +145,7 @@ def test_detectable_severity_is_that_of_the_start_that_fits():
 
 
 def test_noisier_data_show_less():
-    quiet, loud = (detectable(screen(*reversed(screened(Toy(white=w))[1:]))) for w in (1.0, 4.0))
+    looks = [screened(Toy(white=w)) for w in (1.0, 4.0)]
+    quiet, loud = (detectable(screen(candidates, responded)) for _, responded, candidates in looks)
     assert set(quiet) == set(loud) >= {"drag", "twin", "play", "decoy_0"}
     assert loud["decoy_0"].value > 2.5 * quiet["decoy_0"].value

@@ -11,7 +11,7 @@ from wlr_gym.runs.format import CHANNELS
 from wlr_gym.runs.noise import channel_noise
 
 NOISE = np.array([channel_noise(load_robot())[name] for name in CHANNELS])
-T = 0.02 * np.arange(400)
+T = 0.02 * np.arange(400, dtype=np.float64)
 WINDOWS = window_rows(T)
 X, Y, YAW, Z, PITCH = (CHANNELS.index(f"cam_{name}") for name in ("x", "y", "yaw", "z", "pitch"))
 CAMERA = [CHANNELS.index(name) for name in CHANNELS if name.startswith("cam_")]
@@ -52,7 +52,7 @@ def residuals(measured, simulated, windows=None):
 
 def test_windows_cover_every_row_once():
     for seconds, length, count in ((8.0, 2.0, 4), (6.9, 2.0, 3), (0.5, 2.0, 1), (8.0, np.inf, 1)):
-        t = 3.0 + 0.02 * np.arange(round(seconds / 0.02) + 1)
+        t = 3.0 + 0.02 * np.arange(round(seconds / 0.02) + 1, dtype=np.float64)
         windows = window_rows(t, length)
         assert len(windows) == count
         assert np.concatenate([np.arange(len(t))[w] for w in windows]).tolist() == list(range(len(t)))
@@ -84,7 +84,7 @@ def test_measured_pose_and_wheel_angles_of_a_window_do_not_matter():
 def test_frames_from_before_a_window_are_not_compared():
     found = residuals(drive(), drive(bend=0.02)[None])[0]
     assert 4 <= len(EARLY) <= 16
-    assert np.isnan(found[np.ix_(EARLY, CAMERA)]).all()
+    assert np.isnan(found[np.ix_(np.array(EARLY), np.array(CAMERA))]).all()
     assert np.isfinite(np.delete(found, EARLY, axis=0)).all()
 
 
@@ -159,7 +159,7 @@ def test_missing_frames_are_nan_and_change_nothing_else():
     measured[:, PITCH] = np.nan
     found = residuals(measured, simulated)[0]
     expected = np.isnan(measured)
-    expected[np.ix_(EARLY, CAMERA)] = True
+    expected[np.ix_(np.array(EARLY), np.array(CAMERA))] = True
     assert np.array_equal(np.isnan(found), expected)
     assert np.nanmax(np.abs(found[:, YAW])) > 1.0
 
@@ -169,7 +169,7 @@ def test_few_frames_in_a_window(frames):
     measured, simulated = drive(), drive(bend=0.02)[None]
     keep = np.arange(WINDOWS[0].start, WINDOWS[0].stop)[10::40][:frames]
     lost = np.setdiff1d(np.arange(WINDOWS[0].start, WINDOWS[0].stop), keep)
-    measured[np.ix_(lost, [X, Y, YAW])] = np.nan
+    measured[np.ix_(lost, np.array([X, Y, YAW]))] = np.nan
     found = residuals(measured, simulated)[0]
     seen = np.flatnonzero(np.isfinite(found[WINDOWS[0], X]))
     assert len(seen) == (frames if frames > 1 else 0)  # one frame is used up by its own pose

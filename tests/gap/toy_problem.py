@@ -4,7 +4,10 @@ Everything is in noise units and one tolerance of a quantity moves its shape by 
 and in most effects; ``play`` starts with its square, ``ripple`` has an amplitude and a phase.
 """
 
+from collections.abc import Mapping
 from functools import cache
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -59,7 +62,9 @@ class Toy:
         memory: of that error, correlation of neighbouring rows.
     """
 
-    metric, cap, steps, thorough, sealed = "RMS in noise units", 50.0, 4, False, ()
+    metric, cap, steps, thorough = "RMS in noise units", 50.0, 4, False
+    sealed: tuple[str, ...] = ()
+    motions: Mapping[str, str] = MappingProxyType({})
 
     def __init__(self, truth=None, effects=(), seed=0, *, runs=5, rows=200, white=1.0, error=0.0, memory=0.9, reach=REACH):
         self.runs = tuple(f"run_{k + 1}" for k in range(runs))
@@ -103,7 +108,7 @@ class Toy:
             return values["amplitude"] * (np.cos(values["phase"]) * sine + np.sin(values["phase"]) * cosine)
         return sum(values["size"] * self.shape(f"{effect.name} {place}")[run] for place in effect.where)
 
-    def times(self, run):
+    def times(self, run) -> Any:
         return 0.02 * np.arange(self.rows)
 
     def measured(self, run):
@@ -119,7 +124,7 @@ class Toy:
     def floor(self, setting, runs):
         return 1.0
 
-    def features(self, setting, runs):
+    def features(self, setting, runs) -> Any:
         return [{"shape of drag": self.shape("drag left")[r][:, 0], "time": self.times(r)} for r in runs]
 
     def candidates(self, setting, residuals, runs):

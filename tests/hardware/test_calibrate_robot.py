@@ -218,8 +218,10 @@ def sensor(monkeypatch):
 
     def link(self, changed=None):
         made = emulated_link(machine)
-        from wlr_gym.hardware.emulator.memory import MemoryImu
+        from wlr_gym.hardware.emulator.memory import MemoryImu, World
 
+        assert isinstance(made.clock, World)
+        assert changed is not None
         made.imu = MemoryImu(made.clock, changed.imu)
         return made
 

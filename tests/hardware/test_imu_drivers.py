@@ -110,6 +110,13 @@ def connect(chip, port=PORT):
     return imu
 
 
+def read(imu):
+    """Read ``imu``, which must have a reading."""
+    reading = imu.read()
+    assert reading is not None
+    return reading
+
+
 # ---- the chip ----
 
 
@@ -126,7 +133,7 @@ def test_si_values_at_every_range(chip, gyro_range, accel_range):
     imu = connect(chip, PORT.model_copy(update={"gyro_range": gyro_range, "accel_range": accel_range}))
     chip.angular_velocity, chip.force, chip.celsius = np.array([0.5, -1.0, 2.0]), np.array([-3.0, 5.0, 9.0]), 31.0
     chip.clock.now += 0.02
-    reading = imu.read()
+    reading = read(imu)
     np.testing.assert_allclose(reading.gyro, chip.angular_velocity, atol=gyro_per_count(gyro_range))
     np.testing.assert_allclose(reading.accelerometer, chip.force, atol=accel_per_count(accel_range))
     assert reading.temperature == pytest.approx(31.0, abs=0.01)
@@ -142,15 +149,15 @@ def test_all_axes_come_in_one_burst(chip):
 
 def test_one_bus_error_is_repeated_many_age_and_end(chip):
     imu = connect(chip)
-    assert imu.read().age == 0.0
+    assert read(imu).age == 0.0
     chip.clock.now += 0.02
     chip.failures = 1
-    assert imu.read().age == 0.0
+    assert read(imu).age == 0.0
     assert (imu.statistics.errors, imu.statistics.lost) == (1, 0)
     chip.failures = 4
     for tick in (1, 2):
         chip.clock.now += 0.02
-        assert imu.read().age == pytest.approx(0.02 * tick)
+        assert read(imu).age == pytest.approx(0.02 * tick)
     assert (imu.statistics.errors, imu.statistics.lost) == (5, 2)
     chip.failures = 10**6
     for _ in range(22):
@@ -161,11 +168,12 @@ def test_one_bus_error_is_repeated_many_age_and_end(chip):
 
 def test_a_chip_that_fell_asleep_shows_as_age(chip):
     imu = connect(chip)
-    imu.read()
+    reading = imu.read()
     chip.power_on()
     for _ in range(3):
         chip.clock.now += 0.02
         reading = imu.read()
+    assert reading is not None
     assert reading.age == pytest.approx(0.06)
     assert reading.accelerometer[2] == pytest.approx(G, abs=0.01)  # the last good one, not the zeros of a sleeping chip
     assert imu.statistics.unchanged == 3
@@ -186,12 +194,12 @@ def test_another_chip_is_refused(clock, identity, words):
     assert chip.closed
 
 
-def test_nobody_at_the_address_and_a_stuck_register(clock, chip):
+def test_nobody_at_the_address_and_a_stuck_register(clock, chip, monkeypatch):
     with pytest.raises(InputError, match="AD0"):
         connect(chip, PORT.model_copy(update={"address": 0x69}))
     chip = Chip(clock)
     write = chip.write_byte_data
-    chip.write_byte_data = lambda a, r, v: None if r == 0x1A else write(a, r, v)
+    monkeypatch.setattr(chip, "write_byte_data", lambda a, r, v: None if r == 0x1A else write(a, r, v))
     with pytest.raises(InputError, match="register 0x1a reads 0x00 after 0x03 was written"):
         connect(chip)
 
@@ -324,6 +332,7 @@ def test_on_the_emulated_robots_port():
             reading, end = imu.read(), time.monotonic() + 5.0
             while imu.statistics.readings < 100 and time.monotonic() < end:  # the system passes bytes on when it likes
                 reading = imu.read()
+            assert reading is not None
             np.testing.assert_allclose(reading.accelerometer, [0.0, 0.0, 9.81], atol=0.02)
             np.testing.assert_allclose(reading.gyro, 0.0, atol=0.01)
             assert imu.statistics.readings == 100

@@ -60,7 +60,12 @@ def test_the_profile_reaches_the_servos(tmp_path, monkeypatch):
     monkeypatch.setattr(HardwareOption, "link_to", lambda *args: emulated_link(machine))
     seen = []
     step = machine.step
-    machine.step = lambda: (seen.append([servo["profile_acceleration"] for servo in machine.servos.values()]), step())
+
+    def watched_step():
+        seen.append([servo["profile_acceleration"] for servo in machine.servos.values()])
+        step()
+
+    monkeypatch.setattr(machine, "step", watched_step)
     recorded(tmp_path, excitation=("straight",), seconds=0.2)
     assert seen[-1] == [40] * 4 + [30] * 4
     assert machine.servos["leg_lf"]["profile_velocity"] == 60

@@ -30,6 +30,7 @@ from wlr_gym.parameters import Parameters
 from wlr_gym.plants import make_plant
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, standing_state
 from wlr_gym.plants.forces import make_force
+from wlr_gym.plants.simulator import Simulator
 
 #: One parameter of every family of effects.
 EFFECTS = {
@@ -193,6 +194,7 @@ def test_gyroscope_lags_by_its_whole_time_constant(simulator):
 def test_constants_of_formulas_are_per_robot(simulator):
     force = make_force(("floor_force_x",), "push", {"push": 0.0}, {"push": "N"})
     plant = make_plant(simulator, ROBOT, 3, QUIET, (force,))
+    assert isinstance(plant, Simulator)
     plant.set_force_values(np.array([[0.0], [8.0], [-8.0]]))
     wheels_off = np.ones((3, 8), bool)
     wheels_off[:, 4:] = False
@@ -209,6 +211,7 @@ def test_expecting_all_effects_does_not_change_a_bit(simulator):
     for expect in (False, True):
         plant = make(simulator)
         if expect:
+            assert isinstance(plant, Simulator)
             plant.expect_all_effects()
         results.append(run(plant, 0, 20))
         plant.close()

@@ -69,7 +69,7 @@ class ImuPort(_Model):
 
     port: str
     driver: Literal["stream", "i2c"] = "stream"
-    baud_rate: int = Field(115200, gt=0)
+    baud_rate: int = Field(default=115200, gt=0)
     rate: float = Field(gt=0, le=1000)
     gyro_range: Literal[250, 500, 1000, 2000] = 500
     accel_range: Literal[2, 4, 8, 16] = 4

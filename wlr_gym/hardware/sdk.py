@@ -94,6 +94,7 @@ class GuardedPort(sdk.PortHandler):
             raise InputError(f"port {self.port_name}: cannot be opened: {error}") from None
         if not opened:
             raise InputError(f"port {self.port_name}: baud rate {self.baudrate} is not one dynamixel-sdk knows")
+        assert self.ser is not None  # the SDK made it: it opened
         if not _lock(self.ser.fileno()):
             self.closePort()
             raise InputError(
