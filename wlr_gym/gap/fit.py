@@ -171,6 +171,7 @@ def linearise(problem: Problem, model: Model, runs: Sequence[int]) -> tuple[list
 
 
 def scaled_numbers(problem: Problem, model: Model) -> Array:
+    """Values of all numbers, scaled."""
     values = np.array([*model.quantities, *(v for _, values in model.effects for v in values)])
     return values / scales(problem, model)
 
@@ -193,7 +194,7 @@ def cross_products(columns: Sequence[NDArray[np.float32]], others: Sequence[Arra
     total = 0.0
     for column, other in zip(columns, others, strict=True):
         weighted = (np.nan_to_num(other) * noise.weight).reshape(len(other), -1).astype(np.float32)
-        total = total + column.astype(np.float32) @ weighted.T
+        total = total + column @ weighted.T
     return np.asarray(total, np.float64)
 
 

@@ -26,7 +26,7 @@ from wlr_gym.gap.fit import (
     total_cost,
 )
 from wlr_gym.gap.likelihood import Noise, estimate_noise, minus_two_log_likelihood
-from wlr_gym.gap.problem import Candidate, Problem, Setting
+from wlr_gym.gap.problem import Candidate, Problem, Setting, Start
 from wlr_gym.gap.screen import LEAST_GAIN, Score, responses, screen
 
 Array = NDArray[np.float64]
@@ -256,10 +256,16 @@ def finalists(
 def _afresh(problem: Problem, hypothesis: Hypothesis) -> Model:
     """All numbers nominal, the effects found before as they are, the new one as it was probed."""
     candidate = hypothesis.candidate
-    start = candidate.starts[0]
-    low, high = (np.array([getattr(unknown, side) for unknown in candidate.unknowns]) for side in ("low", "high"))
-    probed = np.clip(start.values(np.ones(len(start.directions))), low, high).tolist()
-    return Model(nominal_model(problem).quantities, (*hypothesis.model.effects[:-1], (candidate, tuple(probed))))
+    return Model(
+        nominal_model(problem).quantities,
+        (*hypothesis.model.effects[:-1], (candidate, _probed(candidate, candidate.starts[0]))),
+    )
+
+
+def _probed(candidate: Candidate, start: Start) -> tuple[float, ...]:
+    """Values of a candidate's unknowns in a start's own probes, within the plausible range."""
+    values = start.values(np.ones(len(start.directions)))
+    return tuple(float(np.clip(v, u.low, u.high)) for v, u in zip(values, candidate.unknowns, strict=True))
 
 
 def _carries_over(
@@ -349,9 +355,9 @@ def refit_thoroughly(problem: Problem, runs: Sequence[int], current: Fit, scores
 
 
 def _starting_values(score: Score) -> list[tuple[float, ...]]:
-    probes = (start.values(np.ones(len(start.directions))) for start in score.candidate.starts[:2])
-    low, high = ([getattr(unknown, side) for unknown in score.candidate.unknowns] for side in ("low", "high"))
-    return list(dict.fromkeys(tuple(np.clip(values, low, high).tolist()) for values in (score.values, *probes)))
+    """The first guess, and the first two probes."""
+    candidate = score.candidate
+    return list(dict.fromkeys((score.values, *(_probed(candidate, start) for start in candidate.starts[:2]))))
 
 
 def _bordered(

@@ -223,7 +223,7 @@ def _replay_chunk(
     try:
         recorder = _Recorder(clocks, settings, first, delay, with_truth)
         readings = plant.reset(parameters=lanes, state=first)
-        recorder.start(readings, plant.truth())
+        recorder.start(readings)
         ticks = POSE_TICKS * -(-max(clock.ticks for clock in clocks) // POSE_TICKS)  # the last pose is stored too
         for tick in range(ticks):
             for r, clock in enumerate(clocks):
@@ -300,7 +300,8 @@ class _Recorder:
         self._always_on = all(on.all() for on in self._torque)
         self._offsets = np.repeat([clock.run.meta.marker_offset for clock in clocks], settings, axis=0)
 
-    def start(self, readings: Sensors, truth: Truth) -> None:
+    def start(self, readings: Sensors) -> None:
+        """Count the wheel angles from where the robots stand."""
         self._shift = self._wheels - readings.joint_position[:, 4:]
 
     def start_anew(self, r: int, tick: int, readings: Sensors, truth: Truth) -> None:
@@ -354,7 +355,7 @@ class _Recorder:
             return present[mine]
         last = self._last[mine]
         between = last + share * (present[mine] - last)
-        if self._anchored[r] >= tick - 1:  # right after it motors and accelerometer read nothing yet
+        if self._anchored[r] >= tick - 1:  # what the anchor kept of motors and IMU is the model's before it
             return np.hstack([between[:, :_MOVED], present[mine][:, _MOVED:]])
         if self._before_last is None:
             return between
