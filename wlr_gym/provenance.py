@@ -16,7 +16,10 @@ import yaml
 from wlr_gym.files import replace_file
 from wlr_gym.paths import PACKAGE
 
-PACKAGES = ("wlr-gym", "numpy", "numba", "gymnasium", "mujoco", "torch", "stable-baselines3", "opencv-python-headless")
+PACKAGES = (
+    "wlr-gym", "numpy", "numba", "gymnasium", "mujoco", "torch", "stable-baselines3", "onnx", "onnxruntime",
+    "opencv-python-headless",
+)  # fmt: skip
 CONFIG_FILE = "config.yaml"
 PROVENANCE_FILE = "provenance.yaml"
 

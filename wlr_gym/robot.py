@@ -7,6 +7,7 @@ straight down. Wheel angle: right-handed about body +y, relative to its leg; pos
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from pathlib import Path
@@ -326,3 +327,17 @@ def _fields_at(model: Any, path: list[str]) -> list[str]:
 def standing_height(robot: Robot, leg_angle: float) -> float:
     """Height of the body origin above a level floor with all legs at ``leg_angle``, contacts unloaded (m)."""
     return robot.leg.length * math.sin(leg_angle) + robot.wheel.radius - robot.hip_position.z
+
+
+def robot_hash(robot: Robot) -> str:
+    """Short fingerprint of a robot's numbers."""
+    return _fingerprint(robot)
+
+
+def servo_hash(robot: Robot) -> str:
+    """Short fingerprint of the numbers of a robot's servos."""
+    return _fingerprint(robot.servo)
+
+
+def _fingerprint(numbers: BaseModel) -> str:
+    return hashlib.sha256(numbers.model_dump_json().encode()).hexdigest()[:16]

@@ -20,18 +20,23 @@ from wlr_gym.robot import parse_config
 from .config import PpoConfig
 
 MODEL_FILE = "model.zip"
+#: Weights that act; the others belong to the critic or to exploration.
+ACTOR = ("mlp_extractor.policy_net.", "action_net.")
 
 
 class PpoPolicy:
     """The mean action of a network, clipped to [-1, 1]."""
 
     def __init__(self, network: Any) -> None:
+        import torch
+
         self.network = network
+        self._actor, self._torch = actor(network), torch
 
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return actions (N, 8) for observations (N, D)."""
-        actions, _ = self.network.predict(np.asarray(observations, dtype=np.float32), deterministic=True)
-        return actions
+        with self._torch.no_grad():
+            return self._actor(self._torch.as_tensor(np.asarray(observations, dtype=np.float32))).numpy()
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
         """Nothing to forget: the network has no memory."""
@@ -54,10 +59,31 @@ def load_policy(folder: Path, contract: Mapping[str, Any]) -> PpoPolicy:
 
     try:
         _, parameters, _ = load_from_zip_file(path, device="cpu", load_data=False)
-        network.load_state_dict(parameters["policy"])
+        saved = parameters["policy"]  # the critic may see what is not in the contract, and is not needed any more
+        network.load_state_dict({name: saved[name] for name in network.state_dict() if name.startswith(ACTOR)}, strict=False)
     except Exception as error:  # zip, pickle and torch each raise their own kinds for a broken file
         raise InputError(f"{path}: not a readable model: {error}") from None
     return PpoPolicy(network)
+
+
+def export_network(folder: Path, contract: Mapping[str, Any]) -> bytes:
+    """Return the ONNX model of the trained policy of a folder: observations (N, D) to actions (N, 8).
+
+    Raises:
+        MissingPackageError: a package is not installed.
+    """
+    require_package("torch", "train")
+    require_package("onnxscript", "export")
+    from .export import to_onnx
+
+    return to_onnx(actor(load_policy(folder, contract).network), len(contract["environment"]["observation"]))
+
+
+def actor(network: Any) -> Any:
+    """Return the part of a network that acts, as a torch module: observations (N, D) to actions (N, 8) clipped to [-1, 1]."""
+    from torch import nn
+
+    return nn.Sequential(network.mlp_extractor.policy_net, network.action_net, nn.Hardtanh(-1.0, 1.0))
 
 
 def train(training: Training) -> Path:

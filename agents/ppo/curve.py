@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
 from wlr_gym.envs.core import Core
@@ -42,7 +44,7 @@ class Meter(BaseCallback):
 
     def _on_step(self) -> bool:
         rewards, dones = self.locals["rewards"], self.locals["dones"]
-        if not (np.isfinite(rewards).all() and np.isfinite(self.locals["new_obs"]).all()):
+        if not all(np.isfinite(array).all() for array in (rewards, *_arrays("", self.locals["new_obs"]).values())):
             self.fail("an observation or reward is not finite")
         going_on = ~dones
         slip = self.core.plant.truth()["slip_velocity"].reshape(-1, 4, 2)
@@ -59,7 +61,9 @@ class Meter(BaseCallback):
     def fail(self, reason: str) -> None:
         """Write the state to the dump file and raise :class:`TrainingError`."""
         names = {"obs_tensor", "actions", "rewards", "new_obs"} & set(self.locals)
-        arrays = {name: np.asarray(self.locals[name]) for name in sorted(names)}
+        arrays: dict[str, Any] = {}
+        for name in sorted(names):
+            arrays |= _arrays(name, self.locals[name])
         arrays |= {"parameters": self.core.parameters.values, "robot_seeds": self.core.robot_seeds, "ticks": self.core.ticks}
         replace_file(self.dump, lambda temporary: np.savez(temporary, **arrays))  # type: ignore[arg-type]
         raise TrainingError(f"{reason} after {self.num_timesteps} steps; state written to {self.dump}")
@@ -73,6 +77,13 @@ class Meter(BaseCallback):
         means |= {"slip_speed": self._slip / max(self._robots, 1), "episodes": self._episodes, "falls": self._falls}
         self._clear()
         return means
+
+
+def _arrays(name: str, value: Any) -> dict[str, NDArray]:
+    """Return an observation, or anything else, as arrays by name: groups of an observation apart."""
+    if isinstance(value, Mapping):
+        return {f"{name}.{group}": np.asarray(part) for group, part in value.items()}
+    return {name: np.asarray(value)}
 
 
 class LearningCurve:

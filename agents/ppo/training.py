@@ -16,6 +16,7 @@ from types import FrameType
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
@@ -28,6 +29,7 @@ from wlr_gym.provenance import provenance, record_provenance, write_yaml
 
 from . import checkpoint
 from .agent import policy_keywords
+from .asymmetric import AsymmetricPolicy
 from .config import PpoConfig
 from .curve import LearningCurve, Meter, losses
 
@@ -63,7 +65,7 @@ def _record(training: Training, config: PpoConfig) -> None:
 def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
     """Return an untrained Stable-Baselines3 PPO with the configured settings."""
     return PPO(
-        "MlpPolicy",
+        "MlpPolicy" if isinstance(env.observation_space, spaces.Box) else AsymmetricPolicy,
         env,
         learning_rate=LinearSchedule(config.learning_rate, config.final_learning_rate, end_fraction=1.0),
         n_steps=config.steps_per_env,
@@ -90,6 +92,7 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv) -> Path:
         checkpoint.restore(start, model)
     elif training.resume:
         print(f"{folder}: no checkpoint yet; training starts from the beginning", flush=True)
+    env.set_progress(model.num_timesteps)
     begin_episodes(model, env, config.seed)
     curve = LearningCurve(folder / "learning_curve.csv", model.num_timesteps)
     meter = Meter(env.core, folder / "failure.npz")
@@ -103,6 +106,7 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv) -> Path:
     with StopRequest() as stop, _progress(training, config, first) as show:
         while model.num_timesteps < config.total_steps and not stop.requested and not out_of_time():
             before = model.num_timesteps
+            env.set_progress(before)
             row = update(model, meter, config)
             seconds = time.monotonic() - began
             row |= {"seconds": seconds, "steps_per_second": (model.num_timesteps - first) / seconds}

@@ -6,10 +6,8 @@ import pytest
 from wlr_gym.errors import InputError
 from wlr_gym.evaluation import make_core
 from wlr_gym.policy import agent_names, load_agent, load_agent_config, make_policy
-from wlr_gym.robot import load_robot
 
 ENVIRONMENT = "WLR-Velocity-v0"
-LEFT, RIGHT = [4, 6], [5, 7]
 
 
 @pytest.fixture(scope="module")
@@ -42,46 +40,21 @@ def test_actions_fit_the_action_space(contract, name):
 
 @pytest.mark.parametrize("name", agent_names())
 def test_a_robot_is_driven_alike_alone_and_in_a_batch(contract, name):
-    policy = make_policy(name, contract)
-    readings = np.random.default_rng(1).normal(0, 1, (6, len(contract["observation"]))).astype(np.float32)
-    together = policy.act(readings)
-    alone = np.concatenate([policy.act(row[None]) for row in readings])
+    """Over several ticks: some remember integrals."""
+    readings = np.random.default_rng(1).normal(0, 0.1, (4, 6, len(contract["observation"]))).astype(np.float32)
+
+    def acts(robots):
+        policy = make_policy(name, contract)
+        policy.reset(np.ones(readings[0, robots].shape[0], bool))
+        return [policy.act(tick[robots]) for tick in readings]
+
+    together = acts(slice(None))
+    alone = np.concatenate([acts(slice(k, k + 1)) for k in range(6)], axis=1)
     np.testing.assert_allclose(together, alone, atol=1e-6)
 
 
 def test_do_nothing_does_nothing(contract):
     assert not make_policy("do_nothing", contract).act(np.ones((3, len(contract["observation"])))).any()
-
-
-def test_proportional_rolls_straight_at_the_commanded_speed(contract):
-    action = make_policy("proportional", contract).act(observations(contract, **{"command[linear_velocity_x]": 0.1}))[0]
-    radius = load_robot().wheel.radius
-    scale = contract["action"][4]["scale"]
-    np.testing.assert_allclose(action[4:] * scale * radius, 0.1, rtol=1e-5)
-    assert not action[:4].any()
-
-
-def test_proportional_turns_left_with_the_right_wheels_faster(contract):
-    config = {"robot": "nominal", "steering": 1.0, "yaw_rate_gain": 0.0}
-    policy = load_agent("proportional").make_policy(contract, config)
-    action = policy.act(observations(contract, **{"command[yaw_rate]": 0.3}))[0]
-    robot = load_robot()
-    speed = 0.3 * robot.hip_position.y / robot.wheel.radius / contract["action"][4]["scale"]
-    np.testing.assert_allclose(action[RIGHT], speed, rtol=1e-5)
-    np.testing.assert_allclose(action[LEFT], -speed, rtol=1e-5)
-
-
-def test_proportional_pushes_harder_when_it_turns_too_slowly(contract):
-    policy = load_agent("proportional").make_policy(contract, {"yaw_rate_gain": 2.0})
-    slow = policy.act(observations(contract, **{"command[yaw_rate]": 0.3, "gyro[z]": 0.1}))[0]
-    exact = policy.act(observations(contract, **{"command[yaw_rate]": 0.3, "gyro[z]": 0.3}))[0]
-    assert (slow[RIGHT] > exact[RIGHT]).all()
-
-
-def test_proportional_refuses_another_robot(contract):
-    other = {**contract, "robot": {"name": "other", "hash": "0"}}
-    with pytest.raises(InputError, match="robot 'nominal' is not the environment's"):
-        make_policy("proportional", other)
 
 
 def test_untrained_is_ppo_before_training(contract):
@@ -92,9 +65,16 @@ def test_untrained_is_ppo_before_training(contract):
     assert not np.array_equal(mine, other_seed.act(readings))
 
 
+def test_settings_may_lie_over_those_of_another_file(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("base: ppo\ntotal_steps: 7\nenvironment: {episode_length: 3.0}\n")
+    mine, theirs = load_agent_config(path), load_agent_config("ppo")
+    assert mine == theirs | {"total_steps": 7, "environment": theirs["environment"] | {"episode_length": 3.0}}
+
+
 def test_unknown_agent_names_the_nearest():
-    with pytest.raises(InputError, match="did you mean 'proportional'"):
-        load_agent("proportionl")
+    with pytest.raises(InputError, match="did you mean 'constant_command'"):
+        load_agent("constant_comand")
 
 
 @pytest.mark.parametrize(
@@ -103,7 +83,9 @@ def test_unknown_agent_names_the_nearest():
         ("ppo", {"learning_rat": 1e-3}, "did you mean 'learning_rate'"),
         ("ppo", {"batch_size": 1000}, "does not divide"),
         ("ppo", {"gamma": 1.5}, "gamma = 1.5"),
-        ("proportional", {"yaw_gain": 1.0}, "did you mean 'yaw_rate_gain'"),
+        ("pid", {"yaw_rate_pp": 1.0}, "did you mean 'yaw_rate_p'"),
+        ("pid", {"tasks": {"velocity": {"steerin": 1.0}}}, "task 'velocity': unknown key 'steerin'"),
+        ("slip_compensating", {"slip_limit": 0.0}, "slip_limit = 0.0"),
     ],
 )
 def test_bad_settings_are_named(contract, name, setting, message):

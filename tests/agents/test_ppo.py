@@ -194,7 +194,7 @@ def test_broken_model_file_is_refused(run, tmp_path):
     [
         (["train", "WLR-Velocity-v1"], "did you mean 'WLR-Velocity-v0'"),
         (["train", "--agent", "pop"], "unknown agent"),
-        (["train", "--agent", "do_nothing"], "has no 'train'; agents that have: ppo"),
+        (["train", "--agent", "do_nothing"], "has no 'train'; agents that have: pid, ppo"),
         (["train", "--set", "epochs=0"], "epochs = 0"),
         (["train", "--set", "environment.precison=float32"], "did you mean 'precision'"),
         (["train", "--resume", "/nowhere"], "not a run folder"),

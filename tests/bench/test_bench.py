@@ -13,7 +13,7 @@ from wlr_gym.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.robot import load_robot
 
 
-@pytest.mark.parametrize("name", ["engine", "mujoco", "env_step", "ppo", "import", "start", "batch", "convergence"])
+@pytest.mark.parametrize("name", ["engine", "mujoco", "env_step", "ppo", "learning", "import", "start", "batch", "convergence"])
 def test_measurement_runs_and_reports(name, tmp_path, capsys):
     file = tmp_path / "bench.json"
     assert main(["bench", "--quick", "--rounds", "1", "--only", name, "--json", str(file)]) == 0

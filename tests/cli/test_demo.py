@@ -17,7 +17,7 @@ def test_demo_writes_everything_and_runs_again(tmp_path, capsys):
     for name in ("card.md", "card.json", "learning_curve.png", "episode.png", "config.yaml", "run/policy/contract.json"):
         assert (out / name).stat().st_size > 0, name
     card = json.loads((out / "card.json").read_text())
-    assert list(card["policies"]) == ["PPO", "do_nothing", "untrained", "proportional"]
+    assert list(card["policies"]) == ["PPO", "do_nothing", "untrained", "pid"]
     last_line = capsys.readouterr().out.strip().splitlines()[-1]
     assert last_line.startswith("done in")
     assert "episode.png" in last_line

@@ -35,7 +35,7 @@ def test_description_shows_what_a_randomization_draws(capsys):
     for text in ("``patches``", "drift 2..6 s", "area x_min -1.2..0.7 m", "tolerance x 1, cut at 2", "sensors.imu.gyro_bias"):
         assert text in shown
     assert main(["envs", "WLR-Velocity-v0"]) == 0
-    assert "``nominal``" in capsys.readouterr().out
+    assert "``slippery``" in capsys.readouterr().out
 
 
 def test_bad_randomization(capsys):

@@ -42,7 +42,7 @@ def test_video_by_schedule(tmp_path, capsys, graphics, headless):
 def test_evaluate_writes_policy_and_baseline_side_by_side(tmp_path, capsys, graphics):
     path = tmp_path / "film.webp"
     arguments = ["--episodes", "1", "--baselines", "do_nothing", "--video-seconds", "0.08", "--no-progress"]
-    assert main(["evaluate", "proportional", "--video", str(path), *arguments]) == 0
+    assert main(["evaluate", "pid", "--video", str(path), *arguments]) == 0
     assert f"written: {path}" in capsys.readouterr().out
     with Image.open(path) as image:
         assert image.n_frames == 2
@@ -62,7 +62,7 @@ def test_evaluate_writes_policy_and_baseline_side_by_side(tmp_path, capsys, grap
         (["--video", "film.webp", "--command", "1"], "--command '1': expected linear_velocity_x,yaw_rate"),
         (["--video", "film.webp", "--command", "5,0"], "linear_velocity_x = 5 m/s: the wheels turn no faster than 0.2"),
         (["--video", "film.webp", "--command", "0,0; 3:-1,0"], "linear_velocity_x = -1 m/s: the wheels"),
-        (["--video", "film.webp", "--agent", "proportinal"], "did you mean 'proportional'"),
+        (["--video", "film.webp", "--agent", "pdi"], "did you mean 'pid'"),
         (["--video", "film.webp", "--backend", "mujocoo"], "unknown backend 'mujocoo'"),
         (["--video", "film.webp", "--effects", "nothing.yaml"], "nothing.yaml"),
         (["--video", "film.webp", "--gamepad"], "--gamepad drives in the window"),
@@ -126,7 +126,7 @@ class Window:
 def test_keys_drive_the_robot_until_the_window_is_closed(monkeypatch):
     monkeypatch.setattr("wlr_gym.render.viewer.time.sleep", lambda seconds: None)
     options = play_module.Options(randomization="none")
-    core = make_core(options.env, 1, {"randomization": "none"})
+    core = make_core("WLR-Velocity-v0", 1, {"randomization": "none"})
     driver = play_module._driver(options, core)
     windows = []
 
@@ -134,7 +134,7 @@ def test_keys_drive_the_robot_until_the_window_is_closed(monkeypatch):
         windows.append(Window(model, data, on_key, {1: UP, 2: UP, 30: RESET}, 40))
         return windows[-1]
 
-    play_module.show(options, core, make_policy("proportional", core.contract()), driver, open_window)
+    play_module.show(options, core, make_policy("pid", core.contract()), driver, open_window)
     texts = windows[0].texts
     assert len(texts) == 40
     assert "t 0.00 s" in texts[0]

@@ -8,11 +8,20 @@ import pytest
 
 import wlr_gym  # noqa: F401
 from wlr_gym.envs.core import make_task
-from wlr_gym.envs.evaluation import compile_evaluation, expressions, reader
+from wlr_gym.envs.evaluation import (
+    MATRICES,
+    compile_computation,
+    compile_evaluation,
+    computed_expressions,
+    expressions,
+    reader,
+)
 from wlr_gym.envs.settings import Settings
 from wlr_gym.errors import InputError
+from wlr_gym.observer import ESTIMATE_LAYOUT
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
 from wlr_gym.tasks.describe import column_name
+from wlr_gym.tasks.terms import COMMANDS, COMPUTED, MEASURES, REWARDS, TERMINATIONS
 
 ID = "WLR-Velocity-v0"
 
@@ -188,7 +197,7 @@ def test_observations_never_leave_their_space(fake):
 
 
 def test_commands_are_held_then_redrawn_within_range_and_sometimes_zero(fake):
-    env = make_vec(300, autoreset_mode="SameStep")
+    env = make_vec(300, autoreset_mode="SameStep", task={"commands": {"ramp": None}})
     env.reset(seed=0)
     held, commands = [], [env.core.command.copy()]
     for _ in range(900):
@@ -204,6 +213,24 @@ def test_commands_are_held_then_redrawn_within_range_and_sometimes_zero(fake):
     assert np.abs(history[..., 0]).max() == pytest.approx(0.1, rel=0.01)
     assert np.abs(history[..., 1]).max() == pytest.approx(0.3, rel=0.01)
     assert np.mean((history == 0).all(axis=2)) == pytest.approx(0.1, abs=0.03)
+
+
+def test_drawn_commands_ramp_from_zero_and_given_ones_hold_at_once(fake):
+    env = make_vec(50, task={"commands": {"ramp": {"linear_velocity_x": 0.25, "yaw_rate": 1.5}}})
+    env.reset(seed=0)
+    commands = [env.core.command.copy()]
+    for _ in range(500):
+        env.step(np.zeros((50, 8)))
+        commands.append(env.core.command.copy())
+    jumping = make_vec(50, task={"commands": {"ramp": None}})
+    jumping.reset(seed=0)
+    changes = np.abs(np.diff(np.concatenate([np.zeros((1, 50, 2)), commands]), axis=0))
+    assert changes.max(axis=(0, 1)) == pytest.approx([0.005, 0.03])
+    assert np.array_equal(commands[60], jumping.core.command)
+    env.set_command(linear_velocity_x=-0.1)
+    assert np.all(env.core.command[:, 0] == -0.1)
+    env.step(np.zeros((50, 8)))
+    assert np.all(env.core.command[:, 0] == -0.1)
 
 
 def test_command_can_be_fixed_for_an_episode_and_live(fake):
@@ -228,22 +255,27 @@ def random_matrices(task, count=50):
     rng = np.random.default_rng(0)
     widths = {
         "sensors": SENSOR_LAYOUT.width,
+        "estimate": ESTIMATE_LAYOUT.width,
         "truth": TRUTH_LAYOUT.width,
         "command": len(task.commands),
         "action": 8,
         "previous_action": 8,
+        "start": 3,
+        "clock": 1,
     }
-    matrices = {name: rng.normal(size=(count, width)) for name, width in widths.items()}
+    matrices = {name: rng.normal(size=(count, widths[name])) for name in MATRICES}
     matrices["truth"][:, TRUTH_LAYOUT.slices["quaternion"]] /= 2.0
     return matrices
 
 
 def every_reward():
-    from wlr_gym.tasks.terms import REWARDS, TERMINATIONS
-
     return {
+        "commands": {"terms": {name: [-1.0, 1.0] for name in COMMANDS}},
         "rewards": {name: {"weight": 0.5 + k} for k, name in enumerate(REWARDS)},
         "terminations": {name: {} for name in TERMINATIONS},
+        "measures": {name: {} for name in MEASURES},
+        "observations": {name: {} for name in COMPUTED},
+        "privileged": {name: {} for name in COMPUTED},
     }
 
 
@@ -253,9 +285,9 @@ def test_compiled_rewards_equal_the_same_terms_on_numpy():
     count = len(matrices["truth"])
     expected = expressions(task, reader(task, matrices))
     terms, over = np.zeros((count, len(task.rewards))), np.zeros((count, len(task.terminations)))
-    total, sums = np.zeros(count), np.ones((count, len(task.rewards)))
+    total, sums, measures = np.zeros(count), np.ones((count, len(task.rewards))), np.zeros((count, len(task.measures)))
     evaluation = compile_evaluation(task)
-    bad = evaluation.run(np.ones(count, bool), *matrices.values(), evaluation.numbers, terms, total, over, sums)
+    bad = evaluation.run(np.ones(count, bool), *matrices.values(), evaluation.numbers, terms, total, over, sums, measures)
     assert bad == -1
     for k, name in enumerate(task.rewards):
         np.testing.assert_allclose(
@@ -263,9 +295,25 @@ def test_compiled_rewards_equal_the_same_terms_on_numpy():
         )
     for k, name in enumerate(task.terminations):
         np.testing.assert_allclose(over[:, k], expected[f"over.{name}"], rtol=1e-12, atol=1e-13, err_msg=name)
+    for k, name in enumerate(task.measures):
+        np.testing.assert_allclose(measures[:, k], expected[f"measure.{name}"], rtol=1e-12, atol=1e-12, err_msg=name)
     np.testing.assert_allclose(total, terms.sum(axis=1), rtol=1e-12)
     np.testing.assert_allclose(sums, 1.0 + terms)
     assert (over > 0).any(axis=1).sum() > 0
+
+
+def test_compiled_computed_observations_equal_the_same_terms_on_numpy():
+    task = make_task("velocity", Settings(task=every_reward()))
+    matrices = random_matrices(task)
+    expected = computed_expressions(task, reader(task, matrices))
+    computation = compile_computation(task)
+    computed = np.full((50, len(task.computed)), np.nan)
+    active = np.arange(50) % 2 == 0
+    computation.run(active, *matrices.values(), computation.numbers, computed)
+    for k, name in enumerate(task.computed):
+        wanted = np.broadcast_to(expected[name], 50)[active]
+        np.testing.assert_allclose(computed[active, k], wanted, rtol=1e-12, atol=1e-12, err_msg=name)
+    assert np.isnan(computed[~active]).all()
 
 
 def value_of(name, parameters=None, **truth):

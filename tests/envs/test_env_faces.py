@@ -100,7 +100,8 @@ def test_contract_names_the_task_robot_and_randomization(fake):
             "wlr-nominal",
             "wide",
         )
-        assert len(contract["observation"]) == 36
+        assert len(contract["observation"]) == 52
+        assert contract["observer"] == {"camera": True}
 
 
 # ---- errors ----

@@ -87,8 +87,8 @@ def test_make_vec_env(fake):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*render_mode.*")
         env: Any = make_vec_env(ID, n_envs=2, seed=0, env_kwargs={"randomization": "none"})
-    assert np.shape(env.reset()) == (2, 36)
-    assert np.shape(env.step(np.zeros((2, 8), np.float32))[0]) == (2, 36)
+    assert np.shape(env.reset()) == (2, 52)
+    assert np.shape(env.step(np.zeros((2, 8), np.float32))[0]) == (2, 52)
 
 
 def test_options_attributes_and_methods(fake):

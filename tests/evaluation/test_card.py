@@ -1,95 +1,124 @@
-"""Score cards: figures against hand-made episodes whose answer is known; the same episodes for the same seeds."""
+"""Score cards: what is compared, what is written; and the episodes themselves, the same for the same seeds."""
 
 import json
 
 import numpy as np
+import pandas
 import pytest
+from evaluation_examples import EPISODES, PERIOD, TICKS, measured, rollout
 
-from wlr_gym.cli import main
-from wlr_gym.evaluation import Rollout, make_core, roll_out, rows, score, write_card
+from wlr_gym.evaluation import (
+    MAIN,
+    OTHER_PLANT,
+    Card,
+    comparison_rows,
+    make_core,
+    roll_out,
+    rows,
+    summarise,
+    sweep_rows,
+    transfer_rows,
+    write_card,
+    write_episodes,
+)
+from wlr_gym.evaluation.card_plots import draw_card
 from wlr_gym.evaluation.plots import commanded_path
 from wlr_gym.evaluation.rollout import saturated, yaw_of
+from wlr_gym.evaluation.sweeps import SWEEPS
 from wlr_gym.policy import make_policy
 
-TICKS, EPISODES, PERIOD = 50, 4, 0.02
+ONE = np.ones((TICKS, EPISODES))
 
 
-def rollout(**changes):
-    """Robots that drive along x at 0.1 m/s as told, without slip, drawing 1 W."""
-    one, vector = np.ones((TICKS, EPISODES)), np.zeros((TICKS, EPISODES, 2))
-    position, command = vector.copy(), vector.copy()
-    position[:, :, 0] = 0.1 * PERIOD * np.arange(TICKS)[:, None]
-    command[:, :, 0] = 0.1
-    content = {
-        "control_period": PERIOD,
-        "seeds": np.arange(EPISODES),
-        "command_names": ("linear_velocity_x", "yaw_rate"),
-        "active": one > 0,
-        "fell": np.zeros(EPISODES, bool),
-        "reward": 0.5 * one,
-        "command": command,
-        "position": position,
-        "yaw": 0 * one,
-        "forward_velocity": 0.1 * one,
-        "yaw_rate": 0 * one,
-        "slip_velocity": np.zeros((TICKS, EPISODES, 4, 2)),
-        "energy": 1.0 * PERIOD * one,
-        "saturated": np.zeros((TICKS, EPISODES, 8), bool),
-        "friction": np.ones((EPISODES, 4, 2)),
-        "sampled": ("body.mass",),
-        "samples": np.ones((EPISODES, 1)),
-    }
-    return Rollout(**(content | changes))
+def played(error, reward=1.0, blocks=1):
+    return summarise([rollout(measured=measured(error), reward=reward / TICKS * ONE) for _ in range(blocks)])
 
 
-def test_perfect_driving():
-    card = score(rollout())
-    assert card["velocity_error"].mean == pytest.approx(0.0, abs=1e-12)
-    assert card["success"].mean == 100.0
-    assert card["falls"].mean == card["slip_speed"].mean == card["slip_per_metre"].mean == card["saturation"].mean == 0.0
-    assert card["reward"].mean == pytest.approx(0.5 * TICKS)
-    travelled = 0.1 * PERIOD * (TICKS - 1)
-    assert card["energy_per_metre"].mean == pytest.approx(1.0 * PERIOD * TICKS / travelled)
+def card(**more):
+    main = {"ours": played(0.01, 9.0), "do_nothing": played(0.05, 1.0), "pid": played(0.02, 7.0)}
+    return Card({MAIN: main, **more}, conditions={"environment": "WLR-Velocity-v0"})
 
 
-def test_slip_is_the_length_of_its_vector_averaged_over_wheels():
-    slip = np.zeros((TICKS, EPISODES, 4, 2))
-    slip[:, :, 0] = (0.03, 0.04)
-    card = score(rollout(slip_velocity=slip))
-    assert card["slip_speed"].mean == pytest.approx(0.05 / 4)
-    assert card["slip_per_metre"].mean == pytest.approx(0.05 / 4 / 0.1, rel=0.03)
+def test_the_first_subject_is_compared_with_each_other():
+    better = card().comparison[MAIN]
+    assert list(better) == ["do_nothing", "pid"]
+    assert better["pid"]["velocity_error"].mean == pytest.approx(50.0)
+    assert better["pid"]["reward"].mean == pytest.approx(2.0)  # no share: a reward has no zero
+    assert better["pid"]["success"].mean == better["pid"]["falls"].mean == 0.0
 
 
-def test_interval_holds_the_mean_and_vanishes_without_spread():
-    spread = 0.1 + np.linspace(0.0, 0.03, EPISODES) * np.ones((TICKS, 1))
-    card = score(rollout(forward_velocity=spread))
-    error = card["velocity_error"]
-    assert error.low < error.mean < error.high
-    assert error.mean == pytest.approx(0.015)
-    assert card["reward"].low == card["reward"].high
+def test_less_falls_are_better():
+    fallen = summarise([rollout(fell=np.array([True, False, False, False]))])
+    main = {"ours": played(0.01), "clumsy": fallen}
+    assert Card({MAIN: main}).comparison[MAIN]["clumsy"]["falls"].mean == pytest.approx(25.0)
 
 
-def test_ticks_after_the_end_do_not_count():
-    active = np.ones((TICKS, EPISODES), bool)
-    active[10:, 0] = False
-    wild = np.where(active, 0.1, 99.0)
-    card = score(rollout(active=active, forward_velocity=wild, fell=np.array([True, False, False, False])))
-    assert card["velocity_error"].mean == pytest.approx(0.0, abs=1e-12)
-    assert card["falls"].mean == 25.0
-    assert card["success"].mean == 75.0
+def test_a_score_counts_from_doing_nothing():
+    assert card().share_of == {"pid": pytest.approx(card().share_of["pid"])}
+    assert card().share_of["pid"].mean == pytest.approx(100.0 * (9 - 1) / (7 - 1))
+    without = Card({MAIN: {"ours": played(0.01), "pid": played(0.02)}})
+    assert without.share_of == {}
 
 
-def test_figures_per_metre_need_metres():
-    card = score(rollout(position=np.zeros((TICKS, EPISODES, 2))))
-    assert np.isnan(card["slip_per_metre"].mean)
-    assert dict(zip(*np.array(rows({"still": card}))[[0, 6]].tolist(), strict=True))["still"] == "-"
+def test_what_is_kept_on_the_other_plant_is_paired_with_the_same_episodes():
+    main = {"ours": played(0.01, 9.0, blocks=2), "do_nothing": played(0.05, 1.0, blocks=2)}
+    other = {"ours": played(0.02, 5.0), "do_nothing": played(0.05, 3.0)}
+    both = Card({MAIN: main, OTHER_PLANT: other})
+    assert both.kept["ours"].mean == pytest.approx(100.0 * (5 - 3) / (9 - 1))
+    assert transfer_rows(both)[1][:2] == ["ours", "25.0 [25.0, 25.0]"]
+    assert "do_nothing" not in both.kept
 
 
-def test_card_files(tmp_path):
-    write_card(tmp_path / "new", {"mine": score(rollout())}, {"episodes": EPISODES})
-    content = json.loads((tmp_path / "new" / "card.json").read_text())
-    assert content["policies"]["mine"]["success"]["mean"] == 100.0
-    assert "| success | % | 100 [100, 100] |" in (tmp_path / "new" / "card.md").read_text()
+def test_rows_show_nothing_where_there_is_nothing():
+    still = summarise([rollout(position=np.zeros((TICKS, EPISODES, 2)))])
+    table = dict((row[0], row[2]) for row in rows(Card({MAIN: {"still": still}}).scores[MAIN], card().metrics))
+    assert table["slip_per_metre"] == "-"
+    assert table["power"] == "1.00 [1.00, 1.00]"
+    better = {row[0]: row[2:] for row in comparison_rows(card())}
+    assert better["slip_speed"] == ["-", "-"]
+    assert better["score, in % of its"] == ["-", "133.3 [133.3, 133.3]"]
+
+
+@pytest.fixture(scope="module")
+def swept():
+    sweep = SWEEPS["friction"]
+    points = {sweep.label(p): {"ours": played(0.002 / p.value), "pid": played(0.004 / p.value)} for p in sweep.points}
+    main = {"ours": played(0.01), "do_nothing": played(0.05), "pid": played(0.02)}
+    other = {name: played(0.03) for name in main}
+    for point in points.values():
+        point["do_nothing"] = played(0.05)
+    return Card({MAIN: main, OTHER_PLANT: other, **points}, (sweep,), {"episodes": EPISODES})
+
+
+def test_a_sweep_has_a_row_per_point(swept):
+    header, *body = sweep_rows(swept, 0)
+    assert header[1:] == ["ours", "do_nothing", "pid"]
+    assert [row[0] for row in body] == [point.label for point in SWEEPS["friction"].points]
+    assert body[0][1].startswith("1.414 ±")  # 0.04 m/s: twice one of two limits
+
+
+def test_card_files(swept, tmp_path):
+    folder = tmp_path / "new"
+    folder.mkdir()
+    pictures = draw_card(folder, swept)
+    write_card(folder, swept, pictures)
+    write_episodes(folder / "episodes.parquet", swept, 7)
+    assert set(pictures.values()) == {"spectrum.png", "improvement.png", "sweep_friction.png"}
+    assert all((folder / name).stat().st_size > 5000 for name in pictures.values())
+    text = (folder / "card.md").read_text()
+    assert text.startswith("# Score card: ours\n")
+    assert "| success | % | 100 [100, 100] | 100 [100, 100] | 100 [100, 100] |" in text
+    assert all(f"]({name})" in text for name in pictures.values())
+    content = json.loads((folder / "card.json").read_text())
+    assert content["policies"]["ours"]["velocity_error"]["mean"] == pytest.approx(0.01)
+    assert content["better_than"]["pid"]["velocity_error"]["mean"] == pytest.approx(50.0)
+    assert content["sweeps"]["friction"][0]["at"] == "0.05"
+    assert content["sweeps"]["friction"][0]["policies"]["pid"]["velocity_error"]["mean"] == pytest.approx(0.08)
+    assert content["other_plant"]["policies"]["ours"]["velocity_error"]["mean"] == pytest.approx(0.03)
+    assert content["policies"]["ours"]["slip_per_metre"]["mean"] == 0.0
+    episodes = pandas.read_parquet(folder / "episodes.parquet")
+    assert len(episodes) == EPISODES * 3 * (2 + len(SWEEPS["friction"].points))
+    assert episodes["seed"].tolist()[:EPISODES] == [7, 8, 9, 10]
 
 
 def test_yaw_of_a_quaternion():
@@ -118,7 +147,7 @@ def same(first, second):
 
 
 def test_episodes_repeat_bit_for_bit(core):
-    policy = make_policy("proportional", core.contract())
+    policy = make_policy("constant_command", core.contract())
     first = roll_out(core, policy, 5)
     assert same(first, roll_out(core, policy, 5))
     assert not same(first, roll_out(core, policy, 6))
@@ -126,7 +155,7 @@ def test_episodes_repeat_bit_for_bit(core):
 
 
 def test_an_episode_depends_on_its_seed_and_not_on_the_batch(core):
-    policy = make_policy("proportional", core.contract())
+    policy = make_policy("constant_command", core.contract())
     alone = make_core("WLR-Velocity-v0", 1, {"episode_length": 1.0})
     mine, batch = roll_out(alone, policy, 8), roll_out(core, policy, 5)
     alone.close()
@@ -134,26 +163,43 @@ def test_an_episode_depends_on_its_seed_and_not_on_the_batch(core):
     np.testing.assert_array_equal(mine.slip_velocity[:, 0], batch.slip_velocity[:, 3])
 
 
+def test_parameters_are_set_after_randomisation(core):
+    policy = make_policy("constant_command", core.contract())
+    slippery = roll_out(core, policy, 5, parameters={"ground.mu_x": 0.07, "ground.mu_y": 0.07, "patch.mu": 0.07})
+    np.testing.assert_allclose(slippery.friction, 0.07)
+    assert roll_out(core, policy, 5).friction.std() > 0.05
+
+
 def test_a_fall_ends_the_episode():
     falling = make_core("WLR-Velocity-v0", 3, {"task": {"terminations": {"left_floor": {"clearance": -1.0}}}})
     fallen = roll_out(falling, make_policy("do_nothing", falling.contract()), 0)
     falling.close()
     assert fallen.fell.all()
+    assert not fallen.succeeded.any()
     assert fallen.active.sum() == 3
 
 
+class Spin:
+    """Left wheels back, right wheels ahead at full speed: beyond what the supply can do against skidding."""
+
+    def act(self, observations):
+        return np.tile(np.array([0, 0, 0, 0, -1, 1, -1, 1], np.float32), (len(observations), 1))
+
+    def reset(self, mask):
+        pass
+
+
 def test_full_throttle_saturates_and_rest_does_not(core):
-    class Spin:
-        """Left wheels back, right wheels ahead at full speed: beyond what the supply can do against skidding."""
-
-        def act(self, observations):
-            return np.tile(np.array([0, 0, 0, 0, -1, 1, -1, 1], np.float32), (len(observations), 1))
-
-        def reset(self, mask):
-            pass
-
     assert roll_out(core, Spin(), 0).saturated[-10:, :, 4:].mean() > 0.5
     assert not roll_out(core, make_policy("do_nothing", core.contract()), 0).saturated[25:].any()
+
+
+def test_slip_beyond_a_turn_is_what_the_reward_counts(core):
+    spun = roll_out(core, Spin(), 0)
+    slip = core.task.rewards.index("slip")
+    rate = core.task.config.rewards["slip"]["weight"] * core.task.config.control_period / 0.05
+    np.testing.assert_allclose(spun.excess_slip[-1] * rate, core.terms[:, slip], rtol=1e-9)
+    assert 0.0 < spun.excess_slip.mean() < np.linalg.norm(spun.slip_velocity, axis=-1).mean()
 
 
 def test_saturation_follows_the_motor_law(core):
@@ -165,28 +211,3 @@ def test_saturation_follows_the_motor_law(core):
     limits = saturated(truth, core.task.robot)
     assert limits[:, 4].all()
     assert limits.sum() == core.count
-
-
-def test_evaluate_command_writes_the_same_card_twice(tmp_path, capsys):
-    arguments = ["evaluate", "proportional", "--baselines", "do_nothing", "--episodes", "3", "--no-progress", "--out"]
-    assert main([*arguments, str(tmp_path / "a")]) == 0
-    assert main([*arguments, str(tmp_path / "b")]) == 0
-    assert "yaw_rate_error" in capsys.readouterr().out
-    first, second = (json.loads((tmp_path / name / "card.json").read_text()) for name in "ab")
-    assert first == second
-    assert list(first["policies"]) == ["proportional", "do_nothing"]
-    assert (tmp_path / "a" / "provenance.yaml").is_file()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["evaluate", "proportionl"], "did you mean 'proportional'"),
-        (["evaluate", "do_nothing", "--randomization", "wid"], "did you mean 'wide'"),
-        (["evaluate", "do_nothing", "--env", "WLR-Path-v0"], "unknown environment"),
-        (["evaluate", "do_nothing", "--episodes", "0"], "episodes = 0"),
-    ],
-)
-def test_bad_input_exits_with_2(arguments, message, capsys):
-    assert main(arguments) == 2
-    assert message in capsys.readouterr().err

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toy_problem import NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
-from wlr_gym.gap.fit import fit, nominal_model
+from wlr_gym.gap.fit import fit, linearise, nominal_model
 from wlr_gym.gap.name import EQUIVALENT, MOST_EFFECTS, PER_NAME, drop_idle, name_effects, refit, shortlist
 from wlr_gym.gap.problem import Candidate
 from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
@@ -157,7 +157,8 @@ def test_gain_after_refit_is_the_fall_of_the_cost():
     current = fit(problem, RUNS, nominal_model(problem))
     probes, candidates = problem.candidates(None, [], [])
     scores = screen(candidates, responses(problem, current, RUNS, probes))
-    best = refit(problem, RUNS, current, shortlist(scores))[0]
+    given = linearise(problem, nominal_model(problem), RUNS)[1]
+    best = refit(problem, RUNS, current, shortlist(scores), given)[0]
     memory = fit(problem, RUNS, best.model).noise.memory
     with_it, without = (fit(problem, RUNS, m, memory=memory).cost for m in (best.model, current.model))
     assert best.candidate.name == "decoy_1"

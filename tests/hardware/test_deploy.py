@@ -18,7 +18,6 @@ from robot_rig import Phase, hardware_with, machine_of
 from wlr_gym.cli import FAILED, OK, run_command
 from wlr_gym.errors import InputError
 from wlr_gym.evaluation import make_core, roll_out
-from wlr_gym.evaluation.card import per_episode
 from wlr_gym.evaluation.deployment import act_again, loop_of, read_policy_log
 from wlr_gym.evaluation.deployment import deploy as drive
 from wlr_gym.hardware.log import read_events
@@ -52,7 +51,7 @@ class Wobble:
 
 
 @pytest.mark.parametrize(
-    "make", [lambda core: Wobble(core.observation.shape[1]), lambda core: make_policy("proportional", core.contract())]
+    "make", [lambda core: Wobble(core.observation.shape[1]), lambda core: make_policy("pid", core.contract())]
 )
 def test_the_log_shown_to_the_policy_again_gives_the_same_actions(tmp_path, make):
     core = robot_core(tmp_path)
@@ -71,11 +70,11 @@ def test_the_log_shown_to_the_policy_again_gives_the_same_actions(tmp_path, make
 
 def test_commands_that_change_on_the_way_are_seen_again(tmp_path):
     core = robot_core(tmp_path, 9.0)
-    policy = make_policy("proportional", core.contract())
+    policy = make_policy("pid", core.contract())
     result = drive(core, policy, seed=5)
     assert result.run is not None
     commands = read_policy_log(result.run)["command_yaw_rate"]
-    assert len(np.unique(commands)) == 2
+    assert len(np.unique(commands)) >= 2
     given, answered = act_again(core, policy, result.run)
     np.testing.assert_array_equal(answered, given)
     core.close()
@@ -86,7 +85,7 @@ def test_a_policy_tracks_on_the_robot_as_in_simulation(tmp_path):
     core = robot_core(tmp_path, 8.0)
     machine, seen = machine_of(core), []
     loop_of(core).spare = lambda: seen.append(machine.plant.truth().values[0].copy())
-    result = drive(core, make_policy("proportional", core.contract()), command=COMMAND)
+    result = drive(core, make_policy("pid", core.contract()), command=COMMAND)
     assert result.reason == "time is over"
     columns = machine.plant.truth().layout.slices
     truth = np.array(seen)[-100 - 30 :][:100]  # the last 2 s before the wheels stop
@@ -96,8 +95,8 @@ def test_a_policy_tracks_on_the_robot_as_in_simulation(tmp_path):
     simulated = make_core(
         ID, 32, {"episode_length": 8.0, "task": {"commands": {"terms": held(COMMAND), "zero_probability": 0.0}}}
     )
-    rollout = roll_out(simulated, make_policy("proportional", simulated.contract()))
-    assert per_episode(rollout)["falls"][0].sum() == 0
+    rollout = roll_out(simulated, make_policy("pid", simulated.contract()))
+    assert not rollout.fell.any()
     for value, series in ((speed, rollout.forward_velocity), (turn, rollout.yaw_rate)):
         low, high = np.percentile(series[-100:].mean(axis=0), [2.5, 97.5])
         assert low <= value <= high
@@ -111,7 +110,7 @@ def test_a_stop_by_the_gate_is_reported_and_logged(tmp_path):
     core = robot_core(tmp_path)
     loop = loop_of(core)
     machine_of(core).inject("drop wheels after=1.5")
-    result = drive(core, make_policy("proportional", core.contract()))
+    result = drive(core, make_policy("pid", core.contract()))
     assert result.run is not None
     assert not result.well
     assert result.reason.startswith("silence: no answer from wheel_lf")
@@ -161,7 +160,7 @@ def test_simulators_are_no_robots():
 
 
 def words(folder, *more):
-    return ["proportional", "--emulated", "--stepped", "--seconds", "1", "--out", str(folder), *more]
+    return ["pid", "--emulated", "--stepped", "--seconds", "1", "--out", str(folder), *more]
 
 
 def test_command_line_in_emulated_time(tmp_path, capsys):
@@ -206,15 +205,15 @@ def test_command_line_bad_options(tmp_path, more, message):
 
 def test_faults_are_for_the_emulated_robot(tmp_path):
     with pytest.raises(InputError, match="add --emulated"):
-        run_command("deploy", ["proportional", "--fault", "drop"])
+        run_command("deploy", ["pid", "--fault", "drop"])
     with pytest.raises(InputError, match="cannot be opened"):
-        run_command("deploy", ["proportional", "--yes", "--port", f"legs={tmp_path}/none", "--out", str(tmp_path)])
+        run_command("deploy", ["pid", "--yes", "--port", f"legs={tmp_path}/none", "--out", str(tmp_path)])
 
 
 def test_nobody_there_to_start_the_robot(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     with pytest.raises(InputError, match="nobody there to start the robot"):
-        run_command("deploy", ["proportional", "--out", str(tmp_path)])
+        run_command("deploy", ["pid", "--out", str(tmp_path)])
 
 
 @pytest.mark.parametrize("stop", ["signal", "key"])
@@ -227,7 +226,7 @@ def test_command_line_on_real_terminals(tmp_path, stop):
         patience=0.3, read_time=5.0, late=10000, late_share=1.0, silence=9.0, coast=8.0, imu_silence=9.0, watchdog=2.5
     )
     (tmp_path / "hardware.yaml").write_text(yaml.safe_dump(patient.model_dump(mode="json")), encoding="utf-8")
-    arguments = ["deploy", "proportional", "--emulated", "--seconds", "120", "--out", str(tmp_path / "log")]
+    arguments = ["deploy", "pid", "--emulated", "--seconds", "120", "--out", str(tmp_path / "log")]
     code = "import sys; from wlr_gym.cli import run_command; sys.exit(run_command(sys.argv[1], sys.argv[2:]))"
     process = subprocess.Popen(
         [sys.executable, "-c", code, *arguments, "--hardware", str(tmp_path / "hardware.yaml")],
@@ -254,7 +253,7 @@ def test_command_line_on_real_terminals(tmp_path, stop):
 @pytest.mark.slow
 def test_fifty_times_a_second_for_a_minute(tmp_path):
     """On a computer that has time: no tick is missed, and 99 of 100 start less than 3 ms after their deadline."""
-    arguments = ["deploy", "proportional", "--emulated", "--seconds", "60", "--out", str(tmp_path)]
+    arguments = ["deploy", "pid", "--emulated", "--seconds", "60", "--out", str(tmp_path)]
     code = "import sys; from wlr_gym.cli import run_command; sys.exit(run_command(sys.argv[1], sys.argv[2:]))"
     subprocess.run([sys.executable, "-c", code, *arguments], stdin=subprocess.DEVNULL, check=True, timeout=180)
     statistics = read_events(tmp_path / "run_01.csv")[-1]["statistics"]

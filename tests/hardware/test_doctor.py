@@ -138,17 +138,17 @@ def write_policy(folder, **changes):
     core = make_core("WLR-Velocity-v0", 1, {})
     contract = core.contract() | changes
     core.close()
-    write_contract(folder, "proportional", {}, contract, {"environment": "WLR-Velocity-v0"})
+    write_contract(folder, "pid", {}, contract, {"environment": "WLR-Velocity-v0"})
 
 
 def test_a_policy_that_fits_and_one_that_does_not(machine, capsys, tmp_path):
     write_policy(tmp_path)
     code, text = look(capsys, policy=tmp_path)
-    assert (code, "policy     contract: proportional, velocity" in text) == (0, True)
+    assert (code, "policy     contract: pid, velocity" in text) == (0, True)
     write_policy(tmp_path, control_period=0.01)
     code, text = look(capsys, policy=tmp_path)
     assert code == 1
     assert "First: policy, contract" in text
     assert "control_period is 0.01 in the policy, 0.02" in text
     code, text = look(capsys, policy=tmp_path / "nowhere")
-    assert (code, "no policy in" in text) == (1, True)
+    assert (code, "is no policy" in text) == (1, True)

@@ -44,7 +44,7 @@ def test_contract_survives_writing_and_reading(folder, contract):
         (lambda c: c["observation"][3].update(scale=9.0), r"observation\[3\]\.scale"),
         (lambda c: c["observation"][5].update(unit="deg"), r"observation\[5\]\.unit"),
         (lambda c: c["observation"].insert(0, c["observation"].pop(1)), r"observation\[0\]\.name"),
-        (lambda c: c["observation"].pop(), r"length of observation is 36 in the policy, 35 in the environment"),
+        (lambda c: c["observation"].pop(), r"length of observation is (\d+) in the policy, \d+ in the environment"),
         (lambda c: c["action"][0].update(centre=1.0), r"action\[0\]\.centre"),
     ],
 )
@@ -95,5 +95,5 @@ def test_a_place_without_a_policy(tmp_path, contract):
 
 
 def test_neither_agent_nor_folder(contract):
-    with pytest.raises(InputError, match=r"neither a policy folder nor an agent \(did you mean 'do_nothing'"):
+    with pytest.raises(InputError, match=r"neither a folder, .* nor a shipped policy \(did you mean 'do_nothing'"):
         make_policy("do_nothin", contract)

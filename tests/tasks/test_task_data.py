@@ -69,7 +69,13 @@ def test_history_and_limits_shape_the_observation(robot):
 
 
 def test_only_measurable_quantities_are_policy_terms(robot):
-    assert {column.source for column in load_task("velocity", robot).policy} <= {"sensors", "command", "action"}
+    assert {column.source for column in load_task("velocity", robot).policy} <= {
+        "sensors",
+        "command",
+        "action",
+        "estimate",
+        "computed",
+    }
 
 
 def test_tables_list_every_column_in_order(robot):

@@ -1,6 +1,12 @@
-"""Speed of Stable-Baselines3's PPO on our batch, against the same PPO on single environments on MuJoCo."""
+"""Speed of Stable-Baselines3's PPO on our batch, and the time it takes to learn, against the same on MuJoCo environments."""
 
 from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from contextlib import contextmanager
+from typing import Any
 
 from wlr_gym.bench.measure import Contender, Measurement, Size, against_fastest, interleave, rate
 from wlr_gym.bench.mujoco_loop import BACKEND, register_backend
@@ -10,41 +16,82 @@ from wlr_gym.errors import require_package
 require_package("stable_baselines3", "train")
 
 import gymnasium as gym  # noqa: E402
+import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from stable_baselines3 import PPO  # noqa: E402
+from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv  # noqa: E402
 
 from wlr_gym.envs import Sb3VecEnv  # noqa: E402
+from wlr_gym.policy import load_agent_config  # noqa: E402
+from wlr_gym.tasks.task import read_task  # noqa: E402
 
 EPOCHS = 4
+#: Reward per second of simulated time, exploration included, from which the task counts as learnt: see docs/learning.md.
+SOLVED = 1.8
+#: Frames over which it is averaged. Frames after which a run is given up.
+WINDOW, MOST_FRAMES = 16_384, 4_000_000
+#: Settings that learnt fastest on each: many robots, large minibatches; few robots, small ones.
+OURS = {"batch_size": 2048, "learning_rate": 3e-3}
+PEERS = {"batch_size": 256, "learning_rate": 1e-3}
+
+
+def keywords() -> dict[str, Any]:
+    """Return what both sides are made with: nothing random, and no slip observer, whose work is the same on both."""
+    return {"randomization": "none", "task": load_agent_config("ppo_blind")["environment"]["task"]}
 
 
 def make_mujoco_env() -> gym.Env:
     """Return the environment on the MuJoCo loop, in any process."""
     register_backend()
-    return gym.make(f"wlr_gym:{ENVIRONMENT}", randomization="none", backend=BACKEND)
+    return gym.make(f"wlr_gym:{ENVIRONMENT}", backend=BACKEND, **keywords())
 
 
 def measure_ppo(size: Size) -> list[Measurement]:
     """Frames per second of whole PPO updates (64x64 networks, one torch thread); ours as ``wlr train`` sets it up."""
+    robots, workers = size(512, 16), (2,) if size.quick else (2, 8)
+    with _vectors(robots, workers) as vectors:
+        contenders = {name: _updates(vector, size, ours=name == "ours") for name, vector in vectors.items()}
+        values = interleave(contenders, size.rounds)
+    return [_against_peers("ppo", f"PPO frames, {robots} robots, float32", "1/s", values, 7.0)]
+
+
+def measure_learning(size: Size) -> list[Measurement]:
+    """How often per hour PPO learns the task from nothing; every round has another seed, the same for all."""
+    robots = size(256, 16)
+    with _vectors(robots, (2,)) as vectors:
+        for name, vector in vectors.items():
+            _learner(vector, 0, size, ours=name == "ours").learn(vector.num_envs)  # compilation is not measured
+        values: dict[str, list[float]] = {name: [] for name in vectors}
+        for seed in range(size.rounds):
+            for name, vector in vectors.items():
+                values[name].append(3600.0 / _seconds_to_solve(vector, seed, size, ours=name == "ours"))
+    found = {name: tuple(series) for name, series in values.items()}
+    return [_against_peers("learning", f"times learnt (reward {SOLVED:g}/s), {robots} robots", "1/h", found, 5.0)]
+
+
+@contextmanager
+def _vectors(robots: int, workers: tuple[int, ...]) -> Any:
+    """Yield ours and its peers by name; one torch thread meanwhile."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    robots, workers = size(512, 16), (2,) if size.quick else (2, 8)
     # Workers are forked first, while this process has a single thread; spawned ones would run the command line again.
     vectors: dict[str, VecEnv] = {
         f"SubprocVecEnv({n})": SubprocVecEnv([make_mujoco_env] * n, start_method="fork") for n in workers
     }
     vectors["DummyVecEnv(8)"] = DummyVecEnv([make_mujoco_env] * 8)
-    vectors["ours"] = Sb3VecEnv(ENVIRONMENT, robots, seed=0, randomization="none", precision="float32")
+    vectors["ours"] = Sb3VecEnv(ENVIRONMENT, robots, seed=0, precision="float32", **keywords())
     try:
-        contenders = {name: _updates(vector, size, ours=name == "ours") for name, vector in vectors.items()}
-        values = interleave(contenders, size.rounds)
+        yield vectors
     finally:
         for vector in vectors.values():
             vector.close()
         torch.set_num_threads(threads)
-    peers = {f"{name} on MuJoCo": series for name, series in values.items() if name != "ours"}
-    return [against_fastest("ppo", f"PPO frames, {robots} robots, float32", "1/s", values["ours"], peers, 7.0)]
+
+
+def _against_peers(name: str, what: str, unit: str, values: Mapping[str, tuple[float, ...]], bar: float) -> Measurement:
+    peers = {f"{peer} on MuJoCo": series for peer, series in values.items() if peer != "ours"}
+    return against_fastest(name, what, unit, values["ours"], peers, bar)
 
 
 def _updates(vector: VecEnv, size: Size, *, ours: bool) -> Contender:
@@ -59,3 +106,40 @@ def _updates(vector: VecEnv, size: Size, *, ours: bool) -> Contender:
         return rate(lambda: model.learn(frames, reset_num_timesteps=False), frames)
 
     return run
+
+
+def _learner(vector: VecEnv, seed: int, size: Size, *, ours: bool) -> PPO:
+    """The PPO of ``wlr train``, with the batch and learning rate that suit the number of robots."""
+    steps = size(32 if ours else 2048 // vector.num_envs, 8)
+    settings: dict[str, Any] = dict(OURS if ours else PEERS)
+    settings["batch_size"] = min(settings["batch_size"], steps * vector.num_envs)
+    policy = {"net_arch": [64, 64], "log_std_init": -1.0}
+    settings |= {"n_steps": steps, "n_epochs": EPOCHS, "gamma": 0.97, "policy_kwargs": policy, "seed": seed}
+    return PPO("MlpPolicy", vector, device="cpu", **settings)
+
+
+def _seconds_to_solve(vector: VecEnv, seed: int, size: Size, *, ours: bool) -> float:
+    """Return the wall time until the task is learnt; infinite where it was given up."""
+    model = _learner(vector, seed, size, ours=ours)
+    watch = _Solved(size(MOST_FRAMES, 1))
+    start = time.perf_counter()
+    model.learn(10 * MOST_FRAMES, callback=watch)
+    return time.perf_counter() - start if watch.solved or size.quick else math.inf
+
+
+class _Solved(BaseCallback):
+    """Ends the training when the mean reward of the newest frames reaches :data:`SOLVED`, or after ``most`` frames."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__()
+        self.most = most
+        self._goal = SOLVED * read_task("velocity").control_period
+        self.solved = False
+        self._rewards: list[float] = []
+
+    def _on_step(self) -> bool:
+        self._rewards.append(float(np.mean(self.locals["rewards"])))
+        ticks = max(1, WINDOW // self.training_env.num_envs)
+        newest = self._rewards[-ticks:]
+        self.solved = len(newest) == ticks and float(np.mean(newest)) >= self._goal
+        return not self.solved and self.num_timesteps < self.most

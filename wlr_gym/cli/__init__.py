@@ -17,6 +17,7 @@ COMMANDS = {
     "effects": "list the effects that can be added to the robot, explain one, or check patch files",
     "train": "train an agent on an environment; resumes after an interruption",
     "evaluate": "score a policy or agent over many episodes, against baselines, with confidence intervals",
+    "export": "write a trained policy as one file (ONNX with its contract) that runs without torch, or its model card",
     "play": "drive a robot in a window with keys or a gamepad, or into a video",
     "replay": "drive a simulator with the commands of measured runs and report where they part",
     "compare": "drive two plants with the same goals and report where they part, in noise units",

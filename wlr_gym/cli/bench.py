@@ -27,6 +27,7 @@ MEASUREMENTS = {
     "mujoco": "wlr_gym.bench.mujoco_plant:measure_mujoco",
     "env_step": "wlr_gym.bench.speed:measure_env_step",
     "ppo": "wlr_gym.bench.training:measure_ppo",
+    "learning": "wlr_gym.bench.training:measure_learning",
     "import": "wlr_gym.bench.speed:measure_import",
     "start": "wlr_gym.bench.speed:measure_start",
     "batch": "wlr_gym.bench.speed:measure_batch",
@@ -36,8 +37,8 @@ MEASUREMENTS = {
 }
 #: Measurements with rows of their own kind; each has its list in the report.
 _OWN_ROWS = ("convergence", "vision")
-#: Takes a quarter of an hour, needs the robot's packages: only made when they are asked for.
-_ON_REQUEST = ("vision", "bus")
+#: Take a quarter of an hour or need the robot's packages: only made when they are asked for.
+_ON_REQUEST = ("vision", "bus", "learning")
 #: Its own kind: hours, resumable, with a folder of results. See docs/gap_benchmark.md.
 BLIND_TEST = "gap"
 SCHEMA = 1
@@ -48,7 +49,7 @@ class Options:
     what: tyro.conf.Positional[tuple[str, ...]] = ()
     """Measurements to make, as with --only."""
     only: tuple[str, ...] = ()
-    """engine, mujoco, env_step, ppo, import, start, batch, bus, convergence, vision; default: all but the last.
+    """engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, vision.
     gap (the blind test of the gap workflow): alone, with --out"""
     json: Path | None = None
     """File for all numbers."""

@@ -12,19 +12,33 @@ import numpy as np
 from rich.console import Console
 
 from wlr_gym.cli import OK
-from wlr_gym.cli.evaluate import play, print_cards
+from wlr_gym.cli.evaluate import print_card, progress
 from wlr_gym.cli.options import EffectsOption
 from wlr_gym.cli.train import add_effects
+from wlr_gym.envs.core import make_task
+from wlr_gym.envs.registry import task_name_of
+from wlr_gym.envs.settings import read_settings
 from wlr_gym.errors import InputError, require_package
-from wlr_gym.evaluation import Rollout, read_curve, score, write_card
+from wlr_gym.evaluation import (
+    FIRST_SEED,
+    MAIN,
+    Card,
+    Condition,
+    Rollout,
+    Subject,
+    play,
+    read_curve,
+    read_subjects,
+    work,
+    write_card,
+)
 from wlr_gym.files import make_output_folder
 from wlr_gym.policy import Training, load_agent, load_agent_config
 from wlr_gym.provenance import PROVENANCE_FILE, record_provenance
 
 ENVIRONMENT = "WLR-Velocity-v0"
-BASELINES = ("do_nothing", "untrained", "proportional")
+BASELINES = ("do_nothing", "untrained", "pid")
 EPISODES = 64
-FIRST_SEED = 10_000
 FILES = ("run/policy", "card.md", "card.json", "learning_curve.png", "episode.png")
 #: More than the usual training time; a slow machine stops here, with a policy that has learnt less.
 MAX_TRAINING_SECONDS = 120.0
@@ -76,12 +90,20 @@ def _train(options: Options) -> Path:
 def _evaluate(options: Options, policy: Path) -> dict[str, Rollout]:
     patch = options.patch()
     keywords = {"precision": "float32", "effects": patch}  # precision as in training: the engine is compiled once
-    rollouts = play(ENVIRONMENT, [policy, *BASELINES], options.episodes, FIRST_SEED, keywords, options.progress)
-    rollouts = {"PPO" if name == str(policy) else name: rollout for name, rollout in rollouts.items()}
-    cards = {name: score(rollout) for name, rollout in rollouts.items()}
-    print_cards(cards)
-    conditions = {"environment": ENVIRONMENT, "episodes": options.episodes, "first seed": FIRST_SEED}
-    write_card(options.out, cards, conditions | {"effects": patch.summary()})
+    condition = Condition(MAIN, keywords, episodes=options.episodes)
+    subjects = [Subject("PPO", (str(policy),)), *read_subjects(BASELINES)]
+    rollouts: dict[str, Rollout] = {}
+
+    def watch(condition: Condition, subject: Subject, block: int, rollout: Rollout) -> None:
+        rollouts[subject.name] = rollout
+
+    ticks = make_task(task_name_of(ENVIRONMENT), read_settings(keywords)).episode_ticks
+    with progress(work([condition], subjects, ticks), options.progress) as tell:
+        results = play(ENVIRONMENT, subjects, [condition], tell=tell, watch=watch)
+    said = {"environment": ENVIRONMENT, "episodes": options.episodes, "first seed": FIRST_SEED, "effects": patch.summary()}
+    card = Card(results, conditions=said)
+    print_card(card)
+    write_card(options.out, card)
     return rollouts
 
 

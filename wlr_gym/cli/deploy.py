@@ -18,6 +18,7 @@ import tyro
 from rich.console import Console
 
 from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.options import environment_of
 from wlr_gym.cli.robot_options import wait_for_enter
 from wlr_gym.errors import InputError
 
@@ -33,9 +34,9 @@ _STATUS_TICKS = 10
 @dataclass(frozen=True)
 class Options:
     policy: tyro.conf.Positional[str]
-    """Policy folder, run folder, or name of an agent."""
-    env: str = "WLR-Velocity-v0"
-    """Environment id; see: wlr envs."""
+    """Policy file or folder, run folder, or name of an agent or shipped policy."""
+    env: str | None = None
+    """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
     hardware: str = "nominal"
     """Hardware file, or name in configs/hardware/: ports, mounting, safety limits."""
     port: tuple[str, ...] = ()
@@ -73,9 +74,11 @@ def run(options: Options) -> int:
     from wlr_gym.evaluation import make_core
     from wlr_gym.evaluation.deployment import deploy, loop_of
     from wlr_gym.hardware.operator import Keys
-    from wlr_gym.policy import make_policy
+    from wlr_gym.policy import make_policy, policy_environment
 
     command = _check(options)
+    environment = environment_of(options.env, options.policy)
+    fed = policy_environment(options.policy)
     console = Console()
     with contextlib.ExitStack() as stack:
         ports = _pairs("--port", options.port)
@@ -89,8 +92,8 @@ def run(options: Options) -> int:
             "log": options.out,
             "deadman": options.deadman,
         }
-        keywords = {"backend": "dynamixel", "hardware": robot_options, "episode_length": options.seconds}
-        core = make_core(options.env, 1, keywords)
+        keywords = {"backend": "dynamixel", "hardware": robot_options, "episode_length": options.seconds} | fed
+        core = make_core(environment, 1, keywords)
         stack.callback(core.close)
         policy = make_policy(options.policy, core.contract())
         _say_what_is_not_known(core, console)
@@ -179,7 +182,11 @@ def _signals(loop: ControlLoop) -> contextlib.AbstractContextManager[None]:
 
 
 def _say_what_is_not_known(core: Core, console: Console) -> None:
+    from wlr_gym.policy import needs_camera
+
     console.print(f"not measured on a robot, and left out: {', '.join(core.unmeasured)}", style="dim")
+    if needs_camera(core.contract()):
+        console.print("note: the policy's slip observer had a camera in training; this robot has none", style="yellow")
 
 
 @contextlib.contextmanager

@@ -30,14 +30,14 @@ class Options(RobotOption):
     """Look at a robot.
 
     Attributes:
-        policy: policy or run folder that is to drive it: does it fit this robot?
+        policy: policy file or folder, run folder or shipped policy that is to drive it: does it fit this robot?
         mend: write the register values that mend what is wrong (servos' torque must be off).
         scan: search every bus at every baud rate for servos, whatever their ids.
         json: file for all checks.
         verbose: show every check of every joint.
     """
 
-    policy: Annotated[Path | None, tyro.conf.Positional] = None
+    policy: Annotated[str | None, tyro.conf.Positional] = None
     mend: bool = False
     scan: bool = False
     json: Path | None = None
@@ -66,7 +66,7 @@ def run(options: Options) -> int:
     finally:
         link.close()
     if options.policy is not None:
-        checks.append(check_policy(options.policy, options.robot))
+        checks += check_policy(options.policy, options.robot)
     _print(checks, console, options.verbose)
     if options.json is not None:
         write_json(options.json, [check._asdict() for check in checks])
@@ -101,26 +101,28 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: Options, cons
     return found
 
 
-def check_policy(source: Path, robot: str) -> Check:
-    """Return whether a policy was made for this robot, its observations and its control period."""
+def check_policy(source: str, robot: str) -> list[Check]:
+    """Return whether a policy was made for this robot, its observations and its control period, and does without a camera."""
     from wlr_gym.evaluation.rollout import make_core
     from wlr_gym.hardware.checks import Check
-    from wlr_gym.policy.file import check_contract, policy_folder, read_contract
+    from wlr_gym.policy import check_contract, contract_of, needs_camera, policy_environment
 
     remedy = "Choose another policy, train it for this robot, or name the robot file it was trained with (--robot)."
     try:
-        folder = policy_folder(source)
-        if folder is None:
-            raise InputError(f"no policy in {source}")
-        policy = read_contract(folder)
-        core = make_core(policy.get("training", {}).get("environment", "WLR-Velocity-v0"), 1, {"robot": robot})
+        policy = contract_of(source)
+        environment = policy.get("training", {}).get("environment", "WLR-Velocity-v0")
+        core = make_core(environment, 1, {"robot": robot} | policy_environment(source))
         try:
-            check_contract(policy["environment"], core.contract(), str(folder))
+            check_contract(policy["environment"], core.contract(), source)
         finally:
             core.close()
     except InputError as error:
-        return Check("policy", "contract", False, str(error), "one that fits", remedy)
-    return Check("policy", "contract", True, f"{policy['agent']}, {policy['environment']['task']}", "", "")
+        return [Check("policy", "contract", False, str(error), "one that fits", remedy)]
+    checks = [Check("policy", "contract", True, f"{policy['agent']}, {policy['environment']['task']}", "", "")]
+    if needs_camera(policy["environment"]):
+        remedy = "Its slip observer goes by wheels and IMU alone: expect worse tracking, or train with observer.camera false."
+        checks.append(Check("policy", "camera", False, "none on this robot", "the one of its training", remedy, False))
+    return checks
 
 
 def _scan(link: Link, hardware: Hardware, buses: Sequence[str], console: Console) -> None:

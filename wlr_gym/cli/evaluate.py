@@ -1,47 +1,95 @@
-"""Score a policy or agent over many episodes, played as one batch, against baselines on the same seeds."""
+"""Score a policy or agent over many episodes, against baselines on the same seeds: a card with confidence intervals."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import tyro
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import EffectsOption
-from wlr_gym.errors import InputError
-from wlr_gym.evaluation import Card, Rollout, make_core, record_episodes, roll_out, rows, score, write_card, write_samples
+from wlr_gym.envs.core import make_task
+from wlr_gym.envs.registry import task_name_of
+from wlr_gym.envs.settings import read_settings
+from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.evaluation import (
+    FIRST_SEED,
+    MAIN,
+    OTHER_PLANT,
+    Card,
+    Condition,
+    Rollout,
+    Subject,
+    comparison_rows,
+    make_player,
+    play,
+    read_subjects,
+    read_sweep,
+    record_episodes,
+    rows,
+    sweep_rows,
+    sweeps_for,
+    transfer_rows,
+    work,
+    write_card,
+    write_episodes,
+    write_samples,
+)
 from wlr_gym.files import make_output_folder
-from wlr_gym.policy import make_policy
+from wlr_gym.policy import shipped_names, trained_environment
 from wlr_gym.provenance import record_provenance
 from wlr_gym.render.video import check_video
+
+BACKENDS = ("gibbs_appell", "mujoco")
+BASELINES, FULL_BASELINES = ("do_nothing", "pid"), ("do_nothing", "constant_command", "pid", "slip_compensating")
+#: What is played where no option says otherwise: quickly, and with --full.
+EPISODES, FULL_EPISODES = 64, 256
+SEEDS, FULL_SEEDS = 1, 5
+SWEEP_EPISODES, OTHER_EPISODES = 128, 64
 
 
 @dataclass(frozen=True)
 class Options(EffectsOption):
     policy: tyro.conf.Positional[str]
-    """Policy folder, run folder, or name of an agent."""
-    env: str = "WLR-Velocity-v0"
-    """Environment id; see: wlr envs."""
-    baselines: tuple[str, ...] = ("do_nothing", "proportional")
-    """Policies or agents to compare with, on the same episodes."""
-    episodes: int = 64
-    """Number of episodes."""
-    seed: int = 0
-    """Seed of the first episode; the others count up from it."""
-    backend: str = "gibbs_appell"
-    """Simulator: gibbs_appell or mujoco."""
+    """Agent, policy file (.onnx), policy or run folder, or shipped policy. NAME=POLICY names it; NAME=POLICY,POLICY,... is one
+    agent trained with several seeds."""
+    env: str | None = None
+    """Environment id (see: wlr envs); default: the one the policy was trained in, else WLR-Velocity-v0."""
+    baselines: tuple[str, ...] | None = None
+    """What to compare with, on the same episodes; as the policy. Default: do_nothing and pid, with --full every agent without
+    learning and the environment's shipped policies."""
+    full: bool = False
+    """The whole card: 256 episodes x 5 seeds, every sweep, both simulators. Minutes per policy; options below still count."""
+    episodes: int | None = None
+    """Number of episodes per seed; default 64, with --full 256."""
+    seeds: int | None = None
+    """Number of seeds, each with its own episodes; default 1, with --full 5."""
+    seed: int = FIRST_SEED
+    """Seed of the first episode; the others count up from it, each further block of --seeds from 10000 above the last one."""
+    backend: str | None = None
+    """Simulator: gibbs_appell, mujoco, or both (the second for the main table only); default: the first, with --full both."""
+    other_episodes: int = OTHER_EPISODES
+    """Episodes in the second simulator."""
+    sweep: tuple[str, ...] | None = None
+    """Sweeps: friction, split, floors, slope, grip, latency, payload; default none, with --full all that suit the task."""
+    sweep_episodes: int = SWEEP_EPISODES
+    """Episodes per point of a sweep."""
     randomization: str | None = None
     """Name in configs/randomization/, path, or a gap result (.json); default: the task's."""
     robot: str | None = None
     """Name in configs/robot/ or path; default: the task's."""
+    threads: int = 1
+    """Threads of the simulator; results do not depend on it."""
     out: Path | None = None
-    """Folder for card.md, card.json and samples.csv (what randomization drew); default: only print."""
+    """Folder for card.md, card.json, pictures, episodes.parquet (every episode's scores) and samples.csv (what randomization
+    drew); default: only print."""
     record: int = 0
     """Write so many of the policy's episodes as runs into the folder OUT/runs."""
     video: Path | None = None
@@ -54,98 +102,166 @@ class Options(EffectsOption):
 
 def run(options: Options) -> int:
     """Play, print the card, write it."""
+    _check(options)
+    patch = options.patch()
+    if options.out is not None:
+        make_output_folder(options.out)
+    environment = options.env or trained_environment(read_subjects([options.policy])[0].sources[0]) or "WLR-Velocity-v0"
+    subjects = read_subjects([options.policy, *_baselines(options, environment)])
+    keywords: dict[str, Any] = {"randomization": options.randomization, "robot": options.robot, "effects": patch}
+    keywords |= {"threads": options.threads}
+    main, *others = _backends(options)
+    card, samples = _play(options, environment, subjects, keywords | {"backend": main}, others, patch.summary())
+    print_card(card)
+    keywords["backend"] = main
+    if options.out is not None:
+        settings = {key: _plain(value) for key, value in asdict(options).items()}
+        record_provenance(options.out, settings | {"effects": patch.content()["effects"]}, options.seed)
+        _write(options.out, card, samples, options.seed)
+        if options.record:
+            _record(environment, subjects[0], options, options.out / "runs", keywords)
+    if options.video is not None:
+        _film(environment, subjects[:2], options, options.video, keywords)
+    return OK
+
+
+def _check(options: Options) -> None:
+    episodes = options.episodes or (FULL_EPISODES if options.full else EPISODES)
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
-    if not 0 <= options.record <= options.episodes or (options.record and options.out is None):
-        raise InputError(f"--record {options.record}: expected 0 to {options.episodes} (--episodes), and --out for the runs")
-    patch = options.patch()
+    if not 0 <= options.record <= episodes or (options.record and options.out is None):
+        raise InputError(f"--record {options.record}: expected 0 to {episodes} (--episodes), and --out for the runs")
     if options.video is not None:
         check_video(options.video)
         if not 0 < options.video_seconds < float("inf"):
             raise InputError(f"--video-seconds {options.video_seconds:g}: expected more than 0")
-    if options.out is not None:
-        make_output_folder(options.out)
-    keywords = {"backend": options.backend, "randomization": options.randomization, "robot": options.robot, "effects": patch}
-    subjects = list(dict.fromkeys([options.policy, *options.baselines]))
-    rollouts = play(options.env, subjects, options.episodes, options.seed, keywords, options.progress)
-    cards = {name: score(rollout) for name, rollout in rollouts.items()}
-    print_cards(cards)
-    if options.out is not None:
-        conditions = {
-            "environment": options.env, "backend": options.backend, "episodes": options.episodes, "first seed": options.seed,
-            "randomization": options.randomization or "the task's", "robot": options.robot or "the task's",
-            "effects": patch.summary(),
-        }  # fmt: skip
-        settings = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
-        record_provenance(options.out, settings | {"effects": patch.content()["effects"]}, options.seed)
-        write_card(options.out, cards, conditions)
-        write_samples(options.out / "samples.csv", rollouts[options.policy])
-        print(f"written: {', '.join(str(options.out / name) for name in ('card.md', 'card.json', 'samples.csv'))}")
-        if options.record:
-            _record(options, options.out / "runs", keywords)
-    if options.video is not None:
-        _film(options, options.video, subjects[:2], keywords)
-    return OK
 
 
-def _record(options: Options, folder: Path, keywords: Mapping[str, Any]) -> None:
+def _backends(options: Options) -> tuple[str, ...]:
+    backend = options.backend or ("both" if options.full else BACKENDS[0])
+    if backend not in (*BACKENDS, "both"):
+        raise unknown_name("backend", backend, (*BACKENDS, "both"), "--backend")
+    return BACKENDS if backend == "both" else (backend,)
+
+
+def _baselines(options: Options, environment: str) -> tuple[str, ...]:
+    if options.baselines is not None:
+        return options.baselines
+    if not options.full:
+        return BASELINES
+    shipped = [name for name in shipped_names() if trained_environment(name) == environment]
+    return (*FULL_BASELINES, *shipped)
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
+
+
+def _play(
+    options: Options,
+    environment: str,
+    subjects: Sequence[Subject],
+    keywords: Mapping[str, Any],
+    others: Sequence[str],
+    effects: str,
+) -> tuple[Card, Rollout]:
+    """Play everything; returns the card, and the first block of the first subject."""
+    task = task_name_of(environment)
+    chosen = sweeps_for(task) if options.full and options.sweep is None else options.sweep or ()
+    sweeps = tuple(read_sweep(name, task) for name in dict.fromkeys(chosen))
+    episodes = (FULL_EPISODES if options.full else EPISODES) if options.episodes is None else options.episodes
+    seeds = (FULL_SEEDS if options.full else SEEDS) if options.seeds is None else options.seeds
+    conditions = [Condition(MAIN, keywords, episodes=episodes, blocks=seeds)]
+    for sweep in sweeps:
+        conditions += sweep.conditions(keywords, options.sweep_episodes)
+    fewer = min(options.other_episodes, episodes)
+    conditions += [Condition(OTHER_PLANT, {**keywords, "backend": other}, episodes=fewer) for other in others]
+    first: list[Rollout] = []
+
+    def watch(condition: Condition, subject: Subject, block: int, rollout: Rollout) -> None:
+        if not first:
+            first.append(rollout)
+
+    ticks = make_task(task, read_settings(keywords)).episode_ticks
+    with progress(work(conditions, subjects, ticks), options.progress) as tell:
+        results = play(environment, subjects, conditions, options.seed, tell, watch)
+    said = {
+        "environment": environment, "backend": str(keywords["backend"]), "episodes": f"{episodes} x {seeds} seeds",
+        "first seed": options.seed, "randomization": options.randomization or "the task's",
+        "robot": options.robot or "the task's", "effects": effects,
+    }  # fmt: skip
+    said |= {"second simulator": f"{others[0]}, {fewer} episodes"} if others else {}
+    said |= {"sweeps": f"{options.sweep_episodes} episodes per point"} if sweeps else {}
+    return Card(results, sweeps, said), first[0]
+
+
+@contextmanager
+def progress(total: int, shown: bool) -> Iterator[Callable[[str, int], None]]:
+    """Show a bar with the time left; yields a function that is told what is going on and how much of ``total`` was done."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True, disable=not shown) as bar:
+        task = bar.add_task("evaluating", total=total)
+        yield lambda text, done: bar.update(task, description=f"evaluating {text}", advance=done)
+
+
+def _write(folder: Path, card: Card, samples: Rollout, seed: int) -> None:
+    from wlr_gym.evaluation.card_plots import draw_card
+
+    pictures = draw_card(folder, card)
+    write_card(folder, card, pictures)
+    write_episodes(folder / "episodes.parquet", card, seed)
+    write_samples(folder / "samples.csv", samples)
+    names = ("card.md", "card.json", "episodes.parquet", "samples.csv", *pictures.values())
+    print(f"written to {folder}: {', '.join(names)}")
+
+
+def _record(environment: str, subject: Subject, options: Options, folder: Path, keywords: Mapping[str, Any]) -> None:
     """Write the first episodes of the policy as runs."""
-    core = make_core(options.env, options.record, keywords)
+    core, policy = make_player(environment, subject.sources[0], options.record, keywords)
     try:
-        written = record_episodes(core, make_policy(options.policy, core.contract()), folder, options.seed)
+        written = record_episodes(core, policy, folder, options.seed)
     finally:
         core.close()
     print(f"written: {len(written)} runs in {folder}")
 
 
-def _film(options: Options, path: Path, subjects: Sequence[str], keywords: Mapping[str, Any]) -> None:
+def _film(environment: str, subjects: Sequence[Subject], options: Options, path: Path, keywords: Mapping[str, Any]) -> None:
     """Write the first episode of up to two subjects, side by side."""
     from wlr_gym.evaluation.film import film, film_length
     from wlr_gym.render import side_by_side, write_video
 
-    cores = [make_core(options.env, 1, keywords) for _ in subjects]
+    players = []
     try:
-        count, _, fps = film_length(cores[0], options.video_seconds)
-        films = [
-            film(core, make_policy(subject, core.contract()), options.seed, options.video_seconds)
-            for core, subject in zip(cores, subjects, strict=True)
-        ]
-        pictures = side_by_side(films[0], films[1], (subjects[0], subjects[1])) if len(films) == 2 else films[0]
+        for subject in subjects:
+            players.append(make_player(environment, subject.sources[0], 1, keywords))
+        count, _, fps = film_length(players[0][0], options.video_seconds)
+        films = [film(core, policy, options.seed, options.video_seconds) for core, policy in players]
+        names = [subject.name for subject in subjects]
+        pictures = side_by_side(films[0], films[1], (names[0], names[1])) if len(films) == 2 else films[0]
         with Progress(transient=True, disable=not options.progress) as bar:
             write_video(path, bar.track(pictures, count, description="drawing"), fps, count)
     finally:
-        for core in cores:
+        for core, _ in players:
             core.close()
     print(f"written: {path}")
 
 
-def play(
-    environment: str, subjects: Sequence[str | Path], episodes: int, seed: int, keywords: Mapping[str, Any], progress: bool
-) -> dict[str, Rollout]:
-    """Return subject -> its episodes; every subject gets the same ones.
-
-    Raises:
-        InputError: unknown environment, agent or keyword, or a policy that does not fit the environment.
-    """
-    core = make_core(environment, episodes, keywords)
-    try:
-        policies = {str(subject): make_policy(subject, core.contract()) for subject in subjects}
-        rollouts: dict[str, Rollout] = {}
-        with Progress(transient=True, disable=not progress) as bar:
-            for name, policy in policies.items():
-                task = bar.add_task(f"evaluating {name}", total=core.limit)
-                rollouts[name] = roll_out(core, policy, seed, lambda task=task: bar.advance(task))
-    finally:
-        core.close()
-    return rollouts
+def print_card(card: Card) -> None:
+    """Print the tables of a card, intervals as ± half of their width."""
+    _print("mean over episodes ± half of the 95 % confidence interval", rows(card.scores[MAIN], card.metrics, short=True))
+    if len(card.names) > 1:
+        _print(f"{card.names[0]} is better by, paired episode by episode", comparison_rows(card, short=True))
+    for index, sweep in enumerate(card.sweeps):
+        _print(f"sweep {sweep.name}: tracking error", sweep_rows(card, index))
+    if OTHER_PLANT in card.results:
+        _print("on both simulators, same episodes", transfer_rows(card, short=True))
 
 
-def print_cards(cards: Mapping[str, Card]) -> None:
-    """Print score cards side by side."""
-    header, *body = rows(cards, short=True)
-    table = Table(*header, box=None, title="mean over episodes ± half of the 95 % confidence interval", title_justify="left")
+def _print(title: str, table: Sequence[Sequence[str]]) -> None:
+    header, *body = table
+    shown = Table(*header, box=None, title=f"\n{title}", title_justify="left")
     for row in body:
-        table.add_row(*row)
+        shown.add_row(*row)
     console = Console()
-    console.width = max(console.width, 26 + 18 * len(cards))  # rather a wide line than a cut number
-    console.print(table)
+    console.width = max(console.width, 30 + 20 * len(header))  # rather a wide line than a cut number
+    console.print(shown)

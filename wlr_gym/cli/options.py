@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -25,3 +26,14 @@ class EffectsOption:
         from wlr_gym.effects import load_patch
 
         return load_patch(list(self.effects))
+
+
+def environment_of(env: str | None, policy: str | Path) -> str:
+    """Return the environment id asked for; else the one a policy was trained in; else ``WLR-Velocity-v0``.
+
+    Raises:
+        InputError: see :func:`wlr_gym.policy.trained_environment`.
+    """
+    from wlr_gym.policy import trained_environment
+
+    return env or trained_environment(policy) or "WLR-Velocity-v0"

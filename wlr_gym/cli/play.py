@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.options import EffectsOption, environment_of
 from wlr_gym.errors import InputError
 from wlr_gym.render.display import require_display
 from wlr_gym.render.view import View
@@ -29,10 +29,10 @@ SECONDS = 10.0
 
 @dataclass(frozen=True)
 class Options(EffectsOption):
-    env: tyro.conf.Positional[str] = "WLR-Velocity-v0"
-    """Environment id; see: wlr envs."""
-    agent: str = "proportional"
-    """Policy folder, run folder, or name of an agent."""
+    env: tyro.conf.Positional[str | None] = None
+    """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
+    agent: str = "pid"
+    """Policy file or folder, run folder, or name of an agent or shipped policy."""
     backend: str = "gibbs_appell"
     """Simulator."""
     randomization: str | None = None
@@ -60,11 +60,12 @@ class Options(EffectsOption):
 def run(options: Options) -> int:
     """Play, until the window is closed or the video is written."""
     from wlr_gym.evaluation import make_core
-    from wlr_gym.policy import make_policy
+    from wlr_gym.policy import make_policy, policy_environment
 
     _check(options)
     keywords = {name: getattr(options, name) for name in ("backend", "randomization", "robot")}
-    core = make_core(options.env, 1, keywords | {"effects": options.patch()})
+    keywords |= {"effects": options.patch()} | policy_environment(options.agent)
+    core = make_core(environment_of(options.env, options.agent), 1, keywords)
     try:
         policy = make_policy(options.agent, core.contract())
         driver = _driver(options, core)

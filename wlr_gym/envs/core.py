@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from wlr_gym import plants
 from wlr_gym.effects import apply_patch, load_patch
 from wlr_gym.envs import kernels
-from wlr_gym.envs.evaluation import compile_evaluation
+from wlr_gym.envs.evaluation import compile_computation, compile_evaluation
 from wlr_gym.envs.measured import measurable, measured_truth
 from wlr_gym.envs.settings import Settings
 from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.observer import ESTIMATE_LAYOUT, SlipObserver
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, PlantState, Sensors
 from wlr_gym.random import stream_number
@@ -28,7 +29,8 @@ from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.tasks.describe import contract, describe
 from wlr_gym.tasks.draws import episode_seeds, stream_numbers, uniforms
 from wlr_gym.tasks.randomization import DRIFT_PERIOD, load_randomization
-from wlr_gym.tasks.task import ObservationColumn, Task, TaskConfig, bounds, build_task, read_task
+from wlr_gym.tasks.signals import START
+from wlr_gym.tasks.task import ObservationColumn, RampConfig, Task, TaskConfig, bounds, build_task, read_task
 from wlr_gym.tasks.terms.events import normal
 
 Array = NDArray[np.float64]
@@ -66,6 +68,8 @@ class Core:
         terminated, truncated: (N,) flags of the last step.
         command: (N, C) present commands. action: (N, 8) last actions. ticks: (N,) control ticks since the episode began.
         goals: (N, 8) last goals, rad and rad/s. torque_on: (N, 8) whether the motors are on; None = all.
+        measures: (N, M) measures of the last step, named by ``task.measures``; SI units.
+        observer: the slip observer, None where the task needs no estimate; its ``values`` are the present estimate.
         sensors: last readings, noise and all. state: where the robots of the present episodes started.
         changed: (N,) whether randomisation changed the robot's parameters at the end of the last step.
         unmeasured: rewards and terminations of the task that are left out because a real robot cannot measure them.
@@ -94,7 +98,11 @@ class Core:
         self.plant = plants.make_plant(settings.backend, robot, self.count, options, self.patch.forces, settings.robot_options)
         self.limit = self.task.episode_ticks
         self.dictionary = settings.observation == "dict"
+        self.observer: SlipObserver | None = None
+        if self.task.needs_observer:
+            self.observer = SlipObserver(robot, config.control_period, self.count, config.observer.camera)
         self._evaluation = compile_evaluation(self.task)
+        self._computation = compile_computation(self.task) if self.task.computed else None
         self._make_spaces()
         self._make_tables(config)
         self._make_buffers()
@@ -115,11 +123,22 @@ class Core:
 
     def _make_tables(self, config: TaskConfig) -> None:
         task = self.task
-        columns = {"sensors": SENSOR_LAYOUT.elements, "command": task.commands, "action": JOINTS}
+        columns = {
+            "sensors": SENSOR_LAYOUT.elements,
+            "command": task.commands,
+            "action": JOINTS,
+            "estimate": ESTIMATE_LAYOUT.elements,
+            "computed": task.computed,
+            "truth": TRUTH_LAYOUT.elements,
+        }
+
+        def address(column: ObservationColumn) -> list[int]:
+            return [kernels.SOURCES.index(column.source), columns[column.source].index(column.element)]
+
         sampled = list({(c.term, c.element): c for c in task.policy}.values())
         place = {(c.term, c.element): index for index, c in enumerate(sampled)}
         noisy = float(self.randomization.config.sensor_noise)
-        self._sampled_index = np.array([[kernels.SOURCES.index(c.source), columns[c.source].index(c.element)] for c in sampled])
+        self._sampled_index = np.array([address(c) for c in sampled])
         self._sampled_value = np.array([[c.offset, c.noise * noisy] for c in sampled])
         self._sampled_stream = stream_numbers(*(f"noise/{c.term}/{c.element}" for c in sampled))
         self._bias_sigma = np.array([c.bias * noisy for c in sampled])
@@ -129,12 +148,13 @@ class Core:
         self._latency_stream = stream_numbers(*(f"latency/{device}" for device in devices))
         self._column_index = np.array([self._column(c, place, devices) for c in task.policy])
         self._column_value = np.array([[c.limit, c.scale] for c in task.policy])
-        self._privileged_columns = np.array([TRUTH_LAYOUT.elements.index(c.element) for c in task.privileged], dtype=np.int64)
+        self._privileged_index = np.array([address(c) for c in task.privileged], dtype=np.int64).reshape(-1, 2)
         self._privileged_value = np.array([[c.limit, c.scale] for c in task.privileged]).reshape(-1, 2)
         self._action_table = np.array([[a.centre, a.scale, a.low, a.high] for a in task.actions])
-        self._command_table = np.array([config.commands.terms[name] for name in task.commands]).reshape(-1, 2)
+        ramp = {name: rate * config.control_period for name, rate in config.commands.ramp.items()}
+        self._command_table = np.array([[*config.commands.terms[c], ramp.get(c, np.inf)] for c in task.commands]).reshape(-1, 3)
         hold = [time / config.control_period for time in config.commands.hold_time]
-        self._command_timing = np.array([*hold, config.commands.zero_probability])
+        self._command_timing = np.array([*hold, config.commands.zero_probability, 1.0])
         self._command_stream = stream_number("command")
         longest_lag = max(c.lag for c in task.policy)
         longest_delay = float(self._latency.max()) if devices else 0.0
@@ -155,11 +175,17 @@ class Core:
         self.reward = np.zeros(count)
         self.terms = np.zeros((count, len(task.rewards)))
         self.sums = np.zeros((count, len(task.rewards)))
+        self.measures = np.zeros((count, len(task.measures)))
         self._over = np.zeros((count, len(task.terminations)))
         self.terminated = np.zeros(count, bool)
         self.truncated = np.zeros(count, bool)
         self.ticks = np.zeros(count, np.int64)
+        self._clock = np.zeros((count, 1))
+        self._start = np.zeros((count, len(START)))
+        self._no_estimate = np.zeros((count, ESTIMATE_LAYOUT.width))
+        self._computed = np.zeros((count, len(task.computed)))
         self.command = np.zeros((count, len(task.commands)))
+        self._command_target = np.zeros((count, len(task.commands)))
         self._command_until = np.zeros(count, np.int64)
         self._command_draws = np.zeros(count, np.int64)
         self.action = np.zeros((count, actions))
@@ -190,10 +216,12 @@ class Core:
         self.sensors = Sensors(np.zeros((self.count, SENSOR_LAYOUT.width)))
         kernels.start_commands(
             self.everyone, self.episode_seeds, self._command_stream, self._command_table, self._command_timing,
-            self.command, self._command_until, self._command_draws,
+            self.command, self._command_target, self._command_until, self._command_draws,
         )  # fmt: skip
-        self._observe(self.everyone, self.sensors.values, True)
+        self._start_observer(self.everyone)
+        self._observe(self.everyone, True)
         self._take_action(self.action, self.everyone)
+        self._update_observer(self.everyone)
         self._finish_tick(self.everyone)
         self._make_buffers()
 
@@ -232,14 +260,15 @@ class Core:
                 getattr(self.state, name)[rows] = value
         self.sensors = self.plant.reset(seeds=self.episode_seeds, parameters=self.parameters, mask=mask, state=self.state)
         self._clear(rows)
+        self._start_observer(mask)
         self._draw_imperfections(rows, seeds)
         kernels.start_commands(
             mask, self.episode_seeds, self._command_stream, self._command_table, self._command_timing,
-            self.command, self._command_until, self._command_draws,
+            self.command, self._command_target, self._command_until, self._command_draws,
         )  # fmt: skip
         if fixed_command:
             self._hold_command(rows, fixed_command)
-        self._observe(mask, self.sensors.values, True)
+        self._observe(mask, True)
 
     def _draw_parameters(
         self,
@@ -255,6 +284,9 @@ class Core:
     def _clear(self, rows: NDArray[np.intp]) -> None:
         for buffer in (self.ticks, self.action, self._previous_action, self.sums, self.terms, self.reward, self._occurrences):
             buffer[rows] = 0
+        self.measures[rows] = 0.0
+        self._start[rows, :2] = self.state.position[rows, :2]
+        self._start[rows, 2] = yaw_of(self.state.quaternion[rows])
         self.terminated[rows] = self.truncated[rows] = self.changed[rows] = False
         if self.randomization.intervals:
             self._strike_at[rows] = self._next_strike(rows)
@@ -282,11 +314,18 @@ class Core:
     def _hold_command(self, rows: NDArray[np.intp], values: Mapping[int, float]) -> None:
         self._command_until[rows] = FOREVER
         for column, value in values.items():
-            self.command[rows, column] = value
+            self.command[rows, column] = self._command_target[rows, column] = value
 
     def set_command(self, values: Mapping[str, float]) -> None:
         """Command all robots from the next step on, until the episode ends (teleoperation, evaluation)."""
         self._hold_command(np.arange(self.count), self._read_command(values))
+
+    def set_progress(self, steps: float) -> None:
+        """Say how many environment steps, of all robots together, a training has done: what is drawn from now on is spread as
+        far as the task's curriculum says for so many steps. Without it the whole task is met."""
+        curriculum = self.task.config.curriculum
+        self._command_timing[3] = _share(curriculum.commands, steps)
+        self.randomization.spread = _share(curriculum.randomization, steps)
 
     # ---- stepping ----
 
@@ -303,6 +342,7 @@ class Core:
         """
         self._take_action(actions, mask)
         self.sensors = self.plant.step(self.goals, self.torque_on)
+        self._update_observer(mask)
         return self._finish_tick(mask)
 
     def _take_action(self, actions: ArrayLike, mask: Mask) -> None:
@@ -313,12 +353,11 @@ class Core:
 
     def _finish_tick(self, mask: Mask) -> bool:
         """Rewards, ends, new commands and parameters, observation; returns whether an episode ended."""
-        sensors = self.sensors.values
         evaluation = self._evaluation
+        self._clock[:, 0] = (self.ticks + 1) * self.task.config.control_period
         bad = evaluation.run(
-            mask, sensors, self._truth(), self.command, self.action, self._previous_action,
-            evaluation.numbers, self.terms, self.reward, self._over, self.sums,
-        )  # fmt: skip
+            mask, *self._matrices(), evaluation.numbers, self.terms, self.reward, self._over, self.sums, self.measures
+        )
         if bad >= 0:
             hint = "; a formula among its effects may have left its domain" if self.patch.forces else ""
             raise FloatingPointError(
@@ -326,25 +365,47 @@ class Core:
             )
         any_done = kernels.advance(
             mask, self.limit, self.ticks, self._over, self.terminated, self.truncated, self.episode_seeds, self._command_stream,
-            self._command_table, self._command_timing, self.command, self._command_until, self._command_draws,
+            self._command_table, self._command_timing, self.command, self._command_target, self._command_until,
+            self._command_draws,
         )  # fmt: skip
         if self.randomization.timed_elements:
             self._change_parameters(mask & ~(self.terminated | self.truncated) if any_done else mask)
-        self._observe(mask, sensors, False)
+        self._observe(mask, False)
         return any_done
+
+    def _start_observer(self, mask: Mask) -> None:
+        if self.observer is not None:
+            self.observer.reset(mask, self.sensors.values)
+
+    def _update_observer(self, mask: Mask) -> None:
+        if self.observer is not None:
+            self.observer.update(mask, self.sensors.values)
+
+    def _matrices(self) -> tuple[Array, ...]:
+        """What terms read, in the order of ``evaluation.MATRICES``."""
+        estimate = self._no_estimate if self.observer is None else self.observer.values
+        return (
+            self.sensors.values, estimate, self._truth(), self.command, self.action, self._previous_action, self._start,
+            self._clock,
+        )  # fmt: skip
 
     def _truth(self) -> Array:
         """The true state, or what a real robot measures of it."""
         return self.plant.truth().values if self.plant.capabilities.has_truth else measured_truth(self.sensors)
 
-    def _observe(self, mask: Mask, sensors: Array, first: bool) -> None:
+    def _observe(self, mask: Mask, first: bool) -> None:
+        matrices = self._matrices()
+        sensors, estimate, truth = matrices[:3]
+        if self._computation is not None:
+            self._clock[:, 0] = self.ticks * self.task.config.control_period
+            self._computation.run(mask, *matrices, self._computation.numbers, self._computed)
         kernels.observe(
-            mask, first, sensors, self.command, self.action, self.episode_seeds, self.ticks, self._bias, self._delays,
-            self._sampled_index, self._sampled_value, self._sampled_stream, self._column_index, self._column_value,
-            self._ring, self.observation,
+            mask, first, sensors, self.command, self.action, estimate, self._computed, truth, self.episode_seeds, self.ticks,
+            self._bias, self._delays, self._sampled_index, self._sampled_value, self._sampled_stream, self._column_index,
+            self._column_value, self._ring, self.observation,
         )  # fmt: skip
         if self.dictionary:
-            kernels.pick(mask, self.plant.truth().values, self._privileged_columns, self._privileged_value, self.privileged)
+            kernels.pick(mask, truth, self._computed, self._privileged_index, self._privileged_value, self.privileged)
 
     def _bad_action(self, given: NDArray[np.float32], index: int) -> InputError:
         row, joint = divmod(int(index), given.shape[1])
@@ -429,6 +490,16 @@ class Core:
     def close(self) -> None:
         """Release the plant."""
         self.plant.close()
+
+
+def _share(ramp: RampConfig | None, steps: float) -> float:
+    return 1.0 if ramp is None else min(1.0, ramp.start + (1.0 - ramp.start) * steps / ramp.steps)
+
+
+def yaw_of(quaternion: Array) -> Array:
+    """Return the heading of the body's x axis in the floor (rad) for quaternions (N, 4) as (w, x, y, z)."""
+    w, x, y, z = quaternion.T
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def read_actions(actions: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -15,7 +15,7 @@ from wlr_gym.random import normals4
 from wlr_gym.tasks.draws import uniform
 
 #: Sources of an observation column, as numbered in the index tables.
-SOURCES = ("sensors", "command", "action")
+SOURCES = ("sensors", "command", "action", "estimate", "computed", "truth")
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -48,11 +48,14 @@ def take_action(mask: Any, given: Any, limit: float, table: Any, action: Any, pr
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_command(
-    i: int, now: int, seeds: Any, stream: Any, table: Any, timing: Any, command: Any, until: Any, draws: Any
+def _draw_target(
+    i: int, now: int, seeds: Any, stream: Any, table: Any, timing: Any, target: Any, until: Any, draws: Any
 ) -> None:
-    """Draw robot i's commands and how long they hold. ``timing``: hold low and high (ticks), probability of all zero."""
-    width = command.shape[1]
+    """Draw where robot i's commands go to and how long they stay there.
+
+    ``timing``: hold low and high (ticks), probability of all zero, share of the ranges about their middle.
+    """
+    width = target.shape[1]
     counter = draws[i] * (width + 2)
     draws[i] += 1
     hold = timing[0] + (timing[1] - timing[0]) * uniform(seeds[i], stream, counter)
@@ -60,16 +63,34 @@ def _draw_command(
     stop = uniform(seeds[i], stream, counter + 1) < timing[2]
     for c in range(width):
         u = uniform(seeds[i], stream, counter + 2 + c)
-        command[i, c] = 0.0 if stop else table[c, 0] + (table[c, 1] - table[c, 0]) * u
+        if timing[3] != 1.0:
+            u = 0.5 + timing[3] * (u - 0.5)
+        target[i, c] = 0.0 if stop else table[c, 0] + (table[c, 1] - table[c, 0]) * u
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def start_commands(mask: Any, seeds: Any, stream: Any, table: Any, timing: Any, command: Any, until: Any, draws: Any) -> None:
-    """Draw the first commands of an episode."""
+def start_commands(
+    mask: Any, seeds: Any, stream: Any, table: Any, timing: Any, command: Any, target: Any, until: Any, draws: Any
+) -> None:
+    """Draw the first commands of an episode. Those that ramp begin at zero."""
     for i in range(command.shape[0]):
         if mask[i]:
             draws[i] = 0
-            _draw_command(i, 0, seeds, stream, table, timing, command, until, draws)
+            _draw_target(i, 0, seeds, stream, table, timing, target, until, draws)
+            for c in range(command.shape[1]):
+                command[i, c] = 0.0
+            _follow(i, table, command, target)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _follow(i: int, table: Any, command: Any, target: Any) -> None:
+    """Move robot i's commands towards their targets, no further than ``table[:, 2]`` in a tick."""
+    for c in range(command.shape[1]):
+        change = target[i, c] - command[i, c]
+        if abs(change) <= table[c, 2]:
+            command[i, c] = target[i, c]
+        else:
+            command[i, c] += math.copysign(table[c, 2], change)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -85,10 +106,14 @@ def advance(
     table: Any,
     timing: Any,
     command: Any,
+    target: Any,
     until: Any,
     draws: Any,
 ) -> bool:
-    """Count a tick, set the end flags, draw new commands where their time is up. Returns whether any episode ended."""
+    """Count a tick, set the end flags, draw new commands where their time is up, let commands ramp.
+
+    ``table`` (C, 3): low, high, largest change in a tick. Returns whether any episode ended.
+    """
     any_done = False
     for i in range(command.shape[0]):
         if not mask[i]:
@@ -101,7 +126,8 @@ def advance(
         truncated[i] = ticks[i] >= limit
         any_done = any_done or terminated[i] or truncated[i]
         if ticks[i] >= until[i]:
-            _draw_command(i, ticks[i], seeds, stream, table, timing, command, until, draws)
+            _draw_target(i, ticks[i], seeds, stream, table, timing, target, until, draws)
+        _follow(i, table, command, target)
     return any_done  # fmt: skip
 
 
@@ -112,6 +138,9 @@ def observe(
     sensors: Any,
     command: Any,
     action: Any,
+    estimate: Any,
+    computed: Any,
+    truth: Any,
     seeds: Any,
     ticks: Any,
     bias: Any,
@@ -146,7 +175,18 @@ def observe(
         for w in range(width):
             column = sampled_index[w, 1]
             source = sampled_index[w, 0]
-            value = sensors[i, column] if source == 0 else (command[i, column] if source == 1 else action[i, column])
+            if source == 0:
+                value = sensors[i, column]
+            elif source == 1:
+                value = command[i, column]
+            elif source == 2:
+                value = action[i, column]
+            elif source == 3:
+                value = estimate[i, column]
+            elif source == 4:
+                value = computed[i, column]
+            else:
+                value = truth[i, column]
             value = value - sampled_value[w, 0] + bias[i, w]
             if sampled_value[w, 1] > 0.0:
                 value += sampled_value[w, 1] * normals4(seeds[i], sampled_stream[w], ticks[i], 0)[0]
@@ -168,11 +208,17 @@ def observe(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pick(mask: Any, values: Any, columns: Any, column_value: Any, out: Any) -> None:
-    """Copy chosen columns, clipped to a limit and scaled: (D, 2) limit and scale."""
+def pick(mask: Any, truth: Any, computed: Any, index: Any, column_value: Any, out: Any) -> None:
+    """Copy chosen columns, clipped to a limit and scaled.
+
+    Args:
+        index: (D, 2) source (see ``SOURCES``) and column there. column_value: (D, 2) limit and scale.
+    """
     for i in range(out.shape[0]):
         if not mask[i]:
             continue
         for d in range(out.shape[1]):
             limit = column_value[d, 0]
-            out[i, d] = column_value[d, 1] * min(max(values[i, columns[d]], -limit), limit)
+            column = index[d, 1]
+            value = computed[i, column] if index[d, 0] == 4 else truth[i, column]
+            out[i, d] = column_value[d, 1] * min(max(value, -limit), limit)

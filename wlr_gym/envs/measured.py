@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.codegen import Graph
-from wlr_gym.envs.evaluation import matrix_columns
 from wlr_gym.errors import InputError
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Sensors
-from wlr_gym.tasks.signals import Signals
-from wlr_gym.tasks.task import Task
-from wlr_gym.tasks.terms import REWARDS, TERMINATIONS, ScalarTerm
+from wlr_gym.tasks.task import Task, signals_of
+from wlr_gym.tasks.terms import COMPUTED, MEASURES, REWARDS, TERMINATIONS
 
 Array = NDArray[np.float64]
 
@@ -37,36 +35,29 @@ def measured_truth(sensors: Sensors) -> Array:
 
 
 def measurable(task: Task) -> tuple[Task, tuple[str, ...]]:
-    """Return the task with the rewards and terminations that a robot can measure, and the names of those it cannot.
+    """Return the task with the rewards, terminations and measures that a robot can measure, and the names of those it cannot.
 
     A robot does not know its speed over the floor, its slip, or the height of its body. It is the safety gate that watches its
-    tilt.
+    tilt. The slip observer runs on its sensors, without a camera.
 
     Raises:
-        InputError: an observation of the camera's, which the robot has not got.
+        InputError: an observation that needs the true state or the camera.
     """
     for column in task.policy:
         if column.device == "camera":
             raise InputError(f"observation '{column.term}': the robot has no camera of its own")
-    config = task.config
-    rewards = {name: values for name, values in config.rewards.items() if _is_known(task, REWARDS[name])}
-    terminations = {name: values for name, values in config.terminations.items() if _is_known(task, TERMINATIONS[name])}
-    left_out = tuple(name for name in [*config.rewards, *config.terminations] if name not in rewards | terminations)
-    return replace(task, config=config.model_copy(update={"rewards": rewards, "terminations": terminations})), left_out
+        if column.source == "truth" or (column.source == "computed" and not _is_known(COMPUTED[column.term].function)):
+            raise InputError(f"observation '{column.term}': only a simulator knows the true state")
+    kept, left_out = {}, []
+    for group, registry in (("rewards", REWARDS), ("terminations", TERMINATIONS), ("measures", MEASURES)):
+        chosen = getattr(task.config, group)
+        kept[group] = {name: values for name, values in chosen.items() if _is_known(registry[name].function)}
+        left_out += [name for name in chosen if name not in kept[group]]
+    kept["success"] = {name: limits for name, limits in task.config.success.items() if name in kept["measures"]}
+    config = task.config.model_copy(update=kept)
+    return replace(task, config=config, privileged=()), tuple(dict.fromkeys(left_out))
 
 
-def _is_known(task: Task, term: ScalarTerm) -> bool:
+def _is_known(function: Callable[..., Any]) -> bool:
     """Whether all signals that a term reads can be measured."""
-    return all(name in _KNOWN for name in _signals_of(task, term) if name.startswith("truth."))
-
-
-def _signals_of(task: Task, term: ScalarTerm) -> set[str]:
-    graph, names, columns = Graph(), set(), matrix_columns(task)
-
-    def read(name: str) -> object:
-        names.add(name)
-        return graph.input(name) if name in columns else 1.0
-
-    parameters: Mapping[str, float] = term.parameters
-    term.function(Signals(read), **parameters)
-    return names
+    return all(name in _KNOWN for name in signals_of(function) if name.startswith(("truth.", "start[")))

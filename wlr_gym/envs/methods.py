@@ -16,6 +16,10 @@ class TaskMethods:
         """Command all robots from the next step on, until their episodes end: ``set_command(linear_velocity_x=0.1)``."""
         self.core.set_command(values)
 
+    def set_progress(self, steps: float) -> None:
+        """Say how many environment steps, of all robots together, a training has done, for the task's curriculum."""
+        self.core.set_progress(steps)
+
     def describe(self) -> str:
         """Return the task's tables as text."""
         return self.core.describe()

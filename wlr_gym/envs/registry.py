@@ -6,7 +6,12 @@ from wlr_gym.errors import unknown_name
 
 #: id -> (task, class of the single and of the vector environment).
 ENVIRONMENTS: dict[str, tuple[str, str, str]] = {
-    "WLR-Velocity-v0": ("velocity", "wlr_gym.envs.velocity:VelocityEnv", "wlr_gym.envs.velocity:VelocityVectorEnv"),
+    f"WLR-{name.capitalize()}-v0": (
+        name,
+        f"wlr_gym.envs.{name}:{name.capitalize()}Env",
+        f"wlr_gym.envs.{name}:{name.capitalize()}VectorEnv",
+    )
+    for name in ("velocity", "path", "posture", "slope")
 }
 
 

@@ -1,22 +1,47 @@
 """Evaluation: whole episodes as one batch, score cards with confidence intervals, and their plots."""
 
-from wlr_gym.evaluation.card import METRICS, Card, Estimate, rows, score, write_card
+from wlr_gym.evaluation.campaign import FIRST_SEED, Condition, play, work
+from wlr_gym.evaluation.card import MAIN, OTHER_PLANT, Card, score
 from wlr_gym.evaluation.curve import read_curve
+from wlr_gym.evaluation.metrics import Metric, Played, metrics_of, summarise
 from wlr_gym.evaluation.record import Recorder, record_episodes, write_samples
-from wlr_gym.evaluation.rollout import Rollout, make_core, roll_out
+from wlr_gym.evaluation.rollout import Measure, Rollout, make_core, roll_out
+from wlr_gym.evaluation.statistics import Estimate
+from wlr_gym.evaluation.subjects import Subject, make_player, read_subjects
+from wlr_gym.evaluation.sweeps import read_sweep, sweeps_for
+from wlr_gym.evaluation.write import comparison_rows, rows, sweep_rows, transfer_rows, write_card, write_episodes
 
 __all__ = [
-    "METRICS",
+    "FIRST_SEED",
+    "MAIN",
+    "OTHER_PLANT",
     "Card",
+    "Condition",
     "Estimate",
+    "Measure",
+    "Metric",
+    "Played",
     "Recorder",
     "Rollout",
+    "Subject",
+    "comparison_rows",
     "make_core",
+    "make_player",
+    "metrics_of",
+    "play",
     "read_curve",
+    "read_subjects",
+    "read_sweep",
     "record_episodes",
     "roll_out",
     "rows",
     "score",
+    "summarise",
+    "sweep_rows",
+    "sweeps_for",
+    "transfer_rows",
+    "work",
     "write_card",
+    "write_episodes",
     "write_samples",
 ]

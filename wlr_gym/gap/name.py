@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.fit import (
+    SETTLED,
     SHARES,
     Fit,
     Model,
     constrained_step,
     cross_products,
     fit,
+    linearise,
     moved,
     nominal_model,
     normal_equations,
@@ -33,7 +35,9 @@ Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
 #: Hypotheses that are refitted in one round, at most so many per name, and rounds of refitting.
-SHORTLIST, PER_NAME, ROUNDS = 8, 3, 3
+SHORTLIST, PER_NAME, ROUNDS = 8, 3, 6
+#: Share of what the best hypothesis buys by which one start may be behind another of the same before it is given up.
+BEHIND = 0.5
 #: The best of every name that buys at least this share of what the best buys is fitted in full before one is taken; so many.
 FINALIST, FINALISTS = 0.75, 3
 #: Beside a set of places its best single place is fitted in full, if it buys at least this share.
@@ -136,9 +140,25 @@ def shortlist(scores: Sequence[Score], size: int = SHORTLIST) -> list[Score]:
 
 
 def name_effects(
-    problem: Problem, runs: Sequence[int], start: Fit, others: Sequence[int] = (), tell: Tell = lambda text: None
+    problem: Problem,
+    runs: Sequence[int],
+    start: Fit,
+    others: Sequence[int] = (),
+    tell: Tell = lambda text: None,
+    given: Sequence[NDArray[np.float32]] | None = None,
 ) -> Naming:
-    """Look for missing effects in ``runs``, beginning with the calibrated model ``start``; ``others`` must agree."""
+    """Look for missing effects.
+
+    Args:
+        problem: the system.
+        runs: those that are fitted.
+        start: the calibrated model.
+        others: runs that must agree.
+        tell: told of progress.
+        given: columns of the model as its file says, where they are known.
+    """
+    if given is None and not problem.thorough:
+        given = linearise(problem, nominal_model(problem), runs)[1]
     current, rounds = start, []
     models = [start.model]
     while True:
@@ -148,7 +168,9 @@ def name_effects(
         scores = screen(candidates, found)
         chosen = scores if problem.thorough else shortlist(scores)
         tell(f"refitting {len(chosen)} hypotheses")
-        hypotheses = (refit_thoroughly if problem.thorough else refit)(problem, runs, current, chosen)
+        hypotheses = (
+            refit_thoroughly(problem, runs, current, chosen) if given is None else refit(problem, runs, current, chosen, given)
+        )
         finals = finalists(problem, runs, hypotheses, others, tell)
         chosen_final = _accepted(current, finals)
         taken = None if chosen_final is None else chosen_final.hypothesis
@@ -233,11 +255,7 @@ def finalists(
     wholes = []
     for hypothesis in best.values():
         tell(f"fitting {hypothesis.candidate.label} in full")
-        near = fit(problem, runs, hypothesis.model, steps=1, tell=tell)
-        # calibration may have taken on what the effect does, and not let go of it: begin once more from the model as given
-        fresh = fit(problem, runs, _afresh(problem, hypothesis), steps=problem.steps, tell=tell)
-        memory = min((near, fresh), key=lambda whole: whole.cost).noise.memory
-        wholes.append(min((near, fresh), key=lambda whole: total_cost(problem, whole.model, whole.residuals, memory)))
+        wholes.append(fit(problem, runs, hypothesis.model, steps=problem.steps, tell=tell))
     if not wholes:
         return []
     memory = min(wholes, key=lambda whole: whole.cost).noise.memory
@@ -251,15 +269,6 @@ def finalists(
         final = replace(hypothesis, model=whole.model, gain=gain, by_run=by_run, residuals=whole.residuals, carries_over=agreed)
         found.append(Final(final, whole))
     return sorted(found, key=lambda final: -final.hypothesis.gain)
-
-
-def _afresh(problem: Problem, hypothesis: Hypothesis) -> Model:
-    """All numbers nominal, the effects found before as they are, the new one as it was probed."""
-    candidate = hypothesis.candidate
-    return Model(
-        nominal_model(problem).quantities,
-        (*hypothesis.model.effects[:-1], (candidate, _probed(candidate, candidate.starts[0]))),
-    )
 
 
 def _probed(candidate: Candidate, start: Start) -> tuple[float, ...]:
@@ -305,36 +314,101 @@ def _by_run(before: Sequence[Array], after: Sequence[Array], noise: Noise) -> Ar
     return np.array([np.nansum((b * b - a * a) * noise.weight) for b, a in zip(before, after, strict=True)])
 
 
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """One start of a hypothesis' refit, and how far it got.
+
+    Attributes:
+        of: which hypothesis; -1 = none, the model without an effect more.
+        known: columns of the numbers that all hypotheses share, where the trial started.
+        model, residuals: the best so far.
+        settled: whether another step gains nothing.
+    """
+
+    of: int
+    known: Sequence[NDArray[np.float32]] = field(repr=False)
+    model: Model
+    residuals: list[Array] = field(default_factory=list, repr=False)
+    settled: bool = False
+
+
 def refit(
-    problem: Problem, runs: Sequence[int], current: Fit, scores: Sequence[Score], rounds: int = ROUNDS
+    problem: Problem,
+    runs: Sequence[int],
+    current: Fit,
+    scores: Sequence[Score],
+    given: Sequence[NDArray[np.float32]],
+    rounds: int = ROUNDS,
 ) -> list[Hypothesis]:
     """Refit every hypothesis together with all known numbers; best first.
 
-    The responses of the known numbers are those of ``current``; those of each hypothesis' own unknowns are simulated anew.
+    Each starts twice: from the calibrated model with its first guess, and from the model as given with its probe, as
+    calibration may have taken on what the effect does, and not let go of it. The responses of the known numbers are those of
+    the two starts; those of each hypothesis' own unknowns are simulated anew.
     """
     if not scores:
         return []
-    models = [current.model.with_effect(score.candidate, score.values) for score in scores]
-    models.append(current.model)  # without an effect more: what the others must beat, refitted as they are
-    residuals = _residuals(problem, models, runs)
+    trials = _simulated(problem, _starts(problem, current, scores, given), runs)
     for _ in range(rounds):
-        memory = _best_memory(problem, current, models, residuals)
-        noise = estimate_noise(min(residuals, key=lambda r: minus_two_log_likelihood(r, memory)), memory)
-        known, _ = normal_equations(current.columns, current.residuals, noise)
-        columns = _own_columns(problem, models, residuals, runs)
-        tries, owner = [], []
-        for k, model in enumerate(models):
-            change = constrained_step(problem, model, *_bordered(known, current, columns[k], residuals[k], noise))
-            tries += [moved(problem, model, share * change) for share in SHARES[:3]]
-            owner += [k] * 3
-        found = _residuals(problem, tries, runs)
-        costs = [total_cost(problem, model, residual, memory) for model, residual in zip(tries, found, strict=True)]
-        for k in range(len(models)):
-            mine = [i for i, who in enumerate(owner) if who == k]
-            best = min(mine, key=lambda i: costs[i])
-            if costs[best] < total_cost(problem, models[k], residuals[k], memory):
-                models[k], residuals[k] = tries[best], found[best]
-    return _ranked(problem, current, scores, models, residuals)
+        memory = _best_memory(problem, current, trials)
+        noise = estimate_noise(min((t.residuals for t in trials), key=lambda r: minus_two_log_likelihood(r, memory)), memory)
+        going = [trial for trial in trials if not trial.settled]
+        if not going:
+            break
+        moved_on = _improved(problem, runs, current, going, noise)
+        trials = _hopeful(problem, [*(trial for trial in trials if trial.settled), *moved_on], memory)
+    memory = _best_memory(problem, current, trials)
+    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
+    best = [
+        trials[min((k for k, t in enumerate(trials) if t.of == of), key=lambda k: costs[k])] for of in (*range(len(scores)), -1)
+    ]
+    return _ranked(problem, scores, [t.model for t in best], [t.residuals for t in best], memory)
+
+
+def _improved(problem: Problem, runs: Sequence[int], current: Fit, trials: Sequence[_Trial], noise: Noise) -> list[_Trial]:
+    """The trials one Gauss-Newton step on."""
+    bases = {id(trial.known): trial.known for trial in trials}
+    matrices = {key: normal_equations(known, current.residuals, noise)[0] for key, known in bases.items()}
+    tries = []
+    for trial, own in zip(trials, _own_columns(problem, trials, runs), strict=True):
+        equations = _bordered(matrices[id(trial.known)], trial.known, own, trial.residuals, noise)
+        change = constrained_step(problem, trial.model, *equations)
+        tries += [replace(trial, model=moved(problem, trial.model, share * change)) for share in SHARES[:3]]
+    tries = _simulated(problem, tries, runs)
+    improved = []
+    for k, trial in enumerate(trials):
+        now = total_cost(problem, trial.model, trial.residuals, noise.memory)
+        best = min(tries[3 * k : 3 * k + 3], key=lambda t: total_cost(problem, t.model, t.residuals, noise.memory))
+        gained = now - total_cost(problem, best.model, best.residuals, noise.memory)
+        improved.append(replace(best if gained > 0.0 else trial, settled=gained < SETTLED))
+    return improved
+
+
+def _hopeful(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[_Trial]:
+    """Of two starts of a hypothesis the better one, if the other is far behind."""
+    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
+    least = {of: min(c for c, t in zip(costs, trials, strict=True) if t.of == of) for of in {t.of for t in trials}}
+    room = max(max(least.values()) - min(least.values()), LEAST_GAIN)
+    return [t for c, t in zip(costs, trials, strict=True) if c - least[t.of] < BEHIND * room]
+
+
+def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequence[NDArray[np.float32]]) -> list[_Trial]:
+    """Where refits begin. The model as given keeps the effects found before."""
+    count = len(problem.quantities)
+    given = [np.vstack([column, now[count:]]) for column, now in zip(given, current.columns, strict=True)]
+    untouched = replace(current.model, quantities=nominal_model(problem).quantities)
+    trials = [_Trial(-1, current.columns, current.model)]
+    for k, score in enumerate(scores):
+        candidate = score.candidate
+        trials.append(_Trial(k, current.columns, current.model.with_effect(candidate, score.values)))
+        trials.append(_Trial(k, given, untouched.with_effect(candidate, _probed(candidate, candidate.starts[0]))))
+    return trials
+
+
+def _simulated(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) -> list[_Trial]:
+    """The trials with the residuals of their models."""
+    found = problem.residuals([trial.model.setting for trial in trials], runs)
+    return [replace(trial, residuals=[r[k] for r in found]) for k, trial in enumerate(trials)]
 
 
 def refit_thoroughly(problem: Problem, runs: Sequence[int], current: Fit, scores: Sequence[Score]) -> list[Hypothesis]:
@@ -351,7 +425,9 @@ def refit_thoroughly(problem: Problem, runs: Sequence[int], current: Fit, scores
         for score in scores
     ]
     fits.append(fit(problem, runs, current.model, memory=memory, steps=problem.steps))
-    return _ranked(problem, current, scores, [f.model for f in fits], [f.residuals for f in fits])
+    trials = [_Trial(k, found.columns, found.model, found.residuals) for k, found in enumerate(fits)]
+    memory = _best_memory(problem, current, trials)
+    return _ranked(problem, scores, [t.model for t in trials], [t.residuals for t in trials], memory)
 
 
 def _starting_values(score: Score) -> list[tuple[float, ...]]:
@@ -361,22 +437,22 @@ def _starting_values(score: Score) -> list[tuple[float, ...]]:
 
 
 def _bordered(
-    known: Array, current: Fit, own: Sequence[Array], residuals: Sequence[Array], noise: Noise
+    matrix: Array, known: Sequence[NDArray[np.float32]], own: Sequence[Array], residuals: Sequence[Array], noise: Noise
 ) -> tuple[Array, Array]:
     """Normal equations of the known numbers, whose matrix is given, and a candidate's own unknowns."""
     both = [np.concatenate([columns, residual[None]]) for columns, residual in zip(own, residuals, strict=True)]
-    across = cross_products(current.columns, both, noise)
+    across = cross_products(known, both, noise)
     root = np.sqrt(noise.weight)
     flat = [np.nan_to_num(part * root).reshape(len(part), -1) for part in both]
     inner = np.sum([part @ part.T for part in flat], axis=0)
-    matrix = np.block([[known, across[:, :-1]], [across[:, :-1].T, inner[:-1, :-1]]])
-    return matrix, np.concatenate([across[:, -1], inner[:-1, -1]])
+    whole = np.block([[matrix, across[:, :-1]], [across[:, :-1].T, inner[:-1, :-1]]])
+    return whole, np.concatenate([across[:, -1], inner[:-1, -1]])
 
 
 def _ranked(
-    problem: Problem, current: Fit, scores: Sequence[Score], models: Sequence[Model], residuals: Sequence[list[Array]]
+    problem: Problem, scores: Sequence[Score], models: Sequence[Model], residuals: Sequence[list[Array]], memory: Array
 ) -> list[Hypothesis]:
-    memory = _best_memory(problem, current, models, residuals)
+    """Hypotheses from refitted models, the last of which has no effect more; best first."""
     base = total_cost(problem, models[-1], residuals[-1], memory)
     found = []
     for score, model, residual in zip(scores, models[:-1], residuals[:-1], strict=True):
@@ -386,45 +462,37 @@ def _ranked(
     return sorted(found, key=lambda hypothesis: -hypothesis.gain)
 
 
-def _best_memory(problem: Problem, current: Fit, models: Sequence[Model], residuals: Sequence[list[Array]]) -> Array:
+def _best_memory(problem: Problem, current: Fit, trials: Sequence[_Trial]) -> Array:
     """Memory of the residuals of the best model so far: the same for all that are compared."""
-    costs = [total_cost(problem, m, r, current.noise.memory) for m, r in zip(models, residuals, strict=True)]
-    best = int(np.argmin(costs))
-    if costs[best] >= total_cost(problem, current.model, current.residuals, current.noise.memory):
-        return current.noise.memory
-    return estimate_noise(residuals[best]).memory
+    memory = current.noise.memory
+    best = min(trials, key=lambda t: total_cost(problem, t.model, t.residuals, memory))
+    if total_cost(problem, best.model, best.residuals, memory) >= current.cost:
+        return memory
+    return estimate_noise(best.residuals).memory
 
 
-def _residuals(problem: Problem, models: Sequence[Model], runs: Sequence[int]) -> list[list[Array]]:
-    """Residuals per model, per run."""
-    found = problem.residuals([model.setting for model in models], runs)
-    return [[r[k] for r in found] for k in range(len(models))]
+def _own_columns(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) -> list[list[Array]]:
+    """Responses of each trial's last effect's unknowns, scaled by their steps: per trial, per run, (unknowns, rows, channels).
 
-
-def _own_columns(
-    problem: Problem, models: Sequence[Model], residuals: Sequence[list[Array]], runs: Sequence[int]
-) -> list[list[Array]]:
-    """Responses of each model's last effect's unknowns, scaled by their steps: per model, per run, (unknowns, rows, channels).
-
-    Only those of the last effect are simulated anew: the others' are among the known columns. The last model has none.
+    Only those of the last effect are simulated anew: the others' are among the known columns.
     """
     settings: list[Setting] = []
     taken: list[list[float]] = []
-    for model in models[:-1]:
-        candidate, values = model.effects[-1]
-        steps = []
+    for trial in trials:
+        taken.append([])
+        if trial.of < 0:
+            continue
+        candidate, values = trial.model.effects[-1]
         for k, unknown in enumerate(candidate.unknowns):
             step = unknown.step if values[k] + unknown.step <= unknown.high else -unknown.step
             changed = tuple(v + step * (i == k) for i, v in enumerate(values))
-            settings.append(Model(model.quantities, (*model.effects[:-1], (candidate, changed))).setting)
-            steps.append(step / unknown.step)
-        taken.append(steps)
+            settings.append(replace(trial.model, effects=(*trial.model.effects[:-1], (candidate, changed))).setting)
+            taken[-1].append(step / unknown.step)
     found = problem.residuals(settings, runs)
     columns, at = [], 0
-    for residual, steps in zip(residuals[:-1], taken, strict=True):
+    for trial, steps in zip(trials, taken, strict=True):
         mine = [r[at : at + len(steps)] for r in found]
-        columns.append(
-            [np.nan_to_num((r - base) / np.array(steps)[:, None, None]) for r, base in zip(mine, residual, strict=True)]
-        )
+        scale = np.array(steps)[:, None, None]
+        columns.append([np.nan_to_num((r - base) / scale) for r, base in zip(mine, trial.residuals, strict=True)])
         at += len(steps)
-    return [*columns, [np.zeros((0, *residual.shape)) for residual in residuals[-1]]]
+    return columns

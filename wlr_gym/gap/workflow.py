@@ -107,7 +107,7 @@ def analyse_problem(
     clock.start("calibrating")
     base = fit(problem, fitted, nominal_model(problem), columns=columns, steps=problem.steps, tell=clock.detail)
     clock.start("naming")
-    naming = name_effects(problem, fitted, base, sealed, clock.detail)
+    naming = name_effects(problem, fitted, base, sealed, clock.detail, columns)
     clock.start("proving")
     models = (nominal_model(problem), base.model, naming.fit.model)
     floor = problem.floor(naming.fit.model.setting, sealed)

@@ -1,18 +1,39 @@
 """Policies and agents: how they are called, loaded by name, saved with their contract, and refused where they do not fit."""
 
 from wlr_gym.policy.agents import Agent, Policy, Training, agent_names, load_agent, load_agent_config
-from wlr_gym.policy.file import check_contract, load_policy, make_policy, read_contract, write_contract
+from wlr_gym.policy.export import Parity, export_policy
+from wlr_gym.policy.file import check_contract, needs_camera, read_contract, write_contract
+from wlr_gym.policy.model_card import check_model_card, write_model_card
+from wlr_gym.policy.sources import (
+    contract_of,
+    find_policy,
+    load_policy,
+    make_policy,
+    policy_environment,
+    shipped_names,
+    trained_environment,
+)
 
 __all__ = [
     "Agent",
+    "Parity",
     "Policy",
     "Training",
     "agent_names",
     "check_contract",
+    "check_model_card",
+    "contract_of",
+    "export_policy",
+    "find_policy",
     "load_agent",
     "load_agent_config",
     "load_policy",
     "make_policy",
+    "needs_camera",
+    "policy_environment",
     "read_contract",
+    "shipped_names",
+    "trained_environment",
     "write_contract",
+    "write_model_card",
 ]

@@ -56,7 +56,7 @@ class Training:
 
 
 class Agent(Protocol):
-    """The functions of an ``agent.py``. ``load_policy`` and ``train`` are absent where there is nothing to learn."""
+    """The functions of an ``agent.py``. All but ``make_policy`` are absent where there is nothing to learn, or to export."""
 
     def make_policy(self, contract: Contract, config: Config) -> Policy:
         """Return the policy an agent has before any training, for an environment's contract."""
@@ -68,6 +68,10 @@ class Agent(Protocol):
 
     def train(self, training: Training) -> Path:
         """Train and return the folder of the final policy."""
+        ...
+
+    def export_network(self, folder: Path, contract: Contract) -> bytes:
+        """Return the policy of a folder as an ONNX model: ``observation`` (N, D) to ``action`` (N, 8); see ``onnx_file``."""
         ...
 
 
@@ -113,7 +117,7 @@ def agent_function(name: str, function: str) -> Callable[..., Any]:
 def load_agent_config(name: str | Path, changes: tuple[str, ...] = ()) -> dict[str, Any]:
     """Read ``configs/agent/<name>.yaml`` (or a path) and lay changes such as ``environment.precision=float64`` over it.
 
-    A name without a file is an agent without settings: empty.
+    A name without a file is an agent without settings: empty. ``base: NAME`` in a file lays it over another.
 
     Raises:
         InputError: no such file, broken YAML, or a change that is not ``key=value``.
@@ -126,9 +130,21 @@ def load_agent_config(name: str | Path, changes: tuple[str, ...] = ()) -> dict[s
         config = read_yaml(path) or {}
         if not isinstance(config, dict):
             raise InputError(f"{path}: expected a mapping, got {type(config).__name__}")
+    if "base" in config:
+        config = _merged(load_agent_config(config.pop("base")), config)
     for change in changes:
         _apply(config, change)
     return config
+
+
+def _merged(base: dict[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``config`` laid over ``base``; groups merge key by key."""
+    groups = {key: _merged(base[key], value) for key, value in config.items() if _both_groups(base.get(key), value)}
+    return {**base, **config, **groups}
+
+
+def _both_groups(base: Any, value: Any) -> bool:
+    return isinstance(base, dict) and isinstance(value, dict)
 
 
 def _apply(config: dict[str, Any], change: str) -> None:

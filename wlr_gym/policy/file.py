@@ -7,16 +7,16 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.errors import InputError, nearest
+from wlr_gym.errors import InputError
 from wlr_gym.files import write_json
-from wlr_gym.policy.agents import Config, Contract, Policy, agent_function, agent_names, load_agent_config
+from wlr_gym.policy.agents import Config, Contract
 from wlr_gym.provenance import versions
 
 FORMAT = 1
 CONTRACT_FILE = "contract.json"
 #: Keys of an environment's contract that a policy depends on. The others (randomisation, commands, latency) are recorded only:
 #: a policy may be tried under conditions it was not trained in.
-BINDING = ("robot", "control_period", "observation", "action")
+BINDING = ("robot", "control_period", "observation", "observer", "action")
 #: Of an observation, what differs by conditions and not by meaning.
 CONDITIONS = ("noise", "bias", "sensor_noise")
 
@@ -55,12 +55,21 @@ def read_contract(folder: str | Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read: {error}") from None
     except json.JSONDecodeError as error:
         raise InputError(f"{path}, line {error.lineno}, column {error.colno}: broken JSON: {error.msg}") from None
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise InputError(f"{path}: not a policy contract of format {FORMAT}")
-    for key in ("agent", "environment", "config"):
-        if key not in content:
-            raise InputError(f"{path}: '{key}' is missing")
+    check_content(content, str(path))
     return content
+
+
+def check_content(content: Any, where: str) -> None:
+    """Refuse what is no policy contract.
+
+    Raises:
+        InputError: another format version, or a key is missing.
+    """
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(f"{where}: not a policy contract of format {FORMAT}")
+    for key in ("agent", "environment", "config"):
+        if not isinstance(content.get(key), str if key == "agent" else dict):
+            raise InputError(f"{where}: '{key}' is missing")
 
 
 def check_contract(policy: Contract, environment: Contract, where: str) -> None:
@@ -93,41 +102,6 @@ def _differences(name: str, mine: Any, theirs: Any) -> Iterator[tuple[str, Any, 
         yield name, mine, theirs
 
 
-def policy_folder(source: str | Path) -> Path | None:
-    """Return the policy folder that ``source`` names: itself, or the ``policy`` in a run folder; None where it is neither."""
-    for folder in (Path(source), Path(source) / "policy"):
-        if (folder / CONTRACT_FILE).is_file():
-            return folder
-    return None
-
-
-def load_policy(source: str | Path, environment: Contract) -> Policy:
-    """Load a trained policy for an environment.
-
-    Args:
-        source: policy folder, or run folder with a ``policy`` in it.
-        environment: what ``env.contract()`` returns.
-
-    Raises:
-        InputError: no policy there, broken contract, or a contract that does not fit, naming the first difference.
-    """
-    folder = policy_folder(source)
-    if folder is None:
-        raise InputError(f"'{source}': no policy there (looked for {CONTRACT_FILE} in it and in its folder 'policy')")
-    contract = read_contract(folder)
-    check_contract(contract["environment"], environment, str(folder))
-    return agent_function(contract["agent"], "load_policy")(folder, contract)
-
-
-def make_policy(source: str | Path, environment: Contract) -> Policy:
-    """Return the policy of an agent's name (with its shipped settings), or the trained one of a folder.
-
-    Raises:
-        InputError: neither an agent nor a policy folder, or a policy that does not fit the environment.
-    """
-    if str(source) in agent_names():
-        return agent_function(str(source), "make_policy")(environment, load_agent_config(source))
-    if not Path(source).exists():
-        hint = nearest(str(source), agent_names())
-        raise InputError(f"'{source}' is neither a policy folder nor an agent{hint}; agents: {', '.join(agent_names())}")
-    return load_policy(source, environment)
+def needs_camera(environment: Contract) -> bool:
+    """Whether what a policy is fed rests on camera poses, through the slip observer."""
+    return bool((environment.get("observer") or {}).get("camera"))

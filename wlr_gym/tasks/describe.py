@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from wlr_gym.robot import robot_hash, servo_hash
 from wlr_gym.tasks.entries import AreaConfig, EventConfig
 from wlr_gym.tasks.randomization import RandomizationConfig
-from wlr_gym.tasks.task import ObservationColumn, Task, robot_hash
-from wlr_gym.tasks.terms import COMMANDS, REWARDS, TERMINATIONS
+from wlr_gym.tasks.task import ObservationColumn, Task, TaskConfig
+from wlr_gym.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 
 
 def describe(task: Task) -> str:
-    """Return the task's action, observation, command, reward and termination tables as text (reStructuredText)."""
+    """Return the task's action, observation, command, reward, termination and measure tables as text (reStructuredText)."""
     config = task.config
     command_rows = [
-        (name, COMMANDS[name].unit, COMMANDS[name].frame, f"[{low:g}, {high:g}]", COMMANDS[name].doc)
+        (name, COMMANDS[name].unit, COMMANDS[name].frame, f"[{low:g}, {high:g}]", _ramp(config, name), COMMANDS[name].doc)
         for name, (low, high) in config.commands.terms.items()
     ]
     reward_rows = [
@@ -30,8 +31,8 @@ def describe(task: Task) -> str:
         (str(index), column_name(column), column.unit, column.frame, f"{column.scale:g}", f"{column.limit:g}")
         for index, column in enumerate(task.privileged)
     ]
-    low, high = config.commands.hold_time
-    stop, period = config.commands.zero_probability, config.control_period * 1000
+    measure_rows = [(name, MEASURES[name].unit, _success(config, name), MEASURES[name].doc) for name in task.measures]
+    period = config.control_period * 1000
     return "\n".join(
         [
             f"**Action** ``Box(-1, 1, ({len(task.actions)},), float32)``: goal = clip(centre + scale * action, low, high)",
@@ -40,12 +41,14 @@ def describe(task: Task) -> str:
             *table(_OBSERVATION_HEADER, _observation_rows(task)),
             f'**Privileged observation** (``observation="dict"``): ``Box(({len(task.privileged)},), float32)``',
             *table(("index", "name", "unit", "frame", "scale", "limit"), privileged_rows),
-            f"**Commands** drawn anew every {low:g} to {high:g} s, all zero with probability {stop:g}",
-            *table(("command", "unit", "frame", "range", "meaning"), command_rows),
+            f"**Commands** {_timing(config)}",
+            *table(("command", "unit", "frame", "range", "largest rate (1/s)", "meaning"), command_rows),
             "**Reward** sum of weight * term * control period",
             *table(("term", "weight (1/s)", "parameters", "meaning"), reward_rows),
             "**Terminated** when a term is greater than 0",
             *table(("term", "parameters", "meaning"), termination_rows),
+            "**Measured**, in ``core.measures``; an episode is a success when nothing terminated it and all limits hold",
+            *table(("measure", "unit", "limits", "meaning"), measure_rows),
             f"**Truncated** after {config.episode_length:g} s ({task.episode_ticks} control ticks of {period:g} ms).",
         ]
     )
@@ -53,6 +56,21 @@ def describe(task: Task) -> str:
 
 def _parameters(values: dict[str, float], defaults: dict[str, float]) -> str:
     return ", ".join(f"{name}={values.get(name, default):g}" for name, default in defaults.items()) or "-"
+
+
+def _timing(config: TaskConfig) -> str:
+    (low, high), stop = config.commands.hold_time, config.commands.zero_probability
+    drawn = "drawn once per episode" if low > config.episode_length else f"drawn anew every {low:g} to {high:g} s"
+    return f"{drawn}, all zero with probability {stop:g}" if stop else drawn
+
+
+def _ramp(config: TaskConfig, command: str) -> str:
+    return f"{config.commands.ramp[command]:g}" if command in config.commands.ramp else "-"
+
+
+def _success(config: TaskConfig, measure: str) -> str:
+    limits = config.success.get(measure)
+    return "-" if limits is None else ", ".join(f"{kind} {value:g}" for kind, value in limits if value is not None)
 
 
 def _action_rows(task: Task) -> list[tuple[str, ...]]:
@@ -176,17 +194,19 @@ def _area(area: AreaConfig) -> str:
 def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
     """Return what a policy must be fed and what its output means, as plain JSON types.
 
-    Keys: task, robot (name, hash), control_period, episode_length, observation (one entry per number, in order: name,
-    source, element, unit, frame, offset, scale, limit, lag, device), latency, action (one entry per number: joint, quantity,
-    unit, centre, scale, low, high), commands and randomization.
+    Keys: task, robot (name, hashes of its servos and of all its numbers), control_period, episode_length, observation (one
+    entry per number, in order: name, source, element, unit, frame, offset, scale, limit, lag, device), observer (settings of
+    the slip observer; None where no term needs it), latency, action (one entry per number: joint, quantity, unit, centre,
+    scale, low, high), commands and randomization.
     """
     config = task.config
     return {
         "task": config.name,
-        "robot": {"name": task.robot.name, "hash": robot_hash(task.robot)},
+        "robot": {"name": task.robot.name, "servo": servo_hash(task.robot), "hash": robot_hash(task.robot)},
         "control_period": config.control_period,
         "episode_length": config.episode_length,
         "observation": [_contract_column(column) for column in task.policy],
+        "observer": config.observer.model_dump(mode="json") if task.needs_observer else None,
         "latency": {device: latency.model_dump(mode="json") for device, latency in config.latency.items()},
         "action": [dict(vars(column)) for column in task.actions],
         "commands": {

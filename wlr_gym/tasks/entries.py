@@ -58,7 +58,8 @@ class EventConfig(Data):
             ``drift`` (all the time: a smooth path through draws ``interval`` seconds apart).
         distribution: ``uniform`` or ``loguniform`` (low, high), ``normal`` (mean, sigma, cut), ``choice`` (values), or
             ``tolerance``: normal with the tolerance the robot's file states, times ``sigmas``, cut at ``cut`` of them.
-        operation: ``set`` the value, ``scale`` or ``add`` to the nominal one.
+        operation: ``set`` the value, ``scale`` or ``add`` to the nominal one; ``below_friction_limit`` sets a slope to the
+            steepest one that the floor's drawn friction holds, atan(mu), less the value (rad), but not below 0.
         per: one draw per ``robot``, per ``label`` (joint, wheel, axis or patch; the same for all parameters listed), or
             ``element``.
         low, high, mean, sigma: numbers, or paths of numbers in the robot's file, such as ``sensors.imu.gyro_bias``.
@@ -69,7 +70,7 @@ class EventConfig(Data):
     parameters: tuple[str, ...] = Field(min_length=1)
     when: Literal["startup", "reset", "interval", "drift"] = "reset"
     distribution: Literal["uniform", "loguniform", "normal", "choice", "tolerance"]
-    operation: Literal["set", "scale", "add"] | None = None
+    operation: Literal["set", "scale", "add", "below_friction_limit"] | None = None
     per: Literal["robot", "label", "element"] = "robot"
     low: Number | None = None
     high: Number | None = None
@@ -110,9 +111,14 @@ class Sampler:
             name: np.flatnonzero([n == name for n in names]) for name in dict.fromkeys(names) if name in DISTRIBUTIONS
         }
 
-    def __call__(self, seeds: NDArray[np.uint64], counters: NDArray[np.int64]) -> Array:
-        """Return values (M, K) for seeds and counters of that shape, K entries."""
+    def __call__(self, seeds: NDArray[np.uint64], counters: NDArray[np.int64], spread: float = 1.0) -> Array:
+        """Return values (M, K) for seeds and counters of that shape, K entries.
+
+        ``spread`` below 1 moves every draw towards the middle of its distribution.
+        """
         u = uniforms(seeds, self._streams, counters)
+        if spread != 1.0:
+            u = 0.5 + spread * (u - 0.5)
         drawn = np.empty_like(u)
         for distribution, which in self._groups.items():
             drawn[:, which] = DISTRIBUTIONS[distribution](
@@ -172,6 +178,8 @@ def _entry(name: str, event: EventConfig, robot: Robot, element: str, where: str
         return _tolerance_entry(event, robot, element, common, where)
     if event.operation is None:
         raise InputError(f"{where}: 'operation' is missing; expected set, scale or add")
+    if event.operation == "below_friction_limit" and spec_of(element).name != "ground.slope":
+        raise InputError(f"{where}: operation 'below_friction_limit' goes with 'ground.slope' only, not with '{element}'")
     common |= {"operation": event.operation, "distribution": event.distribution}
     if event.distribution == "choice":
         if not event.values:

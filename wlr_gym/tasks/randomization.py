@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 Seeds = NDArray[np.uint64]
 
+#: Operation that sets a slope by the floor's friction, once that is drawn.
+BELOW_LIMIT = "below_friction_limit"
 #: s between the updates of a drifting parameter.
 DRIFT_PERIOD = 0.2
 
@@ -175,7 +177,10 @@ class Randomization:
         elements, columns: elements of the parameter table that it changes, and their columns.
         timed_elements, timed_columns: those that also change within an episode.
         intervals: names of the events that strike within an episode. drifts: of those that drift.
+        spread: share of every distribution about its middle that is drawn from: below 1 early in a curriculum.
     """
+
+    spread: float = 1.0
 
     def __init__(self, config: RandomizationConfig, robot: Robot, places: Mapping[str, str] | None = None) -> None:
         self.config = config
@@ -185,7 +190,7 @@ class Randomization:
         places = dict.fromkeys(config.events, "randomization") | dict(places or {})
         entries = [entry for name, event in config.events.items() for entry in entries_of(name, event, robot, places[name])]
         _refuse_double_set(entries, places)
-        self._operations = {kind: [e for e in entries if e.operation == kind] for kind in ("set", "scale", "add")}
+        self._operations = {kind: [e for e in entries if e.operation == kind] for kind in ("set", "scale", "add", BELOW_LIMIT)}
         entries = [entry for kind in self._operations.values() for entry in kind]
         self._sampler = Sampler(entries) if entries else None
         self.intervals, self.drifts = (
@@ -236,12 +241,12 @@ class Randomization:
         if occurrences is not None:
             counts[:, :strikes] = occurrences
         if self._drift_sampler is None:
-            return sampler(seeds, counts[:, self._clock])
+            return sampler(seeds, counts[:, self._clock], self.spread)
         knots = self._knots(episode_seeds, np.zeros(count) if time is None else time)
         counts[:, strikes:-1] = np.floor(knots)
-        drawn = sampler(seeds, counts[:, self._clock])
+        drawn = sampler(seeds, counts[:, self._clock], self.spread)
         clock = self._clock[self._drifting]
-        following = self._drift_sampler(seeds[:, self._drifting], counts[:, clock] + 1)
+        following = self._drift_sampler(seeds[:, self._drifting], counts[:, clock] + 1, self.spread)
         share = (knots - np.floor(knots))[:, clock - strikes]
         share = share * share * (3.0 - 2.0 * share)  # rises smoothly from 0 to 1: the path has no kinks at its knots
         drawn[:, self._drifting] += share * (following - drawn[:, self._drifting])
@@ -260,6 +265,9 @@ class Randomization:
             start += len(entries)
             if kind == "set":
                 values[:, columns] = block
+            elif kind == BELOW_LIMIT:
+                if entries:
+                    values[:, columns] = np.maximum(_friction_limit(values)[:, None] - block, 0.0)
             else:
                 operate = np.multiply if kind == "scale" else np.add
                 operate.at(values.T, columns, block.T)
@@ -277,7 +285,7 @@ class Randomization:
         state = standing_state(self.robot, parameters)
         if not self._spread.any():
             return state
-        offsets = self._spread * (2.0 * uniforms(episode_seeds, self._spread_streams) - 1.0)
+        offsets = self.spread * self._spread * (2.0 * uniforms(episode_seeds, self._spread_streams) - 1.0)
         home = state.joint_position[:, :4].copy()
         angles = np.clip(home + offsets[:, :4], *self.robot.leg_limits)
         state.position[:, 2] += (parameters["leg.length"] * (np.sin(angles) - np.sin(home))).mean(axis=1)
@@ -285,6 +293,12 @@ class Randomization:
         state.quaternion[:, 0], state.quaternion[:, 3] = np.cos(0.5 * offsets[:, 4]), np.sin(0.5 * offsets[:, 4])
         state.linear_velocity_in_body[:], state.angular_velocity_in_body[:] = offsets[:, 5:8], offsets[:, 8:11]
         return state
+
+
+def _friction_limit(values: Array) -> Array:
+    """Return the slope (M,) in rad that the mean friction along the wheels' headings just holds."""
+    robots = Parameters(values)
+    return np.arctan((robots["ground.mu_x"] * robots["wheel.grip"]).mean(axis=1))
 
 
 def _columns(entries: Sequence[Entry]) -> tuple[NDArray[np.int64], tuple[str, ...]]:
@@ -299,7 +313,7 @@ def _limits(config: RandomizationConfig, events: Sequence[str]) -> Array:
 def _refuse_double_set(entries: Sequence[Entry], places: Mapping[str, str]) -> None:
     setters: dict[int, str] = {}
     for entry in entries:
-        if entry.operation == "set" and setters.setdefault(entry.column, entry.event) != entry.event:
+        if entry.operation in ("set", BELOW_LIMIT) and setters.setdefault(entry.column, entry.event) != entry.event:
             other = setters[entry.column]
             where = " over ".join(dict.fromkeys([places[entry.event], places[other]]))
             raise InputError(

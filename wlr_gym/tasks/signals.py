@@ -1,4 +1,4 @@
-"""Named signals that reward and termination terms are written with.
+"""Named signals that rewards, terminations, measures and computed observations are written with.
 
 The same term runs on numpy arrays (one value per robot) and on trace nodes: only ``read`` differs.
 """
@@ -10,10 +10,14 @@ from typing import Any
 
 from wlr_gym.codegen import ops
 from wlr_gym.errors import unknown_name
+from wlr_gym.observer import ESTIMATE_LAYOUT
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Layout
 from wlr_gym.robot import JOINTS
 
 Value = Any  # float, numpy array (N,) or trace node
+
+#: Pose of the body origin where the episode began, floor frame: m, m, rad.
+START = ("x", "y", "yaw")
 
 
 class Signals:
@@ -21,7 +25,7 @@ class Signals:
 
     Args:
         read: returns the value of one scalar signal, such as ``truth.position[x]``, ``command.yaw_rate``,
-            ``action[leg_lf]``, ``robot.leg.length`` or ``task.control_period``.
+            ``estimate.yaw``, ``action[leg_lf]``, ``robot.leg.length``, ``time`` or ``task.control_period``.
     """
 
     def __init__(self, read: Callable[[str], Value]) -> None:
@@ -36,6 +40,20 @@ class Signals:
     def truth(self, channel: str) -> list[Value]:
         """Elements of a channel of ``TRUTH_LAYOUT``."""
         return self._channel(TRUTH_LAYOUT, "truth", channel)
+
+    def estimate(self, channel: str) -> list[Value]:
+        """Elements of a channel of ``ESTIMATE_LAYOUT``: what the slip observer makes of the sensors."""
+        return self._channel(ESTIMATE_LAYOUT, "estimate", channel)
+
+    @property
+    def start(self) -> list[Value]:
+        """Where the body origin was when the episode began: x, y (m) and yaw (rad) in the floor frame."""
+        return [self._read(f"start[{name}]") for name in START]
+
+    @property
+    def time(self) -> Value:
+        """Time since the episode began, s."""
+        return self._read("time")
 
     def _channel(self, layout: Layout, source: str, channel: str) -> list[Value]:
         if channel not in layout.channels:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -16,7 +15,18 @@ from pydantic import BaseModel, ConfigDict, Field
 from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.paths import find_config
 from wlr_gym.robot import JOINTS, LEGS, Robot, parse_config, read_yaml
-from wlr_gym.tasks.terms import COMMANDS, POLICY_TERMS, PRIVILEGED_TERMS, REWARDS, TERMINATIONS, ObservationTerm, ScalarTerm
+from wlr_gym.tasks.signals import Signals
+from wlr_gym.tasks.terms import (
+    COMMANDS,
+    COMPUTED,
+    MEASURES,
+    POLICY_TERMS,
+    PRIVILEGED_TERMS,
+    REWARDS,
+    TERMINATIONS,
+    ObservationTerm,
+    ScalarTerm,
+)
 
 
 class _Data(BaseModel):
@@ -31,10 +41,15 @@ class ActionConfig(_Data):
 
 
 class CommandsConfig(_Data):
-    """Commands drawn uniformly in [low, high], held for a time drawn in ``hold_time`` (s); all zero now and then."""
+    """Commands drawn uniformly in [low, high], held for a time drawn in ``hold_time`` (s); all zero now and then.
+
+    ``ramp``: largest rate of change (unit/s) of a command, from 0 at the start; those not named jump. A command that is given
+    (reset option, ``set_command``) holds at once.
+    """
 
     hold_time: tuple[float, float]
     zero_probability: float = Field(default=0.0, ge=0, le=1)
+    ramp: dict[str, Annotated[float, Field(gt=0)]] = {}
     terms: dict[str, tuple[float, float]]
 
 
@@ -68,8 +83,44 @@ class PrivilegedConfig(_Data):
     limit: float | None = Field(default=None, gt=0)
 
 
+class ObserverConfig(_Data):
+    """The slip observer (:mod:`wlr_gym.observer`); it runs where a term needs its estimate.
+
+    ``camera``: it uses the camera's poses as they come; False = as if there were no camera.
+    """
+
+    camera: bool = True
+
+
+class RampConfig(_Data):
+    """Share of a spread: ``start`` in the beginning, rising evenly to 1 after ``steps`` environment steps of all robots."""
+
+    start: float = Field(gt=0, le=1)
+    steps: float = Field(gt=0)
+
+
+class CurriculumConfig(_Data):
+    """What a training begins with less of. Every draw is moved towards the middle of its distribution.
+
+    It only acts on who says how far training is (``Core.set_progress``): all else meets the whole task.
+    """
+
+    commands: RampConfig | None = None
+    randomization: RampConfig | None = None
+
+
+class SuccessConfig(_Data):
+    """Largest root mean square and largest magnitude of a measure over an episode, in its unit."""
+
+    rms: float | None = Field(default=None, gt=0)
+    max: float | None = Field(default=None, gt=0)
+
+
 class TaskConfig(_Data):
-    """Contents of ``configs/task/*.yaml``."""
+    """Contents of ``configs/task/*.yaml``.
+
+    An episode is a success when no termination term ended it and every measure named in ``success`` stays within its limits.
+    """
 
     name: str
     robot: str = "nominal"
@@ -79,10 +130,14 @@ class TaskConfig(_Data):
     action: ActionConfig
     commands: CommandsConfig
     latency: dict[Literal["joints", "imu", "camera"], LatencyConfig] = {}
+    observer: ObserverConfig = ObserverConfig()
     observations: dict[str, ObservationConfig]
     privileged: dict[str, PrivilegedConfig] = {}
     rewards: dict[str, dict[str, float]]
     terminations: dict[str, dict[str, float]] = {}
+    measures: dict[str, dict[str, float]] = {}
+    success: dict[str, SuccessConfig] = {}
+    curriculum: CurriculumConfig = CurriculumConfig()
 
 
 @dataclass(frozen=True)
@@ -156,6 +211,28 @@ class Task:
         return tuple(self.config.terminations)
 
     @property
+    def measures(self) -> tuple[str, ...]:
+        """Names of the measures, in order."""
+        return tuple(self.config.measures)
+
+    @property
+    def computed(self) -> tuple[str, ...]:
+        """Elements of the computed observations, policy and privileged, in order."""
+        return tuple(dict.fromkeys(c.element for c in (*self.policy, *self.privileged) if c.source == "computed"))
+
+    @property
+    def computed_terms(self) -> tuple[str, ...]:
+        """Names of the computed observation terms, in order."""
+        return tuple(dict.fromkeys(c.term for c in (*self.policy, *self.privileged) if c.source == "computed"))
+
+    @property
+    def needs_observer(self) -> bool:
+        """Whether any term needs the slip observer's estimate."""
+        return any(c.source == "estimate" for c in self.policy) or any(
+            signal.startswith("estimate.") for name in self.computed_terms for signal in signals_of(COMPUTED[name].function)
+        )
+
+    @property
     def episode_ticks(self) -> int:
         """Control ticks until truncation."""
         return max(1, round(self.config.episode_length / self.config.control_period))
@@ -190,6 +267,11 @@ def read_task(source: str | Path | Mapping[str, Any], overrides: Mapping[str, An
                 raise unknown_name(kind, name, registry, where)
     _check_scalars("reward term", config.rewards, REWARDS, {"weight"}, where)
     _check_scalars("termination term", config.terminations, TERMINATIONS, set(), where)
+    _check_scalars("measure", config.measures, MEASURES, set(), where)
+    for name in config.success:
+        if name not in config.measures:
+            raise unknown_name("measure", name, config.measures, f"{where}: success")
+    _check_commands(config, where)
     return config
 
 
@@ -228,6 +310,9 @@ def _check_ranges(config: TaskConfig, where: str) -> None:
         if name not in COMMANDS:
             raise unknown_name("command", name, COMMANDS, where)
         ranges[f"commands.terms.{name}"] = limits
+    for name in config.commands.ramp:
+        if name not in config.commands.terms:
+            raise unknown_name("command", name, config.commands.terms, f"{where}: commands.ramp")
     for device, latency in config.latency.items():
         ranges[f"latency.{device}.delay"] = latency.delay
         if latency.delay[0] < 0:
@@ -263,6 +348,31 @@ def _check_scalars(
                 raise InputError(
                     f"{where}: {kind} '{name}': {key} = {values[key]:g}: expected a number above {low:g} and below {high:g}"
                 )
+
+
+def signals_of(function: Callable[..., Any], parameters: Mapping[str, float] | None = None) -> set[str]:
+    """Return the names of the signals that a term's function reads."""
+    names: set[str] = set()
+
+    def read(name: str) -> float:
+        names.add(name)
+        return 1.0
+
+    with np.errstate(all="ignore"):
+        function(Signals(read), **(parameters or {}))
+    return names
+
+
+def _check_commands(config: TaskConfig, where: str) -> None:
+    """Refuse a term that reads a command which the task does not give."""
+    functions = {f"reward term '{name}'": REWARDS[name].function for name in config.rewards}
+    functions |= {f"measure '{name}'": MEASURES[name].function for name in config.measures}
+    used = [name for name in (*config.observations, *config.privileged) if name in COMPUTED]
+    functions |= {f"observation term '{name}'": COMPUTED[name].function for name in used}
+    for term, function in functions.items():
+        for command in sorted(name.removeprefix("command.") for name in signals_of(function) if name.startswith("command.")):
+            if command not in config.commands.terms:
+                raise InputError(f"{where}: {term} needs the command '{command}', which commands.terms does not give")
 
 
 def _policy_columns(config: TaskConfig, robot: Robot, name: str) -> list[ObservationColumn]:
@@ -305,10 +415,8 @@ def _privileged_columns(config: TaskConfig, name: str) -> list[ObservationColumn
     term, settings = PRIVILEGED_TERMS[name], config.privileged[name]
     limit = term.limit if settings.limit is None else settings.limit
     return [
-        ObservationColumn(
-            name, element, "truth", term.unit, term.frame, 0.0, settings.scale, limit, 0.0, 0.0, 0.0, 0, "", term.doc
-        )
-        for element in term.elements
+        ObservationColumn(name, element, term.source, unit, term.frame, 0.0, settings.scale, limit, 0.0, 0.0, 0.0, 0, "", doc)
+        for element, unit, doc in _term_elements(term, config)
     ]
 
 
@@ -324,8 +432,3 @@ def bounds(columns: tuple[ObservationColumn, ...]) -> tuple[np.ndarray, np.ndarr
     """Lowest and highest value of each observation column, float32."""
     high = np.array([np.float32(column.scale * column.limit) for column in columns], dtype=np.float32)
     return -high, high
-
-
-def robot_hash(robot: Robot) -> str:
-    """Short fingerprint of a robot's numbers."""
-    return hashlib.sha256(robot.model_dump_json().encode()).hexdigest()[:16]

@@ -1,9 +1,21 @@
 """Building blocks of tasks: small documented units that a task's YAML lists by name, with weights and parameters."""
 
 from wlr_gym.tasks.terms.commands import COMMANDS
+from wlr_gym.tasks.terms.computed import COMPUTED
+from wlr_gym.tasks.terms.measures import MEASURES
 from wlr_gym.tasks.terms.observations import POLICY_TERMS, PRIVILEGED_TERMS, ObservationTerm
 from wlr_gym.tasks.terms.rewards import REWARDS
 from wlr_gym.tasks.terms.scalar import ScalarTerm
 from wlr_gym.tasks.terms.terminations import TERMINATIONS
 
-__all__ = ["COMMANDS", "POLICY_TERMS", "PRIVILEGED_TERMS", "REWARDS", "TERMINATIONS", "ObservationTerm", "ScalarTerm"]
+__all__ = [
+    "COMMANDS",
+    "COMPUTED",
+    "MEASURES",
+    "POLICY_TERMS",
+    "PRIVILEGED_TERMS",
+    "REWARDS",
+    "TERMINATIONS",
+    "ObservationTerm",
+    "ScalarTerm",
+]

@@ -1,6 +1,8 @@
-"""Observation terms. Policy terms are what the robot itself can know: its sensors, the command, its last action.
+"""Observation terms. What the robot itself can know: its sensors, the command, its last action, what the slip observer
+estimates from the sensors, and what is computed from these.
 
-Privileged terms are channels of the true state, for asymmetric critics and analysis.
+Terms of the true state are for asymmetric critics, for upper bounds (a policy that sees friction) and for analysis: a real
+robot refuses a policy that needs one.
 """
 
 from __future__ import annotations
@@ -8,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from wlr_gym.observer import ESTIMATE_LAYOUT
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Layout
 from wlr_gym.robot import LEGS, WHEELS, Robot
+from wlr_gym.tasks.terms.computed import COMPUTED, ComputedTerm
 
 RobotNumber = Callable[[Robot], float]
 
@@ -24,7 +28,7 @@ class ObservationTerm:
 
     Attributes:
         name: as in the task's YAML.
-        source: ``sensors``, ``truth``, ``command`` or ``action``.
+        source: ``sensors``, ``command``, ``action``, ``estimate``, ``computed`` or ``truth``.
         elements: full element names in the source; empty = all of the task's commands or actions.
         unit, frame, doc: for the generated tables.
         limit: readings are clipped to +-limit about the offset (in ``unit``), so that the observation space is bounded.
@@ -62,7 +66,7 @@ def _sensor(
     return ObservationTerm(name, "sensors", elements, spec.unit, frame, limit, doc or spec.doc, offset, sensor_noise, device)
 
 
-POLICY_TERMS = {
+_SENSED = {
     term.name: term
     for term in (
         ObservationTerm("command", "command", (), "", "body", 2.0, "what the robot is asked to follow"),
@@ -94,6 +98,23 @@ POLICY_TERMS = {
     )
 }  # fmt: skip
 
+#: Channel of the estimate -> frame, limit.
+_ESTIMATE_LIMITS = {
+    "position": ("start", 20.0),
+    "yaw": ("start", 20.0),
+    "yaw_sigma": ("start", 2.0),
+    "linear_velocity_in_body": ("body", 2.0),
+    "linear_velocity_sigma": ("body", 2.0),
+    "yaw_rate": ("body", 20.0),
+    "gravity_in_body": ("body", 1.0),
+    "slip_velocity": ("wheel", 2.0),
+    "slip_sigma": ("wheel", 2.0),
+    "traction_force": ("wheel", 200.0),
+    "normal_force": ("wheel", 200.0),
+    "traction_use": ("wheel", 5.0),
+    "friction_demand": ("-", 5.0),
+}
+
 _TRUTH_LIMITS = {
     "position": ("floor", 20.0),
     "quaternion": ("body to floor", 1.0),
@@ -113,9 +134,25 @@ _TRUTH_LIMITS = {
 }
 
 
-def _truth(layout: Layout, channel: str, frame: str, limit: float) -> ObservationTerm:
+def _channel(layout: Layout, source: str, channel: str, prefix: str, frame: str, limit: float, device: str) -> ObservationTerm:
     spec = layout.channels[channel]
-    return ObservationTerm(channel, "truth", tuple(spec.elements), spec.unit, frame, limit, spec.doc)
+    elements = tuple(spec.elements)
+    return ObservationTerm(f"{prefix}{channel}", source, elements, spec.unit, frame, limit, spec.doc, device=device)
 
 
-PRIVILEGED_TERMS = {name: _truth(TRUTH_LAYOUT, name, frame, limit) for name, (frame, limit) in _TRUTH_LIMITS.items()}
+def _computed(term: ComputedTerm) -> ObservationTerm:
+    device = "joints" if term.estimated else ""
+    return ObservationTerm(term.name, "computed", term.elements, term.unit, term.frame, term.limit, term.doc, device=device)
+
+
+_ESTIMATED = [
+    _channel(ESTIMATE_LAYOUT, "estimate", channel, "estimated_", frame, limit, "joints")
+    for channel, (frame, limit) in _ESTIMATE_LIMITS.items()
+]
+_TRUE = [_channel(TRUTH_LAYOUT, "truth", channel, "", frame, limit, "") for channel, (frame, limit) in _TRUTH_LIMITS.items()]
+
+#: What a policy may observe. Estimates are as old as the joint readings they are made of.
+POLICY_TERMS = _SENSED | {term.name: term for term in (*_ESTIMATED, *map(_computed, COMPUTED.values()), *_TRUE)}
+
+#: What a critic may observe besides.
+PRIVILEGED_TERMS = {term.name: term for term in (*_TRUE, *map(_computed, COMPUTED.values()))}

@@ -10,6 +10,8 @@ import math
 from wlr_gym.codegen import ops
 from wlr_gym.robot import CORNER_SIGNS
 from wlr_gym.tasks.signals import Signals, Value, mean, norm
+from wlr_gym.tasks.terms import references
+from wlr_gym.tasks.terms.geometry import true_motion, true_yaw
 from wlr_gym.tasks.terms.scalar import POSITIVE, ScalarTerm, registered
 
 REWARDS: dict[str, ScalarTerm] = {}
@@ -18,6 +20,12 @@ REWARDS: dict[str, ScalarTerm] = {}
 def _kernel(error: Value, width: Value) -> Value:
     ratio = error / width
     return ops.exp(-(ratio * ratio))
+
+
+def _levelling(ratio: Value) -> Value:
+    """|ratio| near 0, never more than 8."""
+    size = ops.absolute(ratio)
+    return size / (1.0 + 0.125 * size)
 
 
 @registered(REWARDS, width=POSITIVE)
@@ -30,6 +38,46 @@ def track_linear_velocity(signals: Signals, *, width: Value = 0.1) -> Value:
 def track_yaw_rate(signals: Signals, *, width: Value = 0.3) -> Value:
     """exp(-(error / width)^2) of the body's yaw rate; width in rad/s."""
     return _kernel(signals.command("yaw_rate") - signals.truth("angular_velocity_in_body")[2], width)
+
+
+@registered(REWARDS, linear=POSITIVE, angular=POSITIVE)
+def velocity_error(signals: Signals, *, linear: Value = 0.02, angular: Value = 0.06) -> Value:
+    """|error| of forward velocity over ``linear`` (m/s) plus |error| of yaw rate over ``angular`` (rad/s)."""
+    forward = signals.command("linear_velocity_x") - signals.truth("linear_velocity_in_body")[0]
+    turning = signals.command("yaw_rate") - signals.truth("angular_velocity_in_body")[2]
+    return ops.absolute(forward) / linear + ops.absolute(turning) / angular
+
+
+@registered(REWARDS, lateral=POSITIVE, heading=POSITIVE)
+def path_error(signals: Signals, *, lateral: Value = 0.015, heading: Value = 0.2) -> Value:
+    """|distance from the path| over ``lateral`` (m) plus |heading error| over ``heading`` (rad), 8 each at most."""
+    error = references.path_error(signals, true_motion(signals))
+    return _levelling(error.lateral / lateral) + _levelling(error.heading / heading)
+
+
+@registered(REWARDS, lateral=POSITIVE, heading=POSITIVE)
+def course_error(signals: Signals, *, lateral: Value = 0.01, heading: Value = 0.025) -> Value:
+    """|distance from the line ahead of the start| over ``lateral`` (m) plus |heading| over ``heading`` (rad); 8 each at most."""
+    motion = true_motion(signals)
+    return _levelling(motion.y / lateral) + _levelling(motion.yaw / heading)
+
+
+@registered(REWARDS, scale=POSITIVE)
+def leg_error(signals: Signals, *, scale: Value = 0.1) -> Value:
+    """Mean |error| of the leg angles over ``scale`` (rad)."""
+    return mean([ops.absolute(error) for error in references.leg_errors(signals)]) / scale
+
+
+@registered(REWARDS, width=POSITIVE)
+def track_climb_speed(signals: Signals, *, width: Value = 0.03) -> Value:
+    """exp(-(error / width)^2) of the forward velocity, while climbing and while holding; width in m/s."""
+    return _kernel(references.climb_speed(signals) - signals.truth("linear_velocity_in_body")[0], width)
+
+
+@registered(REWARDS, width=POSITIVE)
+def head_uphill(signals: Signals, *, width: Value = 0.1) -> Value:
+    """|heading against the floor's x axis| over ``width`` (rad), 8 at most."""
+    return _levelling(true_yaw(signals) / width)
 
 
 @registered(REWARDS, linear=POSITIVE, angular=POSITIVE)

@@ -15,7 +15,7 @@ POSITIVE = (0.0, math.inf)
 
 @dataclass(frozen=True)
 class ScalarTerm:
-    """One reward or termination.
+    """One reward, termination or measure.
 
     Attributes:
         name: as in the task's YAML.
@@ -23,6 +23,7 @@ class ScalarTerm:
         parameters: names and default values of its parameters.
         ranges: name -> (low, high) that the parameter must lie between, both excluded.
         doc: first line of its docstring.
+        unit: of its value; rewards and terminations have none.
     """
 
     name: str
@@ -30,9 +31,12 @@ class ScalarTerm:
     parameters: dict[str, float]
     ranges: dict[str, tuple[float, float]]
     doc: str
+    unit: str = ""
 
 
-def registered(registry: dict[str, ScalarTerm], **ranges: tuple[float, float]) -> Callable[[Function], Function]:
+def registered(
+    registry: dict[str, ScalarTerm], unit: str = "", **ranges: tuple[float, float]
+) -> Callable[[Function], Function]:
     """Return a decorator that enters a function into ``registry`` under its own name, with ranges of its parameters."""
 
     def enter(function: Function) -> Function:
@@ -42,7 +46,7 @@ def registered(registry: dict[str, ScalarTerm], **ranges: tuple[float, float]) -
             if parameter.kind is inspect.Parameter.KEYWORD_ONLY
         }
         doc = (inspect.getdoc(function) or "").partition("\n")[0]
-        registry[function.__name__] = ScalarTerm(function.__name__, function, defaults, ranges, doc)
+        registry[function.__name__] = ScalarTerm(function.__name__, function, defaults, ranges, doc, unit)
         return function
 
     return enter

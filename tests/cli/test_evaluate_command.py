@@ -1,0 +1,78 @@
+"""``wlr evaluate``: options, files and messages."""
+
+import json
+
+import pytest
+
+from wlr_gym.cli import evaluate, main
+
+SMALL = ["--episodes", "3", "--no-progress"]
+
+
+def test_it_writes_the_same_card_twice(tmp_path, capsys):
+    arguments = ["evaluate", "constant_command", "--baselines", "do_nothing", "--seeds", "2", *SMALL, "--out"]
+    assert main([*arguments, str(tmp_path / "a")]) == 0
+    assert main([*arguments, str(tmp_path / "b")]) == 0
+    printed = capsys.readouterr().out
+    assert "yaw_rate_error" in printed
+    assert "constant_command is better by" in printed
+    first, second = ((tmp_path / name / "card.json").read_text() for name in "ab")
+    assert first == second
+    content = json.loads(first)
+    assert list(content["policies"]) == ["constant_command", "do_nothing"]
+    assert content["conditions"]["episodes"] == "3 x 2 seeds"
+    files = {path.name for path in (tmp_path / "a").iterdir()}
+    assert files == {
+        "card.md",
+        "card.json",
+        "episodes.parquet",
+        "samples.csv",
+        "spectrum.png",
+        "config.yaml",
+        "provenance.yaml",
+    }
+
+
+def test_full_means_seeds_sweeps_and_both_simulators(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(evaluate, "FULL_EPISODES", 2)
+    arguments = ["evaluate", "constant_command", "--full", "--baselines", "do_nothing", "--sweep", "payload", "--no-progress"]
+    arguments += ["--other-episodes", "1", "--sweep-episodes", "1", "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    content = json.loads((tmp_path / "card.json").read_text())
+    assert content["conditions"]["episodes"] == "2 x 5 seeds"
+    assert content["conditions"]["second simulator"] == "mujoco, 1 episodes"
+    assert [point["at"] for point in content["sweeps"]["payload"]] == ["0", "0.25", "0.5", "1", "2"]
+    assert content["other_plant"]["score_kept"]["constant_command"]["mean"] > 50.0
+    assert "on both simulators" in capsys.readouterr().out
+
+
+def test_full_compares_with_all_that_can_be_compared_with():
+    options = evaluate.Options("pid", full=True)
+    assert set(evaluate._baselines(options, "WLR-Velocity-v0")) >= {
+        "do_nothing",
+        "constant_command",
+        "pid",
+        "slip_compensating",
+    }
+    assert evaluate._baselines(evaluate.Options("pid"), "WLR-Velocity-v0") == ("do_nothing", "pid")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["constant_comand"], "did you mean 'constant_command'"),
+        (["do_nothing", "--randomization", "wid"], "did you mean 'wide'"),
+        (["do_nothing", "--env", "WLR-Velocty-v0"], "unknown environment"),
+        (["do_nothing", "--episodes", "0"], "episodes = 0"),
+        (["do_nothing", "--seeds", "0"], "seeds = 0"),
+        (["do_nothing", "--seed", "-1"], "--seed -1"),
+        (["do_nothing", "--sweep", "slope"], "not for task 'velocity'"),
+        (["do_nothing", "--backend", "mujoko"], "did you mean 'mujoco'"),
+        (["do_nothing", "--record", "3", "--episodes", "2"], "--record 3"),
+        (["do_nothing", "--video", "a.webp", "--video-seconds", "0"], "--video-seconds 0"),
+        (["a=do_nothing", "--baselines", "a=pid"], "two policies are called 'a'"),
+    ],
+)
+def test_bad_input_exits_with_2(arguments, message, capsys):
+    assert main(["evaluate", *arguments, "--no-progress"]) == 2
+    assert message in capsys.readouterr().err

@@ -1,0 +1,171 @@
+"""The four tasks on the engine: checkers, same bits alone and in a batch, what each asks for."""
+
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import wlr_gym  # noqa: F401
+from wlr_gym.envs.registry import ENVIRONMENTS
+from wlr_gym.errors import InputError
+
+ESTIMATES = (
+    "estimated_linear_velocity_in_body",
+    "estimated_linear_velocity_sigma",
+    "estimated_slip_velocity",
+    "estimated_traction_use",
+)
+BLIND = {"observer": {"camera": False}, "observations": dict.fromkeys(ESTIMATES)}
+
+
+def make(env_id, **keywords) -> Any:
+    return gym.make(env_id, **keywords).unwrapped
+
+
+def make_vec(env_id, count, **keywords) -> Any:
+    return gym.make_vec(env_id, num_envs=count, **keywords)
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_checkers_of_gymnasium_and_sb3_without_a_warning(env_id):
+    from stable_baselines3.common.env_checker import check_env as check_sb3
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make(env_id))
+        check_sb3(gym.make(env_id))
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_observation_and_measures_are_the_same_bits_alone_and_in_a_batch(env_id):
+    keywords = {"episode_length": 0.5, "observation": "dict", "autoreset_mode": "SameStep"}
+    vector = make_vec(env_id, 9, **keywords)
+    alone = make_vec(env_id, 1, **keywords)
+    seen, single = vector.reset(seed=40)[0], alone.reset(seed=44)[0]
+    core, one = vector.unwrapped.core, alone.unwrapped.core
+    for actions in np.random.default_rng(2).uniform(-1, 1, (60, 9, 8)).astype(np.float32):
+        for group in ("policy", "privileged"):
+            assert np.array_equal(seen[group][4], single[group][0])
+        seen, single = vector.step(actions)[0], alone.step(actions[4:5])[0]
+        assert np.array_equal(core.measures[4], one.measures[0])
+        assert np.array_equal(core.observer.values[4], one.observer.values[0])
+    assert np.isfinite(core.measures).all()
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_estimates_can_be_left_out(env_id):
+    aware, blind = make(env_id), make(env_id, task=BLIND)
+    left_out = set(aware.core.task.config.observations) - set(blind.core.task.config.observations)
+    assert left_out == set(ESTIMATES)
+    needs = any(name in blind.core.task.config.observations for name in ("path_error", "course_error")) or env_id.startswith(
+        "WLR-Slope"
+    )
+    assert (blind.core.observer is not None) == needs
+    assert blind.contract()["observer"] == ({"camera": False} if needs else None)
+
+
+def test_observer_follows_what_the_sensors_read():
+    """Straight on at constant speed: the estimate of speed and pose is the true one within a few millimetres."""
+    env = make_vec("WLR-Velocity-v0", 20, randomization="nominal", task={"commands": {"zero_probability": 0.0}})
+    env.reset(seed=0, options={"command": {"linear_velocity_x": 0.1, "yaw_rate": 0.0}})
+    action = np.zeros((20, 8), np.float32)
+    action[:, 4:] = 0.1 / 0.034 / 6.0
+    for _ in range(250):
+        observation = env.step(action)[0]
+    core = env.unwrapped.core
+    names = [column.element for column in core.task.policy]
+    speed = observation[:, names.index("linear_velocity_in_body[x]")] / 10.0
+    true = core.plant.truth()["linear_velocity_in_body"][:, 0]
+    assert np.abs(speed - true).max() < 0.005
+
+
+def test_a_policy_that_sees_the_truth_is_for_simulators_only():
+    env = make("WLR-Velocity-v0", task={"observations": {"effective_friction": {}}}, randomization="nominal")
+    observation, info = env.reset(seed=3)
+    mu = info["randomization"]["ground.mu_x[wheel_lf]"]
+    assert observation[-8:] == pytest.approx(np.full(8, mu), rel=1e-6)
+    with pytest.raises(InputError, match=r"'effective_friction'.*only a simulator"):
+        make(
+            "WLR-Velocity-v0",
+            backend="dynamixel",
+            hardware={"emulated": True},
+            task={"observations": {"effective_friction": {}}},
+        )
+
+
+def drive(env_id, count, act, **keywords):
+    """Play one episode of every robot with ``act(core)``; return the core and the measures (T, N, M)."""
+    env = make_vec(env_id, count, **keywords)
+    env.reset(seed=0)
+    core = env.unwrapped.core
+    measures = []
+    while not core.truncated.any():
+        core.step(act(core).astype(np.float32), core.everyone)
+        measures.append(core.measures.copy())
+    return core, np.array(measures)
+
+
+def computed(core, element):
+    return core._computed[:, [core.task.computed.index(element)]]
+
+
+def test_legs_that_follow_their_reference_have_no_leg_error():
+    def follow(core):
+        legs = np.hstack([computed(core, f"leg_reference[{leg}]") for leg in core.task.robot.joints[:4]])
+        return np.hstack([legs / 1.25, np.zeros((core.count, 4))])
+
+    core, measures = drive("WLR-Posture-v0", 12, follow, randomization="none")
+    error = measures[:, :, core.task.measures.index("leg_error")]
+    assert error.max() < 0.12  # the profile lags behind a ramp
+    assert error[-50:].max() < 0.05  # legs sag under load: their servos have no integral part
+    names = core.task.commands
+    second = core.command[:, [names.index("front_leg_second"), names.index("rear_leg_second")]]
+    assert core.plant.truth()["joint_position"][:, [0, 2]] == pytest.approx(second, abs=0.06)
+
+
+def test_slopes_stay_below_what_friction_holds_and_a_braked_robot_stands():
+    def brake(core):
+        return np.zeros((core.count, 8))
+
+    core, _ = drive("WLR-Slope-v0", 40, brake, episode_length=4.0)
+    slope, mu = core.parameters["ground.slope"], core.parameters["ground.mu_x"][:, 0]
+    margin = np.degrees(np.arctan(mu) - slope[:, 0])
+    assert np.all(slope[:, 1] == 0.0)
+    assert np.all(margin[slope[:, 0] > 0] <= np.degrees(0.21) + 1e-9)
+    assert margin.min() >= 1.5
+    assert np.ptp(slope[:, 0]) > 0.2
+    assert np.abs(core.plant.truth()["linear_velocity_in_body"]).max() < 0.01
+    assert np.abs(core.plant.truth()["position"][:, 0]).max() < 0.05
+
+
+def test_a_robot_steeper_than_friction_slides():
+    env = make_vec("WLR-Slope-v0", 4)
+    parameters = {"ground.slope[pitch]": np.arctan(0.3) + np.radians(1.0), "ground.mu_x": 0.3, "ground.mu_y": 0.3}
+    env.reset(seed=0, options={"parameters": parameters})
+    core = env.unwrapped.core
+    for _ in range(150):
+        core.step(np.zeros((4, 8)), core.everyone)
+    assert core.plant.truth()["position"][:, 0].max() < -0.1
+
+
+def test_progress_narrows_what_is_drawn_and_says_nothing_of_the_past():
+    curriculum = {"commands": {"start": 0.2, "steps": 1000}, "randomization": {"start": 0.5, "steps": 2000}}
+    env = make_vec("WLR-Velocity-v0", 200, task={"curriculum": curriculum}, randomization="nominal")
+
+    def widths(steps=None):
+        if steps is not None:
+            env.unwrapped.set_progress(steps)
+        env.reset(seed=7)
+        core = env.unwrapped.core
+        return np.abs(core._command_target[:, 0]).max(), np.ptp(core.parameters["ground.mu_x"][:, 0])
+
+    whole = widths()
+    assert whole[0] == pytest.approx(0.1, abs=0.003)
+    start = widths(0)
+    assert start == pytest.approx((0.2 * whole[0], 0.5 * whole[1]))
+    assert widths(500) == pytest.approx((0.6 * whole[0], 0.625 * whole[1]))
+    assert widths(5000) == whole
+    assert widths(0) == start

@@ -1,0 +1,85 @@
+"""Model cards: written from a file's contract and a score card; every shipped policy has its own."""
+
+import shutil
+from itertools import zip_longest
+
+import pytest
+
+from wlr_gym.cli import main
+from wlr_gym.errors import InputError
+from wlr_gym.policy import check_model_card, contract_of, find_policy, shipped_names, write_model_card
+from wlr_gym.policy.onnx_file import seal
+
+SCORES = "# Score card\n\n| metric | mine |\n|---|---|\n| rms | 0.01 |\n\n![sweep](sweep.png)\n\n## Sweep\n"
+
+
+@pytest.fixture
+def policy(exported, tmp_path):
+    return shutil.copy(exported, tmp_path / "velocity_blind.onnx")
+
+
+def test_a_card_says_what_the_file_is(policy):
+    text = write_model_card(policy, SCORES).read_text()
+    lines = text.splitlines()
+    assert lines[0] == "# velocity_blind"
+    assert "wlr-nominal, at 50 Hz" in text
+    assert "| observation | " in text
+    assert "command 2, leg_position 4" in text
+    assert "ppo, 64 control ticks, 0.0 min with 1 thread(s), seed 0" in text
+    assert "| randomisation |" in text
+    assert "## Score card" in lines
+    assert "### Sweep" in lines
+    assert "sweep.png" not in text
+    check_model_card(policy)
+
+
+@pytest.mark.parametrize(
+    ("sources", "observer", "words"),
+    [
+        (["computed"], None, "It is blind to slip"),
+        (["sensors", "estimate"], {"camera": True}, "slip observer, with a camera"),
+        (["sensors", "estimate"], {"camera": False}, "slip observer, without a camera"),
+        (["estimate", "truth"], {}, "for simulators only"),
+    ],
+)
+def test_a_card_says_what_the_policy_sees(policy, sources, observer, words):
+    content = contract_of(policy)
+    content["environment"]["observer"] = observer
+    for column, source in zip_longest(content["environment"]["observation"], sources, fillvalue="sensors"):
+        column["source"] = source
+    policy.write_bytes(seal(policy.read_bytes(), content))
+    assert words in write_model_card(policy, SCORES).read_text()
+
+
+def test_a_card_of_another_file_is_noticed(policy):
+    write_model_card(policy, SCORES)
+    content = contract_of(policy)
+    content["training"]["seed"] = 1
+    policy.write_bytes(seal(policy.read_bytes(), content))
+    with pytest.raises(InputError, match=r"velocity_blind\.md: is about another file"):
+        check_model_card(policy)
+    policy.with_suffix(".md").write_text("# velocity_blind\n")
+    with pytest.raises(InputError, match="SHA-256 None"):
+        check_model_card(policy)
+    policy.with_suffix(".md").unlink()
+    with pytest.raises(InputError, match="cannot be read"):
+        check_model_card(policy)
+
+
+def test_command_line(policy, tmp_path, capsys):
+    (tmp_path / "scores").mkdir()
+    assert main(["export", str(policy), "--card", str(tmp_path / "scores")]) == 2
+    assert "no card.md of wlr evaluate there" in capsys.readouterr().err
+    (tmp_path / "scores" / "card.md").write_text(SCORES)
+    assert main(["export", str(policy), "--card", str(tmp_path / "scores")]) == 0
+    check_model_card(policy)
+    assert main(["export", str(policy), "--card", str(tmp_path / "scores"), "--out", "x.onnx"]) == 2
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_every_shipped_policy_has_its_card(name):
+    check_model_card(find_policy(name))
+    text = find_policy(name).with_suffix(".md").read_text()
+    for place in ("/tmp", "/home", "/root", "/work", "\\Users"):
+        assert place not in text
+        assert f"{place}/".encode() not in find_policy(name).read_bytes()

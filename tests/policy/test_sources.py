@@ -1,0 +1,101 @@
+"""What names a policy, and what its environment must be made with."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from wlr_gym.errors import InputError
+from wlr_gym.evaluation import make_core
+from wlr_gym.policy import (
+    contract_of,
+    find_policy,
+    load_agent_config,
+    make_policy,
+    policy_environment,
+    shipped_names,
+    sources,
+    trained_environment,
+    write_contract,
+)
+
+ID = "WLR-Velocity-v0"
+#: A policy that is fed no gyroscope and wants its wheel commands scaled by 3; the rest are conditions.
+BLIND = {"observations": {"gyro": None, "command": {"scale": 4.0}}, "action": {"wheel_scale": 3.0}}
+KEYWORDS = {
+    "task": BLIND | {"rewards": {"slip": None}, "episode_length": 1.0},
+    "precision": "float32",
+    "randomization": "wide",
+    "backend": "mujoco",
+}
+
+
+def blind_folder(folder):
+    core = make_core(ID, 1, {"task": BLIND})
+    write_contract(folder, "do_nothing", {"environment": KEYWORDS}, core.contract(), {"environment": ID})
+    core.close()
+    return folder
+
+
+def test_keywords_are_those_that_decide_what_a_policy_is_fed(tmp_path):
+    assert policy_environment(blind_folder(tmp_path)) == {"task": BLIND}
+    core = make_core(ID, 1, {"randomization": "none"} | policy_environment(tmp_path))
+    sources.check_contract(contract_of(tmp_path)["environment"], core.contract(), "here")
+    core.close()
+    core = make_core(ID, 1, {})
+    with pytest.raises(InputError, match=r"observation\[0\]\.scale is 4\.0 in the policy, 5\.0 in the environment"):
+        sources.check_contract(contract_of(tmp_path)["environment"], core.contract(), "here")
+    core.close()
+
+
+def test_a_task_file_is_handed_on(tmp_path):
+    write_contract(tmp_path, "do_nothing", {"environment": {"task": "my_task.yaml"}}, {}, {})
+    assert policy_environment(tmp_path) == {"task": "my_task.yaml"}
+
+
+@pytest.mark.parametrize("config", [{}, {"environment": None}, {"environment": {"task": {"rewards": {"slip": None}}}}])
+def test_the_task_that_ships_needs_no_keywords(tmp_path, config):
+    write_contract(tmp_path, "do_nothing", config, {}, {})
+    assert policy_environment(tmp_path) == {}
+
+
+def test_agents_have_the_keywords_of_their_settings(monkeypatch):
+    assert trained_environment("do_nothing") is None
+    assert policy_environment("do_nothing") == {}
+    monkeypatch.setattr(sources, "load_agent_config", lambda name: load_agent_config(name) | {"environment": KEYWORDS})
+    assert policy_environment("do_nothing") == {"task": BLIND}
+
+
+def test_the_environment_of_the_training_is_known(tmp_path):
+    assert trained_environment(blind_folder(tmp_path)) == ID
+
+
+def test_a_run_folder_and_its_policy_are_the_same(tmp_path):
+    (tmp_path / "policy").mkdir()
+    write_contract(tmp_path / "policy", "do_nothing", {}, {}, {})
+    assert find_policy(tmp_path) == find_policy(tmp_path / "policy") == tmp_path / "policy"
+
+
+def test_shipped_policies_go_by_their_names(exported, tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "shipped_directory", lambda: tmp_path)
+    shutil.copy(exported, tmp_path / "velocity_slip_aware.onnx")
+    assert shipped_names() == ["velocity_slip_aware"]
+    assert trained_environment("velocity_slip_aware") == ID
+    environment = contract_of("velocity_slip_aware")["environment"]
+    seen = np.full((2, len(environment["observation"])), 0.1, np.float32)
+    mine = make_policy("velocity_slip_aware", environment).act(seen)
+    np.testing.assert_array_equal(mine, make_policy(exported, environment).act(seen))
+    with pytest.raises(InputError, match=r"did you mean 'velocity_slip_aware'.*shipped: velocity_slip_aware"):
+        find_policy("velocty_slip_aware")
+
+
+def test_what_is_no_policy(tmp_path):
+    (tmp_path / "notes.txt").write_text("hello")
+    for source, message in (
+        (tmp_path, r"no policy there"),
+        (tmp_path / "notes.txt", r"expected a folder, or a file \.onnx"),
+        (tmp_path / "none.onnx", r"none\.onnx' is no policy"),
+        ("do_nothin", r"did you mean 'do_nothing'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            policy_environment(source)

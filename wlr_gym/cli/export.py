@@ -1,0 +1,117 @@
+"""Write a trained policy as one file: ONNX with its contract inside. It runs wherever a policy is named, without torch."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+from wlr_gym.cli import OK
+from wlr_gym.cli.options import environment_of
+from wlr_gym.errors import InputError
+from wlr_gym.files import make_output_folder
+
+#: Robots and s of the episodes whose observations are compared.
+ROBOTS, SECONDS = 16, 4.0
+#: Options of ``wlr train`` that say where and how it ran, not what it did.
+ELSEWHERE = ("--out", "--resume", "--max-minutes")
+
+
+@dataclass(frozen=True)
+class Options:
+    policy: tyro.conf.Positional[str]
+    """Policy folder or run folder; with --card: policy file, or name of a shipped policy."""
+    out: Path | None = None
+    """The file; default: policy.onnx."""
+    card: Path | None = None
+    """Folder that wlr evaluate --out has written: instead, write the model card beside the policy file."""
+
+
+def run(options: Options) -> int:
+    """Export, compare, say what was written."""
+    if options.card is None:
+        _export(options.policy, options.out or Path("policy.onnx"))
+    elif options.out is None:
+        _write_card(options.policy, options.card)
+    else:
+        raise InputError("--card and --out: one or the other; a card is written beside its policy file")
+    return OK
+
+
+def _export(source: str, out: Path) -> None:
+    from wlr_gym.policy import export_policy, find_policy
+
+    folder = find_policy(source)
+    make_output_folder(out.parent)
+    parity = export_policy(folder, out, real_observations(folder), training_facts(folder))
+    print(
+        f"written: {out} ({out.stat().st_size / 1000:.0f} kB)\n"
+        f"answers as the policy does: actions differ by at most {parity.random:.1e} on random observations, "
+        f"{parity.real:.1e} on those of {ROBOTS} episodes"
+    )
+
+
+def _write_card(source: str, evaluation: Path) -> None:
+    from wlr_gym.policy import find_policy, write_model_card
+
+    try:
+        text = (evaluation / "card.md").read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"--card {evaluation}: no card.md of wlr evaluate there: {error.strerror}") from None
+    print(f"written: {write_model_card(find_policy(source), text)}")
+
+
+def real_observations(source: Path) -> NDArray[np.float32]:
+    """Return the observations (M, D) of a policy that drives robots in the environment it was trained in."""
+    from wlr_gym.evaluation import make_core
+    from wlr_gym.policy import make_policy, policy_environment
+
+    core = make_core(environment_of(None, source), ROBOTS, {"episode_length": SECONDS} | policy_environment(source))
+    seen = []
+    try:
+        policy = make_policy(source, core.contract())
+        for row in range(core.count):
+            core.seed(row, row)
+        core.begin_episodes(core.everyone)
+        active = core.everyone.copy()
+        while active.any():
+            seen.append(core.observation[active])
+            core.step(policy.act(core.observation), active)
+            active &= ~(core.terminated | core.truncated)
+    finally:
+        core.close()
+    return np.concatenate(seen)
+
+
+def training_facts(folder: Path) -> dict[str, Any]:
+    """Return what the run folder around a policy says of its training: command, git commit, wall time; what it does not is left
+    out."""
+    from wlr_gym.evaluation import read_curve
+    from wlr_gym.provenance import PROVENANCE_FILE
+    from wlr_gym.robot import read_yaml
+
+    facts: dict[str, Any] = {}
+    origin, curve = folder.parent / PROVENANCE_FILE, folder.parent / "learning_curve.csv"
+    if origin.is_file():
+        saved = read_yaml(origin) or {}
+        facts |= {"command": portable(saved.get("command", "")), "git_commit": saved.get("git_commit")}
+    if curve.is_file() and (rows := read_curve(curve)):
+        facts["seconds"] = rows[-1]["seconds"]
+    return facts
+
+
+def portable(command: str) -> str:
+    """Return a ``wlr train`` command without its output folder and the like, which belong to the machine it ran on."""
+    words = iter(shlex.split(command))
+    kept = []
+    for word in words:
+        if word in ELSEWHERE:
+            next(words, None)
+        elif word != "--no-progress" and not word.startswith(tuple(f"{option}=" for option in ELSEWHERE)):
+            kept.append(word)
+    return shlex.join(kept)

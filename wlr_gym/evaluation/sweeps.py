@@ -1,0 +1,142 @@
+"""What conditions a card can sweep through. A point sets parameters on top of a randomisation, for all episodes alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.evaluation.campaign import Condition
+
+
+@dataclass(frozen=True)
+class Point:
+    """One condition of a sweep: where it stands on the axis (its rank where there is no number), and what makes it."""
+
+    label: str
+    value: float
+    parameters: Mapping[str, float]
+    randomization: str | None = None
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A family of conditions.
+
+    Attributes:
+        name: as on the command line.
+        axis: quantity and unit of the points.
+        doc: what stays as it is and what changes.
+        points: in order.
+        numeric: the points' values are numbers, not ranks.
+        tasks: for which it makes sense; empty: all.
+    """
+
+    name: str
+    axis: str
+    doc: str
+    points: tuple[Point, ...]
+    numeric: bool = True
+    tasks: tuple[str, ...] = ()
+
+    def conditions(self, keywords: Mapping[str, Any], episodes: int) -> list[Condition]:
+        """Return one condition per point, laid over ``keywords`` of the environment."""
+        return [
+            Condition(
+                label=self.label(point),
+                keywords={**keywords, **({} if point.randomization is None else {"randomization": point.randomization})},
+                parameters=point.parameters,
+                episodes=episodes,
+            )
+            for point in self.points
+        ]
+
+    def label(self, point: Point) -> str:
+        """Return the name of a point's condition."""
+        return f"{self.name} {point.label}"
+
+
+def _degrees_below_limit(mu: float, degrees: float) -> dict[str, float]:
+    """A slope along the floor's x axis so much less steep than the friction limit atan(mu)."""
+    return {**_even_floor(mu), "ground.slope[pitch]": math.atan(mu) - math.radians(degrees)}
+
+
+def _even_floor(mu: float) -> dict[str, float]:
+    return {"ground.mu_x": mu, "ground.mu_y": mu, "patch.mu": mu}
+
+
+FRICTION = (0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)
+LEFT_FRICTION, RIGHT_FRICTION = (0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.8), 0.8
+SLOPE_FRICTION, DEGREES_BELOW_LIMIT = 0.4, (10.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.0, 0.5)
+GRIP_FRICTION, GRIP_DEGREES = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7), 2.0
+DELAY = (0.0, 0.01, 0.02, 0.04, 0.06)
+PAYLOAD = (0.0, 0.25, 0.5, 1.0, 2.0)
+#: m, body frame: up, ahead and left of the middle, where it tips and turns the most without being silly.
+PAYLOAD_PLACE = {"payload.position[x]": 0.05, "payload.position[y]": 0.03, "payload.position[z]": 0.05}
+FLOORS = ("slippery", "nominal", "ice", "split", "patches", "wide")
+
+SWEEPS: dict[str, Sweep] = {
+    sweep.name: sweep
+    for sweep in (
+        Sweep(
+            "friction", "friction coefficient of the floor", "the same friction everywhere, from ice to rubber",
+            tuple(Point(f"{mu:g}", mu, _even_floor(mu)) for mu in FRICTION),
+            tasks=("velocity", "path", "posture"),
+        ),
+        Sweep(
+            "slope", f"slope below the friction limit (degrees; friction {SLOPE_FRICTION:g})",
+            "ever closer to the steepest slope that friction can hold, atan(mu)",
+            tuple(
+                Point(f"{degrees:g}", degrees, _degrees_below_limit(SLOPE_FRICTION, degrees)) for degrees in DEGREES_BELOW_LIMIT
+            ),
+            tasks=("slope",),
+        ),
+        Sweep(
+            "grip", f"friction coefficient (slope {GRIP_DEGREES:g} degrees below atan of it)",
+            "slopes near the friction limit, from ice to rubber",
+            tuple(Point(f"{mu:g}", mu, _degrees_below_limit(mu, GRIP_DEGREES)) for mu in GRIP_FRICTION),
+            tasks=("slope",),
+        ),
+        Sweep(
+            "split", f"friction coefficient under the left wheels (right: {RIGHT_FRICTION:g})",
+            "astride a line along the start heading: left of it another friction than right of it (randomization split)",
+            tuple(
+                Point(f"{mu:g}", mu, {**_even_floor(RIGHT_FRICTION), "patch.mu[patch_1]": mu}, "split") for mu in LEFT_FRICTION
+            ),
+            tasks=("velocity", "path"),
+        ),
+        Sweep(
+            "floors", "randomization", "whole randomizations: robots and floors they draw",
+            tuple(Point(name, float(rank), {}, name) for rank, name in enumerate(FLOORS)),
+            numeric=False, tasks=("velocity", "path"),
+        ),
+        Sweep(
+            "latency", "delay of every command (s)", "commands act this much later than written",
+            tuple(Point(f"{delay:g}", delay, {"command.delay": delay}) for delay in DELAY),
+        ),
+        Sweep(
+            "payload", "payload (kg)", "a mass on the body, off its middle",
+            tuple(Point(f"{mass:g}", mass, {"payload.mass": mass, **PAYLOAD_PLACE}) for mass in PAYLOAD),
+        ),
+    )
+}  # fmt: skip
+
+
+def sweeps_for(task: str) -> tuple[str, ...]:
+    """Return the names of the sweeps that make sense for a task."""
+    return tuple(name for name, sweep in SWEEPS.items() if not sweep.tasks or task in sweep.tasks)
+
+
+def read_sweep(name: str, task: str) -> Sweep:
+    """Return a sweep by name.
+
+    Raises:
+        InputError: unknown, or not for this task.
+    """
+    if name not in SWEEPS:
+        raise unknown_name("sweep", name, SWEEPS)
+    if name not in sweeps_for(task):
+        raise InputError(f"sweep '{name}' is not for task '{task}'; for it: {', '.join(sweeps_for(task))}")
+    return SWEEPS[name]

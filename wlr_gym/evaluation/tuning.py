@@ -1,0 +1,111 @@
+"""Gains of a hand-written controller by search: what ``wlr train ENV --agent pid`` does.
+
+Every setting in turn goes up and down by its step; what scores better stays, and a step that brought nothing is halved. All
+candidates drive the same robots on the same floors, so the result depends on the settings at the start and the seed only.
+The score is what the task's success is judged by: the rms of each measure over an episode as a share of its limit, the
+quadratic mean of these shares, mean over episodes; a fall counts like errors of ten times the limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wlr_gym.errors import InputError
+from wlr_gym.evaluation.rollout import make_core
+from wlr_gym.files import make_output_folder
+from wlr_gym.policy import Policy, Training, write_contract
+from wlr_gym.policy.control import PidConfig, task_settings
+from wlr_gym.provenance import record_provenance
+
+if TYPE_CHECKING:
+    from wlr_gym.envs.core import Core
+
+MakePolicy = Callable[[Mapping[str, Any], Mapping[str, Any]], Policy]
+Say = Callable[[str], object]
+FALL = 10.0
+
+
+def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[PidConfig]) -> Path:
+    """Search from the settings of ``training``, and return the folder of the policy with the best ones.
+
+    Raises:
+        InputError: bad settings, or ``resume``: a search takes minutes and is not continued.
+    """
+    if training.resume:
+        raise InputError(f"agent '{agent}' is tuned by a search of a few minutes, which cannot be resumed: start it anew")
+    config = dict(training.config)
+    episodes = task_settings(model, {"task": ""}, config, agent).search.episodes
+    core = make_core(training.environment, episodes, config.get("environment", {}))
+    try:
+        contract = core.contract()
+        start = task_settings(model, contract, config, agent)
+        make_output_folder(training.folder)
+        record_provenance(
+            training.folder, {"environment": training.environment, "agent": agent, "settings": config}, start.seed
+        )
+        say: Say = print if training.progress else lambda _: None
+        best, score = search(core, make_policy, start, say)
+    finally:
+        core.close()
+    folder = training.folder / "policy"
+    folder.mkdir(exist_ok=True)
+    origin = {"environment": training.environment, "score": score, "episodes": episodes, "seed": start.seed}
+    write_contract(folder, agent, best, contract, origin)
+    return folder
+
+
+def search(core: Core, make_policy: MakePolicy, start: PidConfig, say: Say) -> tuple[dict[str, Any], float]:
+    """Return the best settings found from ``start`` on, without those of other tasks, and their score."""
+    contract = core.contract()
+    best = start.model_dump(mode="json") | {"tasks": {}}
+
+    def tried(settings: Mapping[str, Any]) -> float:
+        return tracking_score(core, make_policy(contract, settings), start.seed)
+
+    score = tried(best)
+    steps = dict(start.search.steps)
+    for _ in range(start.search.rounds):
+        for name, step in steps.items():
+            for candidate in (_changed(best, name, step, type(start)), _changed(best, name, -step, type(start))):
+                value = np.inf if candidate is None else tried(candidate)
+                if candidate is not None and value < score:
+                    best, score = candidate, value
+                    say(f"{name} = {best[name]:.4g}: {score:.4f}")
+                    break
+            else:
+                steps[name] = step / 2
+    return best, score
+
+
+def _changed(settings: Mapping[str, Any], name: str, step: float, model: type[PidConfig]) -> dict[str, Any] | None:
+    """Return the settings with one of them moved by ``step``, None where it would leave its range."""
+    changed = {**settings, name: settings[name] + step}
+    try:
+        model(**changed)
+    except ValueError:
+        return None
+    return changed
+
+
+def tracking_score(core: Core, policy: Policy, first_seed: int) -> float:
+    """Return the score of whole episodes, one per robot of ``core`` (see the module); less is better."""
+    for row in range(core.count):
+        core.seed(row, first_seed + row)
+    core.begin_episodes(core.everyone)
+    policy.reset(core.everyone)
+    active = core.everyone.copy()
+    squares, ticks = np.zeros_like(core.measures), np.zeros(core.count)
+    while active.any():
+        core.step(policy.act(core.observation), active)
+        squares[active] += core.measures[active] ** 2
+        ticks += active
+        active &= ~(core.terminated | core.truncated)
+    rms = np.sqrt(squares / ticks[:, None])
+    names = list(core.task.measures)
+    limits = {name: limit.rms or limit.max for name, limit in core.task.config.success.items()}
+    shares = np.stack([rms[:, names.index(name)] / limit for name, limit in limits.items()])
+    return float(np.mean(np.sqrt((shares**2).mean(axis=0)) + FALL * core.terminated))

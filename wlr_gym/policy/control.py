@@ -1,0 +1,265 @@
+"""Hand-written controllers: readings by name, the wheel speeds of a motion, and the feedback that agents are made of.
+
+Forward velocity v and yaw rate w are commanded, or follow from the errors of a path. A wheel y to the left of the body
+origin rolls at (v - y u) / radius, where the turn u is
+
+    u = steering * w + P (w - gyro) + I integral(w - gyro):
+
+a skid-steered robot turns less than its wheels would, ``steering`` times less on even friction. On a path, w is the
+curvature times v, minus ``heading`` times the heading error, minus ``lateral`` times the lateral error; on a slope gravity
+tells which way is up. Where the forward velocity is estimated, its error is corrected likewise. Moving legs are made up for
+in the wheel speeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.robot import CORNER_SIGNS, LEGS, Robot, load_robot, parse_config, robot_hash
+
+Array = NDArray[np.float64]
+#: Reads one quantity in its own unit (N,) from observations (N, D).
+Reader = Callable[[NDArray[np.floating]], Array]
+#: Where the wanted forward velocity stands, by task.
+FORWARD = ("command[linear_velocity_x]", "speed_command", "climb_command")
+ESTIMATED_FORWARD = "estimated_linear_velocity_in_body[x]"
+
+
+def known_robot(contract: Mapping[str, Any], name: str, agent: str) -> Robot:
+    """Return the robot whose numbers a controller uses.
+
+    Raises:
+        InputError: it is not the environment's.
+    """
+    robot = load_robot(name)
+    if robot_hash(robot) != contract["robot"]["hash"]:
+        raise InputError(f"agent '{agent}': robot '{name}' is not the environment's ('{contract['robot']['name']}')")
+    return robot
+
+
+class Readings:
+    """Quantities of an observation by their names in the contract.
+
+    Args:
+        contract: of the environment.
+        agent: who reads, for messages.
+    """
+
+    def __init__(self, contract: Mapping[str, Any], agent: str) -> None:
+        self.columns = {column["name"]: (index, column) for index, column in enumerate(contract["observation"])}
+        self.agent = agent
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def first(self, names: Sequence[str]) -> Reader:
+        """Return what reads the first of ``names`` that the observation has.
+
+        Raises:
+            InputError: it has none of them; names the nearest.
+        """
+        found = [name for name in names if name in self.columns]
+        if not found:
+            raise unknown_name("observation", names[0], list(self.columns), f"agent '{self.agent}' needs")
+        index, column = self.columns[found[0]]
+        scale, offset = column["scale"], column["offset"]
+        return lambda observations: observations[:, index].astype(np.float64) / scale + offset
+
+    def optional(self, *names: str) -> Reader:
+        """Return what reads the first of ``names`` that the observation has, zeros where it has none."""
+        known = any(name in self.columns for name in names)
+        return self.first(names) if known else lambda observations: np.zeros(len(observations))
+
+    def legs(self, term: str) -> Reader:
+        """Return what reads a quantity of the four legs (N, 4), zeros where the observation does not have it."""
+        readers = [self.optional(f"{term}[{leg}]") for leg in LEGS]
+        return lambda observations: np.stack([read(observations) for read in readers], axis=1)
+
+
+class Chassis:
+    """Geometry of a robot whose wheels stand in a rectangle, and its actions.
+
+    Attributes:
+        left: (4,) y of each wheel in the body frame, m.
+        front: (4,) +1 for front wheels, -1 for rear ones.
+    """
+
+    def __init__(self, contract: Mapping[str, Any], robot: Robot) -> None:
+        self.robot = robot
+        signs = np.array(CORNER_SIGNS, np.float64)
+        self.front = signs[:, 0]
+        self.left = robot.hip_position.y * signs[:, 1]
+        self._centre = np.array([column["centre"] for column in contract["action"]])
+        self._scale = np.array([column["scale"] for column in contract["action"]])
+
+    def rolling_speed(self, forward: Array, turn: Array) -> Array:
+        """Return how fast each wheel moves ahead (N, 4), m/s, for forward velocities and yaw rates (N,)."""
+        return forward[:, None] - turn[:, None] * self.left
+
+    def wheel_rate(self, rolling_speed: Array, leg_angle: Array, leg_rate: Array) -> Array:
+        """Return the wheel rates (N, 4) in rad/s, relative to the legs, that move the hips ahead at ``rolling_speed`` (N, 4).
+
+        A turning leg carries its wheel along at -l sin(angle) * rate and turns it by its own rate (``wlr_gym/slip.py``).
+        """
+        wheel, leg = self.robot.wheel.radius, self.robot.leg.length
+        return (rolling_speed - leg * np.sin(leg_angle) * leg_rate) / wheel - leg_rate
+
+    def actions(self, leg_angle: Array, wheel_rate: Array) -> NDArray[np.float32]:
+        """Return the actions (N, 8) for goals (N, 4) in rad and (N, 4) in rad/s, clipped to [-1, 1]."""
+        goals = np.concatenate([leg_angle, wheel_rate], axis=1)
+        return np.clip((goals - self._centre) / self._scale, -1.0, 1.0).astype(np.float32)
+
+
+class SearchConfig(BaseModel):
+    """How gains are searched (``wlr_gym/evaluation/tuning.py``).
+
+    Attributes:
+        steps: setting -> its first step.
+        rounds: passes over the settings.
+        episodes: that every candidate is scored by.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    steps: dict[str, float] = Field(default_factory=dict)
+    rounds: int = Field(default=5, gt=0)
+    episodes: int = Field(default=256, gt=0)
+
+
+class PidConfig(BaseModel):
+    """Settings. Gains without a unit unless named.
+
+    Attributes:
+        robot: whose geometry is used.
+        steering: wheel speed difference over what rolling alone needs for the wanted yaw rate.
+        yaw_rate_p: on the error of the gyro's yaw rate. yaw_rate_i: on its integral, 1/s.
+        velocity_p: on the error of the estimated forward velocity. velocity_i: on its integral, 1/s.
+        lateral: yaw rate per lateral error, rad/(m s). heading: yaw rate per heading error, 1/s.
+        uphill: yaw rate per specific force to the left, rad s/m: turns the robot uphill on a slope.
+        legs_inward: rad by which the legs reach under the body: a shorter wheelbase turns with less slip.
+        integral_limit: bound of the corrections by integrals, m/s and rad/s.
+        tasks: task name -> settings that differ there.
+        environment: keywords of the environment.
+        seed: of the first episode of the search. search: how it is made.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    robot: str = "nominal"
+    steering: float = Field(1.0, ge=0)
+    yaw_rate_p: float = Field(0.0, ge=0)
+    yaw_rate_i: float = Field(0.0, ge=0)
+    velocity_p: float = Field(0.0, ge=0)
+    velocity_i: float = Field(0.0, ge=0)
+    lateral: float = Field(0.0, ge=0)
+    heading: float = Field(0.0, ge=0)
+    uphill: float = Field(0.0, ge=0)
+    legs_inward: float = Field(0.0, ge=-0.4, le=0.4)
+    integral_limit: float = Field(0.2, gt=0)
+    tasks: dict[str, dict[str, float]] = Field(default_factory=dict)
+    environment: dict[str, Any] = Field(default_factory=dict)
+    seed: int = Field(0, ge=0)
+    search: SearchConfig = Field(default_factory=SearchConfig)
+
+
+Settings = TypeVar("Settings", bound=PidConfig)
+
+
+class Integral:
+    """Integrals of an error, one per robot, bounded.
+
+    Args:
+        gain: 1/s; the integral is of gain * error.
+        period: s per reading.
+        limit: bound of the integral.
+    """
+
+    def __init__(self, gain: float, period: float, limit: float) -> None:
+        self._step = gain * period
+        self._limit = limit
+        self.value: Array = np.zeros(0)
+
+    def add(self, error: Array) -> Array:
+        """Return the integrals (N,) with the present errors (N,) in them."""
+        if len(self.value) != len(error):
+            self.value = np.zeros(len(error))
+        self.value = np.clip(self.value + self._step * error, -self._limit, self._limit)
+        return self.value
+
+    def reset(self, mask: NDArray[np.bool_]) -> None:
+        """Forget the robots in ``mask`` (N,)."""
+        self.value = np.where(mask, 0.0, self.value) if len(self.value) == len(mask) else np.zeros(len(mask))
+
+
+class Pid:
+    """The controller; one integral per robot is what it remembers."""
+
+    def __init__(self, contract: Mapping[str, Any], config: PidConfig, agent: str = "pid") -> None:
+        self.config = config
+        self.chassis = Chassis(contract, known_robot(contract, config.robot, agent))
+        self.readings = Readings(contract, agent)
+        read = self.readings
+        self.forward = read.first(FORWARD)
+        self.turn = read.optional("command[yaw_rate]")
+        self.curvature = read.optional("path_curvature[0 m]")
+        self.lateral_error = read.optional("path_error[lateral]", "course_error[lateral]")
+        self.heading_error = read.optional("path_error[heading]", "course_error[heading]")
+        self.gyro = read.first(("gyro[z]",))
+        self.leftward_force = read.first(("accelerometer[y]",))
+        self.estimated_forward = read.first((ESTIMATED_FORWARD,)) if ESTIMATED_FORWARD in read else None
+        self.leg_offset, self.leg_rate = read.legs("leg_reference"), read.legs("leg_reference_rate")
+        period = contract["control_period"]
+        self._yaw_rate_integral = Integral(config.yaw_rate_i, period, config.integral_limit)
+        self._velocity_integral = Integral(config.velocity_i, period, config.integral_limit)
+
+    def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return actions (N, 8) for observations (N, D)."""
+        forward, turn = self.motion(observations)
+        return self.chassis.actions(self.legs(observations), self.wheels(observations, forward, turn))
+
+    def motion(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
+        """Return the forward velocity and turn (N,) to roll at: what is wanted, with corrections."""
+        config = self.config
+        forward = self.forward(observations)
+        turn = self.wanted_yaw_rate(observations, forward)
+        error = turn - self.gyro(observations)
+        turn = config.steering * turn + config.yaw_rate_p * error + self._yaw_rate_integral.add(error)
+        if self.estimated_forward is not None:
+            error = forward - self.estimated_forward(observations)
+            forward = forward + config.velocity_p * error + self._velocity_integral.add(error)
+        return forward, turn
+
+    def wanted_yaw_rate(self, observations: NDArray[np.floating], forward: Array) -> Array:
+        """Return the commanded yaw rate (N,), or the one that leads back to the path."""
+        lateral, heading = self.lateral_error(observations), self.heading_error(observations)
+        steer = self.curvature(observations) * forward - self.config.lateral * lateral - self.config.heading * heading
+        return self.turn(observations) + steer + self.config.uphill * self.leftward_force(observations)
+
+    def legs(self, observations: NDArray[np.floating]) -> Array:
+        """Return the leg goals (N, 4), rad."""
+        home = self.chassis.robot.home.leg_angle + self.config.legs_inward * self.chassis.front
+        return home + self.leg_offset(observations)
+
+    def wheels(self, observations: NDArray[np.floating], forward: Array, turn: Array) -> Array:
+        """Return the wheel goals (N, 4), rad/s."""
+        rolling = self.chassis.rolling_speed(forward, turn)
+        return self.chassis.wheel_rate(rolling, self.legs(observations), self.leg_rate(observations))
+
+    def reset(self, mask: NDArray[np.bool_]) -> None:
+        """Forget the integrals of the robots in ``mask`` (N,)."""
+        self._yaw_rate_integral.reset(mask)
+        self._velocity_integral.reset(mask)
+
+
+def task_settings(model: type[Settings], contract: Mapping[str, Any], config: Mapping[str, Any], agent: str) -> Settings:
+    """Return checked settings with those of the contract's task laid over."""
+    where = f"agent '{agent}'"
+    general = parse_config(model, dict(config), where)
+    own = general.tasks.get(contract["task"], {})
+    return parse_config(model, {**config, **own}, f"{where}, task '{contract['task']}'") if own else general

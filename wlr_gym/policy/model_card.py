@@ -1,0 +1,118 @@
+"""Model cards: what a policy file is, how it came about and how well it drives, as Markdown beside it."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.errors import InputError
+from wlr_gym.files import replace_file
+from wlr_gym.policy.file import needs_camera
+from wlr_gym.policy.onnx_file import open_policy
+
+SUFFIX = ".md"
+
+
+def write_model_card(policy: Path, evaluation: str) -> Path:
+    """Write the model card of a policy file beside it, and return its path.
+
+    Args:
+        policy: the file.
+        evaluation: score card as Markdown, as ``wlr evaluate --out`` writes it.
+
+    Raises:
+        InputError: no policy file, or a broken one.
+    """
+    _, content = open_policy(policy)
+    card = policy.with_suffix(SUFFIX)
+    text = "\n\n".join([f"# {policy.stem}", _summary(content), _table(_facts(policy, content)), _below(evaluation)]) + "\n"
+    replace_file(card, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    return card
+
+
+def check_model_card(policy: Path) -> None:
+    """Refuse a policy file without a card, or with one that was written for another file.
+
+    Raises:
+        InputError: naming both fingerprints.
+    """
+    card, mine = policy.with_suffix(SUFFIX), file_hash(policy)
+    try:
+        named = re.search(r"SHA-256 \| `([0-9a-f]{64})`", card.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{card}: cannot be read: {error.strerror}") from None
+    if named is None or named[1] != mine:
+        raise InputError(f"{card}: is about another file: SHA-256 {named and named[1]}, that of {policy.name} is {mine}")
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file, as ``sha256sum`` prints it."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _summary(content: Mapping[str, Any]) -> str:
+    environment, training = content["environment"], content.get("training", {})
+    sources = {column["source"] for column in environment["observation"]}
+    if "truth" in sources:
+        sees = "It sees what no robot can measure, friction for example: an upper bound, for simulators only."
+    elif "estimate" in sources:
+        camera = "with" if needs_camera(environment) else "without"
+        sees = f"It sees the estimates of the slip observer, {camera} a camera."
+    else:
+        sees = "It is blind to slip: it sees neither estimates of it nor a camera."
+    return (
+        f"A policy for `{training.get('environment', environment['task'])}`. {sees} Trained and evaluated in simulation; no "
+        "real robot was driven. `wlr play`, `wlr evaluate` and `wlr deploy` take it by name or path."
+    )
+
+
+def _facts(policy: Path, content: Mapping[str, Any]) -> dict[str, str]:
+    environment, training, config = content["environment"], content.get("training", {}), content["config"]
+    facts = {
+        "file": f"`{policy.name}`, {policy.stat().st_size / 1000:.0f} kB",
+        "SHA-256": f"`{file_hash(policy)}`",
+        "robot": f"{environment['robot']['name']}, at {1.0 / environment['control_period']:g} Hz",
+        "observation": f"{len(environment['observation'])} numbers: {_terms(environment['observation'])}",
+        "action": f"{len(environment['action'])} goals of joints",
+        "randomisation": environment.get("randomization", {}).get("name") or "as in the contract",
+    }
+    if "command" in training:
+        facts["trained with"] = f"`{training['command']}`"
+    facts["training"] = ", ".join(_training(content["agent"], training, config))
+    facts["versions"] = ", ".join(f"{name} {version}" for name, version in content.get("versions", {}).items())
+    if "exported" in content:
+        parity = content["exported"]["parity"]
+        largest = max(parity["random"], parity["real"])
+        facts["same as the trained network"] = f"within {largest:.1e} on {parity['observations']} observations"
+    return facts
+
+
+def _terms(columns: list[Mapping[str, Any]]) -> str:
+    """``command 2, gyro 3``: the terms in their order, with how many numbers each has."""
+    counts = Counter(column["name"].partition("[")[0] for column in columns)
+    return ", ".join(f"{term} {count}" for term, count in counts.items())
+
+
+def _training(agent: str, training: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
+    found = [agent]
+    if "steps" in training:
+        found.append(f"{training['steps']:,} control ticks")
+    if "seconds" in training:
+        found.append(f"{training['seconds'] / 60.0:.1f} min with {config.get('torch_threads', 1)} thread(s)")
+    if "seed" in training:
+        found.append(f"seed {training['seed']}")
+    return found
+
+
+def _table(facts: Mapping[str, str]) -> str:
+    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in facts.items())])
+
+
+def _below(evaluation: str) -> str:
+    """Return a score card as part of another document: headings a level deeper, without pictures, which stay where they are."""
+    lines = [line for line in evaluation.strip().splitlines() if not line.startswith("![")]
+    return "\n".join(f"#{line}" if line.startswith("#") else line for line in lines)

@@ -1,0 +1,138 @@
+"""What names a policy: an agent, a policy or run folder, a policy file (``.onnx``), or one shipped in ``agents/shipped/``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.errors import InputError, nearest
+from wlr_gym.paths import data_directory
+from wlr_gym.policy.agents import Contract, Policy, agent_function, agent_names, load_agent_config
+from wlr_gym.policy.file import CONTRACT_FILE, check_contract, read_contract
+from wlr_gym.policy.onnx_file import SUFFIX, open_policy
+
+#: Of a task's settings, what decides which numbers a policy is fed and what its own mean. The others are conditions.
+FED = ("observations", "observer", "action", "control_period")
+
+
+def shipped_directory() -> Path:
+    """Return the folder of the shipped policies, in a clone or a wheel."""
+    return data_directory("agents") / "shipped"
+
+
+def shipped_names() -> list[str]:
+    """Return the names of the shipped policies, such as ``velocity_slip_aware``."""
+    return sorted(path.stem for path in shipped_directory().glob(f"*{SUFFIX}"))
+
+
+def _policy_place(source: str | Path) -> Path | None:
+    """Return the policy folder or file of a trained policy.
+
+    Args:
+        source: policy folder, run folder with a ``policy`` in it, policy file, or name of a shipped policy.
+
+    Returns:
+        None where it is none of these.
+    """
+    path = Path(source)
+    if path.suffix == SUFFIX and path.is_file():
+        return path
+    for folder in (path, path / "policy"):
+        if (folder / CONTRACT_FILE).is_file():
+            return folder
+    return shipped_directory() / f"{source}{SUFFIX}" if str(source) in shipped_names() else None
+
+
+def find_policy(source: str | Path) -> Path:
+    """Return the policy folder or file of a trained policy.
+
+    Raises:
+        InputError: there is none; the message lists the names there are.
+    """
+    place = _policy_place(source)
+    if place is not None:
+        return place
+    if Path(source).is_dir():
+        raise InputError(f"'{source}': no policy there (looked for {CONTRACT_FILE} in it and in its folder 'policy')")
+    if Path(source).exists():
+        raise InputError(f"'{source}': not a policy: expected a folder, or a file {SUFFIX}")
+    hint = nearest(str(source), [*agent_names(), *shipped_names()])
+    raise InputError(
+        f"'{source}' is no policy: neither a folder, a file {SUFFIX}, an agent nor a shipped policy{hint}; "
+        f"agents: {', '.join(agent_names())}; shipped: {', '.join(shipped_names()) or 'none'}"
+    )
+
+
+def contract_of(source: str | Path) -> dict[str, Any]:
+    """Return the contract of a trained policy: what ``contract.json`` says, or the metadata of a policy file.
+
+    Raises:
+        InputError: no policy there, or broken.
+    """
+    place = find_policy(source)
+    return open_policy(place)[1] if place.suffix == SUFFIX else read_contract(place)
+
+
+def load_policy(source: str | Path, environment: Contract) -> Policy:
+    """Load a trained policy for an environment.
+
+    Args:
+        source: policy folder, run folder with a ``policy`` in it, policy file, or name of a shipped policy.
+        environment: what ``env.contract()`` returns.
+
+    Raises:
+        InputError: no policy there, broken, or a contract that does not fit, naming the first difference.
+    """
+    place = find_policy(source)
+    if place.suffix == SUFFIX:
+        policy, contract = open_policy(place)
+        check_contract(contract["environment"], environment, str(place))
+        return policy
+    contract = read_contract(place)
+    check_contract(contract["environment"], environment, str(place))
+    return agent_function(contract["agent"], "load_policy")(place, contract)
+
+
+def make_policy(source: str | Path, environment: Contract) -> Policy:
+    """Return the policy of an agent's name (with its shipped settings), or a trained one; see :func:`load_policy`.
+
+    Raises:
+        InputError: neither an agent nor a policy, or a policy that does not fit the environment.
+    """
+    if str(source) in agent_names():
+        return agent_function(str(source), "make_policy")(environment, load_agent_config(source))
+    return load_policy(source, environment)
+
+
+def policy_environment(source: str | Path) -> dict[str, Any]:
+    """Return the keywords that an environment must be made with so that a policy is fed what it was made for.
+
+    They are those of its training that decide what its inputs and outputs mean (see :data:`FED`). Conditions, such as backend,
+    randomisation, commands or precision, are not among them: a policy may be tried under others.
+
+    Args:
+        source: as of :func:`make_policy`.
+
+    Returns:
+        ``{"task": ...}``, or nothing where the task is the one that ships.
+
+    Raises:
+        InputError: neither an agent nor a policy, or a broken one.
+    """
+    config = load_agent_config(source) if str(source) in agent_names() else contract_of(source)["config"]
+    task = (config.get("environment") or {}).get("task")
+    if isinstance(task, Mapping):
+        task = {key: task[key] for key in FED if key in task}
+    return {"task": task} if task else {}
+
+
+def trained_environment(source: str | Path) -> str | None:
+    """Return the id of the environment that a policy was trained in; None for agents, which nobody trained.
+
+    Raises:
+        InputError: neither an agent nor a policy, or a broken one.
+    """
+    if str(source) in agent_names():
+        return None
+    return contract_of(source).get("training", {}).get("environment")
