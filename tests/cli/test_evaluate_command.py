@@ -35,11 +35,12 @@ def test_it_writes_the_same_card_twice(tmp_path, capsys):
 
 def test_full_means_seeds_sweeps_and_both_simulators(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "FULL_EPISODES", 2)
+    monkeypatch.setattr(evaluate, "FULL_SEEDS", 2)
     arguments = ["evaluate", "constant_command", "--full", "--baselines", "do_nothing", "--sweep", "payload", "--no-progress"]
     arguments += ["--other-episodes", "1", "--sweep-episodes", "1", "--out", str(tmp_path)]
     assert main(arguments) == 0
     content = json.loads((tmp_path / "card.json").read_text())
-    assert content["conditions"]["episodes"] == "2 x 5 seeds"
+    assert content["conditions"]["episodes"] == "2 x 2 seeds"
     assert content["conditions"]["second simulator"] == "mujoco, 1 episodes"
     assert [point["at"] for point in content["sweeps"]["payload"]] == ["0", "0.25", "0.5", "1", "2"]
     assert content["other_plant"]["score_kept"]["constant_command"]["mean"] > 50.0

@@ -74,10 +74,10 @@ def test_observer_follows_what_the_sensors_read():
     action = np.zeros((20, 8), np.float32)
     action[:, 4:] = 0.1 / 0.034 / 6.0
     for _ in range(250):
-        observation = env.step(action)[0]
+        env.step(action)
     core = env.unwrapped.core
     names = [column.element for column in core.task.policy]
-    speed = observation[:, names.index("linear_velocity_in_body[x]")] / 10.0
+    speed = core.observation[:, names.index("linear_velocity_in_body[x]")] / 10.0
     true = core.plant.truth()["linear_velocity_in_body"][:, 0]
     assert np.abs(speed - true).max() < 0.005
 

@@ -12,7 +12,7 @@ from wlr_gym.evaluation.sweeps import SWEEPS, read_sweep, sweeps_for
 ID = "WLR-Velocity-v0"
 SHORT = {"episode_length": 0.2}
 #: What configs of agents say about the environment that they need, by name of the subject.
-BLIND = {"task": {"observations": {"accelerometer": None}}}
+BLIND = {"task": {"observations": {"leg_effort": None}}}
 SUBJECTS = read_subjects(["idle=do_nothing", "constant_command"])
 
 
@@ -30,9 +30,9 @@ def test_every_subject_plays_every_condition_with_the_same_episodes(monkeypatch)
         seen[condition.label, subject.name, block] = rollout
 
     results = play(ID, SUBJECTS, conditions, 100, lambda text, cost: told.append((text, cost)), watch)
-    assert {label: list(names) for label, names in results.items()} == dict.fromkeys(
-        ("main", "icy"), ["idle", "constant_command"]
-    )
+    assert {label: list(names) for label, names in results.items()} == {
+        key: ["idle", "constant_command"] for key in ("main", "icy")
+    }
     assert results["main"]["idle"].pairs["reward"].shape == (2, 3, 2)
     for (label, _, block), rollout in seen.items():
         other = seen[label, "idle", block]
@@ -64,7 +64,7 @@ def test_a_condition_on_the_task_holds_for_a_policy_with_a_task_of_its_own(monke
     [
         (
             {"task": {"commands": {"terms": {"yaw_rate": [-0.5, 0.5]}}}},
-            r"seed 100.* gets another command from control tick \d+",
+            r"seed 10.* gets another command from control tick \d+",
         ),
         ({"randomization": "wide"}, r"seed 100: .* is .* and "),
         ({"randomization": {"base": "slippery", "initial_state": {"yaw": 0.1}}}, "starts in another state"),

@@ -16,6 +16,7 @@ from wlr_gym.evaluation import (
     roll_out,
     rows,
     summarise,
+    sweep_comparison_rows,
     sweep_rows,
     transfer_rows,
     write_card,
@@ -71,7 +72,7 @@ def test_what_is_kept_on_the_other_plant_is_paired_with_the_same_episodes():
 
 def test_rows_show_nothing_where_there_is_nothing():
     still = summarise([rollout(position=np.zeros((TICKS, EPISODES, 2)))])
-    table = dict((row[0], row[2]) for row in rows(Card({MAIN: {"still": still}}).scores[MAIN], card().metrics))
+    table = {row[0]: row[2] for row in rows(Card({MAIN: {"still": still}}).scores[MAIN], card().metrics)}
     assert table["slip_per_metre"] == "-"
     assert table["power"] == "1.00 [1.00, 1.00]"
     better = {row[0]: row[2:] for row in comparison_rows(card())}
@@ -95,6 +96,9 @@ def test_a_sweep_has_a_row_per_point(swept):
     assert header[1:] == ["ours", "do_nothing", "pid"]
     assert [row[0] for row in body] == [point.label for point in SWEEPS["friction"].points]
     assert body[0][1].startswith("1.414 ±")  # 0.04 m/s: twice one of two limits
+    header, *body = sweep_comparison_rows(swept, 0)
+    assert header[1:] == ["do_nothing", "pid"]
+    assert [row[2] for row in body] == ["50.0 [50.0, 50.0]"] * len(body)
 
 
 def test_card_files(swept, tmp_path):
@@ -190,7 +194,8 @@ class Spin:
 
 
 def test_full_throttle_saturates_and_rest_does_not(core):
-    assert roll_out(core, Spin(), 0).saturated[-10:, :, 4:].mean() > 0.5
+    grippy = {"ground.mu_x": 0.9, "ground.mu_y": 0.9, "patch.mu": 0.9}
+    assert roll_out(core, Spin(), 0, parameters=grippy).saturated[-10:, :, 4:].mean() > 0.5
     assert not roll_out(core, make_policy("do_nothing", core.contract()), 0).saturated[25:].any()
 
 

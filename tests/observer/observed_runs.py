@@ -75,7 +75,16 @@ def excited_goals(robot: Robot, ticks: int, count: int, rng: np.random.Generator
     return goals
 
 
-DRIVES = {"commands": commanded_goals, "excitation": excited_goals}
+def climbing_goals(robot: Robot, ticks: int, count: int, rng: np.random.Generator) -> Array:
+    """Drive straight ahead at 0.03 to 0.1 m/s, reached within half a second, for two thirds of the time; then hold."""
+    time = PERIOD * np.arange(ticks)[:, None, None]
+    speed = rng.uniform(0.03, 0.1, (count, 1)) * np.minimum(time / 0.5, 1.0) * (time < time[-1] * 2.0 / 3.0)
+    goals = np.full((ticks, count, 8), robot.home.leg_angle)
+    goals[..., 4:] = speed / robot.wheel.radius
+    return goals
+
+
+DRIVES = {"climb": climbing_goals, "commands": commanded_goals, "excitation": excited_goals}
 
 
 def simulate(backend: str, floor: str, drive: str, count: int, seconds: float, seed: int = 0, **parameters: float) -> Runs:
@@ -130,3 +139,20 @@ def estimated(values: Array, name: str) -> Array:
 def slip_in_truth_order(values: Array) -> Array:
     """Slip velocities (T + 1, N, 8) as (T + 1, N, 4, 2)."""
     return values.reshape(*values.shape[:2], 4, 2)
+
+
+def plain_odometry(runs: Runs) -> Array:
+    """Velocity (T + 1, N, 2) as the wheels' encoders alone tell it: their mean ahead, none to the side."""
+    forward = runs.robot.wheel.radius * runs.sensed("joint_velocity")[..., 4:].mean(axis=-1)
+    return np.stack([forward, np.zeros_like(forward)], axis=-1)
+
+
+def imu_only(runs: Runs) -> Array:
+    """Velocity (T + 1, N, 2) by integrating the accelerometer from rest, less what it reads at the start."""
+    force, rate = runs.sensed("accelerometer"), runs.sensed("gyro")[..., 2]
+    acceleration = force[..., :2] - force[:1, :, :2]
+    out = np.zeros_like(acceleration)
+    for tick in range(1, len(out)):
+        v, w = out[tick - 1], rate[tick][:, None]
+        out[tick] = v + PERIOD * (acceleration[tick - 1 : tick + 1].mean(axis=0) + w * np.stack([v[:, 1], -v[:, 0]], axis=-1))
+    return out

@@ -1,16 +1,42 @@
 """Model cards: written from a file's contract and a score card; every shipped policy has its own."""
 
 import shutil
-from itertools import zip_longest
 
 import pytest
 
 from wlr_gym.cli import main
 from wlr_gym.errors import InputError
-from wlr_gym.policy import check_model_card, contract_of, find_policy, shipped_names, write_model_card
+from wlr_gym.evaluation import make_core
+from wlr_gym.policy import (
+    check_model_card,
+    contract_of,
+    find_policy,
+    make_policy,
+    policy_environment,
+    shipped_names,
+    trained_environment,
+    write_model_card,
+)
 from wlr_gym.policy.onnx_file import seal
 
-SCORES = "# Score card\n\n| metric | mine |\n|---|---|\n| rms | 0.01 |\n\n![sweep](sweep.png)\n\n## Sweep\n"
+SCORES = """# Score card: velocity_blind
+
+| metric | velocity_blind |
+|---|---|
+| rms | 0.01 |
+
+![bars](bars.png)
+
+## Spectrum
+
+![spectrum](spectrum.png)
+
+## Sweep
+
+![sweep](sweep.png)
+
+| friction | rms |
+"""
 
 
 @pytest.fixture
@@ -27,9 +53,9 @@ def test_a_card_says_what_the_file_is(policy):
     assert "command 2, leg_position 4" in text
     assert "ppo, 64 control ticks, 0.0 min with 1 thread(s), seed 0" in text
     assert "| randomisation |" in text
-    assert "## Score card" in lines
-    assert "### Sweep" in lines
-    assert "sweep.png" not in text
+    below = text[text.index("## Score card: velocity_blind") :]
+    assert below.splitlines()[2] == "| metric | velocity_blind |"
+    assert below.endswith("| rms | 0.01 |\n\n### Sweep\n\n| friction | rms |\n")
     check_model_card(policy)
 
 
@@ -45,8 +71,8 @@ def test_a_card_says_what_the_file_is(policy):
 def test_a_card_says_what_the_policy_sees(policy, sources, observer, words):
     content = contract_of(policy)
     content["environment"]["observer"] = observer
-    for column, source in zip_longest(content["environment"]["observation"], sources, fillvalue="sensors"):
-        column["source"] = source
+    for index, column in enumerate(content["environment"]["observation"]):
+        column["source"] = sources[index % len(sources)]
     policy.write_bytes(seal(policy.read_bytes(), content))
     assert words in write_model_card(policy, SCORES).read_text()
 
@@ -66,6 +92,12 @@ def test_a_card_of_another_file_is_noticed(policy):
         check_model_card(policy)
 
 
+def test_scores_of_other_policies_are_refused(policy):
+    with pytest.raises(InputError, match="about other policies than 'velocity_blind'"):
+        write_model_card(policy, "# Score card: velocity_slip_aware\n")
+    assert not policy.with_suffix(".md").exists()
+
+
 def test_command_line(policy, tmp_path, capsys):
     (tmp_path / "scores").mkdir()
     assert main(["export", str(policy), "--card", str(tmp_path / "scores")]) == 2
@@ -74,6 +106,13 @@ def test_command_line(policy, tmp_path, capsys):
     assert main(["export", str(policy), "--card", str(tmp_path / "scores")]) == 0
     check_model_card(policy)
     assert main(["export", str(policy), "--card", str(tmp_path / "scores"), "--out", "x.onnx"]) == 2
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_every_shipped_policy_fits_its_environment(name):
+    core = make_core(trained_environment(name) or "", 1, policy_environment(name))
+    assert make_policy(name, core.contract()).act(core.observation).shape == (1, 8)
+    core.close()
 
 
 @pytest.mark.parametrize("name", shipped_names())

@@ -20,6 +20,7 @@ from wlr_gym.cli import main
 from wlr_gym.errors import InputError, MissingPackageError
 from wlr_gym.evaluation import make_core
 from wlr_gym.policy import contract_of, export_policy, load_agent, load_policy, make_policy, read_contract, write_contract
+from wlr_gym.policy.export import compare
 from wlr_gym.policy.onnx_file import CONTRACT_KEY, FINGERPRINT_KEY, open_policy, seal
 
 ID = "WLR-Velocity-v0"
@@ -167,7 +168,7 @@ def test_any_changed_bit_is_noticed(exported, tmp_path):
         changed = bytearray(data)
         changed[place] ^= 128
         (tmp_path / "p.onnx").write_bytes(changed)
-        with pytest.raises(InputError, match="damaged or changed|not a policy file"):
+        with pytest.raises(InputError, match=r"damaged or changed|not a policy file"):
             open_policy(tmp_path / "p.onnx")
 
 
@@ -209,6 +210,23 @@ def test_a_graph_that_answers_differently_is_not_written(trained, environment, t
     assert len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.parametrize("where", ["random", "real"])
+def test_answers_that_are_no_numbers_are_not_alike(environment, where):
+    class Policy:
+        def __init__(self, bad):
+            self.bad = bad
+
+        def act(self, observations):
+            is_bad = self.bad == ("real" if len(observations) == 4 else "random")
+            return np.full((len(observations), 8), np.nan if is_bad else 0.0, np.float32)
+
+        def reset(self, mask):
+            pass
+
+    with pytest.raises(InputError, match="by up to nan"):
+        compare(Policy(""), Policy(where), environment, rows(environment, 4))
+
+
 def test_what_cannot_be_exported(trained, exported, environment, tmp_path):
     seen, out = rows(environment, 1), tmp_path / "p.onnx"
     with pytest.raises(InputError, match=r"policy\.onnx: is a policy file already"):
@@ -238,6 +256,13 @@ def test_command_line(trained, exported, tmp_path, capsys):
     assert "no policy there" in capsys.readouterr().err
     assert main(["export", "pid", "--out", str(out)]) == 2
     assert main(["export", str(trained), "--out", str(tmp_path / "p.pt")]) == 2
+
+
+@pytest.mark.parametrize(("clock", "seconds"), [([1.0, 2.0, 4.0], 4.0), ([1.0, 2.0, 0.5, 3.0], 5.0), ([7.0], 7.0)])
+def test_wall_time_of_resumed_runs(clock, seconds):
+    from wlr_gym.cli.export import wall_time
+
+    assert wall_time(clock) == seconds
 
 
 def test_training_commands_are_told_without_the_machine():

@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from wlr_gym.envs.registry import ENVIRONMENTS
 from wlr_gym.robot import load_robot
-from wlr_gym.tasks import load_randomization
+from wlr_gym.tasks import load_randomization, load_task
 from wlr_gym.tasks.describe import randomization_table
 from wlr_gym.tasks.entries import AreaConfig, EventConfig
+from wlr_gym.tasks.markdown import task_tables
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "randomization.md").read_text(encoding="utf-8")
@@ -29,6 +31,15 @@ def config(name):
 def test_tables_are_those_of_the_code(name, base):
     block = TEXT.split(f"<!-- {name}: ")[1].split(f"<!-- end of {name} -->")[0]
     assert block.splitlines()[1:] == randomization_table(config(name), None if base is None else config(base))
+
+
+@pytest.mark.parametrize(("env_id", "name"), [(env_id, name) for env_id, (name, _, _) in ENVIRONMENTS.items()])
+def test_tables_of_environments_are_those_of_the_code(env_id, name):
+    text = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
+    section = text.split(f"## {env_id}\n")[1]
+    block = section.split(f"<!-- {name}: ")[1].split(f"<!-- end of {name} -->")[0]
+    assert block.splitlines()[1:] == task_tables(load_task(name, load_robot()))
+    assert (ROOT / "docs" / "figures" / f"environment_{name}.png").is_file()
 
 
 def test_every_preset_is_named():

@@ -24,7 +24,7 @@ def signals(**values: Any) -> Signals:
     return Signals(lambda name: values[name.removeprefix("command.").removeprefix("robot.").replace(".", "_")])
 
 
-def error(shape, x, y, yaw=0.0, *, bend=1.0, wavelength=1.5, offset=0.0, turn=0.0) -> references.PathError:
+def error(shape, x, y, yaw: Any = 0.0, *, bend=1.0, wavelength=1.5, offset=0.0, turn=0.0) -> references.PathError:
     given = {"path_shape": shape, "path_curvature": bend, "path_wavelength": wavelength}
     motion = Motion(np.asarray(x), np.asarray(y), np.asarray(yaw), 0.0, 0.0, 0.0)
     return references.path_error(signals(**given, path_offset=offset, path_heading=turn), motion)
@@ -126,8 +126,8 @@ def test_leg_rates_are_the_slopes_of_the_leg_angles():
 
 
 def test_climbing_ends_when_its_time_is_over():
-    for time, speed in ((0.0, 0.05), (6.9, 0.05), (7.0, 0.0), (9.0, 0.0)):
-        assert references.climb_speed(signals(climb_speed=0.05, climb_time=7.0, time=time)) == speed
+    for time, speed in ((0.0, 0.0), (0.3, 0.03), (0.5, 0.05), (7.0, 0.05), (7.2, 0.03), (7.5, 0.0), (9.0, 0.0)):
+        assert references.climb_speed(signals(climb_speed=0.05, climb_time=7.0, time=time)) == pytest.approx(speed, abs=1e-12)
 
 
 def test_motion_is_seen_from_the_start():

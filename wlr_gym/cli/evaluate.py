@@ -52,7 +52,7 @@ BASELINES, FULL_BASELINES = ("do_nothing", "pid"), ("do_nothing", "constant_comm
 #: What is played where no option says otherwise: quickly, and with --full.
 EPISODES, FULL_EPISODES = 64, 256
 SEEDS, FULL_SEEDS = 1, 5
-SWEEP_EPISODES, OTHER_EPISODES = 128, 64
+SWEEP_EPISODES, OTHER_EPISODES = 64, 64
 
 
 @dataclass(frozen=True)
@@ -263,5 +263,5 @@ def _print(title: str, table: Sequence[Sequence[str]]) -> None:
     for row in body:
         shown.add_row(*row)
     console = Console()
-    console.width = max(console.width, 30 + 20 * len(header))  # rather a wide line than a cut number
+    console.width = max(console.width, 60 + 20 * len(header))  # rather a wide line than a cut number
     console.print(shown)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +91,7 @@ def real_observations(source: Path) -> NDArray[np.float32]:
 
 
 def training_facts(folder: Path) -> dict[str, Any]:
-    """Return what the run folder around a policy says of its training: command, git commit, wall time; what it does not is left
-    out."""
+    """Return what the run folder around a policy says of its training, as far as it does: command, git commit, wall time."""
     from wlr_gym.evaluation import read_curve
     from wlr_gym.provenance import PROVENANCE_FILE
     from wlr_gym.robot import read_yaml
@@ -101,8 +102,13 @@ def training_facts(folder: Path) -> dict[str, Any]:
         saved = read_yaml(origin) or {}
         facts |= {"command": portable(saved.get("command", "")), "git_commit": saved.get("git_commit")}
     if curve.is_file() and (rows := read_curve(curve)):
-        facts["seconds"] = rows[-1]["seconds"]
+        facts["seconds"] = wall_time([row["seconds"] for row in rows])
     return facts
+
+
+def wall_time(clock: Sequence[float]) -> float:
+    """Return the time a run took (s), from a clock that started anew each time the run was resumed."""
+    return sum(now for now, later in pairwise([*clock, 0.0]) if later < now)
 
 
 def portable(command: str) -> str:

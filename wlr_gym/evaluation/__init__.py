@@ -9,7 +9,15 @@ from wlr_gym.evaluation.rollout import Measure, Rollout, make_core, roll_out
 from wlr_gym.evaluation.statistics import Estimate
 from wlr_gym.evaluation.subjects import Subject, make_player, read_subjects
 from wlr_gym.evaluation.sweeps import read_sweep, sweeps_for
-from wlr_gym.evaluation.write import comparison_rows, rows, sweep_rows, transfer_rows, write_card, write_episodes
+from wlr_gym.evaluation.write import (
+    comparison_rows,
+    rows,
+    sweep_comparison_rows,
+    sweep_rows,
+    transfer_rows,
+    write_card,
+    write_episodes,
+)
 
 __all__ = [
     "FIRST_SEED",
@@ -37,6 +45,7 @@ __all__ = [
     "rows",
     "score",
     "summarise",
+    "sweep_comparison_rows",
     "sweep_rows",
     "sweeps_for",
     "transfer_rows",

@@ -112,15 +112,13 @@ class Card:
     @cached_property
     def share_of(self) -> dict[str, Estimate]:
         """Baseline -> the first subject's score in % of the baseline's; a score is the reward above doing nothing's."""
-        if IDLE not in self.main:
-            return {}
-        ours, *others = (name for name in self.names if name != IDLE)
-        if ours != self.names[0]:
+        ours, *others = self.names
+        if IDLE not in others:
             return {}
         idle = self.main[IDLE].pairs["reward"]
         resampling = _bootstrap(self.main[ours])
         reward = {name: played.pairs["reward"] for name, played in self.main.items()}
-        return {name: resampling.share(reward[ours], reward[name], idle, idle) for name in others}
+        return {name: resampling.share(reward[ours], reward[name], idle, idle) for name in others if name != IDLE}
 
     @cached_property
     def kept(self) -> dict[str, Estimate]:

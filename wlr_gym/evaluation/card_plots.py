@@ -132,5 +132,6 @@ def spectra(card: Card) -> Figure:
     axes.set(xlabel="frequency (Hz)", ylabel="power density of the action (1/Hz)", xscale="log", yscale="log")
     axes.set_title(f"Action, mean over joints; jitter is what lies right of {JITTER_FREQUENCY:g} Hz", fontsize=10)
     axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=8)
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(fontsize=8)
     return figure

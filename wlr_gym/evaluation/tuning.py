@@ -1,6 +1,6 @@
 """Gains of a hand-written controller by search: what ``wlr train ENV --agent pid`` does.
 
-Every setting in turn goes up and down by its step; what scores better stays, and a step that brought nothing is halved. All
+Every setting in turn goes up and down by its step; what scores best stays, and a step that brought nothing is halved. All
 candidates drive the same robots on the same floors, so the result depends on the settings at the start and the seed only.
 The score is what the task's success is judged by: the rms of each measure over an episode as a share of its limit, the
 quadratic mean of these shares, mean over episodes; a fall counts like errors of ten times the limits.
@@ -69,13 +69,15 @@ def search(core: Core, make_policy: MakePolicy, start: PidConfig, say: Say) -> t
     score = tried(best)
     steps = dict(start.search.steps)
     for _ in range(start.search.rounds):
-        for name, step in steps.items():
-            for candidate in (_changed(best, name, step, type(start)), _changed(best, name, -step, type(start))):
-                value = np.inf if candidate is None else tried(candidate)
-                if candidate is not None and value < score:
-                    best, score = candidate, value
-                    say(f"{name} = {best[name]:.4g}: {score:.4f}")
-                    break
+        for name, step in list(steps.items()):
+            candidates = [_changed(best, name, move, type(start)) for move in (step, -step)]
+            values = [np.inf if candidate is None else tried(candidate) for candidate in candidates]
+            better = int(np.argmin(values))
+            if values[better] < score:
+                best, score = candidates[better] or best, values[better]
+                say(f"{name} = {best[name]:.4g}: {score:.4f}")
+            elif values[0] == values[1]:
+                del steps[name]  # plays no part in this task
             else:
                 steps[name] = step / 2
     return best, score

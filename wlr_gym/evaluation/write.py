@@ -64,6 +64,16 @@ def sweep_rows(card: Card, index: int, key: str = "tracking_error", *, short: bo
     return [[sweep.axis, *card.names], *body]
 
 
+def sweep_comparison_rows(card: Card, index: int, key: str = "tracking_error", *, short: bool = False) -> Table:
+    """Return how much better the first subject is over a sweep, in %: one row per point with a column per baseline."""
+    sweep = card.sweeps[index]
+    body = [
+        [point.label, *(cell(own[key], 1, short) for own in card.comparison[sweep.label(point)].values())]
+        for point in sweep.points
+    ]
+    return [[sweep.axis, *card.names[1:]], *body]
+
+
 def transfer_rows(card: Card, *, short: bool = False) -> Table:
     """Return scores on both plants on the same floors: a header, then one row per subject."""
     keys = ("tracking_error", "success", "excess_slip")
@@ -93,7 +103,11 @@ def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
         lines += [*_table(comparison_rows(card)), "", *picture("improvement", "Paired improvements")]
     for index, sweep in enumerate(card.sweeps):
         lines += [f"## Sweep: {sweep.name}", "", f"{sweep.doc[0].upper()}{sweep.doc[1:]}. Tracking error:", ""]
-        lines += [*_table(sweep_rows(card, index, short=False)), "", *picture(f"sweep_{sweep.name}", f"Sweep: {sweep.name}")]
+        lines += [*_table(sweep_rows(card, index, short=False)), ""]
+        if len(card.names) > 1:
+            lines += [f"By how much {ours} is better in it (%), paired:", ""]
+            lines += [*_table(sweep_comparison_rows(card, index)), ""]
+        lines += picture(f"sweep_{sweep.name}", f"Sweep: {sweep.name}")
     if OTHER_PLANT in card.results:
         lines += ["## On the other plant", "", "The same floors, robots and commands in the other simulator.", ""]
         lines += [*_table(transfer_rows(card)), ""]

@@ -61,7 +61,9 @@ class Model:
 
     def without_effect(self, index: int) -> Model:
         """Return the model with one effect less."""
-        return replace(self, effects=self.effects[:index] + self.effects[index + 1 :])
+        effects = list(self.effects)
+        del effects[index]
+        return replace(self, effects=tuple(effects))
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ from wlr_gym.gap.fit import (
     moved,
     nominal_model,
     normal_equations,
+    on_bounds,
     total_cost,
 )
 from wlr_gym.gap.likelihood import Noise, estimate_noise, minus_two_log_likelihood
@@ -36,6 +37,8 @@ Tell = Callable[[str], None]
 
 #: Hypotheses that are refitted in one round, at most so many per name, and rounds of refitting.
 SHORTLIST, PER_NAME, ROUNDS = 8, 3, 6
+#: So many known numbers at their bounds, 2.5 tolerances from nominal, are not what a robot is: something else is in them.
+STRAINED = 3
 #: Share of what the best hypothesis buys by which one start may be behind another of the same before it is given up.
 BEHIND = 0.5
 #: The best of every name that buys at least this share of what the best buys is fitted in full before one is taken; so many.
@@ -255,7 +258,8 @@ def finalists(
     wholes = []
     for hypothesis in best.values():
         tell(f"fitting {hypothesis.candidate.label} in full")
-        wholes.append(fit(problem, runs, hypothesis.model, steps=problem.steps, tell=tell))
+        near = fit(problem, runs, hypothesis.model, steps=problem.steps, tell=tell)
+        wholes.append(min((near, *_afresh(problem, runs, hypothesis, near, tell)), key=lambda whole: whole.cost))
     if not wholes:
         return []
     memory = min(wholes, key=lambda whole: whole.cost).noise.memory
@@ -275,6 +279,17 @@ def _probed(candidate: Candidate, start: Start) -> tuple[float, ...]:
     """Values of a candidate's unknowns in a start's own probes, within the plausible range."""
     values = start.values(np.ones(len(start.directions)))
     return tuple(float(np.clip(v, u.low, u.high)) for v, u in zip(values, candidate.unknowns, strict=True))
+
+
+def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near: Fit, tell: Tell) -> list[Fit]:
+    """The fit once more from the model as given, if known numbers are strained by what they took on in the effect's place."""
+    if on_bounds(problem, near.model).sum() < STRAINED:
+        return []
+    tell("known numbers at their bounds: once more from the model as given")
+    candidate = hypothesis.candidate
+    given = replace(hypothesis.model.without_effect(-1), quantities=nominal_model(problem).quantities)
+    start = given.with_effect(candidate, _probed(candidate, candidate.starts[0]))
+    return [fit(problem, runs, start, memory=near.noise.memory, steps=2 * problem.steps, tell=tell)]
 
 
 def _carries_over(

@@ -7,6 +7,11 @@ from typing import Any
 
 from numba import njit
 
+from wlr_gym.plants.base import SENSOR_LAYOUT
+
+_LEG_RATE = SENSOR_LAYOUT.slices["joint_velocity"].start
+_WHEEL_RATE = _LEG_RATE + 4
+_WHEEL_EFFORT = SENSOR_LAYOUT.slices["joint_effort"].start + 4
 #: N. Less than this counts as a wheel in the air when something is divided by its load.
 LEAST_LOAD = 0.5
 
@@ -24,14 +29,14 @@ def look(robot: Any, sensors: Any, r: Any) -> None:
         r: record of the robot; reads ``normal``, ``rate`` (body's angular velocity, body frame).
     """
     nx, ny, nz = r.normal[0], r.normal[1], r.normal[2]
-    scale = 1.0 / math.sqrt(nx * nx + nz * nz)
+    scale = 1.0 / math.sqrt(nx * nx + nz * nz + 1e-12)
     hx, hz = nz * scale, -nx * scale
     r.heading[0], r.heading[1], r.heading[2] = hx, 0.0, hz
     r.left[0], r.left[1], r.left[2] = ny * hz, nz * hx - nx * hz, -ny * hx
     wx, wy, wz = r.rate[0], r.rate[1], r.rate[2]
     reach = robot.wheel_radius * scale
     for i in range(4):
-        angle, leg_rate, wheel_rate = sensors[i], sensors[8 + i], sensors[12 + i]
+        angle, leg_rate, wheel_rate = sensors[i], sensors[_LEG_RATE + i], sensors[_WHEEL_RATE + i]
         leg_x, leg_z = robot.leg_length * math.cos(angle), -robot.leg_length * math.sin(angle)
         rim_x, rim_z = -reach * nx, -reach * nz
         x = robot.hip[i, 0] + leg_x + rim_x
@@ -134,10 +139,10 @@ def pull(robot: Any, sensors: Any, r: Any) -> None:
     Equations (25) to (28) of the paper as corrected.
     """
     for i in range(4):
-        rate = sensors[12 + i]
-        spin = rate + sensors[8 + i] + r.rate[1]
+        rate = sensors[_WHEEL_RATE + i]
+        spin = rate + sensors[_LEG_RATE + i] + r.rate[1]
         spin_up = (spin - r.spin[i]) / robot.period
         dry = robot.gear_friction * math.tanh(rate / robot.velocity_count)
-        torque = sensors[20 + i] - dry - robot.spin_inertia * spin_up
+        torque = sensors[_WHEEL_EFFORT + i] - dry - robot.spin_inertia * spin_up
         r.traction[i] = torque / robot.wheel_radius
         r.spin[i] = spin

@@ -25,9 +25,11 @@ def write_model_card(policy: Path, evaluation: str) -> Path:
         evaluation: score card as Markdown, as ``wlr evaluate --out`` writes it.
 
     Raises:
-        InputError: no policy file, or a broken one.
+        InputError: no policy file, a broken one, or scores that do not name it.
     """
     _, content = open_policy(policy)
+    if policy.stem not in evaluation:
+        raise InputError(f"the score card is about other policies than '{policy.stem}'")
     card = policy.with_suffix(SUFFIX)
     text = "\n\n".join([f"# {policy.stem}", _summary(content), _table(_facts(policy, content)), _below(evaluation)]) + "\n"
     replace_file(card, lambda temporary: temporary.write_text(text, encoding="utf-8"))
@@ -114,5 +116,6 @@ def _table(facts: Mapping[str, str]) -> str:
 
 def _below(evaluation: str) -> str:
     """Return a score card as part of another document: headings a level deeper, without pictures, which stay where they are."""
-    lines = [line for line in evaluation.strip().splitlines() if not line.startswith("![")]
-    return "\n".join(f"#{line}" if line.startswith("#") else line for line in lines)
+    words = re.sub(r"^#.*\n+(?:!\[.*\n*)+(?=#|\Z)", "", evaluation, flags=re.MULTILINE)  # sections that only show one
+    lines = [line for line in words.strip().splitlines() if not line.startswith("![")]
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(f"#{line}" if line.startswith("#") else line for line in lines))

@@ -91,8 +91,8 @@ def check_graph(session: InferenceSession, environment: Mapping[str, Any], where
         InputError: naming the first difference.
     """
     pairs = (
-        (OBSERVATION, session.get_inputs(), len(environment["observation"])),
-        (ACTION, session.get_outputs(), len(environment["action"])),
+        (OBSERVATION, session.get_inputs(), len(environment.get("observation", ()))),
+        (ACTION, session.get_outputs(), len(environment.get("action", ()))),
     )
     for name, places, width in pairs:
         found = [(place.name, place.type, *place.shape[1:]) for place in places]

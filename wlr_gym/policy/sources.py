@@ -71,7 +71,7 @@ def contract_of(source: str | Path) -> dict[str, Any]:
         InputError: no policy there, or broken.
     """
     place = find_policy(source)
-    return open_policy(place)[1] if place.suffix == SUFFIX else read_contract(place)
+    return open_policy(place)[1] if place.is_file() else read_contract(place)
 
 
 def load_policy(source: str | Path, environment: Contract) -> Policy:
@@ -85,7 +85,7 @@ def load_policy(source: str | Path, environment: Contract) -> Policy:
         InputError: no policy there, broken, or a contract that does not fit, naming the first difference.
     """
     place = find_policy(source)
-    if place.suffix == SUFFIX:
+    if place.is_file():
         policy, contract = open_policy(place)
         check_contract(contract["environment"], environment, str(place))
         return policy

@@ -19,6 +19,8 @@ PREVIEW = (0.0, 0.1, 0.2)
 NEWTON_STEPS = 4
 #: s in which the legs go from home to the first posture; s at which the sweep to the second one begins.
 POSTURE_READY, SWEEP_BEGINS = 3.0, 4.0
+#: m/s2 on a slope: less than what is left 1.5 degrees below the friction limit, g sin 1.5 = 0.26.
+CLIMB_RAMP = 0.1
 
 
 @dataclass(frozen=True)
@@ -97,8 +99,8 @@ def leg_references(signals: Signals) -> list[tuple[Value, Value]]:
     From home to ``front_leg_first`` and ``rear_leg_first`` within :data:`POSTURE_READY`; from :data:`SWEEP_BEGINS` on to
     ``..._second`` at ``leg_rate``, and there they stay.
     """
-    axle = {1: _leg_reference(signals, "front"), -1: _leg_reference(signals, "rear")}
-    return [axle[front] for front, _ in CORNER_SIGNS]
+    front, rear = _leg_reference(signals, "front"), _leg_reference(signals, "rear")
+    return [front if ahead > 0 else rear for ahead, _ in CORNER_SIGNS]
 
 
 def _leg_reference(signals: Signals, axle: str) -> tuple[Value, Value]:
@@ -119,5 +121,8 @@ def leg_errors(signals: Signals) -> list[Value]:
 
 
 def climb_speed(signals: Signals) -> Value:
-    """Return the forward speed asked for on a slope, m/s: ``climb_speed`` until ``climb_time``, then 0."""
-    return ops.where_positive(signals.command("climb_time") - signals.time, signals.command("climb_speed"), 0.0)
+    """Return the forward speed asked for on a slope, m/s: ``climb_speed`` until ``climb_time``, then 0; no faster than
+    :data:`CLIMB_RAMP` allows."""
+    speed, time = signals.command("climb_speed"), signals.time
+    rising, falling = CLIMB_RAMP * time, speed - CLIMB_RAMP * (time - signals.command("climb_time"))
+    return ops.clip(ops.minimum(rising, falling), 0.0, speed)

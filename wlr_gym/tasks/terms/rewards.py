@@ -57,7 +57,7 @@ def path_error(signals: Signals, *, lateral: Value = 0.015, heading: Value = 0.2
 
 @registered(REWARDS, lateral=POSITIVE, heading=POSITIVE)
 def course_error(signals: Signals, *, lateral: Value = 0.01, heading: Value = 0.025) -> Value:
-    """|distance from the line ahead of the start| over ``lateral`` (m) plus |heading| over ``heading`` (rad); 8 each at most."""
+    """|distance from the start's line| over ``lateral`` (m) plus |heading| over ``heading`` (rad); at most 8 each."""
     motion = true_motion(signals)
     return _levelling(motion.y / lateral) + _levelling(motion.yaw / heading)
 
@@ -72,6 +72,12 @@ def leg_error(signals: Signals, *, scale: Value = 0.1) -> Value:
 def track_climb_speed(signals: Signals, *, width: Value = 0.03) -> Value:
     """exp(-(error / width)^2) of the forward velocity, while climbing and while holding; width in m/s."""
     return _kernel(references.climb_speed(signals) - signals.truth("linear_velocity_in_body")[0], width)
+
+
+@registered(REWARDS, scale=POSITIVE)
+def climb_speed_error(signals: Signals, *, scale: Value = 0.015) -> Value:
+    """|error| of the forward velocity over ``scale`` (m/s), while climbing and while holding."""
+    return ops.absolute(references.climb_speed(signals) - signals.truth("linear_velocity_in_body")[0]) / scale
 
 
 @registered(REWARDS, width=POSITIVE)

@@ -1,0 +1,82 @@
+"""Pages of the documentation site that are made while it builds, so that they cannot fall behind the code."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[2]
+#: Modules of the API page, in order: title -> module.
+API = {
+    "Environments": "wlr_gym.envs",
+    "Plants": "wlr_gym.plants.base",
+    "Parameters": "wlr_gym.parameters",
+    "Effects": "wlr_gym.effects",
+    "Slip": "wlr_gym.slip",
+    "Slip observer": "wlr_gym.observer",
+    "Runs": "wlr_gym.runs",
+    "Policies": "wlr_gym.policy",
+    "Evaluation": "wlr_gym.evaluation",
+    "Gap workflow": "wlr_gym.gap",
+    "Errors": "wlr_gym.errors",
+}
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages that are made."""
+    made = {
+        "index.md": start_page(),
+        "commands.md": command_page(),
+        "api.md": api_page(),
+        "changes.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
+    }
+    for name, text in made.items():
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def start_page() -> str:
+    """README.md with its links as they are from within docs/."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = re.sub(r"\]\(docs/", "](", text)
+    text = text.replace("](CHANGELOG.md)", "](changes.md)").replace("[CITATION.cff](CITATION.cff)", "`CITATION.cff`")
+    return text.replace("](LICENSE)", "](https://opensource.org/license/mit)")
+
+
+def command_page() -> str:
+    """Every command's help text."""
+    from wlr_gym.cli import COMMANDS, usage
+
+    os.environ["COLUMNS"], os.environ["NO_COLOR"] = "100", "1"
+    parts = ["# Commands", "", _block(usage())]
+    for name in COMMANDS:
+        parts += [f"## wlr {name}", "", _block(help_of(name))]
+    return "\n".join(parts)
+
+
+def help_of(name: str) -> str:
+    """Return what ``wlr NAME --help`` prints."""
+    from wlr_gym.cli import main
+
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+        main([name, "--help"])
+    return re.sub(r"\x1b\[[0-9;]*m", "", text.getvalue()).rstrip()
+
+
+def _block(text: str) -> str:
+    return f"```text\n{text}\n```\n"
+
+
+def api_page() -> str:
+    """What the rooms offer to programs, from their docstrings."""
+    parts = ["# Python interface", "", "`import wlr_gym` registers the environments and loads nothing heavy.", ""]
+    for title, module in API.items():
+        parts += [f"## {title}", "", f"::: {module}", ""]
+    return "\n".join(parts)
