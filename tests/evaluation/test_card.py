@@ -78,6 +78,8 @@ def test_rows_show_nothing_where_there_is_nothing():
     better = {row[0]: row[2:] for row in comparison_rows(card())}
     assert better["slip_speed"] == ["-", "-"]
     assert better["score, in % of its"] == ["-", "133.3 [133.3, 133.3]"]
+    assert better["velocity_error"] == ["**80.0 [80.0, 80.0]**", "**50.0 [50.0, 50.0]**"]
+    assert better["success"][0] == "0 [0, 0]"
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +100,7 @@ def test_a_sweep_has_a_row_per_point(swept):
     assert body[0][1].startswith("1.414 ±")  # 0.04 m/s: twice one of two limits
     header, *body = sweep_comparison_rows(swept, 0)
     assert header[1:] == ["do_nothing", "pid"]
-    assert [row[2] for row in body] == ["50.0 [50.0, 50.0]"] * len(body)
+    assert [row[2] for row in body] == ["**50.0 [50.0, 50.0]**"] * len(body)
 
 
 def test_card_files(swept, tmp_path):

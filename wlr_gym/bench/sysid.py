@@ -5,6 +5,8 @@ Time is the processor's, on one thread each, so that other jobs on the machine c
 
 from __future__ import annotations
 
+import contextlib
+import io
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,16 +15,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.bench.measure import Measurement, Size, against_fastest, interleave
+from wlr_gym.bench.measure import Measurement, Size, against_fastest
 from wlr_gym.errors import MissingPackageError
 from wlr_gym.gap.fit import SETTLED
 from wlr_gym.gap.problem import Quantity
 
 Array = NDArray[np.float64]
 
-#: The peer's two ways to a minimum: its own optimiser, and scipy's on the same batched finite differences. Both scale the
-#: numbers by the Jacobian, as its documentation advises where they differ in size.
+#: The peer's two ways to a minimum: its own optimiser, and scipy's on the same batched finite differences.
 OPTIMISERS = {"mujoco.sysid": "mujoco", "mujoco.sysid, scipy": "scipy_parallel_fd"}
+#: Of its finite differences, in tolerances: its own 1.5e-8 is below what a contact solver resolves.
+PEER_STEP = 1e-4
+#: Numbers scaled by the Jacobian, as its authors advise.
+OPTIONS: Mapping[str, Mapping[str, Any]] = {
+    "mujoco": {"x_scale": "jac", "eps": PEER_STEP},
+    "scipy_parallel_fd": {"x_scale": "jac", "diff_step": PEER_STEP},
+}
+
+
+#: Fits once.
+Fitter = Callable[[], "Fitted"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,17 +53,39 @@ class Fitted:
 
 
 @dataclass(frozen=True, eq=False)
+class Contest:
+    """One system that both sides calibrate.
+
+    Attributes:
+        name: of the system, with the size of the task.
+        quantities: what is fitted. truth: (numbers) their values behind the data.
+        ours: fits with this package. peers: fit with ``mujoco.sysid``, by name of the optimiser.
+    """
+
+    name: str
+    quantities: tuple[Quantity, ...]
+    truth: Array
+    ours: Fitter
+    peers: Mapping[str, Fitter]
+
+    def error(self, found: Fitted) -> float:
+        """Return the largest error of a fit, in % of a tolerance."""
+        sigma = np.array([quantity.sigma for quantity in self.quantities])
+        return 100.0 * float(np.abs((found.values - self.truth) / sigma).max())
+
+
+@dataclass(frozen=True, eq=False)
 class PeerRun:
     """One run as ``mujoco.sysid`` sees it.
 
     Attributes:
-        spec: a model with the right names and sizes.
+        model: of the right sizes.
         build: from the fitted numbers to a compiled model.
         times: (steps) s. control: (steps, actuators). start: full physics state.
         residual: from the fitted numbers and the states (steps - 1, states) after each step to residuals.
     """
 
-    spec: Any
+    model: Any
     build: Callable[[Array], Any]
     times: Array
     control: Array
@@ -73,21 +107,22 @@ class PeerProblem:
         names = ("nominal", "sigma", "low", "high")
         nominal, sigma, low, high = (np.array([getattr(q, name) for q in self.quantities]) for name in names)
         parameters = sysid.ParameterDict()
-        parameters.add(sysid.Parameter("numbers", nominal, low, high))
-        parts = [_residual_function(run) for run in self.runs]
+        parameters.add(sysid.Parameter("tolerances", np.zeros(len(sigma)), (low - nominal) / sigma, (high - nominal) / sigma))
+        parts = [_residual_function(run, lambda given: nominal + sigma * given.as_vector()) for run in self.runs]
         trace: list[tuple[float, float]] = []
 
         def residuals(x: Array, given: Any, **options: Any) -> tuple[list[Array], list[Any], list[Any]]:
             found = [block for part in parts for block in part(x, given, **options)[0]]
-            found.append(((x.T - nominal) / sigma).T)
+            found.append(x)
             if x.ndim == 1 or x.shape[1] == 1:
                 trace.append((time.process_time() - begin, sum(float(np.sum(block**2)) for block in found)))
             return found, [], []
 
         begin = time.process_time()
-        chosen = sysid.optimize(parameters, residuals, optimiser, verbose=False, x_scale="jac")[1].x
+        with contextlib.redirect_stdout(io.StringIO()):  # its optimisers cannot be told to be silent
+            chosen = sysid.optimize(parameters, residuals, optimiser, verbose=False, **OPTIONS[optimiser])[1].x
         seconds = time.process_time() - begin
-        return Fitted(np.asarray(chosen, np.float64).ravel(), seconds, settled(trace))
+        return Fitted(nominal + sigma * np.ravel(chosen), seconds, settled(trace))
 
 
 def settled(trace: Sequence[tuple[float, float]]) -> float:
@@ -96,21 +131,74 @@ def settled(trace: Sequence[tuple[float, float]]) -> float:
     return next(seconds for seconds, cost in trace if cost <= least + SETTLED)
 
 
-def _residual_function(run: PeerRun) -> Callable[..., Any]:
+@dataclass(frozen=True)
+class _Compiled:
+    """All that ``ModelSequences`` asks of a specification where models are built elsewhere."""
+
+    model: Any
+
+    def compile(self) -> Any:
+        return self.model
+
+
+def _residual_function(run: PeerRun, numbers: Callable[[Any], Array]) -> Callable[..., Any]:
     from mujoco import sysid
 
-    measured = sysid.TimeSeries(run.times, np.zeros((len(run.times), 1)))
+    measured = sysid.TimeSeries(run.times, np.zeros((len(run.times), 0)))
 
     def compare(given: Any, predicted: Any, _: Any, model: Any, return_all: bool, state: Array) -> tuple[Array, Any, Any]:
-        return run.residual(given.as_vector(), state), measured, measured
+        return run.residual(numbers(given), state), measured, measured
 
-    sequence = sysid.ModelSequences(
-        "model", run.spec, "run", run.start, sysid.TimeSeries(run.times, run.control), measured, allow_missing_sensors=True
-    )
+    control = sysid.TimeSeries(run.times, run.control)
+    sequence = sysid.ModelSequences("model", _Compiled(run.model), "run", run.start, control, measured)
     return sysid.build_residual_fn(
         models_sequences=[sequence],
-        build_model=lambda given, spec: run.build(given.as_vector()),
+        build_model=lambda given, spec: run.build(numbers(given)),
         modify_residual=compare,
         n_threads=1,
         resample_true=False,
     )
+
+
+def require_sysid() -> None:
+    """Raise :class:`MissingPackageError` where MuJoCo has left its calibration out for want of packages."""
+    from mujoco import sysid
+
+    if not hasattr(sysid, "optimize"):
+        raise MissingPackageError("sysid needs what MuJoCo's calibration does: pip install 'mujoco[sysid]'")
+
+
+def measure_sysid(size: Size) -> list[Measurement]:
+    """Fits per hour of one processor against ``mujoco.sysid``, and how far both are from the truth."""
+    require_sysid()
+    from wlr_gym.bench.sysid_rig import rig_contest
+
+    return rows(rig_contest(size(10, 1)), size.rounds)
+
+
+def rows(contest: Contest, rounds: int) -> list[Measurement]:
+    """Let both sides fit in turn, and return what a contest adds to the report."""
+    fitters = {"ours": contest.ours, **contest.peers}
+    contest.ours()  # compiles
+    found: dict[str, list[Fitted]] = {name: [] for name in fitters}
+    for _ in range(rounds):
+        for name, fitter in fitters.items():
+            found[name].append(fitter())
+    report = []
+    for what, clock in (("same fit", "settled"), ("own convergence", "seconds")):
+        rates = {name: tuple(3600.0 / max(getattr(one, clock), 1e-9) for one in fits) for name, fits in found.items()}
+        bar = 1.0 if clock == "settled" else None
+        ours = rates.pop("ours")
+        report.append(against_fastest("sysid", f"{contest.name}, to {what}", "fits/h", ours, rates, bar))
+    for name, fits in found.items():
+        errors = tuple(contest.error(one) for one in fits)
+        report.append(Measurement("sysid", f"{contest.name}, largest error, {name}", "% of a tolerance", errors))
+    return report
+
+
+def timed(fit: Callable[[], Array]) -> Fitted:
+    """Run a fit of ours; return its numbers and what it took."""
+    begin = time.process_time()
+    values = fit()
+    seconds = time.process_time() - begin
+    return Fitted(values, seconds, seconds)

@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from functools import partial
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym import servo
-from wlr_gym.bench.sysid import PeerProblem, PeerRun
+from wlr_gym.bench.sysid import OPTIMISERS, Contest, PeerProblem, PeerRun, timed
+from wlr_gym.gap.fit import fit, nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.rig import kernel
 from wlr_gym.gap.rig.model import DATA_SHEET_VOLTAGE, DUTY_PER_GAIN, GRAVITY, QUANTITIES, model_of, pack
@@ -46,6 +48,8 @@ class WholeRuns(RigProblem):
         super().__init__(recordings)
         self.quantities = tuple(quantity for quantity, free in zip(QUANTITIES, _FREE, strict=True) if free)
         self.signals = self.signals[:1]
+        for replay in self._replays:  # every run starts at rest where the encoder reads 0, and both sides are told
+            replay.angle[0] = replay.rate[0] = 0.0
 
     def simulate(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
         """Return the angle (settings, rows, 1) of each run, rad."""
@@ -67,6 +71,20 @@ def true_numbers(rng: np.random.Generator) -> Array:
     return np.array([q.nominal + 0.6 * q.sigma * rng.uniform(-1.0, 1.0) for q in free])
 
 
+def rig_contest(seconds: float, seed: int = 0) -> Contest:
+    """Return the contest over recordings of this length (s)."""
+    problem, truth = make_rig(seconds, seed)
+    peer = peer_of(problem)
+    runs = range(len(RUNS))
+    return Contest(
+        f"pendulum, {len(truth)} numbers, {len(RUNS)} runs of {seconds:g} s",
+        problem.quantities,
+        truth,
+        lambda: timed(lambda: fit(problem, runs, nominal_model(problem), steps=problem.steps).model.quantities),
+        {name: partial(peer.fit, optimiser) for name, optimiser in OPTIMISERS.items()},
+    )
+
+
 def make_rig(seconds: float, seed: int = 0) -> tuple[WholeRuns, Array]:
     """Return the problem of recordings of this length (s), and the numbers (7,) behind them."""
     rng = generator(seed, "bench", "sysid")
@@ -76,12 +94,11 @@ def make_rig(seconds: float, seed: int = 0) -> tuple[WholeRuns, Array]:
 
 def peer_of(problem: WholeRuns) -> PeerProblem:
     """Return the same problem for ``mujoco.sysid``."""
-    return PeerProblem(problem.quantities, [_peer_run(recording) for recording in problem.recordings])
+    return PeerProblem(problem.quantities, [_peer_run(replay) for replay in problem._replays])  # the same goals and starts
 
 
-def _peer_run(recording: Recording) -> PeerRun:
-    replay = Replay(recording)
-    model = _model(recording)
+def _peer_run(replay: Replay) -> PeerRun:
+    recording, model = replay.recording, _pendulum()
     delay = round(_NOMINAL[[q.name for q in QUANTITIES].index("delay")] / STEP)
     goals = replay._goals[np.maximum(np.arange(len(replay._goals)) - delay, 0)]
     at_rows = (np.arange(1, len(recording.time)) * ROW) - 1
@@ -95,16 +112,24 @@ def _peer_run(recording: Recording) -> PeerRun:
     start = np.array([0.0, replay.angle[0], replay.rate[0]])
     times = recording.time[0] + STEP * np.arange(len(goals) + 1)
     control = np.append(goals, goals[-1:])[:, None]
-    return PeerRun(_spec(recording), build, times, control, start, residual)
+    return PeerRun(model, build, times, control, start, residual)
 
 
-def _spec(recording: Recording) -> mujoco.MjSpec:
+def _pendulum() -> mujoco.MjModel:
     """The pendulum: one hinge whose position is the encoder's reading, and the servo's voltage law as a limited actuator."""
     spec = mujoco.MjSpec()
     spec.option.timestep = STEP
     spec.option.gravity = 0.0, 0.0, -GRAVITY
     link = spec.worldbody.add_body(name="link", explicitinertial=True, mass=1.0, inertia=[1e-3, 1e-3, 1e-3], ipos=[0, 0, -0.1])
-    link.add_joint(name="servo", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0], damping=[1.0, 0, 0], frictionloss=0.1, armature=1e-3)
+    link.add_joint(
+        name="servo",
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=[0, 1, 0],
+        damping=[1.0, 0.0, 0.0],
+        frictionloss=0.1,
+        armature=1e-3,
+        solref_friction=[2.0 * STEP, 1.0],  # as stiff as the step allows: MuJoCo's friction creeps
+    )
     spec.add_actuator(
         name="servo",
         target="servo",
@@ -114,11 +139,7 @@ def _spec(recording: Recording) -> mujoco.MjSpec:
         forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
         forcerange=[-1.0, 1.0],
     )
-    return spec
-
-
-def _model(recording: Recording) -> mujoco.MjModel:
-    return _spec(recording).compile()
+    return spec.compile()
 
 
 def _with_numbers(model: mujoco.MjModel, recording: Recording, values: Array) -> mujoco.MjModel:
@@ -148,7 +169,10 @@ def _recorded(run: int, seconds: float, truth: Array, rng: np.random.Generator) 
     mass, length, gain = RUNS[run]
     rows = round(seconds / (ROW * STEP)) + 1
     time = ROW * STEP * np.arange(rows)
-    goal = sum(a * np.sin(2 * np.pi * (f * time + p)) for a, f, p in zip((0.8, 0.4, 0.2), rng.uniform(0.3, 2.0, 3), rng.random(3), strict=True))
+    goal = sum(
+        a * np.sin(2 * np.pi * (f * time + p))
+        for a, f, p in zip((0.8, 0.4, 0.2), rng.uniform(0.3, 2.0, 3), rng.random(3), strict=True)
+    )
     zeros, ones = np.zeros(rows), np.ones(rows)
     empty = Recording(
         f"run{run}", "sines", mass, length, None, gain, SUPPLY, time, zeros, zeros, zeros, zeros, SUPPLY * ones, 25.0 * ones,

@@ -34,11 +34,12 @@ MEASUREMENTS = {
     "convergence": "wlr_gym.bench.convergence:measure_convergence",
     "vision": "wlr_gym.bench.vision:measure_vision",
     "bus": "wlr_gym.bench.bus:measure_bus",
+    "sysid": "wlr_gym.bench.sysid:measure_sysid",
 }
 #: Measurements with rows of their own kind; each has its list in the report.
 _OWN_ROWS = ("convergence", "vision")
-#: Take a quarter of an hour or need the robot's packages: only made when they are asked for.
-_ON_REQUEST = ("vision", "bus", "learning")
+#: Take long or need packages that few have: only made when they are asked for.
+_ON_REQUEST = ("vision", "bus", "learning", "sysid")
 #: Its own kind: hours, resumable, with a folder of results. See docs/gap_benchmark.md.
 BLIND_TEST = "gap"
 SCHEMA = 1
@@ -49,7 +50,7 @@ class Options:
     what: tyro.conf.Positional[tuple[str, ...]] = ()
     """Measurements to make, as with --only."""
     only: tuple[str, ...] = ()
-    """engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, vision.
+    """engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, vision, sysid.
     gap (the blind test of the gap workflow): alone, with --out"""
     json: Path | None = None
     """File for all numbers."""

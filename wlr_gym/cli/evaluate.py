@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -102,55 +102,60 @@ class Options(EffectsOption):
 
 def run(options: Options) -> int:
     """Play, print the card, write it."""
+    options = _complete(options)
     _check(options)
     patch = options.patch()
     if options.out is not None:
         make_output_folder(options.out)
-    environment = options.env or trained_environment(read_subjects([options.policy])[0].sources[0]) or "WLR-Velocity-v0"
-    subjects = read_subjects([options.policy, *_baselines(options, environment)])
+    main, *others = BACKENDS if options.backend == "both" else (str(options.backend),)
     keywords: dict[str, Any] = {"randomization": options.randomization, "robot": options.robot, "effects": patch}
-    keywords |= {"threads": options.threads}
-    main, *others = _backends(options)
-    card, samples = _play(options, environment, subjects, keywords | {"backend": main}, others, patch.summary())
+    keywords |= {"backend": main, "threads": options.threads}
+    subjects = read_subjects([options.policy, *(options.baselines or ())])
+    card, samples = _play(options, subjects, keywords, others, patch.summary())
     print_card(card)
-    keywords["backend"] = main
     if options.out is not None:
         settings = {key: _plain(value) for key, value in asdict(options).items()}
         record_provenance(options.out, settings | {"effects": patch.content()["effects"]}, options.seed)
         _write(options.out, card, samples, options.seed)
         if options.record:
-            _record(environment, subjects[0], options, options.out / "runs", keywords)
+            _record(options, subjects[0], options.out / "runs", keywords)
     if options.video is not None:
-        _film(environment, subjects[:2], options, options.video, keywords)
+        _film(options, subjects[:2], options.video, keywords)
     return OK
 
 
+def _complete(options: Options) -> Options:
+    """Return the options with nothing left open that --full and the policy decide."""
+    full = options.full
+    policy = read_subjects([options.policy])[0].sources[0]
+    environment = options.env or trained_environment(policy) or "WLR-Velocity-v0"
+    task = task_name_of(environment)
+    chosen = {
+        "env": environment,
+        "episodes": FULL_EPISODES if full else EPISODES,
+        "seeds": FULL_SEEDS if full else SEEDS,
+        "backend": "both" if full else BACKENDS[0],
+        "sweep": sweeps_for(task) if full else (),
+        "baselines": _full_baselines(environment) if full else BASELINES,
+    }
+    return replace(options, **{name: value for name, value in chosen.items() if getattr(options, name) is None})
+
+
+def _full_baselines(environment: str) -> tuple[str, ...]:
+    return (*FULL_BASELINES, *(name for name in shipped_names() if trained_environment(name) == environment))
+
+
 def _check(options: Options) -> None:
-    episodes = options.episodes or (FULL_EPISODES if options.full else EPISODES)
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
-    if not 0 <= options.record <= episodes or (options.record and options.out is None):
-        raise InputError(f"--record {options.record}: expected 0 to {episodes} (--episodes), and --out for the runs")
+    if options.backend not in (*BACKENDS, "both"):
+        raise unknown_name("backend", str(options.backend), (*BACKENDS, "both"), "--backend")
+    if not 0 <= options.record <= (options.episodes or 0) or (options.record and options.out is None):
+        raise InputError(f"--record {options.record}: expected 0 to {options.episodes} (--episodes), and --out for the runs")
     if options.video is not None:
         check_video(options.video)
         if not 0 < options.video_seconds < float("inf"):
             raise InputError(f"--video-seconds {options.video_seconds:g}: expected more than 0")
-
-
-def _backends(options: Options) -> tuple[str, ...]:
-    backend = options.backend or ("both" if options.full else BACKENDS[0])
-    if backend not in (*BACKENDS, "both"):
-        raise unknown_name("backend", backend, (*BACKENDS, "both"), "--backend")
-    return BACKENDS if backend == "both" else (backend,)
-
-
-def _baselines(options: Options, environment: str) -> tuple[str, ...]:
-    if options.baselines is not None:
-        return options.baselines
-    if not options.full:
-        return BASELINES
-    shipped = [name for name in shipped_names() if trained_environment(name) == environment]
-    return (*FULL_BASELINES, *shipped)
 
 
 def _plain(value: Any) -> Any:
@@ -158,19 +163,12 @@ def _plain(value: Any) -> Any:
 
 
 def _play(
-    options: Options,
-    environment: str,
-    subjects: Sequence[Subject],
-    keywords: Mapping[str, Any],
-    others: Sequence[str],
-    effects: str,
+    options: Options, subjects: Sequence[Subject], keywords: Mapping[str, Any], others: Sequence[str], effects: str
 ) -> tuple[Card, Rollout]:
     """Play everything; returns the card, and the first block of the first subject."""
+    environment, episodes, seeds = str(options.env), options.episodes or 0, options.seeds or 0
     task = task_name_of(environment)
-    chosen = sweeps_for(task) if options.full and options.sweep is None else options.sweep or ()
-    sweeps = tuple(read_sweep(name, task) for name in dict.fromkeys(chosen))
-    episodes = (FULL_EPISODES if options.full else EPISODES) if options.episodes is None else options.episodes
-    seeds = (FULL_SEEDS if options.full else SEEDS) if options.seeds is None else options.seeds
+    sweeps = tuple(read_sweep(name, task) for name in dict.fromkeys(options.sweep or ()))
     conditions = [Condition(MAIN, keywords, episodes=episodes, blocks=seeds)]
     for sweep in sweeps:
         conditions += sweep.conditions(keywords, options.sweep_episodes)
@@ -215,9 +213,9 @@ def _write(folder: Path, card: Card, samples: Rollout, seed: int) -> None:
     print(f"written to {folder}: {', '.join(names)}")
 
 
-def _record(environment: str, subject: Subject, options: Options, folder: Path, keywords: Mapping[str, Any]) -> None:
+def _record(options: Options, subject: Subject, folder: Path, keywords: Mapping[str, Any]) -> None:
     """Write the first episodes of the policy as runs."""
-    core, policy = make_player(environment, subject.sources[0], options.record, keywords)
+    core, policy = make_player(str(options.env), subject.sources[0], options.record, keywords)
     try:
         written = record_episodes(core, policy, folder, options.seed)
     finally:
@@ -225,7 +223,7 @@ def _record(environment: str, subject: Subject, options: Options, folder: Path, 
     print(f"written: {len(written)} runs in {folder}")
 
 
-def _film(environment: str, subjects: Sequence[Subject], options: Options, path: Path, keywords: Mapping[str, Any]) -> None:
+def _film(options: Options, subjects: Sequence[Subject], path: Path, keywords: Mapping[str, Any]) -> None:
     """Write the first episode of up to two subjects, side by side."""
     from wlr_gym.evaluation.film import film, film_length
     from wlr_gym.render import side_by_side, write_video
@@ -233,7 +231,7 @@ def _film(environment: str, subjects: Sequence[Subject], options: Options, path:
     players = []
     try:
         for subject in subjects:
-            players.append(make_player(environment, subject.sources[0], 1, keywords))
+            players.append(make_player(str(options.env), subject.sources[0], 1, keywords))
         count, _, fps = film_length(players[0][0], options.video_seconds)
         films = [film(core, policy, options.seed, options.video_seconds) for core, policy in players]
         names = [subject.name for subject in subjects]

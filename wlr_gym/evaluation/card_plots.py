@@ -56,11 +56,15 @@ def _draw_sweep(axes: Axes, card: Card, sweep: Sweep, metric: Metric) -> None:
     x: list[float] = [point.value for point in sweep.points]
     for name in card.names:
         estimates = [card.scores[sweep.label(point)][name][metric.key] for point in sweep.points]
-        style = _style(card, name)
+        style = _style(card, name) if sweep.numeric else {**_style(card, name), "linestyle": ""}
+        if not sweep.numeric and not style["marker"]:
+            style["marker"] = "_"
         axes.plot(x, [e.mean for e in estimates], label=name, markersize=4, linewidth=1.3, **style)
-        axes.fill_between(
-            x, [e.low for e in estimates], [e.high for e in estimates], color=style["color"], alpha=0.18, linewidth=0
-        )
+        low, high = [e.low for e in estimates], [e.high for e in estimates]
+        if sweep.numeric:
+            axes.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
+        else:
+            axes.vlines(x, low, high, color=style["color"], linewidth=1.2)
     if metric.key == "tracking_error":
         axes.axhline(1.0, color="0.3", linestyle=":", linewidth=1.2)
         axes.set_yscale("log")
@@ -70,7 +74,7 @@ def _draw_sweep(axes: Axes, card: Card, sweep: Sweep, metric: Metric) -> None:
     else:
         axes.set_ylim(bottom=0.0)
         axes.set_title(f"{metric.key.replace('_', ' ')} ({metric.unit})", fontsize=9)
-    if sweep.name in ("friction", "split", "grip"):
+    if sweep.name in ("friction", "grip"):
         axes.set_xscale("log")
     axes.set_xticks(x, [point.label for point in sweep.points], fontsize=8)
     axes.minorticks_off()

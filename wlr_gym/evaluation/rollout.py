@@ -129,9 +129,9 @@ def roll_out(
         core: batch of robots; nothing of its past matters.
         policy: what drives them.
         first_seed: seed of the first episode.
-        parameters: values set after randomisation and effects, the same for all episodes.
         on_tick: called after every control tick (progress bars, logs).
         on_start: called once when the episodes have begun.
+        parameters: values set after randomisation and effects, the same for all episodes.
 
     Raises:
         InputError: a real robot.

@@ -68,12 +68,13 @@ def _even_floor(mu: float) -> dict[str, float]:
 
 
 FRICTION = (0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)
-LEFT_FRICTION, RIGHT_FRICTION = (0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.8), 0.8
+#: Beyond a ratio of about 2 a robot standing square cannot turn: see docs/evaluation.md.
+LEFT_FRICTION, SPLIT_RATIO = 0.25, (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0)
 SLOPE_FRICTION, DEGREES_BELOW_LIMIT = 0.4, (10.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.0, 0.5)
 GRIP_FRICTION, GRIP_DEGREES = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7), 2.0
 DELAY = (0.0, 0.01, 0.02, 0.04, 0.06)
 PAYLOAD = (0.0, 0.25, 0.5, 1.0, 2.0)
-#: m, body frame: up, ahead and left of the middle, where it tips and turns the most without being silly.
+#: m, body frame: ahead, to the left and above the middle, so that the wheels carry unequal loads.
 PAYLOAD_PLACE = {"payload.position[x]": 0.05, "payload.position[y]": 0.03, "payload.position[z]": 0.05}
 FLOORS = ("slippery", "nominal", "ice", "split", "patches", "wide")
 
@@ -100,10 +101,11 @@ SWEEPS: dict[str, Sweep] = {
             tasks=("slope",),
         ),
         Sweep(
-            "split", f"friction coefficient under the left wheels (right: {RIGHT_FRICTION:g})",
-            "astride a line along the start heading: left of it another friction than right of it (randomization split)",
+            "split", f"friction under the right wheels over that under the left ({LEFT_FRICTION:g})",
+            "astride a line along the start heading, ever more friction right of it (randomization split)",
             tuple(
-                Point(f"{mu:g}", mu, {**_even_floor(RIGHT_FRICTION), "patch.mu[patch_1]": mu}, "split") for mu in LEFT_FRICTION
+                Point(f"{ratio:g}", ratio, {**_even_floor(ratio * LEFT_FRICTION), "patch.mu[patch_1]": LEFT_FRICTION}, "split")
+                for ratio in SPLIT_RATIO
             ),
             tasks=("velocity", "path"),
         ),

@@ -46,11 +46,17 @@ def comparison_rows(card: Card, label: str = MAIN, *, short: bool = False) -> Ta
     for metric in card.metrics:
         unit, digits = (metric.unit, metric.digits) if metric.key in BY_DIFFERENCE else ("%", 1)
         unit = "points" if unit == "%" and metric.key in BY_DIFFERENCE else unit
-        table.append([metric.key, unit, *(cell(own[metric.key], digits, short) for own in others.values())])
+        table.append([metric.key, unit, *(_comparing(own[metric.key], digits, short) for own in others.values())])
     if label == MAIN and card.share_of:
         shares = [cell(card.share_of[name], 1, short) if name in card.share_of else "-" for name in others]
         table.append(["score, in % of its", "%", *shares])
     return table
+
+
+def _comparing(estimate: Estimate, digits: int, short: bool) -> str:
+    """A cell, in bold (of Markdown) where the interval excludes zero."""
+    text = cell(estimate, digits, short)
+    return f"**{text}**" if not short and text != "-" and estimate.excludes_zero else text
 
 
 def sweep_rows(card: Card, index: int, key: str = "tracking_error", *, short: bool = True) -> Table:
@@ -68,7 +74,7 @@ def sweep_comparison_rows(card: Card, index: int, key: str = "tracking_error", *
     """Return how much better the first subject is over a sweep, in %: one row per point with a column per baseline."""
     sweep = card.sweeps[index]
     body = [
-        [point.label, *(cell(own[key], 1, short) for own in card.comparison[sweep.label(point)].values())]
+        [point.label, *(_comparing(own[key], 1, short) for own in card.comparison[sweep.label(point)].values())]
         for point in sweep.points
     ]
     return [[sweep.axis, *card.names[1:]], *body]
@@ -99,7 +105,10 @@ def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
     lines += [f"Mean over episodes [{CONFIDENCE:.0%} bootstrap interval over seeds and episodes]; `-` where nothing moved.", ""]
     if len(card.names) > 1:
         lines += [f"## {ours} against the others, on the same episodes", ""]
-        lines += [f"By how much {ours} is better (positive) or worse, paired episode by episode.", ""]
+        lines += [
+            f"By how much {ours} is better (positive) or worse, paired episode by episode; bold: the interval excludes 0.",
+            "",
+        ]
         lines += [*_table(comparison_rows(card)), "", *picture("improvement", "Paired improvements")]
     for index, sweep in enumerate(card.sweeps):
         lines += [f"## Sweep: {sweep.name}", "", f"{sweep.doc[0].upper()}{sweep.doc[1:]}. Tracking error:", ""]

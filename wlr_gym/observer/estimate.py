@@ -39,6 +39,8 @@ _MEMORY = 0.3  # s over which that error lasts
 _GATE = 4.0  # squared normalised innovation beyond which a wheel has slipped
 _CAMERA_GATE = 25.0  # squared normalised innovation beyond which a camera frame may be wrong
 _PATIENCE = 3  # such frames in a row, then it is the estimate that is
+_FRAMES = 8.0  # camera frames over which a lasting disagreement shows
+_DOUBT = 1.5  # twice its mean normalised innovation from which on the wheels are doubted
 _SETTLE = 1.5  # s: how fast the tilt follows the legs
 _SMOOTH = 0.06  # s: low-pass of the friction demand
 
@@ -97,7 +99,7 @@ def _start(robot: Any, sensors: Any, r: Any) -> None:
     r.seen[:] = 0.0
     r.seen[_ACCEL + 2] = robot.gravity
     _take(sensors, r)
-    r.tick = r.yaw = r.gyro_bias = r.demand = r.strange = 0.0
+    r.tick = r.yaw = r.gyro_bias = r.demand = r.doubt = r.strange = 0.0
     r.normal[0], r.normal[1], r.normal[2] = 0.0, 0.0, 1.0
     r.raw[:] = 0.0
     r.yaw_covariance[0], r.yaw_covariance[1], r.yaw_covariance[2] = 0.0, 0.0, robot.gyro_bias**2
@@ -116,7 +118,7 @@ def _start(robot: Any, sensors: Any, r: Any) -> None:
         total = r.force[k]
         bias = total / (1.0 + (total / (3.0 * robot.accel_bias)) ** 4)  # more than that is a slope
         r.leak[k], r.slope[k] = bias, total - bias
-        r.position[k] = r.velocity[k] = r.raw_velocity[k] = 0.0
+        r.position[k] = r.velocity[k] = r.raw_velocity[k] = r.surprise[k] = 0.0
         r.covariance[k, axis.VELOCITY, axis.VELOCITY] = _START_SPEED**2
         r.covariance[k, axis.LEAK, axis.LEAK] = robot.accel_noise**2 + _START_LEAK**2
         for i in range(4):
@@ -185,7 +187,7 @@ def _set_normal(r: Any, x: float, y: float, z: float) -> None:
 
 @njit(cache=True, nogil=True)
 def _sense_force(robot: Any, r: Any) -> float:
-    """Mean specific force over the tick; friction demand, and how far the floor may be at its limit, ``r.limit`` 0 to 1.
+    """Mean specific force over the tick; friction demand, and how far all wheels may slip alike, ``r.limit`` 0 to 1.
 
     Returns:
         How much the specific force changed along the floor, m/s2.
@@ -199,8 +201,8 @@ def _sense_force(robot: Any, r: Any) -> float:
     along = math.sqrt((r.force[0] - r.leak[0]) ** 2 + (r.force[1] - r.leak[1]) ** 2)
     demand = along / max(r.force[2], 0.2 * robot.gravity)
     r.demand += (1.0 - math.exp(-robot.period / _SMOOTH)) * (demand - r.demand)
-    share = min(1.0, max(0.0, (r.demand - _EASY) / (_HARD - _EASY)))
-    r.limit = share * share * (3.0 - 2.0 * share)
+    share = min(1.0, max(0.0, (max(r.demand, demand) - _EASY) / (_HARD - _EASY)))
+    r.limit = max(share * share * (3.0 - 2.0 * share), r.doubt)
     return math.sqrt((r.last_force[0] - x) ** 2 + (r.last_force[1] - y) ** 2)
 
 
@@ -343,7 +345,8 @@ def _balance(robot: Any, r: Any) -> None:
             spread += r.weight[i] / total * (r.slip[k, i] - mean) ** 2
         for i in range(4):
             r.share[i] = r.weight[i] / total
-        variance = (_ROLLING**2 + common**2 + _UNEVEN**2 * spread) * _MEMORY / robot.period
+        together = r.limit * r.limit * mean
+        variance = (_ROLLING**2 + common**2 + together**2 + _UNEVEN**2 * spread) * _MEMORY / robot.period
         _correct(r, k, -mean, axis.see_balance(r.covariance[k], r.share, r.column) + variance)
 
 
@@ -385,12 +388,14 @@ def _see(robot: Any, r: Any) -> None:
         total = axis.see_position(r.covariance[k], age, r.column) + robot.camera_noise**2
         least = innovation * innovation / _CAMERA_GATE
         strange = strange or least > total
+        r.surprise[k] += (innovation / math.sqrt(max(total, least)) - r.surprise[k]) / _FRAMES
         _correct(r, k, innovation, total if r.strange >= _PATIENCE else max(total, least))
     yaw_error = r.seen[_CAMERA + 2] - yaw
     p = r.yaw_covariance
     total = p[0] + 2.0 * age * p[1] + age * age * p[2] + robot.camera_yaw_noise**2
     least = yaw_error * yaw_error / _CAMERA_GATE
     _correct_yaw(r, 1.0, age, yaw_error, total if r.strange >= _PATIENCE else max(total, least))
+    r.doubt = min(1.0, max(0.0, 2.0 * max(abs(r.surprise[0]), abs(r.surprise[1])) - _DOUBT))
     r.strange = r.strange + 1.0 if strange or least > total else 0.0
 
 

@@ -94,7 +94,9 @@ def record(history: int) -> np.dtype[Any]:
         "force": (3,),  # specific, mean over the tick
         "last_force": (3,),
         "demand": (),  # friction demand, smoothed
-        "limit": (),
+        "limit": (),  # 0 to 1: slip that all wheels share is possible
+        "surprise": (2,),  # mean normalised innovation of the camera's last frames
+        "doubt": (),  # 0 to 1: the camera contradicts the wheels
         "strange": (),  # camera frames far off, in a row
         # without corrections, for what the camera saw some ticks ago
         "raw_velocity": (2,),  # start frame

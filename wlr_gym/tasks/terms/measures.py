@@ -8,7 +8,7 @@ from __future__ import annotations
 from wlr_gym.codegen import ops
 from wlr_gym.tasks.signals import Signals, Value, mean, norm
 from wlr_gym.tasks.terms import references
-from wlr_gym.tasks.terms.geometry import true_motion, true_yaw
+from wlr_gym.tasks.terms.geometry import true_motion
 from wlr_gym.tasks.terms.scalar import ScalarTerm, registered
 
 MEASURES: dict[str, ScalarTerm] = {}
@@ -60,12 +60,6 @@ def leg_error(signals: Signals) -> Value:
 def climb_speed_error(signals: Signals) -> Value:
     """Forward velocity of the body origin beyond that asked for while climbing (then 0, while holding)."""
     return signals.truth("linear_velocity_in_body")[0] - references.climb_speed(signals)
-
-
-@registered(MEASURES, unit="rad")
-def uphill_error(signals: Signals) -> Value:
-    """Heading of the body against the floor's x axis, which slopes rise along; positive to the left."""
-    return true_yaw(signals)
 
 
 @registered(MEASURES, unit="m/s")

@@ -11,7 +11,7 @@ from wlr_gym.codegen import ops
 from wlr_gym.robot import CORNER_SIGNS
 from wlr_gym.tasks.signals import Signals, Value, mean, norm
 from wlr_gym.tasks.terms import references
-from wlr_gym.tasks.terms.geometry import true_motion, true_yaw
+from wlr_gym.tasks.terms.geometry import true_motion
 from wlr_gym.tasks.terms.scalar import POSITIVE, ScalarTerm, registered
 
 REWARDS: dict[str, ScalarTerm] = {}
@@ -78,12 +78,6 @@ def track_climb_speed(signals: Signals, *, width: Value = 0.03) -> Value:
 def climb_speed_error(signals: Signals, *, scale: Value = 0.015) -> Value:
     """|error| of the forward velocity over ``scale`` (m/s), while climbing and while holding."""
     return ops.absolute(references.climb_speed(signals) - signals.truth("linear_velocity_in_body")[0]) / scale
-
-
-@registered(REWARDS, width=POSITIVE)
-def head_uphill(signals: Signals, *, width: Value = 0.1) -> Value:
-    """|heading against the floor's x axis| over ``width`` (rad), 8 at most."""
-    return _levelling(true_yaw(signals) / width)
 
 
 @registered(REWARDS, linear=POSITIVE, angular=POSITIVE)
