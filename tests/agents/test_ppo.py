@@ -147,6 +147,20 @@ def test_every_stretch_between_checkpoints_has_new_episodes(tmp_path, monkeypatc
     assert len(set(seeds)) == len(seeds) >= 4
 
 
+def test_the_environment_is_told_how_far_training_is(run, tmp_path, monkeypatch):
+    """Before the first episodes and every update, after a resume too: curricula follow it."""
+    from wlr_gym.envs import Sb3VecEnv
+
+    told = []
+    monkeypatch.setattr(Sb3VecEnv, "set_progress", lambda env, steps: told.append(steps))
+    train(tmp_path / "run")
+    assert told == [0, *range(0, 384, 64)]
+    shutil.rmtree(tmp_path / "run" / "checkpoints" / "step_000000000384")
+    told.clear()
+    train(tmp_path / "run", resume=True)
+    assert told == [256, 256, 320]
+
+
 def test_ctrl_c_saves_a_checkpoint_and_says_how_to_go_on(tmp_path, monkeypatch):
     folder = tmp_path / "interrupted"
     load_agent("ppo")

@@ -233,6 +233,19 @@ def test_drawn_commands_ramp_from_zero_and_given_ones_hold_at_once(fake):
     assert np.all(env.core.command[:, 0] == -0.1)
 
 
+def test_computed_observations_speak_of_the_commands_that_hold_from_now_on(fake):
+    changes = {"commands": {"hold_time": [0.1, 0.1], "ramp": None}, "observations": {"speed_command": {}}}
+    env = make_vec(20, randomization="none", autoreset_mode="SameStep", episode_length=1.0, task=changes)
+    env.reset(seed=0)
+    speed = names(env.unwrapped).index("speed_command")
+    shown = []
+    for _ in range(120):
+        observation = env.step(np.zeros((20, 8)))[0]
+        assert observation[:, speed] == pytest.approx(env.unwrapped.core.command[:, 0])
+        shown.append(observation[0, speed])
+    assert len(set(shown)) > 15
+
+
 def test_command_can_be_fixed_for_an_episode_and_live(fake):
     env = make()
     env.reset(seed=0, options={"command": {"linear_velocity_x": 0.07, "yaw_rate": 0.0}})

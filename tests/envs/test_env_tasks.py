@@ -82,6 +82,36 @@ def test_observer_follows_what_the_sensors_read():
     assert np.abs(speed - true).max() < 0.005
 
 
+def test_path_error_that_is_estimated_is_the_true_one_wherever_the_robot_stood():
+    def ahead(core):
+        return np.hstack([np.zeros((core.count, 4)), np.full((core.count, 4), 0.45)])
+
+    core, _ = drive("WLR-Path-v0", 20, ahead, randomization="nominal", observation="dict", episode_length=4.0)
+    assert np.ptp(core._start[:, 2]) > 3.0
+    for error, bound in (("lateral", 0.01), ("heading", 0.03)):
+        estimated, true = computed(core, f"path_error[{error}]"), computed(core, f"true_path_error[{error}]")
+        assert np.abs(estimated - true).max() < bound
+        assert np.ptp(true) > 5 * bound
+
+
+def test_a_robot_measures_what_it_can_of_a_task():
+    for package in ("dynamixel_sdk", "serial"):
+        pytest.importorskip(package)
+    env = make("WLR-Posture-v0", backend="dynamixel", hardware={"emulated": True, "guard": False})
+    core = env.core
+    assert core.task.measures == ("leg_error",)
+    assert set(core.task.config.success) == {"leg_error"}
+    assert {"course_error", "lateral_error", "slip_speed", "slip"} <= set(core.unmeasured)
+    assert "leg_error" in core.task.rewards
+    observation, _ = env.reset(seed=0)
+    for _ in range(25):
+        observation, *_ = env.step(np.array([0.0] * 4 + [0.3] * 4, np.float32))
+    names = [column.element for column in core.task.policy]
+    assert np.isfinite(observation).all()
+    assert observation[names.index("linear_velocity_in_body[x]")] / 10.0 == pytest.approx(0.3 * 6.0 * 0.034, abs=0.02)
+    env.close()
+
+
 def test_a_policy_that_sees_the_truth_is_for_simulators_only():
     env = make("WLR-Velocity-v0", task={"observations": {"effective_friction": {}}}, randomization="nominal")
     observation, info = env.reset(seed=3)
@@ -124,6 +154,20 @@ def test_legs_that_follow_their_reference_have_no_leg_error():
     names = core.task.commands
     second = core.command[:, [names.index("front_leg_second"), names.index("rear_leg_second")]]
     assert core.plant.truth()["joint_position"][:, [0, 2]] == pytest.approx(second, abs=0.06)
+
+
+def test_reward_and_observation_mean_the_same_moment():
+    """The leg error that is measured is that of the reference which the policy is shown next."""
+    env = make_vec("WLR-Posture-v0", 3, randomization="none")
+    env.reset(seed=1)
+    core = env.unwrapped.core
+    for tick in range(320):
+        core.step(np.zeros((3, 8), np.float32), core.everyone)
+        if tick % 20 == 0:
+            shown = np.hstack([computed(core, f"leg_reference[{leg}]") for leg in core.task.robot.joints[:4]])
+            errors = core.plant.truth()["joint_position"][:, :4] - core.task.robot.home.leg_angle - shown
+            measured = core.measures[:, core.task.measures.index("leg_error")]
+            assert measured == pytest.approx(np.sqrt((errors**2).mean(axis=1)))
 
 
 def test_slopes_stay_below_what_friction_holds_and_a_braked_robot_stands():
@@ -169,3 +213,5 @@ def test_progress_narrows_what_is_drawn_and_says_nothing_of_the_past():
     assert widths(500) == pytest.approx((0.6 * whole[0], 0.625 * whole[1]))
     assert widths(5000) == whole
     assert widths(0) == start
+    with pytest.raises(InputError, match="0 or more"):
+        env.unwrapped.set_progress(-1)

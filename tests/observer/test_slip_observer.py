@@ -7,11 +7,11 @@ import pytest
 from observed_runs import PERIOD, estimated, observe, plain_odometry, simulate, slip_in_truth_order
 
 from wlr_gym.errors import InputError
-from wlr_gym.observer import ESTIMATE_LAYOUT, SlipObserver
+from wlr_gym.observer import ESTIMATE_LAYOUT, SlipObserver, axis
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants import make_plant
 from wlr_gym.plants.base import SENSOR_LAYOUT, PlantOptions, standing_state
-from wlr_gym.robot import load_robot
+from wlr_gym.robot import CORNER_SIGNS, load_robot
 
 ROBOT = load_robot("nominal")
 RADIUS, GRAVITY = ROBOT.wheel.radius, ROBOT.gravity
@@ -58,8 +58,8 @@ def ramp(ticks: int, start: int, stop: int, end: float) -> np.ndarray:
 def test_a_standing_robot_stays_where_it_is_and_learns_its_biases():
     sensors = readings(1000)
     rng = np.random.default_rng(1)
-    sensors[..., SENSOR_LAYOUT.slices["accelerometer"]] += (0.1, -0.08, 0.05) + rng.normal(0, 0.03, (1000, 1, 3))
-    sensors[..., SENSOR_LAYOUT.slices["gyro"]] += (0.001, -0.001, 0.0015) + rng.normal(0, 0.0009, (1000, 1, 3))
+    sensors[..., SENSOR_LAYOUT.slices["accelerometer"]] += rng.normal((0.1, -0.08, 0.05), 0.03, (1000, 1, 3))
+    sensors[..., SENSOR_LAYOUT.slices["gyro"]] += rng.normal((0.001, -0.001, 0.0015), 0.0009, (1000, 1, 3))
     found = follow(sensors)
     assert np.abs(estimated(found, "linear_velocity_in_body")[100:]).max() < 2e-3
     assert np.abs(estimated(found, "position")[-1]).max() < 5e-3
@@ -123,11 +123,31 @@ def test_a_steady_tow_with_locked_wheels_is_not_observable_without_a_camera():
     """Nothing that the robot measures tells it from standing; a camera does."""
     sensors = readings(200, np.full(200, 0.05), np.zeros((200, 4)))
     assert np.abs(estimated(follow(sensors), "linear_velocity_in_body")[-1]).max() < 5e-3
-    with_camera = follow(seen_by_camera(sensors, 0.05 * PERIOD * np.arange(200), delay=0.0), camera=True)
+    x = 0.05 * PERIOD * np.arange(200)
+    with_camera = follow(seen_by_camera(sensors, x, delay=0.11), camera=True)
+    assert estimated(with_camera, "position")[-1, 0, 0] == pytest.approx(x[-1], abs=2e-3)  # seen: 5.5 mm behind
     sigma = estimated(with_camera, "linear_velocity_sigma")[-1, 0, 0]
     assert estimated(with_camera, "linear_velocity_in_body")[-1, 0, 0] == pytest.approx(0.05, abs=2.0 * sigma)
     assert slip_in_truth_order(estimated(with_camera, "slip_velocity"))[-1, 0, :, 0] == pytest.approx(0.05, abs=2.0 * sigma)
-    assert sigma < 5e-3
+    assert sigma < 7e-3
+
+
+def test_a_circle_closes():
+    """Centripetal acceleration is no drift to the side, and the pose turns with the body."""
+    speed, rate = 0.1, 1.0
+    time = PERIOD * np.arange(1 + round(2 * np.pi / rate / PERIOD))
+    sensors = readings(len(time), ramp(len(time), -1, 1, speed))
+    # wheels that roll as the body's motion asks along their heading; to the side they must slip
+    left = np.array([ROBOT.hip_position.y * y for _, y in CORNER_SIGNS])
+    sensors[1:, 0, SENSOR_LAYOUT.slices["joint_velocity"]][:, 4:] = (speed - rate * left) / RADIUS
+    sensors[1:, 0, SENSOR_LAYOUT.slices["gyro"].start + 2] = rate
+    sensors[1:, 0, SENSOR_LAYOUT.slices["accelerometer"].start + 1] = rate * speed
+    found = follow(sensors)
+    assert np.abs(estimated(found, "linear_velocity_in_body")[5:, 0, 1]).max() < 3e-3
+    assert estimated(found, "yaw")[-1, 0] == pytest.approx(2 * np.pi, abs=0.03)
+    half = len(time) // 2
+    assert estimated(found, "position")[half, 0] == pytest.approx([0.0, 2 * speed / rate], abs=8e-3)
+    assert estimated(found, "position")[-1, 0] == pytest.approx([0.0, 0.0], abs=8e-3)
 
 
 # ---- camera ----------------------------------------------------------------------------------------------------------
@@ -190,6 +210,18 @@ def test_normal_forces_are_the_engines_at_rest(legs):
     assert true.sum() == pytest.approx(ROBOT.total_mass * GRAVITY, rel=1e-3)
 
 
+def test_acceleration_shifts_load_to_the_rear():
+    sensors = readings(10, 2.0 * PERIOD * np.arange(10))
+    sensors[..., SENSOR_LAYOUT.slices["accelerometer"].start] = 2.0
+    load = estimated(follow(sensors), "normal_force")[-1, 0]
+    below = ROBOT.leg.length * 4 * (0.5 * ROBOT.leg.mass + ROBOT.wheel.mass) / ROBOT.total_mass
+    height = ROBOT.leg.length + RADIUS - below  # of the centre of mass above the floor
+    shift = ROBOT.total_mass * 2.0 * height / (4 * ROBOT.hip_position.x)
+    weight = ROBOT.total_mass * GRAVITY / 4
+    assert load == pytest.approx([weight - shift, weight - shift, weight + shift, weight + shift], rel=0.01)
+    assert shift > 0.15 * weight
+
+
 def test_traction_in_a_skid_turn_is_the_engines():
     runs = simulate("gibbs_appell", "none", "commands", 4, 3.0)
     found = observe(runs, camera=False)
@@ -198,6 +230,36 @@ def test_traction_in_a_skid_turn_is_the_engines():
     error = (estimated(found, "traction_force") - true)[50:]
     assert turning.sum() > 100
     assert np.sqrt((error[turning] ** 2).mean()) < 0.4
+
+
+# ---- the filter --------------------------------------------------------------------------------------------------------
+
+
+def test_the_filter_is_the_textbooks():
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(7, 7))
+    start, step, decay, noise = root @ root.T, 0.02, rng.uniform(0.5, 1.0, 4), rng.uniform(0.0, 1.0, 7)
+    transition = np.diag([1.0, 1.0, 1.0, *decay])
+    transition[0, 1:3], transition[1, 2] = (step, -0.5 * step**2), -step
+    p = start.copy()
+    axis.predict(p, step, decay, noise)
+    np.testing.assert_allclose(p, transition @ start @ transition.T + np.diag(noise), rtol=1e-12, atol=1e-12)
+
+    age, weights, column = 0.1, np.array([0.1, 0.4, 0.3, 0.2]), np.empty(7)
+    measurements = {
+        axis.see_wheel(p, 2, column): ([0, 1, 0, 0, 0, 1, 0], column.copy()),
+        axis.see_balance(p, weights, column): ([0, 0, 0, *weights], column.copy()),
+        axis.see_position(p, age, column): ([1, -age, -0.5 * age**2, 0, 0, 0, 0], column.copy()),
+    }
+    for spread, (h, seen) in measurements.items():
+        np.testing.assert_allclose(seen, p @ h, rtol=1e-12)
+        assert spread == pytest.approx(h @ p @ h)
+    change, total = np.zeros(7), spread + 0.5
+    corrected = p.copy()
+    axis.correct(corrected, column.copy(), 2.0, total, change)
+    np.testing.assert_allclose(change, 2.0 * (p @ h) / total, rtol=1e-12)
+    np.testing.assert_allclose(corrected, p - np.outer(p @ h, p @ h) / total, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(corrected, corrected.T)
 
 
 # ---- contract --------------------------------------------------------------------------------------------------------

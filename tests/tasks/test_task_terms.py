@@ -14,9 +14,10 @@ from wlr_gym.robot import load_robot
 from wlr_gym.tasks import load_task
 from wlr_gym.tasks.signals import Signals
 from wlr_gym.tasks.success import succeeded
-from wlr_gym.tasks.terms import references
+from wlr_gym.tasks.terms import REWARDS, references
 from wlr_gym.tasks.terms.geometry import Motion, true_motion
 
+POSTURE_COMMANDS = ("front_leg_first", "front_leg_second", "rear_leg_first", "rear_leg_second")
 LINE, CURVE, CIRCLE = 0.5, 1.5, 2.5
 
 
@@ -176,3 +177,28 @@ def test_success_is_staying_within_the_limits_to_the_end():
 def test_terms_that_cannot_work_are_refused(name, changes, expected):
     with pytest.raises(InputError, match=expected):
         load_task(name, load_robot(), changes)
+
+
+def cost(name: str, given: dict[str, float], **parameters: float) -> float:
+    """A reward term of a robot that stands where it started, legs at home, but for the signals given."""
+    home = load_robot().home.leg_angle
+    legs = ("truth.joint_position[leg_{}]", ("lf", "rf", "lr", "rr")), ("command.{}", POSTURE_COMMANDS)
+    table = {pattern.format(name): home for pattern, names in legs for name in names}
+    table |= {"truth.quaternion[w]": 1.0, "robot.home.leg_angle": home, "time": 3.5, **given}
+    return float(REWARDS[name].function(Signals(lambda signal: table.get(signal, 0.0)), **parameters))
+
+
+def test_costs_by_hand():
+    ahead, turning = "truth.linear_velocity_in_body[x]", "truth.angular_velocity_in_body[z]"
+    assert cost("velocity_error", {ahead: -0.04, turning: 0.03}) == pytest.approx(2.0 + 0.5)
+    assert cost("velocity_error", {"command.linear_velocity_x": 0.1, ahead: 0.1}) == 0.0
+    aside = {"truth.position[y]": -0.02}
+    assert cost("course_error", aside, lateral=0.01) == pytest.approx(2.0 / 1.25)
+    assert cost("course_error", {"truth.position[y]": 1e6}) == pytest.approx(8.0, rel=1e-3)
+    assert cost("path_error", aside | {"command.path_wavelength": 1.0}, lateral=0.02) == pytest.approx(1.0 / 1.125)
+    bent = {"truth.joint_position[leg_lf]": load_robot().home.leg_angle + 0.2}
+    assert cost("leg_error", bent, scale=0.1) == pytest.approx(0.5)
+    assert cost("climb_speed_error", {ahead: -0.03}, scale=0.015) == pytest.approx(2.0)
+    climbing = {"command.climb_speed": 0.05, "command.climb_time": 9.0, ahead: 0.05}
+    assert cost("track_climb_speed", climbing) == pytest.approx(1.0)
+    assert cost("track_climb_speed", climbing | {ahead: 0.02}, width=0.03) == pytest.approx(math.exp(-1.0))

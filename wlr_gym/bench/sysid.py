@@ -10,22 +10,26 @@ import io
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.bench.measure import Measurement, Size, against_fastest
 from wlr_gym.errors import MissingPackageError
-from wlr_gym.gap.fit import SETTLED
-from wlr_gym.gap.problem import Quantity
+from wlr_gym.gap.fit import SETTLED, fit, nominal_model
+from wlr_gym.gap.problem import Problem, Quantity
 
 Array = NDArray[np.float64]
 
+Optimiser = Literal["mujoco", "scipy_parallel_fd"]
 #: The peer's two ways to a minimum: its own optimiser, and scipy's on the same batched finite differences.
-OPTIMISERS = {"mujoco.sysid": "mujoco", "mujoco.sysid, scipy": "scipy_parallel_fd"}
+OPTIMISERS: Mapping[str, Optimiser] = {"mujoco.sysid": "mujoco", "mujoco.sysid, scipy": "scipy_parallel_fd"}
 #: Of its finite differences, in tolerances: its own 1.5e-8 is below what a contact solver resolves.
 PEER_STEP = 1e-4
+#: Of its iterations, at most: on contacts its own tolerances of 1e-8 are not met by noise of the solver's size.
+PEER_ITERATIONS = 20
 #: Numbers scaled by the Jacobian, as its authors advise.
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "mujoco": {"x_scale": "jac", "eps": PEER_STEP},
@@ -100,7 +104,7 @@ class PeerProblem:
     quantities: tuple[Quantity, ...]
     runs: Sequence[PeerRun]
 
-    def fit(self, optimiser: str) -> Fitted:
+    def fit(self, optimiser: Optimiser) -> Fitted:
         """Minimise to the optimiser's own tolerances."""
         from mujoco import sysid
 
@@ -120,7 +124,7 @@ class PeerProblem:
 
         begin = time.process_time()
         with contextlib.redirect_stdout(io.StringIO()):  # its optimisers cannot be told to be silent
-            chosen = sysid.optimize(parameters, residuals, optimiser, verbose=False, **OPTIONS[optimiser])[1].x
+            chosen = sysid.optimize(parameters, residuals, optimiser, verbose=False, max_iters=PEER_ITERATIONS, **OPTIONS[optimiser])[1].x
         seconds = time.process_time() - begin
         return Fitted(nominal + sigma * np.ravel(chosen), seconds, settled(trace))
 
@@ -172,8 +176,24 @@ def measure_sysid(size: Size) -> list[Measurement]:
     """Fits per hour of one processor against ``mujoco.sysid``, and how far both are from the truth."""
     require_sysid()
     from wlr_gym.bench.sysid_rig import rig_contest
+    from wlr_gym.bench.sysid_robot import robot_contest
 
-    return rows(rig_contest(size(10, 1)), size.rounds)
+    contests = rig_contest(size(10, 1)), robot_contest(size(6, 1))
+    return [row for contest in contests for row in rows(contest, size.rounds)]
+
+
+def contest_between(name: str, problem: Problem, truth: Array, peer: PeerProblem) -> Contest:
+    """Return the contest over all runs of a problem; ours is the fit with which the gap workflow calibrates."""
+    runs = range(len(problem.runs))
+
+    def ours() -> Fitted:
+        begin = time.process_time()
+        values = fit(problem, runs, nominal_model(problem), steps=problem.steps).model.quantities
+        seconds = time.process_time() - begin
+        return Fitted(values, seconds, seconds)
+
+    peers = {label: partial(peer.fit, optimiser) for label, optimiser in OPTIMISERS.items()}
+    return Contest(f"{name}, {len(truth)} numbers", problem.quantities, truth, ours, peers)
 
 
 def rows(contest: Contest, rounds: int) -> list[Measurement]:
@@ -194,11 +214,3 @@ def rows(contest: Contest, rounds: int) -> list[Measurement]:
         errors = tuple(contest.error(one) for one in fits)
         report.append(Measurement("sysid", f"{contest.name}, largest error, {name}", "% of a tolerance", errors))
     return report
-
-
-def timed(fit: Callable[[], Array]) -> Fitted:
-    """Run a fit of ours; return its numbers and what it took."""
-    begin = time.process_time()
-    values = fit()
-    seconds = time.process_time() - begin
-    return Fitted(values, seconds, seconds)

@@ -11,15 +11,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from functools import partial
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym import servo
-from wlr_gym.bench.sysid import OPTIMISERS, Contest, PeerProblem, PeerRun, timed
-from wlr_gym.gap.fit import fit, nominal_model
+from wlr_gym.bench.sysid import Contest, PeerProblem, PeerRun, contest_between
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.rig import kernel
 from wlr_gym.gap.rig.model import DATA_SHEET_VOLTAGE, DUTY_PER_GAIN, GRAVITY, QUANTITIES, model_of, pack
@@ -74,15 +72,7 @@ def true_numbers(rng: np.random.Generator) -> Array:
 def rig_contest(seconds: float, seed: int = 0) -> Contest:
     """Return the contest over recordings of this length (s)."""
     problem, truth = make_rig(seconds, seed)
-    peer = peer_of(problem)
-    runs = range(len(RUNS))
-    return Contest(
-        f"pendulum, {len(truth)} numbers, {len(RUNS)} runs of {seconds:g} s",
-        problem.quantities,
-        truth,
-        lambda: timed(lambda: fit(problem, runs, nominal_model(problem), steps=problem.steps).model.quantities),
-        {name: partial(peer.fit, optimiser) for name, optimiser in OPTIMISERS.items()},
-    )
+    return contest_between(f"pendulum, {len(RUNS)} runs of {seconds:g} s", problem, truth, peer_of(problem))
 
 
 def make_rig(seconds: float, seed: int = 0) -> tuple[WholeRuns, Array]:
@@ -168,7 +158,7 @@ def _recorded(run: int, seconds: float, truth: Array, rng: np.random.Generator) 
     """Simulate a run with fine steps and read it with a noisy encoder."""
     mass, length, gain = RUNS[run]
     rows = round(seconds / (ROW * STEP)) + 1
-    time = ROW * STEP * np.arange(rows)
+    time: Array = ROW * STEP * np.arange(rows, dtype=np.float64)
     goal = sum(
         a * np.sin(2 * np.pi * (f * time + p))
         for a, f, p in zip((0.8, 0.4, 0.2), rng.uniform(0.3, 2.0, 3), rng.random(3), strict=True)

@@ -78,7 +78,8 @@ class Options(EffectsOption):
     other_episodes: int = OTHER_EPISODES
     """Episodes in the second simulator."""
     sweep: tuple[str, ...] | None = None
-    """Sweeps: friction, split, floors, slope, grip, latency, payload; default none, with --full all that suit the task."""
+    """Sweeps: friction, split, floors, slope, grip, shapes, paper, latency, payload; default none, with --full all that suit
+    the task."""
     sweep_episodes: int = SWEEP_EPISODES
     """Episodes per point of a sweep."""
     randomization: str | None = None

@@ -322,7 +322,13 @@ class Core:
 
     def set_progress(self, steps: float) -> None:
         """Say how many environment steps, of all robots together, a training has done: what is drawn from now on is spread as
-        far as the task's curriculum says for so many steps. Without it the whole task is met."""
+        far as the task's curriculum says for so many steps. Without it the whole task is met.
+
+        Raises:
+            InputError: fewer than 0, or no number.
+        """
+        if not steps >= 0:
+            raise InputError(f"steps = {steps!r}: expected 0 or more")
         curriculum = self.task.config.curriculum
         self._command_timing[3] = _share(curriculum.commands, steps)
         self.randomization.spread = _share(curriculum.randomization, steps)

@@ -36,12 +36,14 @@ class Condition:
         label: name of it, unique.
         keywords: of the environment.
         parameters: elements of the parameter table set after randomisation and effects.
+        commands: held through the episodes.
         episodes: N per block. blocks: S, each with its own seeds.
     """
 
     label: str
     keywords: Mapping[str, Any] = field(default_factory=dict)
     parameters: Mapping[str, float] = field(default_factory=dict)
+    commands: Mapping[str, float] = field(default_factory=dict)
     episodes: int = 64
     blocks: int = 1
 
@@ -124,7 +126,8 @@ def _blocks(
     for block in range(condition.blocks):
         core, policy = players[block % len(players)]
         on_tick = None if tell is None else lambda: tell(text, condition.cost)
-        rollout = roll_out(core, policy, first_seed + BLOCK * block, on_tick, parameters=condition.parameters)
+        seed = first_seed + BLOCK * block
+        rollout = roll_out(core, policy, seed, on_tick, parameters=condition.parameters, commands=condition.commands)
         given = _Given(subject.name, rollout)
         references.setdefault((condition.label, block), given).check(given)
         if watch is not None:

@@ -20,6 +20,8 @@ SWEPT = ("tracking_error", "success", "excess_slip")
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive", "tab:cyan")
 #: Drawn in grey: what any policy should beat.
 REFERENCES = (IDLE, "untrained")
+#: Distance between two subjects at one rank of a sweep without numbers.
+DODGE = 0.09
 MARKERS = "osD^vP*Xh"
 
 
@@ -53,35 +55,39 @@ def sweep_curves(card: Card, sweep: Sweep) -> Figure:
 
 
 def _draw_sweep(axes: Axes, card: Card, sweep: Sweep, metric: Metric) -> None:
-    x: list[float] = [point.value for point in sweep.points]
     for name in card.names:
-        estimates = [card.scores[sweep.label(point)][name][metric.key] for point in sweep.points]
-        style = _style(card, name) if sweep.numeric else {**_style(card, name), "linestyle": ""}
-        if not sweep.numeric and not style["marker"]:
-            style["marker"] = "_"
-        axes.plot(x, [e.mean for e in estimates], label=name, markersize=4, linewidth=1.3, **style)
-        low, high = [e.low for e in estimates], [e.high for e in estimates]
-        if sweep.numeric:
-            axes.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
-        else:
-            axes.vlines(x, low, high, color=style["color"], linewidth=1.2)
+        _draw_subject(axes, card, sweep, metric, name)
     if metric.key == "tracking_error":
         axes.axhline(1.0, color="0.3", linestyle=":", linewidth=1.2)
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_title("tracking error (1 = at the bar)", fontsize=9)
+        axes.set_title("tracking error (1 = at the task's limits)", fontsize=9)
     else:
         axes.set_ylim(bottom=0.0)
         axes.set_title(f"{metric.key.replace('_', ' ')} ({metric.unit})", fontsize=9)
     if sweep.name in ("friction", "grip"):
         axes.set_xscale("log")
-    axes.set_xticks(x, [point.label for point in sweep.points], fontsize=8)
+    axes.set_xticks([point.value for point in sweep.points], [point.label for point in sweep.points], fontsize=8)
     axes.minorticks_off()
     if sweep.name == "slope":
         axes.invert_xaxis()  # the steepest on the right
     axes.set_xlabel(sweep.axis, fontsize=9)
     axes.grid(alpha=0.3)
+
+
+def _draw_subject(axes: Axes, card: Card, sweep: Sweep, metric: Metric, name: str) -> None:
+    x = np.array([point.value for point in sweep.points])
+    estimates = [card.scores[sweep.label(point)][name][metric.key] for point in sweep.points]
+    mean, low, high = ([getattr(estimate, end) for estimate in estimates] for end in ("mean", "low", "high"))
+    style = _style(card, name)
+    if sweep.numeric:
+        axes.plot(x, mean, label=name, markersize=4, linewidth=1.3, **style)
+        axes.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
+        return
+    x = x + DODGE * (card.names.index(name) - (len(card.names) - 1) / 2)
+    axes.plot(x, mean, label=name, markersize=4, **(style | {"linestyle": "", "marker": style["marker"] or "_"}))
+    axes.vlines(x, low, high, color=style["color"], linewidth=1.2)
 
 
 def improvements(card: Card) -> Figure:
@@ -95,7 +101,7 @@ def improvements(card: Card) -> Figure:
         estimates = [card.comparison[MAIN][name][metric.key] for metric in metrics]
         y = np.arange(len(metrics)) + (rank - (len(others) - 1) / 2) * height
         mean = np.array([e.mean for e in estimates])
-        ends = np.array([[e.mean - e.low, e.high - e.mean] for e in estimates]).T
+        ends = np.maximum(0.0, np.array([[e.mean - e.low, e.high - e.mean] for e in estimates]).T)
         axes.barh(
             y,
             mean,

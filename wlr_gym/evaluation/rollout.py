@@ -122,6 +122,7 @@ def roll_out(
     on_tick: Callable[[], object] | None = None,
     on_start: Callable[[], object] | None = None,
     parameters: Mapping[str, float] | None = None,
+    commands: Mapping[str, float] | None = None,
 ) -> Rollout:
     """Play one episode per robot of ``core``; robot i has seed ``first_seed + i``. Deterministic.
 
@@ -132,6 +133,7 @@ def roll_out(
         on_tick: called after every control tick (progress bars, logs).
         on_start: called once when the episodes have begun.
         parameters: values set after randomisation and effects, the same for all episodes.
+        commands: commands held through all episodes; the others are drawn.
 
     Raises:
         InputError: a real robot.
@@ -141,7 +143,7 @@ def roll_out(
     seeds = first_seed + np.arange(core.count)
     for row, seed in enumerate(seeds.tolist()):
         core.seed(row, seed)
-    core.begin_episodes(core.everyone, {"parameters": dict(parameters or {})})
+    core.begin_episodes(core.everyone, {"parameters": dict(parameters or {}), "command": dict(commands or {})})
     table = core.parameters.values.copy()
     start = np.concatenate([v.reshape(core.count, -1) for v in vars(core.state).values() if v is not None], axis=1)
     policy.reset(core.everyone)

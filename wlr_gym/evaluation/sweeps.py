@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from wlr_gym.errors import InputError, unknown_name
@@ -17,8 +17,9 @@ class Point:
 
     label: str
     value: float
-    parameters: Mapping[str, float]
+    parameters: Mapping[str, float] = field(default_factory=dict)
     randomization: str | None = None
+    commands: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class Sweep:
                 label=self.label(point),
                 keywords={**keywords, **({} if point.randomization is None else {"randomization": point.randomization})},
                 parameters=point.parameters,
+                commands=point.commands,
                 episodes=episodes,
             )
             for point in self.points
@@ -67,6 +69,17 @@ def _even_floor(mu: float) -> dict[str, float]:
     return {"ground.mu_x": mu, "ground.mu_y": mu, "patch.mu": mu}
 
 
+def _paper_sweep(front: tuple[float, float], rear: tuple[float, float]) -> dict[str, float]:
+    """Legs (degrees, before and after) at the paper's leg rate and speed."""
+    first, second = ([math.radians(legs[k]) for legs in (front, rear)] for k in (0, 1))
+    names = [f"{axle}_leg_{when}" for when in ("first", "second") for axle in ("front", "rear")]
+    return {**dict(zip(names, [*first, *second], strict=True)), "linear_velocity_x": 0.065, "leg_rate": 0.36}
+
+
+#: Test of the paper -> front and rear legs, degrees, before and after the sweep.
+PAPER_LEGS = {"test 1": ((30.0, 30.0), (30.0, 150.0)), "test 2": ((30.0, 150.0), (150.0, 30.0))}
+#: In the order of the command ``path_shape``: below 1, below 2, above.
+SHAPES = ("line", "S-curve", "circle")
 FRICTION = (0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)
 #: Beyond a ratio of about 2 a robot standing square cannot turn: see docs/evaluation.md.
 LEFT_FRICTION, SPLIT_RATIO = 0.25, (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0)
@@ -111,8 +124,18 @@ SWEEPS: dict[str, Sweep] = {
         ),
         Sweep(
             "floors", "randomization", "whole randomizations: robots and floors they draw",
-            tuple(Point(name, float(rank), {}, name) for rank, name in enumerate(FLOORS)),
+            tuple(Point(name, float(rank), randomization=name) for rank, name in enumerate(FLOORS)),
             numeric=False, tasks=("velocity", "path"),
+        ),
+        Sweep(
+            "shapes", "path", "each kind of path",
+            tuple(Point(name, float(k), commands={"path_shape": k + 0.5}) for k, name in enumerate(SHAPES)),
+            numeric=False, tasks=("path",),
+        ),
+        Sweep(
+            "paper", "test of the paper", "the leg sweeps of the paper's two tests, as commands of the task",
+            tuple(Point(name, float(k), commands=_paper_sweep(*legs)) for k, (name, legs) in enumerate(PAPER_LEGS.items())),
+            numeric=False, tasks=("posture",),
         ),
         Sweep(
             "latency", "delay of every command (s)", "commands act this much later than written",

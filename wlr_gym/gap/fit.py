@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.effects import PatchEffect
-from wlr_gym.gap.likelihood import Noise, estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.likelihood import Noise, estimate_noise, minus_two_log_likelihood, run_scatter
 from wlr_gym.gap.problem import Candidate, Problem, Setting
 
 Array = NDArray[np.float64]
@@ -26,11 +26,11 @@ SHARES = (1.0, 0.5, 0.2, 0.05)
 #: Steps that are taken with the same columns before they are simulated anew.
 CHORDS = 4
 #: Sticking friction makes the cost rough on this scale; so many full steps are taken in the end if it rises by no more.
-ROUGH, RELAXATIONS = 10.0, 2
+ROUGH, RELAXATIONS = 3.0, 2
 #: Stiffness, in tolerances, that holds a number on its bound.
 PINNED = 1e9
 #: A full step that gains less than this (in minus two log likelihood) ends a fit.
-SETTLED = 2.0
+SETTLED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +99,11 @@ def _relaxed(
     columns: Sequence[NDArray[np.float32]],
     residuals: list[Array],
     memory: Array | None,
+    scatter: float,
 ) -> tuple[Model, list[Array]]:
     """Take full steps that a rough cost hides: along what the data cannot tell apart, tolerances alone decide."""
     for _ in range(RELAXATIONS):
-        noise = estimate_noise(residuals, memory)
+        noise = estimate_noise(residuals, memory, scatter)
         cost = total_cost(problem, model, residuals, noise.memory)
         other = moved(problem, model, gauss_newton_step(problem, model, columns, residuals, noise))
         found = [r[0] for r in problem.residuals([other.setting], runs)]
@@ -206,6 +207,7 @@ def fit(
     model: Model,
     *,
     memory: Array | None = None,
+    scatter: float = 1.0,
     columns: list[NDArray[np.float32]] | None = None,
     steps: int = 4,
     renew: bool = True,
@@ -218,6 +220,7 @@ def fit(
         runs: which of its runs.
         model: where to start, with the effects to be fitted.
         memory: of the residuals where it is known already, and must be the same; None = estimated at every step.
+        scatter: of the runs; see :class:`wlr_gym.gap.likelihood.Noise`.
         columns: responses near ``model`` where they are known.
         steps: at most this many Gauss-Newton steps.
         renew: simulate the columns anew at every step; otherwise only once, where ``columns`` are missing.
@@ -230,7 +233,7 @@ def fit(
     for step in range(steps):
         gained = 0.0
         for _ in range(CHORDS):
-            noise = estimate_noise(residuals, memory)
+            noise = estimate_noise(residuals, memory, scatter)
             cost = total_cost(problem, model, residuals, noise.memory)
             change = gauss_newton_step(problem, model, columns, residuals, noise)
             tries = [moved(problem, model, share * change) for share in SHARES]
@@ -247,11 +250,20 @@ def fit(
         if gained < SETTLED or not renew or step == steps - 1:
             break
         residuals, columns = linearise(problem, model, runs)
-    model, residuals = _relaxed(problem, runs, model, columns, residuals, memory)
-    noise = estimate_noise(residuals, memory)
+    model, residuals = _relaxed(problem, runs, model, columns, residuals, memory, scatter)
+    noise = estimate_noise(residuals, memory, scatter)
     matrix, _ = normal_equations(columns, residuals, noise)
     hessian = matrix + np.diag(prior_tightness(problem, model) + PINNED * on_bounds(problem, model))
     return Fit(model, residuals, noise, total_cost(problem, model, residuals, noise.memory), columns, hessian)
+
+
+def widened(problem: Problem, runs: Sequence[int], found: Fit) -> Fit:
+    """Return the fit with a likelihood as wide as the runs differ, its numbers moved to where that leaves them."""
+    free = ~on_bounds(problem, found.model)
+    parts = [normal_equations([c], [r], found.noise) for c, r in zip(found.columns, found.residuals, strict=True)]
+    matrices, vectors = np.stack([m for m, _ in parts])[:, free][:, :, free], np.stack([v for _, v in parts])[:, free]
+    scatter = max(found.noise.scatter * run_scatter(matrices, vectors), 1.0)
+    return fit(problem, runs, found.model, scatter=scatter, columns=found.columns, steps=1)
 
 
 def prior_tightness(problem: Problem, model: Model) -> Array:

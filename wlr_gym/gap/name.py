@@ -27,6 +27,7 @@ from wlr_gym.gap.fit import (
     normal_equations,
     on_bounds,
     total_cost,
+    widened,
 )
 from wlr_gym.gap.likelihood import Noise, estimate_noise, minus_two_log_likelihood
 from wlr_gym.gap.problem import Candidate, Problem, Setting, Start
@@ -46,7 +47,7 @@ FINALIST, FINALISTS = 0.75, 3
 #: Beside a set of places its best single place is fitted in full, if it buys at least this share.
 NARROWER = 0.4
 #: What an effect must buy more for every unknown beyond the first.
-PER_UNKNOWN = 10.0
+PER_UNKNOWN = 3.0
 #: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
 MOST_HARM = 0.2
 #: Runs that were not fitted must gain at least this share of what those that were did, per run.
@@ -174,14 +175,14 @@ def name_effects(
         hypotheses = (
             refit_thoroughly(problem, runs, current, chosen) if given is None else refit(problem, runs, current, chosen, given)
         )
-        finals = finalists(problem, runs, hypotheses, others, tell)
+        finals = finalists(problem, runs, hypotheses, current.noise.scatter, others, tell)
         chosen_final = _accepted(current, finals)
         taken = None if chosen_final is None else chosen_final.hypothesis
         rounds.append(Round(scores, _merged(finals, hypotheses), taken, current.cost))
         if chosen_final is None:
             break
         tell(f"taken: {chosen_final.hypothesis.candidate.label}")
-        current = drop_idle(problem, runs, chosen_final.fit, tell)
+        current = widened(problem, runs, drop_idle(problem, runs, chosen_final.fit, tell))
         if len(current.model.effects) >= MOST_EFFECTS or any(_same(current.model, earlier) for earlier in models):
             break
         models.append(current.model)
@@ -194,7 +195,14 @@ def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tu
     if len(final.model.effects) < 2:
         return swaps
     for index, (candidate, _) in enumerate(final.model.effects):
-        without = fit(problem, runs, final.model.without_effect(index), memory=final.noise.memory, steps=problem.steps)
+        without = fit(
+            problem,
+            runs,
+            final.model.without_effect(index),
+            memory=final.noise.memory,
+            scatter=final.noise.scatter,
+            steps=problem.steps,
+        )
         probes, candidates = problem.candidates(without.model.setting, without.residuals, runs)
         scores = screen(candidates, responses(problem, without, runs, probes))
         rivals = refit_thoroughly(problem, runs, without, scores)
@@ -211,7 +219,7 @@ def _same(one: Model, other: Model) -> bool:
 def drop_idle(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = lambda text: None) -> Fit:
     """Take out effects that the others have made needless, one after the other, the least useful first."""
     while len(current.model.effects) > 1:
-        memory = current.noise.memory
+        noise = current.noise
         kept = len(problem.quantities)
         trials = []
         for index in range(len(current.model.effects)):
@@ -219,14 +227,25 @@ def drop_idle(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = 
             own = slice(kept + sum(sizes[:index]), kept + sum(sizes[: index + 1]))
             columns = [np.delete(column, own, axis=0) for column in current.columns]
             model = current.model.without_effect(index)
-            trials.append(fit(problem, runs, model, memory=memory, columns=columns, steps=problem.steps, renew=False))
+            trials.append(
+                fit(
+                    problem,
+                    runs,
+                    model,
+                    memory=noise.memory,
+                    scatter=noise.scatter,
+                    columns=columns,
+                    steps=problem.steps,
+                    renew=False,
+                )
+            )
         losses = [trial.cost - current.cost for trial in trials]
         least = int(np.argmin(losses))
         unknowns = len(current.model.effects[least][1])
         if losses[least] > LEAST_GAIN + PER_UNKNOWN * (unknowns - 1):
             return current
         tell(f"dropped: {current.model.effects[least][0].label}")
-        current = fit(problem, runs, trials[least].model, steps=1, tell=tell)
+        current = fit(problem, runs, trials[least].model, scatter=noise.scatter, steps=1, tell=tell)
     return current
 
 
@@ -242,6 +261,7 @@ def finalists(
     problem: Problem,
     runs: Sequence[int],
     hypotheses: Sequence[Hypothesis],
+    scatter: float = 1.0,
     others: Sequence[int] = (),
     tell: Tell = lambda text: None,
 ) -> list[Final]:
@@ -258,7 +278,7 @@ def finalists(
     wholes = []
     for hypothesis in best.values():
         tell(f"fitting {hypothesis.candidate.label} in full")
-        near = fit(problem, runs, hypothesis.model, steps=problem.steps, tell=tell)
+        near = fit(problem, runs, hypothesis.model, scatter=scatter, steps=problem.steps, tell=tell)
         wholes.append(min((near, *_afresh(problem, runs, hypothesis, near, tell)), key=lambda whole: whole.cost))
     if not wholes:
         return []
@@ -268,7 +288,7 @@ def finalists(
         # what its fit gained beyond the refit counts for it; what it would have gained without the effect was counted there
         base = total_cost(problem, hypothesis.base, hypothesis.base_residuals, memory)
         gain = base - total_cost(problem, whole.model, whole.residuals, memory)
-        by_run = _by_run(hypothesis.base_residuals, whole.residuals, estimate_noise(whole.residuals, memory))
+        by_run = _by_run(hypothesis.base_residuals, whole.residuals, estimate_noise(whole.residuals, memory, scatter))
         agreed = _carries_over(problem, hypothesis.base, whole.model, gain, runs, others, memory)
         final = replace(hypothesis, model=whole.model, gain=gain, by_run=by_run, residuals=whole.residuals, carries_over=agreed)
         found.append(Final(final, whole))
@@ -289,7 +309,7 @@ def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near:
     candidate = hypothesis.candidate
     given = replace(hypothesis.model.without_effect(-1), quantities=nominal_model(problem).quantities)
     start = given.with_effect(candidate, _probed(candidate, candidate.starts[0]))
-    return [fit(problem, runs, start, memory=near.noise.memory, steps=2 * problem.steps, tell=tell)]
+    return [fit(problem, runs, start, memory=near.noise.memory, scatter=near.noise.scatter, steps=2 * problem.steps, tell=tell)]
 
 
 def _carries_over(
@@ -428,18 +448,25 @@ def _simulated(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) 
 
 def refit_thoroughly(problem: Problem, runs: Sequence[int], current: Fit, scores: Sequence[Score]) -> list[Hypothesis]:
     """Fit every hypothesis in full, from its first guess and from its probes; best first."""
-    memory = current.noise.memory
+    memory, scatter = current.noise.memory, current.noise.scatter
     fits = [
         min(
             (
-                fit(problem, runs, current.model.with_effect(score.candidate, values), memory=memory, steps=problem.steps)
+                fit(
+                    problem,
+                    runs,
+                    current.model.with_effect(score.candidate, values),
+                    memory=memory,
+                    scatter=scatter,
+                    steps=problem.steps,
+                )
                 for values in _starting_values(score)
             ),
             key=lambda found: found.cost,
         )
         for score in scores
     ]
-    fits.append(fit(problem, runs, current.model, memory=memory, steps=problem.steps))
+    fits.append(fit(problem, runs, current.model, memory=memory, scatter=scatter, steps=problem.steps))
     trials = [_Trial(k, found.columns, found.model, found.residuals) for k, found in enumerate(fits)]
     memory = _best_memory(problem, current, trials)
     return _ranked(problem, scores, [t.model for t in trials], [t.residuals for t in trials], memory)
@@ -483,7 +510,7 @@ def _best_memory(problem: Problem, current: Fit, trials: Sequence[_Trial]) -> Ar
     best = min(trials, key=lambda t: total_cost(problem, t.model, t.residuals, memory))
     if total_cost(problem, best.model, best.residuals, memory) >= current.cost:
         return memory
-    return estimate_noise(best.residuals).memory
+    return estimate_noise(best.residuals, scatter=current.noise.scatter).memory
 
 
 def _own_columns(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) -> list[list[Array]]:

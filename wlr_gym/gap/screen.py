@@ -26,7 +26,7 @@ from wlr_gym.gap.problem import Candidate, Probe, Problem, Setting, Start
 Array = NDArray[np.float64]
 
 #: Fall of minus two log posterior below which an effect is not accepted.
-LEAST_GAIN = 60.0
+LEAST_GAIN = 16.0
 #: A response of which less than this share is left after the known numbers have imitated it cannot be told from them.
 LEAST_OWN = 1e-4
 

@@ -13,7 +13,7 @@ from wlr_gym.effects import Source, load_patch
 from wlr_gym.errors import unknown_name
 from wlr_gym.gap import analysis as words
 from wlr_gym.gap.analysis import Analysis, Calibrated, Equivalent, Evidence, FoundEffect, IntakeFinding
-from wlr_gym.gap.fit import Fit, fit, nominal_model
+from wlr_gym.gap.fit import Fit, fit, nominal_model, widened
 from wlr_gym.gap.localise import localise
 from wlr_gym.gap.name import Hypothesis, Naming, Round, name_effects
 from wlr_gym.gap.problem import Problem
@@ -106,6 +106,7 @@ def analyse_problem(
     fitted, sealed, columns = _choose_runs(problem, heldout)
     clock.start("calibrating")
     base = fit(problem, fitted, nominal_model(problem), columns=columns, steps=problem.steps, tell=clock.detail)
+    base = widened(problem, fitted, base)
     clock.start("naming")
     naming = name_effects(problem, fitted, base, sealed, clock.detail, columns)
     clock.start("proving")

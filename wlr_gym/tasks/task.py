@@ -228,8 +228,11 @@ class Task:
     @property
     def needs_observer(self) -> bool:
         """Whether any term needs the slip observer's estimate."""
+        functions = [COMPUTED[name].function for name in self.computed_terms]
+        for names, registry in ((self.rewards, REWARDS), (self.terminations, TERMINATIONS), (self.measures, MEASURES)):
+            functions += [registry[name].function for name in names]
         return any(c.source == "estimate" for c in self.policy) or any(
-            signal.startswith("estimate.") for name in self.computed_terms for signal in signals_of(COMPUTED[name].function)
+            signal.startswith("estimate.") for function in functions for signal in signals_of(function)
         )
 
     @property
@@ -354,9 +357,9 @@ def signals_of(function: Callable[..., Any], parameters: Mapping[str, float] | N
     """Return the names of the signals that a term's function reads."""
     names: set[str] = set()
 
-    def read(name: str) -> float:
+    def read(name: str) -> np.float64:
         names.add(name)
-        return 1.0
+        return np.float64(1.0)
 
     with np.errstate(all="ignore"):
         function(Signals(read), **(parameters or {}))
