@@ -86,7 +86,7 @@ def test_both_sides_have_the_same_robot(robot):
 
     problem, truth = robot
     nominal = np.array([q.nominal for q in problem.quantities])
-    ours = problem.residuals([Setting(truth), Setting(nominal)], range(4))
+    ours = problem.residuals([Setting(truth), Setting(nominal)], range(len(problem.runs)))
     for run, own in zip(peer_of(problem).runs, np.nan_to_num(ours), strict=True):
         peer = np.stack([predicted_by_peer(run, values) for values in (truth, nominal)])
         level = np.sqrt([np.mean(each[..., compared(each)] ** 2, axis=(1, 2)) for each in (own, peer)])

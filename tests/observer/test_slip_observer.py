@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from observed_runs import PERIOD, estimated, observe, plain_odometry, simulate, slip_in_truth_order
 
 from wlr_gym.errors import InputError
@@ -17,7 +18,7 @@ ROBOT = load_robot("nominal")
 RADIUS, GRAVITY = ROBOT.wheel.radius, ROBOT.gravity
 
 
-def readings(ticks: int, speed=0.0, wheel_speed=None, slope: float = 0.0) -> np.ndarray:
+def readings(ticks: int, speed: ArrayLike = 0.0, wheel_speed: np.ndarray | None = None, slope: float = 0.0) -> np.ndarray:
     """Exact sensors (T, 1, W) of a level robot that moves straight ahead.
 
     Args:
@@ -214,6 +215,8 @@ def test_acceleration_shifts_load_to_the_rear():
     sensors = readings(10, 2.0 * PERIOD * np.arange(10))
     sensors[..., SENSOR_LAYOUT.slices["accelerometer"].start] = 2.0
     load = estimated(follow(sensors), "normal_force")[-1, 0]
+    assert ROBOT.leg.mass is not None
+    assert ROBOT.wheel.mass is not None
     below = ROBOT.leg.length * 4 * (0.5 * ROBOT.leg.mass + ROBOT.wheel.mass) / ROBOT.total_mass
     height = ROBOT.leg.length + RADIUS - below  # of the centre of mass above the floor
     shift = ROBOT.total_mass * 2.0 * height / (4 * ROBOT.hip_position.x)
@@ -246,15 +249,15 @@ def test_the_filter_is_the_textbooks():
     np.testing.assert_allclose(p, transition @ start @ transition.T + np.diag(noise), rtol=1e-12, atol=1e-12)
 
     age, weights, column = 0.1, np.array([0.1, 0.4, 0.3, 0.2]), np.empty(7)
-    measurements = {
-        axis.see_wheel(p, 2, column): ([0, 1, 0, 0, 0, 1, 0], column.copy()),
-        axis.see_balance(p, weights, column): ([0, 0, 0, *weights], column.copy()),
-        axis.see_position(p, age, column): ([1, -age, -0.5 * age**2, 0, 0, 0, 0], column.copy()),
-    }
-    for spread, (h, seen) in measurements.items():
-        np.testing.assert_allclose(seen, p @ h, rtol=1e-12)
-        assert spread == pytest.approx(h @ p @ h)
-    change, total = np.zeros(7), spread + 0.5
+    measurements = [
+        (axis.see_wheel(p, 2, column), column.copy(), np.array([0, 1, 0, 0, 0, 1, 0])),
+        (axis.see_balance(p, weights, column), column.copy(), np.array([0, 0, 0, *weights])),
+        (axis.see_position(p, age, column), column.copy(), h := np.array([1, -age, -0.5 * age**2, 0, 0, 0, 0])),
+    ]
+    for spread, seen, row in measurements:
+        np.testing.assert_allclose(seen, p @ row, rtol=1e-12)
+        assert spread == pytest.approx(row @ p @ row)
+    change, total = np.zeros(7), float(h @ p @ h) + 0.5
     corrected = p.copy()
     axis.correct(corrected, column.copy(), 2.0, total, change)
     np.testing.assert_allclose(change, 2.0 * (p @ h) / total, rtol=1e-12)

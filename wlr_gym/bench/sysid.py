@@ -178,7 +178,7 @@ def measure_sysid(size: Size) -> list[Measurement]:
     from wlr_gym.bench.sysid_rig import rig_contest
     from wlr_gym.bench.sysid_robot import robot_contest
 
-    contests = rig_contest(size(10, 1)), robot_contest(size(6, 1))
+    contests = rig_contest(size(10, 1)), robot_contest(size(4, 1))
     return [row for contest in contests for row in rows(contest, size.rounds)]
 
 

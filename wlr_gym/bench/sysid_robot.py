@@ -25,12 +25,14 @@ from wlr_gym.bench.mujoco_loop import build_servo_model
 from wlr_gym.bench.sysid import Contest, PeerProblem, PeerRun, contest_between
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.robot.problem import RobotProblem
+from wlr_gym.gap.robot.simulate import LEAD
 from wlr_gym.gap.robot.windows import anchored_residuals
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants import make_plant
 from wlr_gym.plants.base import PlantOptions, standing_state
 from wlr_gym.random import generator
 from wlr_gym.robot import JOINTS, load_robot
+from wlr_gym.runs.anchor import start_state
 from wlr_gym.runs.format import CHANNELS, COMMANDS, RunMeta
 from wlr_gym.runs.read import Run
 from wlr_gym.runs.simulation import SENSED, channels
@@ -41,7 +43,7 @@ Array = NDArray[np.float64]
 FREE = ("body.mass", "body.com_offset", "wheel.radius", "servo.armature", "servo.coulomb_friction")
 #: Channels that are compared.
 COMPARED = tuple(name for name in CHANNELS if name.startswith(("pos_", "vel_")) or name in ("cam_x", "cam_y", "cam_yaw"))
-RUNS, PERIOD, STEP = 4, 0.02, 0.001
+RUNS, PERIOD, STEP = 2, 0.02, 0.001
 #: s that the robot stands before a run begins.
 REST = 0.5
 #: MuJoCo orders joints along the tree: leg, wheel, leg, wheel, ...
@@ -133,7 +135,7 @@ def peer_of(problem: FewNumbers) -> PeerProblem:
 def _peer_run(problem: FewNumbers, run: int, build: Callable[[Array], mujoco.MjModel]) -> PeerRun:
     nominal = problem.table(np.array([quantity.nominal for quantity in problem.quantities]))
     t, measured = problem.times(run), problem.measured(run)
-    lead = round(REST / STEP)
+    lead = round(LEAD / STEP)
     steps = lead + round(t[-1] / STEP)
     arrival = lead + np.rint((t + nominal["command.delay"][0].max()) / STEP)
     row = np.maximum(np.searchsorted(arrival, np.arange(steps + 1), side="right") - 1, 0)
@@ -148,15 +150,15 @@ def _peer_run(problem: FewNumbers, run: int, build: Callable[[Array], mujoco.MjM
         return np.nan_to_num(found)
 
     control = np.hstack([goals, goals[:, 4:]])
-    return PeerRun(model, build, STEP * np.arange(steps + 1), control, _start(problem, nominal, model), residual)
+    return PeerRun(model, build, STEP * np.arange(steps + 1), control, _start(problem.clocks[run].run, problem, nominal, model), residual)
 
 
-def _start(problem: FewNumbers, nominal: Parameters, model: mujoco.MjModel) -> Array:
-    """Full physics state (time, positions, rates, references) of the robot standing still."""
-    stand, data = standing_state(problem.robot, nominal), mujoco.MjData(model)
-    data.qpos[:3], data.qpos[3:7] = stand.position[0], stand.quaternion[0]
-    data.qpos[7:][_JOINTS] = stand.joint_position[0]
-    data.act[:] = stand.reference_position[0, 4:]
+def _start(run: Run, problem: FewNumbers, nominal: Parameters, model: mujoco.MjModel) -> Array:
+    """Full physics state (time, positions, rates, references) where our replays begin too: tension of the wheels as measured."""
+    begin, data = start_state(run, problem.robot, nominal), mujoco.MjData(model)
+    data.qpos[:3], data.qpos[3:7] = begin.position[0], begin.quaternion[0]
+    data.qpos[7:][_JOINTS] = begin.joint_position[0]
+    data.act[:] = begin.reference_position[0, 4:]
     return np.concatenate([[0.0], data.qpos, data.qvel, data.act])
 
 
