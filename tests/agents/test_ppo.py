@@ -154,11 +154,24 @@ def test_the_environment_is_told_how_far_training_is(run, tmp_path, monkeypatch)
     told = []
     monkeypatch.setattr(Sb3VecEnv, "set_progress", lambda env, steps: told.append(steps))
     train(tmp_path / "run")
-    assert told == [0, *range(0, 384, 64)]
+    assert told == [0, 0, 64, 128, 128, 192, 256, 256, 320, 384]
     shutil.rmtree(tmp_path / "run" / "checkpoints" / "step_000000000384")
     told.clear()
     train(tmp_path / "run", resume=True)
     assert told == [256, 256, 320]
+
+
+def test_a_run_with_a_curriculum_resumes_exactly(tmp_path):
+    curriculum = {"commands": {"start": 0.1, "steps": 384}, "randomization": {"start": 0.1, "steps": 384}}
+    settings = {"environment": SETTINGS["environment"] | {"task": {"curriculum": curriculum}}}
+    folder = tmp_path / "run"
+    whole = train(folder, **settings)
+    shutil.copytree(folder, tmp_path / "copy")
+    for late in sorted((tmp_path / "copy").glob("checkpoints/step_*"))[1:]:
+        shutil.rmtree(late)
+    resumed = train(tmp_path / "copy", resume=True, **settings)
+    assert curve(tmp_path / "copy") == curve(folder)
+    assert_same_weights(resumed, whole)
 
 
 def test_ctrl_c_saves_a_checkpoint_and_says_how_to_go_on(tmp_path, monkeypatch):

@@ -24,7 +24,7 @@ from wlr_gym.evaluation import (
 )
 from wlr_gym.evaluation.card_plots import draw_card
 from wlr_gym.evaluation.plots import commanded_path
-from wlr_gym.evaluation.rollout import saturated, yaw_of
+from wlr_gym.evaluation.rollout import saturated
 from wlr_gym.evaluation.sweeps import SWEEPS
 from wlr_gym.policy import make_policy
 
@@ -130,7 +130,7 @@ def test_card_files(swept, tmp_path):
 def test_yaw_of_a_quaternion():
     angle = np.array([0.0, 1.0, -3.0])
     turned = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], axis=1)
-    np.testing.assert_allclose(yaw_of(turned), angle)
+    np.testing.assert_allclose(yaw_of(*turned.T), angle)
 
 
 def test_commanded_path_of_a_circle_closes():

@@ -89,6 +89,11 @@ def test_shipped_policies_go_by_their_names(exported, tmp_path, monkeypatch):
         find_policy("velocty_slip_aware")
 
 
+def test_an_agent_is_not_taken_for_an_unknown_name():
+    with pytest.raises(InputError, match=r"^'pid' is an agent: expected a trained policy"):
+        find_policy("pid")
+
+
 def test_what_is_no_policy(tmp_path):
     (tmp_path / "notes.txt").write_text("hello")
     for source, message in (

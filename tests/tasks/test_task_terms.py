@@ -27,7 +27,7 @@ def signals(**values: Any) -> Signals:
 
 def error(shape, x, y, yaw: Any = 0.0, *, bend=1.0, wavelength=1.5, offset=0.0, turn=0.0) -> references.PathError:
     given = {"path_shape": shape, "path_curvature": bend, "path_wavelength": wavelength}
-    motion = Motion(np.asarray(x), np.asarray(y), np.asarray(yaw), 0.0, 0.0, 0.0)
+    motion = Motion(np.asarray(x), np.asarray(y), np.asarray(yaw))
     return references.path_error(signals(**given, path_offset=offset, path_heading=turn), motion)
 
 

@@ -124,7 +124,9 @@ class PeerProblem:
 
         begin = time.process_time()
         with contextlib.redirect_stdout(io.StringIO()):  # its optimisers cannot be told to be silent
-            chosen = sysid.optimize(parameters, residuals, optimiser, verbose=False, max_iters=PEER_ITERATIONS, **OPTIONS[optimiser])[1].x
+            chosen = sysid.optimize(
+                parameters, residuals, optimiser, verbose=False, max_iters=PEER_ITERATIONS, **OPTIONS[optimiser]
+            )[1].x
         seconds = time.process_time() - begin
         return Fitted(nominal + sigma * np.ravel(chosen), seconds, settled(trace))
 

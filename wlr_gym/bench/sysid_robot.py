@@ -150,11 +150,13 @@ def _peer_run(problem: FewNumbers, run: int, build: Callable[[Array], mujoco.MjM
         return np.nan_to_num(found)
 
     control = np.hstack([goals, goals[:, 4:]])
-    return PeerRun(model, build, STEP * np.arange(steps + 1), control, _start(problem.clocks[run].run, problem, nominal, model), residual)
+    return PeerRun(
+        model, build, STEP * np.arange(steps + 1), control, _start(problem.clocks[run].run, problem, nominal, model), residual
+    )
 
 
 def _start(run: Run, problem: FewNumbers, nominal: Parameters, model: mujoco.MjModel) -> Array:
-    """Full physics state (time, positions, rates, references) where our replays begin too: tension of the wheels as measured."""
+    """Full physics state (time, positions, rates, references) where our replays begin too, the wheels' tension as measured."""
     begin, data = start_state(run, problem.robot, nominal), mujoco.MjData(model)
     data.qpos[:3], data.qpos[3:7] = begin.position[0], begin.quaternion[0]
     data.qpos[7:][_JOINTS] = begin.joint_position[0]

@@ -27,6 +27,7 @@ from wlr_gym.evaluation import (
     Condition,
     Rollout,
     Subject,
+    Sweep,
     comparison_rows,
     make_player,
     play,
@@ -167,14 +168,9 @@ def _play(
     options: Options, subjects: Sequence[Subject], keywords: Mapping[str, Any], others: Sequence[str], effects: str
 ) -> tuple[Card, Rollout]:
     """Play everything; returns the card, and the first block of the first subject."""
-    environment, episodes, seeds = str(options.env), options.episodes or 0, options.seeds or 0
-    task = task_name_of(environment)
+    task = task_name_of(str(options.env))
     sweeps = tuple(read_sweep(name, task) for name in dict.fromkeys(options.sweep or ()))
-    conditions = [Condition(MAIN, keywords, episodes=episodes, blocks=seeds)]
-    for sweep in sweeps:
-        conditions += sweep.conditions(keywords, options.sweep_episodes)
-    fewer = min(options.other_episodes, episodes)
-    conditions += [Condition(OTHER_PLANT, {**keywords, "backend": other}, episodes=fewer) for other in others]
+    conditions = _conditions(options, sweeps, keywords, others)
     first: list[Rollout] = []
 
     def watch(condition: Condition, subject: Subject, block: int, rollout: Rollout) -> None:
@@ -183,15 +179,33 @@ def _play(
 
     ticks = make_task(task, read_settings(keywords)).episode_ticks
     with progress(work(conditions, subjects, ticks), options.progress) as tell:
-        results = play(environment, subjects, conditions, options.seed, tell, watch)
+        results = play(str(options.env), subjects, conditions, options.seed, tell, watch)
+    return Card(results, sweeps, _said(options, conditions, effects)), first[0]
+
+
+def _conditions(
+    options: Options, sweeps: Sequence[Sweep], keywords: Mapping[str, Any], others: Sequence[str]
+) -> list[Condition]:
+    """Return the main condition, those of the sweeps, and the main one in the other simulator."""
+    episodes = options.episodes or 0
+    conditions = [Condition(MAIN, keywords, episodes=episodes, blocks=options.seeds or 0)]
+    for sweep in sweeps:
+        conditions += sweep.conditions(keywords, options.sweep_episodes)
+    fewer = min(options.other_episodes, episodes)
+    return conditions + [Condition(OTHER_PLANT, {**keywords, "backend": other}, episodes=fewer) for other in others]
+
+
+def _said(options: Options, conditions: Sequence[Condition], effects: str) -> dict[str, Any]:
+    """Return what the card says about how it was played."""
+    main, last = conditions[0], conditions[-1]
     said = {
-        "environment": environment, "backend": str(keywords["backend"]), "episodes": f"{episodes} x {seeds} seeds",
+        "environment": options.env, "backend": main.keywords["backend"], "episodes": f"{main.episodes} x {main.blocks} seeds",
         "first seed": options.seed, "randomization": options.randomization or "the task's",
         "robot": options.robot or "the task's", "effects": effects,
     }  # fmt: skip
-    said |= {"second simulator": f"{others[0]}, {fewer} episodes"} if others else {}
-    said |= {"sweeps": f"{options.sweep_episodes} episodes per point"} if sweeps else {}
-    return Card(results, sweeps, said), first[0]
+    if last.label == OTHER_PLANT:
+        said |= {"second simulator": f"{last.keywords['backend']}, {last.episodes} episodes"}
+    return said | ({"sweeps": f"{options.sweep_episodes} episodes per point"} if options.sweep else {})
 
 
 @contextmanager

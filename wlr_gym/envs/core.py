@@ -31,7 +31,9 @@ from wlr_gym.tasks.draws import episode_seeds, stream_numbers, uniforms
 from wlr_gym.tasks.randomization import DRIFT_PERIOD, load_randomization
 from wlr_gym.tasks.signals import START
 from wlr_gym.tasks.task import ObservationColumn, RampConfig, Task, TaskConfig, bounds, build_task, read_task
+from wlr_gym.tasks.terms import COMMANDS
 from wlr_gym.tasks.terms.events import normal
+from wlr_gym.tasks.terms.geometry import yaw_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -286,7 +288,7 @@ class Core:
             buffer[rows] = 0
         self.measures[rows] = 0.0
         self._start[rows, :2] = self.state.position[rows, :2]
-        self._start[rows, 2] = yaw_of(self.state.quaternion[rows])
+        self._start[rows, 2] = yaw_of(*self.state.quaternion[rows].T)
         self.terminated[rows] = self.truncated[rows] = self.changed[rows] = False
         if self.randomization.intervals:
             self._strike_at[rows] = self._next_strike(rows)
@@ -500,12 +502,6 @@ class Core:
 
 def _share(ramp: RampConfig | None, steps: float) -> float:
     return 1.0 if ramp is None else min(1.0, ramp.start + (1.0 - ramp.start) * steps / ramp.steps)
-
-
-def yaw_of(quaternion: Array) -> Array:
-    """Return the heading of the body's x axis in the floor (rad) for quaternions (N, 4) as (w, x, y, z)."""
-    w, x, y, z = quaternion.T
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def read_actions(actions: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ from wlr_gym.evaluation.record import Recorder, record_episodes, write_samples
 from wlr_gym.evaluation.rollout import Measure, Rollout, make_core, roll_out
 from wlr_gym.evaluation.statistics import Estimate
 from wlr_gym.evaluation.subjects import Subject, make_player, read_subjects
-from wlr_gym.evaluation.sweeps import read_sweep, sweeps_for
+from wlr_gym.evaluation.sweeps import Sweep, read_sweep, sweeps_for
 from wlr_gym.evaluation.write import (
     comparison_rows,
     rows,
@@ -32,6 +32,7 @@ __all__ = [
     "Recorder",
     "Rollout",
     "Subject",
+    "Sweep",
     "comparison_rows",
     "make_core",
     "make_player",

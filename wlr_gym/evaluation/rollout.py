@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from wlr_gym.errors import InputError
 from wlr_gym.robot import Robot
 from wlr_gym.tasks.success import succeeded
+from wlr_gym.tasks.terms.geometry import yaw_of
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
@@ -185,7 +186,7 @@ def _signals(core: Core) -> dict[str, NDArray]:
         "measured": core.measures.copy(),
         "action": core.action.copy(),
         "position": truth["position"][:, :2].copy(),
-        "yaw": yaw_of(truth["quaternion"]),
+        "yaw": yaw_of(*truth["quaternion"].T),
         "forward_velocity": truth["linear_velocity_in_body"][:, 0].copy(),
         "yaw_rate": truth["angular_velocity_in_body"][:, 2].copy(),
         "slip_velocity": truth["slip_displacement"].reshape(shape) / core.task.config.control_period,
@@ -221,12 +222,6 @@ def excess_slip_of(core: Core) -> Callable[[], Array]:
         return REWARDS["slip"].function(signals, speed=1.0)
 
     return excess_slip
-
-
-def yaw_of(quaternion: Array) -> Array:
-    """Return the heading of the body's x axis in the floor (rad) for quaternions (N, 4) as (w, x, y, z)."""
-    w, x, y, z = quaternion.T
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def saturated(truth: Truth, robot: Robot) -> NDArray[np.bool_]:

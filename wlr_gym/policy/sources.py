@@ -57,6 +57,8 @@ def find_policy(source: str | Path) -> Path:
         raise InputError(f"'{source}': no policy there (looked for {CONTRACT_FILE} in it and in its folder 'policy')")
     if Path(source).exists():
         raise InputError(f"'{source}': not a policy: expected a folder, or a file {SUFFIX}")
+    if str(source) in agent_names():
+        raise InputError(f"'{source}' is an agent: expected a trained policy (folder, file {SUFFIX} or shipped policy)")
     hint = nearest(str(source), [*agent_names(), *shipped_names()])
     raise InputError(
         f"'{source}' is no policy: neither a folder, a file {SUFFIX}, an agent nor a shipped policy{hint}; "

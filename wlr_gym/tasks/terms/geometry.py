@@ -10,21 +10,16 @@ from wlr_gym.tasks.signals import Signals, Value
 
 @dataclass(frozen=True)
 class Motion:
-    """Pose and motion of the body origin. Frame: that of the episode's start (x ahead of the robot as it stood there).
+    """Pose of the body origin. Frame: that of the episode's start (x ahead of the robot as it stood there).
 
     Attributes:
         x, y: m.
         yaw: rad.
-        forward, sideways: velocity in the body frame, m/s.
-        yaw_rate: rad/s.
     """
 
     x: Value
     y: Value
     yaw: Value
-    forward: Value
-    sideways: Value
-    yaw_rate: Value
 
 
 def true_motion(signals: Signals) -> Motion:
@@ -32,28 +27,22 @@ def true_motion(signals: Signals) -> Motion:
     x, y, _ = signals.truth("position")
     x0, y0, yaw0 = signals.start
     cos, sin = ops.cos(yaw0), ops.sin(yaw0)
-    forward, sideways, _ = signals.truth("linear_velocity_in_body")
     return Motion(
         x=cos * (x - x0) + sin * (y - y0),
         y=cos * (y - y0) - sin * (x - x0),
-        yaw=wrapped(true_yaw(signals) - yaw0),
-        forward=forward,
-        sideways=sideways,
-        yaw_rate=signals.truth("angular_velocity_in_body")[2],
+        yaw=wrapped(yaw_of(*signals.truth("quaternion")) - yaw0),
     )
 
 
 def estimated_motion(signals: Signals) -> Motion:
     """What the slip observer makes of the sensors."""
     x, y = signals.estimate("position")
-    (yaw,), (yaw_rate,) = signals.estimate("yaw"), signals.estimate("yaw_rate")
-    forward, sideways = signals.estimate("linear_velocity_in_body")
-    return Motion(x, y, yaw, forward, sideways, yaw_rate)
+    (yaw,) = signals.estimate("yaw")
+    return Motion(x, y, yaw)
 
 
-def true_yaw(signals: Signals) -> Value:
-    """Heading of the body's x axis in the floor frame, rad."""
-    w, x, y, z = signals.truth("quaternion")
+def yaw_of(w: Value, x: Value, y: Value, z: Value) -> Value:
+    """Heading of the body's x axis in the floor frame, rad, of a quaternion from body to floor frame."""
     return ops.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
