@@ -92,7 +92,6 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv) -> Path:
         checkpoint.restore(start, model)
     elif training.resume:
         print(f"{folder}: no checkpoint yet; training starts from the beginning", flush=True)
-    env.set_progress(model.num_timesteps)
     begin_episodes(model, env, config.seed)
     curve = LearningCurve(folder / "learning_curve.csv", model.num_timesteps)
     meter = Meter(env.core, folder / "failure.npz")
@@ -122,7 +121,8 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv) -> Path:
 
 
 def begin_episodes(model: PPO, env: Sb3VecEnv, seed: int) -> None:
-    """Start new episodes of all robots with seeds that depend on the run's seed and the steps done only."""
+    """Start new episodes of all robots; seeds and the curriculum depend on the run's seed and the steps done only."""
+    env.set_progress(model.num_timesteps)
     env.seed(int(np.random.SeedSequence([seed, model.num_timesteps]).generate_state(1, np.uint32)[0]))
     model._last_obs = env.reset()
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)

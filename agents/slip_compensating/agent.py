@@ -53,14 +53,12 @@ class SlipCompensating(Pid):
         hip = self.chassis.robot.hip_position
         self._reach = hip.x * hip.x / hip.y
 
-    def wheels(self, observations: NDArray[np.floating], forward: Array, turn: Array) -> Array:
-        """Return the wheel goals (N, 4), rad/s: of ``pid``, within the slip limit of what each wheel travels."""
-        measured = self.gyro(observations)
-        travel = self.chassis.rolling_speed(self.velocity(observations), measured)
+    def rolling_speed(self, observations: NDArray[np.floating], forward: Array, turn: Array) -> Array:
+        """Return how fast each wheel is to roll ahead (N, 4), m/s: as in ``pid``, within the slip limit of what it travels."""
+        travel = self.chassis.rolling_speed(self.velocity(observations), self.gyro(observations))
         allowed = self.settings.slip_limit + self._reach * np.abs(turn / max(self.config.steering, 1.0))
-        wanted = self.chassis.rolling_speed(forward, turn)
-        limited = np.clip(wanted, travel - allowed[:, None], travel + allowed[:, None])
-        return super().wheels(observations, forward, turn) + (limited - wanted) / self.chassis.robot.wheel.radius
+        wanted = super().rolling_speed(observations, forward, turn)
+        return np.clip(wanted, travel - allowed[:, None], travel + allowed[:, None])
 
     def legs(self, observations: NDArray[np.floating]) -> Array:
         """Return the leg goals (N, 4), rad: leaning so that the load is on the axle that slips less."""

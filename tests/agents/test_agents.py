@@ -65,6 +65,42 @@ def test_untrained_is_ppo_before_training(contract):
     assert not np.array_equal(mine, other_seed.act(readings))
 
 
+KNOWS = {
+    "ppo_blind": (None, False),
+    "ppo_slip_aware": (True, False),
+    "ppo_slip_aware_no_camera": (False, False),
+    "ppo_privileged": (True, False),
+    "ppo_oracle": (True, True),
+    "pid": (None, False),
+    "slip_compensating": (True, False),
+}
+
+
+@pytest.mark.parametrize("name", KNOWS)
+def test_each_agent_is_told_what_its_name_says(name):
+    """The observer with or without a camera, or none; true quantities for the oracle only."""
+    core = make_core(ENVIRONMENT, 1, load_agent_config(name)["environment"])
+    contract, groups = core.contract(), core.observation_space
+    core.close()
+    camera, oracle = KNOWS[name]
+    sources = {column["source"] for column in contract["observation"]}
+    assert (contract["observer"] or {}).get("camera") == camera
+    assert ("estimate" in sources) == (camera is not None)
+    assert ("truth" in sources) == oracle
+    assert (getattr(groups, "spaces", None) is not None) == (name == "ppo_privileged")
+
+
+@pytest.mark.parametrize("task", ["Path", "Posture", "Slope"])
+def test_the_blind_know_where_they_are_by_odometry_only(task):
+    core = make_core(f"WLR-{task}-v0", 1, load_agent_config("ppo_blind")["environment"])
+    contract = core.contract()
+    core.close()
+    assert contract["observer"] == {"camera": False}
+    estimated = {column["name"].partition("[")[0] for column in contract["observation"] if column["source"] == "estimate"}
+    assert not estimated
+    assert any(column["name"].endswith("_error[lateral]") for column in contract["observation"])
+
+
 def test_settings_may_lie_over_those_of_another_file(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("base: ppo\ntotal_steps: 7\nenvironment: {episode_length: 3.0}\n")

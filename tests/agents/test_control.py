@@ -140,6 +140,17 @@ def test_load_moves_to_the_axle_that_slips_less(contracts, slipping):
     assert front / (front + rear) == pytest.approx(0.4 if slipping == "front" else 0.6, abs=1e-4)
 
 
+def test_the_difference_of_the_axles_slip_is_smoothed_with_its_time_constant(contracts):
+    """Step response of a first-order low-pass, once per tick, seen in the share of the load the lean stands for."""
+    contract, time, period = contracts["Velocity"], 0.5, 0.02
+    policy = load_agent("slip_compensating").make_policy(contract, {"load_shift": 1.0, "load_shift_time": time})
+    row = observation(contract, {"estimated_slip_velocity[wheel_lf,x]": 0.1, "estimated_slip_velocity[wheel_rf,x]": 0.1})
+    lean = np.array([goals(contract, policy.act(row)[0])[0] for _ in range(25)]) - ROBOT.home.leg_angle
+    shift = np.sin(lean) * ROBOT.leg.length / (2 * ROBOT.hip_position.x)
+    expected = -0.1 * (1.0 - (1.0 - period / time) ** np.arange(1, 26))
+    np.testing.assert_allclose(shift, expected, atol=1e-5)
+
+
 def test_an_observation_that_is_needed_is_named(contracts):
     blind = {**contracts["Velocity"]}
     blind["observation"] = [column for column in blind["observation"] if not column["name"].startswith("estimated_")]

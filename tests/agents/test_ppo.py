@@ -158,7 +158,7 @@ def test_the_environment_is_told_how_far_training_is(run, tmp_path, monkeypatch)
     shutil.rmtree(tmp_path / "run" / "checkpoints" / "step_000000000384")
     told.clear()
     train(tmp_path / "run", resume=True)
-    assert told == [256, 256, 320]
+    assert told == [256, 256, 320, 384]
 
 
 def test_a_run_with_a_curriculum_resumes_exactly(tmp_path):

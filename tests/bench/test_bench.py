@@ -52,6 +52,10 @@ def test_ratio_is_pair_by_pair_against_the_fastest_peer():
     assert Measurement("n", "w", "s", (0.5,), bar=0.3).met is False
 
 
+def test_a_peer_that_got_nothing_done_is_infinitely_slower():
+    assert against_fastest("n", "w", "1/h", (2.0, 0.0, 3.0), {"peer": (0.0, 0.0, 1.0)}, 2.0).ratios == (math.inf, 0.0, 3.0)
+
+
 @pytest.mark.parametrize(("arguments", "message"), [(["--only", "engin"], "engine"), (["--rounds", "0"], "1 or more")])
 def test_bad_input_is_named(arguments, message, capsys):
     assert main(["bench", *arguments]) == 2

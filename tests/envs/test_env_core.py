@@ -283,7 +283,7 @@ def random_matrices(task, count=50):
 
 def every_reward():
     return {
-        "commands": {"terms": {name: [-1.0, 1.0] for name in COMMANDS}},
+        "commands": {"terms": {name: [max(-1.0, term.least), 1.0] for name, term in COMMANDS.items()}},
         "rewards": {name: {"weight": 0.5 + k} for k, name in enumerate(REWARDS)},
         "terminations": {name: {} for name in TERMINATIONS},
         "measures": {name: {} for name in MEASURES},

@@ -67,6 +67,61 @@ def test_estimates_can_be_left_out(env_id):
     assert blind.contract()["observer"] == ({"camera": False} if needs else None)
 
 
+def test_estimates_of_an_episode_end_with_it_and_those_of_the_next_begin_anew():
+    actions = np.random.default_rng(3).uniform(-1, 1, (40, 2, 8)).astype(np.float32)
+
+    def play(env, acts):
+        return [env.step(given) for given in acts]
+
+    short, long, fresh = (
+        make_vec("WLR-Path-v0", n, autoreset_mode="SameStep", episode_length=s) for n, s in ((2, 0.5), (2, 9), (1, 9))
+    )
+    for env in (short, long):
+        env.reset(seed=5)
+    ended, unended = play(short, actions[:25])[-1], play(long, actions[:25])[-1]
+    assert np.array_equal(np.stack(list(ended[4]["final_obs"])), unended[0])
+    fresh.reset(seed=6)
+    fresh.reset()
+    again, anew = play(short, actions[25:]), play(fresh, actions[25:, 1:])
+    assert np.array_equal(again[-1][0][1], anew[-1][0][0])
+
+    long.reset(options={"reset_mask": np.array([False, True])})  # the robot that is not reset goes on
+    other = make_vec("WLR-Path-v0", 2, autoreset_mode="SameStep", episode_length=9)
+    other.reset(seed=5)
+    play(other, actions[:25])
+    rest, undisturbed = play(long, actions[25:]), play(other, actions[25:])
+    assert np.array_equal(rest[-1][0][0], undisturbed[-1][0][0])
+    assert np.array_equal(rest[-1][0][1], anew[-1][0][0])
+
+
+def test_estimates_are_as_old_as_the_joint_readings():
+    task = {"latency": {"joints": {"delay": [0.04, 0.04]}, "imu": {"delay": [0.0, 0.0]}}}
+    late, prompt = (make("WLR-Path-v0", task={"latency": given}) for given in (task["latency"], None))
+    names = [column.term for column in late.core.task.policy]
+    delayed = [k for k, name in enumerate(names) if name.startswith(("estimated_", "path_", "leg_", "wheel_"))]
+    seen = {env: [env.reset(seed=1)[0]] for env in (late, prompt)}
+    for action in np.random.default_rng(4).uniform(-1, 1, (12, 8)).astype(np.float32):
+        for env, rows in seen.items():
+            rows.append(env.step(action)[0])
+    for tick in range(2, 13):
+        assert np.array_equal(seen[late][tick][delayed], seen[prompt][tick - 2][delayed])
+        assert np.array_equal(np.delete(seen[late][tick], delayed), np.delete(seen[prompt][tick], delayed))
+    assert not np.array_equal(seen[late][12][delayed], seen[prompt][12][delayed])
+
+
+@pytest.mark.parametrize(
+    ("env_id", "command", "least"),
+    [
+        ("WLR-Path-v0", {"path_wavelength": 0.0}, "0.1 m"),
+        ("WLR-Posture-v0", {"leg_rate": -0.3}, "0 rad/s"),
+        ("WLR-Slope-v0", {"climb_speed": -0.05}, "0 m/s"),
+    ],
+)
+def test_commands_that_mean_nothing_are_refused(env_id, command, least):
+    with pytest.raises(InputError, match=f"command {next(iter(command))} = .*: expected {least} or more"):
+        make(env_id).reset(seed=0, options={"command": command})
+
+
 def test_observer_follows_what_the_sensors_read():
     """Straight on at constant speed: the estimate of speed and pose is the true one within a few millimetres."""
     env = make_vec("WLR-Velocity-v0", 20, randomization="nominal", task={"commands": {"zero_probability": 0.0}})
@@ -213,5 +268,24 @@ def test_progress_narrows_what_is_drawn_and_says_nothing_of_the_past():
     assert widths(500) == pytest.approx((0.6 * whole[0], 0.625 * whole[1]))
     assert widths(5000) == whole
     assert widths(0) == start
-    with pytest.raises(InputError, match="0 or more"):
-        env.unwrapped.set_progress(-1)
+    for steps in (-1, float("nan"), "all", None):
+        with pytest.raises(InputError, match="0 or more"):
+            env.unwrapped.set_progress(steps)
+
+
+def test_progress_within_an_episode_leaves_its_robot_and_floor_as_they_were():
+    """A push redraws nothing but itself, however far training has come since the episode began."""
+    curriculum = {"randomization": {"start": 0.2, "steps": 1000}}
+    env = make_vec("WLR-Velocity-v0", 4, task={"curriculum": curriculum}, randomization="wide")
+    core = env.unwrapped.core
+    core.set_progress(0)
+    env.reset(seed=0)
+    before = core.parameters.values.copy()
+    core.set_progress(1000)
+    pushes = 0
+    for _ in range(160):
+        core.step(np.zeros((4, 8), np.float32), core.everyone)
+        pushes += core.changed.sum()
+    assert pushes > 4
+    changed = (core.parameters.values != before).any(axis=0)
+    assert set(np.flatnonzero(changed)) <= set(core.randomization.timed_columns)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wlr_gym.errors import InputError
-from wlr_gym.evaluation import Condition, Subject, play, read_subjects, work
+from wlr_gym.evaluation import Condition, Subject, identity, play, read_subjects, work
 from wlr_gym.evaluation import subjects as subjects_module
 from wlr_gym.evaluation.campaign import BLOCK
 from wlr_gym.evaluation.sweeps import SWEEPS, read_sweep, sweeps_for
@@ -103,6 +103,17 @@ def test_subjects_are_read():
     ):
         with pytest.raises(InputError, match=message):
             read_subjects(wrong)
+
+
+def test_a_subject_is_known_by_its_settings_or_its_files(tmp_path):
+    (tmp_path / "policy").mkdir()
+    (tmp_path / "policy" / "contract.json").write_text("{}")
+    before = identity(Subject("a", (str(tmp_path),)))
+    (tmp_path / "policy" / "weights").write_text("1")
+    after = identity(Subject("a", (str(tmp_path),)))
+    assert len(before) == len(after) == 64
+    assert before != after
+    assert identity(SUBJECTS[0]) != identity(SUBJECTS[1])
 
 
 def test_a_folder_with_an_equals_sign_is_a_folder(tmp_path):

@@ -24,7 +24,7 @@ from wlr_gym.evaluation import (
 )
 from wlr_gym.evaluation.card_plots import draw_card
 from wlr_gym.evaluation.plots import commanded_path
-from wlr_gym.evaluation.rollout import saturated
+from wlr_gym.evaluation.rollout import saturated, yaw_of
 from wlr_gym.evaluation.sweeps import SWEEPS
 from wlr_gym.policy import make_policy
 

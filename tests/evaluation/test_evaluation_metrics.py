@@ -58,7 +58,8 @@ def test_ticks_after_the_end_do_not_count():
     errors = measured(0.0) + wild[:, :, None]
     fallen = np.array([True, False, False, False])
     card = score(rollout(active=active, measured=errors, energy=PERIOD + wild, fell=fallen, succeeded=~fallen))
-    assert card["velocity_error"].mean == card["tracking_error"].mean == 0.0
+    assert card["velocity_error"].mean == 0.0
+    assert card["tracking_error"].mean == pytest.approx(10.0 / 4)  # one fall of four
     assert card["power"].mean == pytest.approx(1.0)
     assert card["falls"].mean == 25.0
     assert card["success"].mean == 75.0
@@ -68,10 +69,10 @@ def test_figures_per_metre_need_metres():
     assert np.isnan(score(rollout(position=np.zeros((TICKS, EPISODES, 2))))["slip_per_metre"].mean)
 
 
-def wave(frequency, ticks=400):
-    """An action of amplitude 0.5 in one of eight joints."""
+def wave(frequency, ticks=400, phase=0.0):
+    """An action of amplitude 0.5 in one of eight joints; phase in half turns."""
     action = np.zeros((ticks, EPISODES, 8))
-    action[:, :, 3] = 0.5 * np.sin(2 * np.pi * frequency * PERIOD * np.arange(ticks))[:, None]
+    action[:, :, 3] = 0.5 * np.sin(np.pi * (2 * frequency * PERIOD * np.arange(ticks) + phase))[:, None]
     return rollout(ticks, action=action)
 
 
@@ -80,6 +81,10 @@ def test_the_spectrum_holds_the_power_of_the_action_at_its_frequency():
     assert power.shape == (EPISODES, frequency.size)
     assert frequency[np.argmax(power[0])] == pytest.approx(10.0, abs=frequency[1])
     assert power[0].sum() * frequency[1] == pytest.approx(0.5**2 / 2 / 8, rel=0.02)
+
+
+def test_an_action_that_alternates_every_tick_counts_once():
+    assert score(wave(25.0, phase=0.5))["action_jitter"].mean == pytest.approx(0.5 / np.sqrt(8), rel=0.01)
 
 
 def test_jitter_is_what_is_faster_than_5_hz():

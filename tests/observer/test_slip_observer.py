@@ -281,6 +281,9 @@ def test_a_robot_gets_the_same_bits_alone_in_a_batch_and_behind_a_mask():
     np.testing.assert_array_equal(observer.values[~mask], together[0, ~mask])
     observer.reset(mask, runs.sensors[0])
     np.testing.assert_array_equal(observer.values, together[0])
+    for row in runs.sensors[1:]:  # nothing of the life before
+        observer.update(mask, row)
+    np.testing.assert_array_equal(observer.values[mask], together[-1, mask])
 
 
 def test_covariances_stay_positive_and_readings_that_are_no_numbers_do_no_harm():

@@ -17,6 +17,7 @@ from wlr_gym.policy import (
     trained_environment,
     write_model_card,
 )
+from wlr_gym.policy.model_card import file_hash
 from wlr_gym.policy.onnx_file import seal
 
 SCORES = """# Score card: velocity_blind
@@ -39,13 +40,18 @@ SCORES = """# Score card: velocity_blind
 """
 
 
+def scores(policy):
+    """A score card that says which file was played."""
+    return f"{SCORES}\n## Who played\n\n- velocity_blind: `{file_hash(policy)}`\n"
+
+
 @pytest.fixture
 def policy(exported, tmp_path):
     return shutil.copy(exported, tmp_path / "velocity_blind.onnx")
 
 
 def test_a_card_says_what_the_file_is(policy):
-    text = write_model_card(policy, SCORES).read_text()
+    text = write_model_card(policy, scores(policy)).read_text()
     lines = text.splitlines()
     assert lines[0] == "# velocity_blind"
     assert "wlr-nominal, at 50 Hz" in text
@@ -55,7 +61,7 @@ def test_a_card_says_what_the_file_is(policy):
     assert "| randomisation |" in text
     below = text[text.index("## Score card: velocity_blind") :]
     assert below.splitlines()[2] == "| metric | velocity_blind |"
-    assert below.endswith("| rms | 0.01 |\n\n### Sweep\n\n| friction | rms |\n")
+    assert "| rms | 0.01 |\n\n### Sweep\n\n| friction | rms |\n\n### Who played\n\n- velocity_blind: `" in below
     check_model_card(policy)
 
 
@@ -63,6 +69,7 @@ def test_a_card_says_what_the_file_is(policy):
     ("sources", "observer", "words"),
     [
         (["computed"], None, "It is blind to slip"),
+        (["sensors", "computed"], {"camera": False}, "from the slip observer's pose, without a camera"),
         (["sensors", "estimate"], {"camera": True}, "slip observer, with a camera"),
         (["sensors", "estimate"], {"camera": False}, "slip observer, without a camera"),
         (["estimate", "truth"], {}, "for simulators only"),
@@ -74,11 +81,11 @@ def test_a_card_says_what_the_policy_sees(policy, sources, observer, words):
     for index, column in enumerate(content["environment"]["observation"]):
         column["source"] = sources[index % len(sources)]
     policy.write_bytes(seal(policy.read_bytes(), content))
-    assert words in write_model_card(policy, SCORES).read_text()
+    assert words in write_model_card(policy, scores(policy)).read_text()
 
 
 def test_a_card_of_another_file_is_noticed(policy):
-    write_model_card(policy, SCORES)
+    write_model_card(policy, scores(policy))
     content = contract_of(policy)
     content["training"]["seed"] = 1
     policy.write_bytes(seal(policy.read_bytes(), content))
@@ -95,6 +102,8 @@ def test_a_card_of_another_file_is_noticed(policy):
 def test_scores_of_other_policies_are_refused(policy):
     with pytest.raises(InputError, match="about other policies than 'velocity_blind'"):
         write_model_card(policy, "# Score card: velocity_slip_aware\n")
+    with pytest.raises(InputError, match=rf"about another 'velocity_blind': SHA-256 {file_hash(policy)} is not in it"):
+        write_model_card(policy, SCORES)  # of a file that has since been trained anew
     assert not policy.with_suffix(".md").exists()
 
 
@@ -102,7 +111,7 @@ def test_command_line(policy, tmp_path, capsys):
     (tmp_path / "scores").mkdir()
     assert main(["export", str(policy), "--card", str(tmp_path / "scores")]) == 2
     assert "no card.md of wlr evaluate there" in capsys.readouterr().err
-    (tmp_path / "scores" / "card.md").write_text(SCORES)
+    (tmp_path / "scores" / "card.md").write_text(scores(policy))
     assert main(["export", str(policy), "--card", str(tmp_path / "scores")]) == 0
     check_model_card(policy)
     assert main(["export", str(policy), "--card", str(tmp_path / "scores"), "--out", "x.onnx"]) == 2

@@ -136,6 +136,31 @@ def test_shipped_randomizations_stay_in_the_table_bounds(robot, name):
         assert {element for element, fixed in zip(randomization.elements, still, strict=True) if fixed} == stated
 
 
+def test_slopes_below_the_friction_limit_know_tyres_and_leave_the_other_axis_alone(robot):
+    slope = {"parameters": ["ground.slope[pitch]"], "distribution": "uniform", "operation": "below_friction_limit"}
+    slope |= {"low": 0.02, "high": 0.2, "per": "robot"}
+    mu = {"parameters": ["ground.mu_x"], "distribution": "uniform", "operation": "set", "low": 0.1, "high": 0.7}
+    grip = {
+        "parameters": ["wheel.grip"],
+        "distribution": "uniform",
+        "operation": "scale",
+        "low": 0.4,
+        "high": 1.0,
+        "per": "label",
+    }
+    drawn = draw(robot, slope=slope, tyres=grip, floor=mu)
+    limit = np.arctan((drawn["ground.mu_x"] * drawn["wheel.grip"]).mean(axis=1))
+    margin = (limit - drawn["ground.slope"][:, 0])[drawn["ground.slope"][:, 0] > 0.0]
+    assert margin.min() == pytest.approx(0.02, abs=1e-3)
+    assert margin.max() == pytest.approx(0.2, abs=1e-3)
+    assert drawn["ground.slope"].min() == 0.0
+    assert np.all(drawn["ground.slope"][:, 1] == 0.0)
+    with pytest.raises(InputError, match=r"one slope, got ground.slope\[pitch\], ground.slope\[roll\]"):
+        draw(robot, slope=slope | {"parameters": ["ground.slope"]})
+    with pytest.raises(InputError, match=r"goes with 'ground.slope' only, not with 'body.mass'"):
+        draw(robot, slope=slope | {"parameters": ["body.mass"]})
+
+
 def test_nominal_floor_friction_reaches_both_ends(robot):
     friction = load_randomization("nominal", robot).parameters(SEEDS, SEEDS)["ground.mu_x"]
     assert 0.3 <= friction.min() < 0.31

@@ -14,7 +14,7 @@ from wlr_gym.robot import load_robot
 from wlr_gym.tasks import load_task
 from wlr_gym.tasks.signals import Signals
 from wlr_gym.tasks.success import succeeded
-from wlr_gym.tasks.terms import REWARDS, references
+from wlr_gym.tasks.terms import MEASURES, REWARDS, references
 from wlr_gym.tasks.terms.geometry import Motion, true_motion
 
 POSTURE_COMMANDS = ("front_leg_first", "front_leg_second", "rear_leg_first", "rear_leg_second")
@@ -170,6 +170,7 @@ def test_success_is_staying_within_the_limits_to_the_end():
         ("path", {"success": {"path_lateral_error": {"rms": 0.0}}}, "path_lateral_error.rms"),
         ("velocity", {"measures": {"velocity_eror": {}}}, "did you mean 'velocity_error'"),
         ("velocity", {"commands": {"ramp": {"yaw": 1.0}}}, "did you mean 'yaw_rate'"),
+        ("path", {"commands": {"terms": {"path_wavelength": [0.0, 1.0]}}}, r"path_wavelength = \[0.0, 1.0\]: expected 0.1 m"),
         ("velocity", {"curriculum": {"commands": {"start": 0.0, "steps": 1}}}, "curriculum.commands.start"),
         ("velocity", {"observations": {"estimated_slip": {}}}, "did you mean 'estimated_slip"),
     ],
@@ -179,13 +180,40 @@ def test_terms_that_cannot_work_are_refused(name, changes, expected):
         load_task(name, load_robot(), changes)
 
 
-def cost(name: str, given: dict[str, float], **parameters: float) -> float:
-    """A reward term of a robot that stands where it started, legs at home, but for the signals given."""
+def still(given: dict[str, float]) -> Signals:
+    """Signals of a robot that stands where it started, legs at home, but for those given."""
     home = load_robot().home.leg_angle
     legs = ("truth.joint_position[leg_{}]", ("lf", "rf", "lr", "rr")), ("command.{}", POSTURE_COMMANDS)
     table = {pattern.format(name): home for pattern, names in legs for name in names}
     table |= {"truth.quaternion[w]": 1.0, "robot.home.leg_angle": home, "time": 3.5, **given}
-    return float(REWARDS[name].function(Signals(lambda signal: table.get(signal, 0.0)), **parameters))
+    return Signals(lambda signal: table.get(signal, 0.0))
+
+
+def cost(name: str, given: dict[str, float], **parameters: float) -> float:
+    return float(REWARDS[name].function(still(given), **parameters))
+
+
+def test_measures_by_hand():
+    """What is too much is positive: speed, turning and aside to the left."""
+
+    def measure(name: str, given: dict[str, float]) -> float:
+        return float(MEASURES[name].function(still(given)))
+
+    home, ahead = load_robot().home.leg_angle, {"truth.linear_velocity_in_body[x]": 0.07}
+    assert measure("velocity_error", ahead | {"command.linear_velocity_x": 0.1}) == pytest.approx(-0.03)
+    assert measure("climb_speed_error", ahead) == pytest.approx(0.07)
+    turning = {"truth.angular_velocity_in_body[z]": 0.2, "command.yaw_rate": -0.1}
+    assert measure("yaw_rate_error", turning) == pytest.approx(0.3)
+    aside = {"truth.position[y]": 0.02, "truth.quaternion[w]": math.cos(0.05), "truth.quaternion[z]": math.sin(0.05)}
+    assert measure("lateral_error", aside) == pytest.approx(0.02)
+    assert measure("heading_error", aside) == pytest.approx(0.1)
+    on_line = aside | {"command.path_wavelength": 1.0, "command.path_offset": 0.05}
+    assert measure("path_lateral_error", on_line) == pytest.approx(-0.03)
+    assert measure("path_heading_error", on_line) == pytest.approx(0.1)
+    bent = {"truth.joint_position[leg_lf]": home + 0.2, "truth.joint_position[leg_rr]": home - 0.2}
+    assert measure("leg_error", bent) == pytest.approx(0.2 / math.sqrt(2.0))
+    slip = {"truth.slip_displacement[wheel_lf,x]": 0.003, "truth.slip_displacement[wheel_lf,y]": -0.004}
+    assert measure("slip_speed", slip | {"task.control_period": 0.02}) == pytest.approx(0.005 / 0.02 / 4)
 
 
 def test_costs_by_hand():

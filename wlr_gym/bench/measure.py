@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import statistics
@@ -52,7 +53,7 @@ class Measurement:
     @property
     def ratios(self) -> tuple[float, ...]:
         """Ours over the peer's, pair by pair; empty without a peer."""
-        return tuple(a / b for a, b in zip(self.ours, self.peer, strict=True)) if self.peer else ()
+        return tuple(_ratio(a, b) for a, b in zip(self.ours, self.peer, strict=True)) if self.peer else ()
 
     @property
     def met(self) -> bool | None:
@@ -69,6 +70,13 @@ class Measurement:
             "ratio": summary(self.ratios) if self.peer else None, "bar": self.bar, "met": self.met,
             "other_peers": dict(self.others or {}),
         }  # fmt: skip
+
+
+def _ratio(ours: float, peer: float) -> float:
+    """Ours over the peer's; infinite where only the peer got nothing done, 0 where neither did."""
+    if peer == 0.0:
+        return math.inf if ours > 0.0 else 0.0
+    return ours / peer
 
 
 def summary(values: Sequence[float]) -> dict[str, Any]:

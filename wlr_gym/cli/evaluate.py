@@ -29,6 +29,7 @@ from wlr_gym.evaluation import (
     Subject,
     Sweep,
     comparison_rows,
+    identity,
     make_player,
     play,
     read_subjects,
@@ -180,7 +181,8 @@ def _play(
     ticks = make_task(task, read_settings(keywords)).episode_ticks
     with progress(work(conditions, subjects, ticks), options.progress) as tell:
         results = play(str(options.env), subjects, conditions, options.seed, tell, watch)
-    return Card(results, sweeps, _said(options, conditions, effects)), first[0]
+    identities = {subject.name: identity(subject) for subject in subjects}
+    return Card(results, sweeps, _said(options, conditions, effects), identities), first[0]
 
 
 def _conditions(

@@ -199,6 +199,8 @@ class Core:
         self.robot_seeds = np.zeros(count, np.uint64)
         self.episodes = np.zeros(count, np.int64)
         self.episode_seeds = np.zeros(count, np.uint64)
+        self._spread = 1.0  # share of the randomisation that new episodes are drawn with
+        self._spreads = np.ones(count)  # and the present ones were
         self.parameters = apply_patch(self.patch, Parameters.nominal(task.robot, count))
         self._overrides: dict[int, dict[str, float]] = {}
         self.state: PlantState = self.randomization.state(self.parameters, self.episode_seeds)
@@ -251,13 +253,14 @@ class Core:
         overrides = dict(_mapping("parameters", options.get("parameters")))
         rows = np.flatnonzero(mask)
         seeds = episode_seeds(self.robot_seeds[rows], self.episodes[rows] + 1)
-        robots = self._draw_parameters(rows, seeds)
+        robots = self._draw_parameters(rows, seeds, np.full(len(rows), self._spread))
         _override(robots, overrides)
+        self._spreads[rows] = self._spread
         self.episodes[rows] += 1
         self.episode_seeds[rows] = seeds
         self.parameters.values[rows] = robots.values
         self._overrides |= dict.fromkeys(rows.tolist(), overrides)
-        for name, value in vars(self.randomization.state(robots, seeds)).items():
+        for name, value in vars(self.randomization.state(robots, seeds, self._spread)).items():
             if value is not None:
                 getattr(self.state, name)[rows] = value
         self.sensors = self.plant.reset(seeds=self.episode_seeds, parameters=self.parameters, mask=mask, state=self.state)
@@ -276,11 +279,12 @@ class Core:
         self,
         rows: NDArray[np.intp],
         seeds: NDArray[np.uint64],
+        spread: Array,
         occurrences: NDArray[np.int64] | None = None,
         time: Array | None = None,
     ) -> Parameters:
         """Randomisation of some robots, then the effects."""
-        robots = self.randomization.parameters(self.robot_seeds[rows], seeds, occurrences, time)
+        robots = self.randomization.parameters(self.robot_seeds[rows], seeds, occurrences, time, spread)
         return apply_patch(self.patch, robots) if self.patch else robots
 
     def _clear(self, rows: NDArray[np.intp]) -> None:
@@ -310,6 +314,9 @@ class Core:
             number = np.asarray(value)
             if number.shape != () or number.dtype.kind not in "iuf" or not np.isfinite(number):
                 raise InputError(f"command {name} = {value!r}: expected a finite number")
+            term = COMMANDS[name]
+            if number < term.least:
+                raise InputError(f"command {name} = {value!r}: expected {term.least:g} {term.unit} or more")
             values[self.task.commands.index(name)] = float(value)
         return values
 
@@ -329,11 +336,11 @@ class Core:
         Raises:
             InputError: fewer than 0, or no number.
         """
-        if not steps >= 0:
+        if not isinstance(steps, (int, float, np.number)) or not steps >= 0:
             raise InputError(f"steps = {steps!r}: expected 0 or more")
         curriculum = self.task.config.curriculum
         self._command_timing[3] = _share(curriculum.commands, steps)
-        self.randomization.spread = _share(curriculum.randomization, steps)
+        self._spread = _share(curriculum.randomization, steps)
 
     # ---- stepping ----
 
@@ -438,7 +445,7 @@ class Core:
         if self.randomization.intervals:
             self._strike_at[rows] = np.where(due[rows], self._next_strike(rows), self._strike_at[rows])
         time = np.asarray(self.ticks[rows] * self.task.config.control_period, np.float64)
-        robots = self._draw_parameters(rows, self.episode_seeds[rows], self._occurrences[rows], time)
+        robots = self._draw_parameters(rows, self.episode_seeds[rows], self._spreads[rows], self._occurrences[rows], time)
         for index, row in enumerate(rows.tolist()):
             if self._overrides.get(row):
                 _override(Parameters(robots.values[index : index + 1]), self._overrides[row])

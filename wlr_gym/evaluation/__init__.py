@@ -7,7 +7,7 @@ from wlr_gym.evaluation.metrics import Metric, Played, metrics_of, summarise
 from wlr_gym.evaluation.record import Recorder, record_episodes, write_samples
 from wlr_gym.evaluation.rollout import Measure, Rollout, make_core, roll_out
 from wlr_gym.evaluation.statistics import Estimate
-from wlr_gym.evaluation.subjects import Subject, make_player, read_subjects
+from wlr_gym.evaluation.subjects import Subject, identity, make_player, read_subjects
 from wlr_gym.evaluation.sweeps import Sweep, read_sweep, sweeps_for
 from wlr_gym.evaluation.write import (
     comparison_rows,
@@ -34,6 +34,7 @@ __all__ = [
     "Subject",
     "Sweep",
     "comparison_rows",
+    "identity",
     "make_core",
     "make_player",
     "metrics_of",

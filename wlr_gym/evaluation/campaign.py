@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
     from wlr_gym.policy import Policy
 
-#: Seeds of evaluation episodes begin here: those of training robots lie below.
-FIRST_SEED = 10_000
+#: Seeds of evaluation episodes begin here: beyond those that searches of gains and trials while training use.
+FIRST_SEED = 100_000
 #: Distance between the first seeds of two blocks of episodes.
 BLOCK = 10_000
 #: One control tick on MuJoCo takes as long as so many on the engine: for the progress bar only.

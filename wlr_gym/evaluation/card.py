@@ -72,11 +72,13 @@ class Card:
         results: condition -> subject -> what is kept. Conditions: ``MAIN``, perhaps ``OTHER_PLANT``, and those of the sweeps.
         sweeps: which were played.
         conditions: what to say about how it was played.
+        identities: subject -> what identifies it; see :func:`wlr_gym.evaluation.subjects.identity`.
     """
 
     results: Results
     sweeps: tuple[Sweep, ...] = ()
     conditions: Mapping[str, Any] = field(default_factory=dict)
+    identities: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def main(self) -> dict[str, Played]:

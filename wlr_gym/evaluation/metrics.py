@@ -20,6 +20,8 @@ SHORTEST_TRAVEL = 0.05
 ACTION_AT_LIMIT = 0.99
 #: Hz from which a movement of the action counts as jitter: no command of a task changes that fast.
 JITTER_FREQUENCY = 5.0
+#: What a fall adds to the tracking error of its episode, which otherwise knows the time before it only.
+FALL = 10.0
 #: Control ticks of one window of the spectrum; windows overlap by half.
 WINDOW = 128
 
@@ -60,7 +62,13 @@ def metrics_of(measures: Sequence[Measure]) -> tuple[Metric, ...]:
         if m.max is not None:
             own.append(Metric(f"{m.name}_max", m.unit, 4, True, f"largest magnitude in the episode: {m.doc}"))
     return (
-        Metric("tracking_error", "-", 3, True, f"rms over the task's limits of what is reached of each ({', '.join(limits)})"),
+        Metric(
+            "tracking_error",
+            "-",
+            3,
+            True,
+            f"rms over the task's limits of what is reached of each ({', '.join(limits)}); a fall adds {FALL:g}",
+        ),
         *own,
         Metric("success", "%", 0, False, "episodes without a fall and within every limit"),
         *GENERAL,
@@ -121,7 +129,10 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
     ones = np.ones(rollout.episodes)
     values = {
         **{name if kind == "rms" else f"{name}_{kind}": error for (name, kind), error in errors.items()},
-        "tracking_error": (np.sqrt((shares**2).sum(axis=0) / max(1, len(limits))), ones if limits else 0.0 * ones),
+        "tracking_error": (
+            np.sqrt((shares**2).sum(axis=0) / max(1, len(limits))) + FALL * rollout.fell,
+            ones if limits else 0.0 * ones,
+        ),
         "success": 100.0 * rollout.succeeded,
         "falls": 100.0 * rollout.fell,
         "slip_speed": _sum(slip, active) / ticks,
@@ -162,7 +173,10 @@ def spectrum(rollout: Rollout) -> tuple[Array, Array]:
     size = min(WINDOW, len(rollout.active))
     frequency: Array = np.arange(size // 2 + 1) / np.float64(size * rollout.control_period)
     window = np.hanning(size + 1)[:size] if size > 1 else np.ones(1)
-    density = 2.0 * rollout.control_period / (window @ window)
+    density = np.full(frequency.size, 2.0 * rollout.control_period / (window @ window))
+    density[0] /= 2.0  # one-sided: all but the ends of an even window stand for two frequencies
+    if size % 2 == 0:
+        density[-1] /= 2.0
     total = np.zeros((rollout.episodes, frequency.size))
     windows = np.zeros(rollout.episodes)
     for first in range(0, len(rollout.active) - size + 1, max(1, size // 2)):

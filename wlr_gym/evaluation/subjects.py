@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from wlr_gym.errors import InputError
 from wlr_gym.evaluation.rollout import make_core
-from wlr_gym.policy import make_policy, policy_environment
+from wlr_gym.policy import agent_names, find_policy, load_agent_config, make_policy, policy_environment
 from wlr_gym.tasks.task import overlay
 
 if TYPE_CHECKING:
@@ -52,6 +54,23 @@ def _subject(text: str) -> Subject:
     if not name or not found:
         raise InputError(f"policy '{text}': expected NAME=POLICY or NAME=POLICY,POLICY,...")
     return Subject(name, found)
+
+
+def identity(subject: Subject) -> str:
+    """Return who exactly plays: the SHA-256 of each source's policy file or folder, or of its agent's settings."""
+    return ", ".join(_identity(source) for source in subject.sources)
+
+
+def _identity(source: str) -> str:
+    if source in agent_names():
+        return f"agent, settings {hashlib.sha256(json.dumps(load_agent_config(source)).encode()).hexdigest()}"
+    place = find_policy(source)
+    if place.is_file():
+        return hashlib.sha256(place.read_bytes()).hexdigest()
+    digest = hashlib.sha256()
+    for path in sorted(path for path in place.rglob("*") if path.is_file()):
+        digest.update(str(path.relative_to(place)).encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def make_player(environment: str, source: str | Path, episodes: int, keywords: Mapping[str, Any]) -> tuple[Core, Policy]:

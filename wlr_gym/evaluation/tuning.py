@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wlr_gym.errors import InputError
+from wlr_gym.evaluation.metrics import FALL
 from wlr_gym.evaluation.rollout import make_core
 from wlr_gym.files import make_output_folder
 from wlr_gym.policy import Policy, Training, write_contract
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 MakePolicy = Callable[[Mapping[str, Any], Mapping[str, Any]], Policy]
 Say = Callable[[str], object]
-FALL = 10.0
 
 
 def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[PidConfig]) -> Path:

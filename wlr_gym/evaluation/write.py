@@ -122,6 +122,9 @@ def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
         lines += [*_table(transfer_rows(card)), ""]
     if "spectrum" in shown:
         lines += ["## Spectrum of the action", "", *picture("spectrum", "Spectrum of the action")]
+    if card.identities:
+        lines += ["## Who played", "", "SHA-256 of the policy file or of an agent's settings:", ""]
+        lines += [*(f"- {name}: `{identity}`" for name, identity in card.identities.items()), ""]
     lines += ["## Meaning of the rows", ""]
     lines += [f"- `{m.key}` ({m.unit}, {'less' if m.less_is_better else 'more'} is better): {m.doc}" for m in card.metrics]
     lines += ["- score: reward above that of doing nothing on the same episodes"]
@@ -138,6 +141,7 @@ def content(card: Card) -> dict[str, Any]:
     document: dict[str, Any] = {
         "format": FORMAT,
         "conditions": dict(card.conditions),
+        "identities": dict(card.identities),
         "metrics": {m.key: {"unit": m.unit, "less_is_better": m.less_is_better, "doc": m.doc} for m in card.metrics},
         "policies": _scores(card.scores[MAIN]),
         "better_than": _scores(card.comparison[MAIN]),

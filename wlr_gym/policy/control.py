@@ -221,7 +221,9 @@ class Pid:
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return actions (N, 8) for observations (N, D)."""
         forward, turn = self.motion(observations)
-        return self.chassis.actions(self.legs(observations), self.wheels(observations, forward, turn))
+        legs = self.legs(observations)
+        rolling = self.rolling_speed(observations, forward, turn)
+        return self.chassis.actions(legs, self.chassis.wheel_rate(rolling, legs, self.leg_rate(observations)))
 
     def motion(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
         """Return the forward velocity and turn (N,) to roll at: what is wanted, with corrections."""
@@ -246,10 +248,9 @@ class Pid:
         home = self.chassis.robot.home.leg_angle + self.config.legs_inward * self.chassis.front
         return home + self.leg_offset(observations)
 
-    def wheels(self, observations: NDArray[np.floating], forward: Array, turn: Array) -> Array:
-        """Return the wheel goals (N, 4), rad/s."""
-        rolling = self.chassis.rolling_speed(forward, turn)
-        return self.chassis.wheel_rate(rolling, self.legs(observations), self.leg_rate(observations))
+    def rolling_speed(self, observations: NDArray[np.floating], forward: Array, turn: Array) -> Array:
+        """Return how fast each wheel is to roll ahead (N, 4), m/s."""
+        return self.chassis.rolling_speed(forward, turn)
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
         """Forget the integrals of the robots in ``mask`` (N,)."""

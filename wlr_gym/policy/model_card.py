@@ -25,11 +25,13 @@ def write_model_card(policy: Path, evaluation: str) -> Path:
         evaluation: score card as Markdown, as ``wlr evaluate --out`` writes it.
 
     Raises:
-        InputError: no policy file, a broken one, or scores that do not name it.
+        InputError: no policy file, a broken one, or scores that do not name it and its fingerprint.
     """
     _, content = open_policy(policy)
     if policy.stem not in evaluation:
         raise InputError(f"the score card is about other policies than '{policy.stem}'")
+    if file_hash(policy) not in evaluation:
+        raise InputError(f"the score card is about another '{policy.stem}': SHA-256 {file_hash(policy)} is not in it; evaluate anew")
     card = policy.with_suffix(SUFFIX)
     text = "\n\n".join([f"# {policy.stem}", _summary(content), _table(_facts(policy, content)), _below(evaluation)]) + "\n"
     replace_file(card, lambda temporary: temporary.write_text(text, encoding="utf-8"))
@@ -59,11 +61,13 @@ def file_hash(path: Path) -> str:
 def _summary(content: Mapping[str, Any]) -> str:
     environment, training = content["environment"], content.get("training", {})
     sources = {column["source"] for column in environment["observation"]}
+    camera = "with" if needs_camera(environment) else "without"
     if "truth" in sources:
         sees = "It sees what no robot can measure, friction for example: an upper bound, for simulators only."
     elif "estimate" in sources:
-        camera = "with" if needs_camera(environment) else "without"
         sees = f"It sees the estimates of the slip observer, {camera} a camera."
+    elif environment.get("observer"):
+        sees = f"It sees no estimate of slip, but errors of its way from the slip observer's pose, {camera} a camera."
     else:
         sees = "It is blind to slip: it sees neither estimates of it nor a camera."
     return (

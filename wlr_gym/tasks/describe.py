@@ -20,18 +20,18 @@ def describe(task: Task) -> str:
         for name, (low, high) in config.commands.terms.items()
     ]
     reward_rows = [
-        (name, f"{values['weight']:g}", _parameters(values, REWARDS[name].parameters), REWARDS[name].doc)
+        (name, f"{values['weight']:g}", parameters_text(values, REWARDS[name].parameters), REWARDS[name].doc)
         for name, values in config.rewards.items()
     ]
     termination_rows = [
-        (name, _parameters(values, TERMINATIONS[name].parameters), TERMINATIONS[name].doc)
+        (name, parameters_text(values, TERMINATIONS[name].parameters), TERMINATIONS[name].doc)
         for name, values in config.terminations.items()
     ]
     privileged_rows = [
         (str(index), column_name(column), column.unit, column.frame, f"{column.scale:g}", f"{column.limit:g}")
         for index, column in enumerate(task.privileged)
     ]
-    measure_rows = [(name, MEASURES[name].unit, _success(config, name), MEASURES[name].doc) for name in task.measures]
+    measure_rows = [(name, MEASURES[name].unit, limits_text(config, name), MEASURES[name].doc) for name in task.measures]
     period = config.control_period * 1000
     return "\n".join(
         [
@@ -54,8 +54,9 @@ def describe(task: Task) -> str:
     )
 
 
-def _parameters(values: dict[str, float], defaults: dict[str, float]) -> str:
-    return ", ".join(f"{name}={values.get(name, default):g}" for name, default in defaults.items()) or "-"
+def parameters_text(values: dict[str, float], defaults: dict[str, float]) -> str:
+    """Return ``width 0.06, ...`` for the parameters of a term."""
+    return ", ".join(f"{name} {values.get(name, default):g}" for name, default in defaults.items()) or "-"
 
 
 def _timing(config: TaskConfig) -> str:
@@ -68,9 +69,11 @@ def _ramp(config: TaskConfig, command: str) -> str:
     return f"{config.commands.ramp[command]:g}" if command in config.commands.ramp else "-"
 
 
-def _success(config: TaskConfig, measure: str) -> str:
+def limits_text(config: TaskConfig, measure: str) -> str:
+    """Return ``rms at most 0.02`` for a measure that success depends on."""
     limits = config.success.get(measure)
-    return "-" if limits is None else ", ".join(f"{kind} {value:g}" for kind, value in limits if value is not None)
+    texts = [] if limits is None else [f"{kind} at most {value:g}" for kind, value in limits if value is not None]
+    return ", ".join(texts) or "-"
 
 
 def _action_rows(task: Task) -> list[tuple[str, ...]]:

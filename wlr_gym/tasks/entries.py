@@ -111,14 +111,12 @@ class Sampler:
             name: np.flatnonzero([n == name for n in names]) for name in dict.fromkeys(names) if name in DISTRIBUTIONS
         }
 
-    def __call__(self, seeds: NDArray[np.uint64], counters: NDArray[np.int64], spread: float = 1.0) -> Array:
+    def __call__(self, seeds: NDArray[np.uint64], counters: NDArray[np.int64], spread: Array) -> Array:
         """Return values (M, K) for seeds and counters of that shape, K entries.
 
-        ``spread`` below 1 moves every draw towards the middle of its distribution.
+        ``spread`` (M,) below 1 moves every draw of a robot towards the middle of its distribution.
         """
-        u = uniforms(seeds, self._streams, counters)
-        if spread != 1.0:
-            u = 0.5 + spread * (u - 0.5)
+        u = 0.5 + spread[:, None] * (uniforms(seeds, self._streams, counters) - 0.5)  # with 1 exact
         drawn = np.empty_like(u)
         for distribution, which in self._groups.items():
             drawn[:, which] = DISTRIBUTIONS[distribution](
@@ -147,6 +145,11 @@ def entries_of(name: str, event: EventConfig, robot: Robot, source: str = "rando
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     entries = [_entry(name, event, robot, element, where) for element in elements]
+    if event.operation == "below_friction_limit" and len(elements) > 1:
+        raise InputError(
+            f"{where}: operation 'below_friction_limit' sets one slope, got {', '.join(elements)}: together they would be "
+            f"steeper than friction holds"
+        )
     return entries + ([] if event.area is None else _area_entries(name, event, event.area, elements, where))
 
 

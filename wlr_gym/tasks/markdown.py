@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from wlr_gym.tasks.task import ObservationColumn, Task, TaskConfig
+from wlr_gym.tasks.describe import limits_text, parameters_text
+from wlr_gym.tasks.task import ObservationColumn, Task
 from wlr_gym.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 
 
@@ -16,14 +17,14 @@ def task_tables(task: Task) -> list[str]:
         for name, (low, high) in config.commands.terms.items()
     ]
     rewards = [
-        (f"`{name}`", f"{values['weight']:g}", _numbers(values, REWARDS[name].parameters), REWARDS[name].doc)
+        (f"`{name}`", f"{values['weight']:g}", parameters_text(values, REWARDS[name].parameters), REWARDS[name].doc)
         for name, values in config.rewards.items()
     ]
     terminations = [
-        (f"`{name}`", _numbers(values, TERMINATIONS[name].parameters), TERMINATIONS[name].doc)
+        (f"`{name}`", parameters_text(values, TERMINATIONS[name].parameters), TERMINATIONS[name].doc)
         for name, values in config.terminations.items()
     ]
-    measures = [(f"`{name}`", MEASURES[name].unit, _limits(config, name), MEASURES[name].doc) for name in task.measures]
+    measures = [(f"`{name}`", MEASURES[name].unit, limits_text(config, name), MEASURES[name].doc) for name in task.measures]
     return [
         *_table(("command", "range", "unit", "meaning"), commands),
         *_table(("observation", "numbers", "unit", "frame", "scale", "meaning"), _terms(task.policy)),
@@ -54,13 +55,3 @@ def _terms(columns: Sequence[ObservationColumn]) -> list[tuple[str, ...]]:
         )
         for term, group in groups.items()
     ]
-
-
-def _numbers(values: dict[str, float], defaults: dict[str, float]) -> str:
-    return ", ".join(f"{name} {values.get(name, default):g}" for name, default in defaults.items()) or "-"
-
-
-def _limits(config: TaskConfig, measure: str) -> str:
-    limits = config.success.get(measure)
-    texts = [] if limits is None else [f"{kind} at most {value:g}" for kind, value in limits if value is not None]
-    return ", ".join(texts) or "-"

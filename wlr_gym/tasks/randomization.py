@@ -177,10 +177,7 @@ class Randomization:
         elements, columns: elements of the parameter table that it changes, and their columns.
         timed_elements, timed_columns: those that also change within an episode.
         intervals: names of the events that strike within an episode. drifts: of those that drift.
-        spread: share of every distribution about its middle that is drawn from: below 1 early in a curriculum.
     """
-
-    spread: float = 1.0
 
     def __init__(self, config: RandomizationConfig, robot: Robot, places: Mapping[str, str] | None = None) -> None:
         self.config = config
@@ -208,16 +205,21 @@ class Randomization:
         self._drift_streams = stream_numbers(*(f"drift/{name}" for name in self.drifts))
         self._drift_limits = _limits(config, self.drifts)
         self._low, self._high = _table_bounds()
-        spread = config.initial_state
-        widths = {"leg_angle": (spread.leg_angle, LEGS), "yaw": (spread.yaw, ("z",))}
-        widths |= {"linear_velocity": (spread.linear_velocity, XYZ), "angular_velocity": (spread.angular_velocity, XYZ)}
-        self._spread = np.array([width for width, labels in widths.values() for _ in labels])
-        self._spread_streams = stream_numbers(
+        start = config.initial_state
+        widths = {"leg_angle": (start.leg_angle, LEGS), "yaw": (start.yaw, ("z",))}
+        widths |= {"linear_velocity": (start.linear_velocity, XYZ), "angular_velocity": (start.angular_velocity, XYZ)}
+        self._state_width = np.array([width for width, labels in widths.values() for _ in labels])
+        self._state_streams = stream_numbers(
             *(f"initial_state/{n}/{label}" for n, (_, labels) in widths.items() for label in labels)
         )
 
     def parameters(
-        self, robot_seeds: Seeds, episode_seeds: Seeds, occurrences: Counts | None = None, time: Array | None = None
+        self,
+        robot_seeds: Seeds,
+        episode_seeds: Seeds,
+        occurrences: Counts | None = None,
+        time: Array | None = None,
+        spread: Array | None = None,
     ) -> Parameters:
         """Return the parameters of M robots.
 
@@ -226,14 +228,24 @@ class Randomization:
             episode_seeds: (M,) what all others draw from.
             occurrences: (M, len(intervals)) how often each interval event has struck in this episode; None = never.
             time: (M,) s since the episode began, for what drifts; None = 0.
+            spread: (M,) share of every distribution about its middle that is drawn from, below 1 early in a curriculum;
+                None = 1.
         """
-        values = np.repeat(self._nominal.values, len(episode_seeds), axis=0)
+        count = len(episode_seeds)
+        values = np.repeat(self._nominal.values, count, axis=0)
         if self._sampler is not None:
-            self._apply(values, self._draw(self._sampler, robot_seeds, episode_seeds, occurrences, time))
+            spread = np.ones(count) if spread is None else spread
+            self._apply(values, self._draw(self._sampler, robot_seeds, episode_seeds, occurrences, time, spread))
         return Parameters(values)
 
     def _draw(
-        self, sampler: Sampler, robot_seeds: Seeds, episode_seeds: Seeds, occurrences: Counts | None, time: Array | None
+        self,
+        sampler: Sampler,
+        robot_seeds: Seeds,
+        episode_seeds: Seeds,
+        occurrences: Counts | None,
+        time: Array | None,
+        spread: Array,
     ) -> Array:
         count, strikes = len(episode_seeds), len(self.intervals)
         seeds = np.where(self._at_startup, robot_seeds[:, None], episode_seeds[:, None])
@@ -241,12 +253,12 @@ class Randomization:
         if occurrences is not None:
             counts[:, :strikes] = occurrences
         if self._drift_sampler is None:
-            return sampler(seeds, counts[:, self._clock], self.spread)
+            return sampler(seeds, counts[:, self._clock], spread)
         knots = self._knots(episode_seeds, np.zeros(count) if time is None else time)
         counts[:, strikes:-1] = np.floor(knots)
-        drawn = sampler(seeds, counts[:, self._clock], self.spread)
+        drawn = sampler(seeds, counts[:, self._clock], spread)
         clock = self._clock[self._drifting]
-        following = self._drift_sampler(seeds[:, self._drifting], counts[:, clock] + 1, self.spread)
+        following = self._drift_sampler(seeds[:, self._drifting], counts[:, clock] + 1, spread)
         share = (knots - np.floor(knots))[:, clock - strikes]
         share = share * share * (3.0 - 2.0 * share)  # rises smoothly from 0 to 1: the path has no kinks at its knots
         drawn[:, self._drifting] += share * (following - drawn[:, self._drifting])
@@ -280,12 +292,13 @@ class Randomization:
         wait = low + (high - low) * uniforms(episode_seeds, self._interval_streams, occurrences)
         return np.maximum(1, np.rint(wait / control_period)).astype(np.int64)
 
-    def state(self, parameters: Parameters, episode_seeds: Seeds) -> PlantState:
-        """Return where M robots start: standing at home, spread by ``initial_state``; the height follows the legs."""
+    def state(self, parameters: Parameters, episode_seeds: Seeds, spread: float = 1.0) -> PlantState:
+        """Return where M robots start: standing at home, by ``spread`` times ``initial_state`` about it; the height follows the
+        legs."""
         state = standing_state(self.robot, parameters)
-        if not self._spread.any():
+        if not self._state_width.any():
             return state
-        offsets = self.spread * self._spread * (2.0 * uniforms(episode_seeds, self._spread_streams) - 1.0)
+        offsets = spread * self._state_width * (2.0 * uniforms(episode_seeds, self._state_streams) - 1.0)
         home = state.joint_position[:, :4].copy()
         angles = np.clip(home + offsets[:, :4], *self.robot.leg_limits)
         state.position[:, 2] += (parameters["leg.length"] * (np.sin(angles) - np.sin(home))).mean(axis=1)

@@ -313,6 +313,9 @@ def _check_ranges(config: TaskConfig, where: str) -> None:
         if name not in COMMANDS:
             raise unknown_name("command", name, COMMANDS, where)
         ranges[f"commands.terms.{name}"] = limits
+        term = COMMANDS[name]
+        if limits[0] < term.least:
+            raise InputError(f"{where}: commands.terms.{name} = {list(limits)}: expected {term.least:g} {term.unit} or more")
     for name in config.commands.ramp:
         if name not in config.commands.terms:
             raise unknown_name("command", name, config.commands.terms, f"{where}: commands.ramp")
