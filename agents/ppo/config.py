@@ -21,6 +21,7 @@ class PpoConfig(BaseModel):
         target_kl: end the passes of an update early beyond 1.5 times this divergence; None = never.
         hidden_layers, activation: of the networks of policy and value, which share nothing.
         initial_log_std: logarithm of the exploration noise at the start, in actions.
+        teacher: agent whose actions the actor learns before PPO goes on (``warm_start.py``); None = from nothing.
         checkpoint_every: control ticks between checkpoints.
         keep_checkpoints: how many of the newest stay.
         torch_threads: more than 1 was slower on busy machines, and changes the last bits.
@@ -47,6 +48,7 @@ class PpoConfig(BaseModel):
     hidden_layers: tuple[int, ...] = (64, 64)
     activation: Literal["tanh", "elu", "relu"] = "tanh"
     initial_log_std: float = 0.0
+    teacher: str | None = None
     checkpoint_every: int = Field(1_000_000, gt=0)
     keep_checkpoints: int = Field(3, gt=0)
     torch_threads: int = Field(1, gt=0)

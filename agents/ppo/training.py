@@ -32,6 +32,7 @@ from .agent import policy_keywords
 from .asymmetric import AsymmetricPolicy
 from .config import PpoConfig
 from .curve import LearningCurve, Meter, losses
+from .warm_start import imitate
 
 
 def run_training(training: Training, config: PpoConfig) -> Path:
@@ -93,6 +94,9 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv) -> Path:
     elif training.resume:
         print(f"{folder}: no checkpoint yet; training starts from the beginning", flush=True)
     begin_episodes(model, env, config.seed)
+    if start is None and config.teacher is not None:
+        imitate(model, env, config)
+        begin_episodes(model, env, config.seed)
     curve = LearningCurve(folder / "learning_curve.csv", model.num_timesteps)
     meter = Meter(env.core, folder / "failure.npz")
     model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))

@@ -108,6 +108,17 @@ def test_settings_may_lie_over_those_of_another_file(tmp_path):
     assert mine == theirs | {"total_steps": 7, "environment": theirs["environment"] | {"episode_length": 3.0}}
 
 
+@pytest.mark.parametrize(
+    ("base", "message"),
+    [("mine.yaml", "is its own base"), ("5", "base = 5: expected a name"), ("ppo_blnd", "did you mean 'ppo_blind'")],
+)
+def test_a_base_that_is_none_is_refused(tmp_path, monkeypatch, base, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").write_text(f"base: {base}\n")
+    with pytest.raises(InputError, match=message):
+        load_agent_config("mine.yaml")
+
+
 def test_unknown_agent_names_the_nearest():
     with pytest.raises(InputError, match="did you mean 'constant_command'"):
         load_agent("constant_comand")

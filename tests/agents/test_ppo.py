@@ -15,7 +15,7 @@ import yaml
 from wlr_gym.cli import main
 from wlr_gym.errors import InputError
 from wlr_gym.evaluation import make_core, read_curve
-from wlr_gym.policy import Training, load_agent, load_policy, read_contract
+from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
 
 torch = pytest.importorskip("torch")
 
@@ -235,6 +235,36 @@ def test_bad_input_exits_with_2(arguments, message, capsys, tmp_path, monkeypatc
     assert not list(tmp_path.iterdir())  # nothing is left that would be in the way of the next try
 
 
+def test_runs_of_different_settings_have_different_folders(tmp_path, monkeypatch):
+    from wlr_gym.cli import train as command
+
+    monkeypatch.chdir(tmp_path)
+    for config, folder in ((None, "WLR-Velocity-v0_ppo_0"), ("ppo_blind", "WLR-Velocity-v0_ppo_blind_0")):
+        assert command._new(command.Options(config=config))[1].folder.name == folder
+
+
 def test_a_full_folder_is_not_overwritten(run, capsys):
     assert main(["train", ENVIRONMENT, "--out", str(run)]) == 2
     assert "not empty" in capsys.readouterr().err
+
+
+def test_a_start_from_a_controller_drives_like_it_and_is_reproducible(tmp_path):
+    """Before any update of PPO the actor does nearly what its teacher does; resuming does not teach again."""
+    changes = {"teacher": "pid", "total_steps": 64, "checkpoint_every": 64, "num_envs": 8}
+    changes["environment"] = {"episode_length": 4.0, "randomization": "none"}
+    first = load_agent("ppo").train(Training(ENVIRONMENT, tmp_path / "a", SETTINGS | changes, max_seconds=0.0, progress=False))
+    again = load_agent("ppo").train(Training(ENVIRONMENT, tmp_path / "b", SETTINGS | changes, max_seconds=0.0, progress=False))
+    assert_same_weights(first, again)
+    core = make_core(ENVIRONMENT, 8, changes["environment"])
+    taught, teacher = load_policy(first, core.contract()), make_policy("pid", core.contract())
+    rng = np.random.default_rng(1)
+    for row in range(8):
+        core.seed(row, 100 + row)
+    core.begin_episodes(core.everyone)
+    actions = []
+    for _ in range(100):
+        actions.append((teacher.act(core.observation), taught.act(core.observation)))
+        core.step(np.clip(actions[-1][0] + 0.03 * rng.standard_normal((8, 8)), -1, 1), core.everyone)
+    core.close()
+    wanted, done = np.array(actions).swapaxes(0, 1)
+    assert np.abs(done - wanted)[..., 4:].mean() < 0.3 * np.abs(wanted[..., 4:]).mean()

@@ -186,7 +186,8 @@ def _say_what_is_not_known(core: Core, console: Console) -> None:
 
     console.print(f"not measured on a robot, and left out: {', '.join(core.unmeasured)}", style="dim")
     if needs_camera(core.contract()):
-        console.print("note: the policy's slip observer had a camera in training; this robot has none", style="yellow")
+        note = "note: the policy's slip observer had a camera in training; this robot has none: expect worse tracking"
+        console.print(note, style="yellow")
 
 
 @contextlib.contextmanager

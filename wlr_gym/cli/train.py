@@ -36,7 +36,7 @@ class Options(EffectsOption):
     seed: int | None = None
     """Seed of everything random; default: that of the settings."""
     out: Path | None = None
-    """Run folder; default: runs_out/<env>_<agent>_<seed>."""
+    """Run folder; default: runs_out/<env>_<config or agent>_<seed>."""
     resume: Path | None = None
     """Run folder to go on with; its own environment, agent and settings are used."""
     max_minutes: float | None = None
@@ -64,7 +64,8 @@ def _new(options: Options) -> tuple[str, Training]:
     if options.backend is not None:
         config["environment"] = (config.get("environment") or {}) | {"backend": options.backend}
     add_effects(config, options.patch())
-    folder = options.out or Path("runs_out") / f"{options.env.rpartition(':')[2]}_{options.agent}_{config.get('seed', 0)}"
+    settings = Path(options.config or options.agent).stem
+    folder = options.out or Path("runs_out") / f"{options.env.rpartition(':')[2]}_{settings}_{config.get('seed', 0)}"
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: not empty; give another --out, or go on with what is there: wlr train --resume {folder}")
     return options.agent, _training(options, options.env, folder, config, resume=False)

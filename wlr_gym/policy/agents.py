@@ -120,21 +120,31 @@ def load_agent_config(name: str | Path, changes: tuple[str, ...] = ()) -> dict[s
     A name without a file is an agent without settings: empty. ``base: NAME`` in a file lays it over another.
 
     Raises:
-        InputError: no such file, broken YAML, or a change that is not ``key=value``.
+        InputError: no such file, broken YAML, a base that is none, or a change that is not ``key=value``.
     """
-    shipped = data_directory("configs") / "agent" / f"{name}.yaml"
-    if str(name) in agent_names() and not shipped.is_file():
-        config: Any = {}
-    else:
-        path = find_config("agent", name)
-        config = read_yaml(path) or {}
-        if not isinstance(config, dict):
-            raise InputError(f"{path}: expected a mapping, got {type(config).__name__}")
-    if "base" in config:
-        config = _merged(load_agent_config(config.pop("base")), config)
+    config = _read_config(name)
     for change in changes:
         _apply(config, change)
     return config
+
+
+def _read_config(name: str | Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Return the settings of a name or path, laid over those of its base; ``above``: the files that lie over it."""
+    shipped = data_directory("configs") / "agent" / f"{name}.yaml"
+    if str(name) in agent_names() and not shipped.is_file():
+        return {}
+    path = find_config("agent", name)
+    config = read_yaml(path) or {}
+    if not isinstance(config, dict):
+        raise InputError(f"{path}: expected a mapping, got {type(config).__name__}")
+    base = config.pop("base", None)
+    if base is None:
+        return config
+    if not isinstance(base, str):
+        raise InputError(f"{path}: base = {base!r}: expected a name in configs/agent/, or a path")
+    if path in above:
+        raise InputError(f"{path}: is its own base")
+    return _merged(_read_config(base, (*above, path)), config)
 
 
 def _merged(base: dict[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:

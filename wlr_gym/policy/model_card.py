@@ -31,7 +31,9 @@ def write_model_card(policy: Path, evaluation: str) -> Path:
     if policy.stem not in evaluation:
         raise InputError(f"the score card is about other policies than '{policy.stem}'")
     if file_hash(policy) not in evaluation:
-        raise InputError(f"the score card is about another '{policy.stem}': SHA-256 {file_hash(policy)} is not in it; evaluate anew")
+        raise InputError(
+            f"the score card is about another '{policy.stem}': SHA-256 {file_hash(policy)} is not in it; evaluate anew"
+        )
     card = policy.with_suffix(SUFFIX)
     text = "\n\n".join([f"# {policy.stem}", _summary(content), _table(_facts(policy, content)), _below(evaluation)]) + "\n"
     replace_file(card, lambda temporary: temporary.write_text(text, encoding="utf-8"))
