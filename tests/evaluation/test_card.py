@@ -11,6 +11,7 @@ from wlr_gym.evaluation import (
     MAIN,
     OTHER_PLANT,
     Card,
+    Estimate,
     comparison_rows,
     make_core,
     roll_out,
@@ -26,6 +27,7 @@ from wlr_gym.evaluation.card_plots import draw_card
 from wlr_gym.evaluation.plots import commanded_path
 from wlr_gym.evaluation.rollout import saturated, yaw_of
 from wlr_gym.evaluation.sweeps import SWEEPS
+from wlr_gym.evaluation.write import cell
 from wlr_gym.policy import make_policy
 
 ONE = np.ones((TICKS, EPISODES))
@@ -80,6 +82,11 @@ def test_rows_show_nothing_where_there_is_nothing():
     assert better["score, in % of its"] == ["-", "133.3 [133.3, 133.3]"]
     assert better["velocity_error"] == ["**80.0 [80.0, 80.0]**", "**50.0 [50.0, 50.0]**"]
     assert better["success"][0] == "0 [0, 0]"
+
+
+def test_next_to_nothing_has_no_sign():
+    assert cell(Estimate(-0.2, -0.4, 0.3), 0) == "0 [0, 0]"
+    assert cell(Estimate(5000.0, 1.0, 9000.0), 0) == "-"
 
 
 @pytest.fixture(scope="module")

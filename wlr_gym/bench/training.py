@@ -27,8 +27,9 @@ from wlr_gym.policy import load_agent_config  # noqa: E402
 from wlr_gym.tasks.task import read_task  # noqa: E402
 
 EPOCHS = 4
-#: Reward per second of simulated time, exploration included, from which the task counts as learnt: see docs/learning.md.
-SOLVED = 1.8
+#: Reward per second of simulated time, exploration included, from which the task counts as learnt: both tracking kernels are
+#: beyond 0.93 then, where errors at the limits of success (0.02 m/s, 0.06 rad/s) would give 0.90 and 0.91.
+SOLVED = 1.7
 #: Frames over which it is averaged. Frames after which a run is given up.
 WINDOW, MOST_FRAMES = 16_384, 4_000_000
 #: Settings that learnt fastest on each: many robots, large minibatches; few robots, small ones.

@@ -35,8 +35,12 @@ def cell(estimate: Estimate, digits: int, short: bool = False) -> str:
     if not abs(estimate.mean) <= LARGEST:
         return "-"
     if short:
-        return f"{estimate.mean:.{digits}f} ± {(estimate.high - estimate.low) / 2:.{digits}f}"
-    return f"{estimate.mean:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+        return f"{_text(estimate.mean, digits)} ± {_text((estimate.high - estimate.low) / 2, digits)}"
+    return f"{_text(estimate.mean, digits)} [{_text(estimate.low, digits)}, {_text(estimate.high, digits)}]"
+
+
+def _text(value: float, digits: int) -> str:
+    return f"{round(value, digits) + 0.0:.{digits}f}"  # no -0
 
 
 def comparison_rows(card: Card, label: str = MAIN, *, short: bool = False) -> Table:

@@ -74,7 +74,7 @@ SENSOR_LAYOUT = Layout(
         Channel("gyro", XYZ, "rad/s", "body frame"),
         Channel("accelerometer", XYZ, "m/s2", "body frame, specific force (+9.81 on z at rest)"),
         Channel("supply_voltage", (), "V", "at the servos"),
-        Channel("camera_pose", ("x", "y", "yaw"), "m, m, rad", "last vision pose of the body origin in the floor frame"),
+        Channel("camera_pose", ("x", "y", "yaw"), "m, m, rad", "last vision pose of the body origin, seen from the start pose"),
         Channel("joint_age", (), "s", "time since the joint readings were taken"),
         Channel("imu_age", (), "s", "time since the IMU was read"),
         Channel("camera_age", (), "s", "time since the shown camera frame was exposed"),

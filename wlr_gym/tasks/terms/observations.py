@@ -89,10 +89,10 @@ _SENSED = {
             offset=lambda r: r.servo.supply_voltage, doc="from nominal",
         ),
         _sensor(
-            "camera_position", "camera_pose", "floor", 20.0, "camera", lambda r: r.sensors.camera.position_noise,
+            "camera_position", "camera_pose", "start", 20.0, "camera", lambda r: r.sensors.camera.position_noise,
             labels=("x", "y"),
         ),
-        _sensor("camera_yaw", "camera_pose", "floor", 20.0, "camera", lambda r: r.sensors.camera.yaw_noise, labels=("yaw",)),
+        _sensor("camera_yaw", "camera_pose", "start", 20.0, "camera", lambda r: r.sensors.camera.yaw_noise, labels=("yaw",)),
         _sensor("camera_age", "camera_age", "-", 1.0, "camera", _zero),
         _sensor("camera_is_new", "camera_is_new", "-", 1.0, "camera", _zero),
     )
