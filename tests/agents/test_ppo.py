@@ -175,7 +175,7 @@ def test_a_run_with_a_curriculum_resumes_exactly(tmp_path):
 
 
 def test_ctrl_c_saves_a_checkpoint_and_says_how_to_go_on(tmp_path, monkeypatch):
-    folder = tmp_path / "interrupted"
+    folder, handler = tmp_path / "interrupted", signal.getsignal(signal.SIGINT)
     load_agent("ppo")
     training = importlib.import_module("wlr_gym_agents_ppo.training")
     update = training.update
@@ -192,7 +192,7 @@ def test_ctrl_c_saves_a_checkpoint_and_says_how_to_go_on(tmp_path, monkeypatch):
     monkeypatch.setattr(training, "update", update)
     train(folder, resume=True)
     assert read_contract(folder / "policy")["training"]["steps"] == 384
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is handler
 
 
 def test_weights_that_are_not_finite_stop_the_run_with_a_dump(tmp_path):
