@@ -1,48 +1,23 @@
 """A critic that sees more than the actor: what each sees, and that training with it is as reproducible as without."""
 
 import shutil
-from typing import Any
 
 import numpy as np
 import pytest
+from ppo_runs import ENVIRONMENT, assert_same_weights, curve, weights
+from ppo_runs import train as train_plain
 
-from wlr_gym.evaluation import make_core, read_curve
-from wlr_gym.policy import Training, load_agent, load_policy, read_contract
+from wlr_gym.evaluation import make_core
+from wlr_gym.policy import load_agent, load_policy, read_contract
 
 torch = pytest.importorskip("torch")
 
-ENVIRONMENT = "WLR-Velocity-v0"
-SETTINGS = {
-    "total_steps": 384,
-    "num_envs": 8,
-    "steps_per_env": 8,
-    "batch_size": 32,
-    "epochs": 2,
-    "checkpoint_every": 128,
-    "keep_checkpoints": 10,
-    "environment": {"episode_length": 0.2, "observation": "dict"},
-}
+
+SEES_MORE = {"episode_length": 0.2, "observation": "dict"}
 
 
 def train(folder, *, resume=False, **changes):
-    return load_agent("ppo").train(Training(ENVIRONMENT, folder, SETTINGS | changes, resume=resume, progress=False))
-
-
-def weights(folder) -> dict[str, Any]:
-    from stable_baselines3.common.save_util import load_from_zip_file
-
-    return load_from_zip_file(folder / "model.zip", device="cpu", load_data=False)[1]["policy"]  # type: ignore[return-value]
-
-
-def assert_same_weights(first, second):
-    mine, theirs = weights(first), weights(second)
-    assert mine.keys() == theirs.keys()
-    assert all(torch.equal(mine[name], theirs[name]) for name in mine)
-
-
-def curve(folder):
-    clock = ("seconds", "steps_per_second")
-    return [{key: value for key, value in row.items() if key not in clock} for row in read_curve(folder / "learning_curve.csv")]
+    return train_plain(folder, resume=resume, **{"environment": SEES_MORE, **changes})
 
 
 @pytest.fixture(scope="module")
