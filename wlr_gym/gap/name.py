@@ -38,8 +38,6 @@ Tell = Callable[[str], None]
 
 #: Hypotheses that are refitted in one round, at most so many per name, and rounds of refitting.
 SHORTLIST, PER_NAME, ROUNDS = 8, 3, 6
-#: So many known numbers at their bounds, 2.5 tolerances from nominal, are not what a robot is: something else is in them.
-STRAINED = 3
 #: Share of what the best hypothesis buys by which one start may be behind another of the same before it is given up.
 BEHIND = 0.5
 #: The best of every name that buys at least this share of what the best buys is fitted in full before one is taken; so many.
@@ -167,6 +165,8 @@ def name_effects(
     models = [start.model]
     while True:
         probes, candidates = problem.candidates(current.model.setting, current.residuals, runs)
+        had = {candidate.label for candidate, _ in current.model.effects}
+        candidates = [candidate for candidate in candidates if candidate.label not in had]
         tell(f"screening {len(candidates)} candidates")
         found = responses(problem, current, runs, probes)
         scores = screen(candidates, found)
@@ -279,7 +279,9 @@ def finalists(
     for hypothesis in best.values():
         tell(f"fitting {hypothesis.candidate.label} in full")
         near = fit(problem, runs, hypothesis.model, scatter=scatter, steps=problem.steps, tell=tell)
-        wholes.append(min((near, *_afresh(problem, runs, hypothesis, near, tell)), key=lambda whole: whole.cost))
+        both = (near, *_afresh(problem, runs, hypothesis, near, tell))
+        memory = min(both, key=lambda whole: whole.cost).noise.memory
+        wholes.append(min(both, key=lambda whole: total_cost(problem, whole.model, whole.residuals, memory)))
     if not wholes:
         return []
     memory = min(wholes, key=lambda whole: whole.cost).noise.memory
@@ -303,13 +305,13 @@ def _probed(candidate: Candidate, start: Start) -> tuple[float, ...]:
 
 def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near: Fit, tell: Tell) -> list[Fit]:
     """The fit once more from the model as given, if known numbers are strained by what they took on in the effect's place."""
-    if on_bounds(problem, near.model).sum() < STRAINED:
+    if not on_bounds(problem, near.model).any():
         return []
-    tell("known numbers at their bounds: once more from the model as given")
+    tell("a known number at its bound: once more from the model as given")
     candidate = hypothesis.candidate
     given = replace(hypothesis.model.without_effect(-1), quantities=nominal_model(problem).quantities)
     start = given.with_effect(candidate, _probed(candidate, candidate.starts[0]))
-    return [fit(problem, runs, start, memory=near.noise.memory, scatter=near.noise.scatter, steps=2 * problem.steps, tell=tell)]
+    return [fit(problem, runs, start, scatter=near.noise.scatter, steps=2 * problem.steps, tell=tell)]
 
 
 def _carries_over(
