@@ -412,12 +412,12 @@ def _improved(problem: Problem, runs: Sequence[int], current: Fit, trials: Seque
         change = constrained_step(problem, trial.model, *equations)
         tries += [replace(trial, model=moved(problem, trial.model, share * change)) for share in SHARES[:3]]
     tries = _simulated(problem, tries, runs)
+    costs = [total_cost(problem, t.model, t.residuals, noise.memory) for t in tries]
     improved = []
     for k, trial in enumerate(trials):
-        now = total_cost(problem, trial.model, trial.residuals, noise.memory)
-        best = min(tries[3 * k : 3 * k + 3], key=lambda t: total_cost(problem, t.model, t.residuals, noise.memory))
-        gained = now - total_cost(problem, best.model, best.residuals, noise.memory)
-        improved.append(replace(best if gained > 0.0 else trial, settled=gained < SETTLED))
+        best = min(range(3 * k, 3 * k + 3), key=lambda i: costs[i])
+        gained = total_cost(problem, trial.model, trial.residuals, noise.memory) - costs[best]
+        improved.append(replace(tries[best] if gained > 0.0 else trial, settled=gained < SETTLED))
     return improved
 
 
