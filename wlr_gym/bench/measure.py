@@ -39,6 +39,7 @@ class Measurement:
         ours: one value per round. peer: those of the fastest peer, None where there is none. peer_name: which one.
         bar: least ratio to the peer, or, without a peer, the upper limit of ``ours``; None = for information.
         others: median of every slower peer.
+        at_least: the peer did not get to the end in every round: its values are upper bounds and the ratios lower ones.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Measurement:
     peer_name: str = ""
     bar: float | None = None
     others: Mapping[str, float] | None = None
+    at_least: bool = False
 
     @property
     def ratios(self) -> tuple[float, ...]:
@@ -68,7 +70,7 @@ class Measurement:
             "name": self.name, "what": self.what, "unit": self.unit, "ours": summary(self.ours),
             "peer_name": self.peer_name or None, "peer": summary(self.peer) if self.peer else None,
             "ratio": summary(self.ratios) if self.peer else None, "bar": self.bar, "met": self.met,
-            "other_peers": dict(self.others or {}),
+            "other_peers": dict(self.others or {}), "at_least": self.at_least,
         }  # fmt: skip
 
 

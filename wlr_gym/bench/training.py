@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any
 
 from wlr_gym.bench.measure import Contender, Measurement, Size, against_fastest, interleave, rate
@@ -32,9 +33,13 @@ EPOCHS = 4
 SOLVED = 1.7
 #: Frames over which it is averaged. Frames after which a run is given up.
 WINDOW, MOST_FRAMES = 16_384, 4_000_000
-#: Settings that learnt fastest on each: many robots, large minibatches; few robots, small ones.
-OURS = {"batch_size": 2048, "learning_rate": 3e-3}
-PEERS = {"batch_size": 256, "learning_rate": 1e-3}
+#: A peer is given up after so many times our wall time.
+PATIENCE = 10.0
+#: Settings with which each learnt fastest of those tried (docs/learning.md): many robots, few large minibatches; few robots,
+#: more and smaller ones. ``samples`` are those of an update.
+OUR_ROBOTS = 256
+OURS = {"samples": 8192, "batch_size": 512, "learning_rate": 2e-3}
+PEERS = {"samples": 1024, "batch_size": 128, "learning_rate": 1.5e-3}
 
 
 def keywords() -> dict[str, Any]:
@@ -45,7 +50,13 @@ def keywords() -> dict[str, Any]:
 def make_mujoco_env() -> gym.Env:
     """Return the environment on the MuJoCo loop, in any process."""
     register_backend()
-    return gym.make(f"wlr_gym:{ENVIRONMENT}", backend=BACKEND, **keywords())
+    return _WithClock(gym.make(f"wlr_gym:{ENVIRONMENT}", backend=BACKEND, **keywords()))
+
+
+class _WithClock(gym.Wrapper):
+    def processor_seconds(self) -> float:
+        """Return what the process of this environment has used."""
+        return time.process_time()
 
 
 def measure_ppo(size: Size) -> list[Measurement]:
@@ -58,17 +69,37 @@ def measure_ppo(size: Size) -> list[Measurement]:
 
 
 def measure_learning(size: Size) -> list[Measurement]:
-    """How often per hour PPO learns the task from nothing; every round has another seed, the same for all."""
-    robots = size(256, 16)
+    """Wall time in which PPO learns the task from nothing; every round has another seed, the same for all.
+
+    A peer that has not learnt it in :data:`PATIENCE` times our wall time is given up; the ratio is a lower bound then.
+    """
+    robots = size(OUR_ROBOTS, 16)
     with _vectors(robots, (2,)) as vectors:
         for name, vector in vectors.items():
             _learner(vector, 0, size, ours=name == "ours").learn(vector.num_envs)  # compilation is not measured
-        values: dict[str, list[float]] = {name: [] for name in vectors}
+        runs: dict[str, list[_Run]] = {name: [] for name in vectors}
+        peers = [name for name in vectors if name != "ours"]
         for seed in range(size.rounds):
-            for name, vector in vectors.items():
-                values[name].append(3600.0 / _seconds_to_solve(vector, seed, size, ours=name == "ours"))
-    found = {name: tuple(series) for name, series in values.items()}
-    return [_against_peers("learning", f"times learnt (reward {SOLVED:g}/s), {robots} robots", "1/h", found, 5.0)]
+            ours = _learn(_learner(vectors["ours"], seed, size, ours=True), size, math.inf)
+            runs["ours"].append(ours)
+            for name in peers:
+                runs[name].append(_learn(_learner(vectors[name], seed, size, ours=False), size, PATIENCE * ours.seconds))
+    rates = {name: tuple(3600.0 / run.seconds for run in series) for name, series in runs.items()}
+    rates["ours"] = tuple(rate if run.solved else 0.0 for rate, run in zip(rates["ours"], runs["ours"], strict=True))
+    row = _against_peers("learning", f"times learnt (reward {SOLVED:g}/s), {robots} robots", "1/h", rates, 5.0)
+    given_up = any(not run.solved for name in peers if _on_mujoco(name) == row.peer_name for run in runs[name])
+    return [replace(row, at_least=given_up), *(row for name, series in runs.items() for row in _details(name, series))]
+
+
+def _details(name: str, runs: Sequence[_Run]) -> list[Measurement]:
+    """Return what a contender took for it, for information."""
+    given_up = sum(not run.solved for run in runs)
+    who = f"{name}, not learnt in {given_up} of {len(runs)}" if given_up else name
+    return [
+        Measurement("learning", f"wall time, {who}", "s", tuple(run.seconds for run in runs)),
+        Measurement("learning", f"processor time, {who}", "s", tuple(run.processor_seconds for run in runs)),
+        Measurement("learning", f"frames, {who}", "", tuple(float(run.frames) for run in runs)),
+    ]
 
 
 @contextmanager
@@ -91,8 +122,12 @@ def _vectors(robots: int, workers: tuple[int, ...]) -> Any:
 
 
 def _against_peers(name: str, what: str, unit: str, values: Mapping[str, tuple[float, ...]], bar: float) -> Measurement:
-    peers = {f"{peer} on MuJoCo": series for peer, series in values.items() if peer != "ours"}
+    peers = {_on_mujoco(peer): series for peer, series in values.items() if peer != "ours"}
     return against_fastest(name, what, unit, values["ours"], peers, bar)
+
+
+def _on_mujoco(peer: str) -> str:
+    return f"{peer} on MuJoCo"
 
 
 def _updates(vector: VecEnv, size: Size, *, ours: bool) -> Contender:
@@ -111,29 +146,46 @@ def _updates(vector: VecEnv, size: Size, *, ours: bool) -> Contender:
 
 def _learner(vector: VecEnv, seed: int, size: Size, *, ours: bool) -> PPO:
     """The PPO of ``wlr train``, with the batch and learning rate that suit the number of robots."""
-    steps = size(32 if ours else 2048 // vector.num_envs, 8)
     settings: dict[str, Any] = dict(OURS if ours else PEERS)
+    steps = size(settings.pop("samples") // vector.num_envs, 8)
     settings["batch_size"] = min(settings["batch_size"], steps * vector.num_envs)
     policy = {"net_arch": [64, 64], "log_std_init": -1.0}
     settings |= {"n_steps": steps, "n_epochs": EPOCHS, "gamma": 0.97, "policy_kwargs": policy, "seed": seed}
     return PPO("MlpPolicy", vector, device="cpu", **settings)
 
 
-def _seconds_to_solve(vector: VecEnv, seed: int, size: Size, *, ours: bool) -> float:
-    """Return the wall time until the task is learnt; infinite where it was given up."""
-    model = _learner(vector, seed, size, ours=ours)
-    watch = _Solved(size(MOST_FRAMES, 1))
-    start = time.perf_counter()
+@dataclass(frozen=True)
+class _Run:
+    """What a training took until the task was learnt, or until it was given up. Processor time is that of all processes."""
+
+    solved: bool
+    seconds: float
+    processor_seconds: float
+    frames: int
+
+
+def _learn(model: PPO, size: Size, most_seconds: float) -> _Run:
+    assert model.env is not None
+    watch = _Solved(size(MOST_FRAMES, 1), most_seconds)
+    processor, start = _processor_seconds(model.env), time.perf_counter()
     model.learn(10 * MOST_FRAMES, callback=watch)
-    return time.perf_counter() - start if watch.solved or size.quick else math.inf
+    seconds = time.perf_counter() - start
+    return _Run(watch.solved, seconds, _processor_seconds(model.env) - processor, model.num_timesteps)
+
+
+def _processor_seconds(vector: VecEnv) -> float:
+    """Return what this process and the workers of a ``SubprocVecEnv`` have used."""
+    workers = vector.env_method("processor_seconds") if isinstance(vector, SubprocVecEnv) else []
+    return time.process_time() + sum(workers)
 
 
 class _Solved(BaseCallback):
-    """Ends the training when the mean reward of the newest frames reaches :data:`SOLVED`, or after ``most`` frames."""
+    """Ends the training when the newest frames' mean reward reaches :data:`SOLVED`, or after ``most`` frames or seconds."""
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, most_seconds: float = math.inf) -> None:
         super().__init__()
         self.most = most
+        self._end = time.perf_counter() + most_seconds
         self._goal = SOLVED * read_task("velocity").control_period
         self.solved = False
         self._rewards: list[float] = []
@@ -143,4 +195,4 @@ class _Solved(BaseCallback):
         ticks = max(1, WINDOW // self.training_env.num_envs)
         newest = self._rewards[-ticks:]
         self.solved = len(newest) == ticks and float(np.mean(newest)) >= self._goal
-        return not self.solved and self.num_timesteps < self.most
+        return not self.solved and self.num_timesteps < self.most and time.perf_counter() < self._end

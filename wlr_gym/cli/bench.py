@@ -133,6 +133,7 @@ def _speed_table(rows: Sequence[Measurement]) -> Table:
         found = row.as_dict()
         peer = f"{found['peer']['median']:,.0f} {row.unit} ({row.peer_name})" if row.peer else "-"
         ratio = "{median:.3g} [{min:.3g}..{max:.3g}]".format(**found["ratio"]) if row.peer else "-"
+        ratio = f">= {ratio}" if row.at_least else ratio
         bar = "-" if row.bar is None else f">= {row.bar:.3g}x" if row.peer else f"< {row.bar:g} {row.unit}"
         table.add_row(row.what, _number(found["ours"], row.unit), peer, ratio, bar, _YES_NO[row.met])
     return table
