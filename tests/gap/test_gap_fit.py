@@ -1,10 +1,24 @@
 """Fit and likelihood against closed forms: weighted least squares with priors, AR(1) memory, Monte Carlo."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from toy_problem import NOMINAL, QUANTITIES, REACH, SIGMA, STRENGTH, Toy, candidate, coloured
 
-from wlr_gym.gap.fit import Model, fit, linearise, moved, nominal_model, on_bounds, prior_cost, scaled_numbers, total_cost
+from wlr_gym.gap.fit import (
+    Model,
+    corrected,
+    fit,
+    linearise,
+    moved,
+    nominal_model,
+    on_bounds,
+    prior_cost,
+    scaled_numbers,
+    total_cost,
+    untouched,
+)
 from wlr_gym.gap.likelihood import LONGEST, estimate_noise, minus_two_log_likelihood
 
 
@@ -76,9 +90,9 @@ def test_columns_at_a_bound_are_taken_inwards():
     assert columns[0][0] == pytest.approx(-STRENGTH * problem.shape("gain")[0].ravel(), abs=1e-5)
 
 
-def exact(problem, weight, columns):
-    """Weighted least squares with unit priors: scaled numbers away from nominal."""
-    matrix, vector = np.eye(columns[0].shape[0]), np.zeros(columns[0].shape[0])
+def exact(problem, weight, columns, tight=1.0):
+    """Weighted least squares with priors that count ``tight`` times: scaled numbers away from nominal."""
+    matrix, vector = np.eye(columns[0].shape[0]) * tight, np.zeros(columns[0].shape[0])
     residuals = problem.residuals([nominal_model(problem).setting], all_runs(problem))
     for column, residual in zip(columns, residuals, strict=True):
         weights = np.broadcast_to(weight, residual[0].shape).ravel()
@@ -99,6 +113,37 @@ def test_linear_fit_is_weighted_least_squares_with_priors(seed):
     best, matrix = exact(problem, found.noise.weight, shape_columns(problem))
     assert (found.model.quantities - NOMINAL) / SIGMA == pytest.approx(best, abs=0.01)
     assert found.covariance() == pytest.approx(np.linalg.inv(matrix), rel=1e-3, abs=1e-7)
+
+
+def test_imperfect_simulator_moves_a_number_only_for_what_is_said_louder():
+    problem = Toy({"gain": 1.2, "offset": -0.7, "mass": 0.3}, white=2.0, error=1.5)
+    problem.firmness = 30.0
+    problem.quantities = (*problem.quantities[:2], replace(problem.quantities[2], drifts=True))
+    found = fit(problem, all_runs(problem), nominal_model(problem))
+    best, matrix = exact(problem, found.noise.weight, shape_columns(problem), np.array([30.0, 30.0, 1.0]))
+    assert (found.model.quantities - NOMINAL) / SIGMA == pytest.approx(best, abs=0.01)
+    assert found.covariance() == pytest.approx(30.0 * np.linalg.inv(matrix), rel=1e-3, abs=1e-7)
+    assert untouched(problem, found.model).quantities.tolist() == [*NOMINAL[:2], found.model.quantities[2]]
+
+
+def test_corrected_columns_predict_the_step_and_nothing_else_changes():
+    rng = np.random.default_rng(1)
+    columns, taken = rng.standard_normal((4, 60)).astype(np.float32), np.array([0.5, 0.0, -2.0, 0.1])
+    before, after = rng.standard_normal((2, 20, 3))
+    before[3, 1] = np.nan
+    new = corrected(columns, taken, before, after)
+    assert taken @ new == pytest.approx(np.nan_to_num(after - before).ravel(), abs=1e-5)
+    across = np.array([2.0, 7.0, 0.5, 0.0])  # at right angles to the step
+    assert across @ new == pytest.approx(across @ columns, abs=1e-5)
+
+
+def test_columns_from_far_away_are_good_enough_once_corrected():
+    """One linearisation where the effect hardly does anything: its response grows with its square."""
+    toy = Toy()
+    play = candidate(toy, "play")
+    problem = Toy({"gain": -1.0}, [play.effect((2.4,))])
+    found = fit(problem, all_runs(problem), nominal_model(problem).with_effect(play, (0.4,)), steps=1)
+    assert found.model.effects[0][1] == pytest.approx((2.4,), abs=0.05)
 
 
 def test_weak_data_leave_a_number_where_its_file_says():

@@ -2,7 +2,8 @@
 
 Maximum a posteriori by Gauss-Newton steps: residuals weighted by level and memory (:mod:`wlr_gym.gap.likelihood`), quantities
 drawn to their nominal values by their tolerances, unknowns of effects free within their plausible range. All columns of a step
-are simulated as one batch.
+are simulated as one batch; between two simulations of them they are corrected by what each step really changed (Broyden's
+secant update), which costs nothing and keeps steps from creeping.
 """
 
 from __future__ import annotations
@@ -22,15 +23,16 @@ Array = NDArray[np.float64]
 #: Step of finite differences in a quantity, in tolerances.
 STEP = 0.5
 #: Share of a step that is tried in turn until the fit gets better.
-SHARES = (1.0, 0.5, 0.2, 0.05)
-#: Steps that are taken with the same columns before they are simulated anew.
-CHORDS = 4
+SHARES = (2.0, 1.0, 0.5, 0.2, 0.05)
+#: Steps that are taken before the columns are simulated anew.
+CHORDS = 10
 #: Sticking friction makes the cost rough on this scale; so many full steps are taken in the end if it rises by no more.
 ROUGH, RELAXATIONS = 3.0, 2
 #: Stiffness, in tolerances, that holds a number on its bound.
 PINNED = 1e9
-#: A full step that gains less than this (in minus two log likelihood) ends a fit.
-SETTLED = 0.5
+#: A step that gains less than this (in minus two log posterior) is the last with its columns; new columns that gain less than
+#: RENEWED are the last of a fit.
+SETTLED, RENEWED = 0.5, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +80,7 @@ class Fit:
         columns: one (numbers, rows x channels) array per run: change of the residuals per scaled number (quantities in
             tolerances, unknowns in their steps), at or near the best model; unweighted, NaN as 0.
         hessian: (numbers, numbers) of half the cost, scaled numbers, tolerances included; numbers on their bounds are pinned.
+        firmness: of the problem.
     """
 
     model: Model
@@ -86,10 +89,11 @@ class Fit:
     cost: float
     columns: list[NDArray[np.float32]] = field(repr=False)
     hessian: Array = field(repr=False)
+    firmness: float = 1.0
 
     def covariance(self) -> Array:
-        """Covariance (numbers, numbers) of the scaled numbers."""
-        return np.asarray(np.linalg.inv(self.hessian), np.float64)
+        """Covariance (numbers, numbers) of the scaled numbers, as wide as tolerances that count once leave them."""
+        return np.asarray(self.firmness * np.linalg.inv(self.hessian), np.float64)
 
 
 def _relaxed(
@@ -122,6 +126,12 @@ def scales(problem: Problem, model: Model) -> Array:
 def nominal_model(problem: Problem) -> Model:
     """Return the model as its file says."""
     return Model(np.array([quantity.nominal for quantity in problem.quantities]))
+
+
+def untouched(problem: Problem, model: Model) -> Model:
+    """Return the model with its effects, and its numbers as the file says, but for those that drift."""
+    drifts = np.array([quantity.drifts for quantity in problem.quantities])
+    return replace(model, quantities=np.where(drifts, model.quantities, nominal_model(problem).quantities))
 
 
 def prior_cost(problem: Problem, model: Model) -> float:
@@ -231,30 +241,54 @@ def fit(
     else:
         residuals = [r[0] for r in problem.residuals([model.setting], runs)]
     for step in range(steps):
-        gained = 0.0
-        for _ in range(CHORDS):
-            noise = estimate_noise(residuals, memory, scatter)
-            cost = total_cost(problem, model, residuals, noise.memory)
-            change = gauss_newton_step(problem, model, columns, residuals, noise)
-            tries = [moved(problem, model, share * change) for share in SHARES]
-            found = problem.residuals([m.setting for m in tries], runs)
-            costs = [total_cost(problem, m, [r[k] for r in found], noise.memory) for k, m in enumerate(tries)]
-            best = int(np.argmin(costs))
-            if not costs[best] < cost:
-                break
-            model, residuals = tries[best], [r[best] for r in found]
-            gained += cost - costs[best]
-            if cost - costs[best] < SETTLED:
-                break
+        model, residuals, gained = _descend(problem, runs, model, columns, residuals, memory, scatter)
         tell(f"step {step + 1} of {steps}: {gained:.0f} better")
-        if gained < SETTLED or not renew or step == steps - 1:
+        if gained < RENEWED or not renew or step == steps - 1:
             break
         residuals, columns = linearise(problem, model, runs)
     model, residuals = _relaxed(problem, runs, model, columns, residuals, memory, scatter)
     noise = estimate_noise(residuals, memory, scatter)
     matrix, _ = normal_equations(columns, residuals, noise)
     hessian = matrix + np.diag(prior_tightness(problem, model) + PINNED * on_bounds(problem, model))
-    return Fit(model, residuals, noise, total_cost(problem, model, residuals, noise.memory), columns, hessian)
+    return Fit(model, residuals, noise, total_cost(problem, model, residuals, noise.memory), columns, hessian, problem.firmness)
+
+
+def _descend(
+    problem: Problem,
+    runs: Sequence[int],
+    model: Model,
+    columns: Sequence[NDArray[np.float32]],
+    residuals: list[Array],
+    memory: Array | None,
+    scatter: float,
+) -> tuple[Model, list[Array], float]:
+    """Go downhill from ``model``, whose residuals are given, with the columns simulated there; return also how far it went."""
+    memory = estimate_noise(residuals, scatter=scatter).memory if memory is None else memory  # one hill, not another each step
+    secant, cost = list(columns), total_cost(problem, model, residuals, memory)
+    top = cost
+    for _ in range(CHORDS):
+        noise = estimate_noise(residuals, memory, scatter)
+        change = gauss_newton_step(problem, model, secant, residuals, noise)
+        tries = [moved(problem, model, share * change) for share in SHARES]
+        found = problem.residuals([m.setting for m in tries], runs)
+        costs = [total_cost(problem, m, [r[k] for r in found], memory) for k, m in enumerate(tries)]
+        best = int(np.argmin(costs))
+        gained = cost - costs[best]
+        if not gained > 0.0:
+            break
+        taken = scaled_numbers(problem, tries[best]) - scaled_numbers(problem, model)
+        before, model, residuals, cost = residuals, tries[best], [r[best] for r in found], costs[best]
+        if gained < SETTLED:
+            break
+        secant = [corrected(c, taken, old, new) for c, old, new in zip(secant, before, residuals, strict=True)]
+    return model, residuals, top - cost
+
+
+def corrected(columns: NDArray[np.float32], taken: Array, before: Array, after: Array) -> NDArray[np.float32]:
+    """Return one run's columns with the least change that predicts what the step ``taken`` (scaled) really did."""
+    unit = (taken / (taken @ taken)).astype(np.float32)
+    missed = np.nan_to_num(after - before).ravel().astype(np.float32) - taken.astype(np.float32) @ columns
+    return columns + np.outer(unit, missed)
 
 
 def widened(problem: Problem, runs: Sequence[int], found: Fit) -> Fit:
@@ -267,9 +301,13 @@ def widened(problem: Problem, runs: Sequence[int], found: Fit) -> Fit:
 
 
 def prior_tightness(problem: Problem, model: Model) -> Array:
-    """Weight (numbers) of what is known beforehand, scaled: tolerances; unknowns lie within half their range of neutral."""
+    """Weight (numbers) of what is known beforehand, scaled: tolerances; unknowns lie within half their range of neutral.
+
+    It counts ``problem.firmness`` times, but for numbers that drift.
+    """
     unknowns = [4.0 * (u.step / (u.high - u.low)) ** 2 for candidate, _ in model.effects for u in candidate.unknowns]
-    return np.array([1.0] * len(problem.quantities) + unknowns)
+    known = [1.0 if quantity.drifts else problem.firmness for quantity in problem.quantities]
+    return np.array([*known, *(problem.firmness * u for u in unknowns)])
 
 
 def gauss_newton_step(

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from wlr_gym.gap.fit import (
     SETTLED,
-    SHARES,
     Fit,
     Model,
     constrained_step,
@@ -26,7 +25,9 @@ from wlr_gym.gap.fit import (
     nominal_model,
     normal_equations,
     on_bounds,
+    scaled_numbers,
     total_cost,
+    untouched,
     widened,
 )
 from wlr_gym.gap.likelihood import Noise, estimate_noise, minus_two_log_likelihood
@@ -38,6 +39,8 @@ Tell = Callable[[str], None]
 
 #: Hypotheses that are refitted in one round, at most so many per name, and rounds of refitting.
 SHORTLIST, PER_NAME, ROUNDS = 8, 3, 6
+#: Shares of a step that a refit tries.
+TRIED = (2.0, 1.0, 0.5, 0.2)
 #: Share of what the best hypothesis buys by which one start may be behind another of the same before it is given up.
 BEHIND = 0.5
 #: The best of every name that buys at least this share of what the best buys is fitted in full before one is taken; so many.
@@ -49,7 +52,7 @@ PER_UNKNOWN = 3.0
 #: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
 MOST_HARM = 0.2
 #: Runs that were not fitted must gain at least this share of what those that were did, per run.
-LEAST_CARRIED = 0.2
+LEAST_CARRIED = 0.1
 #: Also at least this share of minus two log posterior.
 LEAST_SHARE = 0.02
 #: Effects in one analysis.
@@ -175,7 +178,7 @@ def name_effects(
         hypotheses = (
             refit_thoroughly(problem, runs, current, chosen) if given is None else refit(problem, runs, current, chosen, given)
         )
-        finals = finalists(problem, runs, hypotheses, current.noise.scatter, others, tell)
+        finals = finalists(problem, runs, hypotheses, current.noise, others, tell)
         chosen_final = _accepted(current, finals)
         taken = None if chosen_final is None else chosen_final.hypothesis
         rounds.append(Round(scores, _merged(finals, hypotheses), taken, current.cost))
@@ -261,11 +264,12 @@ def finalists(
     problem: Problem,
     runs: Sequence[int],
     hypotheses: Sequence[Hypothesis],
-    scatter: float = 1.0,
+    noise: Noise,
     others: Sequence[int] = (),
     tell: Tell = lambda text: None,
 ) -> list[Final]:
-    """Fit the best hypotheses in full, with responses simulated anew; best first."""
+    """Fit the best hypotheses in full, with responses simulated anew; best first. ``noise`` is that of the model so far."""
+    memory, scatter = noise.memory, noise.scatter
     best: dict[str, Hypothesis] = {}
     for hypothesis in hypotheses:
         leading = hypotheses[0]
@@ -280,11 +284,10 @@ def finalists(
         tell(f"fitting {hypothesis.candidate.label} in full")
         near = fit(problem, runs, hypothesis.model, scatter=scatter, steps=problem.steps, tell=tell)
         both = (near, *_afresh(problem, runs, hypothesis, near, tell))
-        memory = min(both, key=lambda whole: whole.cost).noise.memory
-        wholes.append(min(both, key=lambda whole: total_cost(problem, whole.model, whole.residuals, memory)))
+        wholes.append(_cheapest(problem, both, memory))
     if not wholes:
         return []
-    memory = min(wholes, key=lambda whole: whole.cost).noise.memory
+    memory = _cheapest(problem, wholes, memory).noise.memory
     found = []
     for hypothesis, whole in zip(best.values(), wholes, strict=True):
         # what its fit gained beyond the refit counts for it; what it would have gained without the effect was counted there
@@ -295,6 +298,11 @@ def finalists(
         final = replace(hypothesis, model=whole.model, gain=gain, by_run=by_run, residuals=whole.residuals, carries_over=agreed)
         found.append(Final(final, whole))
     return sorted(found, key=lambda final: -final.hypothesis.gain)
+
+
+def _cheapest(problem: Problem, fits: Sequence[Fit], memory: Array) -> Fit:
+    """The fit with the lowest cost under one memory: each under its own would compare nothing."""
+    return min(fits, key=lambda whole: total_cost(problem, whole.model, whole.residuals, memory))
 
 
 def _probed(candidate: Candidate, start: Start) -> tuple[float, ...]:
@@ -309,9 +317,9 @@ def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near:
         return []
     tell("a known number at its bound: once more from the model as given")
     candidate = hypothesis.candidate
-    given = replace(hypothesis.model.without_effect(-1), quantities=nominal_model(problem).quantities)
+    given = untouched(problem, hypothesis.model.without_effect(-1))
     start = given.with_effect(candidate, _probed(candidate, candidate.starts[0]))
-    return [fit(problem, runs, start, scatter=near.noise.scatter, steps=2 * problem.steps, tell=tell)]
+    return [fit(problem, runs, start, scatter=near.noise.scatter, steps=problem.steps, tell=tell)]
 
 
 def _carries_over(
@@ -359,6 +367,8 @@ class _Trial:
         of: which hypothesis; -1 = none, the model without an effect more.
         known: columns of the numbers that all hypotheses share, where the trial started.
         model, residuals: the best so far.
+        corrections: of ``known``, one per step taken (Broyden): a direction (numbers) of these numbers, and by what residuals
+            change more along it, one (rows, channels) per run.
         settled: whether another step gains nothing.
     """
 
@@ -366,6 +376,7 @@ class _Trial:
     known: Sequence[NDArray[np.float32]] = field(repr=False)
     model: Model
     residuals: list[Array] = field(default_factory=list, repr=False)
+    corrections: tuple[tuple[Array, list[Array]], ...] = field(default=(), repr=False)
     settled: bool = False
 
 
@@ -406,19 +417,50 @@ def _improved(problem: Problem, runs: Sequence[int], current: Fit, trials: Seque
     """The trials one Gauss-Newton step on."""
     bases = {id(trial.known): trial.known for trial in trials}
     matrices = {key: normal_equations(known, current.residuals, noise)[0] for key, known in bases.items()}
-    tries = []
-    for trial, own in zip(trials, _own_columns(problem, trials, runs), strict=True):
-        equations = _bordered(matrices[id(trial.known)], trial.known, own, trial.residuals, noise)
+    tries, owns = [], _own_columns(problem, trials, runs)
+    for trial, own in zip(trials, owns, strict=True):
+        equations = _equations(matrices[id(trial.known)], trial, own, noise)
         change = constrained_step(problem, trial.model, *equations)
-        tries += [replace(trial, model=moved(problem, trial.model, share * change)) for share in SHARES[:3]]
+        tries += [replace(trial, model=moved(problem, trial.model, share * change)) for share in TRIED]
     tries = _simulated(problem, tries, runs)
     costs = [total_cost(problem, t.model, t.residuals, noise.memory) for t in tries]
     improved = []
-    for k, trial in enumerate(trials):
-        best = min(range(3 * k, 3 * k + 3), key=lambda i: costs[i])
+    for k, (trial, own) in enumerate(zip(trials, owns, strict=True)):
+        best = min(range(len(TRIED) * k, len(TRIED) * (k + 1)), key=lambda i: costs[i])
         gained = total_cost(problem, trial.model, trial.residuals, noise.memory) - costs[best]
-        improved.append(replace(tries[best] if gained > 0.0 else trial, settled=gained < SETTLED))
+        better = _corrected(problem, trial, own, tries[best]) if gained > 0.0 else trial
+        improved.append(replace(better, settled=gained < SETTLED))
     return improved
+
+
+def _equations(matrix: Array, trial: _Trial, own: Sequence[Array], noise: Noise) -> tuple[Array, Array]:
+    """Normal equations of a trial's numbers: the known ones' matrix is given, its corrections are so many columns more."""
+    size, more = len(matrix), len(trial.corrections)
+    runs = range(len(trial.residuals))
+    columns = [np.concatenate([own[r], *(missed[r][None] for _, missed in trial.corrections)]) for r in runs]
+    wide, push = _bordered(matrix, trial.known, columns, trial.residuals, noise)
+    mix = np.eye(len(wide) - more, len(wide))
+    for k, (direction, _) in enumerate(trial.corrections):
+        mix[:size, len(wide) - more + k] = direction
+    return mix @ wide @ mix.T, mix @ push
+
+
+def _corrected(problem: Problem, before: _Trial, own: Sequence[Array], after: _Trial) -> _Trial:
+    """The trial after a step, its known columns corrected by what the step did beyond what they and its own had promised."""
+    taken = scaled_numbers(problem, after.model) - scaled_numbers(problem, before.model)
+    size = len(before.known[0])
+    known, rest = taken[:size], taken[size:]
+    length = float(known @ known)
+    if length < 1e-9:
+        return after
+    shares = [known @ direction for direction, _ in before.corrections]
+    missed = []
+    for r, (old, new) in enumerate(zip(before.residuals, after.residuals, strict=True)):
+        promised = (known.astype(np.float32) @ before.known[r]).reshape(old.shape) + np.tensordot(rest, own[r], 1)
+        for share, (_, beyond) in zip(shares, before.corrections, strict=True):
+            promised += share * beyond[r]
+        missed.append((np.nan_to_num(new - old) - promised) / length)
+    return replace(after, corrections=(*before.corrections, (known, missed)))
 
 
 def _hopeful(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[_Trial]:
@@ -433,12 +475,12 @@ def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequ
     """Where refits begin. The model as given keeps the effects found before."""
     count = len(problem.quantities)
     given = [np.vstack([column, now[count:]]) for column, now in zip(given, current.columns, strict=True)]
-    untouched = replace(current.model, quantities=nominal_model(problem).quantities)
+    as_given = untouched(problem, current.model)
     trials = [_Trial(-1, current.columns, current.model)]
     for k, score in enumerate(scores):
         candidate = score.candidate
         trials.append(_Trial(k, current.columns, current.model.with_effect(candidate, score.values)))
-        trials.append(_Trial(k, given, untouched.with_effect(candidate, _probed(candidate, candidate.starts[0]))))
+        trials.append(_Trial(k, given, as_given.with_effect(candidate, _probed(candidate, candidate.starts[0]))))
     return trials
 
 

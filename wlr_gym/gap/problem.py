@@ -28,6 +28,7 @@ class Quantity:
         nominal: value in the model.
         sigma: tolerance, one standard deviation, in ``unit``.
         low, high: how far calibration may move it: a few tolerances, within what the simulator accepts.
+        drifts: whether it differs each time the system is switched on, as a sensor's bias: no missing effect hides in it.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Quantity:
     sigma: float
     low: float
     high: float
+    drifts: bool = False
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,8 @@ class Problem(Protocol):
         metric: what the gap's numbers are, in words.
         cap: noise units beyond which a residual counts no more in the gap's numbers.
         steps: Gauss-Newton steps of a fit, at most.
+        firmness: how many times what is known beforehand counts. What a simulator gets wrong is the same in all runs, so they
+            agree on it: only what the data say so many times louder than a tolerance may move a number. 1 = a perfect simulator.
         thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
         motions: effect -> name of the motion that shows it best, for advice on what to record; may be empty.
         sealed: names of the runs to keep for the proof, where the problem knows better than a general rule; else empty.
@@ -168,6 +172,7 @@ class Problem(Protocol):
     metric: str
     cap: float
     steps: int
+    firmness: float
     thorough: bool
     motions: Mapping[str, str]
     sealed: tuple[str, ...]

@@ -349,9 +349,12 @@ def _loads(lists: _Lists) -> None:
 
 
 def _load(values: Sequence[float]) -> dict[str, float]:
-    """Mass and place of a load from its mass and moments; a load of no mass is nowhere."""
+    """Mass and place of a load from its mass and moments; none is carried farther out than plausible."""
     mass = max(float(values[0]), 1e-6)
-    places = {axis: float(np.clip(moment / mass, -0.5, 0.5)) for axis, moment in zip("xyz", values[1:], strict=True)}
+    places = {}
+    for axis, moment in zip("xyz", values[1:], strict=True):
+        low, high = EFFECTS["payload"].parameters[axis].prior
+        places[axis] = float(np.clip(moment / mass, low, high))
     return {"mass": mass, **places}
 
 

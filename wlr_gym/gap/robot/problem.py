@@ -34,6 +34,9 @@ Array = NDArray[np.float64]
 
 #: Noise units beyond which a residual counts no more in the gap's numbers, and Gauss-Newton steps of a fit.
 CAP, STEPS = 50.0, 3
+#: See :class:`wlr_gym.gap.problem.Problem`; between two simulators of one robot what they do not share moved numbers by two to
+#: three tolerances with 1, and by none with 10.
+FIRMNESS = 10.0
 
 
 class RobotProblem:
@@ -65,7 +68,7 @@ class RobotProblem:
         self.metric = f"RMS over channels of measured minus replayed, in units of sensor noise, windows of {window:g} s"
         if any(run.meta.profile != runs[0].meta.profile for run in runs):
             raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
-        self.cap, self.steps = CAP, STEPS
+        self.cap, self.steps, self.firmness = CAP, STEPS, FIRMNESS
         self.thorough, self.sealed, self.motions = False, (), SHOWN_BY
         self.robot = robot or robot_of(runs[0])
         self.known = load_patch(known)

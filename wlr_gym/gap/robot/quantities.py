@@ -87,7 +87,7 @@ def knobs(robot: Robot, physics_step: float) -> tuple[Knob, ...]:
     imu = robot.sensors.imu
     for name, sigma in (("imu.gyro_bias", imu.gyro_bias), ("imu.accel_bias", imu.accel_bias)):
         spec = SPECS[name]
-        found += [Knob(_quantity(e, name, 0.0, sigma, REACH_OF_BIAS), (e,)) for e in spec.elements]
+        found += [Knob(replace(_quantity(e, name, 0.0, sigma, REACH_OF_BIAS), drifts=True), (e,)) for e in spec.elements]
     return tuple(found)
 
 
