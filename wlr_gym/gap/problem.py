@@ -163,7 +163,7 @@ class Problem(Protocol):
         cap: noise units beyond which a residual counts no more in the gap's numbers.
         steps: Gauss-Newton steps of a fit, at most.
         firmness: how many times what is known beforehand counts. What a simulator gets wrong is the same in all runs, so they
-            agree on it: only what the data say so many times louder than a tolerance may move a number. 1 = a perfect simulator.
+            agree on it: only what the data say so many times louder than a tolerance may move a number. 1 = it is perfect.
         thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
         motions: effect -> name of the motion that shows it best, for advice on what to record; may be empty.
         sealed: names of the runs to keep for the proof, where the problem knows better than a general rule; else empty.

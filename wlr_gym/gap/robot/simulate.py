@@ -227,17 +227,26 @@ def _replay_chunk(
         readings = plant.reset(parameters=lanes, state=first)
         recorder.start(readings)
         ticks = POSE_TICKS * -(-max(clock.ticks for clock in clocks) // POSE_TICKS)  # the last pose is stored too
+        anchors = _anchors_by_tick(clocks)
         for tick in range(ticks):
-            for r, clock in enumerate(clocks):
-                for window in np.flatnonzero(clock.anchors.tick == tick):
-                    readings = _anchor(plant, clock, int(window), run_of == r, lanes, readings)
-                    recorder.start_anew(r, tick, readings, plant.truth())
+            for r, window in anchors.get(tick, ()):
+                readings = _anchor(plant, clocks[r], window, run_of == r, lanes, readings)
+                recorder.start_anew(r, tick, readings, plant.truth())
             recorder.see(tick, readings, plant.truth())
             readings = plant.step(recorder.idle_goals, recorder.torque_on(tick))
         recorder.see(ticks, readings, plant.truth())
     finally:
         plant.close()
     return [recorder.result(r, Parameters(lanes.values[run_of == r])) for r in range(runs)]
+
+
+def _anchors_by_tick(clocks: Sequence[RunClock]) -> dict[int, list[tuple[int, int]]]:
+    """Which windows of which runs start at which tick."""
+    found: dict[int, list[tuple[int, int]]] = {}
+    for r, clock in enumerate(clocks):
+        for window, tick in enumerate(clock.anchors.tick.tolist()):
+            found.setdefault(tick, []).append((r, window))
+    return found
 
 
 def _anchor(
@@ -297,9 +306,11 @@ class _Recorder:
         self._last: Array | None = None
         self._before_last: Array | None = None
         self._anchored = [-1] * len(clocks)
-        self._switch_rows = [clock.t - clock.begin for clock in clocks]
         self._torque = [clock.torque_on for clock in clocks]
         self._always_on = all(on.all() for on in self._torque)
+        now = (np.arange(ticks + POSE_TICKS) + 0.5) * CLOCK
+        last = [np.searchsorted(clock.t - clock.begin, now, side="right") - 1 for clock in clocks]
+        self._torque_row = np.maximum(last, 0).T.tolist()
         self._offsets = np.repeat([clock.run.meta.marker_offset for clock in clocks], settings, axis=0)
 
     def start(self, readings: Sensors) -> None:
@@ -316,9 +327,7 @@ class _Recorder:
         """Switching the torque is not delayed."""
         if self._always_on:
             return None
-        now = (tick + 0.5) * CLOCK
-        rows = [max(int(np.searchsorted(times, now, side="right")) - 1, 0) for times in self._switch_rows]
-        return np.repeat([on[row] for on, row in zip(self._torque, rows, strict=True)], self.settings, axis=0)
+        return np.repeat([on[row] for on, row in zip(self._torque, self._torque_row[tick], strict=True)], self.settings, axis=0)
 
     def see(self, tick: int, readings: Sensors, truth: Truth) -> None:
         if tick % POSE_TICKS == 0:
