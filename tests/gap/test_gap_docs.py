@@ -33,6 +33,7 @@ def test_outcomes():
         "inconsistent",
         "does not carry over",
         "implausible",
+        "within tolerance",
         "screened out",
     }
     assert {one.outcome for one in EFFECT_FOUND.evidence} <= explained

@@ -136,6 +136,19 @@ def test_every_effect_of_the_library_is_tried(tried):
     assert {candidate.name for candidate in tried[1]} == set(EFFECTS)
 
 
+def test_effects_that_add_to_a_known_number_know_its_tolerance(tried):
+    radius = next(c for c in tried[1] if c.label == "wheel_radius_error wheel_lf")
+    sigma = KNOBS["wheel.radius[wheel_lf]"].quantity.sigma / KNOBS["wheel.radius[wheel_lf]"].quantity.nominal
+    assert radius.tolerable((1.0 - 2.4 * sigma,))
+    assert not radius.tolerable((1.0 + 2.6 * sigma,))
+    centre = next(c for c in tried[1] if c.name == "com_offset")
+    sigma = KNOBS["body.com_offset[y]"].quantity.sigma
+    assert centre.tolerable((0.0, 2.4 * sigma, 0.0))
+    assert not centre.tolerable((0.0, -2.6 * sigma, 0.0))
+    play = next(c for c in tried[1] if c.name == "backlash")
+    assert not play.tolerable((1e-6,))
+
+
 def test_places_are_places_of_the_effect(tried):
     for candidate in tried[1]:
         assert candidate.where

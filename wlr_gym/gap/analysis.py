@@ -70,7 +70,7 @@ class Evidence:
         round: 1 for the first effect.
         gain: what adding it bought after a refit; ``screened`` what the first-order score had promised.
         outcome: ``taken``, ``equivalent``, ``weaker``, ``too little``, ``inconsistent``, ``does not carry over``,
-            ``implausible`` or ``screened out``.
+            ``implausible``, ``within tolerance`` or ``screened out``.
         reason: one sentence: why it won or lost.
         by_run: fall of the weighted squares per fit run; empty where it was only screened.
     """

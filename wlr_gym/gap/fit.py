@@ -292,11 +292,11 @@ def corrected(columns: NDArray[np.float32], taken: Array, before: Array, after: 
 
 
 def widened(problem: Problem, runs: Sequence[int], found: Fit) -> Fit:
-    """Return the fit with a likelihood as wide as the runs differ, its numbers moved to where that leaves them."""
+    """Return the fit with a likelihood as wide as the runs differ and the simulator errs; its numbers follow."""
     free = ~on_bounds(problem, found.model)
     parts = [normal_equations([c], [r], found.noise) for c, r in zip(found.columns, found.residuals, strict=True)]
     matrices, vectors = np.stack([m for m, _ in parts])[:, free][:, :, free], np.stack([v for _, v in parts])[:, free]
-    scatter = max(found.noise.scatter * run_scatter(matrices, vectors), 1.0)
+    scatter = max(problem.firmness * found.noise.scatter * run_scatter(matrices, vectors), 1.0)
     return fit(problem, runs, found.model, scatter=scatter, columns=found.columns, steps=1)
 
 

@@ -47,6 +47,8 @@ BEHIND = 0.5
 FINALIST, FINALISTS = 0.75, 3
 #: Beside a set of places its best single place is fitted in full, if it buys at least this share.
 NARROWER = 0.4
+#: A hypothesis that has bought less than this share of the best after so many steps is not improved any further.
+HOPELESS, PATIENCE = 0.4, 2
 #: What an effect must buy more for every unknown beyond the first.
 PER_UNKNOWN = 3.0
 #: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
@@ -103,6 +105,16 @@ class Hypothesis:
         )
 
     @property
+    def tolerable(self) -> bool:
+        """Whether tolerances of known numbers allow as much."""
+        return self.candidate.tolerable(self.values)
+
+    @property
+    def plausible(self) -> bool:
+        """Whether its value says that the effect is there, at a size that a robot may have, and the runs agree."""
+        return not self.at_bound and not self.tolerable and self.consistent and self.carries_over
+
+    @property
     def consistent(self) -> bool:
         """Whether the runs agree that it is there."""
         help_, harm = self.by_run.clip(min=0.0).sum(), -self.by_run.clip(max=0.0).sum()
@@ -132,14 +144,18 @@ class Naming:
     swaps: dict[str, tuple[Hypothesis, list[Hypothesis]]]
 
 
-def shortlist(scores: Sequence[Score], size: int = SHORTLIST) -> list[Score]:
-    """Return the best scores, at most :data:`PER_NAME` of one effect, and only those that promise something."""
+def shortlist(scores: Sequence[Score], size: int = SHORTLIST, cost: float = 0.0) -> list[Score]:
+    """Return the best scores, at most :data:`PER_NAME` of one effect, and only those that promise something.
+
+    To first order an effect promises as little as a quarter of what it buys; ``cost`` is that of the model without it.
+    """
+    least = 0.25 * max(LEAST_GAIN, LEAST_SHARE * cost)
     chosen: list[Score] = []
     for score in scores:
         if len(chosen) == size:
             break
         same = [other for other in chosen if other.candidate.name == score.candidate.name]
-        if len(same) < PER_NAME and score.gain > 0.25 * LEAST_GAIN:
+        if len(same) < PER_NAME and score.gain > least:
             chosen.append(score)
     return chosen
 
@@ -173,7 +189,7 @@ def name_effects(
         tell(f"screening {len(candidates)} candidates")
         found = responses(problem, current, runs, probes)
         scores = screen(candidates, found)
-        chosen = scores if problem.thorough else shortlist(scores)
+        chosen = scores if problem.thorough else shortlist(scores, cost=current.cost)
         tell(f"refitting {len(chosen)} hypotheses")
         hypotheses = (
             refit_thoroughly(problem, runs, current, chosen) if given is None else refit(problem, runs, current, chosen, given)
@@ -345,8 +361,7 @@ def _accepted(current: Fit, finals: Sequence[Final]) -> Final | None:
     good = []
     for final in finals:
         least = max(LEAST_GAIN + PER_UNKNOWN * (len(final.hypothesis.values) - 1), LEAST_SHARE * current.cost)
-        hypothesis = final.hypothesis
-        if hypothesis.gain >= least and not hypothesis.at_bound and hypothesis.consistent and hypothesis.carries_over:
+        if final.hypothesis.gain >= least and final.hypothesis.plausible:
             good.append(final)
     if not good:
         return None
@@ -397,8 +412,10 @@ def refit(
     if not scores:
         return []
     trials = _simulated(problem, _starts(problem, current, scores, given), runs)
-    for _ in range(rounds):
+    for done in range(rounds):
         memory = _best_memory(problem, current, trials)
+        if done >= PATIENCE:
+            trials = _given_up(problem, trials, memory)
         noise = estimate_noise(min((t.residuals for t in trials), key=lambda r: minus_two_log_likelihood(r, memory)), memory)
         going = [trial for trial in trials if not trial.settled]
         if not going:
@@ -469,6 +486,15 @@ def _hopeful(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[
     least = {of: min(c for c, t in zip(costs, trials, strict=True) if t.of == of) for of in {t.of for t in trials}}
     room = max(max(least.values()) - min(least.values()), LEAST_GAIN)
     return [t for c, t in zip(costs, trials, strict=True) if c - least[t.of] < BEHIND * room]
+
+
+def _given_up(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[_Trial]:
+    """The trials; those of hypotheses that are far behind the best are settled."""
+    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
+    base = min(c for c, t in zip(costs, trials, strict=True) if t.of < 0)
+    gains = {of: base - min(c for c, t in zip(costs, trials, strict=True) if t.of == of) for of in {t.of for t in trials}}
+    best = max(gains.values())
+    return [replace(t, settled=t.settled or (t.of >= 0 and gains[t.of] < HOPELESS * best)) for t in trials]
 
 
 def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequence[NDArray[np.float32]]) -> list[_Trial]:

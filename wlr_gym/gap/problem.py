@@ -100,6 +100,8 @@ class Candidate:
         fixed: parameters of the effect that are not fitted.
         convert: from fitted values to the effect's parameters, where the data are more nearly linear in other numbers (mass and
             moments of a load, not its place); None = they are the same.
+        beyond: per unknown, how far from neutral the tolerances of numbers it adds to reach already: an effect is what goes
+            farther in one of them; empty = it adds to none.
     """
 
     name: str
@@ -110,6 +112,12 @@ class Candidate:
     units: Mapping[str, str] = field(default_factory=dict)
     fixed: Mapping[str, float] = field(default_factory=dict)
     convert: Callable[[Sequence[float]], Mapping[str, float]] | None = None
+    beyond: tuple[float, ...] = ()
+
+    def tolerable(self, values: Sequence[float]) -> bool:
+        """Whether tolerances of known numbers allow as much without an effect."""
+        away = [abs(value - unknown.neutral) for unknown, value in zip(self.unknowns, values, strict=True)]
+        return bool(self.beyond) and all(far <= allowed for far, allowed in zip(away, self.beyond, strict=True))
 
     @property
     def label(self) -> str:
@@ -162,8 +170,8 @@ class Problem(Protocol):
         metric: what the gap's numbers are, in words.
         cap: noise units beyond which a residual counts no more in the gap's numbers.
         steps: Gauss-Newton steps of a fit, at most.
-        firmness: how many times what is known beforehand counts. What a simulator gets wrong is the same in all runs, so they
-            agree on it: only what the data say so many times louder than a tolerance may move a number. 1 = it is perfect.
+        firmness: what a simulator gets wrong is the same in all runs, so they agree on it: what data say counts so many times
+            less than the runs' differences would let it, and what is known beforehand so many times more. 1 = it is perfect.
         thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
         motions: effect -> name of the motion that shows it best, for advice on what to record; may be empty.
         sealed: names of the runs to keep for the proof, where the problem knows better than a general rule; else empty.

@@ -33,6 +33,12 @@ def mean_squares(residuals: Sequence[Array], cap: float) -> Array:
     return np.stack(squares)
 
 
+def mean_of_runs(squares: Array) -> Array:
+    """Return the mean over runs (channels) of mean squares; NaN where no run measured a channel."""
+    measured = np.isfinite(squares).sum(axis=0)
+    return np.where(measured > 0, np.nansum(squares, axis=0) / np.maximum(measured, 1), np.nan)
+
+
 def level(squares: Array) -> float:
     """Return the root mean over channels (and runs) of mean squares."""
     return float(np.sqrt(np.nanmean(squares)))
@@ -68,7 +74,7 @@ def prove(
     names = [problem.runs[k] for k in (*fitted, *heldout)]
     gaps = tuple(RunGap(name, k >= len(fitted), *(level(s[k]) for s in squares)) for k, name in enumerate(names))
     channels = tuple(
-        ChannelGap(signal.name, signal.unit, signal.noise, *(float(np.sqrt(np.nanmean(s[outside][:, c]))) for s in squares))
+        ChannelGap(signal.name, signal.unit, signal.noise, *(float(np.sqrt(mean_of_runs(s[outside])[c])) for s in squares))
         for c, signal in enumerate(problem.signals)
         if np.isfinite(squares[0][outside][:, c]).any()
     )

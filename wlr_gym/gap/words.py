@@ -35,6 +35,8 @@ _SIDES = {
     frozenset(("lf", "lr")): "both left",
     frozenset(("rf", "rr")): "both right",
 }
+#: Times what a model without error would reach, from which on there is something left that has no name.
+UNEXPLAINED = 1.5
 _PLACES = {"ground": "floor", "sensor": "sensors"}
 _MEASURED = {
     "pos_leg": "angle", "pos_wheel": "angle", "vel_leg": "speed", "vel_wheel": "speed",
@@ -164,7 +166,12 @@ def _nothing_missing(analysis: Analysis) -> str:
     if gap is None:
         return f"The model lacks nothing that these runs could show{calibrated}."
     rest = f"it replays runs kept aside to within {error(gap.heldout_calibrated)} times the sensor noise"
-    return f"The model lacks nothing that these runs could show: {rest}{calibrated}."
+    if gap.heldout_calibrated < UNEXPLAINED * gap.noise_floor:
+        return f"The model lacks nothing that these runs could show: {rest}{calibrated}."
+    return (
+        f"No effect of the library is clear enough in these runs to be named: the model {rest.removeprefix('it ')}{calibrated}"
+        f", where one without error would reach {error(gap.noise_floor)}."
+    )
 
 
 def _effect_found(analysis: Analysis) -> str:

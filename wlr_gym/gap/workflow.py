@@ -17,7 +17,7 @@ from wlr_gym.gap.fit import Fit, fit, nominal_model, widened
 from wlr_gym.gap.localise import localise
 from wlr_gym.gap.name import Hypothesis, Naming, Round, name_effects
 from wlr_gym.gap.problem import Problem
-from wlr_gym.gap.prove import mean_squares, prove
+from wlr_gym.gap.prove import mean_of_runs, mean_squares, prove
 from wlr_gym.gap.recommend import recommend, separating_run
 from wlr_gym.gap.split import informative_split, named_split
 from wlr_gym.gap.sure import confidence, detectable, equivalents, estimates, standard_errors
@@ -30,6 +30,8 @@ Tell = Callable[[str, float], None]
 
 #: Stages and the share of the work that is done when they begin (measured on eight runs of 20 s).
 STAGES = {"reading": 0.0, "choosing runs": 0.02, "calibrating": 0.1, "naming": 0.35, "proving": 0.85, "drawing": 0.97}
+#: How many times more than their rows promise runs are taken to differ until a fit has told.
+SCATTER = 5.0
 #: Kinds of rigs.
 RIGS = ("pendulum",)
 #: Share of the effects that must be visible within their plausible range for "nothing missing" to mean anything.
@@ -105,7 +107,8 @@ def analyse_problem(
     clock.start("choosing runs")
     fitted, sealed, columns = _choose_runs(problem, heldout)
     clock.start("calibrating")
-    base = fit(problem, fitted, nominal_model(problem), columns=columns, steps=problem.steps, tell=clock.detail)
+    start, scatter = nominal_model(problem), SCATTER * problem.firmness
+    base = fit(problem, fitted, start, scatter=scatter, columns=columns, steps=problem.steps, tell=clock.detail)
     base = widened(problem, fitted, base)
     clock.start("naming")
     naming = name_effects(problem, fitted, base, sealed, clock.detail, columns)
@@ -116,7 +119,7 @@ def analyse_problem(
     places, maps = localise(
         problem,
         base.residuals,
-        np.nanmean(mean_squares(naming.fit.residuals, problem.cap), axis=0),
+        mean_of_runs(mean_squares(naming.fit.residuals, problem.cap)),
         naming.fit.noise,
         problem.features(base.model.setting, fitted),
     )
@@ -263,6 +266,8 @@ def _fate(hypothesis: Hypothesis, look: Round, equal: set[str]) -> tuple[str, st
         return "equivalent", f"buys {hypothesis.gain / best.gain:.0%} of what the taken one buys"
     if hypothesis.at_bound:
         return "implausible", "needs a value outside its plausible range"
+    if hypothesis.tolerable:
+        return "within tolerance", "the tolerances of known numbers allow as much"
     if not hypothesis.carries_over:
         return "does not carry over", "runs that were not fitted do not get better by it"
     if not hypothesis.consistent:

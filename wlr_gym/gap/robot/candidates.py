@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.effects import EFFECTS, PatchEffect
 from wlr_gym.gap.problem import Candidate, Probe, Start, Unknown
+from wlr_gym.gap.robot.quantities import REACH
 from wlr_gym.parameters import Parameters
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 from wlr_gym.runs.format import CHANNELS
@@ -70,12 +71,14 @@ class _Lists:
     def add_known(self, name: str, where: Sequence[str], parts: Sequence[_Part], mu: float = 0.6) -> None:
         """Add an effect of :class:`_Part` s: its first guess needs no probe where the numbers have tolerances."""
         neutral = {unknown.name: unknown.neutral for unknown in unknowns(name, mu)}
-        directions, amounts = [], []
+        directions, amounts, beyond = [], [], []
         for part in parts:
             if all(quantity in self.tolerances for quantity in part.quantities):
                 directions.append(part.quantities)
                 amounts.append(part.scale * self.tolerances[part.quantities[0]])
+                beyond.append(REACH * abs(amounts[-1]))
             else:
+                beyond.append(0.0)
                 changed = {**neutral, part.parameter: neutral[part.parameter] + part.size}
                 directions.append((self.probe(name, where, changed, part.parameter),))
                 amounts.append(part.size)
@@ -84,15 +87,17 @@ class _Lists:
         def values(a: Array) -> tuple[float, ...]:
             return tuple(float(n + size * k) for n, size, k in zip(middle, amounts, a, strict=True))
 
-        self.add(name, where, [Start(tuple(directions), values)], mu)
+        self.add(name, where, [Start(tuple(directions), values)], mu, tuple(beyond))
 
     def probe(self, name: str, where: Sequence[str], parameters: dict[str, float], note: str = "") -> str:
         key = " ".join([name, *where, note]).strip()
         self.probes.append(Probe(key, (PatchEffect(name, tuple(where), parameters),)))
         return key
 
-    def add(self, name: str, where: Sequence[str], starts: Iterable[Start], robot_mu: float = 0.6) -> None:
-        self.candidates.append(Candidate(name, tuple(where), unknowns(name, robot_mu), tuple(starts)))
+    def add(
+        self, name: str, where: Sequence[str], starts: Iterable[Start], robot_mu: float = 0.6, beyond: tuple[float, ...] = ()
+    ) -> None:
+        self.candidates.append(Candidate(name, tuple(where), unknowns(name, robot_mu), tuple(starts), beyond=beyond))
 
 
 def unknowns(name: str, mu: float) -> tuple[Unknown, ...]:

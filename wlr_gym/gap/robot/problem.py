@@ -34,9 +34,9 @@ Array = NDArray[np.float64]
 
 #: Noise units beyond which a residual counts no more in the gap's numbers, and Gauss-Newton steps of a fit.
 CAP, STEPS = 50.0, 3
-#: See :class:`wlr_gym.gap.problem.Problem`; between two simulators of one robot what they do not share moved numbers by two to
-#: three tolerances with 1, and by none with 10.
-FIRMNESS = 10.0
+#: See :class:`wlr_gym.gap.problem.Problem`: with 1, what two simulators of one robot do not share moves numbers by two to three
+#: tolerances.
+FIRMNESS = 3.0
 
 
 class RobotProblem:
