@@ -70,11 +70,12 @@ class Plan:
 
 
 def analyse_folder(folder: Path, out: Path) -> Mapping[str, Any]:
-    """Run the gap workflow on a folder; return its result file."""
+    """Run the gap workflow on a folder; return its result file. The report with its pictures is not drawn."""
+    from wlr_gym.gap.result import write_result
     from wlr_gym.gap.workflow import analyse
 
-    analyse(folder, out=out, threads=1)
-    return json.loads((out / "result.json").read_text(encoding="utf-8"))
+    make_output_folder(out)
+    return read_result(write_result(analyse(folder, threads=1), out))
 
 
 def run_blind_test(

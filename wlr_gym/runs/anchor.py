@@ -152,9 +152,16 @@ def _wheel_tension(run: Run, robot: Robot, parameters: Parameters) -> Array:
     """Distance of the wheels' reference from their angle (1, 4) that gives the measured effort at rest."""
     nominal_voltage = robot.servo.supply_voltage
     constant, resistance = motor_constants(robot.servo.wheel.stall_torque, robot.servo.wheel.no_load_speed, nominal_voltage)
-    early = run["t"] <= run["t"][0] + CAMERA_WINDOW
-    effort = [np.mean(run[f"eff_{joint}"][early]) if f"eff_{joint}" in run else 0.0 for joint in JOINTS[4:]]
+    still = _rows_before_motion(run)
+    effort = [np.mean(run[f"eff_{joint}"][still]) if f"eff_{joint}" in run else 0.0 for joint in JOINTS[4:]]
     return np.nan_to_num(effort) * resistance / constant / np.maximum(parameters["servo.kp"][:, 4:], 1e-9)
+
+
+def _rows_before_motion(run: Run) -> NDArray[np.bool_]:
+    """Rows of the first tenths of a second that were read before any goal asked a wheel to turn; the first one at least."""
+    asked = np.any([np.nan_to_num(run[f"cmd_{joint}"]) != 0.0 for joint in JOINTS[4:]], axis=0)
+    before = np.concatenate([[False], np.logical_or.accumulate(asked)[:-1]])
+    return (run["t"] <= run["t"][0] + CAMERA_WINDOW) & ~before
 
 
 # --- geometry ---------------------------------------------------------------------------------------------------------

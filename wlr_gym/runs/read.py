@@ -104,8 +104,8 @@ def read_dataset(folder: str | Path) -> DataSet:
 
 
 def run_files(folder: Path) -> list[Path]:
-    """Return the runs of a folder, ``run_2`` before ``run_10``."""
-    files = [path for path in folder.glob("run_*") if path.suffix.lower() in SUFFIXES]
+    """Return the runs of a folder, ``run_2`` before ``run_10``; what a policy was asked and answered lies beside them."""
+    files = [path for path in folder.glob("run_*") if path.suffix.lower() in SUFFIXES and not path.stem.endswith(".policy")]
     return sorted(files, key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)])
 
 
