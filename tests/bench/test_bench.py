@@ -2,13 +2,17 @@
 
 import json
 import math
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from wlr_gym.bench.measure import Measurement, against_fastest, interleave
+from wlr_gym.bench import training
+from wlr_gym.bench.measure import Measurement, Size, against_fastest, interleave
 from wlr_gym.bench.mujoco_loop import MujocoLoopPlant
-from wlr_gym.cli import main
+from wlr_gym.cli import bench, main
 from wlr_gym.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.robot import load_robot
 
@@ -54,6 +58,47 @@ def test_ratio_is_pair_by_pair_against_the_fastest_peer():
 
 def test_a_peer_that_got_nothing_done_is_infinitely_slower():
     assert against_fastest("n", "w", "1/h", (2.0, 0.0, 3.0), {"peer": (0.0, 0.0, 1.0)}, 2.0).ratios == (math.inf, 0.0, 3.0)
+
+
+class _Learner:
+    """Stands for a PPO that learns the task in ``seconds``."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+
+    def learn(self, frames: int) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("dummy", "workers", "ratio", "at_least"),
+    [(60.0, 80.0, 6.0, False), (500.0, 80.0, 8.0, False), (500.0, 500.0, 10.0, True)],
+)
+def test_a_peer_that_is_given_up_gives_a_lower_bound(monkeypatch, dummy, workers, ratio, at_least):
+    """Ours takes 10 s; a peer is given up after ten times that, and what is told then is no ratio but a bound."""
+    seconds = {"SubprocVecEnv(2)": workers, "DummyVecEnv(8)": dummy, "ours": 10.0}
+
+    def learn(model, size, most_seconds):
+        spent = min(model.seconds, most_seconds)
+        return training._Run(model.seconds <= most_seconds, spent, spent, 1000)
+
+    vectors = {name: SimpleNamespace(num_envs=8, seconds=value) for name, value in seconds.items()}
+    monkeypatch.setattr(training, "_vectors", lambda robots, workers: nullcontext(vectors))
+    monkeypatch.setattr(training, "_learner", lambda vector, seed, size, ours: _Learner(vector.seconds))
+    monkeypatch.setattr(training, "_learn", learn)
+    row, *details = training.measure_learning(Size(2))
+    assert row.ratios == (ratio, ratio)
+    assert row.at_least == at_least
+    assert row.as_dict()["at_least"] == at_least
+    assert row.met
+    given_up = [name for name, value in seconds.items() if value > 100.0]
+    assert all(any(name in detail.what and "not learnt in 2 of 2" in detail.what for detail in details) for name in given_up)
+    assert len(details) == 9
+
+
+def test_a_lower_bound_is_printed_as_one(capsys):
+    row = Measurement("learning", "w", "1/h", (20.0,), (2.0,), "peer", 5.0, at_least=True)
+    bench._print(Console(), bench._speed_table([row]))
+    assert ">= 10 [10..10]" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("arguments", "message"), [(["--only", "engin"], "engine"), (["--rounds", "0"], "1 or more")])
