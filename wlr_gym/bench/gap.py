@@ -150,14 +150,13 @@ def _run(plan: Plan, cases: Sequence[Case], analyser: str, say: Callable[[str], 
 
 def _start(plan: Plan, one: Case, analyser: str) -> subprocess.Popen[bytes]:
     """Start a process for one set: what it breaks or leaks is gone with it, and it can be stopped."""
-    threads = str(max(1, (os.cpu_count() or 1) // plan.processes))
     task = {**vars(plan), "out": str(plan.out), "index": one.seed - plan.first_seed, "analyser": analyser}
     with open(_log_file(plan, one), "wb") as log:
         return subprocess.Popen(
             [sys.executable, "-m", "wlr_gym.bench.gap", json.dumps(task)],
             stdout=log,
             stderr=subprocess.STDOUT,
-            env={**os.environ, **dict.fromkeys(_THREADS, threads)},
+            env={**os.environ, **dict.fromkeys(_THREADS, "1")},
         )
 
 
