@@ -90,9 +90,9 @@ def test_columns_at_a_bound_are_taken_inwards():
     assert columns[0][0] == pytest.approx(-STRENGTH * problem.shape("gain")[0].ravel(), abs=1e-5)
 
 
-def exact(problem, weight, columns, tight=1.0):
+def exact(problem, weight, columns, tight=(1.0,)):
     """Weighted least squares with priors that count ``tight`` times: scaled numbers away from nominal."""
-    matrix, vector = np.eye(columns[0].shape[0]) * tight, np.zeros(columns[0].shape[0])
+    matrix, vector = np.eye(columns[0].shape[0]) * np.array(tight), np.zeros(columns[0].shape[0])
     residuals = problem.residuals([nominal_model(problem).setting], all_runs(problem))
     for column, residual in zip(columns, residuals, strict=True):
         weights = np.broadcast_to(weight, residual[0].shape).ravel()
@@ -120,7 +120,7 @@ def test_imperfect_simulator_moves_a_number_only_for_what_is_said_louder():
     problem.firmness = 30.0
     problem.quantities = (*problem.quantities[:2], replace(problem.quantities[2], drifts=True))
     found = fit(problem, all_runs(problem), nominal_model(problem))
-    best, matrix = exact(problem, found.noise.weight, shape_columns(problem), np.array([30.0, 30.0, 1.0]))
+    best, matrix = exact(problem, found.noise.weight, shape_columns(problem), (30.0, 30.0, 1.0))
     assert (found.model.quantities - NOMINAL) / SIGMA == pytest.approx(best, abs=0.01)
     assert found.covariance() == pytest.approx(30.0 * np.linalg.inv(matrix), rel=1e-3, abs=1e-7)
     assert untouched(problem, found.model).quantities.tolist() == [*NOMINAL[:2], found.model.quantities[2]]

@@ -286,9 +286,9 @@ def _descend(
 
 def corrected(columns: NDArray[np.float32], taken: Array, before: Array, after: Array) -> NDArray[np.float32]:
     """Return one run's columns with the least change that predicts what the step ``taken`` (scaled) really did."""
-    unit = (taken / (taken @ taken)).astype(np.float32)
-    missed = np.nan_to_num(after - before).ravel().astype(np.float32) - taken.astype(np.float32) @ columns
-    return columns + np.outer(unit, missed)
+    change = taken.astype(np.float32)
+    missed = np.nan_to_num(after - before).ravel() - change @ columns
+    return (columns + np.outer(change / (change @ change), missed.astype(np.float32))).astype(np.float32, copy=False)
 
 
 def widened(problem: Problem, runs: Sequence[int], found: Fit) -> Fit:
