@@ -9,7 +9,7 @@ import pandas
 import pytest
 from engine_runs import META, ROBOT, posture_and_turns, record, spaced
 
-from wlr_gym.effects import EFFECTS, UNKNOWN_EFFECT, Patch, apply_patch, load_patch
+from wlr_gym.effects import EFFECTS, UNKNOWN_EFFECT, Patch, PatchEffect, apply_patch, load_patch
 from wlr_gym.errors import InputError
 from wlr_gym.gap.fit import nominal_model
 from wlr_gym.gap.problem import Setting
@@ -454,3 +454,24 @@ def test_rolling_resistance_is_found_in_four_runs(tmp_path):
     assert value.low < 0.1 < value.high
     assert found.gap is not None
     assert found.gap.reduction > 0.5
+
+
+def test_what_a_robot_cannot_have_beside_its_effects_is_not_tried(good):
+    """A joint has one Stribeck speed: where one is found, or given as known, another is no candidate."""
+    problem = RobotProblem([good])
+    wheels = PatchEffect("stribeck_friction", ("wheel_lf", "wheel_rf"), {"extra_static_torque": 0.1, "stribeck_speed": 0.5})
+    setting = nominal_model(problem).setting
+    found = replace(setting, effects=(wheels,))
+    residuals = [np.zeros_like(problem.measured(0))]
+    probes, candidates = problem.candidates(found, residuals, [0])
+    left = places_tried(candidates, "stribeck_friction")
+    assert not {("wheel_lf",), ("wheel_rf",), ("wheel_lf", "wheel_lr")} & left
+    assert {("wheel_lr",), ("leg_lf",), ("leg_lf", "leg_rf")} <= left
+    assert {candidate.name for candidate in candidates} == {c.name for c in problem.candidates(setting, residuals, [0])[1]}
+    problem.parameters([replace(found, effects=(wheels, *probe.effects)) for probe in probes])
+    given = RobotProblem([good], known=Patch((wheels,)))
+    assert ("wheel_lf",) not in places_tried(given.candidates(setting, residuals, [0])[1], "stribeck_friction")
+
+
+def places_tried(candidates, name):
+    return {candidate.where for candidate in candidates if candidate.name == name}

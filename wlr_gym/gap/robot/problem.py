@@ -164,7 +164,17 @@ class RobotProblem:
         measured = [self._measured[r] for r in runs]
         probes, candidates = robot_candidates(parameters, tolerances, measured, residuals)
         more, formulas = formula_candidates()
-        return [*probes, *more], [*candidates, *formulas]
+        possible = [probe for probe in (*probes, *more) if self._possible(setting, probe)]
+        keys = {probe.key for probe in possible} | set(tolerances)
+        return possible, [usable for candidate in (*candidates, *formulas) if (usable := _with_starts(candidate, keys))]
+
+    def _possible(self, setting: Setting, probe: Probe) -> bool:
+        """Whether a robot can have a probe's effects beside those it has: it has one Stribeck speed per joint, for example."""
+        try:
+            self.parameters([replace(setting, effects=(*setting.effects, *probe.effects))])
+        except InputError:
+            return False
+        return True
 
     def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
         """Return joint speeds, loads, slip and place over the rows of each run."""
@@ -185,6 +195,12 @@ class RobotProblem:
                 first = start[force.where, repr(force.formula)]
                 row[first : first + len(force.parameters)] += list(force.parameters.values())
         return tuple(samples.values()), constants
+
+
+def _with_starts(candidate: Candidate, keys: set[str]) -> Candidate | None:
+    """The candidate with those of its starts whose probes there are; None where none is left."""
+    starts = tuple(start for start in candidate.starts if all(key in keys for part in start.directions for key in part))
+    return replace(candidate, starts=starts) if starts else None
 
 
 def _features(truth: Array) -> Mapping[str, Array]:
