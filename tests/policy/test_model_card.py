@@ -84,6 +84,16 @@ def test_a_card_says_what_the_policy_sees(policy, sources, observer, words):
     assert words in write_model_card(policy, scores(policy)).read_text()
 
 
+@pytest.mark.parametrize(
+    ("commit", "shown"), [("0123456789abcdef", "seed 0, commit 0123456 |"), ("0123456789-dirty", "0123456-dirty |")]
+)
+def test_a_card_names_the_commit_it_was_trained_with(policy, commit, shown):
+    content = contract_of(policy)
+    content["training"]["git_commit"] = commit
+    policy.write_bytes(seal(policy.read_bytes(), content))
+    assert shown in write_model_card(policy, scores(policy)).read_text()
+
+
 def test_a_card_of_another_file_is_noticed(policy):
     write_model_card(policy, scores(policy))
     content = contract_of(policy)

@@ -113,7 +113,15 @@ def _training(agent: str, training: Mapping[str, Any], config: Mapping[str, Any]
         found.append(f"{training['seconds'] / 60.0:.1f} min with {config.get('torch_threads', 1)} thread(s)")
     if "seed" in training:
         found.append(f"seed {training['seed']}")
+    if training.get("git_commit"):
+        found.append(f"commit {_short(training['git_commit'])}")
     return found
+
+
+def _short(commit: str) -> str:
+    """Abbreviate the hash; ``-dirty`` stays."""
+    name, _, state = commit.partition("-")
+    return f"{name[:7]}-{state}" if state else name[:7]
 
 
 def _table(facts: Mapping[str, str]) -> str:
