@@ -7,8 +7,8 @@ import pytest
 from toy_problem import NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap.fit import fit, linearise, nominal_model
-from wlr_gym.gap.name import EQUIVALENT, MOST_EFFECTS, PER_NAME, drop_idle, name_effects, refit, shortlist
-from wlr_gym.gap.problem import Candidate
+from wlr_gym.gap.name import EQUIVALENT, MOST_EFFECTS, PER_NAME, SHORTLIST, drop_idle, name_effects, refit, shortlist
+from wlr_gym.gap.problem import Candidate, Tolerance
 from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
 from wlr_gym.gap.sure import equivalents
 
@@ -125,7 +125,7 @@ def test_what_a_tolerance_allows_is_no_effect(monkeypatch, size, is_effect):
     """A tolerance that counts many times makes a copy of the number cheap, whatever its size."""
     problem = Toy({"gain": size}, rows=400)
     problem.firmness = 10.0
-    copy = replace(candidate(problem, "copy"), beyond=(REACH,))
+    copy = replace(candidate(problem, "copy"), tolerances=(Tolerance(("gain",), 1.0, REACH),))
     monkeypatch.setattr(Toy, "_copy", lambda self: ([], [copy]))
     look = named(problem).rounds[0]
     first = look.hypotheses[0]
@@ -208,11 +208,12 @@ def test_shortlist_keeps_some_of_every_name():
     probes, candidates = problem.candidates(None, [], [])
     scores = screen(candidates, responses(problem, current, RUNS, probes))
     many = [replace(score, gain=100.0) for score in scores for _ in range(4)]
-    chosen = shortlist(many, size=9)
-    assert len(chosen) == 9
+    chosen = shortlist(many)
+    assert len(chosen) == SHORTLIST
     names = [score.candidate.name for score in chosen]
     assert max(names.count(name) for name in names) == PER_NAME
     assert shortlist([replace(score, gain=0.1) for score in scores]) == []
+    assert shortlist(many, cost=1e6) == []  # next to nothing of what is left
 
 
 def test_same_data_same_bits():

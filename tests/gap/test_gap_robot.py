@@ -11,7 +11,8 @@ from engine_runs import META, ROBOT, posture_and_turns, record, spaced
 
 from wlr_gym.effects import EFFECTS, UNKNOWN_EFFECT, Patch, PatchEffect, apply_patch, load_patch
 from wlr_gym.errors import InputError
-from wlr_gym.gap.fit import nominal_model
+from wlr_gym.gap.fit import Model, nominal_model
+from wlr_gym.gap.name import within_tolerance
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.robot.candidates import ripple_order, robot_candidates
 from wlr_gym.gap.robot.formulas import formula_candidates
@@ -129,24 +130,42 @@ def tried():
     measured = rng.standard_normal((300, len(CHANNELS)))
     measured[:, CHANNELS.index("cam_x")] = np.linspace(0.0, 0.6, 300)
     sigmas = {name: knob.quantity.sigma for name, knob in KNOBS.items()}
-    return robot_candidates(NOMINAL, sigmas, [measured], [rng.standard_normal(measured.shape)])
+    drifting = {name for name, knob in KNOBS.items() if knob.quantity.drifts}
+    return robot_candidates(NOMINAL, sigmas, [measured], [rng.standard_normal(measured.shape)], drifting)
 
 
 def test_every_effect_of_the_library_is_tried(tried):
     assert {candidate.name for candidate in tried[1]} == set(EFFECTS)
 
 
-def test_effects_that_add_to_a_known_number_know_its_tolerance(tried):
-    radius = next(c for c in tried[1] if c.label == "wheel_radius_error wheel_lf")
-    sigma = KNOBS["wheel.radius[wheel_lf]"].quantity.sigma / KNOBS["wheel.radius[wheel_lf]"].quantity.nominal
-    assert radius.tolerable((1.0 - 2.4 * sigma,))
-    assert not radius.tolerable((1.0 + 2.6 * sigma,))
-    centre = next(c for c in tried[1] if c.name == "com_offset")
-    sigma = KNOBS["body.com_offset[y]"].quantity.sigma
-    assert centre.tolerable((0.0, 2.4 * sigma, 0.0))
-    assert not centre.tolerable((0.0, -2.6 * sigma, 0.0))
-    play = next(c for c in tried[1] if c.name == "backlash")
-    assert not play.tolerable((1e-6,))
+def test_effects_that_meet_a_known_number_know_its_tolerance(tried, good):
+    problem = RobotProblem([good])
+    nominal = nominal_model(problem)
+    names = [quantity.name for quantity in problem.quantities]
+
+    def tolerable(name, place, values, moved=(), tolerances=0.0):
+        chosen = next(c for c in tried[1] if c.name == name and c.where[0] == place)
+        quantities = nominal.quantities.copy()
+        for k, quantity in enumerate(problem.quantities):
+            quantities[k] += tolerances * quantity.sigma * (quantity.name in moved)
+        return within_tolerance(problem, Model(quantities).with_effect(chosen, values))
+
+    sigma = {name: problem.quantities[names.index(name)].sigma for name in names}
+    radius = sigma["wheel.radius[wheel_lf]"] / ROBOT.wheel.radius
+    assert tolerable("wheel_radius_error", "wheel_lf", (1.0 - 2.4 * radius,))
+    assert not tolerable("wheel_radius_error", "wheel_lf", (1.0 + 2.6 * radius,))
+    # number and effect count together
+    assert not tolerable("wheel_radius_error", "wheel_lf", (1.0 + radius,), ["wheel.radius[wheel_lf]"], 2.0)
+    assert tolerable("wheel_radius_error", "wheel_lf", (1.0 + 3.0 * radius,), ["wheel.radius[wheel_lf]"], -1.0)
+    offset = sigma["body.com_offset[y]"]
+    assert tolerable("com_offset", "body", (0.0, 2.4 * offset, 0.0))
+    assert not tolerable("com_offset", "body", (0.0, -2.6 * offset, 0.0))
+    # the level of the floor takes the place of the number, wherever calibration has moved that
+    level = sigma["ground.mu"]
+    assert tolerable("friction_level", "ground", (0.6 - 2.4 * level,), ["ground.mu"], -2.5)
+    assert not tolerable("friction_level", "ground", (0.6 - 2.6 * level,), ["ground.mu"], -2.5)
+    assert not tolerable("backlash", "leg_lf", (1e-6,))
+    assert not tolerable("gyro_bias", "sensor", (0.002, 0.0, 0.0))  # a bias drifts
 
 
 def test_places_are_places_of_the_effect(tried):
@@ -239,6 +258,13 @@ def test_ripple_is_looked_for_at_its_own_order():
     residual[:, CHANNELS.index("eff_wheel_lf")] = np.sin(12 * angle + 0.7) + 0.5 * rng.standard_normal(800)
     residual[rng.random(800) < 0.2] = np.nan
     assert ripple_order("wheel_lf", [measured], [residual]) == 12.0
+    swing, bend = np.zeros((2, 800, len(CHANNELS)))
+    swing[:, CHANNELS.index("pos_leg_lf")] = 1.0 + 0.4 * np.sin(angle)
+    bend[:, CHANNELS.index("eff_leg_lf")] = np.sin(swing[:, CHANNELS.index("pos_leg_lf")])  # one period per turn: any bend
+    order = ripple_order("leg_lf", [swing], [bend])
+    assert order is not None
+    assert order >= 1.5 * 2 * np.pi / 0.8
+    assert ripple_order("leg_rf", [swing], [bend]) is None  # it stood still
 
 
 def test_patch_of_floor_needs_a_floor_that_was_driven():

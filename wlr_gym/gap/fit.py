@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 #: Step of finite differences in a quantity, in tolerances.
 STEP = 0.5
-#: Share of a step that is tried in turn until the fit gets better.
+#: Shares of a step that are tried; the best is taken.
 SHARES = (2.0, 1.0, 0.5, 0.2, 0.05)
 #: Steps that are taken before the columns are simulated anew.
 CHORDS = 10
@@ -80,7 +80,7 @@ class Fit:
         columns: one (numbers, rows x channels) array per run: change of the residuals per scaled number (quantities in
             tolerances, unknowns in their steps), at or near the best model; unweighted, NaN as 0.
         hessian: (numbers, numbers) of half the cost, scaled numbers, tolerances included; numbers on their bounds are pinned.
-        firmness: of the problem.
+        precision: (numbers, numbers) inverse covariance of the scaled numbers, tolerances counted once.
     """
 
     model: Model
@@ -89,11 +89,11 @@ class Fit:
     cost: float
     columns: list[NDArray[np.float32]] = field(repr=False)
     hessian: Array = field(repr=False)
-    firmness: float = 1.0
+    precision: Array = field(repr=False)
 
     def covariance(self) -> Array:
-        """Covariance (numbers, numbers) of the scaled numbers, as wide as tolerances that count once leave them."""
-        return np.asarray(self.firmness * np.linalg.inv(self.hessian), np.float64)
+        """Covariance (numbers, numbers) of the scaled numbers: an imperfect simulator's word counts less, tolerances once."""
+        return np.asarray(np.linalg.inv(self.precision), np.float64)
 
 
 def _relaxed(
@@ -229,7 +229,7 @@ def fit(
         problem: the system.
         runs: which of its runs.
         model: where to start, with the effects to be fitted.
-        memory: of the residuals where it is known already, and must be the same; None = estimated at every step.
+        memory: of the residuals where it is known already, and must be the same; None = estimated where each descent begins.
         scatter: of the runs; see :class:`wlr_gym.gap.likelihood.Noise`.
         columns: responses near ``model`` where they are known.
         steps: at most this many Gauss-Newton steps.
@@ -249,8 +249,10 @@ def fit(
     model, residuals = _relaxed(problem, runs, model, columns, residuals, memory, scatter)
     noise = estimate_noise(residuals, memory, scatter)
     matrix, _ = normal_equations(columns, residuals, noise)
-    hessian = matrix + np.diag(prior_tightness(problem, model) + PINNED * on_bounds(problem, model))
-    return Fit(model, residuals, noise, total_cost(problem, model, residuals, noise.memory), columns, hessian, problem.firmness)
+    pinned = np.diag(PINNED * on_bounds(problem, model))
+    hessian = matrix + np.diag(prior_tightness(problem, model)) + pinned
+    precision = matrix / problem.firmness + np.diag(_tightness_once(problem, model)) + pinned
+    return Fit(model, residuals, noise, total_cost(problem, model, residuals, noise.memory), columns, hessian, precision)
 
 
 def _descend(
@@ -296,7 +298,8 @@ def widened(problem: Problem, runs: Sequence[int], found: Fit) -> Fit:
     free = ~on_bounds(problem, found.model)
     parts = [normal_equations([c], [r], found.noise) for c, r in zip(found.columns, found.residuals, strict=True)]
     matrices, vectors = np.stack([m for m, _ in parts])[:, free][:, :, free], np.stack([v for _, v in parts])[:, free]
-    scatter = max(problem.firmness * found.noise.scatter * run_scatter(matrices, vectors), 1.0)
+    differ = run_scatter(matrices, vectors)
+    scatter = found.noise.scatter if differ is None else max(problem.firmness * found.noise.scatter * differ, 1.0)
     return fit(problem, runs, found.model, scatter=scatter, columns=found.columns, steps=1)
 
 
@@ -305,9 +308,14 @@ def prior_tightness(problem: Problem, model: Model) -> Array:
 
     It counts ``problem.firmness`` times, but for numbers that drift.
     """
+    drifts = [quantity.drifts for quantity in problem.quantities]
+    firmness = np.where([*drifts, *(False,) * (model.size - len(drifts))], 1.0, problem.firmness)
+    return firmness * _tightness_once(problem, model)
+
+
+def _tightness_once(problem: Problem, model: Model) -> Array:
     unknowns = [4.0 * (u.step / (u.high - u.low)) ** 2 for candidate, _ in model.effects for u in candidate.unknowns]
-    known = [1.0 if quantity.drifts else problem.firmness for quantity in problem.quantities]
-    return np.array([*known, *(problem.firmness * u for u in unknowns)])
+    return np.array([1.0] * len(problem.quantities) + unknowns)
 
 
 def gauss_newton_step(

@@ -64,23 +64,23 @@ def minus_two_log_likelihood(residuals: Sequence[Array], memory: Array) -> float
     return float(np.sum(noise.rows / memory * (np.log(noise.level**2) + np.minimum(noise.square, 1.0) - 1.0)))
 
 
-def run_scatter(matrices: Array, vectors: Array) -> float:
+def run_scatter(matrices: Array, vectors: Array) -> float | None:
     """Return how many times more than expected the runs differ in where they pull the numbers.
 
     The runs' gradients at their common best fit should scatter as their curvature says (White's information equality); the mean
-    ratio over the directions that the data tell something of.
+    ratio over the directions that the data tell something of; None where they tell nothing.
 
     Args:
         matrices, vectors: (runs, numbers, numbers), (runs, numbers) normal equations of each run.
     """
     runs = len(vectors)
     if runs < 2:
-        return 1.0
+        return None
     told, directions = np.linalg.eigh(matrices.sum(axis=0))
     pulls = (vectors - vectors.mean(axis=0)) @ directions
     known = told > 1.0
     if not known.any():
-        return 1.0
+        return None
     ratio = (pulls**2).sum(axis=0)[known] * runs / (runs - 1) / told[known]
     return float(ratio.mean())
 

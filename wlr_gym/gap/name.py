@@ -32,7 +32,7 @@ from wlr_gym.gap.fit import (
 )
 from wlr_gym.gap.likelihood import Noise, estimate_noise, minus_two_log_likelihood
 from wlr_gym.gap.problem import Candidate, Problem, Setting, Start
-from wlr_gym.gap.screen import LEAST_GAIN, Score, responses, screen
+from wlr_gym.gap.screen import LEAST_GAIN, Score, least_gain, responses, screen
 
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
@@ -49,14 +49,12 @@ FINALIST, FINALISTS = 0.75, 3
 NARROWER = 0.4
 #: A hypothesis that has bought less than this share of the best after so many steps is not improved any further.
 HOPELESS, PATIENCE = 0.4, 2
-#: What an effect must buy more for every unknown beyond the first.
-PER_UNKNOWN = 3.0
 #: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
 MOST_HARM = 0.2
 #: Runs that were not fitted must gain at least this share of what those that were did, per run.
 LEAST_CARRIED = 0.1
-#: Also at least this share of minus two log posterior.
-LEAST_SHARE = 0.02
+#: Of an unknown that meets no known number, what counts as an effect, in its steps.
+NOTICED = 0.25
 #: Effects in one analysis.
 MOST_EFFECTS = 4
 #: A named effect is preferred to a formula if it buys at least this share of what the formula buys.
@@ -78,6 +76,7 @@ class Hypothesis:
         residuals: of the model.
         base, base_residuals: the model without the effect, refitted as long.
         carries_over: whether runs that were not fitted agree (checked for finalists only).
+        tolerable: whether the tolerances of known numbers allow as much.
     """
 
     candidate: Candidate
@@ -89,6 +88,7 @@ class Hypothesis:
     base: Model = field(repr=False)
     base_residuals: list[Array] = field(repr=False)
     carries_over: bool = True
+    tolerable: bool = False
 
     @property
     def values(self) -> tuple[float, ...]:
@@ -103,11 +103,6 @@ class Hypothesis:
             or (value <= u.low + 1e-9 * abs(u.low) and u.low != u.neutral)
             for u, value in zip(self.candidate.unknowns, self.values, strict=True)
         )
-
-    @property
-    def tolerable(self) -> bool:
-        """Whether tolerances of known numbers allow as much."""
-        return self.candidate.tolerable(self.values)
 
     @property
     def plausible(self) -> bool:
@@ -144,15 +139,33 @@ class Naming:
     swaps: dict[str, tuple[Hypothesis, list[Hypothesis]]]
 
 
-def shortlist(scores: Sequence[Score], size: int = SHORTLIST, cost: float = 0.0) -> list[Score]:
+def within_tolerance(problem: Problem, model: Model) -> bool:
+    """Whether the tolerances of the numbers that the last effect meets allow what number and effect do together."""
+    candidate, values = model.effects[-1]
+    known = {q.name: (q, value) for q, value in zip(problem.quantities, model.quantities, strict=True)}
+    for unknown, value, tolerance in zip(candidate.unknowns, values, candidate.tolerances, strict=bool(candidate.tolerances)):
+        if tolerance is None:
+            if abs(value - unknown.neutral) > NOTICED * unknown.step:
+                return False
+            continue
+        for quantity, now in (known[name] for name in tolerance.quantities):
+            shift = (value - quantity.nominal) / tolerance.size
+            if not tolerance.replaces:
+                shift = (now - quantity.nominal) / quantity.sigma + (value - unknown.neutral) / tolerance.size
+            if abs(shift) > tolerance.reach:
+                return False
+    return bool(candidate.tolerances)
+
+
+def shortlist(scores: Sequence[Score], cost: float = 0.0) -> list[Score]:
     """Return the best scores, at most :data:`PER_NAME` of one effect, and only those that promise something.
 
     To first order an effect promises as little as a quarter of what it buys; ``cost`` is that of the model without it.
     """
-    least = 0.25 * max(LEAST_GAIN, LEAST_SHARE * cost)
+    least = 0.25 * least_gain(1, cost)
     chosen: list[Score] = []
     for score in scores:
-        if len(chosen) == size:
+        if len(chosen) == SHORTLIST:
             break
         same = [other for other in chosen if other.candidate.name == score.candidate.name]
         if len(same) < PER_NAME and score.gain > least:
@@ -261,7 +274,7 @@ def drop_idle(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = 
         losses = [trial.cost - current.cost for trial in trials]
         least = int(np.argmin(losses))
         unknowns = len(current.model.effects[least][1])
-        if losses[least] > LEAST_GAIN + PER_UNKNOWN * (unknowns - 1):
+        if losses[least] > least_gain(unknowns):
             return current
         tell(f"dropped: {current.model.effects[least][0].label}")
         current = fit(problem, runs, trials[least].model, scatter=noise.scatter, steps=1, tell=tell)
@@ -287,8 +300,9 @@ def finalists(
     """Fit the best hypotheses in full, with responses simulated anew; best first. ``noise`` is that of the model so far."""
     memory, scatter = noise.memory, noise.scatter
     best: dict[str, Hypothesis] = {}
-    for hypothesis in hypotheses:
-        leading = hypotheses[0]
+    effects = [hypothesis for hypothesis in hypotheses if not hypothesis.tolerable]
+    for hypothesis in effects:
+        leading = effects[0]
         enough = hypothesis.gain >= max(FINALIST * leading.gain, 0.5 * LEAST_GAIN)
         if enough and len(best) < FINALISTS:
             best.setdefault(hypothesis.candidate.name + hypothesis.candidate.formula, hypothesis)
@@ -311,7 +325,15 @@ def finalists(
         gain = base - total_cost(problem, whole.model, whole.residuals, memory)
         by_run = _by_run(hypothesis.base_residuals, whole.residuals, estimate_noise(whole.residuals, memory, scatter))
         agreed = _carries_over(problem, hypothesis.base, whole.model, gain, runs, others, memory)
-        final = replace(hypothesis, model=whole.model, gain=gain, by_run=by_run, residuals=whole.residuals, carries_over=agreed)
+        final = replace(
+            hypothesis,
+            model=whole.model,
+            gain=gain,
+            by_run=by_run,
+            residuals=whole.residuals,
+            carries_over=agreed,
+            tolerable=within_tolerance(problem, whole.model),
+        )
         found.append(Final(final, whole))
     return sorted(found, key=lambda final: -final.hypothesis.gain)
 
@@ -360,7 +382,7 @@ def _accepted(current: Fit, finals: Sequence[Final]) -> Final | None:
     """The best that buys enough at a plausible value; a formula only where no named effect buys nearly as much."""
     good = []
     for final in finals:
-        least = max(LEAST_GAIN + PER_UNKNOWN * (len(final.hypothesis.values) - 1), LEAST_SHARE * current.cost)
+        least = least_gain(len(final.hypothesis.values), current.cost)
         if final.hypothesis.gain >= least and final.hypothesis.plausible:
             good.append(final)
     if not good:
@@ -570,7 +592,8 @@ def _ranked(
     for score, model, residual in zip(scores, models[:-1], residuals[:-1], strict=True):
         by_run = _by_run(residuals[-1], residual, estimate_noise(residual, memory))
         gain = base - total_cost(problem, model, residual, memory)
-        found.append(Hypothesis(score.candidate, model, gain, by_run, score.gain, residual, models[-1], residuals[-1]))
+        hypothesis = Hypothesis(score.candidate, model, gain, by_run, score.gain, residual, models[-1], residuals[-1])
+        found.append(replace(hypothesis, tolerable=within_tolerance(problem, model)))
     return sorted(found, key=lambda hypothesis: -hypothesis.gain)
 
 
@@ -600,6 +623,8 @@ def _own_columns(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]
             changed = tuple(v + step * (i == k) for i, v in enumerate(values))
             settings.append(replace(trial.model, effects=(*trial.model.effects[:-1], (candidate, changed))).setting)
             taken[-1].append(step / unknown.step)
+    if not settings:
+        return [[np.zeros((0, *residual.shape)) for residual in trial.residuals] for trial in trials]
     found = problem.residuals(settings, runs)
     columns, at = [], 0
     for trial, steps in zip(trials, taken, strict=True):

@@ -88,6 +88,23 @@ class Start:
 
 
 @dataclass(frozen=True)
+class Tolerance:
+    """How an unknown of an effect meets numbers that calibration may move.
+
+    Attributes:
+        quantities: their names.
+        size: one tolerance of theirs, in the unknown's unit.
+        reach: tolerances by which calibration may move them: what goes farther is an effect.
+        replaces: whether the unknown takes their place; otherwise it adds to them.
+    """
+
+    quantities: tuple[str, ...]
+    size: float
+    reach: float
+    replaces: bool = False
+
+
+@dataclass(frozen=True)
 class Candidate:
     """An effect that may be missing, at one place or set of places.
 
@@ -100,8 +117,7 @@ class Candidate:
         fixed: parameters of the effect that are not fitted.
         convert: from fitted values to the effect's parameters, where the data are more nearly linear in other numbers (mass and
             moments of a load, not its place); None = they are the same.
-        beyond: per unknown, how far from neutral the tolerances of numbers it adds to reach already: an effect is what goes
-            farther in one of them; empty = it adds to none.
+        tolerances: per unknown, the known numbers it meets; empty = it meets none.
     """
 
     name: str
@@ -112,12 +128,7 @@ class Candidate:
     units: Mapping[str, str] = field(default_factory=dict)
     fixed: Mapping[str, float] = field(default_factory=dict)
     convert: Callable[[Sequence[float]], Mapping[str, float]] | None = None
-    beyond: tuple[float, ...] = ()
-
-    def tolerable(self, values: Sequence[float]) -> bool:
-        """Whether tolerances of known numbers allow as much without an effect."""
-        away = [abs(value - unknown.neutral) for unknown, value in zip(self.unknowns, values, strict=True)]
-        return bool(self.beyond) and all(far <= allowed for far, allowed in zip(away, self.beyond, strict=True))
+    tolerances: tuple[Tolerance | None, ...] = ()
 
     @property
     def label(self) -> str:

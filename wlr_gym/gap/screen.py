@@ -27,8 +27,22 @@ Array = NDArray[np.float64]
 
 #: Fall of minus two log posterior below which an effect is not accepted.
 LEAST_GAIN = 16.0
+#: What an effect must buy more for every unknown beyond the first; also at least this share of minus two log posterior.
+PER_UNKNOWN, LEAST_SHARE = 3.0, 0.02
 #: A response of which less than this share is left after the known numbers have imitated it cannot be told from them.
 LEAST_OWN = 1e-4
+
+
+def least_gain(unknowns: int, cost: float = 0.0) -> float:
+    """Return what an effect with so many unknowns must buy; ``cost`` is minus two log posterior of the model without it."""
+    return max(LEAST_GAIN + PER_UNKNOWN * (unknowns - 1), LEAST_SHARE * cost)
+
+
+def least_amplitude(candidate: Candidate, information: Array, k: int, cost: float = 0.0) -> float:
+    """Return the smallest amplitude of direction ``k`` that would be accepted: clear, and beyond what a tolerance allows."""
+    clear = float(np.sqrt(least_gain(len(candidate.unknowns), cost) / max(float(information[k, k]), 1e-12)))
+    tolerance = candidate.tolerances[k] if k < len(candidate.tolerances) else None
+    return clear if tolerance is None else max(clear, tolerance.reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,10 +155,10 @@ def _fall(found: Responses, mix: Array) -> tuple[float, Array]:
 
 def _visible(candidate: Candidate, start: Start, information: Array) -> bool:
     """Whether the smallest severity that would be accepted lies in the plausible range, in some direction."""
-    for k, told in enumerate(np.diag(information)):
+    for k in range(len(information)):
         for sign in (1.0, -1.0):
             amplitude = np.zeros(len(information))
-            amplitude[k] = sign * np.sqrt(LEAST_GAIN / max(float(told), 1e-12))
+            amplitude[k] = sign * least_amplitude(candidate, information, k)
             values = start.values(amplitude)
             if all(u.low <= v <= u.high for u, v in zip(candidate.unknowns, values, strict=True)):
                 return True

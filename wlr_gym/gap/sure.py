@@ -12,7 +12,7 @@ from wlr_gym.gap.analysis import Detectable, Estimate
 from wlr_gym.gap.fit import PINNED, Fit, normal_equations, on_bounds, prior_tightness, scaled_nominal, scaled_numbers, scales
 from wlr_gym.gap.name import EQUIVALENT, Hypothesis
 from wlr_gym.gap.problem import Candidate, Problem
-from wlr_gym.gap.screen import LEAST_GAIN, Score
+from wlr_gym.gap.screen import LEAST_GAIN, Score, least_amplitude
 
 Array = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[
 def confidence(taken: Hypothesis, others: Sequence[Hypothesis]) -> float:
     """Return the share of bootstrap samples of the runs in which the taken effect is accepted and no other name is better."""
     rng = np.random.default_rng(0)
-    rivals = [other for other in others if other.candidate.name != taken.candidate.name]
+    rivals = [other for other in others if other.candidate.name != taken.candidate.name and not other.tolerable]
     picks = rng.integers(0, len(taken.by_run), (SAMPLES, len(taken.by_run)))
     gains = taken.by_run[picks].sum(axis=1)
     wins = gains > LEAST_GAIN
@@ -98,7 +98,8 @@ def equivalents(taken: Hypothesis, others: Sequence[Hypothesis]) -> list[Hypothe
     found: dict[str, Hypothesis] = {}
     for other in others:
         name = other.candidate.name
-        if name != taken.candidate.name and not other.at_bound and name not in found and _as_good(taken, other):
+        possible = not other.at_bound and not other.tolerable
+        if name != taken.candidate.name and possible and name not in found and _as_good(taken, other):
             found[name] = other
     return list(found.values())
 
@@ -112,18 +113,18 @@ def _as_good(taken: Hypothesis, other: Hypothesis) -> bool:
     return bool(other.gain > RIVAL * taken.gain and ahead.mean() < AGREED * spread)
 
 
-def detectable(scores: Sequence[Score]) -> dict[str, Detectable]:
+def detectable(scores: Sequence[Score], cost: float = 0.0) -> dict[str, Detectable]:
     """Return the smallest severity of every effect that would have been accepted, at the place where it is hardest to see.
 
-    First order: the gain of an effect grows with the square of its severity.
+    First order: the gain of an effect grows with the square of its severity. ``cost`` is that of the model without it.
     """
     found: dict[str, tuple[float, Detectable]] = {}
     for score in scores:
         if len(score.candidate.where) > 1:
             continue
-        amplitude = np.sqrt(LEAST_GAIN / max(float(np.diag(score.information).max()), 1e-12))
         start = score.start
         which = int(np.argmax(np.diag(score.information)))
+        amplitude = least_amplitude(score.candidate, score.information, which, cost)
         steps = np.zeros(len(start.directions))
         steps[min(which, len(steps) - 1)] = amplitude
         values = start.values(steps)

@@ -123,7 +123,7 @@ def analyse_problem(
         naming.fit.noise,
         problem.features(base.model.setting, fitted),
     )
-    shown = detectable(naming.rounds[-1].scores)
+    shown = detectable(naming.rounds[-1].scores, naming.fit.cost)
     verdict, groups = _verdict(naming), _equivalent(problem, naming)
     clock.stop()
     return Analysis(
@@ -249,7 +249,7 @@ def _evidence(problem: Problem, number: int, look: Round, fitted: Sequence[int])
             continue
         seen.add(score.candidate.name)
         values = score.candidate.parameters(score.values)
-        reason = "the known numbers imitate it" if score.own < 0.05 else "its response does not fit what is left"
+        reason = "the known numbers imitate it" if score.own < 0.05 else "it promises too little of what is left"
         entries.append(
             Evidence(
                 number, score.candidate.name, score.candidate.where, values, score.gain, score.gain, "screened out", reason

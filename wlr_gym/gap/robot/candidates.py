@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.effects import EFFECTS, PatchEffect
-from wlr_gym.gap.problem import Candidate, Probe, Start, Unknown
+from wlr_gym.gap.problem import Candidate, Probe, Start, Tolerance, Unknown
 from wlr_gym.gap.robot.quantities import REACH
 from wlr_gym.parameters import Parameters
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
@@ -34,6 +34,8 @@ _OF_JOINTS = (*_OF_LEGS, *_OF_WHEELS, tuple(JOINTS))
 LEAST = {("tyre_creep", "creep_speed"): 0.003}
 #: Periods per turn at which a ripple is looked for.
 ORDERS = range(1, 65)
+#: Periods that a joint must go through before a wave can be told from a bend.
+PERIODS = 1.5
 #: m; width of the strips of floor in which another friction is looked for.
 STRIP = 0.15
 #: Across, a patch has no end.
@@ -65,20 +67,23 @@ class _Part:
 @dataclass
 class _Lists:
     tolerances: Mapping[str, float]
+    drifting: Set[str]
     probes: list[Probe]
     candidates: list[Candidate]
 
     def add_known(self, name: str, where: Sequence[str], parts: Sequence[_Part], mu: float = 0.6) -> None:
         """Add an effect of :class:`_Part` s: its first guess needs no probe where the numbers have tolerances."""
         neutral = {unknown.name: unknown.neutral for unknown in unknowns(name, mu)}
-        directions, amounts, beyond = [], [], []
+        directions, amounts, tolerances = [], [], []
         for part in parts:
             if all(quantity in self.tolerances for quantity in part.quantities):
                 directions.append(part.quantities)
                 amounts.append(part.scale * self.tolerances[part.quantities[0]])
-                beyond.append(REACH * abs(amounts[-1]))
+                replaces = not isinstance(EFFECTS[name].parameters[part.parameter].neutral, float | int)
+                met = None if self.drifting & {*part.quantities} else Tolerance(part.quantities, amounts[-1], REACH, replaces)
+                tolerances.append(met)
             else:
-                beyond.append(0.0)
+                tolerances.append(None)
                 changed = {**neutral, part.parameter: neutral[part.parameter] + part.size}
                 directions.append((self.probe(name, where, changed, part.parameter),))
                 amounts.append(part.size)
@@ -87,7 +92,7 @@ class _Lists:
         def values(a: Array) -> tuple[float, ...]:
             return tuple(float(n + size * k) for n, size, k in zip(middle, amounts, a, strict=True))
 
-        self.add(name, where, [Start(tuple(directions), values)], mu, tuple(beyond))
+        self.add(name, where, [Start(tuple(directions), values)], mu, tuple(tolerances))
 
     def probe(self, name: str, where: Sequence[str], parameters: dict[str, float], note: str = "") -> str:
         key = " ".join([name, *where, note]).strip()
@@ -95,9 +100,15 @@ class _Lists:
         return key
 
     def add(
-        self, name: str, where: Sequence[str], starts: Iterable[Start], robot_mu: float = 0.6, beyond: tuple[float, ...] = ()
+        self,
+        name: str,
+        where: Sequence[str],
+        starts: Iterable[Start],
+        robot_mu: float = 0.6,
+        tolerances: tuple[Tolerance | None, ...] = (),
     ) -> None:
-        self.candidates.append(Candidate(name, tuple(where), unknowns(name, robot_mu), tuple(starts), beyond=beyond))
+        candidate = Candidate(name, tuple(where), unknowns(name, robot_mu), tuple(starts), tolerances=tolerances)
+        self.candidates.append(candidate)
 
 
 def unknowns(name: str, mu: float) -> tuple[Unknown, ...]:
@@ -113,7 +124,11 @@ def unknowns(name: str, mu: float) -> tuple[Unknown, ...]:
 
 
 def robot_candidates(
-    parameters: Parameters, tolerances: Mapping[str, float], measured: Sequence[Array], residuals: Sequence[Array]
+    parameters: Parameters,
+    tolerances: Mapping[str, float],
+    measured: Sequence[Array],
+    residuals: Sequence[Array],
+    drifting: Set[str] = frozenset(),
 ) -> tuple[list[Probe], list[Candidate]]:
     """Return probes and candidates beyond a calibrated model.
 
@@ -122,8 +137,9 @@ def robot_candidates(
         tolerances: of the quantities that calibration may move, by name.
         measured: (rows, signals) per run.
         residuals: of the model, (rows, signals) per run.
+        drifting: names of the quantities that drift: no effect hides in their tolerance.
     """
-    lists = _Lists(tolerances, [], [])
+    lists = _Lists(tolerances, drifting, [], [])
     mu = float(parameters["ground.mu_x"].mean())
     _friction_and_motors(lists)
     _backlash(lists)
@@ -206,6 +222,8 @@ def _ripple(lists: _Lists, measured: Sequence[Array], residuals: Sequence[Array]
     """One candidate per joint, at the period that its own residuals show best."""
     for joint in JOINTS:
         order = ripple_order(joint, measured, residuals)
+        if order is None:
+            continue
         amount = 0.05 if joint in LEGS else 0.02
         keys = [
             lists.probe(
@@ -224,21 +242,32 @@ def _ripple(lists: _Lists, measured: Sequence[Array], residuals: Sequence[Array]
         lists.candidates.append(Candidate("torque_ripple", (joint,), (*waves, period), (start,), convert=_ripple_parameters))
 
 
-def ripple_order(joint: str, measured: Sequence[Array], residuals: Sequence[Array]) -> float:
-    """Return the number of periods per turn that explains most of a joint's residuals of speed and effort."""
+def ripple_order(joint: str, measured: Sequence[Array], residuals: Sequence[Array]) -> float | None:
+    """Return the number of periods per turn that explains most of a joint's residuals of speed and effort.
+
+    Only of those of which the joint has gone through :data:`PERIODS` in some run: part of a wave is any bend. None where it has
+    hardly moved.
+    """
     angle = CHANNELS.index(f"pos_{joint}")
-    power = np.zeros(len(ORDERS))
+    covered = max(
+        (float(np.ptp(seen[known, angle])) for seen in measured if (known := np.isfinite(seen[:, angle])).any()), default=0
+    )
+    least = 2.0 * math.pi * PERIODS / max(covered, 1e-9)
+    orders = [order for order in ORDERS if order >= least]
+    if not orders:
+        return None
+    power = np.zeros(len(orders))
     for name in (f"vel_{joint}", f"eff_{joint}"):
         column = CHANNELS.index(name)
         for seen, residual in zip(measured, residuals, strict=True):
             known = np.isfinite(residual[:, column]) & np.isfinite(seen[:, angle])
             if known.sum() < 20:
                 continue
-            waves = np.exp(1j * np.outer(list(ORDERS), seen[known, angle]))
+            waves = np.exp(1j * np.outer(orders, seen[known, angle]))
             waves -= waves.mean(axis=1, keepdims=True)
             left = residual[known, column] - residual[known, column].mean()
             power += np.abs(waves @ left) ** 2 / np.maximum((np.abs(waves) ** 2).sum(axis=1), 1e-9)
-    return float(list(ORDERS)[int(np.argmax(power))])
+    return float(orders[int(np.argmax(power))])
 
 
 def _ground(lists: _Lists, mu: float, radius: float) -> None:

@@ -162,7 +162,8 @@ class RobotProblem:
         parameters = self.parameters([setting])
         tolerances = {quantity.name: quantity.sigma for quantity in self.quantities}
         measured = [self._measured[r] for r in runs]
-        probes, candidates = robot_candidates(parameters, tolerances, measured, residuals)
+        drifting = {quantity.name for quantity in self.quantities if quantity.drifts}
+        probes, candidates = robot_candidates(parameters, tolerances, measured, residuals, drifting)
         more, formulas = formula_candidates()
         possible = [probe for probe in (*probes, *more) if self._possible(setting, probe)]
         keys = {probe.key for probe in possible} | set(tolerances)
