@@ -165,7 +165,7 @@ def test_effects_that_meet_a_known_number_know_its_tolerance(tried, good):
     assert tolerable("friction_level", "ground", (0.6 - 2.4 * level,), ["ground.mu"], -2.5)
     assert not tolerable("friction_level", "ground", (0.6 - 2.6 * level,), ["ground.mu"], -2.5)
     assert not tolerable("backlash", "leg_lf", (1e-6,))
-    assert not tolerable("gyro_bias", "sensor", (0.002, 0.0, 0.0))  # a bias drifts
+    assert not tolerable("gyro_bias", "sensor", (1e-6, 0.0, 0.0))  # a bias drifts
 
 
 def test_places_are_places_of_the_effect(tried):

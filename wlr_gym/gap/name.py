@@ -142,8 +142,10 @@ class Naming:
 def within_tolerance(problem: Problem, model: Model) -> bool:
     """Whether the tolerances of the numbers that the last effect meets allow what number and effect do together."""
     candidate, values = model.effects[-1]
+    if not any(candidate.tolerances):
+        return False
     known = {q.name: (q, value) for q, value in zip(problem.quantities, model.quantities, strict=True)}
-    for unknown, value, tolerance in zip(candidate.unknowns, values, candidate.tolerances, strict=bool(candidate.tolerances)):
+    for unknown, value, tolerance in zip(candidate.unknowns, values, candidate.tolerances, strict=True):
         if tolerance is None:
             if abs(value - unknown.neutral) > NOTICED * unknown.step:
                 return False
@@ -154,7 +156,7 @@ def within_tolerance(problem: Problem, model: Model) -> bool:
                 shift = (now - quantity.nominal) / quantity.sigma + (value - unknown.neutral) / tolerance.size
             if abs(shift) > tolerance.reach:
                 return False
-    return bool(candidate.tolerances)
+    return True
 
 
 def shortlist(scores: Sequence[Score], cost: float = 0.0) -> list[Score]:
