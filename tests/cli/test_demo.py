@@ -1,32 +1,109 @@
-"""``wlr demo`` end to end, with a training far too short to learn."""
+"""``wlr demo`` end to end, as short as can be, and what it does when things are missing or somebody stops it."""
 
-import json
+import re
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 
-from wlr_gym.cli import main
+from wlr_gym.cli import INTERRUPTED, main
+from wlr_gym.demo import lanes
+from wlr_gym.demo.settings import Demo
+from wlr_gym.demo.stage import SKIPPED
+from wlr_gym.effects import load_patch
+from wlr_gym.runs import read_dataset
 
-pytest.importorskip("torch")
+COMMAND = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "demo", "--quick"]
+TITLES = [stage.title for stages in lanes.LANES.values() for stage in stages]
 
 
-def test_demo_writes_everything_and_runs_again(tmp_path, capsys):
+def test_the_whole_loop_ends_in_one_page(tmp_path, capsys):
+    for package in ("torch", "stable_baselines3", "onnxruntime", "dynamixel_sdk", "serial"):
+        pytest.importorskip(package)
     out = tmp_path / "demo"
-    arguments = ["demo", "--out", str(out), "--steps", "20000", "--episodes", "4", "--no-progress"]
-    assert main(arguments) == 0
-    assert main(arguments) == 0  # replaces the demo before
-    for name in ("card.md", "card.json", "learning_curve.png", "episode.png", "config.yaml", "run/policy/contract.json"):
-        assert (out / name).stat().st_size > 0, name
-    card = json.loads((out / "card.json").read_text())
-    assert list(card["policies"]) == ["PPO", "do_nothing", "untrained", "pid"]
-    last_line = capsys.readouterr().out.strip().splitlines()[-1]
-    assert last_line.startswith("done in")
-    assert "episode.png" in last_line
+    assert main(["demo", "--quick", "--out", str(out), "--seed", "0", "--no-progress"]) == 0
+    assert capsys.readouterr().out.strip().splitlines()[-1] == str(out / "demo.html")
+    page = (out / "demo.html").read_text()
+    assert all(f"<h2>{title}</h2>" in page.replace("&#x27;", "'") for title in TITLES)
+    assert not re.search(r'(src|href)="(?!data:)', page)  # all of it is inside
+    assert "http" not in re.sub(r'"data:[^"]*"', "", page)
+    assert page.count("data:image/png") >= 4
+    hidden = load_patch(out / "hidden.yaml").effects[0]
+    assert hidden.name.replace("_", " ") in page
+    assert len(read_dataset(out / "measured_runs").runs) == 3
+    assert (out / "gap" / "patch.yaml").is_file()
+    for table in re.findall(r"<table>.*?</table>", page, re.DOTALL):
+        assert "nan" not in table
+
+
+def test_what_is_not_installed_is_left_out_and_said(tmp_path, monkeypatch):
+    def missing(package, extra):
+        raise lanes.MissingPackageError(f"this needs the package '{package}': pip install 'wlr-gym[{extra}]'")
+
+    monkeypatch.setattr(lanes, "require_package", missing)
+    sent = []
+    for lane in lanes.LANES:
+        lanes.work(lane, Demo(tmp_path), sent.append)
+    sections = [message["section"] for message in sent if "section" in message]
+    assert [one["title"] for one in sections] == TITLES
+    assert [one["verdict"] for one in sections[:3]] == [SKIPPED] * 3
+    assert "pip install &#x27;wlr-gym[train]&#x27;" in sections[0]["html"]
+    assert "the robot was not driven" in sections[3]["html"]
+    assert "no result of the gap workflow" in sections[4]["html"]
+
+
+def test_a_stage_that_fails_does_not_take_the_others_with_it(tmp_path, monkeypatch, capsys):
+    def broken(demo, tell):
+        raise RuntimeError("boom")
+
+    monkeypatch.setattr(lanes, "LANES", {"one": (lanes.Stage("bad", broken, 0.5), lanes.Stage("good", _good, 0.5))})
+    sent = []
+    lanes.work("one", Demo(tmp_path), sent.append)
+    bad, good = (message["section"] for message in sent if "section" in message)
+    assert (bad["verdict"], good["verdict"]) == (lanes.FAILED, "shown")
+    assert "RuntimeError: boom" in bad["html"]
+    assert "RuntimeError: boom" in capsys.readouterr().err
+
+
+def _good(demo, tell):
+    tell("working", 0.5)
+    return lanes.Section("good", "it works", "<p>fine</p>")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+def test_ctrl_c_leaves_what_was_made(tmp_path):
+    pytest.importorskip("torch")
+    out = tmp_path / "demo"
+    process = subprocess.Popen(
+        [*COMMAND, "--steps", "50_000_000", "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    curve = out / "run" / "learning_curve.csv"
+    deadline = time.monotonic() + 120.0
+    while not curve.is_file() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    said, trouble = process.communicate(timeout=60)
+    assert process.returncode == INTERRUPTED, trouble
+    assert said.strip().splitlines()[-1] == str(out / "demo.html")
+    page = (out / "demo.html").read_text()
+    assert "Stopped before it was over" in page
+    assert "Not reached: the demo was stopped." in page
+    assert list((out / "run" / "checkpoints").glob("step_*"))  # the policy so far
+
+
+def test_bad_options(tmp_path, capsys):
+    assert main(["demo", "--seed", "-1", "--out", str(tmp_path / "a")]) == 2
+    assert main(["demo", "--steps", "0", "--out", str(tmp_path / "a")]) == 2
+    assert not (tmp_path / "a").exists()
+    assert "--seed -1: expected 0 or more" in capsys.readouterr().err
 
 
 def test_demo_does_not_remove_what_is_not_its_own(tmp_path, capsys):
-    mine = tmp_path / "demo" / "run" / "thesis.txt"
-    mine.parent.mkdir(parents=True)
+    mine = tmp_path / "demo" / "thesis.txt"
+    mine.parent.mkdir()
     mine.write_text("years of work")
     assert main(["demo", "--out", str(tmp_path / "demo")]) == 2
-    assert "in the way" in capsys.readouterr().err
+    assert "'thesis.txt' is in the way" in capsys.readouterr().err
     assert mine.read_text() == "years of work"

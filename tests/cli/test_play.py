@@ -13,9 +13,9 @@ from PIL import Image
 from wlr_gym.cli import main
 from wlr_gym.cli import play as play_module
 from wlr_gym.evaluation import make_core
-from wlr_gym.evaluation.film import film, film_length
+from wlr_gym.evaluation.film import Journey, drive, film, film_length
 from wlr_gym.policy import make_policy
-from wlr_gym.render.teleop import RESET, UP
+from wlr_gym.render.teleop import RESET, UP, Script
 from wlr_gym.render.view import View
 
 
@@ -49,10 +49,35 @@ def test_evaluate_writes_policy_and_baseline_side_by_side(tmp_path, capsys, grap
         assert image.size[0] == 2 * 640 + 4
 
 
+def test_two_policies_side_by_side_with_their_paths(tmp_path, capsys, graphics, headless):
+    path = tmp_path / "film.webp"
+    arguments = ["--agent", "pid", "--beside", "do_nothing", "--seconds", "0.4", "--fps", "10", "--command", "0.1,0", "--path"]
+    assert main(["play", "--video", str(path), *arguments, "--size", "96", "64"]) == 0
+    assert f"written: {path}" in capsys.readouterr().out
+    with Image.open(path) as image:
+        assert (image.n_frames, image.size[0]) == (4, 2 * 96 + 4)
+
+
+def test_a_path_is_where_the_robot_went_and_where_it_was_told_to_go():
+    core = make_core("WLR-Velocity-v0", 1, {"randomization": "none"})
+    policy, path = make_policy("do_nothing", core.contract()), Journey()
+    for _, _ in zip(drive(core, policy, 0, Script("0.1,0.2", core.task.commands)), range(101), strict=False):
+        path.note(core)
+    wanted, driven = (trail.points for trail in path.trails())
+    core.close()
+    start, turn, speed = driven[0], 2.0 * 0.2, 0.1
+    circle = start + speed / 0.2 * np.array([np.sin(turn), 1.0 - np.cos(turn)])  # it starts along x
+    np.testing.assert_allclose(wanted[-1], circle, atol=0.002)
+    assert np.abs(driven - start).max() < 0.01  # this one stays where it is
+    assert len(wanted) == len(driven) == 101
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         ([], "no display here"),
+        (["--beside", "pid"], "--beside: two robots are shown in a video only"),
+        (["--video", "film.webp", "--fps", "0"], "--fps 0: expected 1 to 1000"),
         (["--video", "film.avi"], "--video film.avi: expected a file that ends in"),
         (["--video", "nowhere/film.webp"], "--video nowhere/film.webp: folder nowhere does not exist"),
         (["--video", "film.webp", "--seconds", "-1"], "--seconds -1: expected more than 0"),

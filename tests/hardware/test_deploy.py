@@ -23,6 +23,7 @@ from wlr_gym.evaluation.deployment import deploy as drive
 from wlr_gym.hardware.log import read_events
 from wlr_gym.policy import make_policy
 from wlr_gym.runs.read import read_run
+from wlr_gym.runs.replay import replay
 
 ID = "WLR-Velocity-v0"
 COMMAND = {"linear_velocity_x": 0.08, "yaw_rate": 0.15}
@@ -45,6 +46,19 @@ class Wobble:
 
     def reset(self, mask):
         self.state = np.zeros(8, np.float32)
+
+
+def run_of(core):
+    """Drive with the PID controller, close, and return the log."""
+    result = drive(core, make_policy("pid", core.contract()), seed=1, command=COMMAND)
+    core.close()
+    assert result.run is not None
+    return read_run(result.run)
+
+
+def tired_core(folder):
+    hardware = {"emulated": True, "log": folder, "effects": "tired_battery"}
+    return make_core(ID, 1, {"backend": "dynamixel", "hardware": hardware, "episode_length": 2.0})
 
 
 # ---- deploying ---------------------------------------------------------------------------------------------------------
@@ -156,6 +170,25 @@ def test_simulators_are_no_robots():
     core.close()
 
 
+def test_a_policys_run_is_replayed_from_its_first_tick(tmp_path):
+    """The robot drives off at once: the effort of that is no tension that it stood under before."""
+    core = robot_core(tmp_path)
+    errors = replay(run_of(core)).errors
+    assert max(error.segment_rms / error.noise for error in errors.values()) < 8.0  # else 140
+    assert errors["gyro_z"].segment_rms < 2.0 * errors["gyro_z"].noise
+
+
+def test_an_emulated_robot_may_hide_something(tmp_path):
+    """Effects act on what is emulated; environment and policy are not told."""
+    runs = {}
+    for name, core in (("sound", robot_core(tmp_path / "sound", 2.0)), ("tired", tired_core(tmp_path / "tired"))):
+        runs[name] = run_of(core)
+        assert not core.patch.effects
+    assert runs["tired"]["volt"].mean() < runs["sound"]["volt"].mean() - 0.2
+    with pytest.raises(InputError, match="a real robot has its own"):
+        make_core(ID, 1, {"backend": "dynamixel", "hardware": {"effects": "tired_battery"}})
+
+
 # ---- command line ------------------------------------------------------------------------------------------------------
 
 
@@ -196,6 +229,7 @@ def test_command_line_dry_run(tmp_path):
         (["--port", "legs=/dev/x"], "brings its own ports"),
         (["--fault", "dorp"], "unknown fault 'dorp'"),
         (["--hardware", "nominl"], "nominal"),
+        (["--effects", "tired_batery"], "did you mean 'tired_battery'"),
     ],
 )
 def test_command_line_bad_options(tmp_path, more, message):
@@ -206,6 +240,8 @@ def test_command_line_bad_options(tmp_path, more, message):
 def test_faults_are_for_the_emulated_robot(tmp_path):
     with pytest.raises(InputError, match="add --emulated"):
         run_command("deploy", ["pid", "--fault", "drop"])
+    with pytest.raises(InputError, match="add --emulated"):
+        run_command("deploy", ["pid", "--effects", "tired_battery"])
     with pytest.raises(InputError, match="cannot be opened"):
         run_command("deploy", ["pid", "--yes", "--port", f"legs={tmp_path}/none", "--out", str(tmp_path)])
 

@@ -29,6 +29,31 @@ def lay_patch(parameters, index, mu, x, y):
         parameters[f"patch.{name}"][:, index] = value
 
 
+# ---- paths ----
+
+
+def test_a_path_lies_where_it_was_driven(new_scene, parameters):
+    scene = new_scene(View(size=(320, 240), camera="top", text=False))
+    points = np.stack([np.linspace(-0.5, 0.5, 101), np.full(101, 0.3)], axis=1)
+    truth = truth_of(parameters)
+    picture = scene.draw(truth, parameters, trails=[marks.Trail(points, (1.0, 0.0, 0.0))])
+    red, green, _ = at(picture, scene, [0.2, 0.3, 0.0])
+    assert red > 1.5 * green
+    red, green, _ = at(picture, scene, [0.2, 0.4, 0.0])
+    assert red < 1.2 * green
+    assert np.array_equal(scene.draw(truth, parameters), scene.draw(truth, parameters, trails=[]))
+
+
+def test_pieces_of_a_path():
+    points = np.stack([np.linspace(0.0, 0.3, 31), np.zeros(31)], axis=1)
+    whole = marks.pieces(marks.Trail(points, (0.0, 0.0, 0.0)))
+    assert whole[0].start[0] == 0.0
+    assert whole[-1].end[0] == pytest.approx(0.3)
+    assert sum(np.hypot(*(one.end - one.start)[:2]) for one in whole) == pytest.approx(0.3)
+    assert len(marks.pieces(marks.Trail(points, (0.0, 0.0, 0.0), dashed=True))) == (len(whole) + 1) // 2
+    assert marks.pieces(marks.Trail(points[:1], (0.0, 0.0, 0.0))) == []
+
+
 # ---- the picture ----
 
 

@@ -329,6 +329,12 @@ def test_dataset_is_read_in_the_order_of_the_numbers(tmp_path, table):
     assert data.meta.ground == "mat"
 
 
+def test_a_policys_log_beside_a_run_is_no_run(tmp_path, table):
+    write_run(tmp_path / "run_01.csv", table)
+    (tmp_path / "run_01.policy.csv").write_text("command_yaw_rate,action_leg_lf\n0.1,0.2\n")
+    assert [run.name for run in read_dataset(tmp_path).runs] == ["run_01"]
+
+
 def test_dataset_refuses_what_is_no_data_set(tmp_path, table):
     with pytest.raises(InputError, match="no such folder"):
         read_dataset(tmp_path / "nowhere")

@@ -1,138 +1,99 @@
-"""The main job end to end: train PPO, evaluate it against baselines on floors of random friction, draw the pictures."""
+"""The whole loop in about three minutes: learn, drive on ice, find the hidden fault of a robot, prove it; ends with one page.
+
+A policy learns; slip-aware and blind drive on the same ice; an emulated robot with a hidden fault is driven; the gap workflow
+names the fault; the patched simulator agrees with the robot again. All pictures are in the page, demo.html.
+
+Uses two cores. Parts whose packages are not installed are left out, and the page says how to install them; Ctrl-C leaves what
+was made until then.
+"""
 
 from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-from rich.console import Console
-
-from wlr_gym.cli import OK
-from wlr_gym.cli.evaluate import print_card, progress
-from wlr_gym.cli.options import EffectsOption
-from wlr_gym.cli.train import add_effects
-from wlr_gym.envs.core import make_task
-from wlr_gym.envs.registry import task_name_of
-from wlr_gym.envs.settings import read_settings
-from wlr_gym.errors import InputError, require_package
-from wlr_gym.evaluation import (
-    FIRST_SEED,
-    MAIN,
-    Card,
-    Condition,
-    Rollout,
-    Subject,
-    play,
-    read_curve,
-    read_subjects,
-    work,
-    write_card,
-)
+from wlr_gym.cli import FAILED, INTERRUPTED, OK
+from wlr_gym.cli.progress import progress
+from wlr_gym.errors import InputError
 from wlr_gym.files import make_output_folder
-from wlr_gym.policy import Training, load_agent, load_agent_config
 from wlr_gym.provenance import PROVENANCE_FILE, record_provenance
 
-ENVIRONMENT = "WLR-Velocity-v0"
-BASELINES = ("do_nothing", "untrained", "pid")
-EPISODES = 64
-FILES = ("run/policy", "card.md", "card.json", "learning_curve.png", "episode.png")
-#: More than the usual training time; a slow machine stops here, with a policy that has learnt less.
-MAX_TRAINING_SECONDS = 120.0
+if TYPE_CHECKING:
+    from wlr_gym.demo.settings import Demo
+    from wlr_gym.demo.stage import Section
+
+STEPS, QUICK_STEPS = 3_000_000, 16_384
 
 
 @dataclass(frozen=True)
-class Options(EffectsOption):
+class Options:
     out: Path = Path("out/demo")
-    """Folder for the policy, the score card and the pictures; a demo already in it is replaced."""
-    steps: int | None = None
-    """Control ticks to train for, all robots together; default: that of configs/agent/ppo.yaml."""
-    episodes: int = EPISODES
-    """Episodes per policy in the evaluation."""
+    """Folder for the page and everything it was made from; a demo already in it is replaced."""
     seed: int = 0
-    """Seed of the training."""
+    """Seed of everything random: training, episodes, and what the robot hides."""
+    steps: int | None = None
+    """Control ticks to train for, all robots together; default: three million."""
+    quick: bool = False
+    """Everything as short as can be, to see that it works: nothing is learnt, and nothing need be found."""
     progress: bool = True
-    """Show progress bars."""
+    """Show progress and the remaining time."""
 
 
 def run(options: Options) -> int:
-    """Train, evaluate, draw, and name the files."""
-    require_package("torch", "train")
-    require_package("stable_baselines3", "train")
-    options.patch()  # a bad one is refused before anything is written
-    make_output_folder(options.out)
-    began = time.monotonic()
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(f"[bold]1/3 train[/] PPO on {ENVIRONMENT}: follow commands of forward velocity and yaw rate")
-    policy = _train(options)
-    console.print(f"[bold]2/3 evaluate[/] {options.episodes} new episodes on floors of random friction, the same for all")
-    rollouts = _evaluate(options, policy)
-    console.print("[bold]3/3 draw[/] learning curve and an episode")
-    _draw(options.out, rollouts)
-    console.print(f"done in {time.monotonic() - began:.0f} s; in {options.out}: {', '.join(FILES)}")
-    return OK
+    """Run all stages, write the page; the path of the page is the last line.
+
+    Raises:
+        InputError: bad options, or a folder that holds anything else.
+    """
+    from rich.console import Console
+
+    from wlr_gym.demo.lanes import LANES, run_lanes
+    from wlr_gym.demo.page import write_page
+    from wlr_gym.gap.words import duration
+
+    demo = _demo(options)
+    _clear(demo.out)
+    record_provenance(demo.out, {"seed": demo.seed, "steps": demo.steps, "quick": options.quick}, demo.seed)
+    console, began = Console(highlight=False, soft_wrap=True), time.monotonic()
+    console.print("A policy learns; slip-aware and blind drive on ice; a robot hides a fault; the gap workflow looks for it.")
+    with progress(console, tuple(LANES), options.progress) as tell:
+        outcome = run_lanes(demo, tell)
+    write_page(demo, outcome.sections, outcome.interrupted)
+    for one in outcome.sections:
+        console.print(f"{one.title}: {one.headline or one.verdict}", markup=False)
+    console.print(f"{'stopped' if outcome.interrupted else 'done'} after {duration(time.monotonic() - began)}; the page:")
+    console.print(str(demo.page), markup=False)
+    return INTERRUPTED if outcome.interrupted else _code(outcome.sections)
 
 
-def _train(options: Options) -> Path:
-    config = load_agent_config("ppo") | {"seed": options.seed}
-    if options.steps is not None:
-        config["total_steps"] = options.steps
-    add_effects(config, options.patch())
-    _clear(options.out / "run")
-    record_provenance(options.out, {"environment": ENVIRONMENT, "agent": "ppo", "settings": config}, options.seed)
-    training = Training(ENVIRONMENT, options.out / "run", config, max_seconds=MAX_TRAINING_SECONDS, progress=options.progress)
-    return load_agent("ppo").train(training)
+def _demo(options: Options) -> Demo:
+    from wlr_gym.demo.settings import Demo
+
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: expected 0 or more")
+    if options.steps is not None and options.steps < 1:
+        raise InputError(f"--steps {options.steps}: expected 1 or more")
+    steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
+    short = {"episodes": 4, "film_seconds": 0.4, "run_seconds": 3.2, "runs": 3} if options.quick else {}
+    return Demo(options.out, options.seed, steps, **short)
 
 
-def _evaluate(options: Options, policy: Path) -> dict[str, Rollout]:
-    patch = options.patch()
-    keywords = {"precision": "float32", "effects": patch}  # precision as in training: the engine is compiled once
-    condition = Condition(MAIN, keywords, episodes=options.episodes)
-    subjects = [Subject("PPO", (str(policy),)), *read_subjects(BASELINES)]
-    rollouts: dict[str, Rollout] = {}
+def _code(sections: list[Section]) -> int:
+    from wlr_gym.demo import stage
 
-    def watch(condition: Condition, subject: Subject, block: int, rollout: Rollout) -> None:
-        rollouts[subject.name] = rollout
-
-    ticks = make_task(task_name_of(ENVIRONMENT), read_settings(keywords)).episode_ticks
-    with progress(work([condition], subjects, ticks), options.progress) as tell:
-        results = play(ENVIRONMENT, subjects, [condition], tell=tell, watch=watch)
-    said = {"environment": ENVIRONMENT, "episodes": options.episodes, "first seed": FIRST_SEED, "effects": patch.summary()}
-    card = Card(results, conditions=said)
-    print_card(card)
-    write_card(options.out, card)
-    return rollouts
-
-
-def _draw(folder: Path, rollouts: Mapping[str, Rollout]) -> None:
-    from wlr_gym.evaluation import plots
-
-    curve = read_curve(folder / "run" / "learning_curve.csv")
-    references = {name: reward_per_second(rollouts[name]) for name in BASELINES}
-    plots.save(plots.learning_curve(curve, references), folder / "learning_curve.png")
-    trained = rollouts["PPO"]
-    chosen = liveliest(trained)
-    title = f"Trained policy, episode of seed {trained.seeds[chosen]}, friction {trained.friction[chosen].mean():.2f}"
-    plots.save(plots.episode(trained, chosen, title), folder / "episode.png")
-
-
-def reward_per_second(rollout: Rollout) -> float:
-    """Return the mean reward per second over all episodes."""
-    return float(rollout.reward[rollout.active].mean() / rollout.control_period)
-
-
-def liveliest(rollout: Rollout) -> int:
-    """Return the episode that was asked for the most driving and turning: the most to see."""
-    largest = np.maximum(np.abs(rollout.command).max(axis=(0, 1)), 1e-9)
-    effort = (np.abs(rollout.command) / largest).sum(axis=-1)
-    return int(np.argmax(np.where(rollout.active, effort, 0.0).sum(axis=0)))
+    return FAILED if any(one.verdict == stage.FAILED for one in sections) else OK
 
 
 def _clear(folder: Path) -> None:
-    """Remove the run of an earlier demo; anything else that is in the way is refused."""
-    if folder.exists() and not (folder / PROVENANCE_FILE).is_file():
-        raise InputError(f"{folder}: in the way, and not the run of an earlier demo; give another --out")
-    shutil.rmtree(folder, ignore_errors=True)
+    """Make the folder anew; one that holds anything but a demo is refused."""
+    make_output_folder(folder)
+    inside = list(folder.iterdir())
+    if inside and not (folder / PROVENANCE_FILE).is_file():
+        raise InputError(
+            f"{folder}: '{inside[0].name}' is in the way, and this is not the folder of a demo; give another --out"
+        )
+    for path in inside:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import tyro
 from rich.console import Console
 
-from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import environment_of
+from wlr_gym.cli import FAILED, IMPORTED, OK
+from wlr_gym.cli.options import EffectsOption, environment_of
 from wlr_gym.cli.robot_options import wait_for_enter
 from wlr_gym.errors import InputError
 
@@ -32,7 +32,7 @@ _STATUS_TICKS = 10
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(EffectsOption):
     policy: tyro.conf.Positional[str]
     """Policy file or folder, run folder, or name of an agent or shipped policy."""
     env: str | None = None
@@ -88,6 +88,7 @@ def run(options: Options) -> int:
             "hardware": options.hardware,
             "ports": ports,
             "emulated": options.emulated and options.stepped,
+            "effects": options.patch() if options.stepped else None,
             "dry_run": options.dry_run,
             "log": options.out,
             "deadman": options.deadman,
@@ -121,6 +122,9 @@ def _check(options: Options) -> dict[str, float]:
         raise InputError(f"--deadman {options.deadman:g}: expected more than 0")
     if not options.emulated and (options.stepped or options.fault):
         raise InputError("--stepped and --fault are for the emulated robot: add --emulated")
+    if options.effects and not options.emulated:
+        raise InputError("--effects: a real robot has its own; add --emulated")
+    options.patch()  # a bad one is refused before a robot is started for it
     if options.emulated and options.port:
         raise InputError("--port: the emulated robot brings its own ports")
     commands = _pairs("--command", options.command)
@@ -158,7 +162,11 @@ def _emulator(options: Options, console: Console) -> Iterator[dict[str, str]]:
         words = ["--links", str(links), "--hardware", options.hardware]
         for fault in options.fault:
             words += ["--fault", fault]
-        command = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "emulate", *words]
+        if options.effects:
+            words += ["--effects", *options.effects]
+        modules = [word for module in IMPORTED for word in ("--import", module)]
+        main = "import sys; from wlr_gym.cli import main; sys.exit(main())"
+        command = [sys.executable, "-c", main, *modules, "emulate", *words]
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
         )

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -242,22 +244,15 @@ def _record(options: Options, subject: Subject, folder: Path, keywords: Mapping[
 
 def _film(options: Options, subjects: Sequence[Subject], path: Path, keywords: Mapping[str, Any]) -> None:
     """Write the first episode of up to two subjects, side by side."""
-    from wlr_gym.evaluation.film import film, film_length
-    from wlr_gym.render import side_by_side, write_video
+    from wlr_gym.evaluation.film import film_beside
 
-    players = []
-    try:
-        for subject in subjects:
-            players.append(make_player(str(options.env), subject.sources[0], 1, keywords))
-        count, _, fps = film_length(players[0][0], options.video_seconds)
-        films = [film(core, policy, options.seed, options.video_seconds) for core, policy in players]
-        names = [subject.name for subject in subjects]
-        pictures = side_by_side(films[0], films[1], (names[0], names[1])) if len(films) == 2 else films[0]
-        with Progress(transient=True, disable=not options.progress) as bar:
-            write_video(path, bar.track(pictures, count, description="drawing"), fps, count)
-    finally:
-        for core, _ in players:
-            core.close()
+    with Progress(transient=True, disable=not options.progress) as bar:
+
+        def watch(pictures: Iterable[NDArray[np.uint8]], count: int) -> Iterable[NDArray[np.uint8]]:
+            return bar.track(pictures, count, description="drawing")
+
+        seconds = options.video_seconds
+        film_beside(path, str(options.env), subjects, options.seed, seconds, keywords, watch=watch)
     print(f"written: {path}")
 
 

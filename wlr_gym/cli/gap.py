@@ -7,10 +7,9 @@ docs/gap.md says how to read the report.
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,15 +17,13 @@ import tyro
 
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.progress import progress
 from wlr_gym.errors import InputError, unknown_name
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from wlr_gym.gap.analysis import Analysis
-
-#: Share of the work that must be done before the remaining time is shown.
-LEAST_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -62,7 +59,7 @@ def run(options: Options) -> int:
     known = options.patch()
     check_folder(options.out)
     console = Console(soft_wrap=True, highlight=False)
-    with _progress(console) as tell:
+    with progress(console) as tell:
         analysis = analyse(
             options.data,
             options.out,
@@ -71,7 +68,7 @@ def run(options: Options) -> int:
             backend=options.backend,
             heldout=options.heldout,
             threads=options.threads or os.cpu_count() or 1,
-            tell=tell,
+            tell=partial(tell, ""),
         )
     settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
     record_provenance(options.out, settings | {"heldout": list(options.heldout), "effects": known.content()["effects"]})
@@ -93,37 +90,6 @@ def _check(options: Options) -> None:
         raise InputError(f"--rig {options.rig}: the rig has a simulator of its own: leave --backend out")
     if options.threads is not None and options.threads < 1:
         raise InputError(f"--threads {options.threads}: expected 1 or more")
-
-
-@contextmanager
-def _progress(console: Console) -> Iterator[Callable[[str, float], None]]:
-    """Show the stage, the share done and the remaining time; without a terminal, a line per stage."""
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
-        TextColumn("{task.fields[left]}"),
-    )  # fmt: skip
-    begin, last = time.monotonic(), [""]
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("reading", total=1.0, left="")
-
-        def tell(text: str, share: float) -> None:
-            left = _left(time.monotonic() - begin, share)
-            bar.update(task, description=text, completed=share, left=left)
-            stage = text.partition(":")[0]
-            if not console.is_terminal and stage != last[0]:
-                console.print(f"{100.0 * share:3.0f} %  {stage}{left and '; '}{left}", markup=False)
-            last[0] = stage
-
-        yield tell
-
-
-def _left(passed: float, share: float) -> str:
-    """Return the remaining time in words; empty while nobody can know."""
-    from wlr_gym.gap.words import duration
-
-    return f"about {duration(passed * (1.0 - share) / share)} left" if share >= LEAST_SHARE and passed > 1.0 else ""
 
 
 # ---- the summary -----------------------------------------------------------------------------------------------------

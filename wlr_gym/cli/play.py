@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 #: s; length of a video unless asked otherwise.
 SECONDS = 10.0
+#: Pictures per second of a video.
+FPS = 25.0
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class Options(EffectsOption):
     """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
     agent: str = "pid"
     """Policy file or folder, run folder, or name of an agent or shipped policy."""
+    beside: str | None = None
+    """A second one, in the same episode, beside the first in a video."""
     backend: str = "gibbs_appell"
     """Simulator."""
     randomization: str | None = None
@@ -49,12 +53,16 @@ class Options(EffectsOption):
     """Write a video (.webp, .gif, .png, .mp4) instead of opening a window; without --command, the task's own commands."""
     seconds: float | None = None
     """Length; default: 10 s of video, or until the window is closed."""
+    fps: float = FPS
+    """Pictures per second of a video, where the control period allows."""
     camera: str = "follow"
     """follow, chase, side or top."""
     size: tuple[int, int] = (640, 480)
     """Width and height of the video, pixels."""
     forces: bool = False
     """Also draw the friction force on each wheel."""
+    path: bool = False
+    """In a video: also draw where the robot went and where its commands would have taken it."""
 
 
 def run(options: Options) -> int:
@@ -63,13 +71,15 @@ def run(options: Options) -> int:
     from wlr_gym.policy import make_policy, policy_environment
 
     _check(options)
-    keywords = {name: getattr(options, name) for name in ("backend", "randomization", "robot")}
-    keywords |= {"effects": options.patch()} | policy_environment(options.agent)
-    core = make_core(environment_of(options.env, options.agent), 1, keywords)
+    keywords: dict[str, Any] = {name: getattr(options, name) for name in ("backend", "randomization", "robot")}
+    keywords["effects"] = options.patch()
+    core = make_core(environment_of(options.env, options.agent), 1, keywords | policy_environment(options.agent))
     try:
         policy = make_policy(options.agent, core.contract())
         driver = _driver(options, core)
-        if options.video is not None:
+        if options.beside is not None:
+            _film_beside(options, keywords)
+        elif options.video is not None:
             _film(options, core, policy, driver)
         else:
             show(options, core, policy, driver)
@@ -85,9 +95,13 @@ def _check(options: Options) -> None:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
     if options.seconds is not None and not 0 < options.seconds < float("inf"):
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
+    if not 1 <= options.fps <= 1000:
+        raise InputError(f"--fps {options.fps:g}: expected 1 to 1000")
     if options.gamepad and (options.command is not None or options.video is not None):
         raise InputError("--gamepad drives in the window: leave out --command and --video")
     _view(options)
+    if options.beside is not None and options.video is None:
+        raise InputError("--beside: two robots are shown in a video only: add --video")
     if options.video is not None:
         check_video(options.video)
     else:
@@ -95,7 +109,7 @@ def _check(options: Options) -> None:
 
 
 def _view(options: Options) -> View:
-    return View(size=options.size, camera=options.camera, forces=options.forces)
+    return View(size=options.size, camera=options.camera, forces=options.forces, path=options.path)
 
 
 def _driver(options: Options, core: Core) -> Driver | None:
@@ -138,11 +152,34 @@ def _film(options: Options, core: Core, policy: Policy, driver: Driver | None) -
 
     assert options.video is not None
     seconds = SECONDS if options.seconds is None else options.seconds
-    count, _, fps = film_length(core, seconds)
+    count, _, fps = film_length(core, seconds, options.fps)
     title = f"{options.agent} on {core.plant.capabilities.name}"
-    pictures = film(core, policy, options.seed, seconds, view=_view(options), driver=driver, title=title)
+    pictures = film(core, policy, options.seed, seconds, view=_view(options), driver=driver, title=title, fps=options.fps)
     write_video(options.video, track(pictures, total=count, description="drawing", transient=True), fps, count)
     print(f"written: {options.video} ({count} pictures, {count / fps:g} s)")
+
+
+def _film_beside(options: Options, keywords: dict[str, Any]) -> None:
+    from rich.progress import track
+
+    from wlr_gym.evaluation import read_subjects
+    from wlr_gym.evaluation.film import film_beside
+
+    assert options.video is not None
+    assert options.beside is not None
+    film_beside(
+        options.video,
+        environment_of(options.env, options.agent),
+        read_subjects([options.agent, options.beside]),
+        options.seed,
+        SECONDS if options.seconds is None else options.seconds,
+        keywords,
+        view=_view(options),
+        schedule=options.command,
+        fps=options.fps,
+        watch=lambda pictures, count: track(pictures, total=count, description="drawing", transient=True),
+    )
+    print(f"written: {options.video}")
 
 
 def show(options: Options, core: Core, policy: Policy, driver: Driver | None, open: OpenWindow | None = None) -> None:

@@ -51,23 +51,17 @@ class HardwareOption:
         Raises:
             InputError: a patch for a real robot.
         """
-        from wlr_gym.hardware.link import emulated_link, serial_link
+        from wlr_gym.hardware.link import emulated_link, emulated_robot, serial_link
 
         if not self.emulated:
             if patch is not None and patch.effects:
                 raise InputError("--effects: a real robot has its own; they are for simulators and the emulated robot")
             return serial_link(robot, hardware)
-        from wlr_gym.effects import apply_patch
-        from wlr_gym.hardware.emulator import Machine, MachineOptions
-        from wlr_gym.hardware.emulator.line import NO_TIME
-        from wlr_gym.parameters import Parameters
+        if patch is not None:
+            return emulated_robot(robot, hardware, patch)
+        from wlr_gym.hardware.emulator import Machine
 
-        parameters = Parameters.nominal(robot)
-        if patch is None:
-            return emulated_link(Machine(robot, hardware))
-        options = MachineOptions(timing=NO_TIME)
-        machine = Machine(robot, hardware, options, parameters=apply_patch(patch, parameters), forces=patch.forces)
-        return emulated_link(machine)
+        return emulated_link(Machine(robot, hardware))
 
     def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
         """Return the robot as a plant, limp; every start is logged in a new run of ``log``."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from wlr_gym.errors import InputError
 from wlr_gym.evaluation.rollout import make_core
 from wlr_gym.policy import agent_names, find_policy, load_agent_config, make_policy, policy_environment
-from wlr_gym.tasks.task import overlay
+from wlr_gym.robot import overlay
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core

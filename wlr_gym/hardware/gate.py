@@ -228,6 +228,11 @@ class Gate:
         )
         return values.min(axis=0), values.max(axis=0)
 
+    @property
+    def written(self) -> Array:
+        """Last goals (8,) as the servos' registers hold them: what they really follow."""
+        return self.__servos.joint_map.written(self._within_registers(self.goals))
+
     def _within_registers(self, goals: Array) -> Array:
         return np.clip(goals, self.frame.low, self.frame.high)
 

@@ -14,6 +14,7 @@ from wlr_gym.hardware.servos import Servos
 from wlr_gym.robot import Robot
 
 if TYPE_CHECKING:
+    from wlr_gym.effects.patch import Source
     from wlr_gym.hardware.emulator.machine import Machine
 
 
@@ -109,3 +110,26 @@ def emulated_link(machine: Machine) -> Link:
         lambda port, baud_rate, patience: MemoryPort(world, names[port], baud_rate, patience),
     )
     return Link(servos, MemoryImu(world, hardware.imu), world, is_serial=False, finish=machine.close)
+
+
+def emulated_robot(robot: Robot, hardware: Hardware, effects: Source = None, *, sensor_noise: bool = True) -> Link:
+    """Return a link to a new emulated robot whose lines and adapters take no time.
+
+    Args:
+        robot: the robot.
+        hardware: wiring and mounting.
+        effects: what the emulated robot has that its file does not say.
+        sensor_noise: of the simulator behind it.
+
+    Raises:
+        InputError: effects that cannot be read or that this robot cannot have.
+    """
+    from wlr_gym.effects import apply_patch, load_patch
+    from wlr_gym.hardware.emulator.line import NO_TIME
+    from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
+    from wlr_gym.parameters import Parameters
+
+    patch = load_patch(effects)
+    options = MachineOptions(timing=NO_TIME, sensor_noise=sensor_noise)
+    parameters = apply_patch(patch, Parameters.nominal(robot))
+    return emulated_link(Machine(robot, hardware, options, parameters=parameters, forces=patch.forces))

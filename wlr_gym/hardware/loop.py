@@ -428,7 +428,7 @@ class ControlLoop:
             self._write_row(self.log, view, decision)
 
     def _write_row(self, log: RunLog, view: View, decision: Any) -> None:
-        goals = np.where(self._gate.torque_on & (decision.level < Level.OFF), self._gate.goals, np.nan)
+        goals = np.where(self._gate.torque_on & (decision.level < Level.OFF), self._gate.written, np.nan)
         log.row(view.time, sensors_of(view, self._wheel_zero, self._started), goals)
         rules = {verdict.rule: {"level": verdict.level.name, "text": verdict.text} for verdict in decision.verdicts}
         rules |= {rule: {"joints": [JOINTS[k] for k in np.flatnonzero(mask)]} for rule, mask in decision.limited.items()}

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.errors import InputError
-from wlr_gym.hardware.config import load_hardware, with_ports
-from wlr_gym.hardware.link import Link, emulated_link, serial_link
+from wlr_gym.hardware.config import Hardware, load_hardware, with_ports
+from wlr_gym.hardware.link import Link, emulated_robot, serial_link
 from wlr_gym.hardware.log import sensors_of
 from wlr_gym.hardware.loop import ControlLoop
 from wlr_gym.parameters import Parameters
@@ -63,7 +63,7 @@ class RobotPlant:
             safety = description.safety.model_copy(update={"deadman": chosen.deadman})
             description = description.model_copy(update={"safety": safety})
         if link is None:
-            link = _emulate(robot, description, self.options) if chosen.emulated else serial_link(robot, description)
+            link = _link(robot, description, chosen, self.options)
         self.loop = ControlLoop(
             robot,
             description,
@@ -159,11 +159,7 @@ class RobotPlant:
         self.loop.close()
 
 
-def _emulate(robot: Robot, hardware: object, options: PlantOptions) -> Link:
-    from wlr_gym.hardware.config import Hardware
-    from wlr_gym.hardware.emulator import Machine, MachineOptions
-    from wlr_gym.hardware.emulator.line import NO_TIME
-
-    assert isinstance(hardware, Hardware)
-    machine = Machine(robot, hardware, MachineOptions(timing=NO_TIME, sensor_noise=options.sensor_noise))
-    return emulated_link(machine)
+def _link(robot: Robot, hardware: Hardware, chosen: RobotOptions, options: PlantOptions) -> Link:
+    if not chosen.emulated:
+        return serial_link(robot, hardware)
+    return emulated_robot(robot, hardware, chosen.effects, sensor_noise=options.sensor_noise)

@@ -75,6 +75,11 @@ class JointMap:
         counts = self._sign * values / np.where(legs, self._position, self._velocity) + np.where(legs, self._zero, 0.0)
         return np.rint(counts).astype(np.int64)
 
+    def written(self, goals: ArrayLike) -> Array:
+        """Return goals (8,) as the registers hold them: rounded to whole counts, in rad and rad/s; see :meth:`goals`."""
+        counts = self.goals(goals)
+        return np.where(np.arange(len(JOINTS)) < len(LEGS), self.position(counts), self.velocity(counts))
+
 
 @dataclass(frozen=True)
 class JointReadings:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -276,6 +276,11 @@ class RobotOptions:
         log: folder for the logs of runs; None = none.
         guard: start the guard process, which switches torque off when this one is killed.
         deadman: s the operator may be silent; None = the hardware file's.
+        effects: what the emulated robot has that its file does not say, as ``effects=`` of a simulator; no environment,
+            policy or log is told of it.
+
+    Raises:
+        InputError: effects for a robot that is not emulated.
     """
 
     hardware: str | Path = "nominal"
@@ -285,6 +290,11 @@ class RobotOptions:
     log: Path | None = None
     guard: bool = True
     deadman: float | None = None
+    effects: Any = None
+
+    def __post_init__(self) -> None:
+        if self.effects and not self.emulated:
+            raise InputError("effects: a real robot has its own; they are for simulators and the emulated robot")
 
 
 def read_robot_options(given: object) -> RobotOptions:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,10 +22,10 @@ Rows = NDArray[np.intp]
 LIGHTEST_SHARE = 0.05
 
 
-class Simulator:
+class Simulator(ABC):
     """Base of the simulators; see :class:`wlr_gym.plants.base.Plant` for the contract.
 
-    A simulator ends its constructor with :meth:`_start`, and defines ``step`` and the methods that raise here.
+    A simulator ends its constructor with :meth:`_start`, and defines ``step`` and what is abstract here.
     """
 
     def __init__(self, robot: Robot, count: int, options: PlantOptions | None) -> None:
@@ -44,32 +46,32 @@ class Simulator:
     def _start(self) -> None:
         self.reset(seeds=np.zeros(self._count, np.uint64), parameters=self.parameters)
 
+    @abstractmethod
     def _use_parameters(self, rows: Rows, chosen: Parameters) -> None:
         """Hand checked parameters (len(rows)) of robots ``rows`` to the simulation."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _fit_rotors(self, rows: Rows, chosen: Parameters) -> None:
         """Move the rotors of gears whose play changes (:func:`refitted_lead`); a new rotor turns with its joint."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _write_state(self, state: PlantState, rows: Rows) -> None:
         """Put robots ``rows`` where ``state`` (N) says."""
-        raise NotImplementedError
 
+    @abstractmethod
     def get_state(self) -> PlantState:
         """Return a copy of the mechanical and servo state."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _look(self, rows: Rows) -> None:
         """Fill truth and raw sensor signals of robots ``rows``."""
-        raise NotImplementedError
 
-    def expect_all_effects(self) -> None:
+    def expect_all_effects(self) -> None:  # noqa: B027 (a simulator may have nothing to do)
         """Get ready for every effect at once, where each would otherwise need a kernel of its own; the bits do not change."""
 
+    @abstractmethod
     def set_force_values(self, values: Array) -> None:
         """Take the constants of the formula forces per robot: (N, constants of all forces one after the other)."""
-        raise NotImplementedError
 
     @property
     def count(self) -> int:

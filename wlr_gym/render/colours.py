@@ -11,6 +11,9 @@ FRICTION = ((0.0, (0.30, 0.62, 0.96)), (0.3, (0.62, 0.82, 0.90)), (0.6, (0.80, 0
 #: Slip speed (m/s) -> colour of its arrow.
 SLIP = ((0.0, (1.0, 0.85, 0.10)), (0.05, (1.0, 0.55, 0.05)), (0.2, (0.90, 0.08, 0.08)))
 FORCE: Colour = (0.10, 0.45, 0.15)
+#: Paths over the floor: as commanded, and as driven.
+WANTED: Colour = (0.10, 0.10, 0.12)
+DRIVEN: Colour = (0.95, 0.10, 0.55)
 
 
 def friction_colour(mu: float) -> Colour:

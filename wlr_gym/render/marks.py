@@ -1,4 +1,4 @@
-"""What is drawn besides the robot: areas of other friction, slip and force arrows. Nothing here needs OpenGL."""
+"""What is drawn besides the robot: areas of other friction, paths, slip and force arrows. Nothing here needs OpenGL."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo fills its namespace when it is imported.)
@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -28,6 +29,8 @@ BESIDE, BESIDE_SLIP_ARROWS = 0.022, 0.040
 #: m; areas are drawn on the floor this far around the robot.
 REACH = 15.0
 LAYER = 4e-4
+#: m: half the width of a trail, and the length of its pieces.
+LINE, PIECE = 0.004, 0.03
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,24 @@ class Area:
 @dataclass(frozen=True)
 class Arrow:
     """An arrow in the floor frame, m."""
+
+    start: Array
+    end: Array
+    colour: Colour
+
+
+@dataclass(frozen=True)
+class Trail:
+    """A path over the floor: points (N, 2), m, and colour; dashed = every second piece is left out."""
+
+    points: Array
+    colour: Colour
+    dashed: bool = False
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A straight piece of a trail, m."""
 
     start: Array
     end: Array
@@ -100,6 +121,20 @@ def spots(stage: Stage, parameters: Parameters, row: int) -> list[Spot]:
     return [Spot(point, float(value)) for point, value in zip(points, mu, strict=True)]
 
 
+def pieces(trail: Trail) -> list[Piece]:
+    """Return a trail as straight pieces of at least :data:`PIECE`."""
+    corners = [trail.points[:1]]
+    for point in trail.points[1:]:
+        if np.hypot(*(point - corners[-1][0])) >= PIECE:
+            corners.append(point[None])
+    if len(trail.points) > 1:
+        corners.append(trail.points[-1:])
+    heights = np.full((len(corners), 1), 2.0 * LINE)
+    places = np.hstack([np.concatenate(corners), heights]) if corners else np.zeros((0, 3))
+    every = 2 if trail.dashed else 1
+    return [Piece(a, b, trail.colour) for a, b in list(pairwise(places))[::every] if np.hypot(*(b - a)[:2]) > 1e-6]
+
+
 def slip_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) -> list[Arrow]:
     """Return one arrow per slipping wheel: where its contact point skids to over the floor."""
     slip = truth.slip_velocity[row].reshape(4, 2)
@@ -133,13 +168,18 @@ def _arrows(
 # --- into MuJoCo's scene ----------------------------------------------------------------------------------------------
 
 
-def add_marks(scene: mujoco.MjvScene, marks: Iterable[Area | Arrow | Spot]) -> None:
+def add_marks(scene: mujoco.MjvScene, marks: Iterable[Area | Arrow | Spot | Piece]) -> None:
     """Append marks to a scene; what does not fit in is left out."""
     for mark in marks:
         if scene.ngeom >= scene.maxgeom:
             return
         _ADD[type(mark)](scene.geoms[scene.ngeom], mark)
         scene.ngeom += 1
+
+
+def _add_piece(geom: mujoco.MjvGeom, piece: Piece) -> None:
+    _start(geom, "CAPSULE", [LINE, LINE, LINE], piece.start, piece.colour)
+    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, LINE, piece.start, piece.end)
 
 
 def _add_area(geom: mujoco.MjvGeom, area: Area) -> None:
@@ -166,4 +206,4 @@ def _start(geom: mujoco.MjvGeom, kind: str, size: Iterable[float], position: Ite
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR.value
 
 
-_ADD = {Area: _add_area, Spot: _add_spot, Arrow: _add_arrow}
+_ADD = {Area: _add_area, Spot: _add_spot, Arrow: _add_arrow, Piece: _add_piece}

@@ -4,7 +4,7 @@
 # (MuJoCo fills its namespace when it is imported.)
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 #: Areas, pads and arrows a scene has room for.
-MAX_MARKS = 200
+MAX_MARKS = 400
 
 
 class Scene:
@@ -53,6 +53,7 @@ class Scene:
         command: Mapping[str, float] | None = None,
         title: str = "",
         look_at: ArrayLike | None = None,
+        trails: Sequence[marks.Trail] = (),
     ) -> Picture:
         """Return the picture (H, W, 3), uint8, of one robot.
 
@@ -64,6 +65,7 @@ class Scene:
             command: name -> value in SI units, written into the picture beside what the robot does.
             title: first line of the text.
             look_at: (x, y) of the floor in the middle of the picture, m; None = the robot.
+            trails: paths over the floor to draw.
 
         Raises:
             InputError: no OpenGL on this machine; the message says what to install or set.
@@ -73,9 +75,8 @@ class Scene:
         stage = self._stage
         stage.pose(truth, parameters, row)
         canvas, scene = self._open(stage)
-        floor = self._compose(
-            scene, stage, truth, parameters, row, truth.position[row] if look_at is None else np.asarray(look_at)
-        )
+        middle = truth.position[row] if look_at is None else np.asarray(look_at)
+        floor = self._compose(scene, stage, truth, parameters, row, middle, trails)
         picture = canvas.draw(scene)
         if not self.view.text:
             return picture
@@ -103,7 +104,14 @@ class Scene:
         return self._canvas, self._scene
 
     def _compose(
-        self, scene: mujoco.MjvScene, stage: Stage, truth: Truth, parameters: Parameters, row: int, look_at: Array
+        self,
+        scene: mujoco.MjvScene,
+        stage: Stage,
+        truth: Truth,
+        parameters: Parameters,
+        row: int,
+        look_at: Array,
+        trails: Sequence[marks.Trail],
     ) -> list[marks.Area]:
         eye = mujoco.MjvCamera()
         up = camera.up_direction(parameters["ground.slope"][row])
@@ -116,6 +124,7 @@ class Scene:
         camera.aim(scene, *place)
         floor = marks.areas(parameters, row, truth.position[row]) if self.view.friction else []
         marks.add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
+        marks.add_marks(scene, [piece for trail in trails for piece in marks.pieces(trail)])
         return floor
 
     def _labels(self, floor: list[marks.Area], position: NDArray[np.float64]) -> list[overlay.Note]:
@@ -144,6 +153,8 @@ class Scene:
             lines.append(f"slip: 0.1 m of arrow = {0.1 / marks.SLIP_SCALE:g} m/s")
         if self.view.forces:
             lines.append(f"friction (green): 0.1 m = {0.1 / marks.FORCE_SCALE:g} N")
+        if self.view.path:
+            lines.append("path: pink; as commanded: dashed")
         return lines
 
 

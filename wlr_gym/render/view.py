@@ -23,6 +23,7 @@ class View:
         friction: areas of other friction in their colours, and the bar that says which colour is which.
         slip: an arrow per slipping wheel, along the velocity of its contact point over the floor.
         forces: an arrow per wheel, along the floor's friction force.
+        path: of films: where the robot went, and, dashed, where its commands would have taken it from the same start.
         text: time, commands, speed, slip and the legend.
     """
 
@@ -31,6 +32,7 @@ class View:
     friction: bool = True
     slip: bool = True
     forces: bool = False
+    path: bool = False
     text: bool = True
 
     def __post_init__(self) -> None:
@@ -40,7 +42,7 @@ class View:
         if not (isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, int) and _fits(n) for n in size)):
             raise InputError(f"view: size = {size!r}: expected width and height, each {SMALLEST} to {LARGEST} pixels")
         object.__setattr__(self, "size", (int(size[0]), int(size[1])))
-        for name in ("friction", "slip", "forces", "text"):
+        for name in ("friction", "slip", "forces", "path", "text"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"view: {name} = {getattr(self, name)!r}: expected True or False")
 

@@ -1,0 +1,54 @@
+"""What the demo's robot hides, and how an answer is judged."""
+
+from wlr_gym.demo.answer import judge
+from wlr_gym.demo.secret import hide
+from wlr_gym.effects import load_patch
+from wlr_gym.gap.result import EffectEntry, ParameterEntry
+
+
+def found(name, where, **values):
+    parameters = {key: ParameterEntry(value=value, ci95=(0.9 * value, 1.1 * value), unit="") for key, value in values.items()}
+    return EffectEntry(name=name, where=list(where), parameters=parameters, confidence=1.0)
+
+
+HIDDEN = load_patch([{"name": "coulomb_friction", "where": ["leg_lf"], "parameters": {"torque": 0.4}}]).effects[0]
+
+
+def test_the_seed_decides_what_is_hidden():
+    drawn = [hide(seed) for seed in range(40)]
+    assert drawn == [hide(seed) for seed in range(40)]
+    assert len({one["name"] for one in drawn}) >= 2
+    assert len({str(one) for one in drawn}) > 30
+    for one in drawn:
+        load_patch([one])  # every one is an effect of the library, in its range
+
+
+def test_a_right_answer():
+    answer = judge(HIDDEN, [found("coulomb_friction", ["leg_lf"], torque=0.42)])
+    assert answer.right
+    assert answer.sizes["torque"] == (0.4, 0.42, 0.9 * 0.42, 1.1 * 0.42)
+    assert answer.sentence == "The name and the place were right, the size off by 5 %."
+
+
+def test_wrong_answers_are_said_to_be_wrong():
+    elsewhere = judge(HIDDEN, [found("coulomb_friction", ["leg_rf"], torque=0.4)])
+    assert (elsewhere.named, elsewhere.placed, elsewhere.right) == (True, False, False)
+    assert "not the place" in elsewhere.sentence
+    other = judge(HIDDEN, [found("backlash", ["leg_lf"], angle=0.03)])
+    assert not other.named
+    assert other.sentence == "The name was not found."
+    assert (
+        "alternative" in judge(HIDDEN, [found("backlash", ["leg_lf"], angle=0.03)], [["backlash", "coulomb_friction"]]).sentence
+    )
+    nothing = judge(HIDDEN, [])
+    assert not nothing.named
+    assert not nothing.right
+
+
+def test_what_is_named_besides_is_not_right():
+    answer = judge(HIDDEN, [found("payload", ["body"], mass=0.3), found("coulomb_friction", ["leg_lf"], torque=0.4)])
+    assert answer.named
+    assert answer.placed
+    assert not answer.right
+    assert answer.extra == ("payload",)
+    assert "payload was named, too, but is not there" in answer.sentence
