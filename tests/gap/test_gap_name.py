@@ -8,7 +8,7 @@ from toy_problem import NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap.fit import fit, linearise, nominal_model
 from wlr_gym.gap.name import EQUIVALENT, MOST_EFFECTS, PER_NAME, SHORTLIST, drop_idle, name_effects, refit, shortlist
-from wlr_gym.gap.problem import Candidate, Tolerance
+from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
 from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
 from wlr_gym.gap.sure import equivalents
 
@@ -134,6 +134,24 @@ def test_what_a_tolerance_allows_is_no_effect(monkeypatch, size, is_effect):
     assert first.gain > LEAST_GAIN
     assert first.tolerable is not is_effect
     assert (look.taken is not None) is is_effect
+
+
+def test_effect_that_takes_the_place_of_a_number_is_refitted_without_that_number():
+    """Calibration went as far as it may; beside the effect the number does nothing, and only its tolerance pulls it home."""
+    problem = Toy({"gain": 6.0}, rows=400)
+    problem.firmness = 3.0
+    unknown = Unknown("size", "1", 0.0, -20.0, 20.0, 1.0)
+    start = Start((("gain",),), lambda a: (float(a[0]),))
+    tolerance = Tolerance(("gain",), SIGMA[0], REACH, replaces=True)
+    level = Candidate("level", ("body",), (unknown,), (start,), tolerances=(tolerance,))
+    current = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
+    given = linearise(problem, nominal_model(problem), RUNS)[1]
+    probes, _ = problem.candidates(None, [], [])
+    score = screen([level], responses(problem, current, RUNS, probes))[0]
+    refitted = refit(problem, RUNS, current, [score], given)[0]
+    whole = fit(problem, RUNS, nominal_model(problem).with_effect(level, (5.0,)), scatter=current.noise.scatter)
+    assert refitted.values == pytest.approx((6.0,), abs=0.2)
+    assert refitted.model.quantities == pytest.approx(whole.model.quantities, abs=0.2 * SIGMA.min())
 
 
 def test_neutral_edge_of_a_range_is_no_bound():

@@ -87,6 +87,9 @@ class Toy:
 
     def _response(self, quantities, effects, run):
         scaled = (quantities - NOMINAL) / SIGMA
+        for effect in effects:
+            if effect.name == "level":  # takes the place of a quantity
+                scaled = np.array([effect.parameters["size"], *scaled[1:]])
         total = self.shape("base")[run].copy()
         for name, amount in zip(QUANTITIES, scaled, strict=True):
             total += STRENGTH * amount * self.shape(name)[run]
@@ -97,6 +100,8 @@ class Toy:
     def effect_response(self, effect, run):
         """Response (rows, channels) in noise units."""
         values = effect.parameters
+        if effect.name == "level":
+            return 0.0
         if effect.name == "copy":  # the same as the quantity, without its tolerance
             return STRENGTH * values["size"] * self.shape("gain")[run]
         if effect.name == "twin":

@@ -529,9 +529,24 @@ def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequ
     trials = [_Trial(-1, current.columns, current.model)]
     for k, score in enumerate(scores):
         candidate = score.candidate
-        trials.append(_Trial(k, current.columns, current.model.with_effect(candidate, score.values)))
-        trials.append(_Trial(k, given, as_given.with_effect(candidate, _probed(candidate, candidate.starts[0]))))
+        near, anew = (_without_replaced(problem, candidate, known) for known in (current.columns, given))
+        trials.append(_Trial(k, near, current.model.with_effect(candidate, score.values)))
+        trials.append(_Trial(k, anew, as_given.with_effect(candidate, _probed(candidate, candidate.starts[0]))))
     return trials
+
+
+def _without_replaced(
+    problem: Problem, candidate: Candidate, known: Sequence[NDArray[np.float32]]
+) -> Sequence[NDArray[np.float32]]:
+    """Columns of the known numbers; those whose place a candidate takes do nothing beside it."""
+    replaced = {name for met in candidate.tolerances if met is not None and met.replaces for name in met.quantities}
+    if not replaced:
+        return known
+    rows = [k for k, quantity in enumerate(problem.quantities) if quantity.name in replaced]
+    silent = [column.copy() for column in known]
+    for column in silent:
+        column[rows] = 0.0
+    return silent
 
 
 def _simulated(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) -> list[_Trial]:
