@@ -5,7 +5,14 @@ import sys
 
 import pytest
 
-HEAVY = ("torch", "stable_baselines3", "mujoco", "numba", "cv2", "matplotlib", "pandas", "scipy", "sympy", "tyro")
+HEAVY = (
+    "torch", "stable_baselines3", "mujoco", "numba", "cv2", "matplotlib", "pandas", "pyarrow", "scipy", "sympy", "onnx",
+    "onnxruntime", "pydantic", "tyro", "rich",
+)  # fmt: skip
+
+
+#: Processor time (s) as a process counts it itself: a busy machine hardly changes it.
+OWN_TIME = "import time; start = time.process_time(); import wlr_gym; print(time.process_time() - start)"
 
 
 def modules_after(code: str) -> set[str]:
@@ -24,3 +31,13 @@ def modules_after(code: str) -> set[str]:
 )
 def test_heavy_packages_are_not_touched(code):
     assert modules_after(code).isdisjoint(HEAVY)
+
+
+def test_the_package_adds_nothing_to_gymnasium():
+    own = modules_after("import wlr_gym") - modules_after("import gymnasium")
+    assert own == {"wlr_gym", "wlr_gym.envs", "wlr_gym.envs.registry", "wlr_gym.errors"}
+
+
+def test_import_takes_less_than_a_third_of_a_second():
+    answers = [subprocess.run([sys.executable, "-c", OWN_TIME], capture_output=True, text=True, check=True) for _ in range(3)]
+    assert min(float(answer.stdout) for answer in answers) < 0.3

@@ -184,3 +184,46 @@ def test_a_uniform_box_is_possible_and_a_thousandth_of_it_is_not():
     assert len(faults) == 3
     assert all("impossible" in fault for fault in faults)
     assert isinstance(shrunk, Robot)
+
+
+def test_a_robot_file_is_laid_over_its_base(tmp_path):
+    path = tmp_path / "heavy.yaml"
+    path.write_text("base: nominal\nname: heavy\nbody: {mass: 3.5}\n")
+    heavy, nominal = load_robot(path), load_robot()
+    assert (heavy.name, heavy.body.mass, heavy.body.size) == ("heavy", 3.5, nominal.body.size)
+    further = tmp_path / "further.yaml"
+    further.write_text("base: heavy.yaml\nname: further\nwheel: {radius: 0.04}\n")  # beside it, not in the present folder
+    assert (load_robot(further).body.mass, load_robot(further).wheel.radius) == (3.5, 0.04)
+
+
+def test_a_robot_with_a_base_has_a_name_of_its_own(tmp_path):
+    path = tmp_path / "robot.yaml"
+    path.write_text("base: nominal\nbody: {mass: 3.5}\n")
+    with pytest.raises(InputError, match="'name' is missing"):
+        load_robot(path)
+
+
+def test_a_fault_in_a_base_is_said_with_its_name(tmp_path):
+    (tmp_path / "base.yaml").write_text("base: nominal\nname: base\nbody: {mas: 3.5}\n")
+    path = tmp_path / "robot.yaml"
+    path.write_text("base: base.yaml\nname: robot\n")
+    with pytest.raises(InputError, match=r"base\.yaml: unknown key 'body\.mas'"):
+        load_robot(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("base: nominl\n", "did you mean 'nominal'"), ("base: 3\n", "base = 3: expected the name"), ("base: {}\n", "base = {}")],
+)
+def test_a_bad_base_is_named(tmp_path, text, message):
+    path = tmp_path / "robot.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=re.escape(message)):
+        load_robot(path)
+
+
+def test_a_robot_that_is_its_own_base_is_refused(tmp_path):
+    path = tmp_path / "robot.yaml"
+    path.write_text(f"base: {path}\n")
+    with pytest.raises(InputError, match="is its own base"):
+        load_robot(path)

@@ -7,9 +7,11 @@ straight down. Wheel angle: right-handed about body +y, relative to its leg; pos
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -251,7 +253,40 @@ def load_robot(source: str | Path | Robot = "nominal", *, check: bool = True) ->
 
 
 def _read(path: Path) -> Robot:
-    return parse_config(Robot, read_yaml(path), str(path))
+    return parse_config(Robot, _resolved(path), str(path))
+
+
+def _resolved(path: Path, above: tuple[Path, ...] = ()) -> Any:
+    """Return what a robot file says, laid over its ``base`` where it names one: a config name, or a path from this file on.
+
+    The name is its own: another robot has another one.
+    """
+    data = read_yaml(path)
+    if not isinstance(data, dict) or "base" not in data:
+        return data
+    if path in above:
+        raise InputError(f"{path}: is its own base ({' -> '.join(map(str, [*above, path]))})")
+    base = data.pop("base")
+    if not isinstance(base, str):
+        raise InputError(f"{path}: base = {base!r}: expected the name or the path of a robot file")
+    beside = path.parent / base
+    place = beside if beside.is_file() else find_config("robot", base)
+    lower = _resolved(place, (*above, path))
+    parse_config(Robot, lower, str(place))  # what is wrong in a base is said with its own name
+    return overlay({key: value for key, value in lower.items() if key != "name"}, data)
+
+
+def overlay(base: Any, changes: Mapping[str, Any]) -> Any:
+    """Return ``base`` with ``changes`` laid over it: mappings merge key by key, None removes a key."""
+    if not isinstance(base, Mapping):
+        return dict(changes)
+    merged = dict(copy.deepcopy(base))
+    for key, value in changes.items():
+        if value is None:
+            merged.pop(key, None)
+        else:
+            merged[key] = overlay(merged.get(key) or {}, value) if isinstance(value, Mapping) else value
+    return merged
 
 
 def read_yaml(path: str | Path) -> Any:

@@ -7,22 +7,31 @@ import io
 import os
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mkdocs.structure.files import File, Files
+if TYPE_CHECKING:
+    from mkdocs.structure.files import Files
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Modules of the API page, in order: title -> module.
+#: Modules of the API page, in order: title -> module. They are the public interface (docs/versions.md).
 API = {
     "Environments": "wlr_gym.envs",
-    "Plants": "wlr_gym.plants.base",
+    "Tasks": "wlr_gym.tasks",
+    "Terms of tasks": "wlr_gym.tasks.terms",
+    "Signals that terms are written with": "wlr_gym.tasks.signals",
+    "Scalar operations": "wlr_gym.codegen.ops",
+    "Robot": "wlr_gym.robot",
     "Parameters": "wlr_gym.parameters",
+    "Plants": "wlr_gym.plants",
+    "The contract of a plant": "wlr_gym.plants.base",
     "Effects": "wlr_gym.effects",
     "Slip": "wlr_gym.slip",
     "Slip observer": "wlr_gym.observer",
     "Runs": "wlr_gym.runs",
     "Policies": "wlr_gym.policy",
     "Evaluation": "wlr_gym.evaluation",
+    "Pictures": "wlr_gym.render",
+    "Vision": "wlr_gym.vision",
     "Gap workflow": "wlr_gym.gap",
     "Errors": "wlr_gym.errors",
 }
@@ -30,6 +39,8 @@ API = {
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages that are made."""
+    from mkdocs.structure.files import File
+
     made = {
         "index.md": start_page(),
         "commands.md": command_page(),
@@ -76,7 +87,8 @@ def _block(text: str) -> str:
 
 def api_page() -> str:
     """What the rooms offer to programs, from their docstrings."""
-    parts = ["# Python interface", "", "`import wlr_gym` registers the environments and loads nothing heavy.", ""]
+    intro = "`import wlr_gym` registers the environments and loads nothing heavy. [Public](versions.md) is what stands here."
+    parts = ["# Python interface", "", intro, ""]
     for title, module in API.items():
         parts += [f"## {title}", "", f"::: {module}", ""]
     return "\n".join(parts)

@@ -5,9 +5,11 @@ import types
 from dataclasses import dataclass
 
 import pytest
+from rich.console import Console
 
 import wlr_gym
 from wlr_gym import cli
+from wlr_gym.cli import deploy
 from wlr_gym.errors import InputError, MissingPackageError
 
 
@@ -91,3 +93,38 @@ def test_every_command_explains_itself(name, capsys):
         cli.main([name, "--help"])
     assert caught.value.code == 0
     assert f"usage: wlr {name}" in capsys.readouterr().out
+
+
+def test_modules_are_imported_first(tmp_path, monkeypatch, capsys):
+    (tmp_path / "adds_a_command.py").write_text("from wlr_gym import cli\ncli.COMMANDS['probe'] = 'from a module of my own'\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(cli, "COMMANDS", dict(cli.COMMANDS))
+    assert cli.main(["--import", "adds_a_command", "--help"]) == 0
+    assert "from a module of my own" in capsys.readouterr().out
+    assert cli.IMPORTED == ["adds_a_command"]
+    assert cli.main(["--import=adds_a_command", "--version"]) == 0
+    assert cli.IMPORTED == ["adds_a_command"]
+    assert cli.main(["--version"]) == 0
+    assert cli.IMPORTED == []
+
+
+@pytest.mark.parametrize("words", [["--import"], ["--import", "no_such_module_here", "envs"], ["--import", ".foo", "envs"]])
+def test_a_module_that_is_not_there_is_named(words, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert cli.main(words) == 2
+    assert "expected a module of Python" in capsys.readouterr().err
+
+
+def test_an_emulator_of_its_own_process_imports_the_same(monkeypatch):
+    asked = []
+
+    def start(command, **_):
+        asked.extend(command)
+        raise OSError("no process today")
+
+    monkeypatch.setattr("subprocess.Popen", start)
+    monkeypatch.setattr(deploy, "IMPORTED", ["mine"])
+    with pytest.raises(OSError, match="today"), deploy._emulator(deploy.Options("pid", emulated=True), Console()):
+        pass
+    assert asked[3:6] == ["--import", "mine", "emulate"]

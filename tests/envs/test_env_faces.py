@@ -83,7 +83,7 @@ def test_a_vector_environment_is_pickled_by_its_arguments(fake):
 
 
 def test_class_documentation_is_made_from_the_data(fake):
-    from wlr_gym.envs.velocity import VelocityEnv, VelocityVectorEnv
+    from wlr_gym.envs.classes import VelocityEnv, VelocityVectorEnv
 
     for cls in (VelocityEnv, VelocityVectorEnv):
         for text in ("wheel_velocity[wheel_lf]", "track_yaw_rate", "free_wheels", "v0: first version", "leg_rr"):

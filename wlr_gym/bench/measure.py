@@ -9,6 +9,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -115,8 +116,9 @@ def rate(work: Callable[[], object], amount: float) -> float:
 
 
 def machine() -> dict[str, Any]:
-    """Return what the numbers depend on: processor, cores, load at the start, versions, commit."""
+    """Return what the numbers depend on: date, processor, cores, load at the start, versions, commit."""
     return {
+        "date": datetime.now(UTC).date().isoformat(),
         "processor": _processor(),
         "cores": os.cpu_count(),
         "load_average": list(os.getloadavg()) if hasattr(os, "getloadavg") else None,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
 
 from wlr_gym.envs.settings import Settings
 from wlr_gym.robot import load_robot
@@ -17,11 +16,11 @@ last step also ``episode_reward_terms`` {term: sum}; where randomisation changed
 ``parameters`` {name or element: value} set after randomisation."""
 
 
-def class_document(task_name: str, summary: str, history: Mapping[str, str]) -> str:
+def class_document(task_name: str) -> str:
     """Return the class documentation of an environment: summary, tables, keywords, version history."""
     config = read_task(task_name)
     tables = describe(build_task(config, load_robot(config.robot)))
     keywords = (inspect.getdoc(Settings) or "").partition("Attributes:\n")[2]
-    versions = "\n".join(f"- {version}: {change}" for version, change in history.items())
-    parts = (summary, tables, _INFO, "**Keywords**", inspect.cleandoc(keywords), "**Version history**", versions)
+    versions = "\n".join(f"- {version}: {change}" for version, change in config.history.items())
+    parts = (config.summary.strip(), tables, _INFO, "**Keywords**", inspect.cleandoc(keywords), "**Version history**", versions)
     return "\n\n".join(parts) + "\n"

@@ -19,11 +19,10 @@ from wlr_gym.errors import InputError, nearest
 from wlr_gym.parameters import ELEMENTS, TABLE, XYZ, Parameters
 from wlr_gym.paths import find_config
 from wlr_gym.plants.base import PlantState, standing_state
-from wlr_gym.robot import LEGS, Robot, parse_config, read_yaml
+from wlr_gym.robot import LEGS, Robot, overlay, parse_config, read_yaml
 from wlr_gym.tasks.draws import stream_numbers, uniforms
 from wlr_gym.tasks.entries import DISTRIBUTION_KEYS, Data, Entry, EventConfig, Sampler, elements_of, entries_of
 from wlr_gym.tasks.identified import identified_events
-from wlr_gym.tasks.task import overlay
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]

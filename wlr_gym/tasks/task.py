@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.paths import find_config
-from wlr_gym.robot import JOINTS, LEGS, Robot, parse_config, read_yaml
+from wlr_gym.robot import JOINTS, LEGS, Robot, overlay, parse_config, read_yaml
 from wlr_gym.tasks.signals import Signals
 from wlr_gym.tasks.terms import (
     COMMANDS,
@@ -120,9 +119,13 @@ class TaskConfig(_Data):
     """Contents of ``configs/task/*.yaml``.
 
     An episode is a success when no termination term ended it and every measure named in ``success`` stays within its limits.
+    ``summary`` opens the environment's documentation, ``history`` closes it: version of the id -> what changed. The last
+    version is the present one.
     """
 
-    name: str
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    summary: str = ""
+    history: dict[Annotated[str, Field(pattern=r"^v\d+$")], str] = Field(default={"v0": "first version"}, min_length=1)
     robot: str = "nominal"
     randomization: str = "nominal"
     control_period: float = Field(gt=0, le=0.5)
@@ -292,19 +295,6 @@ def _task_data(source: Any) -> tuple[Any, str]:
         raise InputError(f"task = {source!r}: expected a name, a path or a mapping")
     path = find_config("task", source)
     return read_yaml(path), str(path)
-
-
-def overlay(base: Any, changes: Mapping[str, Any]) -> Any:
-    """Return ``base`` with ``changes`` laid over it: mappings merge key by key, None removes a key."""
-    if not isinstance(base, Mapping):
-        return dict(changes)
-    merged = dict(copy.deepcopy(base))
-    for key, value in changes.items():
-        if value is None:
-            merged.pop(key, None)
-        else:
-            merged[key] = overlay(merged.get(key) or {}, value) if isinstance(value, Mapping) else value
-    return merged
 
 
 def _check_ranges(config: TaskConfig, where: str) -> None:

@@ -13,6 +13,8 @@ from wlr_gym.robot import LEGS
 from wlr_gym.tasks.signals import Signals, Value
 from wlr_gym.tasks.terms import references
 from wlr_gym.tasks.terms.geometry import Motion, estimated_motion, true_motion
+from wlr_gym.tasks.terms.observations import POLICY_TERMS, PRIVILEGED_TERMS, ObservationTerm
+from wlr_gym.tasks.terms.scalar import refuse_another
 
 Function = Callable[[Signals], list[Value]]
 
@@ -22,35 +24,38 @@ class ComputedTerm:
     """Some numbers computed from signals.
 
     Attributes:
-        name: as in the task's YAML.
         function: ``function(signals)`` returns one value per element; written with ``wlr_gym.codegen.ops``.
         elements: ``name[label]`` of each number.
-        unit, frame, limit: for the tables and the observation space.
-        doc: first line of the function's docstring.
-        estimated: made of the slip observer's estimate, and so as old as that.
     """
 
-    name: str
     function: Function
     elements: tuple[str, ...]
-    unit: str
-    frame: str
-    limit: float
-    doc: str
-    estimated: bool
 
 
 COMPUTED: dict[str, ComputedTerm] = {}
 
 
 def computed(*labels: str, unit: str, frame: str, limit: float, estimated: bool = False) -> Callable[[Function], Function]:
-    """Return a decorator that enters a function into :data:`COMPUTED` under its own name."""
+    """Return a decorator that makes a function an observation term under its own name, for policies and critics.
+
+    Args:
+        labels: of its numbers; none for a single number.
+        unit, frame: for the tables; the first line of the docstring says the rest.
+        limit: values are clipped to +-limit (in ``unit``), so that the observation space is bounded.
+        estimated: made of the slip observer's estimate, and so as old as the joint readings that is made of.
+    """
 
     def enter(function: Function) -> Function:
         name = function.__name__
         elements = tuple(f"{name}[{label}]" for label in labels) or (name,)
         doc = (inspect.getdoc(function) or "").partition("\n")[0]
-        COMPUTED[name] = ComputedTerm(name, function, elements, unit, frame, limit, doc, estimated)
+        device = "joints" if estimated else ""
+        if name in POLICY_TERMS:
+            refuse_another(function, COMPUTED[name].function if name in COMPUTED else None)
+        COMPUTED[name] = ComputedTerm(function, elements)
+        POLICY_TERMS[name] = PRIVILEGED_TERMS[name] = ObservationTerm(
+            name, "computed", elements, unit, frame, limit, doc, device=device
+        )
         return function
 
     return enter

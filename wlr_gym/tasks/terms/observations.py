@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from wlr_gym.observer import ESTIMATE_LAYOUT
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Layout
 from wlr_gym.robot import LEGS, WHEELS, Robot
-from wlr_gym.tasks.terms.computed import COMPUTED, ComputedTerm
 
 RobotNumber = Callable[[Robot], float]
 
@@ -140,19 +139,14 @@ def _channel(layout: Layout, source: str, channel: str, prefix: str, frame: str,
     return ObservationTerm(f"{prefix}{channel}", source, elements, spec.unit, frame, limit, spec.doc, device=device)
 
 
-def _computed(term: ComputedTerm) -> ObservationTerm:
-    device = "joints" if term.estimated else ""
-    return ObservationTerm(term.name, "computed", term.elements, term.unit, term.frame, term.limit, term.doc, device=device)
-
-
 _ESTIMATED = [
     _channel(ESTIMATE_LAYOUT, "estimate", channel, "estimated_", frame, limit, "joints")
     for channel, (frame, limit) in _ESTIMATE_LIMITS.items()
 ]
 _TRUE = [_channel(TRUTH_LAYOUT, "truth", channel, "", frame, limit, "") for channel, (frame, limit) in _TRUTH_LIMITS.items()]
 
-#: What a policy may observe. Estimates are as old as the joint readings they are made of.
-POLICY_TERMS = _SENSED | {term.name: term for term in (*_ESTIMATED, *map(_computed, COMPUTED.values()), *_TRUE)}
+#: What a policy may observe. Estimates are as old as the joint readings they are made of. ``computed`` terms enter themselves.
+POLICY_TERMS = _SENSED | {term.name: term for term in (*_ESTIMATED, *_TRUE)}
 
 #: What a critic may observe besides.
-PRIVILEGED_TERMS = {term.name: term for term in (*_TRUE, *map(_computed, COMPUTED.values()))}
+PRIVILEGED_TERMS = {term.name: term for term in _TRUE}

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from wlr_gym.errors import InputError
+
 Function = Callable[..., Any]
 
 POSITIVE = (0.0, math.inf)
@@ -34,6 +36,17 @@ class ScalarTerm:
     unit: str = ""
 
 
+def refuse_another(function: Function, present: Function | None) -> None:
+    """Refuse a term whose name is taken by another one; the same one may come again, as its module is imported anew.
+
+    Raises:
+        InputError: naming both modules.
+    """
+    if present is None or (present.__module__, present.__qualname__) != (function.__module__, function.__qualname__):
+        where = "the library" if present is None else present.__module__
+        raise InputError(f"term '{function.__name__}' of {function.__module__}: {where} has one of that name; give it another")
+
+
 def registered(
     registry: dict[str, ScalarTerm], unit: str = "", **ranges: tuple[float, float]
 ) -> Callable[[Function], Function]:
@@ -46,6 +59,8 @@ def registered(
             if parameter.kind is inspect.Parameter.KEYWORD_ONLY
         }
         doc = (inspect.getdoc(function) or "").partition("\n")[0]
+        if function.__name__ in registry:
+            refuse_another(function, registry[function.__name__].function)
         registry[function.__name__] = ScalarTerm(function.__name__, function, defaults, ranges, doc, unit)
         return function
 

@@ -1,0 +1,135 @@
+"""The numbers of docs/performance.md: kept in docs/data/bench.json, taken from reports of ``wlr bench --json``.
+
+``python .ci/docs/performance.py bench.json ...`` takes the rows of the reports over, each with its machine, versions and date,
+and writes the tables anew; without a report only the tables. What is measured again replaces all of its older rows.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ROOT / "docs" / "data" / "bench.json"
+PAGE = ROOT / "docs" / "performance.md"
+#: Measurements with a table of their own, or none.
+APART = ("batch",)
+BATCH = re.compile(r"(\d+) robots, (\w+), (\d+) threads?")
+
+Row = dict[str, Any]
+
+
+def merged(kept: list[Row], report: dict[str, Any]) -> list[Row]:
+    """Return the rows with those of a report taken over, each with what it was measured on; refuse a quick report."""
+    if report["quick"]:
+        raise SystemExit("a report of wlr bench --quick: its numbers mean nothing")
+    conditions = {**report["machine"], "rounds": report["rounds"]}
+    new = {(row["name"], row["what"]): {**row, "measured": conditions} for row in report["measurements"]}
+    old = [row for row in kept if row["name"] not in {name for name, _ in new}]
+    return sorted([*old, *new.values()], key=lambda row: _ORDER.index(row["name"]) if row["name"] in _ORDER else len(_ORDER))
+
+
+_ORDER = ("engine", "mujoco", "env_step", "ppo", "learning", "sysid", "bus", "import", "start", "batch")
+
+
+def speed_table(rows: Iterable[Row]) -> list[str]:
+    """Return the table of everything that has a peer or a bar, as lines of Markdown."""
+    rows = [row for row in rows if row["name"] not in APART and (row["peer"] or row["bar"])]
+    lines = ["| what | ours | peer | ratio [min..max] | bar | command | measured |", "|---|---|---|---|---|---|---|"]
+    for row in rows:
+        cells = (row["what"], _value(row["ours"], row["unit"]), _peer(row), _ratio(row), _bar(row))
+        lines.append(f"| {' | '.join(cells)} | `wlr bench --only {row['name']}` | {_condition(row['measured'])} |")
+    return lines
+
+
+def batch_table(rows: Iterable[Row]) -> list[str]:
+    """Return substeps per second by batch size as lines of Markdown; none where they were not measured."""
+    found = {}
+    for row in rows:
+        if row["name"] == "batch" and (match := BATCH.fullmatch(row["what"])):
+            found[match[2], int(match[3]), int(match[1])] = row["ours"]["median"]
+    counts = sorted({count for *_, count in found})
+    lines = [f"| robots | {' | '.join(map(str, counts))} |", "|---" * (len(counts) + 1) + "|"]
+    for precision, threads in dict.fromkeys((precision, threads) for precision, threads, _ in found):
+        cells = [_short(found[precision, threads, count]) for count in counts]
+        lines.append(f"| {precision}, {threads} thread{'s' * (threads > 1)} | {' | '.join(cells)} |")
+    return lines
+
+
+def machine_lines(rows: Iterable[Row]) -> list[str]:
+    """Return one line per machine and set of versions that rows were measured on."""
+    lines = []
+    for row in rows:
+        found = row["measured"]
+        packages = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+        note = f" {found['note']}" if found.get("note") else ""
+        lines.append(f"- {found['date']}: {found['processor']}, {found['cores']} cores, {found['system']}; {packages}.{note}")
+    return list(dict.fromkeys(lines))
+
+
+def _value(found: Row, unit: str) -> str:
+    if unit == "s" and found["min"] < found["max"]:
+        return f"{found['median']:.3g} s [{found['min']:.3g}..{found['max']:.3g}]"
+    per = {"1/s": "/s", "1/h": "/h"}.get(unit, f" {unit}")
+    return f"{_short(found['median'])}{per}".rstrip()
+
+
+def _short(value: float) -> str:
+    for size, letter in ((1e6, "M"), (1e3, "k")):
+        if value >= size:
+            return f"{value / size:.3g} {letter}"
+    return f"{value:.3g}"
+
+
+def _peer(row: Row) -> str:
+    return f"{_value(row['peer'], row['unit'])} ({row['peer_name']})" if row["peer"] else "-"
+
+
+def _ratio(row: Row) -> str:
+    if not row["ratio"]:
+        return "-"
+    least = ">= " if row.get("at_least") else ""  # a peer that was given up: its time is a lower bound
+    return f"{least}{row['ratio']['median']:.3g} [{row['ratio']['min']:.3g}..{row['ratio']['max']:.3g}]"
+
+
+def _bar(row: Row) -> str:
+    if row["bar"] is None:
+        return "-"
+    limit = f">= {row['bar']:g}" if row["peer"] else f"< {row['bar']:g} {row['unit']}"
+    return limit if row["met"] else f"{limit}: missed"
+
+
+def _condition(found: Row) -> str:
+    load = "" if not found["load_average"] else f", load {found['load_average'][0]:.1f}"
+    return f"{found['date']}, {found['rounds']} round{'s' * (found['rounds'] > 1)}{load}"
+
+
+def tables(rows: list[Row]) -> dict[str, list[str]]:
+    """Return every generated part of the page by its marker."""
+    return {"speed": speed_table(rows), "batch": batch_table(rows), "machines": machine_lines(rows)}
+
+
+def write_page(text: str, rows: list[Row]) -> str:
+    """Return the page with its generated parts replaced."""
+    for name, lines in tables(rows).items():
+        begin, end = f"<!-- {name}: made by .ci/docs/performance.py -->", f"<!-- end of {name} -->"
+        before, _, rest = text.partition(begin)
+        text = "\n".join([before + begin, *lines, end]) + rest.partition(end)[2]
+    return text
+
+
+def main(reports: list[str]) -> None:
+    """Take reports over and write the page."""
+    rows = json.loads(DATA.read_text(encoding="utf-8"))["rows"] if DATA.is_file() else []
+    for path in reports:
+        rows = merged(rows, json.loads(Path(path).read_text(encoding="utf-8")))
+    DATA.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
+    PAGE.write_text(write_page(PAGE.read_text(encoding="utf-8"), rows), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,104 @@
+"""Code blocks of README.md and docs/, and how each is run.
+
+A comment before a block says what else than "run it" is to be done with it:
+
+- ``<!-- file: NAME -->``: it is the contents of that file, in the folder in which the page is run;
+- ``<!-- slow -->``: run in the slow suite only;
+- ``<!-- checked by tests/... -->``: that test runs it, or compares it with the code;
+- ``<!-- demo-command -->``, ``<!-- test-command -->``: ``.ci/run`` runs it in a new virtual environment;
+- ``<!-- not run: REASON -->``: nothing runs it.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.cli import main
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+_BLOCK = re.compile(r"^(?:<!-- (?P<mark>[^\n]*?) -->\n)?```(?P<language>\w*)\n(?P<text>.*?)^```", re.S | re.M)
+_MARK = re.compile(r"(file|slow|checked by|not run|demo-command|test-command)(?:: | |$)(.*)")
+
+#: Words of a command -> options that make it small enough for a test, added to its own.
+SMALLER = {
+    "train": "--max-minutes 0.02 --no-progress",
+    "evaluate": "--episodes 2 --seeds 1 --sweep-episodes 1 --other-episodes 1 --video-seconds 0.1 --no-progress",
+    "evaluate --full": "--sweep friction",
+    "play": "--seconds 0.2 --size 96 64",
+    "deploy": "--stepped --seconds 0.5 --yes --no-status",
+    "compare": "--seconds 1 --no-plots",
+    "bench": "--quick --rounds 1",
+    "record": "--seconds 4",
+    "paper": "--plant gibbs_appell --draws 0",
+}
+
+
+@dataclass(frozen=True)
+class Block:
+    """One code block: where it stands, its language, its text, and its mark with the words after it."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+    mark: str = ""
+    words: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.page.relative_to(ROOT)}:{self.line}"
+
+    @property
+    def commands(self) -> list[str]:
+        """Its lines, comments cut off; a line that ends in a backslash goes on."""
+        joined = self.text.replace("\\\n", " ")
+        lines = [re.split(r"\s{2,}#|\s#\s", line)[0].strip() for line in joined.splitlines()]
+        return [line for line in lines if line and not line.startswith("#")]
+
+
+def blocks(page: Path) -> list[Block]:
+    """Return the code blocks of a page that are no plain text."""
+    text, found = page.read_text(encoding="utf-8"), []
+    for match in _BLOCK.finditer(text):
+        if match["language"] == "text":
+            continue
+        mark = _MARK.fullmatch(match["mark"] or "")
+        kind, words = mark.groups() if mark else ("", "")
+        line = text[: match.start("language")].count("\n") + 1
+        found.append(Block(page, line, match["language"], match["text"], kind, words))
+    return found
+
+
+def run_page(page: Path, *, slow: bool) -> dict[str, Any]:
+    """Run a page's blocks in order in the present folder; return the names its Python blocks leave."""
+    names: dict[str, Any] = {"__name__": page.stem}
+    found = blocks(page)
+    for block in found:
+        if block.mark == "file":
+            Path(block.words).write_text(block.text, encoding="utf-8")
+    for block in found:
+        if not block.mark or (slow and block.mark == "slow"):
+            run_block(block, names)
+    return names
+
+
+def run_block(block: Block, names: dict[str, Any]) -> None:
+    """Run one block: Python in ``names``, or commands, each of which must end well."""
+    if block.language == "python":
+        exec(compile("\n" * block.line + block.text, str(block.page), "exec"), names)
+        return
+    assert block.language == "bash", f"{block}: a block of '{block.language}' cannot be run"
+    for command in block.commands:
+        assert run_command(command) == 0, f"{block}: {command}"
+
+
+def run_command(command: str) -> int:
+    """Run ``wlr ...`` in this process, smaller; return its exit code."""
+    program, *words = shlex.split(command)
+    assert program == "wlr", f"{command}: only wlr is run here"
+    smaller = [option for key, options in SMALLER.items() if set(key.split()) <= set(words) for option in options.split()]
+    return main([*words, *smaller])

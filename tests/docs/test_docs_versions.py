@@ -1,0 +1,60 @@
+"""docs/versions.md: versions of the environments are those of the task files; the public interface is documented and typed."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+from typing import Any
+
+import pytest
+from blocks import ROOT
+
+import wlr_gym
+from wlr_gym.envs.registry import ENVIRONMENTS
+from wlr_gym.tasks.task import read_task
+
+
+def _public_modules() -> dict[str, str]:
+    spec = importlib.util.spec_from_file_location("pages", ROOT / ".ci" / "docs" / "pages.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.API
+
+
+def _public(module: Any) -> dict[str, Any]:
+    """What a module offers: ``__all__``, or what it defines itself without an underscore."""
+    if hasattr(module, "__all__"):
+        return {name: getattr(module, name) for name in module.__all__}
+    found = {name: value for name, value in vars(module).items() if not name.startswith("_")}
+    return {name: value for name, value in found.items() if getattr(value, "__module__", "") == module.__name__}
+
+
+def test_the_table_is_that_of_the_task_files():
+    text = (ROOT / "docs" / "versions.md").read_text(encoding="utf-8")
+    block = text.split("<!-- environments: ")[1].split("<!-- end of environments -->")[0]
+    rows = []
+    for env_id, (task, _, _) in ENVIRONMENTS.items():
+        title = env_id.rpartition("-")[0]
+        rows += [f"| `{title}-{version}` | {change} |" for version, change in read_task(task).history.items()]
+    assert block.splitlines()[3:] == rows
+
+
+@pytest.mark.parametrize("name", _public_modules().values())
+def test_public_names_are_documented_and_typed(name):
+    module = importlib.import_module(name)
+    assert module.__doc__
+    for label, value in _public(module).items():
+        if inspect.isclass(value) or inspect.isfunction(value):
+            assert inspect.getdoc(value), f"{name}.{label} says nothing about itself"
+        if inspect.isfunction(value):
+            untyped = [p for p in inspect.signature(value).parameters.values() if p.annotation is inspect.Parameter.empty]
+            assert not untyped, f"{name}.{label}: {untyped}"
+            assert inspect.signature(value).return_annotation is not inspect.Signature.empty, f"{name}.{label}"
+
+
+def test_the_package_says_that_it_is_typed():
+    assert (ROOT / "wlr_gym" / "py.typed").is_file()
+    assert wlr_gym.__doc__

@@ -1,0 +1,106 @@
+"""Environments that are registered from a task file, and the versions of those that ship."""
+
+import pickle
+
+import gymnasium as gym
+import pytest
+
+from wlr_gym.envs import register_task
+from wlr_gym.envs.registry import ENVIRONMENTS, title_of
+from wlr_gym.errors import InputError
+from wlr_gym.tasks.task import read_task
+
+TASK = """
+name: {name}
+summary: Turn on the spot.
+history: {{v0: first version, v1: turns faster}}
+control_period: 0.02
+episode_length: 1.0
+action: {{leg_scale: 0.4, wheel_scale: 6.0}}
+commands: {{hold_time: [2.0, 4.0], terms: {{yaw_rate: [-0.5, 0.5]}}}}
+observations: {{command: {{}}, gyro: {{}}}}
+rewards: {{track_yaw_rate: {{weight: 1.0}}}}
+"""
+
+
+@pytest.fixture
+def registry():
+    """Keep both registries as they are."""
+    known = dict(ENVIRONMENTS)
+    yield
+    for env_id in set(ENVIRONMENTS) - set(known):
+        del ENVIRONMENTS[env_id], gym.registry[env_id]
+
+
+@pytest.fixture
+def task(tmp_path):
+    path = tmp_path / "my_task.yaml"
+    path.write_text(TASK.format(name="turn_about"))
+    return path
+
+
+def test_a_task_file_becomes_an_environment(registry, task):
+    assert register_task(task) == register_task(task) == "WLR-TurnAbout-v1"
+    env = gym.make("WLR-TurnAbout-v1", robot="nominal")
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    kind = type(env.unwrapped)
+    assert kind.__name__ == "TurnAboutV1Env"
+    assert "Turn on the spot." in str(kind.__doc__)
+    assert "- v1: turns faster" in str(kind.__doc__)
+    assert pickle.loads(pickle.dumps(env.unwrapped)).core.task.config.name == "turn_about"
+    batch = gym.make_vec("WLR-TurnAbout-v1", num_envs=2)
+    assert batch.reset(seed=0)[0].shape == (2, 4)
+
+
+def test_an_id_is_not_taken_twice(registry, task, tmp_path):
+    register_task(task)
+    other = tmp_path / "other.yaml"
+    other.write_text(TASK.format(name="turn_about"))
+    with pytest.raises(InputError, match=r"'WLR-TurnAbout-v1' is the task .*my_task\.yaml' already"):
+        register_task(other)
+
+
+def test_each_version_is_its_own_environment(registry, task, tmp_path):
+    register_task(task)
+    newer = tmp_path / "newer.yaml"
+    changed = TASK.replace("v1: turns faster", "v1: faster, v2: longer").replace("episode_length: 1.0", "episode_length: 3.0")
+    newer.write_text(changed.format(name="turn_about"))
+    assert register_task(newer) == "WLR-TurnAbout-v2"
+    assert [gym.make(f"WLR-TurnAbout-v{n}").unwrapped.core.limit for n in (1, 2)] == [50, 150]  # type: ignore[attr-defined]
+    assert [gym.make_vec(f"WLR-TurnAbout-v{n}", num_envs=2).core.limit for n in (1, 2)] == [50, 150]  # type: ignore[attr-defined]
+
+
+def test_another_version_of_a_shipped_task_is_not_the_shipped_one(registry, tmp_path):
+    path = tmp_path / "velocity.yaml"
+    path.write_text(TASK.format(name="velocity"))
+    assert register_task(path) == "WLR-Velocity-v1"
+    assert gym.make("WLR-Velocity-v1").unwrapped.core.task.commands == ("yaw_rate",)  # type: ignore[attr-defined]
+    assert len(gym.make("WLR-Velocity-v0").unwrapped.core.task.commands) == 2  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("name: turn_about", "name: turn about"), ("name: turn_about", "name: ''"), ("v1: turns", "second: turns")],
+)
+def test_what_can_be_no_id_is_refused(registry, task, old, new):
+    task.write_text(task.read_text().replace(old, new))
+    known = set(ENVIRONMENTS)
+    with pytest.raises(InputError, match="pattern"):
+        register_task(task)
+    assert set(ENVIRONMENTS) == known
+
+
+def test_a_broken_file_is_refused(registry, tmp_path):
+    path = tmp_path / "task.yaml"
+    path.write_text("name: nothing\n")
+    with pytest.raises(InputError, match="'control_period' is missing"):
+        register_task(path)
+    assert "WLR-Nothing-v0" not in ENVIRONMENTS
+
+
+def test_versions_of_ids_are_the_last_of_the_history():
+    for env_id, (name, _, _) in ENVIRONMENTS.items():
+        config = read_task(name)
+        assert env_id == f"WLR-{title_of(name)}-{list(config.history)[-1]}"
+        assert config.summary
