@@ -16,7 +16,7 @@ from wlr_gym.gap import report as module
 from wlr_gym.gap.analysis import Estimate, Evidence, FoundEffect, HeatMap, IntakeFinding, Place
 from wlr_gym.gap.plots import draw, figures
 from wlr_gym.gap.report import check_folder, report, save_analysis
-from wlr_gym.gap.words import channel, error, estimate, feature, number, percent, places, plain, sentence
+from wlr_gym.gap.words import channel, error, estimate, feature, number, percent, places, plain, sentence, title
 
 EVERY = pytest.mark.parametrize("analysis", examples.ALL.values(), ids=list(examples.ALL))
 PICTURE = {"gap": b"\x89PNG"}
@@ -226,6 +226,16 @@ def test_sentences_say_what_was_found():
     assert sentence(replace(examples.EFFECT_FOUND, effects=two, equivalent=())).startswith(
         "The model lacks 2 effects: rolling resistance (both front wheels) and payload (body); added, they remove 95 %"
     )
+
+
+def test_what_is_left_without_a_name_is_not_called_nothing():
+    none = examples.NOTHING_MISSING
+    assert none.gap is not None
+    rest = replace(none, gap=replace(none.gap, heldout_calibrated=3.2, heldout_after=3.2, noise_floor=1.1))
+    assert (title(none), title(rest)) == ("Nothing missing", "Nothing clear enough to be named")
+    assert "to within 3.20 times the sensor noise" in sentence(rest)
+    assert sentence(rest).endswith("where one without error would reach 1.10.")
+    assert "lacks nothing" not in sentence(rest)
 
 
 @pytest.mark.parametrize(

@@ -98,10 +98,10 @@ def _check(options: Options) -> None:
 def _print(analysis: Analysis, out: Path, console: Console) -> None:
     from wlr_gym.gap.report import REPORT_FILE
     from wlr_gym.gap.result import PATCH_FILE, RESULT_FILE
-    from wlr_gym.gap.words import TITLES, sentence
+    from wlr_gym.gap.words import sentence, title
 
     colours = {"bad_data": "red", "not_excited": "yellow", "nothing_missing": "green"}
-    console.print(TITLES[analysis.verdict], style=f"bold {colours.get(analysis.verdict, 'blue')}")
+    console.print(title(analysis), style=f"bold {colours.get(analysis.verdict, 'blue')}")
     for line in (sentence(analysis), *_findings(analysis), *_numbers(analysis), *_advice(analysis)):
         console.print(line, markup=False)
     for label, name in (("report", REPORT_FILE), ("result", RESULT_FILE), ("patch", PATCH_FILE)):

@@ -34,7 +34,6 @@ from wlr_gym.gap.page import commands, document, folded, heading, pictures_of, s
 from wlr_gym.gap.plots import SCREENED_OUT, draw
 from wlr_gym.gap.result import PATCH_FILE, RESULT_FILE, TWO_SIGMA, patch_of, read_result, result_of, write_result
 from wlr_gym.gap.words import (
-    TITLES,
     channel,
     duration,
     error,
@@ -46,6 +45,7 @@ from wlr_gym.gap.words import (
     places,
     plain,
     sentence,
+    title,
     unit_of,
 )
 from wlr_gym.parameters import TABLE
@@ -137,7 +137,6 @@ def report(analysis: Analysis, pictures: Mapping[str, bytes], folder: Path) -> s
         pictures: name -> PNG, of :func:`wlr_gym.gap.plots.draw`.
         folder: where the results are, for the commands it shows.
     """
-    title = f"{TITLES[analysis.verdict]}: {analysis.data}"
     body = [
         _header(analysis),
         _where(analysis, pictures),
@@ -150,7 +149,7 @@ def report(analysis: Analysis, pictures: Mapping[str, bytes], folder: Path) -> s
         _use(analysis, folder),
         _footer(analysis),
     ]
-    return document(title, _COLOURS[analysis.verdict], body)
+    return document(f"{title(analysis)}: {analysis.data}", _COLOURS[analysis.verdict], body)
 
 
 def _pictures(kind: str, pictures: Mapping[str, bytes]) -> str:
@@ -167,7 +166,7 @@ def _header(analysis: Analysis) -> str:
     if known:
         facts.append(f"known from the start: {escape(listed([plain(name) for name in known]))}")
     return (
-        f'<header>\n<p class="label">{escape(TITLES[analysis.verdict])}</p>\n<h1>{escape(sentence(analysis))}</h1>\n'
+        f'<header>\n<p class="label">{escape(title(analysis))}</p>\n<h1>{escape(sentence(analysis))}</h1>\n'
         f'<p class="small">{"; ".join(facts)}.</p>\n</header>\n{_tiles(analysis)}'
     )
 

@@ -27,6 +27,8 @@ TITLES = {
     EFFECT_FOUND: "Missing effect found",
     UNKNOWN: "Something unknown is missing",
 }
+#: Title where nothing was named, and yet something is left.
+NOTHING_CLEAR = "Nothing clear enough to be named"
 _CORNERS: dict[str, str] = dict(zip(CORNERS, ("left front", "right front", "left rear", "right rear"), strict=True))
 _SIDES = {
     frozenset(CORNERS): "all four",
@@ -144,6 +146,18 @@ def duration(seconds: float) -> str:
 # ---- the verdict -----------------------------------------------------------------------------------------------------
 
 
+def title(analysis: Analysis) -> str:
+    """Return the title of a report."""
+    return NOTHING_CLEAR if _leaves_something(analysis) else TITLES[analysis.verdict]
+
+
+def _leaves_something(analysis: Analysis) -> bool:
+    """Whether nothing was named although the error of runs kept aside is well above what a model without error would leave."""
+    gap = analysis.gap
+    named_nothing = analysis.verdict == NOTHING_MISSING and gap is not None
+    return named_nothing and gap.heldout_calibrated >= UNEXPLAINED * gap.noise_floor
+
+
 def sentence(analysis: Analysis) -> str:
     """Return the verdict in one sentence: the analysis' own, or one made from its numbers."""
     return analysis.summary or _SENTENCES[analysis.verdict](analysis)
@@ -166,7 +180,7 @@ def _nothing_missing(analysis: Analysis) -> str:
     if gap is None:
         return f"The model lacks nothing that these runs could show{calibrated}."
     rest = f"it replays runs kept aside to within {error(gap.heldout_calibrated)} times the sensor noise"
-    if gap.heldout_calibrated < UNEXPLAINED * gap.noise_floor:
+    if not _leaves_something(analysis):
         return f"The model lacks nothing that these runs could show: {rest}{calibrated}."
     return (
         f"No effect of the library is clear enough in these runs to be named: the model {rest.removeprefix('it ')}{calibrated}"
