@@ -49,6 +49,20 @@ def test_command_parses(command: str, capsys: pytest.CaptureFixture[str]) -> Non
         pytest.fail(capsys.readouterr().err or capsys.readouterr().out)
 
 
+def test_what_the_readme_says_reproduces_a_number_exists(capsys: pytest.CaptureFixture[str]) -> None:
+    table = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Measured")[2].partition("\n## ")[0]
+    last_cells = [line.split("|")[-2] for line in table.splitlines() if line.startswith("| ") and "reproduce" not in line]
+    commands = [re.search(r"`([^`]+)`", cell) for cell in last_cells]
+    assert all(commands)
+    for command in (match[1] for match in commands if match):
+        if command.startswith("wlr "):
+            test_command_parses(command, capsys)
+        else:
+            program, *paths = command.split()
+            assert program == "pytest"
+            assert all((ROOT / path).exists() for path in paths), command
+
+
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md"], ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page) -> None:
     for target, _ in LINK.findall(page.read_text(encoding="utf-8")):
