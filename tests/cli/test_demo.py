@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import pytest
 
@@ -19,6 +20,7 @@ COMMAND = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.
 TITLES = [stage.title for stages in lanes.LANES.values() for stage in stages]
 
 
+@pytest.mark.slow
 def test_the_whole_loop_ends_in_one_page(tmp_path, capsys):
     for package in ("torch", "stable_baselines3", "onnxruntime", "dynamixel_sdk", "serial"):
         pytest.importorskip(package)
@@ -72,12 +74,17 @@ def _good(demo, tell):
     return lanes.Section("good", "it works", "<p>fine</p>")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 def test_ctrl_c_leaves_what_was_made(tmp_path):
     pytest.importorskip("torch")
     out = tmp_path / "demo"
     process = subprocess.Popen(
-        [*COMMAND, "--steps", "50_000_000", "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*COMMAND, "--steps", "50_000_000", "--out", str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a background shell has switched it off
     )
     curve = out / "run" / "learning_curve.csv"
     deadline = time.monotonic() + 120.0

@@ -77,7 +77,7 @@ def test_bad_words_are_refused(capsys, arguments, words):
         assert word in text
 
 
-@pytest.mark.parametrize("command", [["train"], ["evaluate", "do_nothing"], ["demo"]], ids=lambda words: words[0])
+@pytest.mark.parametrize("command", [["train"], ["evaluate", "do_nothing"]], ids=lambda words: words[0])
 def test_bad_patches_are_refused_before_anything_is_written(tmp_path, capsys, command):
     if command[0] != "evaluate":
         pytest.importorskip("torch")
