@@ -154,8 +154,9 @@ def title(analysis: Analysis) -> str:
 def _leaves_something(analysis: Analysis) -> bool:
     """Whether nothing was named although the error of runs kept aside is well above what a model without error would leave."""
     gap = analysis.gap
-    named_nothing = analysis.verdict == NOTHING_MISSING and gap is not None
-    return named_nothing and gap.heldout_calibrated >= UNEXPLAINED * gap.noise_floor
+    if analysis.verdict != NOTHING_MISSING or gap is None:
+        return False
+    return gap.heldout_calibrated >= UNEXPLAINED * gap.noise_floor
 
 
 def sentence(analysis: Analysis) -> str:
