@@ -7,7 +7,6 @@ the gap workflow fits it, logs record it. Names are dotted, with the joint, whee
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -68,7 +67,6 @@ def _motor(field: str) -> Callable[[Robot], list[float]]:
 
 INERTIA_LABELS = ("xx", "yy", "zz", "xy", "xz", "yz")
 LEG_INERTIA_LABELS = tuple(f"{leg},{axis}" for leg in LEGS for axis in XYZ)
-INF = math.inf
 
 TABLE: tuple[ParameterSpec, ...] = (
     ParameterSpec("gravity", "m/s2", (), lambda r: r.gravity, 0, 30, "", "gravitational acceleration"),
