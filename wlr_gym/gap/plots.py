@@ -144,7 +144,7 @@ def _write_values(axes: Axes, values: Array, norm: Normalize) -> None:
 def _evidence(evidence: Sequence[Evidence]) -> Figure:
     rounds = sorted({one.round for one in evidence})
     shown = [_strongest([one for one in evidence if one.round == turn]) for turn in rounds]
-    heights = [0.9 + 0.24 * len(members) for members in shown]
+    heights = [1.1 + 0.24 * len(members) for members in shown]
     figure = _new(9.5, sum(heights) + 0.6)
     panels = figure.subplots(len(rounds), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, turn, members in zip(panels, rounds, shown, strict=True):
@@ -152,7 +152,7 @@ def _evidence(evidence: Sequence[Evidence]) -> Figure:
         total = sum(one.round == turn for one in evidence)
         part = f": the strongest of {total} explanations" if total > len(members) else ""
         axes.set_title(f"Round {turn}{part}", fontsize=10, loc="left")
-    panels[-1].set_xlabel("gain: how much better the model explains the fitted runs (fall of -2 log posterior)", fontsize=9)
+        axes.set_xlabel("gain: how much better the model explains the fitted runs (fall of -2 log posterior)", fontsize=9)
     labels = ((_TAKEN, "taken"), (_EQUIVALENT, "equivalent: cannot be told from it"), (_LOST, "lost after its fit"))
     handles = [panels[0].barh([0], [0], color=colour, label=label) for colour, label in labels]
     handles.append(panels[0].barh([0], [0], fill=False, edgecolor=_LOST, label="promised by the first look only"))
