@@ -220,5 +220,7 @@ def _map_figure(comparison: Comparison) -> Figure:
         f"rms in units of sensor noise; effects: {comparison.effects}",
         fontsize=10,
     )
-    figure.colorbar(image, ax=axes, shrink=0.8)
+    axes.set_xlabel("motion", fontsize=9)
+    axes.set_ylabel("signal", fontsize=9)
+    figure.colorbar(image, ax=axes, shrink=0.8, label="rms difference (1 = sensor noise)")
     return figure
