@@ -504,21 +504,24 @@ def _corrected(problem: Problem, before: _Trial, own: Sequence[Array], after: _T
     return replace(after, corrections=(*before.corrections, (known, missed)))
 
 
+def _least_costs(problem: Problem, trials: Sequence[_Trial], memory: Array) -> tuple[list[float], dict[int, float]]:
+    """Costs of the trials, and of the best trial of each hypothesis."""
+    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
+    return costs, {of: min(c for c, t in zip(costs, trials, strict=True) if t.of == of) for of in {t.of for t in trials}}
+
+
 def _hopeful(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[_Trial]:
     """Of two starts of a hypothesis the better one, if the other is far behind."""
-    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
-    least = {of: min(c for c, t in zip(costs, trials, strict=True) if t.of == of) for of in {t.of for t in trials}}
+    costs, least = _least_costs(problem, trials, memory)
     room = max(max(least.values()) - min(least.values()), LEAST_GAIN)
     return [t for c, t in zip(costs, trials, strict=True) if c - least[t.of] < BEHIND * room]
 
 
 def _given_up(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[_Trial]:
     """The trials; those of hypotheses that are far behind the best are settled."""
-    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
-    base = min(c for c, t in zip(costs, trials, strict=True) if t.of < 0)
-    gains = {of: base - min(c for c, t in zip(costs, trials, strict=True) if t.of == of) for of in {t.of for t in trials}}
-    best = max(gains.values())
-    return [replace(t, settled=t.settled or (t.of >= 0 and gains[t.of] < HOPELESS * best)) for t in trials]
+    _, least = _least_costs(problem, trials, memory)
+    enough = HOPELESS * (least[-1] - min(least.values()))
+    return [replace(t, settled=t.settled or (t.of >= 0 and least[-1] - least[t.of] < enough)) for t in trials]
 
 
 def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequence[NDArray[np.float32]]) -> list[_Trial]:
