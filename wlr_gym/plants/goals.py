@@ -14,7 +14,13 @@ Array = NDArray[np.float64]
 
 
 class Goals(Protocol):
-    """Where a simulator gets the goals of a tick from; see :class:`GoalHistory`."""
+    """Where a simulator gets the goals of a tick from; see :class:`GoalHistory`.
+
+    Attributes:
+        given: they come from elsewhere; what is written to the simulator is ignored.
+    """
+
+    given: bool
 
     def reset(self, rows: NDArray[np.intp], state: PlantState, parameters: Parameters) -> None: ...
 
@@ -28,6 +34,8 @@ class GoalHistory:
 
     Within one control tick a joint follows the older of two neighbouring goals until ``switch_time``, then the newer one.
     """
+
+    given = False
 
     def __init__(self, count: int, control_period: float) -> None:
         self._period = control_period

@@ -9,7 +9,17 @@ from numpy.typing import NDArray
 
 from wlr_gym.errors import InputError
 from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, PlantState, Sensors, Truth, standing_state
+from wlr_gym.plants.base import (
+    SENSOR_LAYOUT,
+    TRUTH_LAYOUT,
+    PlantOptions,
+    PlantState,
+    Sensors,
+    Truth,
+    check_goals,
+    hold_where_off,
+    standing_state,
+)
 from wlr_gym.plants.goals import GoalHistory, Goals
 from wlr_gym.plants.sensors import RAW_LAYOUT, SensorModel
 from wlr_gym.robot import Robot
@@ -106,6 +116,24 @@ class Simulator(ABC):
     def use_goals(self, goals: Goals) -> None:
         """Take the goals from a schedule of one's own instead of the history of those written."""
         self._goals = goals
+
+    def keep_going(self, count: int) -> None:  # noqa: B027 (a simulator may have no use for it)
+        """From now on nobody looks at any but the first ``count`` robots: a simulator need not move the others."""
+
+    def _take_goals(self, goals: Array, torque_on: NDArray[np.bool_] | None, on: Array) -> tuple[Array, Array, Array]:
+        """Write into ``on`` (N, 8) which motors are on; return newer goals, older goals and switch time of this tick.
+
+        Raises:
+            InputError: wrong shape or a non-finite goal of a motor that is on.
+        """
+        if torque_on is None:
+            on.fill(1.0)
+        elif self._goals.given:
+            on[...] = torque_on
+        else:
+            goals = hold_where_off(goals, torque_on, self._present_goals())
+            on[...] = np.asarray(torque_on, dtype=bool)
+        return self._goals.push(goals if self._goals.given else check_goals(goals, self._count))
 
     def _rows(self, mask: NDArray[np.bool_] | None) -> Rows:
         if mask is None:

@@ -11,14 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.gap.robot.recorder import CLOCK, POSE_TICKS, Recorder, Replays
 from wlr_gym.gap.robot.windows import WINDOW, window_rows
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants import make_plant
-from wlr_gym.plants.base import PlantOptions, PlantState, Sensors, Truth, standing_state
+from wlr_gym.plants.base import PlantOptions, PlantState, Sensors, standing_state
 from wlr_gym.plants.forces import Force
 from wlr_gym.plants.sensors import rotation
 from wlr_gym.plants.simulator import Simulator
@@ -35,43 +38,21 @@ from wlr_gym.runs.anchor import (
     starts_at_rest,
     unwrapped,
 )
-from wlr_gym.runs.format import CHANNELS, COMMANDS
+from wlr_gym.runs.format import COMMANDS
 from wlr_gym.runs.read import Run
 from wlr_gym.runs.replay import held_goals, profile_parameters
 from wlr_gym.servo import motor_constants
 
 Array = NDArray[np.float64]
 
-#: s; the plant's tick, and its physics step.
-CLOCK = 0.004
+#: s; of the plant.
 PHYSICS_STEP = 0.001
 #: Simulators that are twice as fast with numbers whose rounding (0.05 sensor noises after windows of 2 s) does not matter here.
 PRECISION = {"gibbs_appell": "float32"}
 #: s; the robot stands this long before the first row.
 LEAD = 0.3
-#: Ticks between two stored poses, from which the camera's are interpolated.
-POSE_TICKS = 3
 #: Robots simulated at once: more need more memory and are no faster.
 MOST_ROBOTS = 1024
-DIRECT = tuple(name for name in CHANNELS if not name.startswith("cam_"))
-CAMERA = tuple(name for name in CHANNELS if name.startswith("cam_"))
-#: Of DIRECT, the leading columns of joint positions and speeds.
-_MOVED = 16
-#: Truth channels that residuals are mapped over.
-TRUTH = ("joint_position", "joint_velocity", "motor_torque", "contact_force", "slip_velocity", "position")
-
-
-@dataclass(frozen=True, eq=False)
-class Replays:
-    """One run under every setting.
-
-    Attributes:
-        values: (settings, rows, len(CHANNELS)) what the sensors would have read.
-        truth: (settings, rows, columns) of :data:`TRUTH`, or None.
-    """
-
-    values: Array
-    truth: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +106,8 @@ class RunClock:
 class WrittenGoals:
     """Goals that arrive at their measured times, each joint's late by its own ``command.delay``."""
 
+    given = True
+
     def __init__(self, clocks: Sequence[RunClock], run_of: NDArray[np.intp], delay: Array) -> None:
         rows = [len(clock.t) for clock in clocks]
         start = np.concatenate([[0], np.cumsum([n + 1 for n in rows])])[:-1]
@@ -132,7 +115,7 @@ class WrittenGoals:
         self._goals = np.concatenate([np.vstack([clock.goals, clock.goals[-1:]]) for clock in clocks])
         self._row = np.repeat(start[run_of][:, None], 8, axis=1)
         self._delay = delay
-        self._joint = np.arange(8)[None, :]
+        self._newer, self._older, self._wait = (np.zeros(delay.shape) for _ in range(3))
         self._tick = 0
 
     def reset(self, rows: NDArray[np.intp], state: PlantState, parameters: Parameters) -> None:
@@ -142,15 +125,28 @@ class WrittenGoals:
         """Nothing: the delays are given."""
 
     def push(self, goals: Array) -> tuple[Array, Array, Array]:
-        """Return the newer goals, the older goals and the time between (s) of the present tick; see GoalHistory."""
-        now = self._tick * CLOCK
+        """Return the newer goals, the older goals and the time between (s) of the present tick; see GoalHistory.
+
+        The next call overwrites them.
+        """
+        arrived = (self._newer, self._older, self._wait)
+        _arrive(self._tick * CLOCK, self._times, self._goals, self._delay, self._row, *arrived)
         self._tick += 1
-        due = self._times[self._row + 1] + self._delay - now
-        arrives = due < CLOCK
-        older = self._goals[self._row, self._joint]
-        self._row += arrives
-        newer = self._goals[self._row, self._joint]
-        return newer, older, np.where(arrives, np.maximum(due, 0.0), 0.0)
+        return arrived
+
+
+@njit(cache=True, nogil=True)
+def _arrive(now: Any, times: Any, goals: Any, delay: Any, rows: Any, newer: Any, older: Any, wait: Any) -> None:
+    """Fill the goals of a tick and move ``rows`` on to those that have arrived."""
+    for i in range(len(rows)):
+        for j in range(8):
+            older[i, j] = goals[rows[i, j], j]
+            due = times[rows[i, j] + 1] + delay[i, j] - now
+            wait[i, j] = 0.0
+            if due < CLOCK:
+                rows[i, j] += 1
+                wait[i, j] = max(due, 0.0)
+            newer[i, j] = goals[rows[i, j], j]
 
 
 def replay_batch(
@@ -177,10 +173,12 @@ def replay_batch(
     """
     settings = len(parameters)
     chunk = max(1, MOST_ROBOTS // len(clocks))
+    order = sorted(range(len(clocks)), key=lambda r: -clocks[r].ticks)  # a run that is over need not be simulated any further
+    longest_first = [clocks[r] for r in order]
     parts = [
         _replay_chunk(
             robot,
-            clocks,
+            longest_first,
             Parameters(parameters.values[k : k + chunk]),
             backend,
             forces,
@@ -195,7 +193,7 @@ def replay_batch(
             np.concatenate([part[r].values for part in parts]),
             np.concatenate([part[r].truth for part in parts]) if with_truth else None,  # type: ignore[arg-type]
         )
-        for r in range(len(clocks))
+        for r in np.argsort(order)
     ]
 
 
@@ -223,12 +221,14 @@ def _replay_chunk(
     plant.use_goals(WrittenGoals(clocks, run_of, delay))
     first = _join([_start(clock.run, robot, parameters) for clock in clocks])
     try:
-        recorder = _Recorder(clocks, settings, first, delay, with_truth)
+        recorder = Recorder(clocks, settings, first, delay, with_truth)
         readings = plant.reset(parameters=lanes, state=first)
         recorder.start(readings)
         ticks = POSE_TICKS * -(-max(clock.ticks for clock in clocks) // POSE_TICKS)  # the last pose is stored too
-        anchors = _anchors_by_tick(clocks)
+        anchors, ends = _anchors_by_tick(clocks), np.array([clock.ticks + POSE_TICKS for clock in clocks])
         for tick in range(ticks):
+            if tick in ends:
+                plant.keep_going(settings * int((ends > tick).sum()))
             for r, window in anchors.get(tick, ()):
                 readings = _anchor(plant, clocks[r], window, run_of == r, lanes, readings)
                 recorder.start_anew(r, tick, readings, plant.truth())
@@ -286,131 +286,6 @@ def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.boo
     state.position[mine, 0] = cosine * x - sine * y - offset[:, 0]
     state.position[mine, 1] = sine * x + cosine * y - offset[:, 1]
     state.quaternion[mine] = quaternion(heading, pitch, roll)
-
-
-class _Recorder:
-    """Readings at the rows' times, on a straight line through two ticks; poses on a coarser clock, for the camera's delay."""
-
-    def __init__(self, clocks: Sequence[RunClock], settings: int, first: PlantState, delay: Array, with_truth: bool) -> None:
-        self._soonest = delay.min(axis=1)
-        self.clocks, self.settings, self.with_truth = clocks, settings, with_truth
-        count = settings * len(clocks)
-        self.idle_goals = np.zeros((count, 8))
-        self._wheels = first.joint_position[:, 4:]
-        self._rows = [np.zeros((settings, len(clock.t), len(DIRECT))) for clock in clocks]
-        self._truths = [np.zeros((settings, len(clock.t), 0)) for clock in clocks]
-        self._place = [(clock.t - clock.begin) / CLOCK for clock in clocks]
-        self._next = [0] * len(clocks)
-        ticks = max(clock.ticks for clock in clocks) + 2
-        self._poses = np.zeros((ticks // POSE_TICKS + 2, count, len(CAMERA)))
-        self._last: Array | None = None
-        self._before_last: Array | None = None
-        self._anchored = [-1] * len(clocks)
-        self._torque = [clock.torque_on for clock in clocks]
-        self._always_on = all(on.all() for on in self._torque)
-        now = (np.arange(ticks + POSE_TICKS) + 0.5) * CLOCK
-        last = [np.searchsorted(clock.t - clock.begin, now, side="right") - 1 for clock in clocks]
-        self._torque_row = np.maximum(last, 0).T.tolist()
-        self._offsets = np.repeat([clock.run.meta.marker_offset for clock in clocks], settings, axis=0)
-
-    def start(self, readings: Sensors) -> None:
-        """Count the wheel angles from where the robots stand."""
-        self._shift = self._wheels - readings.joint_position[:, 4:]
-
-    def start_anew(self, r: int, tick: int, readings: Sensors, truth: Truth) -> None:
-        """Count the wheel angles of one run on after an anchor; what was read before it says nothing about what follows."""
-        mine = slice(r * self.settings, (r + 1) * self.settings)
-        self._shift[mine] = truth.joint_position[mine, 4:] - readings.joint_position[mine, 4:]
-        self._anchored[r] = tick
-
-    def torque_on(self, tick: int) -> NDArray[np.bool_] | None:
-        """Switching the torque is not delayed."""
-        if self._always_on:
-            return None
-        return np.repeat([on[row] for on, row in zip(self._torque, self._torque_row[tick], strict=True)], self.settings, axis=0)
-
-    def see(self, tick: int, readings: Sensors, truth: Truth) -> None:
-        if tick % POSE_TICKS == 0:
-            self._poses[tick // POSE_TICKS] = _poses(truth, self._offsets)
-        wanted = [
-            r
-            for r, place in enumerate(self._place)
-            if self._next[r] < len(place) and tick - 1 <= place[self._next[r]] <= tick + 2
-        ]
-        if not wanted:
-            self._last = self._before_last = None
-            return
-        present = _direct(readings, self._shift)
-        seen = np.concatenate([truth[name] for name in TRUTH], axis=1) if self.with_truth else None
-        for r in wanted:
-            self._take(r, tick, present, seen)
-        self._before_last, self._last = self._last, present
-
-    def _take(self, r: int, tick: int, present: Array, seen: Array | None) -> None:
-        place, mine = self._place[r], slice(r * self.settings, (r + 1) * self.settings)
-        while self._next[r] < len(place) and place[self._next[r]] <= tick:
-            row = self._next[r]
-            self._rows[r][:, row] = self._at(place[row] - (tick - 1), r, tick, mine, present)
-            if seen is not None:
-                if not self._truths[r].shape[2]:
-                    self._truths[r] = np.zeros((self.settings, len(place), seen.shape[1]))
-                self._truths[r][:, row] = seen[mine]
-            self._next[r] += 1
-
-    def _at(self, share: float, r: int, tick: int, mine: slice, present: Array) -> Array:
-        """Readings between the last tick and this one.
-
-        A row's own goal acts after its reading: where it would act before this tick, the line is that of the two ticks before.
-        """
-        if self._last is None or share > 1.0 - 1e-9:
-            return present[mine]
-        last = self._last[mine]
-        between = last + share * (present[mine] - last)
-        if self._anchored[r] >= tick - 1:  # what the anchor kept of motors and IMU is the model's before it
-            return np.hstack([between[:, :_MOVED], present[mine][:, _MOVED:]])
-        if self._before_last is None:
-            return between
-        in_time = self._soonest[mine] >= (1.0 - share) * CLOCK
-        return np.where(in_time[:, None], between, last + share * (last - self._before_last[mine]))
-
-    def result(self, r: int, parameters: Parameters) -> Replays:
-        mine = slice(r * self.settings, (r + 1) * self.settings)
-        values = np.zeros((*self._rows[r].shape[:2], len(CHANNELS)))
-        values[:, :, [CHANNELS.index(name) for name in DIRECT]] = self._rows[r]
-        poses = _interpolated(self._poses[:, mine], self._place[r][None, :] - parameters["camera.delay"][:, None] / CLOCK)
-        _turn(poses, parameters)
-        values[:, :, [CHANNELS.index(name) for name in CAMERA]] = poses
-        return Replays(values, self._truths[r] if self.with_truth else None)
-
-
-def _direct(readings: Sensors, shift: Array) -> Array:
-    position = readings.joint_position + np.hstack([np.zeros_like(shift), shift])
-    groups = (position, readings.joint_velocity, readings.joint_effort, readings.gyro, readings.accelerometer)
-    return np.column_stack([*groups, readings.supply_voltage])
-
-
-def _poses(truth: Truth, offsets: Array) -> Array:
-    yaw, pitch, roll = euler_angles(truth.quaternion)
-    marker = truth.position + np.einsum("nij,nj->ni", rotation(yaw, pitch, roll), offsets)
-    return np.column_stack([marker[:, 0], marker[:, 1], yaw, marker[:, 2], pitch])
-
-
-def _interpolated(poses: Array, places: Array) -> Array:
-    """Interpolate stored poses (times, settings, 5) at ``places`` (settings, rows) in ticks."""
-    poses[:, :, 2] = np.unwrap(poses[:, :, 2], axis=0)
-    places = np.maximum(places / POSE_TICKS, 0.0)
-    before = np.minimum(places.astype(int), len(poses) - 2)
-    share = (places - before)[:, :, None]
-    settings = np.arange(poses.shape[1])[:, None]
-    return (1 - share) * poses[before, settings] + share * poses[before + 1, settings]
-
-
-def _turn(poses: Array, parameters: Parameters) -> None:
-    """From the floor frame into the camera's, in place."""
-    mount, scale = parameters["camera.mount_yaw"][:, None], parameters["camera.scale"][:, None]
-    cosine, sine = scale * np.cos(mount), scale * np.sin(mount)
-    x, y = poses[:, :, 0].copy(), poses[:, :, 1].copy()
-    poses[:, :, 0], poses[:, :, 1] = cosine * x + sine * y, cosine * y - sine * x
 
 
 def _start(run: Run, robot: Robot, parameters: Parameters) -> PlantState:

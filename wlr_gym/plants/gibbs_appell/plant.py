@@ -18,8 +18,6 @@ from wlr_gym.plants.base import (
     PlantOptions,
     PlantState,
     Sensors,
-    check_goals,
-    hold_where_off,
 )
 from wlr_gym.plants.forces import Force, compile_forces
 from wlr_gym.plants.gibbs_appell import kernel, packing
@@ -73,7 +71,7 @@ class GibbsAppellPlant(Simulator):
         self._float = np.dtype(self.options.precision).type
         self._step = self._float(self.options.physics_step)
         self._width = 1 if count == 1 else kernel.WIDTH[self.options.precision]
-        self._tiles = -(-count // self._width)
+        self._tiles = self._going = -(-count // self._width)
         self._lanes = np.zeros((self._tiles, len(STORED) * self._width), self._float)
         self._constants = np.zeros((self._tiles, len(packing.PARAMETER_LANES) * self._width), self._float)
         self._torque_on = np.ones((count, 8))
@@ -212,23 +210,21 @@ class GibbsAppellPlant(Simulator):
 
     # ---- stepping ----
 
+    def keep_going(self, count: int) -> None:
+        """Leave the tiles without any of the first ``count`` robots; see :class:`wlr_gym.plants.simulator.Simulator`."""
+        self._going = -(-count // self._width)
+        self._chunks = [(first, min(last, self._going)) for first, last in self._chunks if first < self._going]
+
     def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick; see :meth:`wlr_gym.plants.base.Plant.step`.
 
         Raises:
             InputError: wrong shape or a non-finite goal of a motor that is on.
         """
-        if torque_on is None:
-            self._torque_on.fill(1.0)
-        else:
-            goals = hold_where_off(goals, torque_on, self._present_goals())
-            self._torque_on[...] = np.asarray(torque_on, dtype=bool)
-        goals = check_goals(goals, self._count)
-        new, old, switch_time = self._goals.push(goals)
-        inputs = (new, old, switch_time, self._torque_on, self._formula_values)
+        inputs = (*self._take_goals(goals, torque_on, self._torque_on), self._torque_on, self._formula_values)
         arguments = (self._lanes, self._constants, *inputs, self._truth.values, self._raw)
         if self._pool is None:
-            self._run(arguments, 0, self._tiles)
+            self._run(arguments, 0, self._going)
         else:
             waiting = [self._pool.submit(self._run, arguments, *chunk) for chunk in self._chunks[1:]]
             self._run(arguments, *self._chunks[0])

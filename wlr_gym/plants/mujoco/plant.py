@@ -15,8 +15,6 @@ from wlr_gym.plants.base import (
     PlantOptions,
     PlantState,
     Sensors,
-    check_goals,
-    hold_where_off,
 )
 from wlr_gym.plants.forces import COORDINATES, INPUTS, Force, compile_forces
 from wlr_gym.plants.mujoco import packing
@@ -167,13 +165,7 @@ class MujocoPlant(Simulator):
         Raises:
             InputError: wrong shape or a non-finite goal of a motor that is on.
         """
-        on = self._inputs[3]
-        if torque_on is None:
-            on.fill(1.0)
-        else:
-            goals = hold_where_off(goals, torque_on, self._present_goals())
-            on[...] = np.asarray(torque_on, dtype=bool)
-        for target, values in zip(self._inputs, self._goals.push(check_goals(goals, self._count)), strict=False):
+        for target, values in zip(self._inputs, self._take_goals(goals, torque_on, self._inputs[3]), strict=False):
             target[...] = values
         self._tick()
         self._sensors.measure(self._raw, self._readings.values)
