@@ -113,12 +113,13 @@ class RobotProblem:
         """Return what the sensors would have read: (settings, rows, signals) per run, SI."""
         plain = [k for k, setting in enumerate(settings) if not Patch((*self.known.effects, *setting.effects)).forces]
         formulas = [k for k in range(len(settings)) if k not in set(plain)]
+        if not plain or not formulas:
+            return [replays.values for replays in self._replay(settings, runs)]
         results = [np.zeros((len(settings), len(self.times(r)), len(CHANNELS))) for r in runs]
         for members in (plain, formulas):
-            if members:
-                chosen = [settings[k] for k in members]
-                for result, replays in zip(results, self._replay(chosen, runs), strict=True):
-                    result[members] = replays.values
+            chosen = [settings[k] for k in members]
+            for result, replays in zip(results, self._replay(chosen, runs), strict=True):
+                result[members] = replays.values
         return results
 
     def _replay(self, settings: Sequence[Setting], runs: Sequence[int], with_truth: bool = False) -> list[Replays]:

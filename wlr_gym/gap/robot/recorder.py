@@ -10,10 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from wlr_gym.model.dynamics import rotation_matrix
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, Sensors, Truth
-from wlr_gym.runs.anchor import euler_angles
 from wlr_gym.runs.format import CHANNELS
 from wlr_gym.runs.read import Run
 
@@ -23,13 +21,12 @@ Array = NDArray[np.float64]
 CLOCK = 0.004
 #: Ticks between two stored poses, from which the camera's are interpolated.
 POSE_TICKS = 3
-DIRECT = tuple(name for name in CHANNELS if not name.startswith("cam_"))
-CAMERA = tuple(name for name in CHANNELS if name.startswith("cam_"))
 #: Truth channels that residuals are mapped over.
 TRUTH = ("joint_position", "joint_velocity", "motor_torque", "contact_force", "slip_velocity", "position")
-#: The leading columns of the sensor layout are those of DIRECT: joint positions and speeds, then what only motors and IMU know.
-_READ, _MOVED = SENSOR_LAYOUT.slices["supply_voltage"].stop, SENSOR_LAYOUT.slices["joint_velocity"].stop
-assert len(DIRECT) == _READ
+#: Channels begin as the sensors do: joint positions and speeds, then what only motors and IMU know; the camera follows.
+_MOVED, _READ = SENSOR_LAYOUT.slices["joint_velocity"].stop, SENSOR_LAYOUT.slices["accelerometer"].stop
+_VOLTAGE, _VOLT = SENSOR_LAYOUT.slices["supply_voltage"].start, CHANNELS.index("volt")
+_CAMERA = slice(CHANNELS.index("cam_x"), CHANNELS.index("cam_pitch") + 1)
 #: The leading columns of the truth layout: position and quaternion.
 _POSE = TRUTH_LAYOUT.slices["quaternion"].stop
 
@@ -66,13 +63,13 @@ class Recorder:
         count = settings * len(clocks)
         self.idle_goals = np.zeros((count, 8))
         self._wheels = first.joint_position[:, 4:]
-        self._rows = [np.zeros((settings, len(clock.t), _READ)) for clock in clocks]
+        self._values = [np.zeros((settings, len(clock.t), len(CHANNELS))) for clock in clocks]
         self._truths = [np.zeros((settings, len(clock.t), 0)) for clock in clocks]
         self._place = [(clock.t - clock.begin) / CLOCK for clock in clocks]
         self._next = [0] * len(clocks)
         ticks = max(clock.ticks for clock in clocks) + 2
         self._poses = np.zeros((ticks // POSE_TICKS + 2, count, _POSE))
-        self._recent = np.zeros((3, count, _READ))  # readings of this tick and the two before it, by tick modulo 3
+        self._recent = np.zeros((3, count, len(CHANNELS)))  # readings of this tick and the two before it, by tick modulo 3
         self._anchored = [-1] * len(clocks)
         self._torque = _torque_changes(clocks, ticks + POSE_TICKS, settings)
         self._torque_on: NDArray[np.bool_] | None = None
@@ -109,13 +106,13 @@ class Recorder:
         row, mine = self._next[r], self._mine(r)
         share = self._place[r][row] - (tick - 1)
         if tick == 0 or share > 1.0 - 1e-9:
-            self._rows[r][:, row] = self._recent[tick % 3, mine]
+            self._values[r][:, row] = self._recent[tick % 3, mine]
         else:
             # what an anchor kept of motors and IMU is the model's before it
             only_moved = self._anchored[r] >= tick - 1
             early = np.inf if only_moved or tick == 1 else (1.0 - share) * CLOCK
             now, last, before = (self._recent[(tick - ago) % 3, mine] for ago in range(3))
-            _interpolate(share, now, last, before, self._soonest[mine], early, only_moved, self._rows[r][:, row])
+            _interpolate(share, now, last, before, self._soonest[mine], early, only_moved, self._values[r][:, row])
         if self.with_truth:
             seen = np.concatenate([truth[name][mine] for name in TRUTH], axis=1)
             if not self._truths[r].shape[2]:
@@ -125,13 +122,12 @@ class Recorder:
 
     def result(self, r: int, parameters: Parameters) -> Replays:
         """What was read of run ``r`` under every setting, whose parameters are given."""
-        values = np.zeros((*self._rows[r].shape[:2], len(CHANNELS)))
-        values[:, :, [CHANNELS.index(name) for name in DIRECT]] = self._rows[r]
-        poses = _marker_poses(self._poses[:, self._mine(r)], np.asarray(self.clocks[r].run.meta.marker_offset))
-        poses = _interpolated(poses, self._place[r][None, :] - parameters["camera.delay"][:, None] / CLOCK)
-        _turn(poses, parameters)
-        values[:, :, [CHANNELS.index(name) for name in CAMERA]] = poses
-        return Replays(values, self._truths[r] if self.with_truth else None)
+        offset = np.asarray(self.clocks[r].run.meta.marker_offset, np.float64)
+        late = self._place[r][None, :] - parameters["camera.delay"][:, None] / CLOCK
+        places = np.maximum(late / POSE_TICKS, 0.0)
+        mount, scale = parameters["camera.mount_yaw"], parameters["camera.scale"]
+        _show(self._poses[:, self._mine(r)], offset, places, mount, scale, self._values[r][:, :, _CAMERA])
+        return Replays(self._values[r], self._truths[r] if self.with_truth else None)
 
 
 def _torque_changes(clocks: Sequence[Clock], ticks: int, settings: int) -> dict[int, NDArray[np.bool_]]:
@@ -153,6 +149,7 @@ def _store(readings: Any, shift: Any, out: Any) -> None:
             out[i, c] = readings[i, c]
         for k in range(4):
             out[i, 4 + k] += shift[i, k]
+        out[i, _VOLT] = readings[i, _VOLTAGE]
 
 
 @njit(cache=True, nogil=True)
@@ -164,7 +161,7 @@ def _interpolate(share: Any, now: Any, last: Any, before: Any, soonest: Any, ear
     """
     for i in range(len(out)):
         ahead = early < np.inf and soonest[i] < early
-        for c in range(_READ):
+        for c in range(out.shape[1]):
             if only_moved and c >= _MOVED:
                 out[i, c] = now[i, c]
             elif ahead:
@@ -173,27 +170,42 @@ def _interpolate(share: Any, now: Any, last: Any, before: Any, soonest: Any, ear
                 out[i, c] = last[i, c] + share * (now[i, c] - last[i, c])
 
 
-def _marker_poses(stored: Array, offset: Array) -> Array:
-    """x, y, heading, z and pitch (times, settings, 5) of the marker, from body positions and quaternions."""
-    flat = stored.reshape(-1, _POSE)
-    yaw, pitch, _ = euler_angles(flat[:, 3:])
-    marker = flat[:, :3] + rotation_matrix(flat[:, 3:]) @ offset
-    return np.column_stack([marker[:, 0], marker[:, 1], yaw, marker[:, 2], pitch]).reshape(*stored.shape[:2], len(CAMERA))
+@njit(cache=True, nogil=True)
+def _show(stored: Any, offset: Any, places: Any, mount: Any, scale: Any, out: Any) -> None:
+    """Fill what the camera shows of the marker: x, y, heading, z and pitch (settings, rows, 5).
+
+    Args:
+        stored: (times, settings, 7) positions and quaternions of the body.
+        offset: of the marker in the body frame, m.
+        places: (settings, rows) where the rows lie among the times: whole numbers are times.
+        mount, scale: (settings) heading of the camera, rad, and its scale.
+        out: filled.
+    """
+    times = len(stored)
+    poses = np.zeros((times, 5))
+    for i in range(len(out)):
+        for k in range(times):
+            _pose(stored[k, i], offset, poses[k])
+            if k > 0:  # the heading goes on where it was
+                turn = poses[k, 2] - poses[k - 1, 2]
+                poses[k, 2] -= 2.0 * np.pi * np.rint(turn / (2.0 * np.pi))
+        cosine, sine = scale[i] * np.cos(mount[i]), scale[i] * np.sin(mount[i])
+        for row in range(out.shape[1]):
+            before = min(int(places[i, row]), times - 2)
+            share = places[i, row] - before
+            for c in range(5):
+                out[i, row, c] = (1.0 - share) * poses[before, c] + share * poses[before + 1, c]
+            x, y = out[i, row, 0], out[i, row, 1]  # from the floor frame into the camera's
+            out[i, row, 0], out[i, row, 1] = cosine * x + sine * y, cosine * y - sine * x
 
 
-def _interpolated(poses: Array, places: Array) -> Array:
-    """Interpolate stored poses (times, settings, 5) at ``places`` (settings, rows) in ticks."""
-    poses[:, :, 2] = np.unwrap(poses[:, :, 2], axis=0)
-    places = np.maximum(places / POSE_TICKS, 0.0)
-    before = np.minimum(places.astype(int), len(poses) - 2)
-    share = (places - before)[:, :, None]
-    settings = np.arange(poses.shape[1])[:, None]
-    return (1 - share) * poses[before, settings] + share * poses[before + 1, settings]
-
-
-def _turn(poses: Array, parameters: Parameters) -> None:
-    """From the floor frame into the camera's, in place."""
-    mount, scale = parameters["camera.mount_yaw"][:, None], parameters["camera.scale"][:, None]
-    cosine, sine = scale * np.cos(mount), scale * np.sin(mount)
-    x, y = poses[:, :, 0].copy(), poses[:, :, 1].copy()
-    poses[:, :, 0], poses[:, :, 1] = cosine * x + sine * y, cosine * y - sine * x
+@njit(cache=True, nogil=True)
+def _pose(stored: Any, offset: Any, out: Any) -> None:
+    """x, y, heading, z and pitch (5) of the marker of one body."""
+    w, x, y, z = stored[3], stored[4], stored[5], stored[6]
+    a, b, c = offset[0], offset[1], offset[2]
+    out[0] = stored[0] + (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * c
+    out[1] = stored[1] + 2 * (x * y + w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - w * x) * c
+    out[3] = stored[2] + 2 * (x * z - w * y) * a + 2 * (y * z + w * x) * b + (1 - 2 * (x * x + y * y)) * c
+    out[2] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    out[4] = np.arcsin(min(max(2 * (w * y - x * z), -1.0), 1.0))

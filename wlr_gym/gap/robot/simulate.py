@@ -188,6 +188,8 @@ def replay_batch(
         )
         for k in range(0, settings, chunk)
     ]
+    if len(parts) == 1:
+        return [parts[0][r] for r in np.argsort(order)]
     return [
         Replays(
             np.concatenate([part[r].values for part in parts]),
