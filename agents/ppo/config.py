@@ -26,6 +26,7 @@ class PpoConfig(BaseModel):
         keep_checkpoints: how many of the newest stay.
         torch_threads: more than 1 was slower on busy machines, and changes the last bits.
         environment: keywords of the environment (precision, randomization, task, ...).
+        tasks: task name -> settings that differ there (``load_agent_config`` lays them over the others).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -53,6 +54,7 @@ class PpoConfig(BaseModel):
     keep_checkpoints: int = Field(3, gt=0)
     torch_threads: int = Field(1, gt=0)
     environment: dict[str, Any] = Field(default_factory=dict)
+    tasks: dict[str, dict[str, Any]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _whole_batches(self) -> PpoConfig:

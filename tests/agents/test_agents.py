@@ -108,6 +108,22 @@ def test_settings_may_lie_over_those_of_another_file(tmp_path):
     assert mine == theirs | {"total_steps": 7, "environment": theirs["environment"] | {"episode_length": 3.0}}
 
 
+def test_settings_of_a_task_lie_over_the_general_ones_and_changes_over_both(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("{gamma: 0.9, seed: 1, environment: {a: 1}, tasks: {path: {gamma: 0.99, seed: 2, environment: {b: 2}}}}")
+    assert load_agent_config(path, task="path") == {"gamma": 0.99, "seed": 2, "environment": {"a": 1, "b": 2}}
+    assert load_agent_config(path, ("seed=3",), task="path")["seed"] == 3
+    assert load_agent_config(path, task="slope") == {"gamma": 0.9, "seed": 1, "environment": {"a": 1}}
+
+
+@pytest.mark.parametrize("task", ["velocity", "path", "posture", "slope"])
+@pytest.mark.parametrize(
+    "name", ["ppo", "ppo_slip_aware", "ppo_slip_aware_no_camera", "ppo_blind", "ppo_privileged", "ppo_oracle"]
+)
+def test_settings_of_every_task_are_valid(contract, name, task):
+    load_agent("ppo").make_policy(contract, load_agent_config(name, task=task))
+
+
 @pytest.mark.parametrize(
     ("base", "message"),
     [("mine.yaml", "is its own base"), ("5", "base = 5: expected a name"), ("ppo_blnd", "did you mean 'ppo_blind'")],

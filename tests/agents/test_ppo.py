@@ -216,7 +216,7 @@ def test_a_full_folder_is_not_overwritten(run, capsys):
 
 def test_a_start_from_a_controller_drives_like_it_and_is_reproducible(tmp_path):
     """Before any update of PPO the actor does nearly what its teacher does; resuming does not teach again."""
-    changes = {"teacher": "pid", "total_steps": 64, "checkpoint_every": 64, "num_envs": 8}
+    changes = {"teacher": "pid", "total_steps": 64, "checkpoint_every": 64, "num_envs": 64}
     changes["environment"] = {"episode_length": 4.0, "randomization": "none"}
     first = load_agent("ppo").train(Training(ENVIRONMENT, tmp_path / "a", SETTINGS | changes, max_seconds=0.0, progress=False))
     again = load_agent("ppo").train(Training(ENVIRONMENT, tmp_path / "b", SETTINGS | changes, max_seconds=0.0, progress=False))

@@ -57,8 +57,7 @@ def run(options: Options) -> int:
 
 
 def _new(options: Options) -> tuple[str, Training]:
-    task_name_of(options.env)
-    config = load_agent_config(options.config or options.agent, options.set)
+    config = load_agent_config(options.config or options.agent, options.set, task_name_of(options.env))
     if options.seed is not None:
         config["seed"] = options.seed
     if options.backend is not None:

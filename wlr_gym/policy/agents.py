@@ -114,15 +114,19 @@ def agent_function(name: str, function: str) -> Callable[..., Any]:
     return getattr(agent, function)
 
 
-def load_agent_config(name: str | Path, changes: tuple[str, ...] = ()) -> dict[str, Any]:
+def load_agent_config(name: str | Path, changes: tuple[str, ...] = (), task: str | None = None) -> dict[str, Any]:
     """Read ``configs/agent/<name>.yaml`` (or a path) and lay changes such as ``environment.precision=float64`` over it.
 
-    A name without a file is an agent without settings: empty. ``base: NAME`` in a file lays it over another.
+    A name without a file is an agent without settings: empty. ``base: NAME`` in a file lays it over another. With a ``task``
+    the settings are that task's: those in ``tasks: {TASK: ...}`` lie over the general ones, and changes over both.
 
     Raises:
         InputError: no such file, broken YAML, a base that is none, or a change that is not ``key=value``.
     """
     config = _read_config(name)
+    if task is not None:
+        own = (config.pop("tasks", None) or {}).get(task)
+        config = _merged(config, own or {})
     for change in changes:
         _apply(config, change)
     return config
