@@ -154,6 +154,21 @@ def test_effect_that_takes_the_place_of_a_number_is_refitted_without_that_number
     assert refitted.model.quantities == pytest.approx(whole.model.quantities, abs=0.2 * SIGMA.min())
 
 
+def test_what_a_hypothesis_finds_by_starting_elsewhere_is_no_evidence_for_it():
+    """The calibrated model is stuck; with the effect the numbers get free, and then nothing is left for the effect."""
+    problem = Toy({"gain": 2.0, "offset": -2.0}, rows=400)
+    given = linearise(problem, nominal_model(problem), RUNS)[1]
+    residuals = [r[0] for r in problem.residuals([nominal_model(problem).setting], RUNS)]
+    good = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
+    silent = [np.zeros_like(columns) for columns in given]
+    stuck = replace(good, model=nominal_model(problem), residuals=residuals, columns=silent)
+    probes, candidates = problem.candidates(None, [], [])
+    score = next(s for s in screen(candidates, responses(problem, good, RUNS, probes)) if s.candidate.name == "decoy_1")
+    refitted = refit(problem, RUNS, stuck, [score], given)[0]
+    assert refitted.model.quantities == pytest.approx(good.model.quantities, abs=0.2 * SIGMA.min())
+    assert abs(refitted.gain) < 0.5 * LEAST_GAIN
+
+
 def test_neutral_edge_of_a_range_is_no_bound():
     problem = Toy({}, [sized("weak", 0.3)])
     hypotheses = named(problem).rounds[0].hypotheses

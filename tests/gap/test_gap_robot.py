@@ -17,7 +17,7 @@ from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.robot.candidates import ripple_order, robot_candidates
 from wlr_gym.gap.robot.formulas import formula_candidates
 from wlr_gym.gap.robot.open import LEAST_RUNS, open_robot
-from wlr_gym.gap.robot.problem import RobotProblem
+from wlr_gym.gap.robot.problem import LOST, RobotProblem
 from wlr_gym.gap.robot.quantities import knobs, tolerance, write
 from wlr_gym.gap.robot.simulate import PHYSICS_STEP
 from wlr_gym.parameters import Parameters
@@ -501,3 +501,19 @@ def test_what_a_robot_cannot_have_beside_its_effects_is_not_tried(good):
 
 def places_tried(candidates, name):
     return {candidate.where for candidate in candidates if candidate.name == name}
+
+
+def test_a_simulation_that_breaks_down_is_far_from_the_data_and_harms_no_other():
+    """A force that blows the robot up (a drag that pushes, and grows with its cube) is a bad hypothesis, not an error."""
+    run = record(posture_and_turns, spaced(5.0))
+    problem = RobotProblem([run], ROBOT)
+    model = nominal_model(problem).setting
+    units = {"d": "N m s3/rad3"}
+    wild = PatchEffect(UNKNOWN_EFFECT, ("body_torque_yaw",), {"d": -1e6}, "-d * yaw_rate * yaw_rate * yaw_rate", units)
+    calm = replace(wild, parameters={"d": 0.1})
+    alone = problem.residuals([replace(model, effects=(calm,))], [0])[0]
+    both = problem.residuals([replace(model, effects=(wild,)), replace(model, effects=(calm,))], [0])[0]
+    assert np.array_equal(both[1], alone[0], equal_nan=True)
+    measured = np.isfinite(alone[0])
+    assert np.array_equal(np.isfinite(both[0]), measured)
+    assert (both[0][measured] == LOST).all()

@@ -55,6 +55,8 @@ MOST_HARM = 0.2
 LEAST_CARRIED = 0.1
 #: Of an unknown that meets no known number, what counts as an effect, in its steps.
 NOTICED = 0.25
+#: Hypotheses whose known numbers the model without an effect more tries too.
+NUDGES = 2
 #: Effects in one analysis.
 MOST_EFFECTS = 4
 #: A named effect is preferred to a formula if it buys at least this share of what the formula buys.
@@ -431,11 +433,25 @@ def refit(
 
     Each starts twice: from the calibrated model with its first guess, and from the model as given with its probe, as
     calibration may have taken on what the effect does, and not let go of it. The responses of the known numbers are those of
-    the two starts; those of each hypothesis' own unknowns are simulated anew.
+    the two starts; those of each hypothesis' own unknowns are simulated anew. The model without an effect more is refitted too,
+    in the end also from where the best hypotheses are.
     """
     if not scores:
         return []
     trials = _simulated(problem, _starts(problem, current, scores, given), runs)
+    trials = _descended(problem, runs, current, trials, rounds)
+    plain = _simulated(problem, _without_effect(problem, current, trials), runs)
+    trials += _descended(problem, runs, current, plain, rounds)
+    memory = _best_memory(problem, current, trials)
+    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
+    best = [
+        trials[min((k for k, t in enumerate(trials) if t.of == of), key=lambda k: costs[k])] for of in (*range(len(scores)), -1)
+    ]
+    return _ranked(problem, scores, [t.model for t in best], [t.residuals for t in best], memory)
+
+
+def _descended(problem: Problem, runs: Sequence[int], current: Fit, trials: list[_Trial], rounds: int) -> list[_Trial]:
+    """The trials after so many steps; those that are far behind are dropped or no longer improved."""
     for done in range(rounds):
         memory = _best_memory(problem, current, trials)
         if done >= PATIENCE:
@@ -446,12 +462,17 @@ def refit(
             break
         moved_on = _improved(problem, runs, current, going, noise)
         trials = _hopeful(problem, [*(trial for trial in trials if trial.settled), *moved_on], memory)
+    return trials
+
+
+def _without_effect(problem: Problem, current: Fit, trials: Sequence[_Trial]) -> list[_Trial]:
+    """The model without an effect more, where the best hypotheses have moved the known numbers.
+
+    The cost is rough: what lets go of a minimum may be any nudge, and then it is no evidence for the effect that gave it.
+    """
     memory = _best_memory(problem, current, trials)
-    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
-    best = [
-        trials[min((k for k, t in enumerate(trials) if t.of == of), key=lambda k: costs[k])] for of in (*range(len(scores)), -1)
-    ]
-    return _ranked(problem, scores, [t.model for t in best], [t.residuals for t in best], memory)
+    effects = sorted((t for t in trials if t.of >= 0), key=lambda t: total_cost(problem, t.model, t.residuals, memory))
+    return [replace(t, of=-1, model=t.model.without_effect(-1), settled=False) for t in effects[:NUDGES]]
 
 
 def _improved(problem: Problem, runs: Sequence[int], current: Fit, trials: Sequence[_Trial], noise: Noise) -> list[_Trial]:
@@ -520,7 +541,7 @@ def _hopeful(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[
 def _given_up(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[_Trial]:
     """The trials; those of hypotheses that are far behind the best are settled."""
     _, least = _least_costs(problem, trials, memory)
-    enough = HOPELESS * (least[-1] - min(least.values()))
+    enough = HOPELESS * (least[-1] - min(least.values())) if -1 in least else 0.0
     return [replace(t, settled=t.settled or (t.of >= 0 and least[-1] - least[t.of] < enough)) for t in trials]
 
 

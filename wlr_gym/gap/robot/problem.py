@@ -35,6 +35,8 @@ Array = NDArray[np.float64]
 
 #: Noise units beyond which a residual counts no more in the gap's numbers, and Gauss-Newton steps of a fit.
 CAP, STEPS = 50.0, 3
+#: Noise units that every residual of a simulation that broke down counts.
+LOST = 1e3
 #: See :class:`wlr_gym.gap.problem.Problem`: with 1, what two simulators of one robot do not share moves numbers by two to three
 #: tolerances.
 FIRMNESS = 3.0
@@ -130,10 +132,15 @@ class RobotProblem:
 
     def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
         """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`."""
-        return [
-            anchored_residuals(self.times(r), self._measured[r], simulated, self._noise, self.clocks[r].windows)
-            for r, simulated in zip(runs, self.simulate(settings, runs), strict=True)
-        ]
+        return [self._residuals(r, simulated) for r, simulated in zip(runs, self.simulate(settings, runs), strict=True)]
+
+    def _residuals(self, r: int, simulated: Array) -> Array:
+        """Of one run; a setting whose simulation broke down is as far from the data as can be."""
+        lost = ~np.isfinite(simulated).all(axis=(1, 2))
+        simulated[lost] = 0.0
+        found = anchored_residuals(self.times(r), self._measured[r], simulated, self._noise, self.clocks[r].windows)
+        found[lost] = np.where(np.isfinite(found[lost]), LOST, np.nan)
+        return found
 
     def floor(self, setting: Setting, runs: Sequence[int]) -> float:
         """Return the level that the model reaches on data it made itself, with the robot's sensors."""

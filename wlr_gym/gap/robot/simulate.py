@@ -255,7 +255,7 @@ def _anchor(
     plant: Simulator, clock: RunClock, window: int, mine: NDArray[np.bool_], lanes: Parameters, readings: Sensors
 ) -> Sensors:
     """Put one run's robots where they were measured at the start of a window."""
-    anchors, state = clock.anchors, plant.get_state()
+    anchors, state = clock.anchors, _standing_where_lost(plant, lanes)
     legs = anchors.legs[window] - lanes["joint.zero_offset"][mine]
     state.joint_position[mine, :4] = legs
     missing = np.nan_to_num(anchors.effort[window] - readings.joint_effort[mine, 4:])
@@ -267,6 +267,19 @@ def _anchor(
     for name, values in kept.items():  # a reset has no torque and no acceleration yet
         fresh[name][mine] = values
     return fresh
+
+
+def _standing_where_lost(plant: Simulator, lanes: Parameters) -> PlantState:
+    """The state of all robots; those whose simulation broke down stand still, and what was recorded of them is not finite."""
+    state = plant.get_state()
+    parts = {name: value for name, value in vars(state).items() if value is not None}
+    lost = ~np.all([np.isfinite(value).reshape(len(lanes), -1).all(axis=1) for value in parts.values()], axis=0)
+    if lost.any():
+        standing = standing_state(plant.robot, lanes)
+        for name, value in parts.items():
+            instead = getattr(standing, name)
+            value[lost] = 0.0 if instead is None else instead[lost]
+    return state
 
 
 def _tension_per_effort(robot: Robot, lanes: Parameters, mine: NDArray[np.bool_]) -> Array:
