@@ -75,13 +75,13 @@ def test_engine_with_the_true_numbers_agrees_to_the_noise(tmp_path):
 _SHOWS = dict.fromkeys(NAMED, 7) | {"friction_patch": 2, "friction_level": 2, "supply_sag": 2, "camera_misalignment": 3}
 
 
-#: Generator and engine part by more than allowed at severity 4 in these, and nobody knows yet which of them is wrong.
-_UNEXPLAINED = pytest.mark.xfail(strict=True, reason="generator and engine part by more than the bound; unexplained")
-_OPEN = ("viscous_friction", "stribeck_friction", "friction_patch")
+def excess(found, floor):
+    """Errors beyond those that a robot without the effect leaves: wheel angles have some, as goals arrive on a 2 ms clock."""
+    return {prefix: np.sqrt(max(found[prefix] ** 2 - floor[prefix] ** 2, 0.0)) for prefix in found}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[_UNEXPLAINED] if name in _OPEN else []) for name in NAMED])
+@pytest.mark.parametrize("name", NAMED)
 def test_true_effect_closes_the_gap(name, tmp_path):
     effect = named(name, 4.0, np.random.default_rng(2))
     if name == "backlash":
@@ -89,8 +89,20 @@ def test_true_effect_closes_the_gap(name, tmp_path):
     if name == "friction_patch":
         effect["parameters"] |= {"x_min": -0.1, "x_max": 0.4}
     kind = _SHOWS[name]
+    floor = errors(tmp_path / "none", [], 8, kind, None)
     without = errors(tmp_path / "a", [effect], 8, kind, None)
     with_it = errors(tmp_path / "b", [effect], 8, kind, [effect])
-    worst = max(without, key=lambda prefix: without[prefix])
-    assert with_it[worst] < 0.5 * without[worst], (worst, without[worst], with_it[worst])
-    assert all(with_it[prefix] < 2.5 for prefix in SHARP), with_it
+    left, gap = excess(with_it, floor), excess(without, floor)
+    worst = max(gap, key=lambda prefix: gap[prefix])
+    assert left[worst] < 0.5 * gap[worst], (worst, without[worst], with_it[worst], floor[worst])
+    allowed = dict.fromkeys(SHARP, 2.5)
+    if name == "friction_patch":
+        allowed |= {prefix: max(2.5, found) for prefix, found in edges_moved(effect, kind, tmp_path / "c").items()}
+    assert all(with_it[prefix] < allowed[prefix] for prefix in SHARP), with_it
+
+
+def edges_moved(effect, kind, folder):
+    """Errors with a patch's edges 2 mm off: the camera that says where a segment starts is no better (1 mm, one sigma)."""
+    numbers = effect["parameters"]
+    moved = {**effect, "parameters": {**numbers, "x_min": numbers["x_min"] - 0.002, "x_max": numbers["x_max"] - 0.002}}
+    return errors(folder, [effect], 8, kind, [moved])
