@@ -16,7 +16,8 @@ class PpoConfig(BaseModel):
         num_envs, steps_per_env: robots, and control ticks of each, per update.
         batch_size: samples per gradient step. Small ones cap the speed: the optimiser, not the physics, takes the time.
         epochs: passes over the samples of an update.
-        learning_rate, final_learning_rate: Adam's, falling linearly over the training.
+        learning_rate, final_learning_rate, learning_rate_falls: Adam's, over the training. Once little exploration noise is
+            left, a small step of the weights is a large one of the policy: then it should have fallen far.
         gamma, gae_lambda, clip_range, entropy_coefficient, value_coefficient, max_gradient_norm: as in Stable-Baselines3.
         target_kl: end the passes of an update early beyond 1.5 times this divergence; None = never.
         hidden_layers, activation: of the networks of policy and value, which share nothing.
@@ -39,6 +40,7 @@ class PpoConfig(BaseModel):
     epochs: int = Field(5, gt=0)
     learning_rate: float = Field(1e-3, gt=0)
     final_learning_rate: float = Field(1e-4, gt=0)
+    learning_rate_falls: Literal["linearly", "exponentially"] = "linearly"
     gamma: float = Field(0.99, gt=0, lt=1)
     gae_lambda: float = Field(0.95, ge=0, le=1)
     clip_range: float = Field(0.2, gt=0)

@@ -63,12 +63,20 @@ def _record(training: Training, config: PpoConfig) -> None:
     record_provenance(training.folder, settings, config.seed)
 
 
+def learning_rate(config: PpoConfig) -> Callable[[float], float]:
+    """Return the learning rate as a function of the share of the training that remains."""
+    first, last = config.learning_rate, config.final_learning_rate
+    if config.learning_rate_falls == "linearly":
+        return LinearSchedule(first, last, end_fraction=1.0)
+    return lambda remaining: last * (first / last) ** remaining
+
+
 def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
     """Return an untrained Stable-Baselines3 PPO with the configured settings."""
     return PPO(
         "MlpPolicy" if isinstance(env.observation_space, spaces.Box) else AsymmetricPolicy,
         env,
-        learning_rate=LinearSchedule(config.learning_rate, config.final_learning_rate, end_fraction=1.0),
+        learning_rate=learning_rate(config),
         n_steps=config.steps_per_env,
         batch_size=config.batch_size,
         n_epochs=config.epochs,

@@ -234,3 +234,12 @@ def test_a_start_from_a_controller_drives_like_it_and_is_reproducible(tmp_path):
     core.close()
     wanted, done = np.array(actions).swapaxes(0, 1)
     assert np.abs(done - wanted)[..., 4:].mean() < 0.3 * np.abs(wanted[..., 4:]).mean()
+
+
+def test_the_learning_rate_falls_as_it_is_told_to():
+    training = importlib.import_module("wlr_gym_agents_ppo.training")
+    config = importlib.import_module("wlr_gym_agents_ppo.config").PpoConfig(learning_rate=4e-3, final_learning_rate=1e-3)
+    linearly = training.learning_rate(config)
+    exponentially = training.learning_rate(config.model_copy(update={"learning_rate_falls": "exponentially"}))
+    np.testing.assert_allclose([linearly(share) for share in (1.0, 0.5, 0.0)], [4e-3, 2.5e-3, 1e-3])
+    np.testing.assert_allclose([exponentially(share) for share in (1.0, 0.5, 0.0)], [4e-3, 2e-3, 1e-3])
