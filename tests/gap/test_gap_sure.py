@@ -106,6 +106,18 @@ def test_estimates_are_values_with_two_sided_intervals():
     assert own.low < 0.7 < own.high
 
 
+def test_disagreement_of_simulators_adds_a_share_of_the_effect():
+    problem = Toy(TRUTH, [sized("drag", 0.7, "right")], white=1.5)
+    found = fitted(problem)
+    (narrow,) = estimates(problem, found)[0].values()
+    problem.disagreement = 0.1
+    (wide,) = estimates(problem, found)[0].values()
+    assert wide.value == narrow.value
+    both = np.hypot(narrow.high - narrow.value, TWO_SIDED_95 * 0.1 * narrow.value)
+    assert wide.high - wide.value == pytest.approx(both, rel=1e-6)
+    assert wide.value - wide.low == pytest.approx(both, rel=1e-6)
+
+
 def test_confidence_counts_the_samples_in_which_the_effect_wins():
     problem = Toy({}, [sized("drag", 0.8, "right")], error=0.5)
     look = name_effects(problem, RUNS, fit(problem, RUNS, nominal_model(problem))).rounds[0]

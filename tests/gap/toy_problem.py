@@ -62,7 +62,7 @@ class Toy:
         memory: of that error, correlation of neighbouring rows.
     """
 
-    metric, cap, steps, thorough, firmness = "RMS in noise units", 50.0, 4, False, 1.0
+    metric, cap, steps, thorough, firmness, disagreement = "RMS in noise units", 50.0, 4, False, 1.0, 0.0
     sealed: tuple[str, ...] = ()
     motions: Mapping[str, str] = MappingProxyType({})
 

@@ -183,6 +183,7 @@ class Problem(Protocol):
         steps: Gauss-Newton steps of a fit, at most.
         firmness: what a simulator gets wrong is the same in all runs, so they agree on it: what data say counts so many times
             less than the runs' differences would let it, and what is known beforehand so many times more. 1 = it is perfect.
+        disagreement: share of an effect's size by which a simulator and the system may differ on it; widens intervals.
         thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
         motions: effect -> name of the motion that shows it best, for advice on what to record; may be empty.
         sealed: names of the runs to keep for the proof, where the problem knows better than a general rule; else empty.
@@ -192,6 +193,7 @@ class Problem(Protocol):
     cap: float
     steps: int
     firmness: float
+    disagreement: float
     thorough: bool
     motions: Mapping[str, str]
     sealed: tuple[str, ...]

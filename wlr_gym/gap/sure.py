@@ -51,12 +51,17 @@ def standard_errors(problem: Problem, fit: Fit) -> Array:
 
 
 def estimates(problem: Problem, fit: Fit) -> list[dict[str, Estimate]]:
-    """Return the parameters of each of the model's effects with 95 % intervals."""
+    """Return the parameters of each of the model's effects with 95 % intervals.
+
+    To what the data leave open comes what two simulators of one system disagree by (``problem.disagreement``), the same share of
+    all parameters of an effect.
+    """
     spread = covariance(problem, fit)
     found, at = [], len(problem.quantities)
     for candidate, values in fit.model.effects:
         own = slice(at, at + len(values))
-        found.append(_with_intervals(candidate, np.array(values), spread[own, own]))
+        away = problem.disagreement * np.array([v - u.neutral for u, v in zip(candidate.unknowns, values, strict=True)])
+        found.append(_with_intervals(candidate, np.array(values), spread[own, own] + np.outer(away, away)))
         at += len(values)
     return found
 

@@ -47,7 +47,7 @@ class RigProblem:
     cap = 1e4
     steps = 20
     #: A replay costs milliseconds, and a joint that sticks answers far from linearly: every hypothesis is worth a whole fit.
-    thorough, firmness = True, 1.0
+    thorough, firmness, disagreement = True, 1.0, 0.0
     motions: Mapping[str, str] = MappingProxyType({})
 
     def __init__(

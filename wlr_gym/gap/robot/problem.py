@@ -40,6 +40,8 @@ LOST = 1e3
 #: See :class:`wlr_gym.gap.problem.Problem`: with 1, what two simulators of one robot do not share moves numbers by two to three
 #: tolerances.
 FIRMNESS = 3.0
+#: Two simulators of one robot found sizes that differed by so much (root mean square over eight development sets).
+DISAGREEMENT = 0.04
 
 
 class RobotProblem:
@@ -72,6 +74,7 @@ class RobotProblem:
         if any(run.meta.profile != runs[0].meta.profile for run in runs):
             raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
         self.cap, self.steps, self.firmness = CAP, STEPS, FIRMNESS
+        self.disagreement = DISAGREEMENT
         self.thorough, self.sealed, self.motions = False, (), SHOWN_BY
         self.robot = robot or robot_of(runs[0])
         self.known = load_patch(known)
