@@ -1,5 +1,7 @@
 """Standard errors against Monte Carlo and the jackknife's definition; confidence; equals; what would have been seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from toy_problem import NOMINAL, REACH, SIGMA, Toy, candidate, sized
@@ -104,6 +106,16 @@ def test_estimates_are_values_with_two_sided_intervals():
     assert (own.low, own.high) == pytest.approx((own.value - half, own.value + half), rel=1e-3)
     assert own.unit == "1"
     assert own.low < 0.7 < own.high
+
+
+def test_parameter_at_the_edge_of_its_range_keeps_its_interval():
+    problem = Toy({}, [sized("drag", 0.7, "right")], white=1.5)
+    found = fitted(problem)
+    own, values = found.model.effects[0]
+    (free,) = estimates(problem, found)[0].values()
+    clipped = replace(own, convert=lambda numbers: {"size": min(numbers[0], values[0])})
+    (held,) = estimates(problem, replace(found, model=replace(found.model, effects=((clipped, values),))))[0].values()
+    assert (held.low, held.high) == pytest.approx((free.low, free.high))
 
 
 def test_disagreement_of_simulators_adds_a_share_of_the_effect():

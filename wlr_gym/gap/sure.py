@@ -53,8 +53,8 @@ def standard_errors(problem: Problem, fit: Fit) -> Array:
 def estimates(problem: Problem, fit: Fit) -> list[dict[str, Estimate]]:
     """Return the parameters of each of the model's effects with 95 % intervals.
 
-    To what the data leave open comes what two simulators of one system disagree by (``problem.disagreement``), the same share of
-    all parameters of an effect.
+    To what the data leave open comes what two simulators of one system disagree by (``problem.disagreement``), the same share
+    of all parameters of an effect.
     """
     spread = covariance(problem, fit)
     found, at = [], len(problem.quantities)
@@ -72,10 +72,10 @@ def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[
     errors = np.sqrt(np.maximum(np.diag(spread), 0.0))
     slopes = {name: np.zeros(len(values)) for name in here}
     for k, error in enumerate(errors):
-        step = 0.1 * error + 1e-9
-        beside = candidate.parameters((values + step * (np.arange(len(values)) == k)).tolist())
-        for name in here:
-            slopes[name][k] = (beside[name] - here[name]) / step
+        for step in (0.1 * error + 1e-9, -0.1 * error - 1e-9):  # a parameter at the edge of its range moves only inwards
+            beside = candidate.parameters((values + step * (np.arange(len(values)) == k)).tolist())
+            for name in here:
+                slopes[name][k] = max(slopes[name][k], (beside[name] - here[name]) / step, key=abs)
     units = {unknown.name: unknown.unit for unknown in candidate.unknowns}
     if candidate.name in EFFECTS:
         units |= {name: spec.unit for name, spec in EFFECTS[candidate.name].parameters.items()}
