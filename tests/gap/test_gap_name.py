@@ -6,8 +6,23 @@ import numpy as np
 import pytest
 from toy_problem import NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
-from wlr_gym.gap.fit import fit, linearise, nominal_model
-from wlr_gym.gap.name import EQUIVALENT, MOST_EFFECTS, PER_NAME, SHORTLIST, drop_idle, name_effects, refit, shortlist
+from wlr_gym.gap import name as naming_module
+from wlr_gym.gap.fit import fit, linearise, nominal_model, total_cost
+from wlr_gym.gap.likelihood import estimate_noise
+from wlr_gym.gap.name import (
+    EQUIVALENT,
+    MOST_EFFECTS,
+    PER_NAME,
+    SHORTLIST,
+    Final,
+    Hypothesis,
+    drop_idle,
+    finalists,
+    name_effects,
+    refit,
+    settle,
+    shortlist,
+)
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
 from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
 from wlr_gym.gap.sure import equivalents
@@ -17,6 +32,14 @@ RUNS = range(5)
 
 def named(problem, runs=RUNS):
     return name_effects(problem, runs, fit(problem, runs, nominal_model(problem), steps=problem.steps))
+
+
+def level():
+    """An effect that takes the place of the quantity ``gain``."""
+    unknown = Unknown("size", "1", 0.0, -20.0, 20.0, 1.0)
+    start = Start((("gain",),), lambda a: (float(a[0]),))
+    tolerance = Tolerance(("gain",), SIGMA[0], REACH, replaces=True)
+    return Candidate("level", ("body",), (unknown,), (start,), tolerances=(tolerance,))
 
 
 def labels(naming):
@@ -140,33 +163,106 @@ def test_effect_that_takes_the_place_of_a_number_is_refitted_without_that_number
     """Calibration went as far as it may; beside the effect the number does nothing, and only its tolerance pulls it home."""
     problem = Toy({"gain": 6.0}, rows=400)
     problem.firmness = 3.0
-    unknown = Unknown("size", "1", 0.0, -20.0, 20.0, 1.0)
-    start = Start((("gain",),), lambda a: (float(a[0]),))
-    tolerance = Tolerance(("gain",), SIGMA[0], REACH, replaces=True)
-    level = Candidate("level", ("body",), (unknown,), (start,), tolerances=(tolerance,))
     current = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
     given = linearise(problem, nominal_model(problem), RUNS)[1]
     probes, _ = problem.candidates(None, [], [])
-    score = screen([level], responses(problem, current, RUNS, probes))[0]
+    score = screen([level()], responses(problem, current, RUNS, probes))[0]
     refitted = refit(problem, RUNS, current, [score], given)[0]
-    whole = fit(problem, RUNS, nominal_model(problem).with_effect(level, (5.0,)), scatter=current.noise.scatter)
+    whole = fit(problem, RUNS, nominal_model(problem).with_effect(level(), (5.0,)), scatter=current.noise.scatter)
     assert refitted.values == pytest.approx((6.0,), abs=0.2)
     assert refitted.model.quantities == pytest.approx(whole.model.quantities, abs=0.2 * SIGMA.min())
+
+
+def stuck_and_free(problem):
+    """A calibrated model that cannot move, the one it should be, and the columns of the model as given."""
+    given = linearise(problem, nominal_model(problem), RUNS)[1]
+    residuals = [r[0] for r in problem.residuals([nominal_model(problem).setting], RUNS)]
+    free = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
+    noise = estimate_noise(residuals)
+    cost = total_cost(problem, nominal_model(problem), residuals, noise.memory)
+    silent = [np.zeros_like(columns) for columns in given]
+    stuck = replace(free, model=nominal_model(problem), residuals=residuals, columns=silent, noise=noise, cost=cost)
+    return stuck, free, given
 
 
 def test_what_a_hypothesis_finds_by_starting_elsewhere_is_no_evidence_for_it():
     """The calibrated model is stuck; with the effect the numbers get free, and then nothing is left for the effect."""
     problem = Toy({"gain": 2.0, "offset": -2.0}, rows=400)
-    given = linearise(problem, nominal_model(problem), RUNS)[1]
-    residuals = [r[0] for r in problem.residuals([nominal_model(problem).setting], RUNS)]
-    good = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
-    silent = [np.zeros_like(columns) for columns in given]
-    stuck = replace(good, model=nominal_model(problem), residuals=residuals, columns=silent)
+    stuck, good, given = stuck_and_free(problem)
     probes, candidates = problem.candidates(None, [], [])
     score = next(s for s in screen(candidates, responses(problem, good, RUNS, probes)) if s.candidate.name == "decoy_1")
     refitted = refit(problem, RUNS, stuck, [score], given)[0]
     assert refitted.model.quantities == pytest.approx(good.model.quantities, abs=0.2 * SIGMA.min())
     assert abs(refitted.gain) < 0.5 * LEAST_GAIN
+
+
+def test_number_whose_place_an_effect_takes_is_a_rival_of_it():
+    problem = Toy({"gain": 2.0, "offset": -2.0}, rows=400)
+    stuck, good, given = stuck_and_free(problem)
+    probes, _ = problem.candidates(None, [], [])
+    score = screen([level()], responses(problem, good, RUNS, probes))[0]
+    refitted = refit(problem, RUNS, stuck, [score], given)[0]
+    assert abs(refitted.gain) < 0.5 * LEAST_GAIN
+    assert refitted.base.quantities == pytest.approx(good.model.quantities, abs=0.2 * SIGMA.min())
+
+
+@pytest.mark.parametrize(("effects", "names"), [([], []), ([sized("drag", 0.8, "right")], ["drag right"])])
+def test_stuck_calibration_is_done_anew_from_where_refits_have_been(monkeypatch, effects, names):
+    monkeypatch.setattr(naming_module, "shortlist", lambda scores, cost: scores[:2])  # also where none promises anything
+    problem = Toy({"gain": 2.0, "offset": -2.0}, effects, rows=400)
+    stuck, free, given = stuck_and_free(problem)
+    naming = name_effects(problem, RUNS, stuck, given=given)
+    assert labels(naming) == names
+    assert naming.calibrated.model.quantities == pytest.approx(free.model.quantities, abs=0.5 * SIGMA.min())
+
+
+class Trap(Toy):
+    """Beside ``drag``, ``gain`` does harm from 1.5 tolerances on, less the farther it goes: a fit that begins there stays."""
+
+    def _response(self, quantities, effects, run):
+        amount = (quantities[0] - NOMINAL[0]) / SIGMA[0]
+        if amount > 1.5 and any(effect.name == "drag" for effect in effects):
+            amount = 2.0 - 0.3 * (amount - 2.0)
+        return super()._response(np.array([NOMINAL[0] + SIGMA[0] * amount, *quantities[1:]]), effects, run)
+
+
+def test_effect_that_is_taken_settles_also_from_the_model_as_given():
+    problem = Trap({}, [sized("drag", 0.8, "right")], rows=400)
+    own = candidate(problem, "drag", ["right"])
+    far = nominal_model(problem).with_effect(own, (0.5,))
+    trapped = fit(problem, RUNS, replace(far, quantities=far.quantities + np.array([2.4 * SIGMA[0], 0.0, 0.0])), steps=1)
+    base = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
+    found = Hypothesis(own, trapped.model, 1.0, np.ones(5), 1.0, trapped.residuals, base.model, base.residuals)
+    settled = settle(problem, RUNS, Final(found, trapped), (), lambda text: None)
+    assert trapped.model.quantities[0] > NOMINAL[0] + 1.5 * SIGMA[0]
+    assert settled.fit.model.quantities[0] == pytest.approx(NOMINAL[0], abs=0.3 * SIGMA[0])
+    assert settled.hypothesis.values == settled.fit.model.effects[0][1]
+    assert settled.hypothesis.gain > LEAST_GAIN
+
+
+def test_known_numbers_that_a_whole_fit_finds_count_for_nothing():
+    """The model without the effect was left at nominal; the whole fit has found the numbers, and there is no effect."""
+    problem = Toy({"gain": 2.0, "offset": -2.0}, rows=400)
+    nominal, own = nominal_model(problem), candidate(problem, "drag", ["right"])
+    whole = fit(problem, RUNS, nominal.with_effect(own, (0.1,)), steps=problem.steps)
+    residuals = [r[0] for r in problem.residuals([nominal.setting], RUNS)]
+    left = Hypothesis(own, nominal.with_effect(own, (0.1,)), 1e3, np.ones(5), 1.0, residuals, nominal, residuals)
+    final = finalists(problem, RUNS, [left], whole.noise)[0]
+    assert final.fit.model.quantities == pytest.approx(whole.model.quantities, abs=0.2 * SIGMA.min())
+    assert abs(final.hypothesis.gain) < 0.5 * LEAST_GAIN
+
+
+def test_effect_is_taken_only_once_it_has_settled(monkeypatch):
+    problem = Toy({}, [sized("drag", 0.8, "right")])
+    assert labels(named(problem)) == ["drag right"]
+    settling = naming_module.settle
+
+    def gone(*arguments):
+        final = settling(*arguments)
+        return replace(final, hypothesis=replace(final.hypothesis, tolerable=True))
+
+    monkeypatch.setattr(naming_module, "settle", gone)
+    assert labels(named(problem)) == []
 
 
 def test_neutral_edge_of_a_range_is_no_bound():

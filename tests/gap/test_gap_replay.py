@@ -11,7 +11,7 @@ from wlr_gym.gap.robot.recorder import CLOCK, TRUTH
 from wlr_gym.gap.robot.simulate import RunClock, WrittenGoals, replay_batch
 from wlr_gym.gap.robot.windows import anchored_residuals
 from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import TRUTH_LAYOUT
+from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
 from wlr_gym.robot import JOINTS
 from wlr_gym.runs import RunMeta
 from wlr_gym.runs.format import CHANNELS
@@ -105,6 +105,28 @@ def test_chunks_and_threads_do_not_change_a_bit(other, monkeypatch):
     assert whole.truth is not None
     assert chunked.truth is not None
     assert np.array_equal(whole.truth, chunked.truth)
+
+
+def test_channels_begin_as_the_sensors_do():
+    """The recorder copies by position."""
+    kinds = {"joint_position": "pos", "joint_velocity": "vel", "joint_effort": "eff", "gyro": "gyro", "accelerometer": "acc"}
+    labels = [f"{short}_{label}" for name, short in kinds.items() for label in SENSOR_LAYOUT.channels[name].labels]
+    assert tuple(labels) == CHANNELS[: len(labels)]
+    assert list(SENSOR_LAYOUT.channels)[: len(kinds)] == list(kinds)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_runs_of_different_length_are_each_as_alone(threads):
+    """More robots than one thread's tiles; the shorter run comes first, is over first, and its robots are left behind."""
+    clocks = [RunClock(record(posture_and_turns, spaced(seconds))) for seconds in (0.4, 0.8)]
+    table = Parameters(np.tile(several(4).values, (35, 1)))
+    together = replay_batch(ROBOT, clocks, table, with_truth=True, threads=threads)
+    for clock, replays in zip(clocks, together, strict=True):
+        alone = replay_batch(ROBOT, [clock], Parameters(table.values[-20:]), with_truth=True)[0]
+        assert np.array_equal(replays.values[-20:], alone.values)
+        assert replays.truth is not None
+        assert alone.truth is not None
+        assert np.array_equal(replays.truth[-20:], alone.truth)
 
 
 def test_truth_comes_on_the_rows(run):

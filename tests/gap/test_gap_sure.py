@@ -109,13 +109,24 @@ def test_estimates_are_values_with_two_sided_intervals():
 
 
 def test_parameter_at_the_edge_of_its_range_keeps_its_interval():
+    """The data ask for 0.7, more than 0.5 is not plausible: the fit ends there, and knows how well the data tell it."""
     problem = Toy({}, [sized("drag", 0.7, "right")], white=1.5)
-    found = fitted(problem)
-    own, values = found.model.effects[0]
-    (free,) = estimates(problem, found)[0].values()
-    clipped = replace(own, convert=lambda numbers: {"size": min(numbers[0], values[0])})
-    (held,) = estimates(problem, replace(found, model=replace(found.model, effects=((clipped, values),))))[0].values()
-    assert (held.low, held.high) == pytest.approx((free.low, free.high))
+    (free,) = estimates(problem, fitted(problem))[0].values()
+    edge = {"within": lambda v: (min(v[0], 0.5),), "convert": lambda v: {"size": min(v[0], 0.5)}}
+    model = nominal_model(problem).with_effect(replace(candidate(problem, "drag", ["right"]), **edge), (0.3,))
+    (held,) = estimates(problem, fit(problem, range(5), model, steps=problem.steps))[0].values()
+    assert held.value == 0.5
+    assert held.high - held.low == pytest.approx(free.high - free.low, rel=0.3)
+
+
+def test_simulators_do_not_disagree_about_places():
+    problem = Toy(TRUTH, [sized("drag", 0.7, "right")], white=1.5)
+    own = candidate(problem, "drag", ["right"])
+    place = replace(own, unknowns=tuple(replace(unknown, is_size=False) for unknown in own.unknowns))
+    found = fit(problem, range(5), nominal_model(problem).with_effect(place, (0.7,)), steps=problem.steps)
+    (plain,) = estimates(problem, found)[0].values()
+    problem.disagreement = 0.1
+    assert estimates(problem, found)[0]["size"] == plain
 
 
 def test_disagreement_of_simulators_adds_a_share_of_the_effect():

@@ -152,11 +152,10 @@ def moved(problem: Problem, model: Model, change: Array) -> Model:
     quantities = np.clip(model.quantities + sigma * change[:count], low, high)
     effects, at = [], count
     for candidate, values in model.effects:
-        new = []
-        for unknown, value in zip(candidate.unknowns, values, strict=True):
-            new.append(float(np.clip(value + unknown.step * change[at], unknown.low, unknown.high)))
-            at += 1
-        effects.append((candidate, tuple(new)))
+        steps = np.array([unknown.step for unknown in candidate.unknowns])
+        new = np.array(values) + steps * change[at : at + len(values)]
+        effects.append((candidate, candidate.kept(new.tolist())))
+        at += len(values)
     return Model(quantities, tuple(effects))
 
 

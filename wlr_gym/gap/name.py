@@ -132,12 +132,13 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class Naming:
-    """Outcome: the final fit, and every round.
+    """Outcome: the calibrated model without effects, the final fit, and every round.
 
     ``swaps`` holds, per effect of a model of several, that effect and its rivals with the other effects kept (thorough
     problems only).
     """
 
+    calibrated: Fit
     fit: Fit
     rounds: list[Round]
     swaps: dict[str, tuple[Hypothesis, list[Hypothesis]]]
@@ -199,7 +200,7 @@ def name_effects(
     """
     if given is None and not problem.thorough:
         given = linearise(problem, nominal_model(problem), runs)[1]
-    current, rounds = start, []
+    current, calibrated, rounds, again = start, start, [], None
     models = [start.model]
     while True:
         probes, candidates = problem.candidates(current.model.setting, current.residuals, runs)
@@ -213,18 +214,35 @@ def name_effects(
         hypotheses = (
             refit_thoroughly(problem, runs, current, chosen) if given is None else refit(problem, runs, current, chosen, given)
         )
+        deeper = _deeper(problem, current, hypotheses)
+        if deeper is not None and current is not again:
+            tell("the known numbers fit better elsewhere: calibrated anew from there")
+            again = fit(problem, runs, deeper, scatter=current.noise.scatter, steps=problem.steps)
+            again = current = widened(problem, runs, again)
+            calibrated = calibrated if current.model.effects else current
+            continue
         finals = finalists(problem, runs, hypotheses, current.noise, others, tell)
-        chosen_final = _accepted(current, finals)
-        taken = None if chosen_final is None else chosen_final.hypothesis
-        rounds.append(Round(scores, _merged(finals, hypotheses), taken, current.cost))
-        if chosen_final is None:
+        accepted = _accepted(problem, runs, current, finals, others, tell)
+        taken = None if accepted is None else accepted.hypothesis
+        rounds.append(Round(scores, _merged([*finals, *([accepted] if accepted else [])], hypotheses), taken, current.cost))
+        if accepted is None:
             break
-        tell(f"taken: {chosen_final.hypothesis.candidate.label}")
-        current = widened(problem, runs, _settled(problem, runs, drop_idle(problem, runs, chosen_final.fit, tell), tell))
+        tell(f"taken: {accepted.hypothesis.candidate.label}")
+        current = widened(problem, runs, drop_idle(problem, runs, accepted.fit, tell))
         if len(current.model.effects) >= MOST_EFFECTS or any(_same(current.model, earlier) for earlier in models):
             break
         models.append(current.model)
-    return Naming(current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
+    return Naming(calibrated, current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
+
+
+def _deeper(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> Model | None:
+    """The model without a further effect in another minimum that refits have found, if it is clearly lower than the present."""
+    if not hypotheses or problem.thorough:
+        return None
+    base, residuals = hypotheses[0].base, hypotheses[0].base_residuals
+    memory = estimate_noise(residuals, scatter=current.noise.scatter).memory
+    lower = total_cost(problem, current.model, current.residuals, memory) - total_cost(problem, base, residuals, memory)
+    return base if lower > LEAST_GAIN else None
 
 
 def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tuple[Hypothesis, list[Hypothesis]]]:
@@ -252,21 +270,6 @@ def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tu
 
 def _same(one: Model, other: Model) -> bool:
     return [candidate.label for candidate, _ in one.effects] == [candidate.label for candidate, _ in other.effects]
-
-
-def _settled(problem: Problem, runs: Sequence[int], found: Fit, tell: Tell) -> Fit:
-    """The fit carried on until another step gains nothing, and once more with the known numbers as the file says.
-
-    Beside a strong effect the cost has several minima: known numbers that calibration had moved in the effect's place stay
-    where they are and leave it too small.
-    """
-    if problem.thorough:
-        return found
-    tell("the same from the model as given")
-    scatter = found.noise.scatter
-    on = fit(problem, runs, found.model, scatter=scatter, columns=found.columns, steps=SETTLING, tell=tell)
-    anew = fit(problem, runs, untouched(problem, found.model), scatter=scatter, steps=SETTLING, tell=tell)
-    return _cheapest(problem, (on, anew), found.noise.memory)
 
 
 def drop_idle(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = lambda text: None) -> Fit:
@@ -339,24 +342,41 @@ def finalists(
     if not wholes:
         return []
     memory = _cheapest(problem, wholes, memory).noise.memory
-    found = []
-    for hypothesis, whole in zip(best.values(), wholes, strict=True):
-        # what its fit gained beyond the refit counts for it; what it would have gained without the effect was counted there
-        base = total_cost(problem, hypothesis.base, hypothesis.base_residuals, memory)
-        gain = base - total_cost(problem, whole.model, whole.residuals, memory)
-        by_run = _by_run(hypothesis.base_residuals, whole.residuals, estimate_noise(whole.residuals, memory, scatter))
-        agreed = _carries_over(problem, hypothesis.base, whole.model, gain, runs, others, memory)
-        final = replace(
-            hypothesis,
-            model=whole.model,
-            gain=gain,
-            by_run=by_run,
-            residuals=whole.residuals,
-            carries_over=agreed,
-            tolerable=within_tolerance(problem, whole.model),
-        )
-        found.append(Final(final, whole))
+    pairs = zip(best.values(), wholes, strict=True)
+    found = [_judged(problem, runs, hypothesis, whole, memory, others) for hypothesis, whole in pairs]
     return sorted(found, key=lambda final: -final.hypothesis.gain)
+
+
+def _judged(
+    problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, whole: Fit, memory: Array, others: Sequence[int]
+) -> Final:
+    """A hypothesis as its whole fit shows it: gain, agreement of the runs, what the tolerances allow."""
+    base, base_residuals = hypothesis.base, hypothesis.base_residuals
+    if not problem.thorough:  # what the whole fit found in the known numbers is no evidence for the effect
+        plain = _plain(problem, runs, whole, hypothesis.candidate, memory)
+        if total_cost(problem, plain.model, plain.residuals, memory) < total_cost(problem, base, base_residuals, memory):
+            base, base_residuals = plain.model, plain.residuals
+    gain = total_cost(problem, base, base_residuals, memory) - total_cost(problem, whole.model, whole.residuals, memory)
+    judged = replace(
+        hypothesis,
+        model=whole.model,
+        gain=gain,
+        by_run=_by_run(base_residuals, whole.residuals, estimate_noise(whole.residuals, memory, whole.noise.scatter)),
+        residuals=whole.residuals,
+        base=base,
+        base_residuals=base_residuals,
+        carries_over=_carries_over(problem, base, whole.model, gain, runs, others, memory),
+        tolerable=within_tolerance(problem, whole.model),
+    )
+    return Final(judged, whole)
+
+
+def _plain(problem: Problem, runs: Sequence[int], whole: Fit, candidate: Candidate, memory: Array) -> Fit:
+    """The model without the last effect, from where the known numbers are beside it."""
+    kept = whole.model.size - len(candidate.unknowns)
+    columns = None if _replaced(candidate) else [column[:kept] for column in whole.columns]
+    model, scatter = whole.model.without_effect(-1), whole.noise.scatter
+    return fit(problem, runs, model, memory=memory, scatter=scatter, columns=columns, steps=1)
 
 
 def _cheapest(problem: Problem, fits: Sequence[Fit], memory: Array) -> Fit:
@@ -366,8 +386,7 @@ def _cheapest(problem: Problem, fits: Sequence[Fit], memory: Array) -> Fit:
 
 def _probed(candidate: Candidate, start: Start) -> tuple[float, ...]:
     """Values of a candidate's unknowns in a start's own probes, within the plausible range."""
-    values = start.values(np.ones(len(start.directions)))
-    return tuple(float(np.clip(v, u.low, u.high)) for v, u in zip(values, candidate.unknowns, strict=True))
+    return candidate.kept(start.values(np.ones(len(start.directions))))
 
 
 def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near: Fit, tell: Tell) -> list[Fit]:
@@ -399,17 +418,41 @@ def _merged(finals: Sequence[Final], hypotheses: Sequence[Hypothesis]) -> list[H
     return sorted(merged, key=lambda hypothesis: -hypothesis.gain)
 
 
-def _accepted(current: Fit, finals: Sequence[Final]) -> Final | None:
-    """The best that buys enough at a plausible value; a formula only where no named effect buys nearly as much."""
-    good = []
-    for final in finals:
-        least = least_gain(len(final.hypothesis.values), current.cost)
-        if final.hypothesis.gain >= least and final.hypothesis.plausible:
-            good.append(final)
-    if not good:
-        return None
+def _accepted(
+    problem: Problem, runs: Sequence[int], current: Fit, finals: Sequence[Final], others: Sequence[int], tell: Tell
+) -> Final | None:
+    """The best that buys enough at a plausible value, also once it has settled.
+
+    A formula is taken only where no named effect buys nearly as much.
+    """
+    good = [final for final in finals if _is_good(current, final)]
     named = [final for final in good if not final.hypothesis.candidate.formula]
-    return named[0] if named and named[0].hypothesis.gain >= NAMED_FIRST * good[0].hypothesis.gain else good[0]
+    if named and named[0].hypothesis.gain >= NAMED_FIRST * good[0].hypothesis.gain:
+        good = [named[0], *(final for final in good if final is not named[0])]
+    for final in good:
+        settled = final if problem.thorough else settle(problem, runs, final, others, tell)
+        if _is_good(current, settled):
+            return settled
+    return None
+
+
+def _is_good(current: Fit, final: Final) -> bool:
+    least = least_gain(len(final.hypothesis.values), current.cost)
+    return final.hypothesis.gain >= least and final.hypothesis.plausible
+
+
+def settle(problem: Problem, runs: Sequence[int], final: Final, others: Sequence[int], tell: Tell) -> Final:
+    """The hypothesis fitted on until another step gains nothing, and once more with the known numbers as the file says.
+
+    Beside a strong effect the cost has several minima: known numbers that calibration had moved in the effect's place stay
+    where they are and leave it too small.
+    """
+    tell(f"settling {final.hypothesis.candidate.label}, also from the model as given")
+    found = final.fit
+    starts = (found.model, untouched(problem, found.model))
+    more = [fit(problem, runs, start, scatter=found.noise.scatter, steps=SETTLING, tell=tell) for start in starts]
+    best = _cheapest(problem, (found, *more), found.noise.memory)
+    return final if best is found else _judged(problem, runs, final.hypothesis, best, best.noise.memory, others)
 
 
 def _by_run(before: Sequence[Array], after: Sequence[Array], noise: Noise) -> Array:
@@ -423,7 +466,8 @@ class _Trial:
 
     Attributes:
         of: which hypothesis; -1 = none, the model without an effect more.
-        known: columns of the numbers that all hypotheses share, where the trial started.
+        known: columns of the numbers that all hypotheses share, where the trial started; what its effect replaces does nothing.
+        whole: the same, with those that its effect replaces.
         model, residuals: the best so far.
         corrections: of ``known``, one per step taken (Broyden): a direction (numbers) of these numbers, and by what residuals
             change more along it, one (rows, channels) per run.
@@ -432,6 +476,7 @@ class _Trial:
 
     of: int
     known: Sequence[NDArray[np.float32]] = field(repr=False)
+    whole: Sequence[NDArray[np.float32]] = field(repr=False)
     model: Model
     residuals: list[Array] = field(default_factory=list, repr=False)
     corrections: tuple[tuple[Array, list[Array]], ...] = field(default=(), repr=False)
@@ -457,8 +502,8 @@ def refit(
         return []
     trials = _simulated(problem, _starts(problem, current, scores, given), runs)
     trials = _descended(problem, runs, current, trials, rounds)
-    plain = _simulated(problem, _without_effect(problem, current, trials), runs)
-    trials += _descended(problem, runs, current, plain, rounds)
+    for plain in _without_effect(problem, current, trials):
+        trials += _descended(problem, runs, current, _simulated(problem, [plain], runs), rounds)
     memory = _best_memory(problem, current, trials)
     costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
     best = [
@@ -488,8 +533,12 @@ def _without_effect(problem: Problem, current: Fit, trials: Sequence[_Trial]) ->
     The cost is rough: what lets go of a minimum may be any nudge, and then it is no evidence for the effect that gave it.
     """
     memory = _best_memory(problem, current, trials)
-    effects = sorted((t for t in trials if t.of >= 0), key=lambda t: total_cost(problem, t.model, t.residuals, memory))
-    return [replace(t, of=-1, model=t.model.without_effect(-1), settled=False) for t in effects[:NUDGES]]
+    best: dict[int, _Trial] = {}
+    for trial in sorted(trials, key=lambda t: total_cost(problem, t.model, t.residuals, memory)):
+        if trial.of >= 0:
+            best.setdefault(trial.of, trial)
+    free = [replace(t, of=-1, model=t.model.without_effect(-1), settled=False) for t in list(best.values())[:NUDGES]]
+    return [t if t.known is t.whole else replace(t, known=t.whole, corrections=()) for t in free]
 
 
 def _improved(problem: Problem, runs: Sequence[int], current: Fit, trials: Sequence[_Trial], noise: Noise) -> list[_Trial]:
@@ -558,7 +607,7 @@ def _hopeful(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[
 def _given_up(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[_Trial]:
     """The trials; those of hypotheses that are far behind the best are settled."""
     _, least = _least_costs(problem, trials, memory)
-    enough = HOPELESS * (least[-1] - min(least.values())) if -1 in least else 0.0
+    enough = HOPELESS * (least[-1] - min(least.values()))
     return [replace(t, settled=t.settled or (t.of >= 0 and least[-1] - least[t.of] < enough)) for t in trials]
 
 
@@ -567,12 +616,13 @@ def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequ
     count = len(problem.quantities)
     given = [np.vstack([column, now[count:]]) for column, now in zip(given, current.columns, strict=True)]
     as_given = untouched(problem, current.model)
-    trials = [_Trial(-1, current.columns, current.model)]
+    trials = [_Trial(-1, current.columns, current.columns, current.model)]
     for k, score in enumerate(scores):
         candidate = score.candidate
         near, anew = (_without_replaced(problem, candidate, known) for known in (current.columns, given))
-        trials.append(_Trial(k, near, current.model.with_effect(candidate, score.values)))
-        trials.append(_Trial(k, anew, as_given.with_effect(candidate, _probed(candidate, candidate.starts[0]))))
+        trials.append(_Trial(k, near, current.columns, current.model.with_effect(candidate, score.values)))
+        probed = as_given.with_effect(candidate, _probed(candidate, candidate.starts[0]))
+        trials.append(_Trial(k, anew, given, probed))
     return trials
 
 
@@ -580,7 +630,7 @@ def _without_replaced(
     problem: Problem, candidate: Candidate, known: Sequence[NDArray[np.float32]]
 ) -> Sequence[NDArray[np.float32]]:
     """Columns of the known numbers; those whose place a candidate takes do nothing beside it."""
-    replaced = {name for met in candidate.tolerances if met is not None and met.replaces for name in met.quantities}
+    replaced = _replaced(candidate)
     if not replaced:
         return known
     rows = [k for k, quantity in enumerate(problem.quantities) if quantity.name in replaced]
@@ -588,6 +638,11 @@ def _without_replaced(
     for column in silent:
         column[rows] = 0.0
     return silent
+
+
+def _replaced(candidate: Candidate) -> set[str]:
+    """Names of the known numbers whose place a candidate takes."""
+    return {name for met in candidate.tolerances if met is not None and met.replaces for name in met.quantities}
 
 
 def _simulated(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) -> list[_Trial]:
@@ -617,7 +672,7 @@ def refit_thoroughly(problem: Problem, runs: Sequence[int], current: Fit, scores
         for score in scores
     ]
     fits.append(fit(problem, runs, current.model, memory=memory, scatter=scatter, steps=problem.steps))
-    trials = [_Trial(k, found.columns, found.model, found.residuals) for k, found in enumerate(fits)]
+    trials = [_Trial(k, found.columns, found.columns, found.model, found.residuals) for k, found in enumerate(fits)]
     memory = _best_memory(problem, current, trials)
     return _ranked(problem, scores, [t.model for t in trials], [t.residuals for t in trials], memory)
 

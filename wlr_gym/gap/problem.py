@@ -50,6 +50,7 @@ class Unknown:
         neutral: value at which the effect vanishes.
         low, high: physically plausible range; a fit that leaves it rules the candidate out.
         step: for finite differences.
+        is_size: whether it says how large the effect is (at neutral it vanishes), not where it is or over what it fades.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Unknown:
     low: float
     high: float
     step: float
+    is_size: bool = True
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,8 @@ class Candidate:
         convert: from fitted values to the effect's parameters, where the data are more nearly linear in other numbers (mass and
             moments of a load, not its place); None = they are the same.
         tolerances: per unknown, the known numbers it meets; empty = it meets none.
+        within: brings values back to where the effect is plausible, where ranges of single unknowns do not say it (a load's
+            moments, whose range grows with its mass); None = the ranges say it.
     """
 
     name: str
@@ -129,11 +133,17 @@ class Candidate:
     fixed: Mapping[str, float] = field(default_factory=dict)
     convert: Callable[[Sequence[float]], Mapping[str, float]] | None = None
     tolerances: tuple[Tolerance | None, ...] = ()
+    within: Callable[[Sequence[float]], tuple[float, ...]] | None = None
 
     @property
     def label(self) -> str:
         """Short text: ``coulomb_friction leg_rf``."""
         return " ".join([self.name, *self.where, self.formula]).strip()
+
+    def kept(self, values: Sequence[float]) -> tuple[float, ...]:
+        """Return the values brought into the plausible range."""
+        ranged = tuple(float(np.clip(v, u.low, u.high)) for v, u in zip(values, self.unknowns, strict=True))
+        return ranged if self.within is None else self.within(ranged)
 
     def parameters(self, values: Sequence[float]) -> dict[str, float]:
         """Return the effect's fitted parameters by name."""
@@ -183,7 +193,7 @@ class Problem(Protocol):
         steps: Gauss-Newton steps of a fit, at most.
         firmness: what a simulator gets wrong is the same in all runs, so they agree on it: what data say counts so many times
             less than the runs' differences would let it, and what is known beforehand so many times more. 1 = it is perfect.
-        disagreement: share of an effect's size by which a simulator and the system may differ on it; widens intervals.
+        disagreement: share by which a simulator and the system may differ on how large an effect is; widens intervals.
         thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
         motions: effect -> name of the motion that shows it best, for advice on what to record; may be empty.
         sealed: names of the runs to keep for the proof, where the problem knows better than a general rule; else empty.

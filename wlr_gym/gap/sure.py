@@ -54,13 +54,14 @@ def estimates(problem: Problem, fit: Fit) -> list[dict[str, Estimate]]:
     """Return the parameters of each of the model's effects with 95 % intervals.
 
     To what the data leave open comes what two simulators of one system disagree by (``problem.disagreement``), the same share
-    of all parameters of an effect.
+    of all unknowns that say how large an effect is.
     """
     spread = covariance(problem, fit)
     found, at = [], len(problem.quantities)
     for candidate, values in fit.model.effects:
         own = slice(at, at + len(values))
-        away = problem.disagreement * np.array([v - u.neutral for u, v in zip(candidate.unknowns, values, strict=True)])
+        sizes = [(v - u.neutral) * u.is_size for u, v in zip(candidate.unknowns, values, strict=True)]
+        away = problem.disagreement * np.array(sizes)
         found.append(_with_intervals(candidate, np.array(values), spread[own, own] + np.outer(away, away)))
         at += len(values)
     return found
@@ -71,11 +72,14 @@ def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[
     here = candidate.parameters(values.tolist())
     errors = np.sqrt(np.maximum(np.diag(spread), 0.0))
     slopes = {name: np.zeros(len(values)) for name in here}
+    own = np.eye(len(values))
     for k, error in enumerate(errors):
-        for step in (0.1 * error + 1e-9, -0.1 * error - 1e-9):  # a parameter at the edge of its range moves only inwards
-            beside = candidate.parameters((values + step * (np.arange(len(values)) == k)).tolist())
-            for name in here:
-                slopes[name][k] = max(slopes[name][k], (beside[name] - here[name]) / step, key=abs)
+        step = 0.1 * error + 1e-9
+        if candidate.kept((values + step * own[k]).tolist())[k] < values[k] + 0.5 * step:  # at the edge of its range: inwards
+            step = -step
+        beside = candidate.parameters((values + step * own[k]).tolist())
+        for name in here:
+            slopes[name][k] = (beside[name] - here[name]) / step
     units = {unknown.name: unknown.unit for unknown in candidate.unknowns}
     if candidate.name in EFFECTS:
         units |= {name: spec.unit for name, spec in EFFECTS[candidate.name].parameters.items()}

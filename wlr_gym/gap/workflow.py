@@ -112,6 +112,7 @@ def analyse_problem(
     base = widened(problem, fitted, base)
     clock.start("naming")
     naming = name_effects(problem, fitted, base, sealed, clock.detail, columns)
+    base = naming.calibrated
     clock.start("proving")
     models = (nominal_model(problem), base.model, naming.fit.model)
     floor = problem.floor(naming.fit.model.setting, sealed)

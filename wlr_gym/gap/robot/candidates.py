@@ -32,6 +32,8 @@ _OF_WHEELS = (*((wheel,) for wheel in WHEELS), *_WHEEL_SETS)
 _OF_JOINTS = (*_OF_LEGS, *_OF_WHEELS, tuple(JOINTS))
 #: Below this an effect is what any robot has; smaller values of it are calibration's.
 LEAST = {("tyre_creep", "creep_speed"): 0.003}
+#: Parameters that do not say how large an effect is.
+NO_SIZE = ("stribeck_speed", "slip_speed", "order", "phase")
 #: Periods per turn at which a ripple is looked for.
 ORDERS = range(1, 65)
 #: Periods that a joint must go through before a wave can be told from a bend.
@@ -119,7 +121,7 @@ def unknowns(name: str, mu: float) -> tuple[Unknown, ...]:
         low, high = spec.prior
         low = max(low, LEAST.get((name, key), low))
         step = 0.05 * (high - low)
-        found.append(Unknown(key, spec.unit, float(neutral), low, high, step))
+        found.append(Unknown(key, spec.unit, float(neutral), low, high, step, key not in NO_SIZE))
     return tuple(found)
 
 
@@ -237,7 +239,7 @@ def _ripple(lists: _Lists, measured: Sequence[Array], residuals: Sequence[Array]
 
         bound = EFFECTS["torque_ripple"].parameters["amplitude"].prior[1]
         waves = tuple(Unknown(name, "N m", 0.0, -bound, bound, amount) for name in ("sine", "cosine"))
-        period = Unknown("order", "-", order, order - 0.5, order + 0.5, 0.02)
+        period = Unknown("order", "-", order, order - 0.5, order + 0.5, 0.02, is_size=False)
         start = Start(((keys[0],), (keys[1],)), values)
         lists.candidates.append(Candidate("torque_ripple", (joint,), (*waves, period), (start,), convert=_ripple_parameters))
 
@@ -314,8 +316,8 @@ def _patch(lists: _Lists, mu: float, measured: Sequence[Array]) -> None:
             middle, width = 0.5 * (a + b), b - a
             found.append(Start((tuple(keys[first : last + 1]),), lambda w, m=middle, d=width: (mu + less * float(w[0]), m, d)))
     level = next(unknown for unknown in unknowns("friction_patch", mu) if unknown.name == "mu")
-    middle = Unknown("x_middle", "m", 0.0, low - 10.0, high + 10.0, 0.02)
-    width = Unknown("x_width", "m", 0.0, 0.02, high - low + 10.0, 0.02)
+    middle = Unknown("x_middle", "m", 0.0, low - 10.0, high + 10.0, 0.02, is_size=False)
+    width = Unknown("x_width", "m", 0.0, 0.02, high - low + 10.0, 0.02, is_size=False)
     lists.candidates.append(
         Candidate("friction_patch", ("ground",), (level, middle, width), tuple(found), fixed=UNBOUNDED, convert=_area)
     )
@@ -350,6 +352,7 @@ def _loads(lists: _Lists) -> None:
                 ),
             ),
             convert=_load,
+            within=_carried,
         )
     )
     lists.add_known("com_offset", ("body",), [_Part(axis, (f"body.com_offset[{axis}]",), 0.005) for axis in "xyz"])
@@ -380,6 +383,13 @@ def _loads(lists: _Lists) -> None:
             convert=_tether,
         )
     )
+
+
+def _carried(values: Sequence[float]) -> tuple[float, ...]:
+    """Mass and moments of a load that is carried no farther out than plausible."""
+    mass = float(values[0])
+    ranges = (EFFECTS["payload"].parameters[axis].prior for axis in "xyz")
+    return mass, *(float(np.clip(m, mass * low, mass * high)) for m, (low, high) in zip(values[1:], ranges, strict=True))
 
 
 def _load(values: Sequence[float]) -> dict[str, float]:

@@ -25,7 +25,7 @@ POSE_TICKS = 3
 TRUTH = ("joint_position", "joint_velocity", "motor_torque", "contact_force", "slip_velocity", "position")
 #: Channels begin as the sensors do: joint positions and speeds, then what only motors and IMU know; the camera follows.
 _MOVED, _READ = SENSOR_LAYOUT.slices["joint_velocity"].stop, SENSOR_LAYOUT.slices["accelerometer"].stop
-_VOLTAGE, _VOLT = SENSOR_LAYOUT.slices["supply_voltage"].start, CHANNELS.index("volt")
+_SENSED_VOLT, _VOLT = SENSOR_LAYOUT.slices["supply_voltage"].start, CHANNELS.index("volt")
 _CAMERA = slice(CHANNELS.index("cam_x"), CHANNELS.index("cam_pitch") + 1)
 #: The leading columns of the truth layout: position and quaternion.
 _POSE = TRUTH_LAYOUT.slices["quaternion"].stop
@@ -64,7 +64,8 @@ class Recorder:
         self.idle_goals = np.zeros((count, 8))
         self._wheels = first.joint_position[:, 4:]
         self._values = [np.zeros((settings, len(clock.t), len(CHANNELS))) for clock in clocks]
-        self._truths = [np.zeros((settings, len(clock.t), 0)) for clock in clocks]
+        width = sum(len(TRUTH_LAYOUT.channels[name].elements) for name in TRUTH) if with_truth else 0
+        self._truths = [np.zeros((settings, len(clock.t), width)) for clock in clocks]
         self._place = [(clock.t - clock.begin) / CLOCK for clock in clocks]
         self._next = [0] * len(clocks)
         ticks = max(clock.ticks for clock in clocks) + 2
@@ -114,14 +115,11 @@ class Recorder:
             now, last, before = (self._recent[(tick - ago) % 3, mine] for ago in range(3))
             _interpolate(share, now, last, before, self._soonest[mine], early, only_moved, self._values[r][:, row])
         if self.with_truth:
-            seen = np.concatenate([truth[name][mine] for name in TRUTH], axis=1)
-            if not self._truths[r].shape[2]:
-                self._truths[r] = np.zeros((self.settings, len(self._place[r]), seen.shape[1]))
-            self._truths[r][:, row] = seen
+            self._truths[r][:, row] = np.concatenate([truth[name][mine] for name in TRUTH], axis=1)
         self._next[r] += 1
 
     def result(self, r: int, parameters: Parameters) -> Replays:
-        """What was read of run ``r`` under every setting, whose parameters are given."""
+        """What was read of run ``r`` under every setting; ``parameters`` (settings) are its robots'."""
         offset = np.asarray(self.clocks[r].run.meta.marker_offset, np.float64)
         late = self._place[r][None, :] - parameters["camera.delay"][:, None] / CLOCK
         places = np.maximum(late / POSE_TICKS, 0.0)
@@ -143,21 +141,33 @@ def _torque_changes(clocks: Sequence[Clock], ticks: int, settings: int) -> dict[
 
 @njit(cache=True, nogil=True)
 def _store(readings: Any, shift: Any, out: Any) -> None:
-    """Copy the readings of a tick, wheel angles counted from where the robots stood."""
+    """Copy the readings of a tick (robots, SENSOR_LAYOUT.width) as channels, wheel angles counted from where robots stood.
+
+    Args:
+        readings: of all robots.
+        shift: (robots, 4) rad, added to the wheel angles.
+        out: (robots, len(CHANNELS)), filled but for the camera.
+    """
     for i in range(len(out)):
         for c in range(_READ):
             out[i, c] = readings[i, c]
         for k in range(4):
             out[i, 4 + k] += shift[i, k]
-        out[i, _VOLT] = readings[i, _VOLTAGE]
+        out[i, _VOLT] = readings[i, _SENSED_VOLT]
 
 
 @njit(cache=True, nogil=True)
 def _interpolate(share: Any, now: Any, last: Any, before: Any, soonest: Any, early: Any, only_moved: Any, out: Any) -> None:
-    """Readings between the last tick and this one.
+    """Fill readings between the last tick and this one, ``out`` (robots, channels).
 
-    A row's own goal acts after its reading: where it would act before this tick (``soonest`` below ``early``; infinite = the
-    ticks before tell nothing), the line is that of the two ticks before.
+    A row's own goal acts after its reading: where it would act before this tick, the line is that of the two ticks before.
+
+    Args:
+        share: of the tick that has passed at the row's time.
+        now, last, before: (robots, channels) at this tick, the last and the one before.
+        soonest: (robots) s; the soonest that a goal acts after its row.
+        early: s; a goal that acts sooner acts before this tick. Infinite = the ticks before tell nothing.
+        only_moved: whether only angles and speeds are on a line, the rest is this tick's.
     """
     for i in range(len(out)):
         ahead = early < np.inf and soonest[i] < early

@@ -71,7 +71,7 @@ class GibbsAppellPlant(Simulator):
         self._float = np.dtype(self.options.precision).type
         self._step = self._float(self.options.physics_step)
         self._width = 1 if count == 1 else kernel.WIDTH[self.options.precision]
-        self._tiles = self._going = -(-count // self._width)
+        self._tiles = -(-count // self._width)
         self._lanes = np.zeros((self._tiles, len(STORED) * self._width), self._float)
         self._constants = np.zeros((self._tiles, len(packing.PARAMETER_LANES) * self._width), self._float)
         self._torque_on = np.ones((count, 8))
@@ -83,13 +83,15 @@ class GibbsAppellPlant(Simulator):
         self._start()
 
     def _make_pool(self) -> ThreadPoolExecutor | None:
-        threads = min(self.options.threads, self._tiles // TILES_PER_THREAD)
-        if threads < 2:
-            self._chunks = [(0, self._tiles)]
+        self._chunks = self._shared_out(self._tiles)
+        if len(self._chunks) < 2:
             return None
-        edges = np.linspace(0, self._tiles, threads + 1).astype(int).tolist()
-        self._chunks = list(itertools.pairwise(edges))
-        return ThreadPoolExecutor(threads - 1, thread_name_prefix="wlr-engine")
+        return ThreadPoolExecutor(len(self._chunks) - 1, thread_name_prefix="wlr-engine")
+
+    def _shared_out(self, tiles: int) -> list[tuple[int, int]]:
+        """First and last of the tiles of each thread."""
+        threads = max(1, min(self.options.threads, tiles // TILES_PER_THREAD))
+        return list(itertools.pairwise(np.linspace(0, tiles, threads + 1).astype(int).tolist()))
 
     # ---- parameters and state ----
 
@@ -212,8 +214,8 @@ class GibbsAppellPlant(Simulator):
 
     def keep_going(self, count: int) -> None:
         """Leave the tiles without any of the first ``count`` robots; see :class:`wlr_gym.plants.simulator.Simulator`."""
-        self._going = -(-count // self._width)
-        self._chunks = [(first, min(last, self._going)) for first, last in self._chunks if first < self._going]
+        going = -(-count // self._width)
+        self._chunks = [(0, going)] if self._pool is None else self._shared_out(going)
 
     def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick; see :meth:`wlr_gym.plants.base.Plant.step`.
@@ -224,7 +226,7 @@ class GibbsAppellPlant(Simulator):
         inputs = (*self._take_goals(goals, torque_on, self._torque_on), self._torque_on, self._formula_values)
         arguments = (self._lanes, self._constants, *inputs, self._truth.values, self._raw)
         if self._pool is None:
-            self._run(arguments, 0, self._going)
+            self._run(arguments, *self._chunks[0])
         else:
             waiting = [self._pool.submit(self._run, arguments, *chunk) for chunk in self._chunks[1:]]
             self._run(arguments, *self._chunks[0])
