@@ -271,6 +271,8 @@ def test_numbers_in_words():
     angle = examples.UNKNOWN_EFFECT.effects[0].parameters["a0"]
     assert estimate(angle) == "1.21 (1.17 to 1.25) rad = 69.3°"
     assert estimate(replace(angle, low=float("nan"))) == "1.21 rad = 69.3°"
+    assert estimate(Estimate(1.021709, 1.0173, 1.0261, "-")) == "1.022 (1.017 to 1.026)"
+    assert estimate(Estimate(0.0, -0.1, 0.1, "m")) == "0 (-0.1 to 0.1) m"
 
 
 # ---- pictures --------------------------------------------------------------------------------------------------------

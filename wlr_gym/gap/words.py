@@ -132,9 +132,17 @@ def unit_of(unit: str) -> str:
 def estimate(found: Estimate) -> str:
     """Return ``0.041 (0.038 to 0.045) N m``; angles in degrees, too."""
     known = math.isfinite(found.low) and math.isfinite(found.high)
-    between = f" ({number(found.low)} to {number(found.high)})" if known else ""
+    digits = _digits(found.value, 0.5 * (found.high - found.low)) if known else 3
+    between = f" ({number(found.low, digits)} to {number(found.high, digits)})" if known else ""
     degrees = f" = {number(math.degrees(found.value))}°" if found.unit == "rad" else ""
-    return f"{number(found.value)}{between}{unit_of(found.unit)}{degrees}"
+    return f"{number(found.value, digits)}{between}{unit_of(found.unit)}{degrees}"
+
+
+def _digits(value: float, uncertainty: float) -> int:
+    """Significant digits that show a value down to its uncertainty, three at least: a scale of 1.022, known to 0.004."""
+    if not 0.0 < uncertainty < abs(value):
+        return 3
+    return max(3, math.ceil(math.log10(abs(value) / uncertainty)) + 1)
 
 
 def duration(seconds: float) -> str:
