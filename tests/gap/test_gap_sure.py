@@ -8,7 +8,7 @@ from toy_problem import NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap.fit import fit, nominal_model, normal_equations, on_bounds
 from wlr_gym.gap.name import name_effects
-from wlr_gym.gap.problem import Candidate, Start
+from wlr_gym.gap.problem import Candidate, Start, Tolerance
 from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
 from wlr_gym.gap.sure import TWO_SIDED_95, confidence, detectable, estimates, standard_errors
 
@@ -117,6 +117,15 @@ def test_parameter_at_the_edge_of_its_range_keeps_its_interval():
     (held,) = estimates(problem, fit(problem, range(5), model, steps=problem.steps))[0].values()
     assert held.value == 0.5
     assert held.high - held.low == pytest.approx(free.high - free.low, rel=0.3)
+
+
+def test_what_adds_to_a_known_number_is_known_no_better_than_it():
+    """However well the data seem to tell them apart: the errors of simulated responses do that, too."""
+    problem = Toy({"gain": 1.0}, white=1.5)
+    adds = replace(candidate(problem, "copy"), tolerances=(Tolerance(("gain", "mass"), 0.5, REACH),))
+    found = fit(problem, range(5), nominal_model(problem).with_effect(adds, (1.0,)), steps=problem.steps)
+    own = estimates(problem, replace(found, precision=1e9 * np.eye(4), columns=[1e4 * c for c in found.columns]))[0]["size"]
+    assert own.high - own.value == pytest.approx(TWO_SIDED_95 * 0.5 / np.sqrt(2.0), rel=1e-3)
 
 
 def test_simulators_do_not_disagree_about_places():

@@ -54,7 +54,8 @@ def estimates(problem: Problem, fit: Fit) -> list[dict[str, Estimate]]:
     """Return the parameters of each of the model's effects with 95 % intervals.
 
     To what the data leave open comes what two simulators of one system disagree by (``problem.disagreement``), the same share
-    of all unknowns that say how large an effect is.
+    of all unknowns that say how large an effect is. An unknown that adds to known numbers is known no better than they are:
+    data tell the sum, and only the small errors of simulated responses make it look otherwise.
     """
     spread = covariance(problem, fit)
     found, at = [], len(problem.quantities)
@@ -62,9 +63,16 @@ def estimates(problem: Problem, fit: Fit) -> list[dict[str, Estimate]]:
         own = slice(at, at + len(values))
         sizes = [(v - u.neutral) * u.is_size for u, v in zip(candidate.unknowns, values, strict=True)]
         away = problem.disagreement * np.array(sizes)
-        found.append(_with_intervals(candidate, np.array(values), spread[own, own] + np.outer(away, away)))
+        untold = np.diag(np.maximum(_untold(candidate) - np.diag(spread)[own], 0.0))
+        found.append(_with_intervals(candidate, np.array(values), spread[own, own] + np.outer(away, away) + untold))
         at += len(values)
     return found
+
+
+def _untold(candidate: Candidate) -> Array:
+    """Least variance (unknowns) of what is told only as a sum with known numbers: that of their mean."""
+    met = candidate.tolerances or (None,) * len(candidate.unknowns)
+    return np.array([0.0 if one is None or one.replaces else one.size**2 / len(one.quantities) for one in met])
 
 
 def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[str, Estimate]:
