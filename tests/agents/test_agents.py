@@ -116,6 +116,13 @@ def test_settings_of_a_task_lie_over_the_general_ones_and_changes_over_both(tmp_
     assert load_agent_config(path, task="slope") == {"gamma": 0.9, "seed": 1, "environment": {"a": 1}}
 
 
+def test_what_a_file_says_lies_over_its_base_for_every_task(tmp_path):
+    base, path = tmp_path / "base.yaml", tmp_path / "mine.yaml"
+    base.write_text("{gamma: 0.9, seed: 1, tasks: {path: {gamma: 0.99, seed: 2}}}")
+    path.write_text(f"base: {base}\ngamma: 0.95\n")
+    assert load_agent_config(path, task="path") == {"gamma": 0.95, "seed": 2}
+
+
 @pytest.mark.parametrize("task", ["velocity", "path", "posture", "slope"])
 @pytest.mark.parametrize(
     "name", ["ppo", "ppo_slip_aware", "ppo_slip_aware_no_camera", "ppo_blind", "ppo_privileged", "ppo_oracle"]

@@ -118,22 +118,20 @@ def load_agent_config(name: str | Path, changes: tuple[str, ...] = (), task: str
     """Read ``configs/agent/<name>.yaml`` (or a path) and lay changes such as ``environment.precision=float64`` over it.
 
     A name without a file is an agent without settings: empty. ``base: NAME`` in a file lays it over another. With a ``task``
-    the settings are that task's: those in ``tasks: {TASK: ...}`` lie over the general ones, and changes over both.
+    the settings are that task's: those in ``tasks: {TASK: ...}`` lie over the file's general ones, what the file says lies over
+    both of its base's, and changes over all.
 
     Raises:
         InputError: no such file, broken YAML, a base that is none, or a change that is not ``key=value``.
     """
-    config = _read_config(name)
-    if task is not None:
-        own = (config.pop("tasks", None) or {}).get(task)
-        config = _merged(config, own or {})
+    config = _read_config(name, task)
     for change in changes:
         _apply(config, change)
     return config
 
 
-def _read_config(name: str | Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return the settings of a name or path, laid over those of its base; ``above``: the files that lie over it."""
+def _read_config(name: str | Path, task: str | None, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Return a task's settings of a name or path, laid over those of its base; ``above``: the files that lie over it."""
     shipped = data_directory("configs") / "agent" / f"{name}.yaml"
     if str(name) in agent_names() and not shipped.is_file():
         return {}
@@ -142,13 +140,15 @@ def _read_config(name: str | Path, above: tuple[Path, ...] = ()) -> dict[str, An
     if not isinstance(config, dict):
         raise InputError(f"{path}: expected a mapping, got {type(config).__name__}")
     base = config.pop("base", None)
+    if task is not None:
+        config = _merged(config, (config.pop("tasks", None) or {}).get(task) or {})
     if base is None:
         return config
     if not isinstance(base, str):
         raise InputError(f"{path}: base = {base!r}: expected a name in configs/agent/, or a path")
     if path in above:
         raise InputError(f"{path}: is its own base")
-    return _merged(_read_config(base, (*above, path)), config)
+    return _merged(_read_config(base, task, (*above, path)), config)
 
 
 def _merged(base: dict[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
