@@ -217,14 +217,14 @@ def name_effects(
         deeper = _deeper(problem, current, hypotheses)
         if deeper is not None and current is not again:
             tell("the known numbers fit better elsewhere: calibrated anew from there")
-            again = fit(problem, runs, deeper, scatter=current.noise.scatter, steps=problem.steps)
-            again = current = widened(problem, runs, again)
+            anew = fit(problem, runs, deeper, scatter=current.noise.scatter, steps=problem.steps)
+            current = again = widened(problem, runs, anew)
             calibrated = calibrated if current.model.effects else current
             continue
         finals = finalists(problem, runs, hypotheses, current.noise, others, tell)
         accepted = _accepted(problem, runs, current, finals, others, tell)
         taken = None if accepted is None else accepted.hypothesis
-        rounds.append(Round(scores, _merged([*finals, *([accepted] if accepted else [])], hypotheses), taken, current.cost))
+        rounds.append(Round(scores, _merged([*finals, accepted] if accepted else finals, hypotheses), taken, current.cost))
         if accepted is None:
             break
         tell(f"taken: {accepted.hypothesis.candidate.label}")
@@ -502,8 +502,8 @@ def refit(
         return []
     trials = _simulated(problem, _starts(problem, current, scores, given), runs)
     trials = _descended(problem, runs, current, trials, rounds)
-    for plain in _without_effect(problem, current, trials):
-        trials += _descended(problem, runs, current, _simulated(problem, [plain], runs), rounds)
+    for plain in _simulated(problem, _without_effect(problem, current, trials), runs):
+        trials += _descended(problem, runs, current, [plain], rounds)
     memory = _best_memory(problem, current, trials)
     costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
     best = [

@@ -173,5 +173,4 @@ def _plausible(
         values = values_of(share * amplitude)
         if all(u.low - 1e-12 <= v <= u.high + 1e-12 for u, v in zip(candidate.unknowns, values, strict=True)):
             return values, share
-    pairs = zip(candidate.unknowns, values_of(0.0 * amplitude), strict=True)
-    return tuple(float(np.clip(v, u.low, u.high)) for u, v in pairs), 0.0
+    return candidate.kept(values_of(0.0 * amplitude)), 0.0
