@@ -55,15 +55,15 @@ def test_truths_are_sealed_away_from_the_data(finished):
     sealed = list((plan.out / "sealed").iterdir())
     assert len(sealed) == 1
     truths = yaml.safe_load(sealed[0].read_text())
-    assert truths["set_1000"]["effects"][0]["name"] == case(0).effects[0]["name"]
+    assert truths["set_2000"]["effects"][0]["name"] == case(0).effects[0]["name"]
     assert any("sha256" in line for line in said)
     text = "".join(file.read_text() for file in (plan.out / "data").rglob("*.yaml"))
-    assert truths["set_1000"]["effects"][0]["name"] not in text
+    assert truths["set_2000"]["effects"][0]["name"] not in text
 
 
 def test_data_are_valid_measured_runs(finished):
     plan, _, _ = finished
-    runs = read_dataset(plan.out / "data" / "set_1001").runs
+    runs = read_dataset(plan.out / "data" / "set_2001").runs
     assert len(runs) == 1
     assert {finding.kind for finding in runs[0].findings} <= {"gap"}
 
@@ -87,8 +87,8 @@ def test_errors_of_the_workflow_are_its_answers(tmp_path):
 
 def test_a_process_that_dies_has_failed(tmp_path):
     report = gap.run_blind_test(gap.Plan(tmp_path, sets=1, processes=1, runs=(6,)), "no_such_module:analyse", lambda line: None)
-    assert report["failed"] == ["set_1000"]
-    assert "No module named 'no_such_module'" in (tmp_path / "results" / "set_1000.json").read_text()
+    assert report["failed"] == ["set_2000"]
+    assert "No module named 'no_such_module'" in (tmp_path / "results" / "set_2000.json").read_text()
 
 
 def test_report_reads_as_a_table(finished):
@@ -118,7 +118,7 @@ def test_impossible_plans_are_refused(tmp_path, numbers):
 def test_other_truths_in_the_same_folder_are_refused(tmp_path):
     plan = gap.Plan(tmp_path, sets=1)
     gap.make_output_folder(tmp_path / "sealed")
-    (tmp_path / "sealed" / "truths_1000_1.yaml").write_text("something else")
+    (tmp_path / "sealed" / "truths_2000_1.yaml").write_text("something else")
     with pytest.raises(InputError, match="other truths"):
         gap.seal(plan, plan.cases())
 

@@ -166,6 +166,14 @@ def test_effects_that_meet_a_known_number_know_its_tolerance(tried, good):
     assert not tolerable("friction_level", "ground", (0.6 - 2.6 * level,), ["ground.mu"], -2.5)
     assert not tolerable("backlash", "leg_lf", (1e-6,))
     assert not tolerable("gyro_bias", "sensor", (1e-6, 0.0, 0.0))  # a bias drifts
+    assert not tolerable("payload", "body", (1e-6, 0.0, 0.0, 0.0))  # any load is one
+
+
+def test_a_load_is_known_no_better_than_the_body_it_adds_to(tried):
+    load = next(c for c in tried[1] if c.name == "payload")
+    mass = ROBOT.body.mass
+    assert [met.size for met in load.tolerances] == pytest.approx([0.03 * mass, *[0.003 * mass] * 3])
+    assert [met.quantities for met in load.tolerances] == [("body.mass",), *((f"body.com_offset[{axis}]",) for axis in "xyz")]
 
 
 def test_places_are_places_of_the_effect(tried):

@@ -96,7 +96,7 @@ class Tolerance:
     Attributes:
         quantities: their names.
         size: one tolerance of theirs, in the unknown's unit.
-        reach: tolerances by which calibration may move them: what goes farther is an effect.
+        reach: tolerances by which calibration may move them: what goes farther is an effect. 0 = any size is one.
         replaces: whether the unknown takes their place; otherwise it adds to them.
     """
 

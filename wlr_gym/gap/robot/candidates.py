@@ -148,7 +148,7 @@ def robot_candidates(
     _ripple(lists, measured, residuals)
     _ground(lists, mu, float(parameters["wheel.radius"].mean()))
     _patch(lists, mu, measured)
-    _loads(lists)
+    _loads(lists, float(parameters["body.mass"][0]))
     _sensors(lists)
     return lists.probes, lists.candidates
 
@@ -329,7 +329,7 @@ def _area(values: Sequence[float]) -> dict[str, float]:
     return {"mu": mu, "x_min": middle - 0.5 * width, "x_max": middle + 0.5 * width}
 
 
-def _loads(lists: _Lists) -> None:
+def _loads(lists: _Lists, body_mass: float) -> None:
     mass = 0.15
     keys = [lists.probe("payload", ("body",), {"mass": mass, "x": 0.0, "y": 0.0, "z": 0.0}, "centre")]
     for axis in "xyz":
@@ -353,6 +353,7 @@ def _loads(lists: _Lists) -> None:
             ),
             convert=_load,
             within=_carried,
+            tolerances=_beside_body(lists, body_mass),
         )
     )
     lists.add_known("com_offset", ("body",), [_Part(axis, (f"body.com_offset[{axis}]",), 0.005) for axis in "xyz"])
@@ -382,6 +383,15 @@ def _loads(lists: _Lists) -> None:
             ),
             convert=_tether,
         )
+    )
+
+
+def _beside_body(lists: _Lists, body_mass: float) -> tuple[Tolerance | None, ...]:
+    """What a load's mass and moments add to: a body weighed and balanced so well. Any load counts as an effect."""
+    sizes = {"body.mass": 1.0, **{f"body.com_offset[{axis}]": body_mass for axis in "xyz"}}
+    return tuple(
+        Tolerance((name,), scale * lists.tolerances[name], reach=0.0) if name in lists.tolerances else None
+        for name, scale in sizes.items()
     )
 
 
