@@ -116,6 +116,13 @@ def test_settings_of_a_task_lie_over_the_general_ones_and_changes_over_both(tmp_
     assert load_agent_config(path, task="slope") == {"gamma": 0.9, "seed": 1, "environment": {"a": 1}}
 
 
+def test_settings_of_a_task_that_does_not_exist_are_refused(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("{gamma: 0.9, tasks: {pth: {gamma: 0.99}}}")
+    with pytest.raises(InputError, match=r"mine\.yaml: tasks: unknown task 'pth'.*'path'"):
+        load_agent_config(path, task="path")
+
+
 def test_what_a_file_says_lies_over_its_base_for_every_task(tmp_path):
     base, path = tmp_path / "base.yaml", tmp_path / "mine.yaml"
     base.write_text("{gamma: 0.9, seed: 1, tasks: {path: {gamma: 0.99, seed: 2}}}")

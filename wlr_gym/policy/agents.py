@@ -15,7 +15,7 @@ import yaml
 from numpy.typing import NDArray
 
 from wlr_gym.errors import InputError, unknown_name
-from wlr_gym.paths import data_directory, find_config
+from wlr_gym.paths import config_names, data_directory, find_config
 from wlr_gym.robot import read_yaml
 
 Contract = Mapping[str, Any]
@@ -122,7 +122,7 @@ def load_agent_config(name: str | Path, changes: tuple[str, ...] = (), task: str
     both of its base's, and changes over all.
 
     Raises:
-        InputError: no such file, broken YAML, a base that is none, or a change that is not ``key=value``.
+        InputError: no such file, broken YAML, a base or a task that is none, or a change that is not ``key=value``.
     """
     config = _read_config(name, task)
     for change in changes:
@@ -141,7 +141,7 @@ def _read_config(name: str | Path, task: str | None, above: tuple[Path, ...] = (
         raise InputError(f"{path}: expected a mapping, got {type(config).__name__}")
     base = config.pop("base", None)
     if task is not None:
-        config = _merged(config, (config.pop("tasks", None) or {}).get(task) or {})
+        config = _merged(config, _of_task(path, config.pop("tasks", None) or {}, task))
     if base is None:
         return config
     if not isinstance(base, str):
@@ -149,6 +149,14 @@ def _read_config(name: str | Path, task: str | None, above: tuple[Path, ...] = (
     if path in above:
         raise InputError(f"{path}: is its own base")
     return _merged(_read_config(base, task, (*above, path)), config)
+
+
+def _of_task(path: Path, tasks: Mapping[str, Any], task: str) -> dict[str, Any]:
+    """Return what a file's ``tasks`` says of one task; a task is a name in ``configs/task/`` or the path of a file."""
+    for name in tasks:
+        if Path(name).suffix not in {".yaml", ".yml"} and name not in config_names("task"):
+            raise unknown_name("task", name, config_names("task"), f"{path}: tasks")
+    return tasks.get(task) or {}
 
 
 def _merged(base: dict[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
