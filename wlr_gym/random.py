@@ -139,18 +139,6 @@ def fill_normals(seeds: Any, stream: Any, counters: Any, out: Any) -> None:
                 out[row, 4 * block + k] = four[k]
 
 
-@njit(cache=True, nogil=True)
-def fill_uniforms(seeds: Any, stream: Any, counters: Any, out: Any) -> None:
-    """Fill ``out`` (N, K) with uniforms in [0, 1) of 53 bits; arguments as in :func:`fill_normals`."""
-    columns = out.shape[1]
-    for row in range(out.shape[0]):
-        for block in range((columns + 1) // 2):
-            words = words4(seeds[row], np.uint64(stream), counters[row], block)
-            for k in range(min(2, columns - 2 * block)):
-                high, low = words[2 * k] >> np.uint64(5), words[2 * k + 1] >> np.uint64(6)
-                out[row, 2 * block + k] = float(np.int64((high << np.uint64(26)) | low)) * 2.0**-53
-
-
 def stream_number(name: str) -> np.uint64:
     """Return the 32-bit number of a named stream: the same on every machine and in every process."""
     return np.uint64(int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "little"))

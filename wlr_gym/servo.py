@@ -46,11 +46,6 @@ def motor_constants(stall_torque: Value, no_load_speed: Value, nominal_voltage: 
     return torque_constant, torque_constant * nominal_voltage / stall_torque
 
 
-def motor_current(torque_constant: Value, resistance: Value, voltage: Value, velocity: Value) -> Value:
-    """Return the winding current (A) at ``voltage`` (V) and shaft ``velocity`` (rad/s): back-EMF and Ohm's law."""
-    return (voltage - torque_constant * velocity) / resistance
-
-
 def motor_torque(torque_constant: Value, resistance: Value, voltage: Value, velocity: Value) -> Value:
     """Return the motor torque at the output shaft (N m), before gear friction."""
     return (torque_constant / resistance) * (voltage - torque_constant * velocity)
@@ -206,13 +201,6 @@ def _rectangle(to_goal: Value, limit: Value, step: Value) -> tuple[Value, ...]:
 # --- readings and registers -------------------------------------------------------------------------------------------
 
 
-def quantise(value: Value, count: ArrayLike) -> Value:
-    """Round ``value`` to whole register counts of size ``count`` (same unit); a count of 0 leaves it as it is."""
-    count = np.asarray(count, dtype=np.float64)
-    size = np.where(count > 0, count, 1.0)
-    return np.where(count > 0, np.rint(np.asarray(value) / size) * size, value)[()]
-
-
 @dataclass(frozen=True)
 class Register:
     """One register quantity: SI unit, SI value of one count, and the range of counts the servo accepts or reports."""
@@ -320,11 +308,3 @@ def effort_counts(robot: Robot) -> Array:
     leg = REGISTER_UNITS["XM540-W150-R"]["current"].per_count * effort_constants(robot)[0]
     wheel = REGISTER_UNITS["XL430-W250-T"]["load"].per_count * robot.servo.wheel.stall_torque
     return np.repeat([leg, wheel], 4)
-
-
-def reported_effort(robot: Robot, motor_currents: ArrayLike) -> Array:
-    """Return the effort (..., 8) in N m that the servos report for their motor currents (..., 8) in A, quantised.
-
-    Motor current times the *nominal* torque constant, before gear friction: a weak or warm motor is not seen in it.
-    """
-    return quantise(np.asarray(motor_currents, dtype=np.float64) * effort_constants(robot), effort_counts(robot))
