@@ -6,7 +6,7 @@ import numpy as np
 import pandas
 
 from wlr_gym.effects import apply_patch, load_patch
-from wlr_gym.gap.robot.recorder import CLOCK
+from wlr_gym.gap.robot.clock import CLOCK
 from wlr_gym.gap.robot.simulate import PHYSICS_STEP
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants import make_plant

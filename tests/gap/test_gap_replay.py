@@ -7,8 +7,9 @@ import pytest
 from engine_runs import META, ROBOT, abrupt, free_rear_wheels, nominal, posture_and_turns, record, spaced
 
 from wlr_gym.gap.robot import simulate
-from wlr_gym.gap.robot.recorder import CLOCK, TRUTH
-from wlr_gym.gap.robot.simulate import RunClock, WrittenGoals, replay_batch
+from wlr_gym.gap.robot.clock import CLOCK, RunClock
+from wlr_gym.gap.robot.recorder import TRUTH
+from wlr_gym.gap.robot.simulate import WrittenGoals, replay_batch
 from wlr_gym.gap.robot.windows import anchored_residuals
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT

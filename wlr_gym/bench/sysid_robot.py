@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 from wlr_gym.bench.mujoco_loop import build_servo_model
 from wlr_gym.bench.sysid import Contest, PeerProblem, PeerRun, contest_between
 from wlr_gym.gap.problem import Setting
+from wlr_gym.gap.robot.clock import LEAD
 from wlr_gym.gap.robot.problem import RobotProblem
-from wlr_gym.gap.robot.simulate import LEAD
 from wlr_gym.gap.robot.windows import anchored_residuals
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants import make_plant

@@ -15,10 +15,11 @@ from wlr_gym.gap.problem import Candidate, Probe, Quantity, Setting, Signal
 from wlr_gym.gap.prove import level, mean_squares
 from wlr_gym.gap.recommend import SHOWN_BY
 from wlr_gym.gap.robot.candidates import robot_candidates
+from wlr_gym.gap.robot.clock import RunClock
 from wlr_gym.gap.robot.formulas import formula_candidates
 from wlr_gym.gap.robot.quantities import Knob, knobs, write
 from wlr_gym.gap.robot.recorder import TRUTH, Replays
-from wlr_gym.gap.robot.simulate import PHYSICS_STEP, RunClock, replay_batch
+from wlr_gym.gap.robot.simulate import PHYSICS_STEP, replay_batch
 from wlr_gym.gap.robot.windows import WINDOW, anchored_residuals
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import TRUTH_LAYOUT

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.gap.robot.clock import CLOCK, RunClock
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, Sensors, Truth
 from wlr_gym.runs.format import CHANNELS
-from wlr_gym.runs.read import Run
 
 Array = NDArray[np.float64]
 
-#: s; the plant's tick.
-CLOCK = 0.004
 #: Ticks between two stored poses, from which the camera's are interpolated.
 POSE_TICKS = 3
 #: Truth channels that residuals are mapped over.
@@ -44,20 +42,10 @@ class Replays:
     truth: Array | None = None
 
 
-class Clock(Protocol):
-    """Where the rows of a run lie on the plant's clock."""
-
-    run: Run
-    t: Array
-    begin: float
-    ticks: int
-    torque_on: NDArray[np.bool_]
-
-
 class Recorder:
     """Readings at the rows' times, on a straight line through two ticks; poses on a coarser clock, for the camera's delay."""
 
-    def __init__(self, clocks: Sequence[Clock], settings: int, first: PlantState, delay: Array, with_truth: bool) -> None:
+    def __init__(self, clocks: Sequence[RunClock], settings: int, first: PlantState, delay: Array, with_truth: bool) -> None:
         self._soonest = delay.min(axis=1)
         self.clocks, self.settings, self.with_truth = clocks, settings, with_truth
         count = settings * len(clocks)
@@ -128,7 +116,7 @@ class Recorder:
         return Replays(self._values[r], self._truths[r] if self.with_truth else None)
 
 
-def _torque_changes(clocks: Sequence[Clock], ticks: int, settings: int) -> dict[int, NDArray[np.bool_]]:
+def _torque_changes(clocks: Sequence[RunClock], ticks: int, settings: int) -> dict[int, NDArray[np.bool_]]:
     """At which ticks motors are switched, and which are on from then on (robots, 8); nothing where all are always on."""
     if all(clock.torque_on.all() for clock in clocks):
         return {}

@@ -10,37 +10,29 @@ they were measured. All else (speeds, references, filters) is the simulation's o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from wlr_gym.gap.robot.recorder import CLOCK, POSE_TICKS, Recorder, Replays
-from wlr_gym.gap.robot.windows import WINDOW, window_rows
+from wlr_gym.gap.robot.clock import CLOCK, RunClock
+from wlr_gym.gap.robot.recorder import POSE_TICKS, Recorder, Replays
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants import make_plant
 from wlr_gym.plants.base import PlantOptions, PlantState, Sensors, standing_state
 from wlr_gym.plants.forces import Force
 from wlr_gym.plants.sensors import rotation
 from wlr_gym.plants.simulator import Simulator
-from wlr_gym.robot import LEGS, WHEELS, Robot
+from wlr_gym.robot import Robot
 from wlr_gym.runs.anchor import (
-    CAMERA_WINDOW,
-    JOINT_WINDOW,
     euler_angles,
-    has_camera,
-    local_fit,
     quaternion,
     rest_pose,
     start_state,
-    starts_at_rest,
-    unwrapped,
 )
-from wlr_gym.runs.format import COMMANDS
 from wlr_gym.runs.read import Run
-from wlr_gym.runs.replay import held_goals, profile_parameters
+from wlr_gym.runs.replay import profile_parameters
 from wlr_gym.servo import motor_constants
 
 Array = NDArray[np.float64]
@@ -49,58 +41,8 @@ Array = NDArray[np.float64]
 PHYSICS_STEP = 0.001
 #: Simulators that are twice as fast with numbers whose rounding (0.05 sensor noises after windows of 2 s) does not matter here.
 PRECISION = {"gibbs_appell": "float32"}
-#: s; the robot stands this long before the first row.
-LEAD = 0.3
 #: Robots simulated at once: more need more memory and are no faster.
 MOST_ROBOTS = 1024
-
-
-@dataclass(frozen=True, eq=False)
-class Anchors:
-    """What was measured at the start of each window: values and rates, one row per window.
-
-    Attributes:
-        tick: of the plant's clock.
-        legs: (W, 4) leg readings, rad.
-        effort: (W, 4) wheel efforts, N m; NaN where not measured or the motor is off.
-        pose, pose_rate: (W, 3) what the camera shows (x, y, heading), and its rate; NaN where not measured.
-    """
-
-    tick: NDArray[np.intp]
-    legs: Array
-    effort: Array
-    pose: Array
-    pose_rate: Array
-
-
-class RunClock:
-    """When the goals of one run arrive at the servos, where its rows lie on the plant's clock, and its windows."""
-
-    def __init__(self, run: Run, window: float = WINDOW) -> None:
-        self.run = run
-        self.windows = window_rows(run["t"], window)
-        self.t = run["t"]
-        commands = np.stack([run[name] for name in COMMANDS], axis=1)
-        self.goals = held_goals(run)
-        self.torque_on = np.isfinite(commands)
-        self.begin = self.t[0] - (LEAD if starts_at_rest(run) else 0.0)
-        self.ticks = int(np.ceil((self.t[-1] - self.begin) / CLOCK)) + 1
-        self.anchors = self._anchors([window.start for window in self.windows[1:]])
-
-    def _anchors(self, rows: list[int]) -> Anchors:
-        run, times = self.run, self.t[rows]
-        legs = [local_fit(self.t, run[f"pos_{joint}"], times, JOINT_WINDOW)[0] for joint in LEGS]
-        effort = np.full((4, len(rows)), np.nan)
-        for k, wheel in enumerate(WHEELS):
-            if np.isfinite(run[f"eff_{wheel}"]).sum() > 2 if f"eff_{wheel}" in run else False:
-                effort[k] = local_fit(self.t, run[f"eff_{wheel}"], times, JOINT_WINDOW)[0]
-        effort[~self.torque_on[rows, 4:].T] = np.nan
-        pose = np.full((2, 3, len(rows)), np.nan)
-        if has_camera(run):
-            fits = [local_fit(self.t, unwrapped(run[f"cam_{name}"]), times, CAMERA_WINDOW) for name in ("x", "y", "yaw")]
-            pose = np.stack(fits, axis=1)
-        tick = np.floor((times - self.begin) / CLOCK + 1e-9).astype(int)
-        return Anchors(tick, np.transpose(legs), effort.T, pose[0].T, pose[1].T)
 
 
 class WrittenGoals:
