@@ -100,10 +100,13 @@ def test_evaluate_plays_with_effects_and_says_so(tmp_path):
 
 def test_train_writes_the_effects_content_into_its_settings(tmp_path):
     pytest.importorskip("torch")
+    (tmp_path / "ice.yaml").write_text(ICE)  # not tired_battery: the engine would be compiled once more for it
     out = tmp_path / "run"
     small = ["total_steps=64", "num_envs=4", "steps_per_env=8", "batch_size=32", "epochs=1"]
-    words = ["train", "--out", str(out), "--no-progress", "--set", *small, "--effects", "tired_battery"]
+    words = ["train", "--out", str(out), "--no-progress", "--set", *small, "--effects", str(tmp_path / "ice.yaml")]
     assert main(words) == 0
     settings = yaml.safe_load((out / "config.yaml").read_text())["settings"]
-    assert [effect["name"] for effect in settings["environment"]["effects"]] == ["supply_sag", "weak_motor"]
+    assert [(effect["name"], effect["parameters"]) for effect in settings["environment"]["effects"]] == [
+        ("friction_level", {"mu": 0.1})
+    ]
     assert main(["train", "--resume", str(out), "--effects", "icy_patch"]) == 2

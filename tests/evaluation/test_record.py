@@ -25,7 +25,10 @@ EVENTS = {
         "when": "drift", "interval": [0.5, 1.0],
     },
 }  # fmt: skip
-RANDOM = {"base": "wide", "events": {**EVENTS, "friction_anisotropy": None}}
+OTHERWISE = {**EVENTS, "friction_anisotropy": None}
+RANDOM = {"base": "wide", "events": OTHERWISE}
+#: The engine need not be compiled in float32 for rolling resistance too.
+FLOAT32 = {"precision": "float32", "randomization": {"base": "wide", "events": {**OTHERWISE, "rolling_resistance": None}}}
 KEYWORDS = {"randomization": RANDOM, "episode_length": 2.0, "effects": [{"name": "gyro_bias", "parameters": {"x": 0.02}}]}
 
 
@@ -41,7 +44,7 @@ def record(path, count=3, robot=1, steps=60, **keywords) -> Any:
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])
-@pytest.mark.parametrize("keywords", [{}, {"free_wheels": ["wheel_lr"], "precision": "float32"}])
+@pytest.mark.parametrize("keywords", [{}, {"free_wheels": ["wheel_lr"], **FLOAT32}])
 def test_a_recorded_episode_simulates_again_bit_for_bit(tmp_path, suffix, keywords):
     env = record(tmp_path / f"run_01{suffix}", **keywords)
     run = read_run(tmp_path / f"run_01{suffix}")

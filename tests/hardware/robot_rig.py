@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from wlr_gym.hardware import loop as loop_module
-from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.config import load_hardware, with_ports
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.link import emulated_link
@@ -22,10 +23,24 @@ HARDWARE = load_hardware()
 PERIOD = 0.02
 DRIVE = np.array([1.5, 1.6, 1.5, 1.6, 3.0, 3.0, 3.0, 3.0])
 
+#: Safety limits for real time: a busy computer must not fail a test that is about something else than deadlines.
+PATIENT = {
+    "patience": 1.0, "read_time": 5.0, "late": 10000, "late_share": 1.0, "silence": 9.0, "coast": 8.0, "imu_silence": 9.0,
+    "watchdog": 2.5,
+}  # fmt: skip
+
 
 def hardware_with(**safety):
     """The nominal hardware with other safety limits."""
     return HARDWARE.model_copy(update={"safety": HARDWARE.safety.model_copy(update=safety)})
+
+
+def hardware_file(folder: Path, ports: dict[str, str], **safety) -> Path:
+    """Write a hardware file with these ports and patient safety limits."""
+    description = with_ports(hardware_with(**PATIENT | safety), ports)
+    path = folder / "hardware.yaml"
+    path.write_text(yaml.safe_dump(description.model_dump(mode="json")), encoding="utf-8")
+    return path
 
 
 def machine_of(core: Any) -> Any:
@@ -64,4 +79,7 @@ class Rig:
         self.machine.inject(text)
 
 
-__all__ = ["DRIVE", "HARDWARE", "JOINTS", "PERIOD", "ROBOT", "Phase", "Rig", "StoppedError", "hardware_with", "machine_of"]
+__all__ = [
+    "DRIVE", "HARDWARE", "JOINTS", "PATIENT", "PERIOD", "ROBOT", "Phase", "Rig", "StoppedError", "hardware_file",
+    "hardware_with", "machine_of",
+]  # fmt: skip

@@ -2,6 +2,8 @@
 
 The other side is a process of its own that answers on pseudo-terminals with what the emulator answered to the same bytes the
 first time, so that little but the host's side is measured: no wire time, no USB latency, no emulator at work.
+
+And whether this computer keeps up: a minute of ``wlr deploy`` at 50 Hz, with the emulated robot in another process.
 """
 
 from __future__ import annotations
@@ -10,15 +12,20 @@ import contextlib
 import os
 import select
 import signal
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from wlr_gym.bench.measure import Measurement, Size, interleave
 from wlr_gym.errors import require_package
 from wlr_gym.hardware.config import Hardware, load_hardware, with_ports
+from wlr_gym.hardware.log import read_events
 from wlr_gym.hardware.tables import Item, load_table
 from wlr_gym.robot import JOINTS, LEGS, Robot, load_robot
 
@@ -27,13 +34,29 @@ if TYPE_CHECKING:
 
 _PEER = "dynamixel-sdk, GroupSyncRead (fast) and GroupSyncWrite"
 _FIRST, _LAST = "realtime_tick", "present_position"
+_TICKS_PER_SECOND = 50
+_DRIVE = """
+import sys
+from wlr_gym.cli import main
+sys.exit(main(["deploy", "pid", "--emulated", "--hardware", sys.argv[1], "--seconds", sys.argv[2], "--out", sys.argv[3]]))
+"""
+#: Safety limits that let a drive on a busy computer go on: an answer that comes late makes a tick late, and is counted there.
+_PATIENT = {
+    "patience": 0.2, "read_time": 5.0, "late": 10**6, "late_share": 1.0, "silence": 9.0, "coast": 8.0, "imu_silence": 9.0,
+    "watchdog": 2.5,
+}  # fmt: skip
 Cycle = Callable[[], None]
 
 
 def measure_bus(size: Size) -> list[Measurement]:
-    """Cycles per second, processor time of a cycle, and the time from the readings' arrival to the goals' departure."""
+    """Bus cycles against the peer's, and deadlines kept in a real-time drive."""
     require_package("dynamixel_sdk", "robot")
     require_package("serial", "robot")
+    return [*_measure_cycle(size), *_measure_deadlines(size)]
+
+
+def _measure_cycle(size: Size) -> list[Measurement]:
+    """Cycles per second, processor time of a cycle, and the time from the readings' arrival to the goals' departure."""
     cycles = size(1000, 20)
     robot, hardware = load_robot(), load_hardware()
     with _answering(robot, hardware) as ports, contextlib.ExitStack() as stack:
@@ -55,6 +78,36 @@ def measure_bus(size: Size) -> list[Measurement]:
         Measurement("bus", "read to write, median", "us", tuple(float(np.median(times)) for times in latency)),
         Measurement("bus", "read to write, p99", "us", tuple(float(np.percentile(times, 99)) for times in latency)),
     ]
+
+
+def _measure_deadlines(size: Size) -> list[Measurement]:
+    """Ticks that a drive at 50 Hz missed, how late the others started, and how long their goals took; once a round."""
+    seconds = size(60, 2)
+    drives = [_drive(seconds) for _ in range(size.rounds)]
+    what = f"{seconds} s at {_TICKS_PER_SECOND} Hz on the emulated robot"
+    missed = tuple(float(drive["missed"]) for drive in drives)
+    late, sent = (tuple(1e3 * drive[name]["p99"] for drive in drives) for name in ("jitter", "latency"))
+    return [
+        Measurement("bus", f"{what}, ticks missed", "ticks", missed, bar=1.0),
+        Measurement("bus", f"{what}, start after the deadline, p99", "us", late, bar=3000.0),
+        Measurement("bus", f"{what}, read to write, p99", "us", sent),
+    ]
+
+
+def _drive(seconds: int) -> dict[str, Any]:
+    """Run ``wlr deploy`` as a user does; return the control loop's statistics."""
+    import yaml
+
+    hardware = load_hardware()
+    hardware = hardware.model_copy(update={"safety": hardware.safety.model_copy(update=_PATIENT)})
+    with tempfile.TemporaryDirectory(prefix="wlr-bench-") as folder:
+        file, log = Path(folder) / "hardware.yaml", Path(folder) / "log"
+        file.write_text(yaml.safe_dump(hardware.model_dump(mode="json")), encoding="utf-8")
+        words = [sys.executable, "-c", _DRIVE, str(file), str(seconds), str(log)]
+        done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+        if done.returncode != 0:
+            raise RuntimeError(f"the emulated robot was not driven to the end:\n{done.stdout}{done.stderr}")
+        return read_events(log / "run_01.csv")[-1]["statistics"]
 
 
 def _rate(cycle: Cycle, count: int, clock: Callable[[], float]) -> Callable[[], float]:
