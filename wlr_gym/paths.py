@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.errors import InputError, nearest, unknown_name
 
 PACKAGE = Path(__file__).resolve().parent
 
@@ -25,7 +25,8 @@ def find_config(kind: str, name: str | Path) -> Path:
     if path.suffix in {".yaml", ".yml"}:
         if path.is_file():
             return path
-        raise InputError(f"{kind} config: no file '{path}'")
+        beside = [other.name for other in path.parent.glob("*.y*ml")]
+        raise InputError(f"{kind} config: no file '{path}'{nearest(path.name, beside)}")
     if str(name) in config_names(kind):
         return data_directory("configs") / kind / f"{name}.yaml"
     raise unknown_name(f"{kind} config", str(name), config_names(kind))

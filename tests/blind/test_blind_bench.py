@@ -1,6 +1,9 @@
 """The blind test from end to end, with stand-ins for the workflow: sealing, resuming, failures, report."""
 
+import dataclasses
 import json
+import shutil
+from collections import Counter
 from pathlib import Path
 
 import pandas as pd
@@ -68,6 +71,43 @@ def test_data_are_valid_measured_runs(finished):
     assert {finding.kind for finding in runs[0].findings} <= {"gap"}
 
 
+def test_results_say_what_they_are_about_and_what_made_them(finished):
+    plan, report, _ = finished
+    made = [gap.read_result(plan.result_file(one))["blind_test"] for one in plan.cases()]
+    assert all(one["runs"] == [6] and len(one["truth_sha256"]) == 64 for one in made)
+    assert made[0]["truth_sha256"] != made[1]["truth_sha256"]
+    assert report["commits"] == Counter(one["commit"] or "unknown" for one in made)
+
+
+def test_results_of_other_data_are_refused(finished, tmp_path):
+    plan = dataclasses.replace(finished[0], out=tmp_path)
+    shutil.copytree(finished[0].out, tmp_path, dirs_exist_ok=True)
+    with pytest.raises(InputError, match=r"set_2000\.json: is about other runs \(\[6\]\)"):
+        _again(dataclasses.replace(plan, runs=(5, 6)))
+    file = plan.result_file(case(1))
+    result = gap.read_result(file)
+    result["blind_test"]["truth_sha256"] = "0" * 64
+    file.write_text(json.dumps(result))
+    with pytest.raises(InputError, match=r"set_2001\.json: is about another hidden truth"):
+        _again(plan)
+
+
+def test_results_of_other_commits_are_counted(finished, tmp_path):
+    plan = dataclasses.replace(finished[0], out=tmp_path)
+    shutil.copytree(finished[0].out, tmp_path, dirs_exist_ok=True)
+    old, other = plan.result_file(case(0)), plan.result_file(case(1))
+    old.write_text(json.dumps({"verdict": "nothing_missing", "effects": []}))
+    other.write_text(other.read_text().replace('"commit": ', '"commit": "abc", "was": '))
+    report = _again(plan)
+    assert report["commits"] == {"unknown": 1, "abc": 1}
+    assert "Sets analysed by commit: unknown 1, abc 1." in gap.markdown(report)
+    assert json.loads((tmp_path / "score.json").read_text())["commits"] == report["commits"]
+
+
+def _again(plan):
+    return gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None)
+
+
 def test_goes_on_where_it_stopped(finished):
     plan, report, _ = finished
     said: list[str] = []
@@ -75,20 +115,24 @@ def test_goes_on_where_it_stopped(finished):
     assert not any("to go" in line for line in said)
 
 
-def test_errors_of_the_workflow_are_its_answers(tmp_path):
+def test_errors_of_the_workflow_are_its_answers(tmp_path, monkeypatch):
+    monkeypatch.setattr(gap, "git_commit", lambda: "abc-dirty")
     plan = gap.Plan(tmp_path, sets=1, runs=(6,))
     for index, verdict in ((0, "refused"), (1, "failed")):
         gap.make_output_folder(tmp_path / "results")
         gap.run_case(plan, case(index), refuses_and_fails)
         result = json.loads((tmp_path / "results" / f"{case(index).name}.json").read_text())
         assert result["verdict"] == verdict
+        assert result["blind_test"]["commit"] == "abc-dirty"
         assert not (tmp_path / "data" / case(index).name).exists(), "data are not kept unless asked for"
 
 
 def test_a_process_that_dies_has_failed(tmp_path):
     report = gap.run_blind_test(gap.Plan(tmp_path, sets=1, processes=1, runs=(6,)), "no_such_module:analyse", lambda line: None)
     assert report["failed"] == ["set_2000"]
-    assert "No module named 'no_such_module'" in (tmp_path / "results" / "set_2000.json").read_text()
+    result = gap.read_result(tmp_path / "results" / "set_2000.json")
+    assert "No module named 'no_such_module'" in result["message"]
+    assert result["blind_test"]["runs"] == [6]
 
 
 def test_report_reads_as_a_table(finished):
@@ -96,7 +140,8 @@ def test_report_reads_as_a_table(finished):
     text = gap.markdown(report)
     assert "| false alarms, parameters only | 0/1 = 0% (at most 95%)" in text
     assert "| parameters only | nothing_missing 1 |" in text
-    assert len(gap.lines(report)) == 15
+    assert "| analyses that crashed | 0/2 = 0% (at most 78%) | 0 | yes |" in text
+    assert len({line.what for line in gap.lines(report)}) == 23
 
 
 def test_same_seed_same_bits_whatever_else_runs(tmp_path):
@@ -115,12 +160,56 @@ def test_impossible_plans_are_refused(tmp_path, numbers):
         gap.Plan(tmp_path, **numbers)
 
 
-def test_other_truths_in_the_same_folder_are_refused(tmp_path):
+@pytest.mark.parametrize("text", ["something else", "{", ""])
+def test_a_seal_that_is_none_is_refused(tmp_path, text):
     plan = gap.Plan(tmp_path, sets=1)
     gap.make_output_folder(tmp_path / "sealed")
-    (tmp_path / "sealed" / "truths_2000_1.yaml").write_text("something else")
-    with pytest.raises(InputError, match="other truths"):
+    (tmp_path / "sealed" / "truths_2000_1.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"truths_2000_1\.yaml: holds no truths"):
         gap.seal(plan, plan.cases())
+
+
+@pytest.mark.parametrize(("first", "second"), [(2, 3), (3, 2), (2, 2)])
+def test_a_test_of_any_length_must_have_the_same_truths(tmp_path, first, second):
+    gap.make_output_folder(tmp_path / "sealed")
+    gap.seal(gap.Plan(tmp_path, first), gap.Plan(tmp_path, first).cases())
+    plan = gap.Plan(tmp_path, second)
+    same = plan.cases()
+    with pytest.raises(InputError, match=rf"truths_2000_{first}\.yaml: holds other truths .*1 sets, first set_2001"):
+        gap.seal(plan, [same[0], dataclasses.replace(same[1], severity=9.0), *same[2:]])
+    assert len(list((tmp_path / "sealed").iterdir())) == 1
+    gap.seal(plan, same)
+    assert (tmp_path / "sealed" / f"truths_2000_{second}.yaml").is_file()
+
+
+def test_a_value_without_its_bound_is_not_shown():
+    good = {"hits": 0, "count": 3, "share": 0.0, "bound95": 0.63}
+    assert gap._at_most("alarms", good, 0.05).met == "not shown"
+    assert gap._at_most("alarms", {**good, "bound95": 0.049}, 0.05).met == "yes"
+    assert gap._at_most("alarms", {**good, "hits": 1, "share": 0.33}, 0.05).met == "no"
+    assert gap._at_least("names", {"hits": 9, "count": 10, "share": 0.9, "bound95": 0.6}, 0.85).met == "not shown"
+    assert gap._none("crashes", good).met == "yes"
+    assert gap._none("crashes", {**good, "hits": 1}).met == "no"
+    assert gap._at_most("alarms", good).met == ""
+
+
+@pytest.mark.parametrize(
+    ("share", "low", "high", "met"),
+    [(0.94, 0.89, 0.97, "yes"), (0.94, 0.8, 0.97, "not shown"), (0.94, 0.89, 0.99, "not shown"), (1.0, 0.9, 1.0, "no")],
+)
+def test_intervals_may_be_too_wide_as_well(share, low, high, met):
+    numbers = {"hits": 1, "count": 1, "share": share, "bound95": low, "bound95_above": high}
+    assert gap._coverage(numbers).met == met
+
+
+@pytest.mark.parametrize(
+    ("median", "bound", "met"), [(0.9, 0.81, "yes"), (0.9, 0.7, "not shown"), (0.9, None, "not shown"), (0.7, 0.6, "no")]
+)
+def test_medians_are_held_to_their_bounds(median, bound, met):
+    numbers = {"median": median, "at_least95": bound, "at_most95": None, "count": 7}
+    assert gap._median("reduction", numbers, least=0.8).met == met
+    mirrored = {"median": -median, "at_most95": None if bound is None else -bound, "at_least95": None, "count": 7}
+    assert gap._median("error", mirrored, most=-0.8).met == met
 
 
 def test_command_asks_for_what_it_needs(tmp_path, capsys):

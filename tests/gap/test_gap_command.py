@@ -67,7 +67,7 @@ def test_what_was_found_is_printed(data, tmp_path, answer, capsys):
     assert "Missing effect found The model lacks rolling resistance (both front wheels)" in shown
     assert "rolling resistance at both front wheels: coefficient 0.0412 (0.0383 to 0.0447); confidence 97 %" in shown
     assert "7.91 as given, 5.24 calibrated, 1.21 with the effects; noise floor 1.00" in shown
-    assert "removed: 95 % of the avoidable error; 95 % interval 91 to 97 %" in shown
+    assert "removed of the avoidable error: 95 % (95 % interval 91 to 97 %)" in shown
     assert "data: run_02: 3 rows are missing" in shown
     assert "cannot tell rolling resistance from coulomb friction; this run would: straight with a payload" in shown
     assert "record next: straight: with 0.5 kg" in shown
@@ -106,10 +106,13 @@ def test_options_reach_the_analysis(data, tmp_path, answer):
     ("options", "words"),
     [
         (["--rig", "pendulm"], "unknown rig 'pendulm' (did you mean 'pendulum'?)"),
-        (["--backend", "mujocco"], "did you mean 'mujoco'"),
+        (["--backend", "mujocco"], "--backend: unknown simulator 'mujocco' (did you mean 'mujoco'?)"),
+        (["--backend", "dynamixel"], "unknown simulator 'dynamixel'; valid: gibbs_appell, mujoco"),
         (["--rig", "pendulum", "--backend", "mujoco"], "the rig has a simulator of its own: leave --backend out"),
         (["--threads", "0"], "--threads 0: expected 1 or more"),
-        (["--effects", "nothing_like_it"], "nothing_like_it"),
+        (["--effects", "nothing_like_it"], "--effects: unknown effects config 'nothing_like_it'"),
+        (["--effects", "knwon.yaml"], "--effects: effects config: no file 'knwon.yaml'"),
+        (["--rig", "pendulum", "--effects", "icy_patch"], "unknown effect of the test rig 'friction_patch'"),
         (["--heldout", "run_99"], "unknown run to hold out"),
     ],
 )
@@ -148,3 +151,26 @@ def test_texts_are_printed_as_they_are(data, tmp_path, answer, capsys):
     answer(replace(examples.NOT_EXCITED, summary="Record [bold]turns[/bold] 机器人."))
     assert main(["gap", str(data), "--out", str(tmp_path / "out")]) == 0
     assert "Record [bold]turns[/bold] 机器人." in printed(capsys)
+
+
+def test_a_file_that_is_not_there_is_named_with_the_nearest(data, tmp_path, answer, capsys):
+    answer(examples.NOTHING_MISSING)
+    (tmp_path / "known.yaml").write_text("effects: []")
+    given = ["--effects", str(tmp_path / "knwon.yaml")]
+    assert main(["gap", str(data), "--out", str(tmp_path / "out"), *given]) == 2
+    assert "did you mean 'known.yaml'?" in " ".join(capsys.readouterr().err.split())
+
+
+def test_what_is_left_is_printed(data, tmp_path, answer, capsys):
+    answer(replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, heldout_after=2.2)))
+    assert main(["gap", str(data), "--out", str(tmp_path / "out")]) == 0
+    shown = printed(capsys)
+    assert "Not all is explained: in runs kept aside an error of 2.20 is left" in shown
+
+
+def test_effects_known_to_the_rig_are_read_as_the_rig_s(data, tmp_path, answer):
+    asked = answer(examples.NOTHING_MISSING)
+    (tmp_path / "patch.yaml").write_text("effects: [{name: torque_saturation, where: [servo], parameters: {coefficient: 0.3}}]")
+    options = ["--rig", "pendulum", "--effects", str(tmp_path / "patch.yaml")]
+    assert main(["gap", str(data), "--out", str(tmp_path / "out"), *options]) == 0
+    assert [effect.name for effect in asked["known"].effects] == ["torque_saturation"]

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toy_problem import NOMINAL, REACH, SIGMA, Toy, candidate, sized
+from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap import name as naming_module
-from wlr_gym.gap.fit import fit, linearise, nominal_model, total_cost
+from wlr_gym.gap.fit import Fit, fit, linearise, nominal_model, total_cost
 from wlr_gym.gap.likelihood import estimate_noise
 from wlr_gym.gap.name import (
     EQUIVALENT,
@@ -16,12 +16,14 @@ from wlr_gym.gap.name import (
     SHORTLIST,
     Final,
     Hypothesis,
+    carries_over,
     drop_idle,
     finalists,
     name_effects,
     refit,
     settle,
     shortlist,
+    told_by_others,
 )
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
 from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
@@ -233,7 +235,7 @@ def test_effect_that_is_taken_settles_also_from_the_model_as_given():
     trapped = fit(problem, RUNS, replace(far, quantities=far.quantities + np.array([2.4 * SIGMA[0], 0.0, 0.0])), steps=1)
     base = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
     found = Hypothesis(own, trapped.model, 1.0, np.ones(5), 1.0, trapped.residuals, base.model, base.residuals)
-    settled = settle(problem, RUNS, Final(found, trapped), (), lambda text: None)
+    settled, _ = settle(problem, RUNS, Final(found, trapped), base, lambda text: None)
     assert trapped.model.quantities[0] > NOMINAL[0] + 1.5 * SIGMA[0]
     assert settled.fit.model.quantities[0] == pytest.approx(NOMINAL[0], abs=0.3 * SIGMA[0])
     assert settled.hypothesis.values == settled.fit.model.effects[0][1]
@@ -247,9 +249,67 @@ def test_known_numbers_that_a_whole_fit_finds_count_for_nothing():
     whole = fit(problem, RUNS, nominal.with_effect(own, (0.1,)), steps=problem.steps)
     residuals = [r[0] for r in problem.residuals([nominal.setting], RUNS)]
     left = Hypothesis(own, nominal.with_effect(own, (0.1,)), 1e3, np.ones(5), 1.0, residuals, nominal, residuals)
-    final = finalists(problem, RUNS, [left], whole.noise)[0]
+    stuck = replace(whole, model=nominal, residuals=residuals)
+    (final,), _ = finalists(problem, RUNS, stuck, [left], stuck)
     assert final.fit.model.quantities == pytest.approx(whole.model.quantities, abs=0.2 * SIGMA.min())
     assert abs(final.hypothesis.gain) < 0.5 * LEAST_GAIN
+
+
+def test_finalists_are_judged_against_the_same_model(monkeypatch):
+    """A model without any effect, found beside one finalist, is better than the other finalist."""
+    problem, nominal = Toy(), nominal_model(Toy())
+    ones = np.ones((200, 3)) * np.sign(np.random.default_rng(0).standard_normal((200, 3)))
+    levels = {"decoy_0": (3.0, 3.2), "decoy_1": (3.5, 20.0)}  # with the effect, and of the model that is left without it
+
+    def levelled(model, level):
+        residuals = [ones * level] * 5
+        noise = estimate_noise(residuals, np.full(3, 100.0))
+        columns = [np.zeros((model.size, 600), np.float32)] * 5
+        cost = total_cost(problem, model, residuals, noise.memory)
+        return Fit(model, residuals, noise, cost, columns, np.eye(1), np.eye(1))
+
+    def fitted(problem, runs, model, **_):
+        return levelled(model, levels[model.effects[-1][0].name][0])
+
+    monkeypatch.setattr(naming_module, "fit", fitted)
+    monkeypatch.setattr(naming_module, "_afresh", lambda *_: [])
+    left = lambda problem, runs, whole, found, memory: levelled(nominal, levels[found.name][1])  # noqa: E731
+    monkeypatch.setattr(naming_module, "_left", left)
+    current = levelled(nominal, 20.0)
+    effects = [candidate(problem, name) for name in levels]
+    hypotheses = [
+        Hypothesis(c, nominal.with_effect(c, (0.1,)), 50.0, np.ones(5), 1.0, current.residuals, nominal, current.residuals)
+        for c in effects
+    ]
+    finals, bare = finalists(problem, RUNS, current, hypotheses, current)
+    assert [final.hypothesis.candidate.name for final in finals] == ["decoy_0", "decoy_1"]
+    assert finals[1].hypothesis.gain < 0.0 < finals[0].hypothesis.gain < LEAST_GAIN
+    assert bare.residuals[0][0, 0] == pytest.approx(3.2 * ones[0, 0])
+
+
+def test_what_the_others_tell_is_the_fit_without_a_run():
+    problem = Toy({"gain": 1.0}, [sized("drag", 0.8, "right")], rows=400)
+    own = candidate(problem, "drag", ["right"])
+    whole = fit(problem, RUNS, nominal_model(problem).with_effect(own, (0.5,)), steps=12)
+    for run, model in zip(RUNS, told_by_others(problem, whole), strict=True):
+        rest = [other for other in RUNS if other != run]
+        anew = fit(problem, rest, whole.model, memory=whole.noise.memory, steps=12)
+        assert model.effects[0][1] == pytest.approx(anew.model.effects[0][1], abs=0.01)
+        assert model.quantities == pytest.approx(anew.model.quantities, abs=0.2 * SIGMA.min())
+
+
+@pytest.mark.parametrize(("seen_in", "carries"), [([0, 1, 2, 3, 4], True), ([2], False)])
+def test_effect_of_one_run_does_not_carry_over(seen_in, carries):
+    problem = Toy(rows=400)
+    for run in seen_in:
+        problem._measured[run] = problem._measured[run] + 1.5 * problem.shape("drag right")[run] * NOISE
+    own = candidate(problem, "drag", ["right"])
+    bare = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
+    whole = fit(problem, RUNS, bare.model.with_effect(own, (0.5,)), steps=problem.steps)
+    memory = whole.noise.memory
+    gain = total_cost(problem, bare.model, bare.residuals, memory) - whole.cost
+    assert gain > LEAST_GAIN
+    assert carries_over(problem, RUNS, bare, whole, gain, memory) is carries
 
 
 def test_effect_is_taken_only_once_it_has_settled(monkeypatch):
@@ -258,8 +318,8 @@ def test_effect_is_taken_only_once_it_has_settled(monkeypatch):
     settling = naming_module.settle
 
     def gone(*arguments):
-        final = settling(*arguments)
-        return replace(final, hypothesis=replace(final.hypothesis, tolerable=True))
+        final, bare = settling(*arguments)
+        return replace(final, hypothesis=replace(final.hypothesis, tolerable=True)), bare
 
     monkeypatch.setattr(naming_module, "settle", gone)
     assert labels(named(problem)) == []
@@ -287,6 +347,15 @@ def test_idle_effect_is_dropped():
         "dropped: decoy_3 body",
     ]
     assert left.model.effects[0][1][0] == pytest.approx(0.8, abs=0.1)
+
+
+def test_effect_that_takes_a_numbers_place_is_dropped_for_that_number():
+    problem = Toy({"gain": 2.0}, [sized("drag", 0.7, "left")], error=1.0)
+    drag = candidate(problem, "drag", ["left"])
+    both = fit(problem, RUNS, nominal_model(problem).with_effect(level(), (2.0,)).with_effect(drag, (0.7,)), steps=4)
+    alone = fit(problem, RUNS, both.model.without_effect(0), memory=both.noise.memory, steps=4)
+    assert alone.cost - both.cost < LEAST_GAIN
+    assert [found.label for found, _ in drop_idle(problem, RUNS, both).model.effects] == [drag.label]
 
 
 def test_needed_effects_are_kept():

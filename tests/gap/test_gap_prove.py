@@ -6,10 +6,10 @@ from toy_problem import CHANNELS, NOISE, Toy, candidate, sized
 
 from wlr_gym.gap.analysis import Place
 from wlr_gym.gap.fit import fit, nominal_model
-from wlr_gym.gap.prove import level, mean_squares, prove, reduction
+from wlr_gym.gap.prove import _interval, level, mean_squares, prove, reduction
 from wlr_gym.gap.traces import MOST, telling_traces
 
-FITTED, SEALED = [0, 1, 2, 4], [3, 5]
+FITTED, SEALED = [0, 1, 2, 4], [3, 5, 6]
 
 
 def models(problem, size=0.8):
@@ -30,28 +30,67 @@ def test_mean_squares_skip_what_was_not_measured_and_cap_what_is_lost():
 def test_reduction_is_the_closed_share_of_the_room_above_the_floor():
     square = np.array([[9.0]])
     assert reduction(square, np.array([[4.0]]), 1.0) == pytest.approx(0.5)
-    assert reduction(square, np.array([[0.5]]), 1.0) == 1.0
-    assert reduction(square, np.array([[16.0]]), 1.0) == 0.0
-    assert reduction(np.array([[1.0]]), np.array([[1.0]]), 1.0) == 0.0
+    assert reduction(square, np.array([[0.25]]), 1.0) == pytest.approx(1.25)
+    assert reduction(square, np.array([[16.0]]), 1.0) == pytest.approx(-0.5)
+    assert np.isnan(reduction(np.array([[1.0]]), np.array([[1.0]]), 1.0))
+
+
+def drawn(rng, runs, share, spread):
+    """Mean squares (runs, 1) of runs whose gaps differ, and what is left when this share of each is removed."""
+    calibrated = rng.normal(5.0, 0.5, (runs, 1))
+    left = 1.0 + (calibrated - 1.0) * (1.0 - rng.normal(share, spread, (runs, 1)))
+    return calibrated**2, left**2
+
+
+@pytest.mark.parametrize("runs", [3, 4])
+@pytest.mark.parametrize("share", [0.8, -0.2])
+def test_interval_holds_the_truth_as_often_as_it_says(runs, share):
+    rng = np.random.default_rng(runs)
+    truth = reduction(*drawn(rng, 200_000, share, 0.06), 1.0)
+    inside = [low <= truth <= high for low, high in (_interval(*drawn(rng, runs, share, 0.06), 1.0) for _ in range(800))]
+    assert 0.92 <= np.mean(inside) <= 0.97
+
+
+def test_interval_is_student_s_of_leaving_out_one_run_after_the_other():
+    calibrated, after = np.array([[25.0], [16.0], [36.0], [30.0]]), np.array([[4.0], [2.0], [9.0], [3.0]])
+    left_out = []
+    for k in range(4):
+        kept = [r for r in range(4) if r != k]
+        before, left = np.sqrt(calibrated[kept].mean()), np.sqrt(after[kept].mean())
+        left_out.append((before - left) / (before - 1.0))
+    half = 3.182 * np.sqrt(3 / 4 * np.sum((np.array(left_out) - np.mean(left_out)) ** 2))
+    whole = reduction(calibrated, after, 1.0)
+    assert _interval(calibrated, after, 1.0) == pytest.approx((whole - half, min(whole + half, 1.0)), rel=1e-3)
+
+
+def test_two_runs_give_no_interval():
+    problem = Toy({"gain": 1.5}, [sized("drag", 1.5, "right")], runs=7)
+    gap, runs, _ = prove(problem, FITTED, [3, 5], models(problem), 1.0)
+    assert np.isnan(gap.reduction_ci95).all()
+    assert gap.reduction > 0.9
+    single = [reduction(np.array([[r.calibrated**2]]), np.array([[r.after**2]]), 1.0) for r in runs]
+    assert [r.reduction for r in runs] == pytest.approx(np.minimum(single, 1.0).tolist())
 
 
 def test_true_effect_closes_the_gap_on_sealed_runs():
-    problem = Toy({"gain": 1.5}, [sized("drag", 1.5, "right")], runs=6)
+    problem = Toy({"gain": 1.5}, [sized("drag", 1.5, "right")], runs=7)
     gap, runs, channels = prove(problem, FITTED, SEALED, models(problem), 1.0)
     assert gap.heldout_before > gap.heldout_calibrated > gap.heldout_after
     assert gap.heldout_after == pytest.approx(1.0, abs=0.06)
     assert gap.fit_before > gap.fit_after
     assert gap.reduction > 0.9
     low, high = gap.reduction_ci95
-    assert 0.0 <= low <= gap.reduction <= high <= 1.0
+    assert low <= gap.reduction <= high <= 1.0
+    assert low > 0.5
     assert [(r.run, r.heldout) for r in runs] == [(f"run_{k + 1}", k in SEALED) for k in (*FITTED, *SEALED)]
     assert [c.channel for c in channels] == list(CHANNELS)
+    assert {c.group for c in channels} == {"all"}
     assert [c.noise for c in channels] == list(NOISE)
     assert gap.metric == problem.metric
 
 
 def test_bars_of_runs_add_up_to_the_whole():
-    problem = Toy({"gain": 1.5}, [sized("drag", 1.0, "right")], runs=6)
+    problem = Toy({"gain": 1.5}, [sized("drag", 1.0, "right")], runs=7)
     gap, runs, channels = prove(problem, FITTED, SEALED, models(problem), 1.0)
     sealed = [r.after for r in runs if r.heldout]
     assert np.sqrt(np.mean(np.square(sealed))) == pytest.approx(gap.heldout_after)
@@ -59,13 +98,21 @@ def test_bars_of_runs_add_up_to_the_whole():
     assert np.sqrt(np.mean([r.before**2 for r in runs if not r.heldout])) == pytest.approx(gap.fit_before)
 
 
-def test_effect_that_is_not_there_buys_nothing():
-    problem = Toy({"gain": 1.0}, runs=6)
+def test_effect_that_makes_runs_worse_is_seen_to():
+    problem = Toy({"gain": 1.0}, error=1.0, runs=7)
     nominal, calibrated, _ = models(problem)
     wrong = calibrated.with_effect(candidate(problem, "drag", ["right"]), (1.0,))
     gap, _, _ = prove(problem, FITTED, SEALED, (nominal, calibrated, wrong), 1.0)
-    assert gap.heldout_after > gap.heldout_calibrated
-    assert gap.reduction == 0.0
+    assert gap.heldout_after > 1.1 * gap.heldout_calibrated
+    assert gap.reduction < -0.2
+    assert gap.reduction_ci95[0] < gap.reduction < gap.reduction_ci95[1] < 0.0
+
+
+def test_where_calibration_leaves_nothing_there_is_no_share_of_it():
+    problem = Toy({"gain": 1.0}, runs=7)
+    nominal, calibrated, _ = models(problem)
+    gap, _, _ = prove(problem, FITTED, SEALED, (nominal, calibrated, calibrated), 2.0)
+    assert np.isnan([gap.reduction, *gap.reduction_ci95]).all()
 
 
 def test_effect_of_one_run_only_has_a_wide_interval():
@@ -75,13 +122,14 @@ def test_effect_of_one_run_only_has_a_wide_interval():
     problem._measured[3] = problem._measured[3] + response * NOISE
     nominal = nominal_model(problem)
     whole = nominal.with_effect(candidate(problem, "drag", ["right"]), (0.9,))
-    low, high = prove(problem, [0, 1, 2], sealed, (nominal, nominal, whole), 0.9)[0].reduction_ci95
-    assert low == 0.0
-    assert high > 0.1
+    gap = prove(problem, [0, 1, 2], sealed, (nominal, nominal, whole), 0.9)[0]
+    low, high = gap.reduction_ci95
+    assert low < 0.0 < high
+    assert low < gap.reduction < high
 
 
 def test_channel_without_values_is_left_out():
-    problem = Toy(runs=6)
+    problem = Toy(runs=7)
     for measured in problem._measured:
         measured[:, 1] = np.nan
     gap, runs, channels = prove(problem, FITTED, SEALED, models(problem), 1.0)
@@ -90,13 +138,12 @@ def test_channel_without_values_is_left_out():
 
 
 def test_traces_show_sealed_runs_where_the_gap_is():
-    problem = Toy({}, [sized("drag", 1.5, "right")], runs=6)
-    traces = telling_traces(problem, FITTED, SEALED, models(problem), (Place("place", 0.7, ""), Place("speed", 0.3, "")))
+    problem = Toy({}, [sized("drag", 1.5, "right")], runs=7)
+    traces = telling_traces(problem, SEALED, models(problem), (Place("place", 0.7, ""), Place("speed", 0.3, "")))
     assert [t.channel for t in traces] == ["place", "speed"]
     assert len(traces) <= MOST
     for trace in traces:
-        assert trace.run in ("run_4", "run_6")
-        assert trace.heldout
+        assert trace.run in ("run_4", "run_6", "run_7")
         c = CHANNELS.index(trace.channel)
         assert trace.measured == pytest.approx(problem.measured(int(trace.run[-1]) - 1)[:, c])
         assert np.std(trace.measured - trace.after) == pytest.approx(NOISE[c], rel=0.15)

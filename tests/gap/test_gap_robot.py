@@ -143,8 +143,8 @@ def test_effects_that_meet_a_known_number_know_its_tolerance(tried, good):
     nominal = nominal_model(problem)
     names = [quantity.name for quantity in problem.quantities]
 
-    def tolerable(name, place, values, moved=(), tolerances=0.0):
-        chosen = next(c for c in tried[1] if c.name == name and c.where[0] == place)
+    def tolerable(name, place, values, moved=(), tolerances=0.0, count=1):
+        chosen = next(c for c in tried[1] if c.name == name and c.where[0] == place and len(c.where) == count)
         quantities = nominal.quantities.copy()
         for k, quantity in enumerate(problem.quantities):
             quantities[k] += tolerances * quantity.sigma * (quantity.name in moved)
@@ -166,6 +166,11 @@ def test_effects_that_meet_a_known_number_know_its_tolerance(tried, good):
     assert not tolerable("friction_level", "ground", (0.6 - 2.6 * level,), ["ground.mu"], -2.5)
     assert not tolerable("backlash", "leg_lf", (1e-6,))
     assert not tolerable("gyro_bias", "sensor", (1e-6, 0.0, 0.0))  # a bias drifts
+    # a host's latency is one number for all joints: what only some of them lack is an effect
+    latency = sigma["command.delay"]
+    assert tolerable("command_delay", "leg_lf", (2.4 * latency,), count=8)
+    assert not tolerable("command_delay", "leg_lf", (2.6 * latency,), count=8)
+    assert not tolerable("command_delay", "leg_lf", (1e-6,), count=4)
     assert not tolerable("payload", "body", (1e-6, 0.0, 0.0, 0.0))  # any load is one
 
 

@@ -1,16 +1,16 @@
-"""Standard errors against Monte Carlo and the jackknife's definition; confidence; equals; what would have been seen."""
+"""Intervals against Monte Carlo and the jackknife's definition; confidence; equals; what would have been seen."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from toy_problem import NOMINAL, REACH, SIGMA, Toy, candidate, sized
+from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap.fit import fit, nominal_model, normal_equations, on_bounds
-from wlr_gym.gap.name import name_effects
-from wlr_gym.gap.problem import Candidate, Start, Tolerance
-from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
-from wlr_gym.gap.sure import TWO_SIDED_95, confidence, detectable, estimates, standard_errors
+from wlr_gym.gap.name import Hypothesis, name_effects
+from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
+from wlr_gym.gap.screen import LEAST_GAIN, Score, least_gain, responses, screen
+from wlr_gym.gap.sure import TWO_SIDED_95, confidence, detectable, estimates, half_widths, two_sided_95
 
 RUNS = range(5)
 TRUTH = {"gain": 0.8, "offset": -1.2, "mass": 0.4}
@@ -29,8 +29,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say(white, error, memory):
             TRUTH, [sized("drag", 0.7, "right")], seed=seed, white=white, error=error, memory=memory, runs=6, rows=120
         )
         found = fitted(problem, 0.5)
-        error_of = standard_errors(problem, found)[-1]
-        inside.append(abs(found.model.effects[0][1][0] - 0.7) < TWO_SIDED_95 * error_of)
+        inside.append(abs(found.model.effects[0][1][0] - 0.7) < half_widths(problem, found)[-1])
     assert 0.88 <= np.mean(inside) <= 0.995
 
 
@@ -54,14 +53,31 @@ def test_differences_from_run_to_run_widen_the_interval():
             toy._measured[r] = toy._measured[r] + toy.effect_response(sized("drag", own, "right"), r) * np.array(
                 [0.1, 2, 0.001]
             )
-    wide, narrow = (standard_errors(toy, fitted(toy))[-1] for toy in (problem, steady))
-    # six sizes with a spread of 0.42: the error of their mean is 0.19
-    assert wide == pytest.approx(0.19, rel=0.5)
+    wide, narrow = (half_widths(toy, fitted(toy))[-1] for toy in (problem, steady))
+    # six sizes with a spread of 0.42: the error of their mean is 0.19, known to five degrees of freedom
+    assert wide == pytest.approx(2.57 * 0.19, rel=0.5)
     assert wide > 2 * narrow
 
 
+def test_few_runs_that_differ_tell_little_of_how_much_they_do():
+    """What 1.96 jackknife errors of three runs hold is 80 %."""
+    inside = []
+    for seed in range(80):
+        problem = Toy({}, seed=seed, runs=3, rows=60, reach=1000)
+        problem.quantities = tuple(replace(q, sigma=100 * q.sigma) for q in problem.quantities)
+        rng = np.random.default_rng([seed, 3])
+        for r in range(3):
+            problem._measured[r] = problem._measured[r] + NOISE * rng.normal(0.0, 1.0) * problem.shape("offset")[r]
+        found = fit(problem, range(3), nominal_model(problem), steps=1)
+        inside.append(abs(found.model.quantities[1]) <= half_widths(problem, found)[1])
+    assert 0.9 <= np.mean(inside) <= 0.99
+
+
 def test_jackknife_is_leaving_one_run_out():
-    problem = Toy({"gain": 1.0}, [sized("drag", 0.7, "right")], error=2.0, memory=0.95, runs=6)
+    problem = Toy({"gain": 1.0}, [sized("drag", 0.7, "right")], error=1.0, memory=0.95, runs=6)
+    for r, more in enumerate((0.3, -0.3, 0.2, -0.2, 0.4, -0.4)):
+        own = problem.effect_response(sized("drag", more, "right"), r)
+        problem._measured[r] = problem._measured[r] + own * NOISE
     found = fitted(problem)
     scale = found.model.effects[0][0].unknowns[0].step
     left_out = []
@@ -74,16 +90,22 @@ def test_jackknife_is_leaving_one_run_out():
         left_out.append(step)
     jackknife = np.sqrt(5 / 6 * ((left_out - np.mean(left_out, axis=0)) ** 2).sum(axis=0))
     curvature = np.sqrt(np.diag(found.covariance()))
-    expected = np.maximum(jackknife, curvature) * np.append(SIGMA, scale)
-    assert standard_errors(problem, found) == pytest.approx(expected, rel=0.01)
+    expected = np.where(jackknife > curvature, 2.571 * jackknife, 1.96 * curvature) * np.append(SIGMA, scale)
+    assert 0 < (jackknife > curvature).sum() < 4
+    assert half_widths(problem, found) == pytest.approx(expected, rel=0.01)
+
+
+def test_student():
+    """Quantiles of any printed table."""
+    assert [two_sided_95(n) for n in (1, 2, 5, 30)] == pytest.approx([12.706, 4.303, 2.571, 2.042], abs=1e-3)
 
 
 def test_number_on_its_bound_does_not_widen_the_others():
     beyond = Toy({"gain": REACH + 2.0}, white=1.0, runs=6)
     found = fit(beyond, range(6), nominal_model(beyond))
     assert on_bounds(beyond, found.model)[0]
-    errors = standard_errors(beyond, found) / SIGMA
-    assert errors[0] < 0.01
+    halves = half_widths(beyond, found) / SIGMA
+    assert halves[0] == 1.0  # the one that is known least of all: a tolerance, not nothing
     # pinned means pinned: the jackknife of the others is that of a model without the number
     tight = np.eye(2)
     away = (found.model.quantities[1:] - NOMINAL[1:]) / SIGMA[1:]
@@ -94,14 +116,15 @@ def test_number_on_its_bound_does_not_widen_the_others():
         left_out.append(-np.linalg.solve(sum(m for m, _ in parts) + tight, sum(v for _, v in parts) + away))
     jackknife = np.sqrt(5 / 6 * ((left_out - np.mean(left_out, axis=0)) ** 2).sum(axis=0))
     curvature = np.sqrt(np.diag(found.covariance()))[1:]
-    assert errors[1:] == pytest.approx(np.maximum(jackknife, curvature), rel=0.02)
+    expected = np.where(jackknife > curvature, 2.571 * jackknife, 1.96 * curvature)
+    assert halves[1:] == pytest.approx(expected, rel=0.02)
 
 
 def test_estimates_are_values_with_two_sided_intervals():
     problem = Toy({}, [sized("drag", 0.7, "right")], white=1.5)
     found = fitted(problem)
     own = estimates(problem, found)[0]["size"]
-    half = TWO_SIDED_95 * standard_errors(problem, found)[-1]
+    half = half_widths(problem, found)[-1]
     assert own.value == found.model.effects[0][1][0]
     assert (own.low, own.high) == pytest.approx((own.value - half, own.value + half), rel=1e-3)
     assert own.unit == "1"
@@ -161,6 +184,43 @@ def test_confidence_counts_the_samples_in_which_the_effect_wins():
     assert confidence(look.taken, look.hypotheses) == confidence(look.taken, look.hypotheses)
 
 
+def explained(problem, name, gain, by_run):
+    """A hypothesis of so much gain, from runs that fall by so much."""
+    own, nominal = candidate(problem, name), nominal_model(problem)
+    model = nominal.with_effect(own, (1.0,) * len(own.unknowns))
+    return Hypothesis(own, model, gain, np.array(by_run, float), 1.0, [], nominal, [])
+
+
+@pytest.mark.parametrize(
+    ("gain", "by_run", "cost", "expected"),
+    [
+        (100.0, [20] * 5, 0.0, 1.0),
+        (20.0, [20] * 5, 0.0, 1.0),
+        (15.0, [20] * 5, 0.0, 0.0),  # the runs' falls of squares are 100: what counts is the gain
+        (100.0, [20] * 5, 6000.0, 0.0),  # two percent of what is left is asked
+        (400.0, [300, -12, -12, -12, -12], 0.0, 0.67),  # drawn once it is enough, not at all (33 %) is harm alone
+        (400.0, [300, -90, -90, 140, 140], 0.0, 0.3),  # in most samples some are harmed too much: no effect
+    ],
+)
+def test_confidence_asks_of_every_sample_what_is_asked_of_an_effect(gain, by_run, cost, expected):
+    problem = Toy()
+    assert confidence(explained(problem, "decoy_1", gain, by_run), [], cost) == pytest.approx(expected, abs=0.12)
+
+
+def test_confidence_asks_more_of_an_effect_with_more_numbers():
+    problem = Toy()
+    assert LEAST_GAIN < 18.0 < least_gain(2)
+    assert confidence(explained(problem, "decoy_1", 18.0, [18 / 5] * 5), []) == 1.0
+    assert confidence(explained(problem, "ripple", 18.0, [18 / 5] * 5), []) == 0.0
+
+
+def test_confidence_falls_with_a_rival_that_buys_as_much():
+    problem = Toy()
+    taken = explained(problem, "decoy_1", 100.0, [20] * 5)
+    rival = explained(problem, "decoy_2", 99.0, [60, 10, 10, 10, 9])
+    assert confidence(taken, [rival]) == pytest.approx(0.74, abs=0.06)  # the run with 60 drawn twice: 26 %
+
+
 def screened(problem):
     found = fit(problem, RUNS, nominal_model(problem))
     probes, candidates = problem.candidates(None, [], [])
@@ -186,6 +246,26 @@ def test_detectable_severity_is_that_of_the_start_that_fits():
     several = Candidate("several", ("body",), decoy.unknowns, (elsewhere, *decoy.starts))
     told = detectable(screen([*candidates, several], responded))
     assert told["several"].value == pytest.approx(told["decoy_2"].value)
+
+
+def test_detectable_severity_is_of_the_direction_that_shows_best_at_the_place_that_shows_worst():
+    unknowns = tuple(Unknown(axis, "m", 0.0, -0.05, 0.05, 0.005) for axis in "xyz")
+    start = Start((("x",), ("y",), ("z",)), lambda a: tuple(0.005 * float(v) for v in a))
+
+    def score(place, *information):
+        return Score(Candidate("shift", (place,), unknowns, (start,)), (0.0,) * 3, 0.0, 1.0, np.diag(information), start, True)
+
+    told = detectable([score("front", 1.0, 400.0, 0.01), score("rear", 1.0, 100.0, 0.01)])["shift"]
+    assert (told.parameter, told.unit) == ("y", "m")
+    assert told.value == pytest.approx(0.005 * np.sqrt(least_gain(3) / 100.0))
+
+
+def test_what_is_left_hides_more_effects():
+    """Two percent of what is left must be bought: what the screen calls visible asks that, too."""
+    responded, candidates = screened(Toy(white=1.5))[1:]
+    assert all(score.visible for score in screen(candidates, responded))
+    hidden = [score for score in screen(candidates, responded, 1e9) if not score.visible]
+    assert len(hidden) == len(screen(candidates, responded))
 
 
 def test_noisier_data_show_less():

@@ -13,10 +13,25 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from wlr_gym.errors import InputError
 from wlr_gym.gap import report as module
-from wlr_gym.gap.analysis import Estimate, Evidence, FoundEffect, HeatMap, IntakeFinding, Place
+from wlr_gym.gap.analysis import ChannelGap, Estimate, Evidence, FoundEffect, HeatMap, IntakeFinding, Place
 from wlr_gym.gap.plots import draw, figures
 from wlr_gym.gap.report import check_folder, report, save_analysis
-from wlr_gym.gap.words import channel, error, estimate, feature, number, percent, places, plain, sentence, title
+from wlr_gym.gap.result import result_of
+from wlr_gym.gap.words import (
+    _GROUPS,
+    channel,
+    closure,
+    error,
+    estimate,
+    feature,
+    number,
+    percent,
+    places,
+    plain,
+    sentence,
+    title,
+)
+from wlr_gym.runs.format import CHANNELS, COLUMNS
 
 EVERY = pytest.mark.parametrize("analysis", examples.ALL.values(), ids=list(examples.ALL))
 PICTURE = {"gap": b"\x89PNG"}
@@ -105,8 +120,8 @@ def test_numbers_are_those_of_the_analysis(tmp_path):
     assert ("eff_wheel_lf", "motor torque, left front wheel", "44 %", "opposes the motion, the same at every speed") in rows
     assert ("ground.mu", "-", "0.6", "0.652", "0.016", "0.09", "+0.6") in rows
     assert ("command.delay", "s", "0.012", "0.0153", "0.00039", "0.003", "+1.1") in rows
-    assert ("run_03", "kept aside", "7.60", "5.20", "1.14") in rows
-    assert ("run_01", "fitted", "7.00", "5.00", "1.10") in rows
+    assert ("run_03", "kept aside", "7.60", "5.20", "1.14", "94 %") in rows
+    assert ("run_01", "fitted", "7.00", "5.00", "1.10", "93 %") in rows
     for one in analysis.channel_gaps:
         cells = next(row for row in page.rows if row[:2] == [one.channel, channel(one.channel)] and len(row) == 6)
         assert cells[3:] == [error(one.before), error(one.calibrated), error(one.after)]
@@ -220,8 +235,16 @@ def test_sentences_say_what_was_found():
     assert "degrees, not rad?" in sentence(examples.BAD_DATA)
     assert sentence(examples.NOT_EXCITED).endswith("record turns and posture.")
     assert sentence(replace(examples.BAD_DATA, summary="So.")) == "So."
-    unsure = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction_ci95=(float("nan"), 1.0)))
-    assert "95 % (interval unknown) of the" in sentence(unsure)
+    two_runs = replace(
+        examples.EFFECT_FOUND,
+        gap=replace(examples.GAP, reduction_ci95=(float("nan"), float("nan"))),
+        run_gaps=tuple(one for one in examples.EFFECT_FOUND.run_gaps if one.run != "run_09"),
+    )
+    assert "it removes 95 % (run by run 94 % and 96 %; no interval) of the avoidable" in sentence(two_runs)
+    worse = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=-0.27, reduction_ci95=(-0.33, -0.21)))
+    assert "added, it makes the error of runs kept aside larger: -27 % (95 % interval -33 to -21 %);" in sentence(worse)
+    no_room = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=float("nan")))
+    assert "; the error of runs kept aside is as small without it;" in sentence(no_room)
     two = (*examples.EFFECT_FOUND.effects, FoundEffect("payload", ("body",), {}, 0.9, 300.0))
     assert sentence(replace(examples.EFFECT_FOUND, effects=two, equivalent=())).startswith(
         "The model lacks 2 effects: rolling resistance (both front wheels) and payload (body); added, they remove 95 %"
@@ -234,8 +257,32 @@ def test_what_is_left_without_a_name_is_not_called_nothing():
     rest = replace(none, gap=replace(none.gap, heldout_calibrated=3.2, heldout_after=3.2, noise_floor=1.1))
     assert (title(none), title(rest)) == ("Nothing missing", "Nothing clear enough to be named")
     assert "to within 3.20 times the sensor noise" in sentence(rest)
-    assert sentence(rest).endswith("where one without error would reach 1.10.")
+    assert closure(rest).startswith(
+        "Not all is explained: in runs kept aside an error of 3.20 is left, where a model without error would reach 1.10; "
+    )
     assert "lacks nothing" not in sentence(rest)
+
+
+@pytest.mark.parametrize("verdict", ["effect_found", "unknown_effect", "nothing_missing", "not_excited"])
+def test_what_is_left_is_said_with_every_verdict_and_where(verdict, tmp_path):
+    few = {"eff_wheel_lf": 2.0, "eff_wheel_rf": 2.5, "eff_leg_lf": 1.8, "gyro_x": 0.9}
+    channels = tuple(ChannelGap(name, "", 1.0, 5.0, 5.0, left, COLUMNS[name].group) for name, left in few.items())
+    little = replace(examples.ALL[verdict], gap=replace(examples.GAP, heldout_after=1.49), channel_gaps=channels)
+    much = replace(little, gap=replace(examples.GAP, heldout_after=1.6))
+    assert closure(little) == result_of(little).closure == ""
+    # above the floor: 3 + 5.25 of the wheels, 2.24 of the leg
+    told = (
+        "Not all is explained: in runs kept aside an error of 1.60 is left, where a model without error would reach 1.00; "
+        "79 % of it is in the motor torques of the wheels."
+    )
+    assert closure(much) == result_of(much).closure == told
+    assert told in page_of(much, tmp_path).text
+    assert "Not all is explained" not in page_of(little, tmp_path).text
+
+
+def test_groups_of_channels_have_words():
+    groups = {COLUMNS[name].group for name in CHANNELS} | {"position"}  # the rig's
+    assert groups <= set(_GROUPS)
 
 
 @pytest.mark.parametrize(
@@ -267,7 +314,7 @@ def test_numbers_in_words():
         "0.0412", "5312", "12", "1e-07", "-0.5", "-"
     ]  # fmt: skip
     assert [error(value) for value in (1.0, 12.34, 456.0, float("nan"))] == ["1.00", "12.3", "456", "-"]
-    assert percent(0.951) == "95 %"
+    assert [percent(share) for share in (0.951, -0.004, -0.27)] == ["95 %", "0 %", "-27 %"]
     angle = examples.UNKNOWN_EFFECT.effects[0].parameters["a0"]
     assert estimate(angle) == "1.21 (1.17 to 1.25) rad = 69.3°"
     assert estimate(replace(angle, low=float("nan"))) == "1.21 rad = 69.3°"

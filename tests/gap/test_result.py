@@ -71,7 +71,7 @@ def test_numbers_survive(tmp_path):
     assert content["separating_runs"] == [analysis.equivalent[0].separating_run]
     mu = content["calibration"]["ground.mu"]
     assert (mu["nominal"], mu["fitted"]) == (0.6, 0.652)
-    assert mu["ci95"] == pytest.approx([0.652 - 1.96 * 0.008, 0.652 + 1.96 * 0.008], abs=1e-5)
+    assert mu["ci95"] == pytest.approx([0.652 - 0.0157, 0.652 + 0.0157])
     assert content["gap"]["reduction"] == 0.951
     assert content["gap"]["reduction_ci95"] == [0.912, 0.973]
     assert len(content["evidence"]) == len(analysis.evidence)
@@ -79,7 +79,7 @@ def test_numbers_survive(tmp_path):
     assert content["run_gaps"][2] == {"run": "run_03", "heldout": True, **{k: getattr(analysis.run_gaps[2], k) for k in GAPS}}
 
 
-GAPS = ("before", "calibrated", "after")
+GAPS = ("before", "calibrated", "after", "reduction")
 
 
 def test_places_come_strongest_first(tmp_path):
@@ -92,7 +92,7 @@ def test_places_come_strongest_first(tmp_path):
 def test_identified_randomization_reads_it(analysis, tmp_path):
     events = identified_events(write_result(analysis, tmp_path), load_robot())
     assert events["calibrated ground.mu"].mean == 0.652
-    assert events["calibrated ground.mu"].sigma == pytest.approx(0.008)
+    assert events["calibrated ground.mu"].sigma == pytest.approx(0.00801, rel=1e-3)
     found = [event for name, event in events.items() if name.startswith("identified")]
     assert len(found) == len(analysis.effects)
     assert all(event.mean == 0.0412 and event.sigma == pytest.approx(0.00163, rel=0.01) for event in found)
@@ -114,7 +114,9 @@ def test_unknown_effect_without_formula_stays_out_of_the_patch(tmp_path):
 def test_what_is_no_number_becomes_null(tmp_path):
     (effect,) = examples.EFFECT_FOUND.effects
     unsure = replace(effect, parameters={"coefficient": Estimate(0.04, math.nan, math.inf, "-")}, gain=math.nan)
-    analysis = replace(examples.EFFECT_FOUND, effects=(unsure,), run_gaps=(RunGap("run_01", False, math.nan, 2.0, 1.0),))
+    analysis = replace(
+        examples.EFFECT_FOUND, effects=(unsure,), run_gaps=(RunGap("run_01", False, math.nan, 2.0, 1.0, math.nan),)
+    )
     text = write_result(analysis, tmp_path).read_text()
     assert "NaN" not in text
     assert "Infinity" not in text
@@ -122,6 +124,7 @@ def test_what_is_no_number_becomes_null(tmp_path):
     assert content["effects"][0]["parameters"]["coefficient"]["ci95"] is None
     assert content["effects"][0]["gain"] is None
     assert content["run_gaps"][0]["before"] is None
+    assert content["gap"]["reduction_ci95"] is None
     assert identified_events(tmp_path / "result.json", load_robot())
 
 
@@ -130,6 +133,12 @@ def test_interval_holds_its_value(tmp_path):
     beside = replace(effect, parameters={"coefficient": Estimate(0.05, 0.03, 0.04, "-")})
     content = written(replace(examples.EFFECT_FOUND, effects=(beside,)), tmp_path)
     assert content["effects"][0]["parameters"]["coefficient"]["ci95"] == [0.03, 0.05]
+
+
+def test_a_reduction_may_be_negative(tmp_path):
+    worse = replace(examples.GAP, reduction=-0.27, reduction_ci95=(-0.33, -0.21))
+    gap = written(replace(examples.EFFECT_FOUND, gap=worse), tmp_path)["gap"]
+    assert (gap["reduction"], gap["reduction_ci95"]) == (-0.27, [-0.33, -0.21])
 
 
 @pytest.mark.parametrize(

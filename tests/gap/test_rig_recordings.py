@@ -8,10 +8,17 @@ import numpy as np
 import pytest
 from rig_bench import Bench, contents, write
 
+from wlr_gym.effects import Patch, save_patch
 from wlr_gym.errors import InputError
-from wlr_gym.gap.rig import RigProblem, findings, open_rig, read_recordings
+from wlr_gym.gap.analysis import Analysis, Estimate, FoundEffect
+from wlr_gym.gap.fit import nominal_model
+from wlr_gym.gap.problem import Setting
+from wlr_gym.gap.result import patch_of
+from wlr_gym.gap.rig import RigProblem, findings, open_rig, read_recordings, rig_patch
+from wlr_gym.gap.rig.candidates import rig_candidates
 from wlr_gym.gap.rig.recording import decode_load, read_recording
 from wlr_gym.gap.rig.replay import GOAL_LEAD, STEP, Replay, smoothed_state
+from wlr_gym.gap.workflow import analyse
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "xl330_pendulum"
 
@@ -192,6 +199,72 @@ def test_opening_leaves_out_what_cannot_be_used(made, tmp_path):
     assert problem is None
     assert found[-1].kind == "few_runs"
     assert found[-1].fatal
+
+
+def test_the_patch_that_an_analysis_of_the_rig_writes_can_be_given_back(made, tmp_path):
+    """Every effect that it may find, through the file; a known effect acts as the same effect in a setting does."""
+    found = []
+    for candidate in rig_candidates({"load_dependent_friction", "coulomb_friction"})[1] + rig_candidates(())[1]:
+        values = candidate.parameters(candidate.kept([0.5 * (u.low + u.high) for u in candidate.unknowns]))
+        estimates = {name: Estimate(value, value, value, "-") for name, value in values.items()}
+        found.append(FoundEffect(candidate.name, candidate.where, estimates, 0.9, 100.0))
+    written = patch_of(Analysis("made", "effect_found", "", effects=tuple(found)))
+    patch = rig_patch(save_patch(written, tmp_path / "patch.yaml"))
+    assert patch.effects == written.effects
+    assert patch.provenance == written.provenance
+    one = Patch(tuple(effect for effect in patch.effects if effect.name == "torque_saturation")[:1])
+    problem, plain = open_rig(made, one)[0], open_rig(made)[0]
+    assert problem is not None
+    assert plain is not None
+    numbers = nominal_model(plain).quantities
+    (known,), (added,), (without,) = (
+        own.simulate([setting], [3])
+        for own, setting in ((problem, Setting(numbers)), (plain, Setting(numbers, one.effects)), (plain, Setting(numbers)))
+    )
+    assert (known == added).all()
+    assert np.abs(known - without).max() > 1e-3
+
+
+def test_patches_of_the_rig_are_read_from_anything_that_effects_are():
+    entry = {"name": "load_dependent_friction", "where": ["servo"], "parameters": {"ratio": 0.2}}
+    formula = {"name": "unknown_effect", "formula": "-b * rate", "parameters": {"b": 0.1}, "units": {"b": "N m s/rad"}}
+    both = rig_patch([entry, {"effects": [formula]}])
+    assert [effect.name for effect in both.effects] == ["load_dependent_friction", "unknown_effect"]
+    assert rig_patch(both) is both
+    assert rig_patch(entry).effects == both.effects[:1]
+    assert not rig_patch(None).effects
+    assert not rig_patch([]).effects
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({"name": "torque_saturaton"}, r"effect 1: unknown effect of the test rig .*did you mean 'torque_saturation'"),
+        ({"name": "rolling_resistance", "parameters": {"coefficient": 0.1}}, "unknown effect of the test rig"),
+        ({"name": "weak_motor", "where": ["wheel_lf"], "parameters": {"scale": 0.9}}, "the rig has one joint, servo"),
+        ({"name": "weak_motor", "parameters": {"skale": 0.9}}, r"unknown parameter 'skale' \(did you mean 'scale'"),
+        ({"name": "weak_motor", "parameters": {"scale": "much"}}, r"scale = 'much': expected a number in \["),
+        ({"name": "torque_saturation", "parameters": {"coefficient": 11}}, r"coefficient = 11: expected a number in \[0, 10\]"),
+        ({"name": "torque_saturation"}, "coefficient = None"),
+        ({"name": "unknown_effect", "formula": "-b * (rate"}, "formula"),
+        ("weak_motor", "expected a mapping with 'name'"),
+    ],
+)
+def test_patches_that_the_rig_cannot_take_are_refused(entry, words):
+    with pytest.raises(InputError, match=words):
+        rig_patch({"effects": [entry]})
+    with pytest.raises(InputError, match="expected a mapping with 'effects'"):
+        rig_patch({"effect": [entry]})
+
+
+def test_a_run_that_cannot_be_used_cannot_be_held_out(tmp_path):
+    for k, one in enumerate(contents(Bench(), [100] * 4, ["sin_sin"] * 4, duration=1.0)):
+        for entry in one["entries"] if k == 0 else ():
+            entry["position"] = 57.3 * entry["position"]
+            entry["goal_position"] = 57.3 * entry["goal_position"]
+        (tmp_path / f"run_{k}.json").write_text(json.dumps(one))
+    with pytest.raises(InputError, match=r"--heldout run_0: the run cannot be used: "):
+        analyse(tmp_path, rig="pendulum", heldout=("run_0",))
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real recordings are not beside the repository")

@@ -1,7 +1,8 @@
 """Blind test of the gap workflow: data sets with sealed truths, analysed one by one, scored at the end.
 
 The sets come from :mod:`wlr_gym.bench.blind`, which shares no code with the workflow. Results of finished sets stay in the
-output folder, so an interrupted test goes on where it stopped, and a longer one adds to a shorter one.
+output folder, so an interrupted test goes on where it stopped, and a longer one adds to a shorter one. Each says which
+truth and which runs it is about, and which commit made it: results of other data are refused, those of other commits counted.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -27,6 +28,7 @@ from wlr_gym.bench.blind.score import score
 from wlr_gym.errors import InputError
 from wlr_gym.files import make_output_folder, replace_file, write_json
 from wlr_gym.paths import data_directory
+from wlr_gym.provenance import git_commit
 
 #: Folder of a data set, folder for the analysis' files -> contents of result.json.
 Analyser = Callable[[Path, Path], Mapping[str, Any]]
@@ -92,30 +94,84 @@ def run_blind_test(
         The score, as in ``score.json``.
 
     Raises:
-        InputError: the output folder cannot be written to, or holds another test.
+        InputError: the output folder cannot be written to, or holds results or truths of another test.
     """
     for name in ("", "results", "data", "sealed", "work"):
         make_output_folder(plan.out / name)
     cases = plan.cases()
     say(f"truths sealed in {plan.out / 'sealed'}: sha256 {seal(plan, cases)}")
-    left = [one for one in cases if not plan.result_file(one).is_file()]
+    there = _kept(plan, cases)
+    left = [one for one in cases if one.name not in there]
     if len(left) < len(cases):
         say(f"{len(cases) - len(left)} of {len(cases)} results are there already")
     _run(plan, left, analyser, say)
-    found = {one.name: read_result(plan.result_file(one)) for one in cases if plan.result_file(one).is_file()}
-    report = score(found, {one.name: one.as_dict() for one in cases})
+    report = score(_kept(plan, cases), {one.name: one.as_dict() for one in cases})
     write_json(plan.out / "score.json", report)
     return report
 
 
 def seal(plan: Plan, cases: Sequence[Case]) -> str:
-    """Write the truths to a file of their own, away from the data, and return its SHA-256."""
-    text = yaml.safe_dump({one.name: _plain(one.as_dict()) for one in cases}, sort_keys=True)
-    file = plan.out / "sealed" / f"truths_{plan.first_seed}_{plan.sets}.yaml"
-    if file.is_file() and file.read_text(encoding="utf-8") != text:
-        raise InputError(f"{file}: holds other truths than these seeds give now; use another --out")
+    """Write the truths to a file of their own, away from the data, and return its SHA-256.
+
+    Raises:
+        InputError: a seal that is there already, of a shorter or longer test, holds other truths of the same sets.
+    """
+    truths, folder = {one.name: _plain(one.as_dict()) for one in cases}, plan.out / "sealed"
+    for file in sorted(folder.glob("truths_*.yaml")):
+        _check_seal(file, truths)
+    text = yaml.safe_dump(truths, sort_keys=True)
+    file = folder / f"truths_{plan.first_seed}_{plan.sets}.yaml"
     replace_file(file, lambda temporary: temporary.write_text(text, encoding="utf-8"))
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _check_seal(file: Path, truths: Mapping[str, Any]) -> None:
+    try:
+        sealed = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError):
+        sealed = None
+    if not isinstance(sealed, dict):
+        raise InputError(f"{file}: holds no truths; use another --out")
+    other = sorted(name for name in sealed.keys() & truths.keys() if sealed[name] != truths[name])
+    if other:
+        raise InputError(
+            f"{file}: holds other truths than these seeds give now ({len(other)} sets, first {other[0]}); use another --out"
+        )
+
+
+def _origin(plan: Plan, one: Case) -> dict[str, Any]:
+    """Return what a result is about, and the commit of the code that makes it."""
+    return {"commit": git_commit(), **_subject(plan, one)}
+
+
+def _subject(plan: Plan, one: Case) -> dict[str, Any]:
+    truth = json.dumps(_plain(one.as_dict()), sort_keys=True)
+    return {"truth_sha256": hashlib.sha256(truth.encode()).hexdigest(), "runs": list(plan.runs)}
+
+
+def _kept(plan: Plan, cases: Sequence[Case]) -> dict[str, dict[str, Any]]:
+    """Read the results that are there.
+
+    Raises:
+        InputError: one is about another truth or other runs than the set of its name now.
+    """
+    found = {}
+    for one in cases:
+        if plan.result_file(one).is_file():
+            found[one.name] = read_result(plan.result_file(one))
+            _check_origin(plan, one, found[one.name])
+    return found
+
+
+def _check_origin(plan: Plan, one: Case, result: Mapping[str, Any]) -> None:
+    """Refuse a result of other data; results that do not say what they are about are taken as they are."""
+    made, now = result.get("blind_test") or {}, _subject(plan, one)
+    for key, what in (("truth_sha256", "another hidden truth"), ("runs", "other runs")):
+        if key in made and made[key] != now[key]:
+            raise InputError(
+                f"{plan.result_file(one)}: is about {what} ({made[key]}) than set {one.name} has now ({now[key]}); "
+                "use another --out, or delete the file to analyse the set again"
+            )
 
 
 def _plain(value: Any) -> Any:
@@ -169,7 +225,8 @@ def _outcome(plan: Plan, one: Case, code: int) -> str:
     file, log = plan.result_file(one), _log_file(plan, one)
     if not file.is_file():
         last = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
-        write_json(file, {"verdict": "failed", "message": f"the process ended with {code}: {' '.join(last)}"})
+        message = f"the process ended with {code}: {' '.join(last)}"
+        write_json(file, {"verdict": "failed", "message": message, "blind_test": _origin(plan, one)})
     result = read_result(file)
     if result["verdict"] != "failed":
         log.unlink()
@@ -193,7 +250,7 @@ def run_case(plan: Plan, one: Case, analyser: Analyser) -> None:
 
     Whatever the analysis raises is its answer: an :class:`InputError` refuses the data, anything else is a failure.
     """
-    folder, out = plan.out / "data" / one.name, plan.out / "work" / one.name
+    folder, out, origin = plan.out / "data" / one.name, plan.out / "work" / one.name, _origin(plan, one)
     make_data(folder, one, plan.runs)
     begin = time.monotonic()
     try:
@@ -202,7 +259,7 @@ def run_case(plan: Plan, one: Case, analyser: Analyser) -> None:
         result = {"verdict": "refused", "message": str(error), "traceback": traceback.format_exc()}
     except Exception as error:
         result = {"verdict": "failed", "message": f"{type(error).__name__}: {error}", "traceback": traceback.format_exc()}
-    result["wall_seconds"] = time.monotonic() - begin
+    result |= {"wall_seconds": time.monotonic() - begin, "blind_test": origin}
     write_json(plan.result_file(one), _plain(result))
     if not plan.keep_data:
         shutil.rmtree(folder)
@@ -228,71 +285,118 @@ def make_data(folder: Path, one: Case, runs: Sequence[int] = range(8)) -> None:
 # --- report -----------------------------------------------------------------------------------------------------------
 
 
+#: Whether a target is reached: ``not shown`` is a value that reaches it with a 95 % bound that does not; empty: no target.
+Met = Literal["yes", "no", "not shown", ""]
+
+
 @dataclass(frozen=True)
 class Line:
     """One line of the report: a number beside its target."""
 
     what: str
     value: str
-    target: str
-    met: bool | None
+    target: str = ""
+    met: Met = ""
 
 
 def lines(report: Mapping[str, Any]) -> list[Line]:
     """Return the numbers that the workflow is judged by, in the order of the targets."""
     alarms, single, pairs, outside = report["false_alarms"], report["single"], report["pairs"], report["outside"]
-    error, coverage, reduction = single["parameter_error"], single["interval_coverage"], single["gap_reduction"]
-    size = single["mean_set_size"]
     return [
-        _share_line("false alarms, nominal robot", alarms["none"], 0.05, most=True),
-        _share_line("false alarms, parameters only", alarms["parameters"], 0.05, most=True),
-        _share_line("right name first, severity >= 2", single["top1"], 0.85),
-        _share_line("truth in the equivalence set", single["in_set"], 0.95),
-        _number_line("mean size of that set", size, "<= 1.5", size is not None and size <= 1.5),
-        _share_line("right place, where named", single["place"], 0.95),
-        _share_line("both of a pair named", pairs["both"], 0.60),
-        _number_line("median parameter error", error["median"], "<= 10 %", (error["median"] or 0) <= 0.10, error["count"]),
-        _interval_line(coverage),
-        _number_line(
-            "median gap reduction", reduction["median"], ">= 0.8", (reduction["median"] or 0) >= 0.8, reduction["count"]
-        ),
-        _share_line("gap grew", single["gap_grew"], 0.0, most=True),
-        _share_line("outside the library: not misnamed", outside["not_misnamed"], 0.90),
-        _share_line("outside the library: formula or unknown", outside["unknown"], None),
-        _share_line("bad data caught", report["bad_data"], None),
-        _share_line("good data refused", alarms["refused_good_data"], None, most=True),
+        _at_most("false alarms, nominal robot", alarms["none"], 0.05),
+        _at_most("false alarms, parameters only", alarms["parameters"], 0.05),
+        _at_least("right name first, severity >= 2", single["top1"], 0.85),
+        _at_least("truth in the equivalence set", single["in_set"], 0.95),
+        _set_size(single["mean_set_size"]),
+        _at_most("a further name beside the right one", single["extra_name"]),
+        _confidence(single["confidence"]),
+        _at_least("right place, where named", single["place"], 0.95),
+        _at_least("both of a pair named", pairs["both"], 0.60),
+        _at_least("both of a pair and nothing else", pairs["exact"]),
+        _median("median error of size", single["size_error"], most=0.10),
+        _median("median error of place or form", single["shape_error"]),
+        _at_least("order of a ripple", single["order"]),
+        _coverage(single["interval_coverage"]),
+        _median("median gap reduction, where found", single["gap_reduction"], least=0.8),
+        _median("median gap reduction, misses as 0", single["gap_reduction_of_all"], least=0.8),
+        _none("gap grew, interval below 0", single["gap_grew_surely"]),
+        _none("gap grew by more than 2 %", single["gap_grew"]),
+        _at_least("outside the library: formula or unknown, no name", outside["unknown"], 0.90),
+        _at_least("outside the library: not misnamed", outside["not_misnamed"]),
+        _at_least("bad data caught", report["bad_data"]),
+        _none("good data refused", alarms["refused_good_data"]),
+        _none("analyses that crashed", report["crashed"]),
     ]
 
 
-def _share_line(what: str, share: Mapping[str, Any], target: float | None, most: bool = False) -> Line:
+def _met(reached: bool, shown: bool) -> Met:
+    return ("yes" if shown else "not shown") if reached else "no"
+
+
+def _share(share: Mapping[str, Any], bound: str) -> str:
     if not share["count"]:
-        return Line(what, "-", "" if target is None else f"{'<=' if most else '>='} {target:.0%}", None)
-    bound = f"{'at most' if most else 'at least'} {share['bound95']:.0%}"
-    value = f"{share['hits']}/{share['count']} = {share['share']:.0%} ({bound})"
+        return "-"
+    return f"{share['hits']}/{share['count']} = {share['share']:.0%} ({bound} {share['bound95']:.0%})"
+
+
+def _at_least(what: str, share: Mapping[str, Any], target: float | None = None) -> Line:
+    value = _share(share, "at least")
     if target is None:
-        return Line(what, value, "", None)
-    met = share["share"] <= target if most else share["share"] >= target
-    return Line(what, value, f"{'<=' if most else '>='} {target:.0%}", met)
+        return Line(what, value)
+    met = _met(share["share"] >= target, share["bound95"] >= target) if share["count"] else ""
+    return Line(what, value, f">= {target:.0%}", met)
 
 
-def _interval_line(coverage: Mapping[str, Any]) -> Line:
+def _at_most(what: str, share: Mapping[str, Any], target: float | None = None) -> Line:
+    value = _share(share, "at most")
+    if target is None:
+        return Line(what, value)
+    met = _met(share["share"] <= target, share["bound95"] <= target) if share["count"] else ""
+    return Line(what, value, f"<= {target:.0%}", met)
+
+
+def _none(what: str, share: Mapping[str, Any]) -> Line:
+    """Something that must not happen in any of these sets: no bound could show that it never does."""
+    return Line(what, _share(share, "at most"), "0", _met(not share["hits"], True) if share["count"] else "")
+
+
+def _coverage(coverage: Mapping[str, Any]) -> Line:
     """Intervals may be too narrow or too wide."""
-    line = _share_line("95 % intervals that hold", coverage, 0.88)
-    met = None if coverage["share"] is None else 0.88 <= coverage["share"] <= 0.98
-    return Line(line.what, line.value, "88-98 %", met)
+    line = _at_least("95 % intervals that hold", coverage)
+    if not coverage["count"]:
+        return Line(line.what, line.value, "88-98 %")
+    shown = coverage["bound95"] >= 0.88 and coverage["bound95_above"] <= 0.98
+    return Line(line.what, line.value, "88-98 %", _met(0.88 <= coverage["share"] <= 0.98, shown))
 
 
-def _number_line(what: str, value: float | None, target: str, met: bool, count: int | None = None) -> Line:
-    if value is None:
-        return Line(what, "-", target, None)
-    return Line(what, f"{value:.3g}" + (f" of {count}" if count is not None else ""), target, met)
+def _median(what: str, numbers: Mapping[str, Any], most: float | None = None, least: float | None = None) -> Line:
+    target = f"<= {most:g}" if most is not None else f">= {least:g}" if least is not None else ""
+    if not numbers["count"]:
+        return Line(what, "-", target)
+    word, bound = ("at least", numbers["at_least95"]) if least is not None else ("at most", numbers["at_most95"])
+    value = f"{numbers['median']:.3g} of {numbers['count']} ({'no bound' if bound is None else f'{word} {bound:.3g}'})"
+    if most is not None:
+        return Line(what, value, target, _met(numbers["median"] <= most, bound is not None and bound <= most))
+    if least is not None:
+        return Line(what, value, target, _met(numbers["median"] >= least, bound is not None and bound >= least))
+    return Line(what, value)
+
+
+def _set_size(size: float | None) -> Line:
+    what, target = "mean size of that set, where found", "<= 1.5"
+    return Line(what, "-", target) if size is None else Line(what, f"{size:.3g}", target, _met(size <= 1.5, True))
+
+
+def _confidence(numbers: Mapping[str, Any]) -> Line:
+    value = f"{numbers['mean_confidence']:.2f}, right {numbers['right']:.2f} of {numbers['count']}" if numbers["count"] else "-"
+    return Line("mean confidence of the first name", value)
 
 
 def markdown(report: Mapping[str, Any]) -> str:
     """Return the report as Markdown tables: numbers beside targets, severities, confusion matrix."""
-    rows = ["| | measured (95 % bound) | target | met |", "|---|---|---|---|"]
-    met = {True: "yes", False: "no", None: ""}
-    rows += [f"| {line.what} | {line.value} | {line.target} | {met[line.met]} |" for line in lines(report)]
+    rows = [f"Sets analysed by commit: {', '.join(f'{commit} {sets}' for commit, sets in report['commits'].items())}.", ""]
+    rows += ["| | measured (95 % bound) | target | met |", "|---|---|---|---|"]
+    rows += [f"| {line.what} | {line.value} | {line.target} | {line.met} |" for line in lines(report)]
     rows += ["", "| severity | sets | found | right name first | in the set |", "|---|---|---|---|---|"]
     for severity, shares in report["single"]["by_severity"].items():
         cells = [f"{shares[key]['share']:.0%}" for key in ("found", "top1", "in_set")]

@@ -23,6 +23,7 @@ from wlr_gym.errors import InputError, unknown_name
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from wlr_gym.effects import Patch
     from wlr_gym.gap.analysis import Analysis
 
 
@@ -56,7 +57,7 @@ def run(options: Options) -> int:
     from wlr_gym.provenance import record_provenance
 
     _check(options)
-    known = options.patch()
+    known = _known(options)
     check_folder(options.out)
     console = Console(soft_wrap=True, highlight=False)
     with progress(console) as tell:
@@ -78,12 +79,13 @@ def run(options: Options) -> int:
 
 def _check(options: Options) -> None:
     from wlr_gym.gap.workflow import RIGS
-    from wlr_gym.plants import check_backend
+    from wlr_gym.plants import SIMULATORS
 
     if not options.data.is_dir():
         what = "is a file" if options.data.exists() else "no such folder"
         raise InputError(f"{options.data}: {what}; expected a folder of runs")
-    check_backend(options.backend)
+    if options.backend not in SIMULATORS:
+        raise unknown_name("simulator", options.backend, SIMULATORS, "--backend")
     if options.rig is not None and options.rig not in RIGS:
         raise unknown_name("rig", options.rig, RIGS)
     if options.rig is not None and options.backend != Options.backend:
@@ -92,17 +94,30 @@ def _check(options: Options) -> None:
         raise InputError(f"--threads {options.threads}: expected 1 or more")
 
 
+def _known(options: Options) -> Patch:
+    """The effects given as known, in the vocabulary of the robot or of the rig."""
+    try:
+        if options.rig is None:
+            return options.patch()
+        from wlr_gym.gap.rig.open import rig_patch
+
+        return rig_patch(list(options.effects))
+    except InputError as error:
+        raise InputError(f"--effects: {error}") from None
+
+
 # ---- the summary -----------------------------------------------------------------------------------------------------
 
 
 def _print(analysis: Analysis, out: Path, console: Console) -> None:
     from wlr_gym.gap.report import REPORT_FILE
     from wlr_gym.gap.result import PATCH_FILE, RESULT_FILE
-    from wlr_gym.gap.words import sentence, title
+    from wlr_gym.gap.words import closure, sentence, title
 
     colours = {"bad_data": "red", "not_excited": "yellow", "nothing_missing": "green"}
     console.print(title(analysis), style=f"bold {colours.get(analysis.verdict, 'blue')}")
-    for line in (sentence(analysis), *_findings(analysis), *_numbers(analysis), *_advice(analysis)):
+    said = [sentence(analysis), *filter(None, [closure(analysis)])]
+    for line in (*said, *_findings(analysis), *_numbers(analysis), *_advice(analysis)):
         console.print(line, markup=False)
     for label, name in (("report", REPORT_FILE), ("result", RESULT_FILE), ("patch", PATCH_FILE)):
         console.print(f"{label}: {out / name}", markup=False)
@@ -115,7 +130,7 @@ def _findings(analysis: Analysis) -> Iterator[str]:
 
 
 def _numbers(analysis: Analysis) -> Iterator[str]:
-    from wlr_gym.gap.words import error, estimate, interval, percent, places, plain
+    from wlr_gym.gap.words import error, estimate, percent, places, plain, removed
 
     for effect in analysis.effects:
         values = ", ".join(f"{name} {estimate(found)}" for name, found in effect.parameters.items())
@@ -127,7 +142,7 @@ def _numbers(analysis: Analysis) -> Iterator[str]:
         steps += [f"{error(gap.heldout_after)} with the effects"] if analysis.effects else []
         yield f"  error of the runs kept aside, 1 = sensor noise: {', '.join(steps)}; noise floor {error(gap.noise_floor)}"
         if analysis.effects:
-            yield f"  removed: {percent(gap.reduction)} of the avoidable error; {interval(*gap.reduction_ci95)}"
+            yield f"  removed of the avoidable error: {removed(analysis)}"
 
 
 def _advice(analysis: Analysis) -> Iterator[str]:

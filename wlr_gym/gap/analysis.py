@@ -48,8 +48,9 @@ class FoundEffect:
     """One effect that was added, strongest first in an analysis.
 
     Attributes:
-        confidence: 0..1: share of bootstrap samples of the runs in which it is accepted and ranked first.
-        gain: fall of minus two log posterior on the fit runs when it is taken out last.
+        confidence: 0..1: share of bootstrap samples of the fitted runs in which it buys enough, the runs agree and no other
+            name buys more; nothing is fitted anew.
+        gain: fall of minus two log posterior on the fitted runs when it was added, beside the effects taken before it.
         formula, units: of an unknown effect; empty otherwise.
     """
 
@@ -118,12 +119,11 @@ class HeatMap:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """One channel of one run: measured, and as three models replay it; SI."""
+    """One channel of one held-out run: measured, and as three models replay it; SI."""
 
     run: str
     channel: str
     unit: str
-    heldout: bool
     t: Array
     measured: Array
     before: Array
@@ -133,7 +133,11 @@ class Trace:
 
 @dataclass(frozen=True)
 class GapFigures:
-    """Noise-normalised RMS error of replayed runs, 1.0 = sensor noise; see the result file."""
+    """Noise-normalised RMS error of replayed runs, 1.0 = sensor noise; see the result file.
+
+    ``reduction`` is the share of what calibration leaves above the noise floor that the effects remove on held-out runs: 1 at
+    most, negative if they make it worse, NaN where calibration leaves nothing; so is its interval, which is NaN of few runs.
+    """
 
     metric: str
     fit_before: float
@@ -148,18 +152,19 @@ class GapFigures:
 
 @dataclass(frozen=True)
 class RunGap:
-    """The same for one run."""
+    """The same for one run; ``reduction`` by the noise floor of all held-out runs."""
 
     run: str
     heldout: bool
     before: float
     calibrated: float
     after: float
+    reduction: float
 
 
 @dataclass(frozen=True)
 class ChannelGap:
-    """RMS residual of one channel over the held-out runs, in noise units."""
+    """RMS residual of one channel over the held-out runs, in noise units; channels of a kind share a ``group``."""
 
     channel: str
     unit: str
@@ -167,11 +172,12 @@ class ChannelGap:
     before: float
     calibrated: float
     after: float
+    group: str = ""
 
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A number that calibration moved."""
+    """A number that calibration moved; ``uncertainty`` is half of its 95 % interval."""
 
     nominal: float
     fitted: float

@@ -51,8 +51,9 @@ NARROWER = 0.4
 HOPELESS, PATIENCE = 0.4, 2
 #: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
 MOST_HARM = 0.2
-#: Runs that were not fitted must gain at least this share of what those that were did, per run.
-LEAST_CARRIED = 0.1
+#: Left out one after the other, the runs must gain together at least this share of what they gain when they are fitted; asked
+#: where so many are.
+LEAST_CARRIED, LEAST_RUNS = 0.3, 3
 #: Of an unknown that meets no known number, what counts as an effect, in its steps.
 NOTICED = 0.25
 #: Hypotheses whose known numbers the model without an effect more tries too.
@@ -79,7 +80,7 @@ class Hypothesis:
         screened: what the first-order score had promised.
         residuals: of the model.
         base, base_residuals: the model without the effect, refitted as long.
-        carries_over: whether runs that were not fitted agree (checked for finalists only).
+        carries_over: whether each run agrees with what the others tell (checked for finalists only).
         tolerable: whether the tolerances of known numbers allow as much.
     """
 
@@ -184,7 +185,6 @@ def name_effects(
     problem: Problem,
     runs: Sequence[int],
     start: Fit,
-    others: Sequence[int] = (),
     tell: Tell = lambda text: None,
     given: Sequence[NDArray[np.float32]] | None = None,
 ) -> Naming:
@@ -192,9 +192,8 @@ def name_effects(
 
     Args:
         problem: the system.
-        runs: those that are fitted.
+        runs: those that are fitted; no other has a say.
         start: the calibrated model.
-        others: runs that must agree.
         tell: told of progress.
         given: columns of the model as its file says, where they are known.
     """
@@ -208,23 +207,25 @@ def name_effects(
         candidates = [candidate for candidate in candidates if candidate.label not in had]
         tell(f"screening {len(candidates)} candidates")
         found = responses(problem, current, runs, probes)
-        scores = screen(candidates, found)
+        scores = screen(candidates, found, current.cost)
         chosen = scores if problem.thorough else shortlist(scores, cost=current.cost)
         tell(f"refitting {len(chosen)} hypotheses")
         hypotheses = (
             refit_thoroughly(problem, runs, current, chosen) if given is None else refit(problem, runs, current, chosen, given)
         )
-        deeper = _deeper(problem, current, hypotheses)
-        if deeper is not None and current is not again:
+        bare = _without_more(problem, current, hypotheses)
+        finals: list[Final] = []
+        if current is again or not _deeper(problem, current, bare):
+            finals, bare = finalists(problem, runs, current, hypotheses, bare, tell)
+        if current is not again and _deeper(problem, current, bare):
             tell("the known numbers fit better elsewhere: calibrated anew from there")
-            anew = fit(problem, runs, deeper, scatter=current.noise.scatter, steps=problem.steps)
+            anew = fit(problem, runs, bare.model, scatter=current.noise.scatter, steps=problem.steps)
             current = again = widened(problem, runs, anew)
             calibrated = calibrated if current.model.effects else current
             continue
-        finals = finalists(problem, runs, hypotheses, current.noise, others, tell)
-        accepted = _accepted(problem, runs, current, finals, others, tell)
+        accepted, finals = _accepted(problem, runs, current, finals, bare, tell)
         taken = None if accepted is None else accepted.hypothesis
-        rounds.append(Round(scores, _merged([*finals, accepted] if accepted else finals, hypotheses), taken, current.cost))
+        rounds.append(Round(scores, _merged(finals, hypotheses), taken, current.cost))
         if accepted is None:
             break
         tell(f"taken: {accepted.hypothesis.candidate.label}")
@@ -235,14 +236,27 @@ def name_effects(
     return Naming(calibrated, current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
 
 
-def _deeper(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> Model | None:
-    """The model without a further effect in another minimum that refits have found, if it is clearly lower than the present."""
-    if not hypotheses or problem.thorough:
-        return None
-    base, residuals = hypotheses[0].base, hypotheses[0].base_residuals
-    memory = estimate_noise(residuals, scatter=current.noise.scatter).memory
-    lower = total_cost(problem, current.model, current.residuals, memory) - total_cost(problem, base, residuals, memory)
-    return base if lower > LEAST_GAIN else None
+def _without_more(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> Fit:
+    """The model without a further effect: the present one, or the one that refits have found if that is better."""
+    if not hypotheses:
+        return current
+    model, residuals = hypotheses[0].base, hypotheses[0].base_residuals
+    noise = estimate_noise(residuals, scatter=current.noise.scatter)
+    found = replace(
+        current, model=model, residuals=residuals, noise=noise, cost=total_cost(problem, model, residuals, noise.memory)
+    )
+    return _cheapest(problem, (current, found), noise.memory)
+
+
+def _deeper(problem: Problem, current: Fit, bare: Fit) -> bool:
+    """Whether a model without a further effect, in another minimum than the present one, is clearly lower."""
+    if problem.thorough:
+        return False
+    memory = bare.noise.memory
+    lower = total_cost(problem, current.model, current.residuals, memory) - total_cost(
+        problem, bare.model, bare.residuals, memory
+    )
+    return lower > LEAST_GAIN
 
 
 def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tuple[Hypothesis, list[Hypothesis]]]:
@@ -281,7 +295,8 @@ def drop_idle(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = 
         for index in range(len(current.model.effects)):
             sizes = [len(values) for _, values in current.model.effects]
             own = slice(kept + sum(sizes[:index]), kept + sum(sizes[: index + 1]))
-            columns = [np.delete(column, own, axis=0) for column in current.columns]
+            silent = _replaced(current.model.effects[index][0])  # a number that an effect replaces has no columns beside it
+            columns = None if silent else [np.delete(column, own, axis=0) for column in current.columns]
             model = current.model.without_effect(index)
             trials.append(
                 fit(
@@ -316,13 +331,41 @@ class Final:
 def finalists(
     problem: Problem,
     runs: Sequence[int],
+    current: Fit,
     hypotheses: Sequence[Hypothesis],
-    noise: Noise,
-    others: Sequence[int] = (),
+    bare: Fit,
     tell: Tell = lambda text: None,
-) -> list[Final]:
-    """Fit the best hypotheses in full, with responses simulated anew; best first. ``noise`` is that of the model so far."""
-    memory, scatter = noise.memory, noise.scatter
+) -> tuple[list[Final], Fit]:
+    """Fit the best hypotheses in full, with responses simulated anew, and judge all against one model without them.
+
+    Args:
+        problem, runs: what is fitted.
+        current: the model so far.
+        hypotheses: refitted, best first.
+        bare: the best model without a further effect so far.
+        tell: told of progress.
+
+    Returns:
+        The finalists, best first; the best model without a further effect, which may be one that a finalist has led to.
+    """
+    chosen, wholes = _worth_a_fit(hypotheses), []
+    for hypothesis in chosen:
+        tell(f"fitting {hypothesis.candidate.label} in full")
+        near = fit(problem, runs, hypothesis.model, scatter=current.noise.scatter, steps=problem.steps, tell=tell)
+        both = (near, *_afresh(problem, runs, hypothesis, near, tell))
+        wholes.append(_cheapest(problem, both, current.noise.memory))
+    if not wholes:
+        return [], bare
+    memory = _cheapest(problem, wholes, current.noise.memory).noise.memory
+    if not problem.thorough:
+        pairs = zip(wholes, chosen, strict=True)
+        bare = _cheapest(problem, [bare, *(_left(problem, runs, whole, h.candidate, memory) for whole, h in pairs)], memory)
+    found = [_judged(problem, runs, h, whole, bare, memory) for h, whole in zip(chosen, wholes, strict=True)]
+    return sorted(found, key=lambda final: -final.hypothesis.gain), bare
+
+
+def _worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The best of every name that buys nearly as much as the best does, and the best's narrower self."""
     best: dict[str, Hypothesis] = {}
     effects = [hypothesis for hypothesis in hypotheses if not hypothesis.tolerable]
     for hypothesis in effects:
@@ -333,50 +376,41 @@ def finalists(
         narrower = len(leading.candidate.where) > 1 and len(hypothesis.candidate.where) == 1
         if narrower and hypothesis.candidate.name == leading.candidate.name and hypothesis.gain > NARROWER * leading.gain:
             best.setdefault("narrower", hypothesis)
-    wholes = []
-    for hypothesis in best.values():
-        tell(f"fitting {hypothesis.candidate.label} in full")
-        near = fit(problem, runs, hypothesis.model, scatter=scatter, steps=problem.steps, tell=tell)
-        both = (near, *_afresh(problem, runs, hypothesis, near, tell))
-        wholes.append(_cheapest(problem, both, memory))
-    if not wholes:
-        return []
-    memory = _cheapest(problem, wholes, memory).noise.memory
-    pairs = zip(best.values(), wholes, strict=True)
-    found = [_judged(problem, runs, hypothesis, whole, memory, others) for hypothesis, whole in pairs]
-    return sorted(found, key=lambda final: -final.hypothesis.gain)
+    return list(best.values())
 
 
-def _judged(
-    problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, whole: Fit, memory: Array, others: Sequence[int]
-) -> Final:
-    """A hypothesis as its whole fit shows it: gain, agreement of the runs, what the tolerances allow."""
-    base, base_residuals = hypothesis.base, hypothesis.base_residuals
-    if not problem.thorough:  # what the whole fit found in the known numbers is no evidence for the effect
-        plain = _plain(problem, runs, whole, hypothesis.candidate, memory)
-        if total_cost(problem, plain.model, plain.residuals, memory) < total_cost(problem, base, base_residuals, memory):
-            base, base_residuals = plain.model, plain.residuals
-    gain = total_cost(problem, base, base_residuals, memory) - total_cost(problem, whole.model, whole.residuals, memory)
+def _judged(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, whole: Fit, bare: Fit, memory: Array) -> Final:
+    """A hypothesis as its whole fit shows it: gain, agreement of the runs, what the tolerances allow.
+
+    What the whole fit found in the known numbers is no evidence for the effect: ``bare`` is without it.
+    """
+    gain = total_cost(problem, bare.model, bare.residuals, memory) - total_cost(problem, whole.model, whole.residuals, memory)
     judged = replace(
         hypothesis,
         model=whole.model,
         gain=gain,
-        by_run=_by_run(base_residuals, whole.residuals, estimate_noise(whole.residuals, memory, whole.noise.scatter)),
+        by_run=_by_run(bare.residuals, whole.residuals, estimate_noise(whole.residuals, memory, whole.noise.scatter)),
         residuals=whole.residuals,
-        base=base,
-        base_residuals=base_residuals,
-        carries_over=_carries_over(problem, base, whole.model, gain, runs, others, memory),
+        base=bare.model,
+        base_residuals=bare.residuals,
+        carries_over=carries_over(problem, runs, bare, whole, gain, memory),
         tolerable=within_tolerance(problem, whole.model),
     )
     return Final(judged, whole)
 
 
-def _plain(problem: Problem, runs: Sequence[int], whole: Fit, candidate: Candidate, memory: Array) -> Fit:
+def _left(problem: Problem, runs: Sequence[int], whole: Fit, candidate: Candidate, memory: Array) -> Fit:
     """The model without the last effect, from where the known numbers are beside it."""
     kept = whole.model.size - len(candidate.unknowns)
     columns = None if _replaced(candidate) else [column[:kept] for column in whole.columns]
-    model, scatter = whole.model.without_effect(-1), whole.noise.scatter
-    return fit(problem, runs, model, memory=memory, scatter=scatter, columns=columns, steps=1)
+    return _plain(problem, runs, whole, whole.model.without_effect(-1), columns, memory)
+
+
+def _plain(
+    problem: Problem, runs: Sequence[int], near: Fit, model: Model, columns: list[NDArray[np.float32]] | None, memory: Array
+) -> Fit:
+    """One descent of a model, with the columns of a fit near it where they are known."""
+    return fit(problem, runs, model, memory=memory, scatter=near.noise.scatter, columns=columns, steps=1)
 
 
 def _cheapest(problem: Problem, fits: Sequence[Fit], memory: Array) -> Fit:
@@ -400,15 +434,25 @@ def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near:
     return [fit(problem, runs, start, scatter=near.noise.scatter, steps=problem.steps, tell=tell)]
 
 
-def _carries_over(
-    problem: Problem, base: Model, whole: Model, gain: float, runs: Sequence[int], others: Sequence[int], memory: Array
-) -> bool:
-    """Whether runs that took no part in the fit get better too, by a share of what their number promises."""
-    if not others:
+def carries_over(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit, gain: float, memory: Array) -> bool:
+    """Whether each run gets better by what the other runs tell of the effect, all together by a share of the gain."""
+    if len(runs) < LEAST_RUNS:
         return True
-    found = problem.residuals([base.setting, whole.setting], others)
+    found = [
+        problem.residuals([without.setting, with_it.setting], [run])[0]
+        for run, without, with_it in zip(runs, told_by_others(problem, bare), told_by_others(problem, whole), strict=True)
+    ]
     before, after = (minus_two_log_likelihood([r[k] for r in found], memory) for k in (0, 1))
-    return before - after > LEAST_CARRIED * gain * len(others) / len(runs)
+    return before - after > LEAST_CARRIED * gain
+
+
+def told_by_others(problem: Problem, found: Fit) -> list[Model]:
+    """The model as it would be without each run in turn, to first order."""
+    parts = [normal_equations([c], [r], found.noise) for c, r in zip(found.columns, found.residuals, strict=True)]
+    matrix, vector = sum(m for m, _ in parts), sum(v for _, v in parts)
+    settled = constrained_step(problem, found.model, matrix, vector)
+    steps = [constrained_step(problem, found.model, matrix - own, vector - pull) for own, pull in parts]
+    return [moved(problem, found.model, step - settled) for step in steps]
 
 
 def _merged(finals: Sequence[Final], hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -419,9 +463,9 @@ def _merged(finals: Sequence[Final], hypotheses: Sequence[Hypothesis]) -> list[H
 
 
 def _accepted(
-    problem: Problem, runs: Sequence[int], current: Fit, finals: Sequence[Final], others: Sequence[int], tell: Tell
-) -> Final | None:
-    """The best that buys enough at a plausible value, also once it has settled.
+    problem: Problem, runs: Sequence[int], current: Fit, finals: Sequence[Final], bare: Fit, tell: Tell
+) -> tuple[Final | None, list[Final]]:
+    """The best that buys enough at a plausible value, also once it has settled, and the finalists as far as they have settled.
 
     A formula is taken only where no named effect buys nearly as much.
     """
@@ -429,11 +473,13 @@ def _accepted(
     named = [final for final in good if not final.hypothesis.candidate.formula]
     if named and named[0].hypothesis.gain >= NAMED_FIRST * good[0].hypothesis.gain:
         good = [named[0], *(final for final in good if final is not named[0])]
+    seen = list(finals)
     for final in good:
-        settled = final if problem.thorough else settle(problem, runs, final, others, tell)
+        settled, bare = (final, bare) if problem.thorough else settle(problem, runs, final, bare, tell)
+        seen = [settled if other is final else other for other in seen]
         if _is_good(current, settled):
-            return settled
-    return None
+            return settled, seen
+    return None, seen
 
 
 def _is_good(current: Fit, final: Final) -> bool:
@@ -441,8 +487,9 @@ def _is_good(current: Fit, final: Final) -> bool:
     return final.hypothesis.gain >= least and final.hypothesis.plausible
 
 
-def settle(problem: Problem, runs: Sequence[int], final: Final, others: Sequence[int], tell: Tell) -> Final:
-    """The hypothesis fitted on until another step gains nothing, and once more with the known numbers as the file says.
+def settle(problem: Problem, runs: Sequence[int], final: Final, bare: Fit, tell: Tell) -> tuple[Final, Fit]:
+    """The hypothesis fitted on until another step gains nothing, and once more with the known numbers as the file says; and the
+    best model without it.
 
     Beside a strong effect the cost has several minima: known numbers that calibration had moved in the effect's place stay
     where they are and leave it too small.
@@ -452,7 +499,9 @@ def settle(problem: Problem, runs: Sequence[int], final: Final, others: Sequence
     starts = (found.model, untouched(problem, found.model))
     more = [fit(problem, runs, start, scatter=found.noise.scatter, steps=SETTLING, tell=tell) for start in starts]
     best = _cheapest(problem, (found, *more), found.noise.memory)
-    return final if best is found else _judged(problem, runs, final.hypothesis, best, best.noise.memory, others)
+    memory = best.noise.memory
+    bare = _cheapest(problem, [bare, _left(problem, runs, best, final.hypothesis.candidate, memory)], memory)
+    return _judged(problem, runs, final.hypothesis, best, bare, memory), bare
 
 
 def _by_run(before: Sequence[Array], after: Sequence[Array], noise: Noise) -> Array:

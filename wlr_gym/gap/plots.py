@@ -226,6 +226,7 @@ def _draw_gap_bars(axes: Axes, gap: GapFigures, *, with_effects: bool) -> None:
     if with_effects and np.all(np.isfinite(interval)):
         low, high = sorted(interval)
         axes.plot([low, high], [rows[-1]] * 2, color="black", linewidth=1.4, marker="|", markersize=9)
+        end = max(end, high)
     axes.axvline(gap.noise_floor, color="#2e7d32", linestyle="--", linewidth=1.2)
     axes.set_ylim(-0.55, len(bars) - 0.1)
     axes.annotate("noise floor", (gap.noise_floor, len(bars) - 0.45), (4, 0), textcoords="offset points", color="#2e7d32",
@@ -311,8 +312,7 @@ def _draw_trace(above: Axes, below: Axes, trace: Trace, noise: float | None, *, 
     if noise is not None:
         below.axhspan(-2.0 * noise, 2.0 * noise, color="#2e7d32", alpha=0.15, linewidth=0.0)
     below.axhline(0.0, color="black", linewidth=0.5)
-    aside = ", kept aside" if trace.heldout else ""
-    above.set_title(f"{trace.channel} ({channel(trace.channel)})\n{trace.run}{aside}", fontsize=9, loc="left")
+    above.set_title(f"{trace.channel} ({channel(trace.channel)})\n{trace.run}, kept aside", fontsize=9, loc="left")
     above.set_ylabel(trace.unit, fontsize=9)
     below.set_ylabel(f"error\n{trace.unit}", fontsize=9)
     above.tick_params(labelbottom=False)

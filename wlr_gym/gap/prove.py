@@ -1,8 +1,8 @@
-"""Proof on runs that took no part: how far are replays from measurements, before and after?
+"""Proof on sealed runs, which no fit and no decision has seen: how far are replays from measurements, before and after?
 
 All numbers are root mean square residuals in units of sensor noise, over the channels of a run. A perfect model does not reach
 1.0: every window of a replay starts from measured, hence noisy, values. What it does reach is found by replaying data that the
-fitted model itself made, with the same sensors (:func:`noise_floor`).
+fitted model itself made, with the same sensors (``problem.floor``).
 """
 
 from __future__ import annotations
@@ -16,11 +16,14 @@ from numpy.typing import NDArray
 from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
 from wlr_gym.gap.fit import Model
 from wlr_gym.gap.problem import Problem
+from wlr_gym.gap.sure import two_sided_95
 
 Array = NDArray[np.float64]
 
-#: Bootstrap samples of the held-out runs.
-SAMPLES = 2000
+#: Sealed runs from which on they tell how sure their mean is.
+LEAST_FOR_INTERVAL = 3
+#: Distance from the noise floor below which nothing is left to be removed.
+LEAST_ROOM = 1e-9
 
 
 def mean_squares(residuals: Sequence[Array], cap: float) -> Array:
@@ -68,13 +71,21 @@ def prove(
         calibrated,
         after,
         floor,
-        reduction(squares[1][outside], squares[2][outside], floor),
+        min(reduction(squares[1][outside], squares[2][outside], floor), 1.0),
         _interval(squares[1][outside], squares[2][outside], floor),
     )
-    names = [problem.runs[k] for k in (*fitted, *heldout)]
-    gaps = tuple(RunGap(name, k >= len(fitted), *(level(s[k]) for s in squares)) for k, name in enumerate(names))
+    gaps = tuple(
+        RunGap(problem.runs[run], k >= len(fitted), *(level(s[k]) for s in squares), reduction=_published(*(s[k] for s in squares[1:]), floor))
+        for k, run in enumerate((*fitted, *heldout))
+    )
     channels = tuple(
-        ChannelGap(signal.name, signal.unit, signal.noise, *(float(np.sqrt(mean_of_runs(s[outside])[c])) for s in squares))
+        ChannelGap(
+            signal.name,
+            signal.unit,
+            signal.noise,
+            *(float(np.sqrt(mean_of_runs(s[outside])[c])) for s in squares),
+            group=signal.group,
+        )
         for c, signal in enumerate(problem.signals)
         if np.isfinite(squares[0][outside][:, c]).any()
     )
@@ -82,17 +93,25 @@ def prove(
 
 
 def reduction(calibrated: Array, after: Array, floor: float) -> float:
-    """Return the share of the gap above the floor that the effects close, 0..1."""
+    """Return the share of the gap above the floor that the effects close: negative where they make it larger.
+
+    ``(L_c - L_a) / (L_c - floor)`` of the levels of all runs given; NaN where calibration leaves nothing to be closed.
+    """
     room = level(calibrated) - floor
-    return float(np.clip((level(calibrated) - level(after)) / room, 0.0, 1.0)) if room > 1e-9 else 0.0
+    return (level(calibrated) - level(after)) / room if room > LEAST_ROOM else math.nan
 
 
 def _interval(calibrated: Array, after: Array, floor: float) -> tuple[float, float]:
-    """95 % interval of the reduction: runs drawn with replacement; one run tells none."""
-    if len(calibrated) < 2:
+    """95 % interval of the reduction, up to 1; NaN where the runs are too few to tell.
+
+    Student's t interval with the jackknife's standard error: ``R +- t(n-1) sqrt((n-1)/n sum (R_k - mean R_k)^2)``, with R_k the
+    reduction without run k.
+    """
+    count = len(calibrated)
+    if count < LEAST_FOR_INTERVAL:
         return math.nan, math.nan
-    rng = np.random.default_rng(0)
-    picks = rng.integers(0, len(calibrated), (SAMPLES, len(calibrated)))
-    drawn = [reduction(calibrated[pick], after[pick], floor) for pick in picks]
-    low, high = np.percentile(drawn, [2.5, 97.5])
-    return float(low), float(high)
+    left_out = np.array([reduction(np.delete(calibrated, k, axis=0), np.delete(after, k, axis=0), floor) for k in range(count)])
+    error = math.sqrt((count - 1) / count * float(((left_out - left_out.mean()) ** 2).sum()))
+    whole, half = reduction(calibrated, after, floor), two_sided_95(count - 1) * error
+    low, high = (min(end, 1.0) if math.isfinite(end) else math.nan for end in (whole - half, whole + half))
+    return low, high

@@ -32,9 +32,11 @@ from wlr_gym.gap.analysis import (
 )
 from wlr_gym.gap.page import commands, document, folded, heading, pictures_of, section, table
 from wlr_gym.gap.plots import SCREENED_OUT, draw
-from wlr_gym.gap.result import PATCH_FILE, RESULT_FILE, TWO_SIGMA, patch_of, read_result, result_of, write_result
+from wlr_gym.gap.prove import LEAST_FOR_INTERVAL
+from wlr_gym.gap.result import PATCH_FILE, RESULT_FILE, patch_of, read_result, result_of, write_result
 from wlr_gym.gap.words import (
     channel,
+    closure,
     duration,
     error,
     estimate,
@@ -44,6 +46,7 @@ from wlr_gym.gap.words import (
     percent,
     places,
     plain,
+    removed,
     sentence,
     title,
     unit_of,
@@ -161,12 +164,13 @@ def _header(analysis: Analysis) -> str:
     if analysis.fit_runs:
         facts.append(f"fitted to {_runs(analysis.fit_runs)}")
     if analysis.heldout_runs:
-        facts.append(f"checked on {_runs(analysis.heldout_runs)}, which no fit has seen")
+        facts.append(f"checked on {_runs(analysis.heldout_runs)}, which no fit and no decision has seen")
     known = [str(effect.get("name", "")) for effect in analysis.known_effects]
     if known:
         facts.append(f"known from the start: {escape(listed([plain(name) for name in known]))}")
+    left = f"<p>{escape(closure(analysis))}</p>\n" if closure(analysis) else ""
     return (
-        f'<header>\n<p class="label">{escape(title(analysis))}</p>\n<h1>{escape(sentence(analysis))}</h1>\n'
+        f'<header>\n<p class="label">{escape(title(analysis))}</p>\n<h1>{escape(sentence(analysis))}</h1>\n{left}'
         f'<p class="small">{"; ".join(facts)}.</p>\n</header>\n{_tiles(analysis)}'
     )
 
@@ -184,7 +188,7 @@ def _tiles(analysis: Analysis) -> str:
         tiles.append((error(gap.heldout_after), "with the effects added"))
     tiles.append((error(gap.noise_floor), "noise floor: as good as it can get"))
     if analysis.effects:
-        tiles.append((percent(gap.reduction), f"of the avoidable error removed; {interval(*gap.reduction_ci95)}"))
+        tiles.append((percent(gap.reduction), f"of the avoidable error removed; {interval(analysis)}"))
     items = "".join(f"<li><b>{escape(value)}</b>{escape(text)}</li>" for value, text in tiles)
     return (
         f'<ul class="figures">{items}</ul>\n<p class="small">Errors are of the runs kept aside, replayed by the model with the '
@@ -293,16 +297,20 @@ def _how_much(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
     if gap is None:
         return ""
     headings = ("as given", "calibrated", "with effects")[: 3 if analysis.effects else 2]
-    runs = [(one.run, "kept aside" if one.heldout else "fitted", *_errors(one)[: len(headings)]) for one in analysis.run_gaps]
+    of_runs = (*headings, "removed") if analysis.effects else headings
+    runs = [
+        (one.run, "kept aside" if one.heldout else "fitted", *(*_errors(one), percent(one.reduction))[: len(of_runs)])
+        for one in analysis.run_gaps
+    ]
     channels = [
         (one.channel, channel(one.channel), f"{number(one.noise)}{unit_of(one.unit)}", *_errors(one)[: len(headings)])
         for one in analysis.channel_gaps
     ]
     return section(
         "How much",
-        _gap_in_words(gap, bool(analysis.effects)),
+        _gap_in_words(gap, analysis),
         _pictures("gap", pictures),
-        table(("run", "", *headings), runs, {2, 3, 4}),
+        table(("run", "", *of_runs), runs, {2, 3, 4, 5}),
         _pictures("channels", pictures),
         folded("Numbers of each channel", table(("channel", "", "noise (1 sigma)", *headings), channels, {2, 3, 4, 5})),
     )
@@ -312,18 +320,19 @@ def _errors(gap: RunGap | ChannelGap) -> tuple[str, str, str]:
     return error(gap.before), error(gap.calibrated), error(gap.after)
 
 
-def _gap_in_words(gap: GapFigures, with_effects: bool) -> str:
-    added = f", {error(gap.heldout_after)} with the effects" if with_effects else ""
+def _gap_in_words(gap: GapFigures, analysis: Analysis) -> str:
+    added = f", {error(gap.heldout_after)} with the effects" if analysis.effects else ""
     text = (
         f"<p>Error of replayed runs ({escape(gap.metric)}; 1 = sensor noise). Runs that were fitted: {error(gap.fit_before)} "
         f"before, {error(gap.fit_after)} after. Runs kept aside: {error(gap.heldout_before)} as given, "
         f"{error(gap.heldout_calibrated)} calibrated{added}; noise floor {error(gap.noise_floor)}.</p>"
     )
-    if not with_effects:
+    if not analysis.effects:
         return text
     return (
-        f"{text}\n<p>What was found removes <b>{percent(gap.reduction)}</b> ({interval(*gap.reduction_ci95)}) of the avoidable "
-        "error of the runs kept aside: of the distance from the calibrated model to the noise floor.</p>"
+        f"{text}\n<p>What was found removes {removed(analysis)} of the avoidable error of the runs kept aside: of the distance "
+        "from the calibrated model to the noise floor. Negative would be: it makes them worse. The interval is Student's, with "
+        f"as many degrees of freedom as there are runs kept aside, less one; fewer than {LEAST_FOR_INTERVAL} give none.</p>"
     )
 
 
@@ -337,8 +346,8 @@ def _how_sure(analysis: Analysis) -> str:
         left = sorted(analysis.adequacy.items(), key=lambda pair: -pair[1] if math.isfinite(pair[1]) else math.inf)
         most = listed([f"{name} ({error(level)})" for name, level in left[:3]])
         parts.append(
-            "<p>What the final model leaves unexplained of each channel, in units of sensor noise: near 1, nothing is left "
-            f"but noise. Most is left of {escape(most)}.</p>"
+            "<p>What the final model leaves of each channel in the fitted runs, in units of sensor noise: near 1, nothing is "
+            f"left but noise. Most is left of {escape(most)}.</p>"
         )
         rows = [(name, channel(name), error(level)) for name, level in left]
         parts.append(folded("Every channel", table(("channel", "", "left"), rows, {2})))
@@ -352,9 +361,13 @@ def _how_sure(analysis: Analysis) -> str:
     return section("How sure", *parts)
 
 
-_SURE = """<p>Confidence is the share of resampled sets of runs in which the same effect is accepted and ranks first. A 95 %
-interval misses the true number in one of 20 cases, provided that nothing else is wrong with the model.</p>"""
-_DETECTABLE = "<p>The smallest size of each effect that would have been noticed. Smaller ones may be there.</p>"
+_SURE = """<p>Confidence: the fitted runs are drawn again and again, with replacement, each with its part in what every
+explanation buys (nothing is fitted anew). It is the share of these draws in which the effect buys enough, the runs agree, and
+no other effect buys more. A 95 % interval misses the true number in one of 20 cases, provided that nothing else is wrong with
+the model.</p>"""
+_DETECTABLE = """<p>The smallest size of each effect that would have been noticed, at the place where it is hardest to see.
+Smaller ones may be there. Of an effect with several directions (a displaced mass: x, y, z) it is the direction that shows best:
+in another it may stay hidden at any size.</p>"""
 
 
 def _next(analysis: Analysis) -> str:
@@ -381,7 +394,8 @@ def _calibration(analysis: Analysis) -> str:
         return ""
     text = (
         "<p>Numbers of the model that are known only to a tolerance were fitted before anything was called missing. "
-        "<i>Moved</i> counts in tolerances: a number that moved by more than 3 is worth a second look.</p>"
+        "<i>Moved</i> counts in tolerances: where a number has moved as far as it may (2.5; biases of sensors 4), doubt the "
+        "tolerance or the model; its interval is set to one tolerance, as the fit tells none.</p>"
     )
     headings, right = ("number", "unit", "nominal", "fitted", "± (95 %)", "tolerance (1 sigma)", "moved"), {2, 3, 4, 5, 6}
     ordered = sorted(analysis.calibration.items(), key=lambda pair: -abs(_shift(pair[1])))
@@ -398,7 +412,7 @@ def _shift(moved: Calibrated) -> float:
 
 def _moved(name: str, moved: Calibrated) -> tuple[str, ...]:
     return (
-        name, moved.unit, number(moved.nominal, 4), number(moved.fitted, 4), number(TWO_SIGMA * moved.uncertainty, 2),
+        name, moved.unit, number(moved.nominal, 4), number(moved.fitted, 4), number(moved.uncertainty, 2),
         number(moved.sigma, 2), f"{_shift(moved):+.1f}",
     )  # fmt: skip
 

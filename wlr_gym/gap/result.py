@@ -21,13 +21,11 @@ from wlr_gym.effects import UNKNOWN_EFFECT, Patch, PatchEffect, save_patch
 from wlr_gym.errors import InputError
 from wlr_gym.files import write_json
 from wlr_gym.gap.analysis import Analysis, Calibrated, Estimate, Evidence, FoundEffect, GapFigures
-from wlr_gym.gap.words import sentence, unit_of
+from wlr_gym.gap.words import closure, sentence, unit_of
 from wlr_gym.plants.forces import COORDINATES
 
 RESULT_FILE, PATCH_FILE = "result.json", "patch.yaml"
 MADE_BY = "wlr gap"
-#: Half of a 95 % interval, in sigmas.
-TWO_SIGMA = 1.959964
 
 
 def _finite(value: Any) -> Any:
@@ -88,7 +86,10 @@ class LocalisationEntry(_Entry):
 
 
 class GapEntry(_Entry):
-    """The gap: rms error of replayed runs, 1.0 = sensor noise."""
+    """The gap: rms error of replayed runs, 1.0 = sensor noise.
+
+    ``reduction`` is negative where the effects make held-out runs worse; its interval is null where these are too few.
+    """
 
     metric: str
     fit_before: MaybeNumber
@@ -97,8 +98,8 @@ class GapEntry(_Entry):
     heldout_calibrated: MaybeNumber
     heldout_after: MaybeNumber
     noise_floor: MaybeNumber
-    reduction: Annotated[float | None, Field(ge=0.0, le=1.0), BeforeValidator(_finite)]
-    reduction_ci95: tuple[MaybeNumber, MaybeNumber]
+    reduction: Annotated[float | None, Field(le=1.0), BeforeValidator(_finite)]
+    reduction_ci95: tuple[MaybeNumber, MaybeNumber] | None
 
 
 class RunsEntry(_Entry):
@@ -130,6 +131,7 @@ class Result(_Entry):
     runs: RunsEntry
     patch: str
     detectable: dict[str, DetectableEntry] = {}
+    closure: str = ""
 
 
 # ---- writing ---------------------------------------------------------------------------------------------------------
@@ -178,6 +180,7 @@ def result_of(analysis: Analysis, patch: Path | str = PATCH_FILE) -> Result:
         "runs": {"fit": list(analysis.fit_runs), "heldout": list(analysis.heldout_runs)},
         "patch": str(patch),
         "detectable": {name: dict(vars(one)) for name, one in analysis.detectable.items()},
+        "closure": closure(analysis),
         "evidence": [_evidence(one) for one in analysis.evidence],
         "run_gaps": [dict(vars(one)) for one in analysis.run_gaps],
         "channel_gaps": [dict(vars(one)) for one in analysis.channel_gaps],
@@ -232,7 +235,7 @@ def _formula(effect: FoundEffect) -> str:
 
 
 def _calibrated(moved: Calibrated) -> dict[str, Any]:
-    half = TWO_SIGMA * moved.uncertainty
+    half = moved.uncertainty
     interval = [moved.fitted - half, moved.fitted + half] if math.isfinite(half) else None
     return {
         "nominal": moved.nominal, "fitted": moved.fitted, "unit": moved.unit, "sigma": moved.sigma, "ci95": interval
@@ -240,7 +243,8 @@ def _calibrated(moved: Calibrated) -> dict[str, Any]:
 
 
 def _gap(gap: GapFigures) -> dict[str, Any]:
-    return {**vars(gap), "reduction_ci95": list(gap.reduction_ci95)}
+    known = all(map(math.isfinite, gap.reduction_ci95))
+    return {**vars(gap), "reduction_ci95": list(gap.reduction_ci95) if known else None}
 
 
 def _evidence(one: Evidence) -> dict[str, Any]:

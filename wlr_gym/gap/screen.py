@@ -114,14 +114,14 @@ def project(problem: Problem, fit: Fit, columns: Sequence[NDArray[np.float32]], 
     return Responses(places, response, push, tight, away, information, *room(problem, fit.model))
 
 
-def screen(candidates: Sequence[Candidate], found: Responses) -> list[Score]:
-    """Return the score of every candidate, best first."""
+def screen(candidates: Sequence[Candidate], found: Responses, cost: float = 0.0) -> list[Score]:
+    """Return the score of every candidate, best first; ``cost`` is that of the model without it."""
     nothing = _fall(found, np.zeros((0, len(found.push))))[0]
-    scores = [score for candidate in candidates if (score := _score(candidate, found, nothing)) is not None]
+    scores = [score for candidate in candidates if (score := _score(candidate, found, nothing, cost)) is not None]
     return sorted(scores, key=lambda score: -score.gain)
 
 
-def _score(candidate: Candidate, found: Responses, nothing: float) -> Score | None:
+def _score(candidate: Candidate, found: Responses, nothing: float, cost: float) -> Score | None:
     best: Score | None = None
     for start in candidate.starts:
         mix = np.zeros((len(start.directions), len(found.push)))
@@ -134,7 +134,7 @@ def _score(candidate: Candidate, found: Responses, nothing: float) -> Score | No
         values, share = _plausible(candidate, start.values, amplitude)
         gain = (fall - nothing) * (2.0 * share - share**2)  # along the way to the minimum of a parabola
         if best is None or gain > best.gain:
-            best = Score(candidate, values, gain, own, information, start, _visible(candidate, start, information))
+            best = Score(candidate, values, gain, own, information, start, _visible(candidate, start, information, cost))
     return best
 
 
@@ -153,14 +153,15 @@ def _fall(found: Responses, mix: Array) -> tuple[float, Array]:
     return -float(2.0 * gradient @ x + x @ matrix @ x), x[known:]
 
 
-def _visible(candidate: Candidate, start: Start, information: Array) -> bool:
+def _visible(candidate: Candidate, start: Start, information: Array, cost: float) -> bool:
     """Whether the smallest severity that would be accepted lies in the plausible range, in some direction."""
     for k in range(len(information)):
         for sign in (1.0, -1.0):
             amplitude = np.zeros(len(information))
-            amplitude[k] = sign * least_amplitude(candidate, information, k)
+            amplitude[k] = sign * least_amplitude(candidate, information, k, cost)
             values = start.values(amplitude)
-            if all(u.low <= v <= u.high for u, v in zip(candidate.unknowns, values, strict=True)):
+            pairs = list(zip(candidate.unknowns, values, strict=True))
+            if all(u.low <= v <= u.high for u, v in pairs) and any(v != u.neutral for u, v in pairs if u.is_size):
                 return True
     return False
 

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from wlr_gym.effects import EFFECTS
 from wlr_gym.gap.analysis import Detectable, Estimate
 from wlr_gym.gap.fit import PINNED, Fit, normal_equations, on_bounds, prior_tightness, scaled_nominal, scaled_numbers, scales
-from wlr_gym.gap.name import EQUIVALENT, Hypothesis
+from wlr_gym.gap.name import EQUIVALENT, MOST_HARM, Hypothesis
 from wlr_gym.gap.problem import Candidate, Problem
-from wlr_gym.gap.screen import LEAST_GAIN, Score, least_amplitude
+from wlr_gym.gap.screen import LEAST_GAIN, Score, least_amplitude, least_gain
 
 Array = NDArray[np.float64]
 
@@ -23,11 +24,17 @@ TWO_SIDED_95 = 1.96
 RIVAL, AGREED = 0.75, 2.0
 
 
+def two_sided_95(degrees: int) -> float:
+    """Return Student's t: half of a 95 % interval in standard errors that so many degrees of freedom tell."""
+    return float(stdtrit(degrees, 0.975))
+
+
 def covariance(problem: Problem, fit: Fit) -> Array:
-    """Return the covariance (numbers, numbers) of all numbers, in their units.
+    """Return the covariance (numbers, numbers) of all numbers, in their units, as wide as 1.96 of its sigmas must be for 95 %.
 
     From the curvature of the likelihood; where leaving out one run after the other (jackknife, one Newton step each) shows more
-    spread, which is what differs from run to run, the number's row and column are widened to that.
+    spread, which is what differs from run to run, the number's row and column are widened to that. A spread that a few runs
+    tell is known to a few degrees of freedom only: it counts Student's t over 1.96 times.
     """
     curvature = fit.covariance()
     parts = [
@@ -40,14 +47,19 @@ def covariance(problem: Problem, fit: Fit) -> Array:
     shifts = [-np.linalg.solve(whole - matrix + stiff, vector - own + pull) for matrix, own in parts]
     spread = np.stack(shifts) - np.mean(shifts, axis=0)
     jackknife = (len(parts) - 1) / len(parts) * (spread**2).sum(axis=0)
-    wider = np.sqrt(np.maximum(jackknife / np.maximum(np.diag(curvature), 1e-300), 1.0))
-    scale = scales(problem, fit.model) * wider
+    wider = np.sqrt(jackknife / np.maximum(np.diag(curvature), 1e-300))
+    few = two_sided_95(len(parts) - 1) / TWO_SIDED_95 if len(parts) > 1 else 1.0
+    scale = scales(problem, fit.model) * np.where(wider > 1.0, few * wider, 1.0)
     return curvature * np.outer(scale, scale)
 
 
-def standard_errors(problem: Problem, fit: Fit) -> Array:
-    """Return one standard error of every number (numbers), in its unit; see :func:`covariance`."""
-    return np.sqrt(np.diag(covariance(problem, fit)))
+def half_widths(problem: Problem, fit: Fit) -> Array:
+    """Return half of the 95 % interval of every number (numbers), in its unit; see :func:`covariance`.
+
+    That of a number on its bound is one tolerance: it is the one that calibration knows least about.
+    """
+    halves = TWO_SIDED_95 * np.sqrt(np.diag(covariance(problem, fit)))
+    return np.where(on_bounds(problem, fit.model), scales(problem, fit.model), halves)
 
 
 def estimates(problem: Problem, fit: Fit) -> list[dict[str, Estimate]]:
@@ -98,16 +110,28 @@ def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[
     return found
 
 
-def confidence(taken: Hypothesis, others: Sequence[Hypothesis]) -> float:
-    """Return the share of bootstrap samples of the runs in which the taken effect is accepted and no other name is better."""
+def confidence(taken: Hypothesis, others: Sequence[Hypothesis], cost: float = 0.0) -> float:
+    """Return the share of bootstrap samples of the runs in which the taken effect is accepted and no other name is better.
+
+    What counts of a run is its part in the gain, as fitted to all runs: no sample is fitted anew. ``cost`` is that of the model
+    without the effect.
+    """
     rng = np.random.default_rng(0)
     rivals = [other for other in others if other.candidate.name != taken.candidate.name and not other.tolerable]
     picks = rng.integers(0, len(taken.by_run), (SAMPLES, len(taken.by_run)))
-    gains = taken.by_run[picks].sum(axis=1)
-    wins = gains > LEAST_GAIN
+    parts = _parts(taken)[picks]
+    gains = parts.sum(axis=1)
+    agreed = -parts.clip(max=0.0).sum(axis=1) <= MOST_HARM * parts.clip(min=0.0).sum(axis=1)
+    wins = agreed & (gains >= least_gain(len(taken.values), cost))
     for rival in rivals:
-        wins &= gains >= rival.by_run[picks].sum(axis=1)
+        wins &= gains >= _parts(rival)[picks].sum(axis=1)
     return float(wins.mean())
+
+
+def _parts(hypothesis: Hypothesis) -> Array:
+    """The runs' parts (runs) in the gain of a hypothesis: their falls of squares, scaled to it."""
+    total = float(hypothesis.by_run.sum())
+    return hypothesis.by_run * (hypothesis.gain / total) if total > 0.0 < hypothesis.gain else hypothesis.by_run
 
 
 def equivalents(taken: Hypothesis, others: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -133,7 +157,9 @@ def _as_good(taken: Hypothesis, other: Hypothesis) -> bool:
 def detectable(scores: Sequence[Score], cost: float = 0.0) -> dict[str, Detectable]:
     """Return the smallest severity of every effect that would have been accepted, at the place where it is hardest to see.
 
-    First order: the gain of an effect grows with the square of its severity. ``cost`` is that of the model without it.
+    Of an effect with directions of its own (x, y, z of a displaced mass) it is the one that shows best: in another it may hide
+    at any size. First order: the gain of an effect grows with the square of its severity. ``cost`` is that of the model without
+    it.
     """
     found: dict[str, tuple[float, Detectable]] = {}
     for score in scores:

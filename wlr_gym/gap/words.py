@@ -13,6 +13,7 @@ from wlr_gym.gap.analysis import (
     NOTHING_MISSING,
     UNKNOWN,
     Analysis,
+    ChannelGap,
     Estimate,
     FoundEffect,
 )
@@ -39,6 +40,14 @@ _SIDES = {
 }
 #: Times what a model without error would reach, from which on there is something left that has no name.
 UNEXPLAINED = 1.5
+#: Groups of channels in words; others as they are.
+_GROUPS = {
+    "pos_leg": "the angles of the legs", "pos_wheel": "the angles of the wheels", "vel_leg": "the speeds of the legs",
+    "vel_wheel": "the speeds of the wheels", "eff_leg": "the motor torques of the legs", "gyro": "the turning rates",
+    "eff_wheel": "the motor torques of the wheels", "acc": "the accelerations", "volt": "the supply voltage",
+    "cam_xy": "the camera's position", "cam_yaw": "the camera's heading", "position": "the angle",
+    "cam_z": "the camera's height", "cam_pitch": "the camera's pitch",
+}  # fmt: skip
 _PLACES = {"ground": "floor", "sensor": "sensors"}
 _MEASURED = {
     "pos_leg": "angle", "pos_wheel": "angle", "vel_leg": "speed", "vel_wheel": "speed",
@@ -115,13 +124,16 @@ def error(value: float) -> str:
 
 def percent(share: float) -> str:
     """Return a share as ``87 %``."""
-    return f"{100.0 * share:.0f} %" if math.isfinite(share) else "-"
+    return f"{round(100.0 * share)} %" if math.isfinite(share) else "-"
 
 
-def interval(low: float, high: float) -> str:
-    """Return ``95 % interval 91 to 97 %`` of a share."""
-    known = math.isfinite(low) and math.isfinite(high)
-    return f"95 % interval {100.0 * low:.0f} to {100.0 * high:.0f} %" if known else "interval unknown"
+def interval(analysis: Analysis) -> str:
+    """Return ``95 % interval 91 to 97 %`` of the reduction; where the runs are too few for one, each run's own."""
+    low, high = analysis.gap.reduction_ci95 if analysis.gap is not None else (math.nan, math.nan)
+    if math.isfinite(low) and math.isfinite(high):
+        return f"95 % interval {round(100.0 * low)} to {round(100.0 * high)} %"
+    single = [percent(one.reduction) for one in analysis.run_gaps if one.heldout and math.isfinite(one.reduction)]
+    return f"run by run {listed(single)}; no interval" if single else "no interval"
 
 
 def unit_of(unit: str) -> str:
@@ -161,10 +173,29 @@ def title(analysis: Analysis) -> str:
 
 def _leaves_something(analysis: Analysis) -> bool:
     """Whether nothing was named although the error of runs kept aside is well above what a model without error would leave."""
+    return analysis.verdict == NOTHING_MISSING and bool(closure(analysis))
+
+
+def closure(analysis: Analysis) -> str:
+    """Return what is left in the runs kept aside, and where, in one sentence; empty if that is hardly more than noise."""
     gap = analysis.gap
-    if analysis.verdict != NOTHING_MISSING or gap is None:
-        return False
-    return gap.heldout_calibrated >= UNEXPLAINED * gap.noise_floor
+    if gap is None or not gap.heldout_after >= UNEXPLAINED * gap.noise_floor:
+        return ""
+    above: dict[str, float] = {}
+    for one in analysis.channel_gaps:
+        above[one.group] = above.get(one.group, 0.0) + _above(one, gap.noise_floor)
+    most = max(above, key=lambda group: above[group], default="")
+    share = above[most] / sum(above.values()) if above and sum(above.values()) > 0.0 else math.nan
+    where = f"; {percent(share)} of it is in {_GROUPS.get(most, most.replace('_', ' '))}" if math.isfinite(share) else ""
+    return (
+        f"Not all is explained: in runs kept aside an error of {error(gap.heldout_after)} is left, where a model without error "
+        f"would reach {error(gap.noise_floor)}{where}."
+    )
+
+
+def _above(gap: ChannelGap, floor: float) -> float:
+    """Mean square of a channel above the noise floor."""
+    return max(gap.after**2 - floor**2, 0.0) if math.isfinite(gap.after) else 0.0
 
 
 def sentence(analysis: Analysis) -> str:
@@ -192,8 +223,7 @@ def _nothing_missing(analysis: Analysis) -> str:
     if not _leaves_something(analysis):
         return f"The model lacks nothing that these runs could show: {rest}{calibrated}."
     return (
-        f"No effect of the library is clear enough in these runs to be named: the model {rest.removeprefix('it ')}{calibrated}"
-        f", where one without error would reach {error(gap.noise_floor)}."
+        f"No effect of the library is clear enough in these runs to be named: the model {rest.removeprefix('it ')}{calibrated}."
     )
 
 
@@ -209,20 +239,27 @@ def _effect_found(analysis: Analysis) -> str:
 
 
 def _unknown(analysis: Analysis) -> str:
-    named = [effect for effect in analysis.effects if effect.name != UNKNOWN_EFFECT]
-    unnamed = [effect for effect in analysis.effects if effect.name == UNKNOWN_EFFECT]
-    beside = f"{listed([f'{plain(effect.name)} ({places(effect.where)})' for effect in named])}, and " if named else ""
-    acts = f" ({places(unnamed[0].where)})" if unnamed else ""
-    formula = "a formula describes it" if any(effect.formula for effect in unnamed) else "no formula describes it, either"
-    return f"The model lacks {beside}something{acts} that no effect of the library explains; {formula}{_bought(analysis)}."
+    acts = f" ({places(analysis.effects[0].where)})" if analysis.effects else ""
+    described = any(effect.formula for effect in analysis.effects)
+    formula = "a formula describes it" if described else "no formula describes it, either"
+    return f"The model lacks something{acts} that no effect of the library explains; {formula}{_bought(analysis)}."
 
 
 def _bought(analysis: Analysis) -> str:
     if analysis.gap is None or not analysis.effects:
         return ""
-    between = interval(*analysis.gap.reduction_ci95)
-    it = "it removes" if len(analysis.effects) == 1 else "they remove"
-    return f"; added, {it} {percent(analysis.gap.reduction)} ({between}) of the avoidable error of runs kept aside"
+    share, one = analysis.gap.reduction, len(analysis.effects) == 1
+    if not math.isfinite(share):
+        return "; the error of runs kept aside is as small without it"
+    if share < 0.0:
+        does = "makes" if one else "make"
+        return f"; added, {'it' if one else 'they'} {does} the error of runs kept aside larger: {removed(analysis)}"
+    return f"; added, {'it removes' if one else 'they remove'} {removed(analysis)} of the avoidable error of runs kept aside"
+
+
+def removed(analysis: Analysis) -> str:
+    """Return ``95 % (95 % interval 91 to 97 %)``: what the effects remove of the avoidable error; negative = they add to it."""
+    return f"{percent(analysis.gap.reduction if analysis.gap else math.nan)} ({interval(analysis)})"
 
 
 def _others(names: Sequence[str], effects: Sequence[FoundEffect]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.effects import Source, load_patch
-from wlr_gym.errors import unknown_name
+from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.gap import analysis as words
 from wlr_gym.gap.analysis import Analysis, Calibrated, Equivalent, Evidence, FoundEffect, IntakeFinding
 from wlr_gym.gap.fit import Fit, fit, nominal_model, widened
@@ -20,7 +20,7 @@ from wlr_gym.gap.problem import Problem
 from wlr_gym.gap.prove import mean_of_runs, mean_squares, prove
 from wlr_gym.gap.recommend import recommend, separating_run
 from wlr_gym.gap.split import informative_split, named_split
-from wlr_gym.gap.sure import confidence, detectable, equivalents, estimates, standard_errors
+from wlr_gym.gap.sure import confidence, detectable, equivalents, estimates, half_widths
 from wlr_gym.gap.traces import telling_traces
 from wlr_gym.provenance import provenance
 
@@ -70,12 +70,14 @@ def analyse(
 
         opened = open_robot(data, known, backend, threads)
     elif rig in RIGS:
-        from wlr_gym.gap.rig.open import open_rig
+        from wlr_gym.gap.rig.open import open_rig, rig_patch
 
-        opened = open_rig(data, load_patch(known))
+        known = rig_patch(known)
+        opened = open_rig(data, known)
     else:
         raise unknown_name("rig", rig, RIGS)
     problem, findings = opened
+    _refuse_left_out(heldout, findings)
     done = (
         _bad_data(str(data), findings)
         if problem is None
@@ -87,6 +89,14 @@ def analyse(
         tell("drawing", STAGES["drawing"])
         save_analysis(done, Path(out))
     return done
+
+
+def _refuse_left_out(heldout: Sequence[str], findings: Sequence[IntakeFinding]) -> None:
+    """A run that cannot be used cannot be kept for the proof either."""
+    for finding in findings:
+        if finding.fatal and finding.run in heldout:
+            place = f"{finding.run} {finding.channel}".strip()
+            raise InputError(f"--heldout {finding.run}: the run cannot be used: {place}: {finding.text}")
 
 
 def _bad_data(data: str, findings: Sequence[IntakeFinding]) -> Analysis:
@@ -111,7 +121,7 @@ def analyse_problem(
     base = fit(problem, fitted, start, scatter=scatter, columns=columns, steps=problem.steps, tell=clock.detail)
     base = widened(problem, fitted, base)
     clock.start("naming")
-    naming = name_effects(problem, fitted, base, sealed, clock.detail, columns)
+    naming = name_effects(problem, fitted, base, clock.detail, columns)
     base = naming.calibrated
     clock.start("proving")
     models = (nominal_model(problem), base.model, naming.fit.model)
@@ -140,7 +150,7 @@ def analyse_problem(
         tuple(entry for number, look in enumerate(naming.rounds, 1) for entry in _evidence(problem, number, look, fitted)),
         places,
         maps,
-        telling_traces(problem, fitted, sealed, models, places),
+        telling_traces(problem, sealed, models, places),
         gap,
         run_gaps,
         channel_gaps,
@@ -199,7 +209,7 @@ def _effects(problem: Problem, naming: Naming) -> tuple[FoundEffect, ...]:
         look = next(r for r in naming.rounds if r.taken is not None and r.taken.candidate.label == candidate.label)
         assert look.taken is not None
         effect = candidate.effect(values)
-        sure = confidence(look.taken, look.hypotheses)
+        sure = confidence(look.taken, look.hypotheses, look.cost)
         found.append(
             FoundEffect(candidate.name, candidate.where, own, sure, look.taken.gain, effect.formula, dict(effect.units))
         )
@@ -221,10 +231,10 @@ def _equivalent(problem: Problem, naming: Naming) -> tuple[Equivalent, ...]:
 
 
 def _calibration(problem: Problem, found: Fit) -> dict[str, Calibrated]:
-    errors = standard_errors(problem, found)
+    halves = half_widths(problem, found)
     return {
-        quantity.name: Calibrated(quantity.nominal, float(value), quantity.unit, quantity.sigma, float(error))
-        for quantity, value, error in zip(problem.quantities, found.model.quantities, errors, strict=False)
+        quantity.name: Calibrated(quantity.nominal, float(value), quantity.unit, quantity.sigma, float(half))
+        for quantity, value, half in zip(problem.quantities, found.model.quantities, halves, strict=False)
     }
 
 
@@ -270,7 +280,7 @@ def _fate(hypothesis: Hypothesis, look: Round, equal: set[str]) -> tuple[str, st
     if hypothesis.tolerable:
         return "within tolerance", "the tolerances of known numbers allow as much"
     if not hypothesis.carries_over:
-        return "does not carry over", "runs that were not fitted do not get better by it"
+        return "does not carry over", "runs do not get better by what the others tell of it"
     if not hypothesis.consistent:
         return "inconsistent", "helps some runs and harms others"
     if best is None:

@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import beta, binom
 
+from wlr_gym.bench.blind.copies import nominal, read_robot
 from wlr_gym.bench.blind.truth import NAMED
+from wlr_gym.paths import data_directory
 
-#: What a result is called that names nothing of the vocabulary.
-NOTHING, UNKNOWN, BAD, QUIET, FAILED = "nothing_missing", "unknown_effect", "bad_data", "not_excited", "failed"
-#: Value at which a parameter means nothing; 0 where not listed. Errors count from there.
-NEUTRAL = {"scale": 1.0, "ratio": {"friction_anisotropy": 1.0}}
-#: Parameters that belong to one vector, whose error is the length of the difference.
-VECTORS = {
+#: Verdict, and name, of a law outside the vocabulary.
+UNKNOWN = "unknown_effect"
+#: Answers that send the data back, and the one that is none: the analysis broke.
+REFUSALS, FAILED = ("refused", "bad_data", "not_excited"), "failed"
+#: Parameters that do not say how large an effect is, but where it acts or what form it has. All others are its size.
+SHAPE = {
+    "torque_ripple": ("order", "phase"),
+    "stribeck_friction": ("stribeck_speed",),
+    "slip_weakening": ("slip_speed",),
+    "friction_patch": ("x_min", "x_max", "y_min", "y_max"),
     "payload": ("x", "y", "z"),
-    "com_offset": ("x", "y", "z"),
-    "floor_slope": ("pitch", "roll"),
-    "external_force": ("fx", "fy"),
     "tether": ("x", "y"),
-    "gyro_bias": ("x", "y", "z"),
-    "imu_misalignment": ("roll", "pitch", "yaw"),
-    "friction_patch": ("x_min", "x_max"),
 }
-#: Angles of periodic laws, whose error is not relative.
-PHASES = ("phase",)
+#: A whole number and an angle of periodic laws: neither has a relative error.
+ORDER, PHASE = "order", "phase"
 #: A name counts as right at this severity and above, where nothing is said about severity.
 CLEAR = 2.0
 
@@ -104,23 +106,46 @@ def _names_within(group: Any) -> set[str]:
     return set().union(*map(_names_within, group)) if isinstance(group, Sequence) else set()
 
 
-def parameter_errors(truth: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, float]:
-    """Return relative errors of the parameters of one effect, from their neutral values; vectors count as one."""
-    name, true, fitted = truth["name"], truth["parameters"], found["parameters"]
-    vector = [key for key in VECTORS.get(name, ()) if key in true or key in fitted]
-    errors = {}
-    for key in true:
-        if key in vector or key in PHASES or key not in fitted:
-            continue
-        neutral = NEUTRAL.get(key, 0.0)
-        neutral = neutral.get(name, 0.0) if isinstance(neutral, dict) else neutral
-        size = abs(true[key] - neutral)
-        if size > 0:
-            errors[key] = abs(_value(fitted[key]) - true[key]) / size
-    if vector and (size := float(np.linalg.norm([true.get(key, 0.0) for key in vector]))) > 0:
-        difference = [_value(fitted.get(key, 0.0)) - true.get(key, 0.0) for key in vector]
-        errors["+".join(vector)] = float(np.linalg.norm(difference)) / size
-    return errors
+def neutral(name: str, parameter: str) -> float:
+    """Return the value at which an effect vanishes: a floor like the nominal one, a factor of 1, else 0."""
+    if parameter in ("mu", "mu_k"):
+        return _floor_friction()
+    return 1.0 if parameter == "scale" or name == "friction_anisotropy" else 0.0
+
+
+@cache
+def _floor_friction() -> float:
+    return nominal(read_robot(data_directory("configs") / "robot" / "nominal.yaml")).mu
+
+
+def size_error(truth: Mapping[str, Any], found: Mapping[str, Any]) -> float:
+    """Return how far off the size of one effect is, relative to the true size: 1.0 = as wrong as not seen at all.
+
+    The size is what parameters differ by from where the effect vanishes; several of them count as a vector, and one that is
+    not given is at that value.
+    """
+    shape = SHAPE.get(truth["name"], ())
+    return _vector_error(truth, found, [key for key in {**truth["parameters"], **found["parameters"]} if key not in shape])
+
+
+def shape_error(truth: Mapping[str, Any], found: Mapping[str, Any]) -> float | None:
+    """Return the relative error of place or form, as one vector; None for an effect that has neither."""
+    shape = [key for key in SHAPE.get(truth["name"], ()) if key in truth["parameters"] and key not in (ORDER, PHASE)]
+    return _vector_error(truth, found, shape) if shape else None
+
+
+def _vector_error(truth: Mapping[str, Any], found: Mapping[str, Any], keys: Sequence[str]) -> float:
+    zero = np.array([neutral(truth["name"], key) for key in keys])
+    true = np.array([truth["parameters"].get(key, value) for key, value in zip(keys, zero, strict=True)])
+    fitted = np.array([_value(found["parameters"].get(key, value)) for key, value in zip(keys, zero, strict=True)])
+    return float(np.linalg.norm(fitted - true) / np.linalg.norm(true - zero))
+
+
+def order_found(truth: Mapping[str, Any], found: Mapping[str, Any]) -> bool | None:
+    """Say whether the order of a ripple is right, as whole numbers; None for an effect without."""
+    if ORDER not in truth["parameters"]:
+        return None
+    return ORDER in found["parameters"] and round(_value(found["parameters"][ORDER])) == truth["parameters"][ORDER]
 
 
 def _value(parameter: Any) -> float:
@@ -131,7 +156,7 @@ def intervals_hold(truth: Mapping[str, Any], found: Mapping[str, Any]) -> list[b
     """Say for each true parameter with an interval whether it lies inside."""
     holds = []
     for key, value in truth["parameters"].items():
-        if key in PHASES:
+        if key == PHASE:
             continue
         interval = (found["parameters"].get(key) or {}) if isinstance(found["parameters"].get(key), Mapping) else {}
         low, high = interval.get("ci95") or (None, None)
@@ -147,7 +172,8 @@ def score(results: Mapping[str, Result], truths: Mapping[str, Truth]) -> dict[st
     """Score results, by the names of their sets, against truths.
 
     Args:
-        results: contents of ``result.json``, or ``{"verdict": "refused" | "failed", "message": ...}``.
+        results: contents of ``result.json``, or ``{"verdict": "refused" | "failed", "message": ...}``; under ``blind_test`` the
+            commit that analysed it, where that is known.
         truths: as of ``cases.Case.as_dict``; those without a result are left out.
 
     Returns:
@@ -158,15 +184,17 @@ def score(results: Mapping[str, Result], truths: Mapping[str, Truth]) -> dict[st
     clear = [pair for pair in of["effect"] if pair[0]["severity"] >= CLEAR]
     return {
         "sets": len(scored),
+        "commits": dict(Counter(_commit(result) for _, result in scored).most_common()),
         "false_alarms": {
-            "none": _share(at_most, [_alarm(result) for _, result in of["none"]]),
-            "parameters": _share(at_most, [_alarm(result) for _, result in of["parameters"]]),
+            "none": _share(at_most, [_alarm(result) for _, result in of["none"] if _answered(result)]),
+            "parameters": _share(at_most, [_alarm(result) for _, result in of["parameters"] if _answered(result)]),
             "refused_good_data": _share(at_most, [_refused(r) for t, r in scored if t["kind"] != "bad"]),
         },
         "single": _single(of["effect"], clear),
         "pairs": _pairs(of["pair"]),
         "outside": _outside(of["stranger"]),
-        "bad_data": _share(at_least, [_caught(result) for _, result in of["bad"]]),
+        "bad_data": _share(at_least, [_refused(result) for _, result in of["bad"]]),
+        "crashed": _share(at_most, [result["verdict"] == FAILED for _, result in scored]),
         "failed": sorted(truth["name"] for truth, result in scored if result["verdict"] == FAILED),
         "seconds": _quantiles([result["wall_seconds"] for _, result in scored if "wall_seconds" in result]),
         "confusion": confusion(scored),
@@ -185,11 +213,16 @@ def _alarm(result: Result) -> bool:
 
 
 def _refused(result: Result) -> bool:
-    return result["verdict"] in ("refused", BAD, FAILED)
+    return result["verdict"] in REFUSALS
 
 
-def _caught(result: Result) -> bool:
-    return result["verdict"] in ("refused", BAD, QUIET)
+def _answered(result: Result) -> bool:
+    """Whether there is an answer about what is missing: silence of a crash or a refusal is none."""
+    return not _refused(result) and result["verdict"] != FAILED
+
+
+def _commit(result: Result) -> str:
+    return (result.get("blind_test") or {}).get("commit") or "unknown"
 
 
 def _top(truth: Truth, result: Result) -> bool:
@@ -217,19 +250,26 @@ def _single(pairs: Sequence[tuple[Truth, Result]], clear: Sequence[tuple[Truth, 
             "in_set": _share(at_least, [_in_set(truth, result) for truth, result in chosen]),
         }
     matched = [match for truth, result in clear for match in _matched(truth, result)]
-    errors = [error for true, found in matched for error in parameter_errors(true, found).values()]
+    shapes = [error for true, found in matched if (error := shape_error(true, found)) is not None]
+    orders = [right for true, found in matched if (right := order_found(true, found)) is not None]
     holds = [hold for true, found in matched for hold in intervals_hold(true, found)]
     gaps = [result.get("gap") or {} for _, result in clear if _alarm(result)]
+    reductions = [gap["reduction"] for gap in gaps if gap.get("reduction") is not None]
+    extra = [set(found_names(r)) != {t["effects"][0]["name"]} for t, r in clear if t["effects"][0]["name"] in found_names(r)]
     return {
         "by_severity": by_severity,
         "top1": _share(at_least, [_top(truth, result) for truth, result in clear]),
         "in_set": _share(at_least, [_in_set(truth, result) for truth, result in clear]),
         "mean_set_size": _mean([len(equivalence_set(r)) for _, r in clear if _alarm(r)]),
         "place": _share(at_least, [_same_place(true, found) for true, found in matched]),
-        "extra_names": _mean([len(set(found_names(r)) - {t["effects"][0]["name"]}) for t, r in clear if _alarm(r)]),
-        "parameter_error": _quantiles(errors),
-        "interval_coverage": _share(at_least, holds),
-        "gap_reduction": _quantiles([gap["reduction"] for gap in gaps if gap.get("reduction") is not None]),
+        "extra_name": _share(at_most, extra),
+        "size_error": _quantiles([size_error(true, found) for true, found in matched]),
+        "shape_error": _quantiles(shapes),
+        "order": _share(at_least, orders),
+        "interval_coverage": {**_share(at_least, holds), "bound95_above": at_most(sum(holds), len(holds)).bound},
+        "gap_reduction": _quantiles(reductions),
+        "gap_reduction_of_all": _quantiles(reductions + [0.0] * (len(clear) - len(reductions))),
+        "gap_grew_surely": _share(at_most, [high < 0 for gap in gaps if (high := _upper_end(gap)) is not None]),
         "gap_grew": _share(at_most, [_grew(gap) for gap in gaps]),
         "confidence": _calibration(clear),
     }
@@ -244,6 +284,11 @@ def _grew(gap: Mapping[str, Any]) -> bool:
     return after is not None and before is not None and after > 1.02 * before
 
 
+def _upper_end(gap: Mapping[str, Any]) -> float | None:
+    """Upper end of the reduction's interval; None where the runs kept aside were too few for one."""
+    return (gap.get("reduction_ci95") or (None, None))[1]
+
+
 def _pairs(pairs: Sequence[tuple[Truth, Result]]) -> dict[str, Any]:
     def names(truth: Truth) -> set[str]:
         return {effect["name"] for effect in truth["effects"]}
@@ -256,11 +301,13 @@ def _pairs(pairs: Sequence[tuple[Truth, Result]]) -> dict[str, Any]:
 
 
 def _outside(pairs: Sequence[tuple[Truth, Result]]) -> dict[str, Any]:
-    """A stranger is answered rightly by a formula or ``unknown_effect``, wrongly by a name; silence is neither."""
-    right = [set(found_names(result)) == {UNKNOWN} or headline(result) == UNKNOWN for _, result in pairs]
-    silent = [not _alarm(result) for _, result in pairs]
-    wrong = [not r and not s for r, s in zip(right, silent, strict=True)]
-    return {"not_misnamed": _share(at_least, [not w for w in wrong]), "unknown": _share(at_least, right), "silent": sum(silent)}
+    """A stranger is answered rightly by a formula or ``unknown_effect`` and no name of the vocabulary beside it.
+
+    Silence names nothing wrong, and is still no answer; a crash or a refusal is neither.
+    """
+    right = [{headline(result), *found_names(result)} == {UNKNOWN} for _, result in pairs]
+    unnamed = [_answered(result) and set(found_names(result)) <= {UNKNOWN} for _, result in pairs]
+    return {"unknown": _share(at_least, right), "not_misnamed": _share(at_least, unnamed)}
 
 
 def _calibration(pairs: Sequence[tuple[Truth, Result]]) -> dict[str, Any]:
@@ -277,16 +324,27 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _quantiles(values: Sequence[float]) -> dict[str, float | int | None]:
+    """Return quantiles and bounds of the median; "worst" is the largest value."""
     if not len(values):
-        return {"median": None, "p90": None, "worst": None, "count": 0}
-    array = np.asarray(values, dtype=float)
+        return dict.fromkeys(("median", "at_least95", "at_most95", "p90", "worst", "lowest"), None) | {"count": 0}
+    array = np.sort(np.asarray(values, dtype=float))
+    low, high = _median_bounds(array)
     return {
         "median": float(np.median(array)),
+        "at_least95": low,
+        "at_most95": high,
         "p90": float(np.quantile(array, 0.9)),
         "worst": float(array.max()),
         "lowest": float(array.min()),
         "count": len(array),
     }
+
+
+def _median_bounds(ordered: np.ndarray) -> tuple[float | None, float | None]:
+    """One-sided 95 % bounds of a median from order statistics, whatever the distribution; none for fewer than five values."""
+    count = len(ordered)
+    rank = int(binom.ppf(0.95, count, 0.5))
+    return (float(ordered[count - 1 - rank]), float(ordered[rank])) if rank < count else (None, None)
 
 
 def confusion(scored: Sequence[tuple[Truth, Result]]) -> dict[str, dict[str, int]]:

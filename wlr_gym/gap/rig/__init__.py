@@ -7,8 +7,8 @@ them (:mod:`.intake`), a fast simulation (:mod:`.law`, :mod:`.kernel`, :mod:`.re
 
 from wlr_gym.gap.rig.intake import findings
 from wlr_gym.gap.rig.model import RIG_EFFECTS
-from wlr_gym.gap.rig.open import open_rig
+from wlr_gym.gap.rig.open import open_rig, rig_patch
 from wlr_gym.gap.rig.problem import RigProblem
 from wlr_gym.gap.rig.recording import Recording, read_recordings
 
-__all__ = ["RIG_EFFECTS", "Recording", "RigProblem", "findings", "open_rig", "read_recordings"]
+__all__ = ["RIG_EFFECTS", "Recording", "RigProblem", "findings", "open_rig", "read_recordings", "rig_patch"]

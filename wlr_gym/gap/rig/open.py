@@ -1,14 +1,23 @@
-"""Open a folder of the rig's recordings: read, check, and make a problem of them."""
+"""Open a folder of the rig's recordings: read, check, and make a problem of them; and patches in the rig's own vocabulary."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from wlr_gym.effects import Patch
+from wlr_gym.codegen.expression import finite_number
+from wlr_gym.effects import UNKNOWN_EFFECT, EffectParameter, Patch, PatchEffect, Source, compose
+from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.gap.analysis import IntakeFinding
+from wlr_gym.gap.rig.formula import rig_force
 from wlr_gym.gap.rig.intake import findings
+from wlr_gym.gap.rig.model import JOINT, RIG_EFFECTS
 from wlr_gym.gap.rig.problem import RigProblem
 from wlr_gym.gap.rig.recording import read_recordings
+from wlr_gym.parameters import range_in_words
+from wlr_gym.paths import find_config
+from wlr_gym.robot import read_yaml
 
 #: Recordings that an analysis needs: two to fit, one for the proof.
 LEAST_RUNS = 3
@@ -34,3 +43,56 @@ def open_rig(data: str | Path, known: Patch | None = None) -> tuple[RigProblem |
         text = f"{len(good)} usable runs of {len(recordings)}: record {LEAST_RUNS} or more, two to fit and one for the proof"
         return None, [*found, IntakeFinding("", "", "few_runs", text, fatal=True)]
     return RigProblem(good, known.effects if known else ()), found
+
+
+def rig_patch(source: Source) -> Patch:
+    """Load a patch of the rig, as its analyses write it: effects of :data:`RIG_EFFECTS` at its joint.
+
+    Args:
+        source: as for :func:`wlr_gym.effects.load_patch`.
+
+    Raises:
+        InputError: naming file, effect, key and the nearest valid name.
+    """
+    if source is None or isinstance(source, Patch):
+        return source or Patch()
+    if isinstance(source, str | Path):
+        path = find_config("effects", source)
+        content, name = read_yaml(path), str(path)
+    elif isinstance(source, Mapping):
+        content, name = {"effects": [source]} if "name" in source else source, "effects"
+    else:
+        return compose(*(rig_patch(one) for one in source))
+    entries = content.get("effects") if isinstance(content, Mapping) else None
+    if not isinstance(entries, list | tuple):
+        raise InputError(f"{name}: expected a mapping with 'effects', a list of effects")
+    effects = tuple(_effect(entry, f"{name}: effect {k}") for k, entry in enumerate(entries, 1))
+    origin: Any = content.get("provenance") or {}
+    return Patch(effects, dict(origin), name)
+
+
+def _effect(entry: Any, place: str) -> PatchEffect:
+    if not isinstance(entry, Mapping) or not isinstance(entry.get("parameters", {}), Mapping):
+        raise InputError(f"{place}: expected a mapping with 'name', 'where' and 'parameters', got {entry!r}")
+    name, given = str(entry.get("name")), dict(entry.get("parameters", {}))
+    if name not in (*RIG_EFFECTS, UNKNOWN_EFFECT):
+        raise unknown_name("effect of the test rig", name, RIG_EFFECTS, place)
+    if entry.get("where", JOINT) not in (JOINT, [JOINT], (JOINT,)):
+        raise InputError(f"{place} ({name}): where = {entry['where']!r}: the rig has one joint, {JOINT}")
+    if name == UNKNOWN_EFFECT:
+        effect = PatchEffect(name, (JOINT,), given, str(entry.get("formula")), dict(entry.get("units") or {}), place)
+        rig_force(effect)
+        return effect
+    known = RIG_EFFECTS[name].parameters
+    for key in given:
+        if key not in known:
+            raise unknown_name("parameter", str(key), known, f"{place} ({name})")
+    numbers = {key: _number(given.get(key), spec, f"{place} ({name}): {key}") for key, spec in known.items()}
+    return PatchEffect(name, (JOINT,), numbers, place=place)
+
+
+def _number(value: Any, spec: EffectParameter, place: str) -> float:
+    number = finite_number(spec.neutral if value is None and spec.optional else value)
+    if number is None or not spec.low <= number <= spec.high:
+        raise InputError(f"{place} = {value!r}: expected a number in {range_in_words(spec.low, spec.high, spec.unit)}")
+    return number

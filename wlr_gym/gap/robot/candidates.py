@@ -192,7 +192,7 @@ def _friction_and_motors(lists: _Lists) -> None:
     for places, starts in _per_place(lists, "weak_motor", _OF_JOINTS[:-1], "scale", [-0.1], 1.0).items():
         lists.add("weak_motor", places, starts)
     for places, starts in _per_place(lists, "command_delay", _OF_JOINTS, "delay", [0.015]).items():
-        lists.add("command_delay", places, starts)
+        lists.add("command_delay", places, starts, tolerances=_beside_latency(lists) if set(places) == set(JOINTS) else ())
     for kind in (_OF_LEGS, _OF_WHEELS):
         found: dict[tuple[str, ...], list[Start]] = {places: [] for places in kind}
         for speed in (0.1, 1.0):
@@ -213,6 +213,12 @@ def _friction_and_motors(lists: _Lists) -> None:
             lists.add("stribeck_friction", places, found[places])
     sag = lists.probe("supply_sag", ("body",), {"resistance": 0.2})
     lists.add("supply_sag", ("body",), [Start(((sag,),), _scaled(0.2))])
+
+
+def _beside_latency(lists: _Lists) -> tuple[Tolerance, ...]:
+    """What a delay of all joints adds to: the latency of a host, known so well."""
+    name = "command.delay"
+    return (Tolerance((name,), lists.tolerances[name], REACH),) if name in lists.tolerances else ()
 
 
 def _backlash(lists: _Lists) -> None:
