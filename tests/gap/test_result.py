@@ -114,9 +114,9 @@ def test_unknown_effect_without_formula_stays_out_of_the_patch(tmp_path):
 def test_what_is_no_number_becomes_null(tmp_path):
     (effect,) = examples.EFFECT_FOUND.effects
     unsure = replace(effect, parameters={"coefficient": Estimate(0.04, math.nan, math.inf, "-")}, gain=math.nan)
-    analysis = replace(
-        examples.EFFECT_FOUND, effects=(unsure,), run_gaps=(RunGap("run_01", False, math.nan, 2.0, 1.0, math.nan),)
-    )
+    nothing = RunGap("run_01", False, math.nan, 2.0, 1.0, math.nan)
+    few_runs = replace(examples.GAP, reduction_ci95=(math.nan, math.nan))
+    analysis = replace(examples.EFFECT_FOUND, effects=(unsure,), run_gaps=(nothing,), gap=few_runs)
     text = write_result(analysis, tmp_path).read_text()
     assert "NaN" not in text
     assert "Infinity" not in text

@@ -63,6 +63,7 @@ def prove(
     squares = [mean_squares([r[k] for r in found], problem.cap) for k in range(3)]
     inside, outside = slice(0, len(fitted)), slice(len(fitted), None)
     before, calibrated, after = (level(s[outside]) for s in squares)
+    singly = [min(reduction(was, now, floor), 1.0) for was, now in zip(squares[1], squares[2], strict=True)]
     figures = GapFigures(
         problem.metric,
         level(squares[0][inside]),
@@ -75,8 +76,8 @@ def prove(
         _interval(squares[1][outside], squares[2][outside], floor),
     )
     gaps = tuple(
-        RunGap(problem.runs[run], k >= len(fitted), *(level(s[k]) for s in squares), reduction=_published(*(s[k] for s in squares[1:]), floor))
-        for k, run in enumerate((*fitted, *heldout))
+        RunGap(problem.runs[run], k >= len(fitted), *(level(s[k]) for s in squares), reduction=closed)
+        for k, (run, closed) in enumerate(zip((*fitted, *heldout), singly, strict=True))
     )
     channels = tuple(
         ChannelGap(
