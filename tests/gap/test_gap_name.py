@@ -19,6 +19,7 @@ from wlr_gym.gap.name import (
     carries_over,
     drop_idle,
     finalists,
+    looked_around,
     name_effects,
     refit,
     settle,
@@ -240,6 +241,31 @@ def test_effect_that_is_taken_settles_also_from_the_model_as_given():
     assert settled.fit.model.quantities[0] == pytest.approx(NOMINAL[0], abs=0.3 * SIGMA[0])
     assert settled.hypothesis.values == settled.fit.model.effects[0][1]
     assert settled.hypothesis.gain > LEAST_GAIN
+
+
+class Bump(Toy):
+    """``bump`` is felt at its place only: from afar no small step shows where that is."""
+
+    def effect_response(self, effect, run):
+        if effect.name != "bump":
+            return super().effect_response(effect, run)
+        near = np.exp(-0.5 * ((np.arange(self.rows) - effect.parameters["place"]) / 1.5) ** 2)
+        return effect.parameters["size"] * near[:, None] * np.ones(3)
+
+
+def test_effect_that_settles_looks_around_for_its_place(monkeypatch):
+    unknowns = (Unknown("size", "1", 0.0, -10.0, 10.0, 0.5), Unknown("place", "row", 0.0, 0.0, 200.0, 8.0, is_size=False))
+    bump = Candidate("bump", ("body",), unknowns, ())
+    problem = Bump({}, [bump.effect((3.0, 100.0))], rows=200)
+    lost = fit(problem, RUNS, nominal_model(problem).with_effect(bump, (3.0, 132.0)), steps=0)
+    assert lost.model.effects[0][1][1] > 120.0
+    assert looked_around(problem, RUNS, lost).effects[0][1][1] == pytest.approx(100.0, abs=2.0)
+    base = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
+    found = Hypothesis(bump, lost.model, 1.0, np.ones(5), 1.0, lost.residuals, base.model, base.residuals)
+    # with fits that hardly move
+    monkeypatch.setattr(naming_module, "fit", lambda *arguments, **options: fit(*arguments, **options | {"steps": 0}))
+    settled, _ = settle(problem, RUNS, Final(found, lost), base, lambda text: None)
+    assert settled.hypothesis.values[1] == pytest.approx(100.0, abs=2.0)
 
 
 def test_known_numbers_that_a_whole_fit_finds_count_for_nothing():

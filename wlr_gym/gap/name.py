@@ -7,6 +7,7 @@ its value lies inside its plausible range. In the end every effect must still be
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -60,6 +61,8 @@ NOTICED = 0.25
 NUDGES = 2
 #: Steps, at most, in which a model with an effect that is taken settles.
 SETTLING = 8
+#: Steps by which a settling effect looks for a better place, in every unknown that says where it is or over what it fades.
+LOOKS = (-8.0, -4.0, 0.0, 4.0, 8.0)
 #: Effects in one analysis.
 MOST_EFFECTS = 4
 #: A named effect is preferred to a formula if it buys at least this share of what the formula buys.
@@ -492,16 +495,30 @@ def settle(problem: Problem, runs: Sequence[int], final: Final, bare: Fit, tell:
     best model without it.
 
     Beside a strong effect the cost has several minima: known numbers that calibration had moved in the effect's place stay
-    where they are and leave it too small.
+    where they are and leave it too small; and the edge of a patch that one run alone has crossed is not seen from afar.
     """
     tell(f"settling {final.hypothesis.candidate.label}, also from the model as given")
     found = final.fit
-    starts = (found.model, untouched(problem, found.model))
+    starts = (looked_around(problem, runs, found), untouched(problem, found.model))
     more = [fit(problem, runs, start, scatter=found.noise.scatter, steps=SETTLING, tell=tell) for start in starts]
     best = _cheapest(problem, (found, *more), found.noise.memory)
     memory = best.noise.memory
     bare = _cheapest(problem, [bare, _left(problem, runs, best, final.hypothesis.candidate, memory)], memory)
     return _judged(problem, runs, final.hypothesis, best, bare, memory), bare
+
+
+def looked_around(problem: Problem, runs: Sequence[int], found: Fit) -> Model:
+    """The model with the last effect where it explains most: steps apart in each unknown that does not say how large it is."""
+    candidate, values = found.model.effects[-1]
+    steps = [np.array(LOOKS) * u.step if not u.is_size else np.zeros(1) for u in candidate.unknowns]
+    places = {candidate.kept((np.array(values) + moves).tolist()) for moves in itertools.product(*steps)}
+    without = found.model.without_effect(-1)
+    models = [found.model, *(without.with_effect(candidate, place) for place in sorted(places - {tuple(values)}))]
+    if len(models) == 1:
+        return found.model
+    residuals = problem.residuals([model.setting for model in models], runs)
+    costs = [total_cost(problem, model, [r[k] for r in residuals], found.noise.memory) for k, model in enumerate(models)]
+    return models[int(np.argmin(costs))]
 
 
 def _by_run(before: Sequence[Array], after: Sequence[Array], noise: Noise) -> Array:
