@@ -452,7 +452,7 @@ def carries_over(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit, g
 def told_by_others(problem: Problem, found: Fit) -> list[Model]:
     """The model as it would be without each run in turn, to first order."""
     parts = [normal_equations([c], [r], found.noise) for c, r in zip(found.columns, found.residuals, strict=True)]
-    matrix, vector = sum(m for m, _ in parts), sum(v for _, v in parts)
+    matrix, vector = np.sum([m for m, _ in parts], axis=0), np.sum([v for _, v in parts], axis=0)
     settled = constrained_step(problem, found.model, matrix, vector)
     steps = [constrained_step(problem, found.model, matrix - own, vector - pull) for own, pull in parts]
     return [moved(problem, found.model, step - settled) for step in steps]
