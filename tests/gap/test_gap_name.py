@@ -6,29 +6,17 @@ import numpy as np
 import pytest
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
+from wlr_gym.gap import judge
 from wlr_gym.gap import name as naming_module
 from wlr_gym.gap.fit import Fit, fit, linearise, nominal_model, total_cost
+from wlr_gym.gap.hypothesis import Hypothesis
+from wlr_gym.gap.judge import Final, carries_over, finalists, looked_around, settle, told_by_others
 from wlr_gym.gap.likelihood import estimate_noise
-from wlr_gym.gap.name import (
-    EQUIVALENT,
-    MOST_EFFECTS,
-    PER_NAME,
-    SHORTLIST,
-    Final,
-    Hypothesis,
-    carries_over,
-    drop_idle,
-    finalists,
-    looked_around,
-    name_effects,
-    refit,
-    settle,
-    shortlist,
-    told_by_others,
-)
+from wlr_gym.gap.name import MOST_EFFECTS, PER_NAME, SHORTLIST, drop_idle, name_effects, shortlist
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
+from wlr_gym.gap.refit import refit
 from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
-from wlr_gym.gap.sure import equivalents
+from wlr_gym.gap.sure import EQUIVALENT, equivalents
 
 RUNS = range(5)
 
@@ -263,7 +251,7 @@ def test_effect_that_settles_looks_around_for_its_place(monkeypatch):
     base = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
     found = Hypothesis(bump, lost.model, 1.0, np.ones(5), 1.0, lost.residuals, base.model, base.residuals)
     # with fits that hardly move
-    monkeypatch.setattr(naming_module, "fit", lambda *arguments, **options: fit(*arguments, **options | {"steps": 0}))
+    monkeypatch.setattr(judge, "fit", lambda *arguments, **options: fit(*arguments, **options | {"steps": 0}))
     settled, _ = settle(problem, RUNS, Final(found, lost), base, lambda text: None)
     assert settled.hypothesis.values[1] == pytest.approx(100.0, abs=2.0)
 
@@ -297,10 +285,10 @@ def test_finalists_are_judged_against_the_same_model(monkeypatch):
     def fitted(problem, runs, model, **_):
         return levelled(model, levels[model.effects[-1][0].name][0])
 
-    monkeypatch.setattr(naming_module, "fit", fitted)
-    monkeypatch.setattr(naming_module, "_afresh", lambda *_: [])
+    monkeypatch.setattr(judge, "fit", fitted)
+    monkeypatch.setattr(judge, "_afresh", lambda *_: [])
     left = lambda problem, runs, whole, found, memory: levelled(nominal, levels[found.name][1])  # noqa: E731
-    monkeypatch.setattr(naming_module, "_left", left)
+    monkeypatch.setattr(judge, "_left", left)
     current = levelled(nominal, 20.0)
     effects = [candidate(problem, name) for name in levels]
     hypotheses = [
@@ -341,13 +329,13 @@ def test_effect_of_one_run_does_not_carry_over(seen_in, carries):
 def test_effect_is_taken_only_once_it_has_settled(monkeypatch):
     problem = Toy({}, [sized("drag", 0.8, "right")])
     assert labels(named(problem)) == ["drag right"]
-    settling = naming_module.settle
+    settling = judge.settle
 
     def gone(*arguments):
         final, bare = settling(*arguments)
         return replace(final, hypothesis=replace(final.hypothesis, tolerable=True)), bare
 
-    monkeypatch.setattr(naming_module, "settle", gone)
+    monkeypatch.setattr(judge, "settle", gone)
     assert labels(named(problem)) == []
 
 

@@ -12,7 +12,7 @@ from engine_runs import META, ROBOT, posture_and_turns, record, spaced
 from wlr_gym.effects import EFFECTS, UNKNOWN_EFFECT, Patch, PatchEffect, apply_patch, load_patch
 from wlr_gym.errors import InputError
 from wlr_gym.gap.fit import Model, nominal_model
-from wlr_gym.gap.name import within_tolerance
+from wlr_gym.gap.hypothesis import within_tolerance
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.robot.candidates import ripple_order, robot_candidates
 from wlr_gym.gap.robot.formulas import formula_candidates

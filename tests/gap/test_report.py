@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from wlr_gym.errors import InputError
 from wlr_gym.gap import report as module
-from wlr_gym.gap.analysis import ChannelGap, Estimate, Evidence, FoundEffect, HeatMap, IntakeFinding, Place
+from wlr_gym.gap.analysis import Analysis, ChannelGap, Estimate, Evidence, FoundEffect, HeatMap, IntakeFinding, Place
 from wlr_gym.gap.plots import draw, figures
 from wlr_gym.gap.report import check_folder, report, save_analysis
 from wlr_gym.gap.result import result_of
@@ -348,6 +348,14 @@ def test_nothing_runs_out_of_a_picture():
             assert box.y0 >= -2, name
             assert box.x1 <= frame.x1 + 2, name
             assert box.y1 <= frame.y1 + 2, name
+
+
+def test_interval_of_an_effect_that_harms_stays_in_the_picture():
+    worse = replace(examples.GAP, heldout_after=6.4, reduction=-0.27, reduction_ci95=(-1.4, 0.86))
+    axes = figures(Analysis("", "effect_found", "", effects=examples.EFFECT_FOUND.effects, gap=worse))["gap"].axes[0]
+    (whisker,) = [line for line in axes.lines if line.get_marker() == "|"]
+    assert max(np.asarray(whisker.get_xdata())) == pytest.approx(5.24 + 1.4 * 4.24)
+    assert axes.get_xlim()[1] > 5.24 + 1.4 * 4.24
 
 
 def widths(figure):

@@ -20,7 +20,7 @@ from wlr_gym.tasks.identified import identified_events
 KEYS = {"verdict", "effects", "equivalent", "calibration", "localisation", "gap", "runs", "patch"}
 GAP_KEYS = {
     "metric", "fit_before", "fit_after", "heldout_before", "heldout_calibrated", "heldout_after", "noise_floor", "reduction",
-    "reduction_ci95",
+    "reduction_signed", "reduction_ci95",
 }  # fmt: skip
 EVERY = pytest.mark.parametrize("analysis", examples.ALL.values(), ids=list(examples.ALL))
 
@@ -135,10 +135,13 @@ def test_interval_holds_its_value(tmp_path):
     assert content["effects"][0]["parameters"]["coefficient"]["ci95"] == [0.03, 0.05]
 
 
-def test_a_reduction_may_be_negative(tmp_path):
+def test_a_reduction_is_a_share_and_what_got_worse_has_a_sign(tmp_path):
     worse = replace(examples.GAP, reduction=-0.27, reduction_ci95=(-0.33, -0.21))
     gap = written(replace(examples.EFFECT_FOUND, gap=worse), tmp_path)["gap"]
-    assert (gap["reduction"], gap["reduction_ci95"]) == (-0.27, [-0.33, -0.21])
+    assert (gap["reduction"], gap["reduction_signed"], gap["reduction_ci95"]) == (0.0, -0.27, [-0.33, -0.21])
+    nothing = replace(examples.GAP, reduction=math.nan, reduction_ci95=(math.nan, math.nan))
+    gap = written(replace(examples.EFFECT_FOUND, gap=nothing), tmp_path)["gap"]
+    assert (gap["reduction"], gap["reduction_signed"], gap["reduction_ci95"]) == (0.0, None, None)
 
 
 @pytest.mark.parametrize(

@@ -145,6 +145,11 @@ def total_cost(problem: Problem, model: Model, residuals: Sequence[Array], memor
     return minus_two_log_likelihood(residuals, memory) + prior_cost(problem, model)
 
 
+def cheapest(problem: Problem, fits: Sequence[Fit], memory: Array) -> Fit:
+    """Return the fit with the lowest cost under one memory: each under its own would compare nothing."""
+    return min(fits, key=lambda whole: total_cost(problem, whole.model, whole.residuals, memory))
+
+
 def moved(problem: Problem, model: Model, change: Array) -> Model:
     """Return the model moved by scaled numbers, kept within bounds and plausible ranges."""
     count = len(problem.quantities)

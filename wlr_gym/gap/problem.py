@@ -145,6 +145,15 @@ class Candidate:
         ranged = tuple(float(np.clip(v, u.low, u.high)) for v, u in zip(values, self.unknowns, strict=True))
         return ranged if self.within is None else self.within(ranged)
 
+    def probed(self, start: Start) -> tuple[float, ...]:
+        """Return the values of the unknowns in a start's own probes, within the plausible range."""
+        return self.kept(start.values(np.ones(len(start.directions))))
+
+    @property
+    def replaced(self) -> set[str]:
+        """Names of the known numbers whose place the effect takes."""
+        return {name for met in self.tolerances if met is not None and met.replaces for name in met.quantities}
+
     def parameters(self, values: Sequence[float]) -> dict[str, float]:
         """Return the effect's fitted parameters by name."""
         if self.convert is not None:

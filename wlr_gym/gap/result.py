@@ -88,7 +88,8 @@ class LocalisationEntry(_Entry):
 class GapEntry(_Entry):
     """The gap: rms error of replayed runs, 1.0 = sensor noise.
 
-    ``reduction`` is negative where the effects make held-out runs worse; its interval is null where these are too few.
+    ``reduction`` lies in 0..1; ``reduction_signed`` is negative where the effects make held-out runs worse, and null where
+    calibration leaves nothing to remove. The interval is that of ``reduction_signed``, null where held-out runs are too few.
     """
 
     metric: str
@@ -98,7 +99,8 @@ class GapEntry(_Entry):
     heldout_calibrated: MaybeNumber
     heldout_after: MaybeNumber
     noise_floor: MaybeNumber
-    reduction: Annotated[float | None, Field(le=1.0), BeforeValidator(_finite)]
+    reduction: Share
+    reduction_signed: Annotated[float | None, Field(le=1.0), BeforeValidator(_finite)]
     reduction_ci95: tuple[MaybeNumber, MaybeNumber] | None
 
 
@@ -244,7 +246,9 @@ def _calibrated(moved: Calibrated) -> dict[str, Any]:
 
 def _gap(gap: GapFigures) -> dict[str, Any]:
     known = all(map(math.isfinite, gap.reduction_ci95))
-    return {**vars(gap), "reduction_ci95": list(gap.reduction_ci95) if known else None}
+    share = min(max(gap.reduction, 0.0), 1.0) if math.isfinite(gap.reduction) else 0.0
+    interval = list(gap.reduction_ci95) if known else None
+    return {**vars(gap), "reduction": share, "reduction_signed": gap.reduction, "reduction_ci95": interval}
 
 
 def _evidence(one: Evidence) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 from wlr_gym.effects import EFFECTS
 from wlr_gym.gap.analysis import Detectable, Estimate
 from wlr_gym.gap.fit import PINNED, Fit, normal_equations, on_bounds, prior_tightness, scaled_nominal, scaled_numbers, scales
-from wlr_gym.gap.name import EQUIVALENT, MOST_HARM, Hypothesis
+from wlr_gym.gap.hypothesis import MOST_HARM, Hypothesis
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.screen import LEAST_GAIN, Score, least_amplitude, least_gain
 
@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 #: Bootstrap samples of the runs.
 SAMPLES = 500
 TWO_SIDED_95 = 1.96
+#: Two explanations are equivalent if the second buys at least this share of what the first buys.
+EQUIVALENT = 0.93
 #: A rival that buys this share is as good unless the runs agree, by so many standard errors, that it is not.
 RIVAL, AGREED = 0.75, 2.0
 

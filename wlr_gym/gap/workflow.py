@@ -14,8 +14,9 @@ from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.gap import analysis as words
 from wlr_gym.gap.analysis import Analysis, Calibrated, Equivalent, Evidence, FoundEffect, IntakeFinding
 from wlr_gym.gap.fit import Fit, fit, nominal_model, widened
+from wlr_gym.gap.hypothesis import Hypothesis
 from wlr_gym.gap.localise import localise
-from wlr_gym.gap.name import Hypothesis, Naming, Round, name_effects
+from wlr_gym.gap.name import Naming, Round, name_effects
 from wlr_gym.gap.problem import Problem
 from wlr_gym.gap.prove import mean_of_runs, mean_squares, prove
 from wlr_gym.gap.recommend import recommend, separating_run

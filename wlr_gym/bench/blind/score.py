@@ -254,7 +254,7 @@ def _single(pairs: Sequence[tuple[Truth, Result]], clear: Sequence[tuple[Truth, 
     orders = [right for true, found in matched if (right := order_found(true, found)) is not None]
     holds = [hold for true, found in matched for hold in intervals_hold(true, found)]
     gaps = [result.get("gap") or {} for _, result in clear if _alarm(result)]
-    reductions = [gap["reduction"] for gap in gaps if gap.get("reduction") is not None]
+    reductions = [share for gap in gaps if (share := gap.get("reduction_signed", gap.get("reduction"))) is not None]
     extra = [set(found_names(r)) != {t["effects"][0]["name"]} for t, r in clear if t["effects"][0]["name"] in found_names(r)]
     return {
         "by_severity": by_severity,

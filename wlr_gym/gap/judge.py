@@ -1,0 +1,228 @@
+"""Judge the best hypotheses: fitted in full, against one model without them, by every run in turn, and once they have settled.
+
+Nothing here sees the sealed runs.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.gap.fit import (
+    Fit,
+    Model,
+    cheapest,
+    constrained_step,
+    fit,
+    moved,
+    normal_equations,
+    on_bounds,
+    total_cost,
+    untouched,
+)
+from wlr_gym.gap.hypothesis import Hypothesis, fall_by_run, within_tolerance
+from wlr_gym.gap.likelihood import estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.problem import Candidate, Problem
+from wlr_gym.gap.screen import LEAST_GAIN, least_gain
+
+Array = NDArray[np.float64]
+Tell = Callable[[str], None]
+
+#: The best of every name that buys at least this share of what the best buys is fitted in full before one is taken; so many.
+FINALIST, FINALISTS = 0.75, 3
+#: Beside a set of places its best single place is fitted in full, if it buys at least this share.
+NARROWER = 0.4
+#: Left out one after the other, the runs must gain together at least this share of what they gain when they are fitted; asked
+#: where so many are.
+LEAST_CARRIED, LEAST_RUNS = 0.3, 3
+#: Steps, at most, in which a model with an effect that is taken settles.
+SETTLING = 8
+#: Steps by which a settling effect looks for a better place, in every unknown that says where it is or over what it fades.
+LOOKS = (-8.0, -4.0, 0.0, 4.0, 8.0)
+#: A named effect is preferred to a formula if it buys at least this share of what the formula buys.
+NAMED_FIRST = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class Final:
+    """A hypothesis fitted in full."""
+
+    hypothesis: Hypothesis
+    fit: Fit
+
+
+def finalists(
+    problem: Problem,
+    runs: Sequence[int],
+    current: Fit,
+    hypotheses: Sequence[Hypothesis],
+    bare: Fit,
+    tell: Tell = lambda text: None,
+) -> tuple[list[Final], Fit]:
+    """Fit the best hypotheses in full, with responses simulated anew, and judge all against one model without them.
+
+    Args:
+        problem, runs: what is fitted.
+        current: the model so far.
+        hypotheses: refitted, best first.
+        bare: the best model without a further effect so far.
+        tell: told of progress.
+
+    Returns:
+        The finalists, best first; the best model without a further effect, which may be one that a finalist has led to.
+    """
+    chosen, wholes = _worth_a_fit(hypotheses), []
+    for hypothesis in chosen:
+        tell(f"fitting {hypothesis.candidate.label} in full")
+        near = fit(problem, runs, hypothesis.model, scatter=current.noise.scatter, steps=problem.steps, tell=tell)
+        both = (near, *_afresh(problem, runs, hypothesis, near, tell))
+        wholes.append(cheapest(problem, both, current.noise.memory))
+    if not wholes:
+        return [], bare
+    memory = cheapest(problem, wholes, current.noise.memory).noise.memory
+    if not problem.thorough:
+        pairs = zip(wholes, chosen, strict=True)
+        bare = cheapest(problem, [bare, *(_left(problem, runs, whole, h.candidate, memory) for whole, h in pairs)], memory)
+    found = [_judged(problem, runs, h, whole, bare, memory) for h, whole in zip(chosen, wholes, strict=True)]
+    return sorted(found, key=lambda final: -final.hypothesis.gain), bare
+
+
+def _worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The best of every name that buys nearly as much as the best does, and the best's narrower self."""
+    best: dict[str, Hypothesis] = {}
+    effects = [hypothesis for hypothesis in hypotheses if not hypothesis.tolerable]
+    for hypothesis in effects:
+        leading = effects[0]
+        enough = hypothesis.gain >= max(FINALIST * leading.gain, 0.5 * LEAST_GAIN)
+        if enough and len(best) < FINALISTS:
+            best.setdefault(hypothesis.candidate.name + hypothesis.candidate.formula, hypothesis)
+        narrower = len(leading.candidate.where) > 1 and len(hypothesis.candidate.where) == 1
+        if narrower and hypothesis.candidate.name == leading.candidate.name and hypothesis.gain > NARROWER * leading.gain:
+            best.setdefault("narrower", hypothesis)
+    return list(best.values())
+
+
+def _judged(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, whole: Fit, bare: Fit, memory: Array) -> Final:
+    """A hypothesis as its whole fit shows it: gain, agreement of the runs, what the tolerances allow.
+
+    What the whole fit found in the known numbers is no evidence for the effect: ``bare`` is without it.
+    """
+    gain = total_cost(problem, bare.model, bare.residuals, memory) - total_cost(problem, whole.model, whole.residuals, memory)
+    judged = replace(
+        hypothesis,
+        model=whole.model,
+        gain=gain,
+        by_run=fall_by_run(bare.residuals, whole.residuals, estimate_noise(whole.residuals, memory, whole.noise.scatter)),
+        residuals=whole.residuals,
+        base=bare.model,
+        base_residuals=bare.residuals,
+        carries_over=carries_over(problem, runs, bare, whole, gain, memory),
+        tolerable=within_tolerance(problem, whole.model),
+    )
+    return Final(judged, whole)
+
+
+def _left(problem: Problem, runs: Sequence[int], whole: Fit, candidate: Candidate, memory: Array) -> Fit:
+    """The model without the last effect, from where the known numbers are beside it."""
+    kept = whole.model.size - len(candidate.unknowns)
+    columns = None if candidate.replaced else [column[:kept] for column in whole.columns]
+    return _plain(problem, runs, whole, whole.model.without_effect(-1), columns, memory)
+
+
+def _plain(
+    problem: Problem, runs: Sequence[int], near: Fit, model: Model, columns: list[NDArray[np.float32]] | None, memory: Array
+) -> Fit:
+    """One descent of a model, with the columns of a fit near it where they are known."""
+    return fit(problem, runs, model, memory=memory, scatter=near.noise.scatter, columns=columns, steps=1)
+
+
+def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near: Fit, tell: Tell) -> list[Fit]:
+    """The fit once more from the model as given, if known numbers are strained by what they took on in the effect's place."""
+    if not on_bounds(problem, near.model).any():
+        return []
+    tell("a known number at its bound: once more from the model as given")
+    candidate = hypothesis.candidate
+    given = untouched(problem, hypothesis.model.without_effect(-1))
+    start = given.with_effect(candidate, candidate.probed(candidate.starts[0]))
+    return [fit(problem, runs, start, scatter=near.noise.scatter, steps=problem.steps, tell=tell)]
+
+
+def carries_over(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit, gain: float, memory: Array) -> bool:
+    """Whether each run gets better by what the other runs tell of the effect, all together by a share of the gain."""
+    if len(runs) < LEAST_RUNS:
+        return True
+    found = [
+        problem.residuals([without.setting, with_it.setting], [run])[0]
+        for run, without, with_it in zip(runs, told_by_others(problem, bare), told_by_others(problem, whole), strict=True)
+    ]
+    before, after = (minus_two_log_likelihood([r[k] for r in found], memory) for k in (0, 1))
+    return before - after > LEAST_CARRIED * gain
+
+
+def told_by_others(problem: Problem, found: Fit) -> list[Model]:
+    """The model as it would be without each run in turn, to first order."""
+    parts = [normal_equations([c], [r], found.noise) for c, r in zip(found.columns, found.residuals, strict=True)]
+    matrix, vector = np.sum([m for m, _ in parts], axis=0), np.sum([v for _, v in parts], axis=0)
+    settled = constrained_step(problem, found.model, matrix, vector)
+    steps = [constrained_step(problem, found.model, matrix - own, vector - pull) for own, pull in parts]
+    return [moved(problem, found.model, step - settled) for step in steps]
+
+
+def accept(
+    problem: Problem, runs: Sequence[int], current: Fit, finals: Sequence[Final], bare: Fit, tell: Tell
+) -> tuple[Final | None, list[Final]]:
+    """The best that buys enough at a plausible value, also once it has settled, and the finalists as far as they have settled.
+
+    A formula is taken only where no named effect buys nearly as much.
+    """
+    good = [final for final in finals if _is_good(current, final)]
+    named = [final for final in good if not final.hypothesis.candidate.formula]
+    if named and named[0].hypothesis.gain >= NAMED_FIRST * good[0].hypothesis.gain:
+        good = [named[0], *(final for final in good if final is not named[0])]
+    seen = list(finals)
+    for final in good:
+        settled, bare = (final, bare) if problem.thorough else settle(problem, runs, final, bare, tell)
+        seen = [settled if other is final else other for other in seen]
+        if _is_good(current, settled):
+            return settled, seen
+    return None, seen
+
+
+def _is_good(current: Fit, final: Final) -> bool:
+    least = least_gain(len(final.hypothesis.values), current.cost)
+    return final.hypothesis.gain >= least and final.hypothesis.plausible
+
+
+def settle(problem: Problem, runs: Sequence[int], final: Final, bare: Fit, tell: Tell) -> tuple[Final, Fit]:
+    """The hypothesis fitted on until another step gains nothing, and once more with the known numbers as the file says; and the
+    best model without it.
+
+    Beside a strong effect the cost has several minima: known numbers that calibration had moved in the effect's place stay
+    where they are and leave it too small; and the edge of a patch that one run alone has crossed is not seen from afar.
+    """
+    tell(f"settling {final.hypothesis.candidate.label}, also from the model as given")
+    found = final.fit
+    starts = (looked_around(problem, runs, found), untouched(problem, found.model))
+    more = [fit(problem, runs, start, scatter=found.noise.scatter, steps=SETTLING, tell=tell) for start in starts]
+    best = cheapest(problem, (found, *more), found.noise.memory)
+    memory = best.noise.memory
+    bare = cheapest(problem, [bare, _left(problem, runs, best, final.hypothesis.candidate, memory)], memory)
+    return _judged(problem, runs, final.hypothesis, best, bare, memory), bare
+
+
+def looked_around(problem: Problem, runs: Sequence[int], found: Fit) -> Model:
+    """The model with the last effect where it explains most: steps apart in each unknown that does not say how large it is."""
+    candidate, values = found.model.effects[-1]
+    steps = [np.array(LOOKS) * u.step if not u.is_size else np.zeros(1) for u in candidate.unknowns]
+    places = {candidate.kept((np.array(values) + moves).tolist()) for moves in itertools.product(*steps)}
+    without = found.model.without_effect(-1)
+    models = [found.model, *(without.with_effect(candidate, place) for place in sorted(places - {tuple(values)}))]
+    if len(models) == 1:
+        return found.model
+    residuals = problem.residuals([model.setting for model in models], runs)
+    costs = [total_cost(problem, model, [r[k] for r in residuals], found.noise.memory) for k, model in enumerate(models)]
+    return models[int(np.argmin(costs))]
