@@ -4,8 +4,11 @@ import re
 from pathlib import Path
 
 from gap_examples import EFFECT_FOUND
+from toy_problem import Toy
 
+from wlr_gym.gap.prove import LEAST_FOR_INTERVAL
 from wlr_gym.gap.result import Result, result_of
+from wlr_gym.gap.split import informative_split
 from wlr_gym.gap.words import TITLES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "gap.md").read_text(encoding="utf-8")
@@ -37,3 +40,9 @@ def test_outcomes():
         "screened out",
     }
     assert {one.outcome for one in EFFECT_FOUND.evidence} <= explained
+
+
+def test_runs_that_give_an_interval():
+    sealed = {runs: len(informative_split(Toy(runs=runs, rows=30))[1]) for runs in (6, 7)}
+    assert sealed[6] < LEAST_FOR_INTERVAL <= sealed[7]
+    assert "(seven runs in all, or `--heldout`)" in PAGE

@@ -8,6 +8,7 @@ from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap import judge
 from wlr_gym.gap import name as naming_module
+from wlr_gym.gap.analysis import NOT_EXCITED
 from wlr_gym.gap.fit import Fit, fit, linearise, nominal_model, total_cost
 from wlr_gym.gap.hypothesis import Hypothesis
 from wlr_gym.gap.judge import Final, carries_over, finalists, looked_around, settle, told_by_others
@@ -17,6 +18,8 @@ from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
 from wlr_gym.gap.refit import refit
 from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
 from wlr_gym.gap.sure import EQUIVALENT, equivalents
+from wlr_gym.gap.words import sentence
+from wlr_gym.gap.workflow import analyse_problem
 
 RUNS = range(5)
 
@@ -323,7 +326,49 @@ def test_effect_of_one_run_does_not_carry_over(seen_in, carries):
     memory = whole.noise.memory
     gain = total_cost(problem, bare.model, bare.residuals, memory) - whole.cost
     assert gain > LEAST_GAIN
-    assert carries_over(problem, RUNS, bare, whole, gain, memory) is carries
+    assert carries_over(problem, RUNS, bare, whole, memory) is carries
+
+
+class Once(Toy):
+    """``decoy_2`` is felt in the first run only."""
+
+    def effect_response(self, effect, run):
+        return super().effect_response(effect, run) if run == 0 or effect.name != "decoy_2" else 0.0
+
+
+def test_what_one_run_alone_shows_is_said_and_not_taken():
+    problem = Once({}, [sized("decoy_2", 3.0)], rows=400, runs=8, error=0.3)
+    analysis = analyse_problem(problem, "toy", heldout=("run_6", "run_7", "run_8"))
+    assert analysis.verdict == NOT_EXCITED
+    assert analysis.effects == ()
+    assert sentence(analysis).startswith("run_1 shows decoy 2 (body), the other runs do not bear it out: record more such runs")
+
+
+def test_better_model_that_settling_finds_is_calibrated_from(monkeypatch):
+    problem = Toy({"gain": 2.0}, [sized("drag", 0.8, "right")], rows=400)
+    stuck, free, given = stuck_and_free(problem)
+    accepting, asked = naming_module.accept, []
+
+    def found_late(*arguments):
+        accepted, finals, bare = accepting(*arguments)
+        asked.append(1)
+        return accepted, finals, free if len(asked) == 1 else bare
+
+    monkeypatch.setattr(naming_module, "_without_more", lambda problem, current, hypotheses: current)
+    monkeypatch.setattr(naming_module, "finalists", keep_bare(naming_module.finalists))
+    monkeypatch.setattr(naming_module, "accept", found_late)
+    naming = name_effects(problem, RUNS, stuck, given=given)
+    assert naming.calibrated is not stuck
+    assert naming.calibrated.model.quantities == pytest.approx(free.model.quantities, abs=0.5 * SIGMA.min())
+
+
+def keep_bare(finding):
+    """Finalists that lead to no better model without them."""
+
+    def found(problem, runs, current, hypotheses, bare, tell):
+        return finding(problem, runs, current, hypotheses, bare, tell)[0], bare
+
+    return found
 
 
 def test_effect_is_taken_only_once_it_has_settled(monkeypatch):

@@ -63,6 +63,15 @@ def test_interval_is_student_s_of_leaving_out_one_run_after_the_other():
     assert _interval(calibrated, after, 1.0) == pytest.approx((whole - half, min(whole + half, 1.0)), rel=1e-3)
 
 
+def test_interval_of_more_than_everything_keeps_its_lower_end():
+    """What is left lies below the floor, which is simulated itself: 1 is told, and how far below it the truth may be."""
+    calibrated, after = np.array([[25.0], [16.0], [36.0]]), np.array([[0.8], [0.85], [0.75]])
+    assert reduction(calibrated, after, 1.0) > 1.02
+    low, high = _interval(calibrated, after, 1.0)
+    assert 0.99 < low < 0.999
+    assert high == 1.0
+
+
 def test_two_runs_give_no_interval():
     problem = Toy({"gain": 1.5}, [sized("drag", 1.5, "right")], runs=7)
     gap, runs, _ = prove(problem, FITTED, [3, 5], models(problem), 1.0)

@@ -198,6 +198,18 @@ def test_own_keys_of_other_versions_are_kept(tmp_path):
     assert read_result(path).model_dump()["later"] == [1]
 
 
+def test_a_result_of_an_earlier_version_is_read(tmp_path):
+    """As they were before reductions had a sign, and the closure and what would have shown were told."""
+    path = write_result(examples.EFFECT_FOUND, tmp_path)
+    content = json.loads(path.read_text())
+    del content["gap"]["reduction_signed"], content["closure"], content["detectable"]
+    path.write_text(json.dumps(content))
+    result = read_result(path)
+    assert result.gap is not None
+    assert (result.gap.reduction, result.gap.reduction_signed) == (0.951, None)
+    assert (result.closure, result.detectable) == ("", {})
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -13,7 +13,7 @@ from wlr_gym.gap.name import name_effects
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.rig import RIG_EFFECTS, RigProblem, read_recordings
 from wlr_gym.gap.rig.candidates import rig_candidates
-from wlr_gym.gap.rig.problem import ENCODER_NOISE
+from wlr_gym.gap.rig.problem import ENCODER_NOISE, LOST
 from wlr_gym.gap.split import named_split
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "xl330_pendulum"
@@ -154,6 +154,20 @@ def test_a_formula_acts_like_the_effect_it_spells_out(loaded):
     (found,) = loaded.simulate([Setting(values), Setting(more), Setting(values, (formula,)), Setting(values, (none,))], [4])
     assert np.abs(found[2] - found[1]).max() < 0.05 * np.abs(found[1] - found[0]).max()
     np.testing.assert_allclose(found[3], found[0], atol=1e-9)
+
+
+def test_a_simulation_that_breaks_down_is_as_far_off_as_can_be(loaded):
+    """A servo that feeds itself speed: neither is that nothing, nor are its rows before the end anything."""
+    setting = Setting(nominal(loaded))
+    running_away = PatchEffect("unknown_effect", ("servo",), {"b": 5.0}, "b * rate", {"b": "N m s/rad"})
+    (simulated,) = loaded.simulate([Setting(setting.quantities, (running_away,))], [4])
+    assert not np.isfinite(simulated).all()
+    (plain,), (both,) = (
+        loaded.residuals(settings, [4]) for settings in ([setting], [setting, Setting(setting.quantities, (running_away,))])
+    )
+    assert (both[0] == plain[0]).all()
+    assert (both[1] == LOST).all()
+    assert np.abs(both[0]).max() < LOST
 
 
 @pytest.mark.parametrize(

@@ -247,6 +247,11 @@ def test_patches_of_the_rig_are_read_from_anything_that_effects_are():
         ({"name": "torque_saturation", "parameters": {"coefficient": 11}}, r"coefficient = 11: expected a number in \[0, 10\]"),
         ({"name": "torque_saturation"}, "coefficient = None"),
         ({"name": "unknown_effect", "formula": "-b * (rate"}, "formula"),
+        ({"name": "unknown_effect"}, r"effect 1 \(unknown_effect\): formula = None: expected a formula"),
+        (
+            {"name": "unknown_effect", "formula": "-b * rate", "parameters": {"b": 0.1}, "units": ["b"]},
+            r"units = \['b'\]: expected a m",
+        ),
         ("weak_motor", "expected a mapping with 'name'"),
     ],
 )
@@ -255,6 +260,19 @@ def test_patches_that_the_rig_cannot_take_are_refused(entry, words):
         rig_patch({"effects": [entry]})
     with pytest.raises(InputError, match="expected a mapping with 'effects'"):
         rig_patch({"effect": [entry]})
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ({"effects": [], "provenance": "abc"}, "effects: provenance = 'abc': expected a mapping"),
+        ({"effects": [], "provenance": [1]}, r"provenance = \[1\]: expected a mapping"),
+        (5, "effects = 5: expected a path, a mapping or a list of effects"),
+    ],
+)
+def test_what_is_no_patch_of_the_rig_is_refused(source, words):
+    with pytest.raises(InputError, match=words):
+        rig_patch(source)
 
 
 def test_a_run_that_cannot_be_used_cannot_be_held_out(tmp_path):

@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 #: Verdicts, as in the result file.
 BAD_DATA, NOT_EXCITED, NOTHING_MISSING = "bad_data", "not_excited", "nothing_missing"
 EFFECT_FOUND, UNKNOWN = "effect_found", "unknown_effect"
+#: Outcome of what some runs show and the others do not bear out.
+NOT_CARRIED = "does not carry over"
 
 
 @dataclass(frozen=True)

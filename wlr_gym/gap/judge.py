@@ -21,6 +21,7 @@ from wlr_gym.gap.fit import (
     moved,
     normal_equations,
     on_bounds,
+    scaled_numbers,
     total_cost,
     untouched,
 )
@@ -84,11 +85,18 @@ def finalists(
     if not wholes:
         return [], bare
     memory = cheapest(problem, wholes, current.noise.memory).noise.memory
+    if bare.columns is current.columns and _far_apart(problem, bare.model, current.model):  # they are of another minimum
+        bare = _plain(problem, runs, bare, bare.model, None, memory)
     if not problem.thorough:
         pairs = zip(wholes, chosen, strict=True)
         bare = cheapest(problem, [bare, *(_left(problem, runs, whole, h.candidate, memory) for whole, h in pairs)], memory)
     found = [_judged(problem, runs, h, whole, bare, memory) for h, whole in zip(chosen, wholes, strict=True)]
     return sorted(found, key=lambda final: -final.hypothesis.gain), bare
+
+
+def _far_apart(problem: Problem, one: Model, other: Model) -> bool:
+    """Whether a number of two models differs by more than a tolerance, or an unknown by more than a step."""
+    return bool(np.abs(scaled_numbers(problem, one) - scaled_numbers(problem, other)).max(initial=0.0) > 1.0)
 
 
 def _worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -120,7 +128,7 @@ def _judged(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, whole
         residuals=whole.residuals,
         base=bare.model,
         base_residuals=bare.residuals,
-        carries_over=carries_over(problem, runs, bare, whole, gain, memory),
+        carries_over=carries_over(problem, runs, bare, whole, memory),
         tolerable=within_tolerance(problem, whole.model),
     )
     return Final(judged, whole)
@@ -151,16 +159,20 @@ def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near:
     return [fit(problem, runs, start, scatter=near.noise.scatter, steps=problem.steps, tell=tell)]
 
 
-def carries_over(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit, gain: float, memory: Array) -> bool:
-    """Whether each run gets better by what the other runs tell of the effect, all together by a share of the gain."""
+def carries_over(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit, memory: Array) -> bool:
+    """Whether the runs, each with what the others tell of the effect, get better, by a share of what all fitted do.
+
+    Of the likelihood alone: what an effect spares the tolerances is its own evidence, and no run's. Two runs are not asked.
+    """
     if len(runs) < LEAST_RUNS:
         return True
+    fitted = minus_two_log_likelihood(bare.residuals, memory) - minus_two_log_likelihood(whole.residuals, memory)
     found = [
         problem.residuals([without.setting, with_it.setting], [run])[0]
         for run, without, with_it in zip(runs, told_by_others(problem, bare), told_by_others(problem, whole), strict=True)
     ]
     before, after = (minus_two_log_likelihood([r[k] for r in found], memory) for k in (0, 1))
-    return before - after > LEAST_CARRIED * gain
+    return before - after > max(LEAST_CARRIED * fitted, 0.0)
 
 
 def told_by_others(problem: Problem, found: Fit) -> list[Model]:
@@ -174,8 +186,9 @@ def told_by_others(problem: Problem, found: Fit) -> list[Model]:
 
 def accept(
     problem: Problem, runs: Sequence[int], current: Fit, finals: Sequence[Final], bare: Fit, tell: Tell
-) -> tuple[Final | None, list[Final]]:
-    """The best that buys enough at a plausible value, also once it has settled, and the finalists as far as they have settled.
+) -> tuple[Final | None, list[Final], Fit]:
+    """The best that buys enough at a plausible value, also once it has settled; the finalists as far as they have settled; the
+    best model without any of them.
 
     A formula is taken only where no named effect buys nearly as much.
     """
@@ -188,8 +201,14 @@ def accept(
         settled, bare = (final, bare) if problem.thorough else settle(problem, runs, final, bare, tell)
         seen = [settled if other is final else other for other in seen]
         if _is_good(current, settled):
-            return settled, seen
-    return None, seen
+            return settled, seen, bare
+    return None, seen, bare
+
+
+def shown_by_some_runs_only(hypothesis: Hypothesis, cost: float) -> bool:
+    """Whether nothing speaks against a hypothesis but that the other runs do not bear it out; ``cost``: of the model so far."""
+    enough = hypothesis.gain >= least_gain(len(hypothesis.values), cost)
+    return enough and not hypothesis.carries_over and replace(hypothesis, carries_over=True).plausible
 
 
 def _is_good(current: Fit, final: Final) -> bool:

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.fit import Fit, Model, cheapest, fit, linearise, nominal_model, total_cost, widened
-from wlr_gym.gap.hypothesis import Hypothesis
+from wlr_gym.gap.hypothesis import Hypothesis, fall_by_run
 from wlr_gym.gap.judge import Final, accept, finalists
 from wlr_gym.gap.likelihood import estimate_noise
 from wlr_gym.gap.problem import Problem
 from wlr_gym.gap.refit import refit, refit_thoroughly
 from wlr_gym.gap.screen import LEAST_GAIN, Score, least_gain, responses, screen
 
+Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
 #: Hypotheses that are refitted in one round, and at most so many per name.
@@ -103,17 +104,20 @@ def name_effects(
         )
         bare = _without_more(problem, current, hypotheses)
         finals: list[Final] = []
+        accepted: Final | None = None
         if current is again or not _deeper(problem, current, bare):
             finals, bare = finalists(problem, runs, current, hypotheses, bare, tell)
+        if current is again or not _deeper(problem, current, bare):
+            accepted, finals, bare = accept(problem, runs, current, finals, bare, tell)
         if current is not again and _deeper(problem, current, bare):
             tell("the known numbers fit better elsewhere: calibrated anew from there")
             anew = fit(problem, runs, bare.model, scatter=current.noise.scatter, steps=problem.steps)
             current = again = widened(problem, runs, anew)
             calibrated = calibrated if current.model.effects else current
             continue
-        accepted, finals = accept(problem, runs, current, finals, bare, tell)
-        taken = None if accepted is None else accepted.hypothesis
-        rounds.append(Round(scores, _merged(finals, hypotheses), taken, current.cost))
+        merged = _merged(problem, finals, hypotheses, bare, accepted or (finals[0] if finals else None))
+        taken = None if accepted is None else _labelled(merged, accepted.hypothesis)
+        rounds.append(Round(scores, merged, taken, current.cost))
         if accepted is None:
             break
         tell(f"taken: {accepted.hypothesis.candidate.label}")
@@ -208,8 +212,25 @@ def drop_idle(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = 
     return current
 
 
-def _merged(finals: Sequence[Final], hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """All hypotheses, those fitted in full in their final form."""
+def _merged(
+    problem: Problem, finals: Sequence[Final], hypotheses: Sequence[Hypothesis], bare: Fit, best: Final | None
+) -> list[Hypothesis]:
+    """All hypotheses, those fitted in full in their final form; where one was, all as they compare under its memory."""
     final = {f.hypothesis.candidate.label: f.hypothesis for f in finals}
     merged = [final.get(h.candidate.label, h) for h in hypotheses]
+    if best is not None:
+        memory = best.fit.noise.memory
+        cost = total_cost(problem, bare.model, bare.residuals, memory)
+        merged = [_compared(problem, hypothesis, bare, cost, memory) for hypothesis in merged]
     return sorted(merged, key=lambda hypothesis: -hypothesis.gain)
+
+
+def _compared(problem: Problem, hypothesis: Hypothesis, bare: Fit, cost: float, memory: Array) -> Hypothesis:
+    """A hypothesis beside the model without any; ``cost`` is that of this model under the same memory."""
+    gain = cost - total_cost(problem, hypothesis.model, hypothesis.residuals, memory)
+    by_run = fall_by_run(bare.residuals, hypothesis.residuals, estimate_noise(hypothesis.residuals, memory))
+    return replace(hypothesis, gain=gain, by_run=by_run, base=bare.model, base_residuals=bare.residuals)
+
+
+def _labelled(hypotheses: Sequence[Hypothesis], wanted: Hypothesis) -> Hypothesis:
+    return next(hypothesis for hypothesis in hypotheses if hypothesis.candidate.label == wanted.candidate.label)

@@ -103,10 +103,11 @@ def reduction(calibrated: Array, after: Array, floor: float) -> float:
 
 
 def _interval(calibrated: Array, after: Array, floor: float) -> tuple[float, float]:
-    """95 % interval of the reduction, up to 1; NaN where the runs are too few to tell.
+    """95 % interval of the reduction; NaN where the runs are too few to tell.
 
     Student's t interval with the jackknife's standard error: ``R +- t(n-1) sqrt((n-1)/n sum (R_k - mean R_k)^2)``, with R_k the
-    reduction without run k.
+    reduction without run k. R counts 1 at most, as it is told; only the upper end is cut off at 1: an interval that lies above
+    it would have no width otherwise.
     """
     count = len(calibrated)
     if count < LEAST_FOR_INTERVAL:
@@ -114,5 +115,6 @@ def _interval(calibrated: Array, after: Array, floor: float) -> tuple[float, flo
     left_out = np.array([reduction(np.delete(calibrated, k, axis=0), np.delete(after, k, axis=0), floor) for k in range(count)])
     error = math.sqrt((count - 1) / count * float(((left_out - left_out.mean()) ** 2).sum()))
     whole, half = reduction(calibrated, after, floor), two_sided_95(count - 1) * error
-    low, high = (min(end, 1.0) if math.isfinite(end) else math.nan for end in (whole - half, whole + half))
-    return low, high
+    if not math.isfinite(whole + half):
+        return math.nan, math.nan
+    return min(whole, 1.0) - half, min(whole + half, 1.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from wlr_gym.gap.analysis import EFFECT_FOUND, Recommendation
+from wlr_gym.gap.judge import shown_by_some_runs_only
 from wlr_gym.gap.name import Naming
 from wlr_gym.runs.excitations import EXCITATIONS
 
@@ -136,6 +137,11 @@ def recommend(
             if names[0] in motions:
                 why = separating_run((names[0], other), motions)
                 found.setdefault(motions[names[0]], f"separates {names[0]} from {other}: {why}")
+    last = naming.rounds[-1]
+    for hypothesis in last.hypotheses:
+        name = hypothesis.candidate.name
+        if name in motions and shown_by_some_runs_only(hypothesis, last.cost):
+            found.setdefault(motions[name], f"some runs show {name} and the others do not bear it out")
     if verdict != EFFECT_FOUND:
         visible: dict[str, bool] = {}
         for score in naming.rounds[-1].scores:

@@ -89,7 +89,8 @@ class GapEntry(_Entry):
     """The gap: rms error of replayed runs, 1.0 = sensor noise.
 
     ``reduction`` lies in 0..1; ``reduction_signed`` is negative where the effects make held-out runs worse, and null where
-    calibration leaves nothing to remove. The interval is that of ``reduction_signed``, null where held-out runs are too few.
+    calibration leaves nothing to remove and in results of versions that did not tell it. The interval is that of
+    ``reduction_signed``, null where held-out runs are too few.
     """
 
     metric: str
@@ -100,7 +101,7 @@ class GapEntry(_Entry):
     heldout_after: MaybeNumber
     noise_floor: MaybeNumber
     reduction: Share
-    reduction_signed: Annotated[float | None, Field(le=1.0), BeforeValidator(_finite)]
+    reduction_signed: Annotated[float | None, Field(le=1.0), BeforeValidator(_finite)] = None
     reduction_ci95: tuple[MaybeNumber, MaybeNumber] | None
 
 

@@ -58,10 +58,13 @@ def covariance(problem: Problem, fit: Fit) -> Array:
 def half_widths(problem: Problem, fit: Fit) -> Array:
     """Return half of the 95 % interval of every number (numbers), in its unit; see :func:`covariance`.
 
-    That of a number on its bound is one tolerance: it is the one that calibration knows least about.
+    A known number is never known less than beforehand, to 1.96 tolerances, unless it drifts; and on its bound no better.
     """
     halves = TWO_SIDED_95 * np.sqrt(np.diag(covariance(problem, fit)))
-    return np.where(on_bounds(problem, fit.model), scales(problem, fit.model), halves)
+    beforehand = TWO_SIDED_95 * scales(problem, fit.model)
+    drifts = np.array([quantity.drifts for quantity in problem.quantities])
+    held = np.concatenate([~drifts, np.zeros(len(halves) - len(drifts), bool)])
+    return np.where(on_bounds(problem, fit.model), beforehand, np.where(held, np.minimum(halves, beforehand), halves))
 
 
 def estimates(problem: Problem, fit: Fit) -> list[dict[str, Estimate]]:

@@ -9,6 +9,7 @@ from wlr_gym.effects import UNKNOWN_EFFECT
 from wlr_gym.gap.analysis import (
     BAD_DATA,
     EFFECT_FOUND,
+    NOT_CARRIED,
     NOT_EXCITED,
     NOTHING_MISSING,
     UNKNOWN,
@@ -17,6 +18,7 @@ from wlr_gym.gap.analysis import (
     Estimate,
     FoundEffect,
 )
+from wlr_gym.gap.screen import LEAST_GAIN
 from wlr_gym.plants.base import TRUTH_LAYOUT
 from wlr_gym.robot import CORNERS, LEGS, WHEELS
 
@@ -211,6 +213,13 @@ def _bad_data(analysis: Analysis) -> str:
 
 def _not_excited(analysis: Analysis) -> str:
     wanted = listed([recommendation.excitation for recommendation in analysis.recommendations])
+    alone = [e for e in analysis.evidence if e.outcome == NOT_CARRIED and e.gain > LEAST_GAIN and e.by_run]
+    if alone:
+        shown = max(alone, key=lambda evidence: evidence.gain)
+        run = max(shown.by_run, key=lambda name: shown.by_run[name])
+        what = f"{plain(shown.name)} ({places(shown.where)})"
+        more = f", and {wanted}" if wanted else ""
+        return f"{run} shows {what}, the other runs do not bear it out: record more such runs{more}."
     return f"These runs move too little to tell whether the model lacks anything{f'; record {wanted}' if wanted else ''}."
 
 

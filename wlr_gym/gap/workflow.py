@@ -15,6 +15,7 @@ from wlr_gym.gap import analysis as words
 from wlr_gym.gap.analysis import Analysis, Calibrated, Equivalent, Evidence, FoundEffect, IntakeFinding
 from wlr_gym.gap.fit import Fit, fit, nominal_model, widened
 from wlr_gym.gap.hypothesis import Hypothesis
+from wlr_gym.gap.judge import shown_by_some_runs_only
 from wlr_gym.gap.localise import localise
 from wlr_gym.gap.name import Naming, Round, name_effects
 from wlr_gym.gap.problem import Problem
@@ -196,7 +197,10 @@ def _verdict(naming: Naming) -> str:
     names = [candidate.name for candidate, _ in naming.fit.model.effects]
     if names:
         return words.UNKNOWN if all(name == words.UNKNOWN for name in names) else words.EFFECT_FOUND
-    scores = naming.rounds[-1].scores
+    last = naming.rounds[-1]
+    if any(shown_by_some_runs_only(h, last.cost) for h in last.hypotheses):
+        return words.NOT_EXCITED
+    scores = last.scores
     visible = {score.candidate.name: False for score in scores}
     for score in scores:
         visible[score.candidate.name] |= score.visible
@@ -281,7 +285,7 @@ def _fate(hypothesis: Hypothesis, look: Round, equal: set[str]) -> tuple[str, st
     if hypothesis.tolerable:
         return "within tolerance", "the tolerances of known numbers allow as much"
     if not hypothesis.carries_over:
-        return "does not carry over", "runs do not get better by what the others tell of it"
+        return words.NOT_CARRIED, "runs do not get better by what the others tell of it"
     if not hypothesis.consistent:
         return "inconsistent", "helps some runs and harms others"
     if best is None:

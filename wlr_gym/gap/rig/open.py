@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,14 +61,15 @@ def rig_patch(source: Source) -> Patch:
         content, name = read_yaml(path), str(path)
     elif isinstance(source, Mapping):
         content, name = {"effects": [source]} if "name" in source else source, "effects"
-    else:
+    elif isinstance(source, Sequence):
         return compose(*(rig_patch(one) for one in source))
+    else:
+        raise InputError(f"effects = {source!r}: expected a path, a mapping or a list of effects")
     entries = content.get("effects") if isinstance(content, Mapping) else None
     if not isinstance(entries, list | tuple):
         raise InputError(f"{name}: expected a mapping with 'effects', a list of effects")
     effects = tuple(_effect(entry, f"{name}: effect {k}") for k, entry in enumerate(entries, 1))
-    origin: Any = content.get("provenance") or {}
-    return Patch(effects, dict(origin), name)
+    return Patch(effects, _mapping(content, "provenance", name), name)
 
 
 def _effect(entry: Any, place: str) -> PatchEffect:
@@ -80,7 +81,12 @@ def _effect(entry: Any, place: str) -> PatchEffect:
     if entry.get("where", JOINT) not in (JOINT, [JOINT], (JOINT,)):
         raise InputError(f"{place} ({name}): where = {entry['where']!r}: the rig has one joint, {JOINT}")
     if name == UNKNOWN_EFFECT:
-        effect = PatchEffect(name, (JOINT,), given, str(entry.get("formula")), dict(entry.get("units") or {}), place)
+        place = f"{place} ({name})"
+        if not isinstance(entry.get("formula"), str):
+            raise InputError(
+                f"{place}: formula = {entry.get('formula')!r}: expected a formula of the torque, such as '-b * rate'"
+            )
+        effect = PatchEffect(name, (JOINT,), given, entry["formula"], _mapping(entry, "units", place), place)
         rig_force(effect)
         return effect
     known = RIG_EFFECTS[name].parameters
@@ -89,6 +95,14 @@ def _effect(entry: Any, place: str) -> PatchEffect:
             raise unknown_name("parameter", str(key), known, f"{place} ({name})")
     numbers = {key: _number(given.get(key), spec, f"{place} ({name}): {key}") for key, spec in known.items()}
     return PatchEffect(name, (JOINT,), numbers, place=place)
+
+
+def _mapping(entry: Mapping[str, Any], key: str, place: str) -> dict[str, Any]:
+    """Return a copy of a mapping that an entry may leave out."""
+    value = entry.get(key) or {}
+    if not isinstance(value, Mapping):
+        raise InputError(f"{place}: {key} = {value!r}: expected a mapping")
+    return dict(value)
 
 
 def _number(value: Any, spec: EffectParameter, place: str) -> float:

@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 #: One sigma of the encoder, rad: one of 4096 counts per turn, for rounding and for what a magnetic encoder adds to it.
 ENCODER_NOISE = 2 * math.pi / 4096
+#: Noise units that every residual of a simulation that broke down counts: more than two turns.
+LOST = 1e4
 #: Signal -> s of free simulation before it starts again from the measured state; None = the whole run.
 HORIZONS: Mapping[str, float | None] = {"position": None, "position_within_0.2s": 0.2}
 _ANGLE = OUTPUTS.index("angle")
@@ -44,7 +46,7 @@ class RigProblem:
 
     metric = "RMS over whole runs and over windows of 0.2 s of measured-minus-replayed angle, in units of sensor noise"
     #: A servo that sticks elsewhere is off by hundreds of counts, and that is the gap.
-    cap = 1e4
+    cap = LOST
     steps = 20
     #: A replay costs milliseconds, and a joint that sticks answers far from linearly: every hypothesis is worth a whole fit.
     thorough, firmness, disagreement = True, 1.0, 0.0
@@ -97,8 +99,15 @@ class RigProblem:
 
     def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
         """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`."""
-        simulated = self.simulate(settings, runs)
-        return [(self.measured(run) - angles) / ENCODER_NOISE for run, angles in zip(runs, simulated, strict=True)]
+        return [self._residuals(run, angles) for run, angles in zip(runs, self.simulate(settings, runs), strict=True)]
+
+    def _residuals(self, run: int, simulated: Array) -> Array:
+        """Of one run; a setting whose simulation broke down is as far from the data as can be."""
+        measured = self.measured(run)
+        found = (measured - simulated) / ENCODER_NOISE
+        lost = ~np.isfinite(simulated).all(axis=(1, 2))
+        found[lost] = np.where(np.isfinite(measured), LOST, np.nan)
+        return found
 
     def candidates(
         self, setting: Setting, residuals: Sequence[Array], runs: Sequence[int]
