@@ -290,7 +290,10 @@ def test_finalists_are_judged_against_the_same_model(monkeypatch):
 
     monkeypatch.setattr(judge, "fit", fitted)
     monkeypatch.setattr(judge, "_afresh", lambda *_: [])
-    left = lambda problem, runs, whole, found, memory: levelled(nominal, levels[found.name][1])  # noqa: E731
+
+    def left(problem, runs, whole, found, memory):
+        return levelled(nominal, levels[found.name][1])
+
     monkeypatch.setattr(judge, "_left", left)
     current = levelled(nominal, 20.0)
     effects = [candidate(problem, name) for name in levels]

@@ -206,6 +206,12 @@ def normal_equations(columns: Sequence[NDArray[np.float32]], residuals: Sequence
     return matrix, vector
 
 
+def equations_by_run(found: Fit) -> tuple[Array, Array]:
+    """Return each run's own normal equations: (runs, numbers, numbers) and (runs, numbers)."""
+    parts = [normal_equations([c], [r], found.noise) for c, r in zip(found.columns, found.residuals, strict=True)]
+    return np.stack([matrix for matrix, _ in parts]), np.stack([vector for _, vector in parts])
+
+
 def cross_products(columns: Sequence[NDArray[np.float32]], others: Sequence[Array], noise: Noise) -> Array:
     """Return ``C W D^T`` of known columns with a few others (D: per run (k, rows, channels)), over all runs."""
     total = 0.0
@@ -300,9 +306,8 @@ def corrected(columns: NDArray[np.float32], taken: Array, before: Array, after: 
 def widened(problem: Problem, runs: Sequence[int], found: Fit) -> Fit:
     """Return the fit with a likelihood as wide as the runs differ and the simulator errs; its numbers follow."""
     free = ~on_bounds(problem, found.model)
-    parts = [normal_equations([c], [r], found.noise) for c, r in zip(found.columns, found.residuals, strict=True)]
-    matrices, vectors = np.stack([m for m, _ in parts])[:, free][:, :, free], np.stack([v for _, v in parts])[:, free]
-    differ = run_scatter(matrices, vectors)
+    matrices, vectors = equations_by_run(found)
+    differ = run_scatter(matrices[:, free][:, :, free], vectors[:, free])
     scatter = found.noise.scatter if differ is None else max(problem.firmness * found.noise.scatter * differ, 1.0)
     return fit(problem, runs, found.model, scatter=scatter, columns=found.columns, steps=1)
 

@@ -17,9 +17,9 @@ from wlr_gym.gap.fit import (
     Model,
     cheapest,
     constrained_step,
+    equations_by_run,
     fit,
     moved,
-    normal_equations,
     on_bounds,
     scaled_numbers,
     total_cost,
@@ -119,19 +119,22 @@ def _judged(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, whole
 
     What the whole fit found in the known numbers is no evidence for the effect: ``bare`` is without it.
     """
-    gain = total_cost(problem, bare.model, bare.residuals, memory) - total_cost(problem, whole.model, whole.residuals, memory)
-    judged = replace(
+    fitted = replace(
         hypothesis,
         model=whole.model,
-        gain=gain,
-        by_run=fall_by_run(bare.residuals, whole.residuals, estimate_noise(whole.residuals, memory, whole.noise.scatter)),
         residuals=whole.residuals,
-        base=bare.model,
-        base_residuals=bare.residuals,
         carries_over=carries_over(problem, runs, bare, whole, memory),
         tolerable=within_tolerance(problem, whole.model),
     )
-    return Final(judged, whole)
+    return Final(beside(problem, fitted, bare, memory), whole)
+
+
+def beside(problem: Problem, hypothesis: Hypothesis, bare: Fit, memory: Array) -> Hypothesis:
+    """The hypothesis with what it buys over the model without any, in all and by run, under this memory."""
+    cost = total_cost(problem, bare.model, bare.residuals, memory)
+    gain = cost - total_cost(problem, hypothesis.model, hypothesis.residuals, memory)
+    by_run = fall_by_run(bare.residuals, hypothesis.residuals, estimate_noise(hypothesis.residuals, memory))
+    return replace(hypothesis, gain=gain, by_run=by_run, base=bare.model, base_residuals=bare.residuals)
 
 
 def _left(problem: Problem, runs: Sequence[int], whole: Fit, candidate: Candidate, memory: Array) -> Fit:
@@ -177,10 +180,12 @@ def carries_over(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit, m
 
 def told_by_others(problem: Problem, found: Fit) -> list[Model]:
     """The model as it would be without each run in turn, to first order."""
-    parts = [normal_equations([c], [r], found.noise) for c, r in zip(found.columns, found.residuals, strict=True)]
-    matrix, vector = np.sum([m for m, _ in parts], axis=0), np.sum([v for _, v in parts], axis=0)
+    matrices, vectors = equations_by_run(found)
+    matrix, vector = matrices.sum(axis=0), vectors.sum(axis=0)
     settled = constrained_step(problem, found.model, matrix, vector)
-    steps = [constrained_step(problem, found.model, matrix - own, vector - pull) for own, pull in parts]
+    steps = [
+        constrained_step(problem, found.model, matrix - own, vector - pull) for own, pull in zip(matrices, vectors, strict=True)
+    ]
     return [moved(problem, found.model, step - settled) for step in steps]
 
 
@@ -192,7 +197,7 @@ def accept(
 
     A formula is taken only where no named effect buys nearly as much.
     """
-    good = [final for final in finals if _is_good(current, final)]
+    good = [final for final in finals if _is_good(current.cost, final.hypothesis)]
     named = [final for final in good if not final.hypothesis.candidate.formula]
     if named and named[0].hypothesis.gain >= NAMED_FIRST * good[0].hypothesis.gain:
         good = [named[0], *(final for final in good if final is not named[0])]
@@ -200,20 +205,18 @@ def accept(
     for final in good:
         settled, bare = (final, bare) if problem.thorough else settle(problem, runs, final, bare, tell)
         seen = [settled if other is final else other for other in seen]
-        if _is_good(current, settled):
+        if _is_good(current.cost, settled.hypothesis):
             return settled, seen, bare
     return None, seen, bare
 
 
 def shown_by_some_runs_only(hypothesis: Hypothesis, cost: float) -> bool:
     """Whether nothing speaks against a hypothesis but that the other runs do not bear it out; ``cost``: of the model so far."""
-    enough = hypothesis.gain >= least_gain(len(hypothesis.values), cost)
-    return enough and not hypothesis.carries_over and replace(hypothesis, carries_over=True).plausible
+    return not hypothesis.carries_over and _is_good(cost, replace(hypothesis, carries_over=True))
 
 
-def _is_good(current: Fit, final: Final) -> bool:
-    least = least_gain(len(final.hypothesis.values), current.cost)
-    return final.hypothesis.gain >= least and final.hypothesis.plausible
+def _is_good(cost: float, hypothesis: Hypothesis) -> bool:
+    return hypothesis.gain >= least_gain(len(hypothesis.values), cost) and hypothesis.plausible
 
 
 def settle(problem: Problem, runs: Sequence[int], final: Final, bare: Fit, tell: Tell) -> tuple[Final, Fit]:

@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.fit import Fit, Model, cheapest, fit, linearise, nominal_model, total_cost, widened
-from wlr_gym.gap.hypothesis import Hypothesis, fall_by_run
-from wlr_gym.gap.judge import Final, accept, finalists
+from wlr_gym.gap.hypothesis import Hypothesis
+from wlr_gym.gap.judge import Final, accept, beside, finalists
 from wlr_gym.gap.likelihood import estimate_noise
 from wlr_gym.gap.problem import Problem
 from wlr_gym.gap.refit import refit, refit_thoroughly
 from wlr_gym.gap.screen import LEAST_GAIN, Score, least_gain, responses, screen
 
-Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
 #: Hypotheses that are refitted in one round, and at most so many per name.
@@ -219,17 +218,8 @@ def _merged(
     final = {f.hypothesis.candidate.label: f.hypothesis for f in finals}
     merged = [final.get(h.candidate.label, h) for h in hypotheses]
     if best is not None:
-        memory = best.fit.noise.memory
-        cost = total_cost(problem, bare.model, bare.residuals, memory)
-        merged = [_compared(problem, hypothesis, bare, cost, memory) for hypothesis in merged]
+        merged = [beside(problem, hypothesis, bare, best.fit.noise.memory) for hypothesis in merged]
     return sorted(merged, key=lambda hypothesis: -hypothesis.gain)
-
-
-def _compared(problem: Problem, hypothesis: Hypothesis, bare: Fit, cost: float, memory: Array) -> Hypothesis:
-    """A hypothesis beside the model without any; ``cost`` is that of this model under the same memory."""
-    gain = cost - total_cost(problem, hypothesis.model, hypothesis.residuals, memory)
-    by_run = fall_by_run(bare.residuals, hypothesis.residuals, estimate_noise(hypothesis.residuals, memory))
-    return replace(hypothesis, gain=gain, by_run=by_run, base=bare.model, base_residuals=bare.residuals)
 
 
 def _labelled(hypotheses: Sequence[Hypothesis], wanted: Hypothesis) -> Hypothesis:

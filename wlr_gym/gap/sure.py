@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 
 from wlr_gym.effects import EFFECTS
 from wlr_gym.gap.analysis import Detectable, Estimate
-from wlr_gym.gap.fit import PINNED, Fit, normal_equations, on_bounds, prior_tightness, scaled_nominal, scaled_numbers, scales
+from wlr_gym.gap.fit import PINNED, Fit, equations_by_run, on_bounds, prior_tightness, scaled_nominal, scaled_numbers, scales
 from wlr_gym.gap.hypothesis import MOST_HARM, Hypothesis
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.screen import LEAST_GAIN, Score, least_amplitude, least_gain
@@ -39,18 +39,18 @@ def covariance(problem: Problem, fit: Fit) -> Array:
     tell is known to a few degrees of freedom only: it counts Student's t over 1.96 times.
     """
     curvature = fit.covariance()
-    parts = [
-        normal_equations([column], [residual], fit.noise) for column, residual in zip(fit.columns, fit.residuals, strict=True)
-    ]
+    matrices, vectors = equations_by_run(fit)
     tight = prior_tightness(problem, fit.model)
     pull = tight * (scaled_numbers(problem, fit.model) - scaled_nominal(problem, fit.model))
     stiff = np.diag(tight + PINNED * on_bounds(problem, fit.model))
-    whole, vector = sum(m for m, _ in parts), sum(v for _, v in parts)
-    shifts = [-np.linalg.solve(whole - matrix + stiff, vector - own + pull) for matrix, own in parts]
+    whole, vector, runs = matrices.sum(axis=0), vectors.sum(axis=0), len(vectors)
+    shifts = [
+        -np.linalg.solve(whole - matrix + stiff, vector - own + pull) for matrix, own in zip(matrices, vectors, strict=True)
+    ]
     spread = np.stack(shifts) - np.mean(shifts, axis=0)
-    jackknife = (len(parts) - 1) / len(parts) * (spread**2).sum(axis=0)
+    jackknife = (runs - 1) / runs * (spread**2).sum(axis=0)
     wider = np.sqrt(jackknife / np.maximum(np.diag(curvature), 1e-300))
-    few = two_sided_95(len(parts) - 1) / TWO_SIDED_95 if len(parts) > 1 else 1.0
+    few = two_sided_95(runs - 1) / TWO_SIDED_95 if runs > 1 else 1.0
     scale = scales(problem, fit.model) * np.where(wider > 1.0, few * wider, 1.0)
     return curvature * np.outer(scale, scale)
 
