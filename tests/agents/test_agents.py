@@ -5,9 +5,11 @@ import pytest
 
 from wlr_gym.errors import InputError
 from wlr_gym.evaluation import make_core
-from wlr_gym.policy import agent_names, load_agent, load_agent_config, make_policy
+from wlr_gym.parameters import ELEMENTS
+from wlr_gym.policy import agent_names, load_agent, load_agent_config, make_policy, policy_environment
 
 ENVIRONMENT = "WLR-Velocity-v0"
+DELAYS = [index for index, element in enumerate(ELEMENTS) if element.startswith("command.delay[")]
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +138,43 @@ def test_what_a_file_says_lies_over_its_base_for_every_task(tmp_path):
 )
 def test_settings_of_every_task_are_valid(contract, name, task):
     load_agent("ppo").make_policy(contract, load_agent_config(name, task=task))
+
+
+@pytest.mark.parametrize("config", ["ppo_slip_aware", "ppo_blind"])
+@pytest.mark.parametrize("task", ["velocity", "posture", "slope"])
+def test_what_is_learnt_from_comes_later_than_what_is_scored(task, config):
+    """Training draws commands 0 to 30 ms late, alike for all joints, on the task's own floors; scores have the task's own."""
+    learnt, scored = _learnt_and_scored(task, config)
+    late = learnt[:, DELAYS]
+    assert late.min() < 0.005
+    assert 0.025 < late.max() <= 0.03
+    np.testing.assert_array_equal(late, late[:, [0]].repeat(8, axis=1))
+    assert scored[:, DELAYS].max() <= 0.01
+    np.testing.assert_array_equal(np.delete(learnt, DELAYS, axis=1), np.delete(scored, DELAYS, axis=1))
+
+
+@pytest.mark.parametrize("config", ["ppo_slip_aware", "ppo_blind"])
+def test_path_learns_from_what_is_scored(config):
+    learnt, scored = _learnt_and_scored("path", config)
+    np.testing.assert_array_equal(learnt, scored)
+
+
+def _learnt_and_scored(task, config):
+    """Parameters (episodes, elements) that training draws, and those that the scores of the shipped policy draw."""
+    environment = f"WLR-{task.capitalize()}-v0"
+    shipped = f"{task}_{config.removeprefix('ppo_')}"
+    settings = load_agent_config(config, task=task)["environment"]
+    return [_drawn(make_core(environment, 64, keywords)) for keywords in (settings, policy_environment(shipped))]
+
+
+def _drawn(core):
+    """Parameters of the first episodes of seeds 0, 1, ..."""
+    for robot in range(core.count):
+        core.seed(robot, robot)
+    core.begin_episodes(core.everyone)
+    values = core.parameters.values.copy()
+    core.close()
+    return values
 
 
 @pytest.mark.parametrize(

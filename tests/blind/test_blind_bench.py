@@ -58,15 +58,15 @@ def test_truths_are_sealed_away_from_the_data(finished):
     sealed = list((plan.out / "sealed").iterdir())
     assert len(sealed) == 1
     truths = yaml.safe_load(sealed[0].read_text())
-    assert truths["set_2000"]["effects"][0]["name"] == case(0).effects[0]["name"]
+    assert truths["set_3000"]["effects"][0]["name"] == case(0).effects[0]["name"]
     assert any("sha256" in line for line in said)
     text = "".join(file.read_text() for file in (plan.out / "data").rglob("*.yaml"))
-    assert truths["set_2000"]["effects"][0]["name"] not in text
+    assert truths["set_3000"]["effects"][0]["name"] not in text
 
 
 def test_data_are_valid_measured_runs(finished):
     plan, _, _ = finished
-    runs = read_dataset(plan.out / "data" / "set_2001").runs
+    runs = read_dataset(plan.out / "data" / "set_3001").runs
     assert len(runs) == 1
     assert {finding.kind for finding in runs[0].findings} <= {"gap"}
 
@@ -82,13 +82,13 @@ def test_results_say_what_they_are_about_and_what_made_them(finished):
 def test_results_of_other_data_are_refused(finished, tmp_path):
     plan = dataclasses.replace(finished[0], out=tmp_path)
     shutil.copytree(finished[0].out, tmp_path, dirs_exist_ok=True)
-    with pytest.raises(InputError, match=r"set_2000\.json: is about other runs \(\[6\]\)"):
+    with pytest.raises(InputError, match=r"set_3000\.json: is about other runs \(\[6\]\)"):
         _again(dataclasses.replace(plan, runs=(5, 6)))
     file = plan.result_file(case(1))
     result = gap.read_result(file)
     result["blind_test"]["truth_sha256"] = "0" * 64
     file.write_text(json.dumps(result))
-    with pytest.raises(InputError, match=r"set_2001\.json: is about another hidden truth"):
+    with pytest.raises(InputError, match=r"set_3001\.json: is about another hidden truth"):
         _again(plan)
 
 
@@ -129,8 +129,8 @@ def test_errors_of_the_workflow_are_its_answers(tmp_path, monkeypatch):
 
 def test_a_process_that_dies_has_failed(tmp_path):
     report = gap.run_blind_test(gap.Plan(tmp_path, sets=1, processes=1, runs=(6,)), "no_such_module:analyse", lambda line: None)
-    assert report["failed"] == ["set_2000"]
-    result = gap.read_result(tmp_path / "results" / "set_2000.json")
+    assert report["failed"] == ["set_3000"]
+    result = gap.read_result(tmp_path / "results" / "set_3000.json")
     assert "No module named 'no_such_module'" in result["message"]
     assert result["blind_test"]["runs"] == [6]
 
@@ -164,8 +164,8 @@ def test_impossible_plans_are_refused(tmp_path, numbers):
 def test_a_seal_that_is_none_is_refused(tmp_path, text):
     plan = gap.Plan(tmp_path, sets=1)
     gap.make_output_folder(tmp_path / "sealed")
-    (tmp_path / "sealed" / "truths_2000_1.yaml").write_text(text)
-    with pytest.raises(InputError, match=r"truths_2000_1\.yaml: holds no truths"):
+    (tmp_path / "sealed" / "truths_3000_1.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"truths_3000_1\.yaml: holds no truths"):
         gap.seal(plan, plan.cases())
 
 
@@ -175,11 +175,11 @@ def test_a_test_of_any_length_must_have_the_same_truths(tmp_path, first, second)
     gap.seal(gap.Plan(tmp_path, first), gap.Plan(tmp_path, first).cases())
     plan = gap.Plan(tmp_path, second)
     same = plan.cases()
-    with pytest.raises(InputError, match=rf"truths_2000_{first}\.yaml: holds other truths .*1 sets, first set_2001"):
+    with pytest.raises(InputError, match=rf"truths_3000_{first}\.yaml: holds other truths .*1 sets, first set_3001"):
         gap.seal(plan, [same[0], dataclasses.replace(same[1], severity=9.0), *same[2:]])
     assert len(list((tmp_path / "sealed").iterdir())) == 1
     gap.seal(plan, same)
-    assert (tmp_path / "sealed" / f"truths_2000_{second}.yaml").is_file()
+    assert (tmp_path / "sealed" / f"truths_3000_{second}.yaml").is_file()
 
 
 def test_a_value_without_its_bound_is_not_shown():

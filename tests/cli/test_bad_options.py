@@ -59,4 +59,4 @@ def test_train_on_mujoco_with_its_precision(tmp_path):
     small = ["total_steps=16", "num_envs=2", "steps_per_env=8", "batch_size=16", "epochs=1", "environment.precision=float64"]
     assert main(["train", "--backend", "mujoco", "--out", str(tmp_path), "--no-progress", "--set", *small]) == 0
     settings = yaml.safe_load((tmp_path / "config.yaml").read_text())["settings"]
-    assert settings["environment"] == {"precision": "float64", "backend": "mujoco"}
+    assert (settings["environment"]["precision"], settings["environment"]["backend"]) == ("float64", "mujoco")

@@ -7,6 +7,7 @@ import numpy as np
 
 from wlr_gym.effects import EFFECTS
 from wlr_gym.gap.analysis import (
+    Adequacy,
     Analysis,
     Calibrated,
     ChannelGap,
@@ -19,8 +20,10 @@ from wlr_gym.gap.analysis import (
     HeatMap,
     IntakeFinding,
     Place,
+    Pulled,
     Recommendation,
     RunGap,
+    Statistic,
     Trace,
 )
 from wlr_gym.robot import JOINTS, load_robot
@@ -55,6 +58,20 @@ def trace(run, channel, size=1.0, seed=0):
         measured[rng.random(t.size) > 0.55] = np.nan
     before, calibrated = size * shape * 0.9, size * shape
     return Trace(run, channel, COLUMNS[channel].unit, t, measured, before, calibrated, truth)
+
+
+ADEQUACY = Adequacy(
+    19,
+    Statistic(1.19, 1.02, 1.03, 0.05),
+    Statistic(7.6, 7.0, 7.6, 0.1),
+    Statistic(2.8, 2.0, 2.4, 0.05),
+    Pulled("ground.mu", "run_05", Statistic(12.7, 6.4, 7.8, 0.05)),
+    {name: (Statistic(1.02, 1.01, 1.05, 0.4), Statistic(1.5, 1.0, 1.2, 0.05)) for name in CHANNELS}
+    | {
+        "acc_z": (Statistic(1.31, 1.0, 1.04, 0.05), Statistic(6.9, 6.8, 7.9, 0.25)),
+        "eff_leg_lf": (Statistic(1.32, 1.18, 1.25, 0.05), Statistic(41.7, 35.7, 40.3, 0.05)),
+    },
+)
 
 
 def evidence():
@@ -141,7 +158,7 @@ EFFECT_FOUND = Analysis(
     ),
     detectable={"viscous_friction": Detectable("coefficient", 0.0081, "N m s/rad")},
     recommendations=(Recommendation("straight", "with 0.5 kg on the body it tells rolling resistance from dry friction"),),
-    adequacy=dict.fromkeys(CHANNELS, 1.02) | {"acc_z": 1.31, "eff_leg_lf": 1.12},
+    adequacy=ADEQUACY,
     seconds={"intake": 1.2, "calibration": 61.0, "naming": 130.4},
     provenance={"backend": "gibbs_appell"},
 )

@@ -462,6 +462,23 @@ def test_formula_wins_only_over_worse_names():
     assert labels(named(toy)) == ["twin body k * rate"]
 
 
+@pytest.mark.parametrize("place", ["body", "elsewhere"])
+def test_no_name_is_looked_for_where_an_unknown_law_acts(place):
+    toy = Toy({}, [sized("drag", 2.0, "left"), sized("decoy_1", 0.8)])  # the decoy acts on the body
+    ordinary = toy.candidates
+
+    def with_formula(setting, residuals, runs):
+        probes, candidates = ordinary(setting, residuals, runs)
+        same = candidate(Toy(), "twin")
+        formula = Candidate("twin", (place,), same.unknowns, same.starts, "k * rate")
+        return probes, [formula, next(c for c in candidates if c.name == "decoy_1")]
+
+    toy.candidates = with_formula
+    found = labels(named(toy))
+    assert found[0] == f"twin {place} k * rate"
+    assert found[1:] == (["decoy_1 body"] if place == "elsewhere" else [])
+
+
 def test_shortlist_keeps_some_of_every_name():
     problem = Toy({}, [sized("drag", 2.0, "left", "right")])
     current = fit(problem, RUNS, nominal_model(problem))

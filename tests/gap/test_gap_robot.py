@@ -8,22 +8,30 @@ import numpy as np
 import pandas
 import pytest
 from engine_runs import META, ROBOT, posture_and_turns, record, spaced
+from gap_examples import EFFECT_FOUND
 
 from wlr_gym.effects import EFFECTS, UNKNOWN_EFFECT, Patch, PatchEffect, apply_patch, load_patch
 from wlr_gym.errors import InputError
+from wlr_gym.gap.analysis import Estimate
 from wlr_gym.gap.fit import Model, nominal_model
 from wlr_gym.gap.hypothesis import within_tolerance
 from wlr_gym.gap.problem import Setting
+from wlr_gym.gap.prove import level, mean_squares, noise_floor
+from wlr_gym.gap.result import write_result
 from wlr_gym.gap.robot.candidates import ripple_order, robot_candidates
-from wlr_gym.gap.robot.formulas import formula_candidates
+from wlr_gym.gap.robot.formulas import formula_candidates, wave_frequency
 from wlr_gym.gap.robot.open import LEAST_RUNS, open_robot
 from wlr_gym.gap.robot.problem import LOST, RobotProblem
 from wlr_gym.gap.robot.quantities import knobs, tolerance, write
 from wlr_gym.gap.robot.simulate import PHYSICS_STEP
+from wlr_gym.gap.workflow import found_effect
 from wlr_gym.parameters import Parameters
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
-from wlr_gym.runs import Run
+from wlr_gym.runs import Run, read_run
+from wlr_gym.runs.excitations import excite
 from wlr_gym.runs.format import CHANNELS
+from wlr_gym.runs.record import record_simulation
+from wlr_gym.runs.replay import replay
 from wlr_gym.runs.write import write_run
 
 NOMINAL = Parameters.nominal(ROBOT)
@@ -293,23 +301,62 @@ def test_patch_of_floor_needs_a_floor_that_was_driven():
 
 
 def test_formulas_parse_and_vanish_with_their_constants():
-    probes, candidates = formula_candidates()
+    times = np.linspace(0.0, 10.0, 500)
+    probes, candidates = formula_candidates([times], [np.ones((len(times), len(CHANNELS)))])
     assert {candidate.name for candidate in candidates} == {UNKNOWN_EFFECT}
-    state = {"angle": 0.7, "rate": -1.3, "abs": abs, "cos": math.cos, "sin": math.sin}
+    state = {
+        "angle": 0.7,
+        "rate": -1.3,
+        "wind_up": 0.4,
+        "time": 3.7,
+        "abs": abs,
+        "cos": math.cos,
+        "sin": math.sin,
+        "tanh": math.tanh,
+    }
+    state |= {f"{kind}_torque{which}": 0.4 for kind in ("leg", "wheel") for which in ("", "_opposite")}
+    state |= {f"wheel_angle_{side}": 0.3 for side in ("lf", "rf", "lr", "rr")}
     state |= {"velocity_x": 0.4, "velocity_y": -0.1, "yaw_rate": 0.8}
     state |= {f"{kind}_rate_{side}": 0.5 for kind in ("leg", "wheel") for side in ("lf", "rf", "lr", "rr")}
     for candidate in candidates:
         patch = load_patch([candidate.effect([0.1] * len(candidate.unknowns)).content()])
         assert len(patch.forces) == 1
-        assert set(candidate.units) == {unknown.name for unknown in candidate.unknowns}
-        constants = {unknown.name: 0.0 for unknown in candidate.unknowns}
+        sizes = [unknown for unknown in candidate.unknowns if unknown.is_size]
+        constants = {unknown.name: unknown.neutral for unknown in candidate.unknowns} | dict(candidate.fixed)
+        assert set(candidate.units) == set(constants)
         assert eval(candidate.formula, {}, {**state, **constants}) == pytest.approx(0.0)
-        for unknown in candidate.unknowns:  # linear in each constant
+        for unknown in sizes:  # linear in each constant
             one, two = (eval(candidate.formula, {}, {**state, **constants, unknown.name: size}) for size in (1.0, 2.0))
             assert two == pytest.approx(2 * one)
             assert abs(one) > 0.0
             assert (unknown.low, unknown.neutral) == (-unknown.high, 0.0)
-    assert len({probe.key for probe in probes}) == len(probes) == sum(len(c.unknowns) for c in candidates)
+    assert len({probe.key for probe in probes}) == len(probes) == sum(u.is_size for c in candidates for u in c.unknowns)
+
+
+def test_every_formula_that_is_found_can_be_written_and_loaded(tmp_path):
+    times = np.linspace(0.0, 10.0, 500)
+    for k, candidate in enumerate(formula_candidates([times], [np.ones((len(times), len(CHANNELS)))])[1]):
+        values = candidate.effect([0.1] * len(candidate.unknowns)).parameters
+        fitted = {u.name: Estimate(values[u.name], 0.0, 0.2, u.unit) for u in candidate.unknowns}
+        done = replace(EFFECT_FOUND, effects=(found_effect(candidate, fitted, 1.0, 50.0),))
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        write_result(done, folder)
+        (loaded,) = load_patch(folder / "patch.yaml").effects
+        assert loaded == candidate.effect([values[u.name] for u in candidate.unknowns])
+
+
+def test_a_wave_that_all_runs_share_is_found_beside_larger_ones_that_differ():
+    rng = np.random.default_rng(4)
+    column = CHANNELS.index("eff_wheel_lf")
+    times = [np.arange(0.0, length, 0.02) for length in (12.0, 17.0, 24.0, 15.0)]
+    residuals = []
+    for k, t in enumerate(times):
+        left = np.full((len(t), len(CHANNELS)), np.nan)
+        slow = np.cumsum(rng.standard_normal(len(t)))  # what any model lacks: most at low frequencies
+        left[:, column] = 0.1 * slow + 3.0 * np.sin(2 * np.pi * (0.3 + 0.2 * k) * t) + 1.0 * np.sin(2 * np.pi * 0.87 * t + 2.0)
+        residuals.append(left)
+    assert wave_frequency(times, residuals) == pytest.approx(0.87, abs=0.02)
 
 
 # ---- opening a folder ------------------------------------------------------------------------------------------------
@@ -456,11 +503,53 @@ def test_known_effects_and_formulas_are_part_of_the_model(good):
     assert np.nanmax(np.abs(mixed[2] - mixed[0])) > 1.0
 
 
+def test_a_formula_that_is_known_and_tried_again_is_two_forces(good):
+    """Frequencies do not add up, and constants go by their names, in whatever order a file has them."""
+    units = {"a": "N", "b": "N", "w": "rad/s"}
+    law, where = "a * sin(w * time) + b * cos(w * time)", ("floor_force_x",)
+    known = PatchEffect(UNKNOWN_EFFECT, where, {"w": 6.0, "b": 0.5, "a": 3.0}, law, units)
+    nothing = PatchEffect(UNKNOWN_EFFECT, where, {"a": 0.0, "b": 0.0, "w": 9.0}, law, units)
+    problem = RobotProblem([good], known=[known.content()])
+    setting = nominal_model(problem).setting
+    alone = problem.residuals([setting], [0])[0][0]
+    beside = problem.residuals([setting, replace(setting, effects=(nothing,))], [0])[0]
+    assert beside[0] == pytest.approx(alone, abs=1e-3, nan_ok=True)
+    assert beside[1] == pytest.approx(alone, abs=1e-3, nan_ok=True)
+    plain = RobotProblem([good]).residuals([setting], [0])[0][0]
+    assert np.nanmax(np.abs(plain - alone)) > 1.0
+
+
+def test_time_of_a_formula_is_that_of_the_run_however_it_is_replayed(tmp_path):
+    """Recorded by the command's own code, replayed in segments and in the gap workflow's windows; 0.5 s off is another law."""
+
+    def push(late):
+        law = "a * sin(w * time + p)"
+        numbers, units = {"a": 5.0, "w": 3.0, "p": 3.0 * late}, {"a": "N", "w": "rad/s", "p": "rad"}
+        return {"name": UNKNOWN_EFFECT, "where": ["floor_force_x"], "formula": law, "parameters": numbers, "units": units}
+
+    motion = excite("straight", 0, seconds=6.0)
+    run = read_run(record_simulation(tmp_path / "run_01.parquet", motion, ROBOT, "gibbs_appell", 0, load_patch([push(0.0)])))
+    errors = []
+    for late in (0.0, 0.5):
+        problem = RobotProblem([run], known=[push(late)])
+        whole = replay(run, effects=[push(late)]).errors["eff_wheel_lf"].as_dict()["segment_in_noise_units"]
+        errors.append((level(mean_squares([problem.residuals([nominal_model(problem).setting], [0])[0][0]], 50.0)), whole))
+    assert max(errors[0]) < 1.6
+    assert min(errors[1]) > 3.0
+
+
 def test_floor_is_what_a_perfect_model_reaches(good):
     problem = RobotProblem([good])
-    floor = problem.floor(nominal_model(problem).setting, [0])
+    setting = nominal_model(problem).setting
+    floor = noise_floor(problem, setting, [0])
     assert 0.9 < floor < 1.25
-    assert problem.floor(nominal_model(problem).setting, [0]) == floor
+    first, second = problem.remade(setting, [0], 2)
+    assert level(mean_squares(first, problem.cap)) == floor  # however many are made
+    assert level(mean_squares(second, problem.cap)) == pytest.approx(floor, rel=0.1)
+    assert not np.array_equal(first[0], second[0], equal_nan=True)
+    _, again = RobotProblem([good], threads=2).remade(setting, [0], 2)
+    assert np.array_equal(again[0], second[0], equal_nan=True)
+    assert np.array_equal(np.isnan(first[0]), np.isnan(problem.residuals([setting], [0])[0][0]))
 
 
 def test_features_are_rows_of_the_run(good):

@@ -14,6 +14,7 @@ from wlr_gym.gap.analysis import Calibrated, Equivalent, Estimate, FoundEffect, 
 from wlr_gym.gap.result import patch_of, read_result, result_of, write_result
 from wlr_gym.gap.robot.quantities import knobs
 from wlr_gym.robot import load_robot
+from wlr_gym.runs.format import CHANNELS
 from wlr_gym.tasks.identified import identified_events
 
 #: What every result file holds, by the format's description.
@@ -76,6 +77,14 @@ def test_numbers_survive(tmp_path):
     assert content["gap"]["reduction_ci95"] == [0.912, 0.973]
     assert len(content["evidence"]) == len(analysis.evidence)
     assert content["evidence"][0]["by_run"]["run_01"] == 885.4
+    adequacy = content["adequacy"]
+    assert adequacy["replicates"] == 19
+    assert adequacy["level"]["channels"].keys() == adequacy["whiteness"]["channels"].keys() == set(CHANNELS)
+    assert adequacy["level"]["channels"]["acc_z"] == {"value": 1.31, "expected": 1.0, "limit": 1.04, "p": 0.05, "ratio": 1.31}
+    assert adequacy["whiteness"]["channels"]["acc_z"]["value"] == 6.9
+    assert (adequacy["whiteness"]["value"], adequacy["constancy"]["ratio"]) == (7.6, 1.4)
+    pulled = adequacy["constancy"]["pulled_most"]
+    assert (pulled["number"], pulled["run"], pulled["value"]) == ("ground.mu", "run_05", 12.7)
     assert content["run_gaps"][2] == {"run": "run_03", "heldout": True, **{k: getattr(analysis.run_gaps[2], k) for k in GAPS}}
 
 
@@ -199,15 +208,16 @@ def test_own_keys_of_other_versions_are_kept(tmp_path):
 
 
 def test_a_result_of_an_earlier_version_is_read(tmp_path):
-    """As they were before reductions had a sign, and the closure and what would have shown were told."""
+    """As they were before reductions had a sign, the closure and what would have shown were told, and adequacy was a test."""
     path = write_result(examples.EFFECT_FOUND, tmp_path)
     content = json.loads(path.read_text())
     del content["gap"]["reduction_signed"], content["closure"], content["detectable"]
+    content["adequacy"] = {"acc_z": 1.31, "volt": None}
     path.write_text(json.dumps(content))
     result = read_result(path)
     assert result.gap is not None
     assert (result.gap.reduction, result.gap.reduction_signed) == (0.951, None)
-    assert (result.closure, result.detectable) == ("", {})
+    assert (result.closure, result.detectable, result.adequacy) == ("", {}, {"acc_z": 1.31, "volt": None})
 
 
 @pytest.mark.parametrize(

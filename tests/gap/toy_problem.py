@@ -64,6 +64,7 @@ class Toy:
 
     metric, cap, steps, thorough, firmness, disagreement = "RMS in noise units", 50.0, 4, False, 1.0, 0.0
     sealed: tuple[str, ...] = ()
+    turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})
     motions: Mapping[str, str] = MappingProxyType({})
 
     def __init__(self, truth=None, effects=(), seed=0, *, runs=5, rows=200, white=1.0, error=0.0, memory=0.9, reach=REACH):
@@ -126,8 +127,10 @@ class Toy:
     def residuals(self, settings, runs):
         return [(self._measured[r] - made) / NOISE for r, made in zip(runs, self.simulate(settings, runs), strict=True)]
 
-    def floor(self, setting, runs):
-        return 1.0
+    def remade(self, setting, runs, count) -> Any:
+        for k in range(count):
+            rng = np.random.default_rng([k, 11])
+            yield [rng.standard_normal((self.rows, len(CHANNELS))) for _ in runs]
 
     def features(self, setting, runs) -> Any:
         return [{"shape of drag": self.shape("drag left")[r][:, 0], "time": self.times(r)} for r in runs]

@@ -29,7 +29,7 @@ from wlr_gym.model import dynamics
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants import make_plant
 from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, standing_state
-from wlr_gym.plants.forces import make_force
+from wlr_gym.plants.forces import WIND_UP, make_force
 from wlr_gym.plants.simulator import Simulator
 
 #: One parameter of every family of effects.
@@ -508,3 +508,60 @@ def test_a_neutral_formula_does_not_change_a_bit(simulator):
     plant = make_plant(simulator, ROBOT, 3, QUIET, (nothing,))
     plant.reset(parameters=parameters_for(3))
     np.testing.assert_array_equal(run(plant, 0, 10), run(make(simulator, 3), 0, 10))
+
+
+def test_a_formula_of_time_is_asked_at_every_step_and_time_goes_on_with_the_state(simulator):
+    """Against an external force set anew before each step, from 2 s on; halfway through, robots are put where they are."""
+    rise = make_force(["floor_force_x"], "f * time", {"f": 2.0}, {"f": "N/s"})
+    start = make(simulator, 2).get_state()
+    start.time = np.array([2.0, 0.0])
+    found = []
+    for ticks, step in ((20, 0.01), (200, 0.001)):
+        plant = make_plant(simulator, ROBOT, 2, PlantOptions(step, 0.001, sensor_noise=False), (rise,))
+        plant.reset(state=start)
+        hold(plant, home(2), ticks // 2)
+        plant.reset(state=plant.get_state(), mask=np.array([True, False]))
+        hold(plant, home(2), ticks // 2)
+        found.append(plant.truth().position.copy())
+        plant.close()
+    pushed = make_plant(simulator, ROBOT, 2, PlantOptions(0.001, 0.001, sensor_noise=False))
+    parameters = Parameters.nominal(ROBOT, 2)
+    for tick in range(200):
+        parameters["external_force"][:, 0] = 2.0 * (start.time + 0.001 * tick)
+        if tick == 0:
+            pushed.reset(parameters=parameters, state=start)
+        pushed.set_parameters(parameters)
+        if tick == 100:
+            pushed.reset(state=pushed.get_state(), mask=np.array([True, False]))
+        hold(pushed, home(2), 1)
+    expected = pushed.truth().position.copy()
+    pushed.close()
+    for position in found:
+        np.testing.assert_allclose(position, expected, atol=1e-7)
+    assert expected[0, 0] > expected[1, 0] + 1e-5
+
+
+def test_wind_up_is_state_of_the_joint_whose_formula_asks_for_it(simulator):
+    law = make_force(["leg_lf"], "-f * wind_up", {"f": 0.3}, {"f": "N m"})
+    goals, found, expected = home(2), [], np.zeros(2)
+    goals[:, :4] += 0.3
+    for ticks, step in ((10, 0.02), (200, 0.001)):
+        plant = make_plant(simulator, ROBOT, 2, PlantOptions(step, 0.001, sensor_noise=False), (law,))
+        for tick in range(ticks):
+            if step == 0.001:
+                way = plant.truth().joint_velocity[:, 0] * step / WIND_UP
+                expected += way - np.abs(way) * expected
+            if tick == ticks // 2:
+                plant.reset(state=plant.get_state(), mask=np.array([True, False]))
+            hold(plant, goals, 1)
+        wound = plant.get_state().wind_up
+        assert wound is not None
+        assert not wound[:, 1:].any()
+        found.append(wound[:, 0].copy())
+        plant.reset()
+        cleared = plant.get_state().wind_up
+        assert cleared is not None
+        assert not cleared.any()
+        plant.close()
+    assert (expected > 0.5).all()
+    np.testing.assert_allclose(found, [expected] * 2, atol=0.01)

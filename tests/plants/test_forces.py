@@ -11,6 +11,8 @@ from wlr_gym.plants.forces import (
     COORDINATES,
     FEATURES,
     INPUTS,
+    MEMORY,
+    WIND_UP,
     Force,
     compile_forces,
     force_source,
@@ -35,7 +37,8 @@ def state() -> dict[str, np.ndarray]:
     yaw, pitch, roll = rng.uniform(-3, 3, COUNT), rng.uniform(-1.4, 1.4, COUNT), rng.uniform(-3, 3, COUNT)
     for k, axis in enumerate("wxyz"):
         inputs[f"quaternion_{axis}"] = quaternion(yaw, pitch, roll)[:, k]
-    return inputs | {"yaw": yaw, "pitch": pitch, "roll": roll}
+    memory = {name: rng.uniform(-1, 1, COUNT) for name in MEMORY}
+    return inputs | memory | {"yaw": yaw, "pitch": pitch, "roll": roll}
 
 
 def matrix(state, precision="float64"):
@@ -46,7 +49,8 @@ def run(forces, state, precision="float64", values=None):
     kernel = compile_forces(forces, precision)
     out = np.full((len(COORDINATES), COUNT), np.nan, precision)
     values = np.repeat(kernel.values[:, None], COUNT, axis=1) if values is None else values
-    kernel.evaluate(matrix(state, precision), np.ascontiguousarray(values, precision), out)
+    memory = np.stack([state[name] for name in MEMORY]).astype(precision)
+    kernel.evaluate(matrix(state, precision), np.ascontiguousarray(values, precision), memory, out, 0.001)
     return dict(zip(COORDINATES, out, strict=True))
 
 
@@ -94,6 +98,7 @@ def test_features_of_a_joint_and_of_its_corner(state, joint):
     expected = {
         "angle": state[f"joint_position_{j}"],
         "rate": state[f"joint_velocity_{j}"],
+        "wind_up": state[f"wind_up_{j}"],
         "motor_torque": state[f"motor_torque_{j}"],
         "leg_angle": state[f"joint_position_{corner}"],
         "leg_rate": state[f"joint_velocity_{corner}"],
@@ -101,6 +106,8 @@ def test_features_of_a_joint_and_of_its_corner(state, joint):
         "wheel_angle": state[f"joint_position_{4 + corner}"],
         "wheel_rate": state[f"joint_velocity_{4 + corner}"],
         "wheel_torque": state[f"motor_torque_{4 + corner}"],
+        "leg_torque_opposite": state[f"motor_torque_{(1, 0, 3, 2)[corner]}"],
+        "wheel_torque_opposite": state[f"motor_torque_{(5, 4, 7, 6)[corner]}"],
         "normal_force": state[f"contact_force_{corner}_z"],
         "slip_velocity_x": state[f"slip_velocity_{corner}_x"],
         "slip_velocity_y": state[f"slip_velocity_{corner}_y"],
@@ -129,6 +136,27 @@ def test_several_places_get_the_law_of_their_own_joint(state):
         np.testing.assert_allclose(forces[joint], -0.3 * state[f"joint_velocity_{j}"], rtol=1e-14)
 
 
+def test_the_kernel_moves_time_and_the_wind_up_it_is_asked_for_on():
+    """A joint that turns on at one rate winds up along an exponential of its way, and after turning back falls twice as far."""
+    force = make_force(["leg_lf"], "-t * wind_up", {"t": 0.5}, {"t": "N m"})
+    inputs, memory = np.zeros((len(INPUTS), 1)), np.zeros((len(MEMORY), 1))
+    memory[2] = 0.3
+    out = np.zeros((len(COORDINATES), 1))
+    step, rate, row = 1e-4, 0.4, INPUTS.index("joint_velocity_0")
+    kernel = compile_forces([force])
+    for sign, start in ((1.0, 0.0), (-1.0, None)):
+        start = memory[1, 0] if start is None else start
+        inputs[row] = sign * rate
+        for _ in range(2000):
+            kernel.evaluate(inputs, kernel.values[:, None], memory, out, step)
+        way = 2000 * step * rate / WIND_UP
+        assert memory[1, 0] == pytest.approx(sign + (start - sign) * np.exp(-way), abs=2e-3)
+    kernel.evaluate(inputs, kernel.values[:, None], memory, out, 0.0)
+    assert out[list(COORDINATES).index("leg_lf"), 0] == -0.5 * memory[1, 0]
+    assert memory[0, 0] == pytest.approx(0.4)
+    assert memory[2, 0] == 0.3  # no formula asks for it
+
+
 def test_forces_on_one_place_add_and_constants_stay_apart(state):
     other = make_force(["leg_lr", "wheel_lf"], "k * sin(angle)", {"k": 0.25}, {"k": "N m"})
     both, first, second = run([SPRING, other], state), run([SPRING], state), run([other], state)
@@ -144,12 +172,14 @@ def test_same_bits_alone_and_in_a_batch(state, precision):
         make_force(["wheel_rf"], "-c * normal_force * tanh(slip_speed / v) * exp(-abs(rate) / w)",
                    {"c": 0.01, "v": 0.1, "w": 2.0}, {"c": "m", "v": "m/s", "w": "rad/s"}),
         make_force(["body_torque_pitch"], "k * sin(yaw) + k * pitch", {"k": 0.4}, {"k": "N m"}),
+        make_force(["floor_force_z"], "a * sin(w * time)", {"a": 0.7, "w": 1.3}, {"a": "N", "w": "rad/s"}),
     ]  # fmt: skip
     kernel, whole = compile_forces(laws, precision), run(laws, state, precision)
-    inputs, values = matrix(state, precision), np.repeat(kernel.values[:, None], 1, axis=1).astype(precision)
+    inputs, values = matrix(state, precision), kernel.values[:, None].astype(precision)
     for k in range(COUNT):
         alone = np.zeros((len(COORDINATES), 1), precision)
-        kernel.evaluate(np.ascontiguousarray(inputs[:, k : k + 1]), values, alone)
+        memory = np.array([[state[name][k]] for name in MEMORY], precision)
+        kernel.evaluate(np.ascontiguousarray(inputs[:, k : k + 1]), values, memory, alone, 0.001)
         assert np.array_equal(alone[:, 0], np.stack(list(whole.values()))[:, k])
     reference = generalised_forces(laws, state)
     for name, value in whole.items():
@@ -197,7 +227,7 @@ def test_the_users_text_never_reaches_the_kernel():
         (["body_torque_yaw"], "k * rate", {"k": 1}, {"k": "N m s"}, ["'rate' belongs to a joint", "body_torque_yaw is none"]),
         (["body_torque_yaw"], "k * leg_rate", {"k": 1}, {"k": "N m s"}, ["name a corner: leg_rate_lf"]),
         (["leg_lf"], "k * leg_rate + leg_angle", {"k": 1}, {"k": "N m s"}, ["do not go together"]),
-        (["leg_lf"], "time", {}, {}, ["unknown name 'time'"]),
+        (["leg_lf"], "warmth", {}, {}, ["unknown name 'warmth'"]),
         (["leg_lf"], "1", {}, {}, ["is in pure number; leg_lf takes N m"]),
     ],
 )

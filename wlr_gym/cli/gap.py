@@ -134,14 +134,14 @@ def _numbers(analysis: Analysis) -> Iterator[str]:
 
     for effect in analysis.effects:
         values = ", ".join(f"{name} {estimate(found)}" for name, found in effect.parameters.items())
-        formula = f"{effect.formula}; " if effect.formula else ""
-        yield f"  {plain(effect.name)} at {places(effect.where)}: {formula}{values}; confidence {percent(effect.confidence)}"
+        told = [effect.formula, values, f"confidence {percent(effect.confidence)}"]
+        yield f"  {plain(effect.name)} at {places(effect.where)}: {'; '.join(filter(None, told))}"
     gap = analysis.gap
     if gap is not None:
         steps = [f"{error(gap.heldout_before)} as given", f"{error(gap.heldout_calibrated)} calibrated"]
-        steps += [f"{error(gap.heldout_after)} with the effects"] if analysis.effects else []
+        steps += [f"{error(gap.heldout_after)} with the effects"] if analysis.added else []
         yield f"  error of the runs kept aside, 1 = sensor noise: {', '.join(steps)}; noise floor {error(gap.noise_floor)}"
-        if analysis.effects:
+        if analysis.added:
             yield f"  removed of the avoidable error: {removed(analysis)}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -198,6 +199,84 @@ class Detectable:
 
 
 @dataclass(frozen=True)
+class Statistic:
+    """One number about what the final model leaves in the fitted runs, beside the same of runs that it made itself.
+
+    Attributes:
+        value: observed.
+        expected: median of the runs made.
+        limit: their 95 % quantile.
+        p: share of them, the observed ones counted in, that are as large; NaN where they cannot be compared.
+    """
+
+    value: float
+    expected: float
+    limit: float
+    p: float
+
+    @property
+    def ratio(self) -> float:
+        """How many times larger than expected; NaN where nothing is expected."""
+        return self.value / self.expected if self.expected > 0.0 else math.nan
+
+    @property
+    def rejected(self) -> bool:
+        """Whether chance alone leaves so much in one case of 20 at most."""
+        return self.p <= 0.05
+
+
+@dataclass(frozen=True)
+class Pulled:
+    """The number that one run pulls farthest from the other runs, in standard errors of what that run tells."""
+
+    number: str
+    run: str
+    errors: Statistic
+
+
+@dataclass(frozen=True)
+class Adequacy:
+    """What the final model leaves in the fitted runs; see :mod:`wlr_gym.gap.adequacy`.
+
+    Attributes:
+        replicates: how many sets of runs the model made.
+        level: root mean square over all channels, noise units.
+        whiteness: rows that say the same, geometric mean over the channels.
+        constancy: how many times more than their rows promise the runs differ in where they pull the numbers; its value is NaN
+            where the data tell nothing of any number.
+        pulled: the number that is pulled most.
+        channels: name -> level and whiteness of one channel.
+    """
+
+    replicates: int
+    level: Statistic
+    whiteness: Statistic
+    constancy: Statistic
+    pulled: Pulled
+    channels: Mapping[str, tuple[Statistic, Statistic]]
+
+
+@dataclass(frozen=True)
+class Turning:
+    """What is left of a signal goes with the turning of its joint; see :mod:`wlr_gym.gap.turning`.
+
+    Attributes:
+        joint, signal: whose.
+        order: periods per turn.
+        share: of the squared residuals that the turning predicts, beyond what other orders do.
+        amplitude: noise units, root mean square over the runs.
+        confidence: 0..1: share of bootstrap samples of the runs in which it is as clear as asked for.
+    """
+
+    joint: str
+    signal: str
+    order: int
+    share: float
+    amplitude: float
+    confidence: float
+
+
+@dataclass(frozen=True)
 class Recommendation:
     """A run to record next: name of an excitation, and why."""
 
@@ -227,7 +306,13 @@ class Analysis:
     channel_gaps: tuple[ChannelGap, ...] = ()
     detectable: Mapping[str, Detectable] = field(default_factory=dict)
     recommendations: tuple[Recommendation, ...] = ()
-    adequacy: Mapping[str, float] = field(default_factory=dict)
+    adequacy: Adequacy | None = None
+    turning: Turning | None = None
     known_effects: tuple[Mapping[str, object], ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
     provenance: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def added(self) -> tuple[FoundEffect, ...]:
+        """The effects that were added to the model: all but an unknown one without a formula."""
+        return tuple(effect for effect in self.effects if effect.name != UNKNOWN or effect.formula)

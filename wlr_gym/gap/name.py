@@ -17,7 +17,7 @@ from wlr_gym.gap.fit import Fit, Model, cheapest, fit, linearise, nominal_model,
 from wlr_gym.gap.hypothesis import Hypothesis
 from wlr_gym.gap.judge import Final, accept, beside, finalists
 from wlr_gym.gap.likelihood import estimate_noise
-from wlr_gym.gap.problem import Problem
+from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.refit import refit, refit_thoroughly
 from wlr_gym.gap.screen import LEAST_GAIN, Score, least_gain, responses, screen
 
@@ -91,8 +91,7 @@ def name_effects(
     models = [start.model]
     while True:
         probes, candidates = problem.candidates(current.model.setting, current.residuals, runs)
-        had = {candidate.label for candidate, _ in current.model.effects}
-        candidates = [candidate for candidate in candidates if candidate.label not in had]
+        candidates = [candidate for candidate in candidates if not _settled(current.model, candidate)]
         tell(f"screening {len(candidates)} candidates")
         found = responses(problem, current, runs, probes)
         scores = screen(candidates, found, current.cost)
@@ -125,6 +124,16 @@ def name_effects(
             break
         models.append(current.model)
     return Naming(calibrated, current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
+
+
+def _settled(model: Model, candidate: Candidate) -> bool:
+    """Whether the model has the candidate, or an unknown law on every joint where it acts.
+
+    What a name buys beside a formula at one joint is what the formula has got wrong of the law.
+    """
+    unknown = {place for other, _ in model.effects if other.formula for place in other.where}
+    had = {other.label for other, _ in model.effects}
+    return candidate.label in had or (not candidate.formula and unknown.issuperset(candidate.where))
 
 
 def _without_more(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> Fit:

@@ -53,13 +53,13 @@ def figures(analysis: Analysis) -> dict[str, Figure]:
     if analysis.evidence:
         found["evidence"] = _evidence(analysis.evidence)
     if analysis.gap is not None:
-        found["gap"] = _gap(analysis.gap, analysis.run_gaps, with_effects=bool(analysis.effects))
+        found["gap"] = _gap(analysis.gap, analysis.run_gaps, with_effects=bool(analysis.added))
     if analysis.channel_gaps:
-        found["channels"] = _channels(analysis.channel_gaps, with_effects=bool(analysis.effects))
+        found["channels"] = _channels(analysis.channel_gaps, with_effects=bool(analysis.added))
     noise = {gap.channel: gap.noise for gap in analysis.channel_gaps}
     for index in range(0, len(analysis.traces), _PANELS):
         shown = analysis.traces[index : index + _PANELS]
-        found[f"overlays_{index // _PANELS + 1}"] = _overlays(shown, noise, with_effects=bool(analysis.effects))
+        found[f"overlays_{index // _PANELS + 1}"] = _overlays(shown, noise, with_effects=bool(analysis.added))
     return found
 
 

@@ -6,7 +6,7 @@ The steps of the workflow (calibrate, test, localise, name, prove) speak only to
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -206,6 +206,7 @@ class Problem(Protocol):
         thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
         motions: effect -> name of the motion that shows it best, for advice on what to record; may be empty.
         sealed: names of the runs to keep for the proof, where the problem knows better than a general rule; else empty.
+        turning: joints without end, whose angle alone changes nothing: name -> its feature, and the signals that would show it.
     """
 
     metric: str
@@ -216,6 +217,7 @@ class Problem(Protocol):
     thorough: bool
     motions: Mapping[str, str]
     sealed: tuple[str, ...]
+    turning: Mapping[str, tuple[str, tuple[str, ...]]]
     runs: tuple[str, ...]
     signals: tuple[Signal, ...]
     quantities: tuple[Quantity, ...]
@@ -232,8 +234,18 @@ class Problem(Protocol):
         """Return what the sensors would have read: (len(settings), rows, signals) per run, SI."""
         ...
 
-    def floor(self, setting: Setting, runs: Sequence[int]) -> float:
-        """Return the level (root mean square residual over signals) of data that the model itself made with these sensors."""
+    def remade(self, setting: Setting, runs: Sequence[int], count: int) -> Iterator[list[Array]]:
+        """Make data sets that a model itself would have recorded with these sensors, and replay them with it.
+
+        Args:
+            setting: the model.
+            runs: which runs are made anew, with the commands of the measured ones.
+            count: how many sets; the k-th is the same however many there are, on any number of threads.
+
+        Yields:
+            The residuals of one set, as :meth:`residuals` of this one setting: (rows, len(signals)) per run. Nothing where the
+            simulation of a whole run, which nothing leads back to what was measured, breaks down.
+        """
         ...
 
     def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:

@@ -2,7 +2,7 @@
 
 All numbers are root mean square residuals in units of sensor noise, over the channels of a run. A perfect model does not reach
 1.0: every window of a replay starts from measured, hence noisy, values. What it does reach is found by replaying data that the
-fitted model itself made, with the same sensors (``problem.floor``).
+fitted model itself made, with the same sensors (:func:`noise_floor`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
 from wlr_gym.gap.fit import Model
-from wlr_gym.gap.problem import Problem
+from wlr_gym.gap.problem import Problem, Setting
 from wlr_gym.gap.sure import two_sided_95
 
 Array = NDArray[np.float64]
@@ -45,6 +45,12 @@ def mean_of_runs(squares: Array) -> Array:
 def level(squares: Array) -> float:
     """Return the root mean over channels (and runs) of mean squares."""
     return float(np.sqrt(np.nanmean(squares)))
+
+
+def noise_floor(problem: Problem, setting: Setting, runs: Sequence[int]) -> float:
+    """Return the level that a model reaches on runs that it made itself, with the same sensors; NaN where it breaks down."""
+    made = next(problem.remade(setting, runs, 1), None)
+    return math.nan if made is None else level(mean_squares(made, problem.cap))
 
 
 def prove(

@@ -17,10 +17,10 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from wlr_gym import __version__
-from wlr_gym.effects import UNKNOWN_EFFECT, Patch, PatchEffect, save_patch
+from wlr_gym.effects import Patch, PatchEffect, save_patch
 from wlr_gym.errors import InputError
 from wlr_gym.files import write_json
-from wlr_gym.gap.analysis import Analysis, Calibrated, Estimate, Evidence, FoundEffect, GapFigures
+from wlr_gym.gap.analysis import Adequacy, Analysis, Calibrated, Estimate, Evidence, FoundEffect, GapFigures, Statistic
 from wlr_gym.gap.words import closure, sentence, unit_of
 from wlr_gym.plants.forces import COORDINATES
 
@@ -120,6 +120,59 @@ class DetectableEntry(_Entry):
     unit: str
 
 
+class StatisticEntry(_Entry):
+    """A statistic of what the final model leaves in the fitted runs, beside the same of runs that it made itself.
+
+    ``expected`` is their median, ``limit`` their 95 % quantile, ``p`` the share of them, the observed ones counted in, that is
+    as large, ``ratio`` value over expected.
+    """
+
+    value: MaybeNumber
+    expected: MaybeNumber
+    limit: MaybeNumber
+    p: MaybeNumber
+    ratio: MaybeNumber
+
+
+class ByChannelEntry(StatisticEntry):
+    """A statistic over all channels, and of each."""
+
+    channels: dict[str, StatisticEntry]
+
+
+class PulledEntry(StatisticEntry):
+    """By how many standard errors one run pulls a number away from the other runs: the largest there is."""
+
+    number: str
+    run: str
+
+
+class ConstancyEntry(StatisticEntry):
+    """How many times more than their rows promise the runs differ in where they pull the model's numbers."""
+
+    pulled_most: PulledEntry
+
+
+class TurningEntry(_Entry):
+    """What the final model leaves of a signal goes with its joint's turning; ``amplitude`` in noise units."""
+
+    joint: str
+    signal: str
+    order: int
+    share: float
+    amplitude: float
+    confidence: float
+
+
+class AdequacyEntry(_Entry):
+    """Whether the final model is adequate: information, no decision. ``replicates`` sets of runs were made by it."""
+
+    replicates: int
+    level: ByChannelEntry
+    whiteness: ByChannelEntry
+    constancy: ConstancyEntry
+
+
 class Result(_Entry):
     """Contents of ``result.json``."""
 
@@ -135,6 +188,8 @@ class Result(_Entry):
     patch: str
     detectable: dict[str, DetectableEntry] = {}
     closure: str = ""
+    turning: TurningEntry | None = None
+    adequacy: AdequacyEntry | dict[str, MaybeNumber] | None = None  # earlier versions: the level of each channel
 
 
 # ---- writing ---------------------------------------------------------------------------------------------------------
@@ -153,8 +208,7 @@ def patch_of(analysis: Analysis) -> Patch:
             effect.formula,
             dict(effect.units),
         )
-        for effect in analysis.effects
-        if effect.name != UNKNOWN_EFFECT or effect.formula
+        for effect in analysis.added
     )
     origin = {"made_by": MADE_BY, "data": [analysis.data], "date": _today(), "version": __version__}
     return Patch(effects, {**origin, "verdict": analysis.verdict}, source=PATCH_FILE)
@@ -184,12 +238,13 @@ def result_of(analysis: Analysis, patch: Path | str = PATCH_FILE) -> Result:
         "patch": str(patch),
         "detectable": {name: dict(vars(one)) for name, one in analysis.detectable.items()},
         "closure": closure(analysis),
+        "turning": None if analysis.turning is None else dict(vars(analysis.turning)),
         "evidence": [_evidence(one) for one in analysis.evidence],
         "run_gaps": [dict(vars(one)) for one in analysis.run_gaps],
         "channel_gaps": [dict(vars(one)) for one in analysis.channel_gaps],
         "intake": [dict(vars(one)) for one in analysis.intake],
         "recommendations": [dict(vars(one)) for one in analysis.recommendations],
-        "adequacy": dict(analysis.adequacy),
+        "adequacy": None if analysis.adequacy is None else _adequacy(analysis.adequacy),
         "known_effects": [dict(known) for known in analysis.known_effects],
         "seconds": dict(analysis.seconds),
         "provenance": {
@@ -250,6 +305,21 @@ def _gap(gap: GapFigures) -> dict[str, Any]:
     share = min(max(gap.reduction, 0.0), 1.0) if math.isfinite(gap.reduction) else 0.0
     interval = list(gap.reduction_ci95) if known else None
     return {**vars(gap), "reduction": share, "reduction_signed": gap.reduction, "reduction_ci95": interval}
+
+
+def _adequacy(found: Adequacy) -> dict[str, Any]:
+    pulled = {"number": found.pulled.number, "run": found.pulled.run, **_statistic(found.pulled.errors)}
+    by_channel = [{name: _statistic(both[k]) for name, both in found.channels.items()} for k in (0, 1)]
+    return {
+        "replicates": found.replicates,
+        "level": {**_statistic(found.level), "channels": by_channel[0]},
+        "whiteness": {**_statistic(found.whiteness), "channels": by_channel[1]},
+        "constancy": {**_statistic(found.constancy), "pulled_most": pulled},
+    }
+
+
+def _statistic(found: Statistic) -> dict[str, float]:
+    return {**vars(found), "ratio": found.ratio}
 
 
 def _evidence(one: Evidence) -> dict[str, Any]:

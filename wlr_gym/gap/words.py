@@ -13,10 +13,13 @@ from wlr_gym.gap.analysis import (
     NOT_EXCITED,
     NOTHING_MISSING,
     UNKNOWN,
+    Adequacy,
     Analysis,
     ChannelGap,
     Estimate,
     FoundEffect,
+    Statistic,
+    Turning,
 )
 from wlr_gym.gap.screen import LEAST_GAIN
 from wlr_gym.plants.base import TRUTH_LAYOUT
@@ -200,6 +203,31 @@ def _above(gap: ChannelGap, floor: float) -> float:
     return max(gap.after**2 - floor**2, 0.0) if math.isfinite(gap.after) else 0.0
 
 
+def adequacy(found: Adequacy) -> str:
+    """Return what the final model leaves in the fitted runs: what chance does not explain, and how large it is."""
+    told = {
+        f"an error of {error(found.level.value)} times the sensor noise": found.level,
+        f"{error(found.whiteness.value)} rows on end that say the same": found.whiteness,
+        "runs that differ in what they say of the model's numbers": found.constancy,
+    }
+    beyond = [f"{text} ({error(one.ratio)} times what is expected)" for text, one in told.items() if one.rejected]
+    compared = f"Compared with {found.replicates} sets of runs that the final model made itself"
+    untold = "" if math.isfinite(found.constancy.p) else " Whether the runs agree could not be tested."
+    if not beyond:
+        return f"{compared}, it leaves nothing in the fitted runs that chance does not explain.{untold}"
+    levels = {name: level for name, (level, _) in found.channels.items() if level.rejected}
+    most = sorted(levels, key=lambda name: -_excess(levels[name]))[:3]
+    where = f" Most of the error that is not expected is in {listed(most)}." if found.level.rejected and most else ""
+    apart = found.pulled.errors.rejected
+    pulled = f" {found.pulled.run} pulls {found.pulled.number} farthest from the others." if apart else ""
+    return f"{compared}, more than chance explains is left in the fitted runs: {listed(beyond)}.{where}{pulled}{untold}"
+
+
+def _excess(level: Statistic) -> float:
+    """Mean square above what is expected."""
+    return level.value**2 - level.expected**2
+
+
 def sentence(analysis: Analysis) -> str:
     """Return the verdict in one sentence: the analysis' own, or one made from its numbers."""
     return analysis.summary or _SENTENCES[analysis.verdict](analysis)
@@ -249,15 +277,26 @@ def _effect_found(analysis: Analysis) -> str:
 
 def _unknown(analysis: Analysis) -> str:
     acts = f" ({places(analysis.effects[0].where)})" if analysis.effects else ""
-    described = any(effect.formula for effect in analysis.effects)
-    formula = "a formula describes it" if described else "no formula describes it, either"
-    return f"The model lacks something{acts} that no effect of the library explains; {formula}{_bought(analysis)}."
+    lacks = f"The model lacks something{acts} that no effect of the library explains"
+    if any(effect.formula for effect in analysis.effects):
+        return f"{lacks}; a formula describes it{_bought(analysis)}."
+    return f"{lacks}; no formula describes it, either{f': {turned(analysis.turning)}' if analysis.turning else ''}."
+
+
+def turned(turning: Turning) -> str:
+    """Say what goes with a joint's turning."""
+    times = {1: "once", 2: "twice"}.get(turning.order, f"{turning.order} times")
+    return (
+        f"{percent(turning.share)} of what is left of {turning.signal} comes and goes {times} per turn of the "
+        f"{places((turning.joint,))} ({error(turning.amplitude)} times the sensor noise), as with a wheel out of round or an "
+        "encoder off its centre"
+    )
 
 
 def _bought(analysis: Analysis) -> str:
-    if analysis.gap is None or not analysis.effects:
+    if analysis.gap is None or not analysis.added:
         return ""
-    share, one = analysis.gap.reduction, len(analysis.effects) == 1
+    share, one = analysis.gap.reduction, len(analysis.added) == 1
     if not math.isfinite(share):
         return "; the error of runs kept aside is as small without it"
     if share < 0.0:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +13,20 @@ from numpy.typing import NDArray
 from wlr_gym.effects import Source, load_patch
 from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.gap import analysis as words
-from wlr_gym.gap.analysis import Analysis, Calibrated, Equivalent, Evidence, FoundEffect, IntakeFinding
+from wlr_gym.gap.adequacy import adequacy_of
+from wlr_gym.gap.analysis import Analysis, Calibrated, Equivalent, Estimate, Evidence, FoundEffect, IntakeFinding, Turning
 from wlr_gym.gap.fit import Fit, fit, nominal_model, widened
 from wlr_gym.gap.hypothesis import Hypothesis
 from wlr_gym.gap.judge import shown_by_some_runs_only
 from wlr_gym.gap.localise import localise
 from wlr_gym.gap.name import Naming, Round, name_effects
-from wlr_gym.gap.problem import Problem
-from wlr_gym.gap.prove import mean_of_runs, mean_squares, prove
+from wlr_gym.gap.problem import Candidate, Problem
+from wlr_gym.gap.prove import mean_of_runs, mean_squares, noise_floor, prove
 from wlr_gym.gap.recommend import recommend, separating_run
 from wlr_gym.gap.split import informative_split, named_split
 from wlr_gym.gap.sure import confidence, detectable, equivalents, estimates, half_widths
 from wlr_gym.gap.traces import telling_traces
+from wlr_gym.gap.turning import turning
 from wlr_gym.provenance import provenance
 
 Array = NDArray[np.float64]
@@ -127,17 +130,21 @@ def analyse_problem(
     base = naming.calibrated
     clock.start("proving")
     models = (nominal_model(problem), base.model, naming.fit.model)
-    floor = problem.floor(naming.fit.model.setting, sealed)
+    floor = noise_floor(problem, naming.fit.model.setting, sealed)
     gap, run_gaps, channel_gaps = prove(problem, fitted, sealed, models, floor)
+    features = problem.features(base.model.setting, fitted)
     places, maps = localise(
         problem,
         base.residuals,
         mean_of_runs(mean_squares(naming.fit.residuals, problem.cap)),
         naming.fit.noise,
-        problem.features(base.model.setting, fitted),
+        features,
     )
+    adequacy = adequacy_of(problem, fitted, naming.fit)
     shown = detectable(naming.rounds[-1].scores, naming.fit.cost)
-    verdict, groups = _verdict(naming), _equivalent(problem, naming)
+    turned = turning(problem, naming.fit.residuals, features)
+    effects = _effects(problem, naming) or _turned(turned)
+    verdict, groups = _verdict(naming, effects), _equivalent(problem, naming)
     clock.stop()
     return Analysis(
         data,
@@ -146,7 +153,7 @@ def analyse_problem(
         tuple(findings),
         tuple(problem.runs[k] for k in fitted),
         tuple(problem.runs[k] for k in sealed),
-        _effects(problem, naming),
+        effects,
         groups,
         _calibration(problem, naming.fit),
         tuple(entry for number, look in enumerate(naming.rounds, 1) for entry in _evidence(problem, number, look, fitted)),
@@ -158,7 +165,8 @@ def analyse_problem(
         channel_gaps,
         shown,
         recommend(naming, [group.names for group in groups], verdict, problem.motions),
-        {signal.name: float(level) for signal, level in zip(problem.signals, naming.fit.noise.level, strict=True)},
+        adequacy,
+        turned,
         tuple(effect.content() for effect in load_patch(known).effects),
         clock.seconds,
         provenance(),
@@ -193,10 +201,9 @@ class _Clock:
             self.seconds[self._stage] = time.perf_counter() - self._since
 
 
-def _verdict(naming: Naming) -> str:
-    names = [candidate.name for candidate, _ in naming.fit.model.effects]
-    if names:
-        return words.UNKNOWN if all(name == words.UNKNOWN for name in names) else words.EFFECT_FOUND
+def _verdict(naming: Naming, effects: Sequence[FoundEffect]) -> str:
+    if effects:
+        return words.UNKNOWN if all(effect.name == words.UNKNOWN for effect in effects) else words.EFFECT_FOUND
     last = naming.rounds[-1]
     if any(shown_by_some_runs_only(h, last.cost) for h in last.hypotheses):
         return words.NOT_EXCITED
@@ -210,15 +217,25 @@ def _verdict(naming: Naming) -> str:
 def _effects(problem: Problem, naming: Naming) -> tuple[FoundEffect, ...]:
     intervals = estimates(problem, naming.fit)
     found = []
-    for (candidate, values), own in zip(naming.fit.model.effects, intervals, strict=True):
+    for (candidate, _), own in zip(naming.fit.model.effects, intervals, strict=True):
         look = next(r for r in naming.rounds if r.taken is not None and r.taken.candidate.label == candidate.label)
         assert look.taken is not None
-        effect = candidate.effect(values)
         sure = confidence(look.taken, look.hypotheses, look.cost)
-        found.append(
-            FoundEffect(candidate.name, candidate.where, own, sure, look.taken.gain, effect.formula, dict(effect.units))
-        )
+        found.append(found_effect(candidate, own, sure, look.taken.gain))
     return tuple(sorted(found, key=lambda effect: -effect.gain))
+
+
+def found_effect(candidate: Candidate, own: Mapping[str, Estimate], confidence: float, gain: float) -> FoundEffect:
+    """Return a fitted candidate as it is written; constants of its formula that were not fitted have no width."""
+    fixed = candidate.fixed if candidate.formula else {}
+    given = {name: Estimate(value, value, value, candidate.units[name]) for name, value in fixed.items()}
+    parameters = {**own, **given}
+    return FoundEffect(candidate.name, candidate.where, parameters, confidence, gain, candidate.formula, dict(candidate.units))
+
+
+def _turned(turned: Turning | None) -> tuple[FoundEffect, ...]:
+    """An effect without name or formula, where nothing that has one explains what goes with a joint's turning."""
+    return () if turned is None else (FoundEffect(words.UNKNOWN, (turned.joint,), {}, turned.confidence, math.nan),)
 
 
 def _equivalent(problem: Problem, naming: Naming) -> tuple[Equivalent, ...]:

@@ -174,6 +174,8 @@ class PlantState:
             in the middle of the play.
         rotor_rate: (N, 8) rate of each rotor relative to the parent link, rad/s. None = turning with its joint.
         supply_drop: (N,) drop of the supply below its open-circuit voltage, V. None = none.
+        time: (N,) since the start of the run or episode, s; only formula forces ask for it. None = its start.
+        wind_up: (N, 8) of the joints, where a formula force asks for it (:data:`wlr_gym.plants.forces.MEMORY`). None = none.
     """
 
     position: Array
@@ -187,6 +189,8 @@ class PlantState:
     rotor_lead: Array | None = None
     rotor_rate: Array | None = None
     supply_drop: Array | None = None
+    time: Array | None = None
+    wind_up: Array | None = None
 
     def __len__(self) -> int:
         return self.position.shape[0]

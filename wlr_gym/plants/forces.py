@@ -3,7 +3,7 @@
 A :class:`Force` is a checked formula over :data:`FEATURES` (what the robot does) and named constants, acting on one or more
 :data:`COORDINATES`. Every simulator takes ``forces`` when it is made and, once per physics step, hands the quantities
 :data:`INPUTS` to the compiled kernel of :func:`compile_forces`, which returns one generalised force per coordinate. It is
-held over the step.
+held over the step. What a formula may remember, :data:`MEMORY`, the kernel moves on by itself.
 """
 
 from __future__ import annotations
@@ -59,6 +59,10 @@ INPUTS: tuple[str, ...] = (
     *(f"slip_velocity_{i}_{a}" for i in range(4) for a in "xy"),
     "supply_voltage",
 )
+#: What formulas know besides: time since the start of the run or episode (s), and how far each joint is wound up.
+MEMORY: tuple[str, ...] = ("time", *(f"wind_up_{j}" for j in range(8)))
+#: rad; scale of the way on which a joint winds up.
+WIND_UP = 0.1
 
 
 # ---- features --------------------------------------------------------------------------------------------------------
@@ -83,6 +87,11 @@ class Feature:
 
 def _lane(pattern: str, shift: int = 0) -> Callable[[Lanes, int], Value]:
     return lambda lanes, number: lanes[pattern.format(number + shift)]
+
+
+def _opposite(pattern: str, shift: int = 0) -> Callable[[Lanes, int], Value]:
+    """The same at the corner on the other side: left and right corners follow one another."""
+    return lambda lanes, corner: lanes[pattern.format((corner ^ 1) + shift)]
 
 
 def _slip_speed(lanes: Lanes, corner: int) -> Value:
@@ -125,6 +134,12 @@ def _yaw(lanes: Lanes, _: int) -> Value:
 FEATURES: dict[str, Feature] = {
     "angle": Feature("rad", "true angle of the joint the force acts on", _lane("joint_position_{}"), "joint"),
     "rate": Feature("rad/s", "its rate, relative to the parent link", _lane("joint_velocity_{}"), "joint"),
+    "wind_up": Feature(
+        "-",
+        f"how far it is wound up since it turned back, -1 to 1: dz = (rate - abs(rate) z) dt / {WIND_UP:g} rad (Dahl)",
+        _lane("wind_up_{}"),
+        "joint",
+    ),
     "motor_torque": Feature(
         "N m", "its motor's torque at the output shaft, before gear friction", _lane("motor_torque_{}"), "joint"
     ),
@@ -134,6 +149,12 @@ FEATURES: dict[str, Feature] = {
     "wheel_angle": Feature("rad", "angle of the wheel, relative to its leg", _lane("joint_position_{}", 4), "corner"),
     "wheel_rate": Feature("rad/s", "its rate, relative to its leg", _lane("joint_velocity_{}", 4), "corner"),
     "wheel_torque": Feature("N m", "torque of the wheel's motor", _lane("motor_torque_{}", 4), "corner"),
+    "leg_torque_opposite": Feature(
+        "N m", "torque of the motor of the leg on the other side", _opposite("motor_torque_{}"), "corner"
+    ),
+    "wheel_torque_opposite": Feature(
+        "N m", "torque of the motor of the wheel on the other side", _opposite("motor_torque_{}", 4), "corner"
+    ),
     "normal_force": Feature("N", "of the floor on the wheel", _lane("contact_force_{}_z"), "corner"),
     "slip_velocity_x": Feature(
         "m/s", "of the wheel's contact point over the floor, along the wheel's heading", _lane("slip_velocity_{}_x"), "corner"
@@ -155,6 +176,7 @@ FEATURES: dict[str, Feature] = {
     "yaw": Feature("rad", "heading in the floor frame, in (-pi, pi]", _yaw),
     **{f"position_{a}": Feature("m", f"{a} of the body origin in the floor frame", _lane(f"position_{a}")) for a in XYZ},
     "supply_voltage": Feature("V", "at the servos", _lane("supply_voltage")),
+    "time": Feature("s", "since the start of the run or episode", _lane("time")),
 }
 
 
@@ -265,7 +287,7 @@ def generalised_forces(forces: Sequence[Force], inputs: Lanes, values: Sequence[
 
     Args:
         forces: what acts.
-        inputs: :data:`INPUTS` as floats, arrays or traced nodes.
+        inputs: :data:`INPUTS` and :data:`MEMORY` as floats, arrays or traced nodes.
         values: constants in the order of :func:`force_values`; None = the forces' own.
     """
     constants = iter(force_values(forces).tolist() if values is None else values)
@@ -303,14 +325,15 @@ class ForceKernel:
     """Compiled forces.
 
     Attributes:
-        evaluate: numba function ``evaluate(inputs, values, generalised)`` on C-ordered matrices of the kernel's precision with
-            one column per robot: reads inputs (len(INPUTS), n) and constants (len(values), n), writes all of generalised
-            (len(COORDINATES), n), zero where nothing acts. Same bits for every n.
+        evaluate: numba function ``evaluate(inputs, values, memory, generalised, step)`` on C-ordered matrices of the kernel's
+            precision with one column per robot: reads inputs (len(INPUTS), n), constants (len(values), n) and memory
+            (len(MEMORY), n), writes all of generalised (len(COORDINATES), n), zero where nothing acts, and moves memory on by
+            step (s): the time, and the wind-up of joints whose formula asks for it. Same bits for every n.
         values: the constants' nominal values (V,); a simulator repeats them for its robots.
         module: name of the module that holds ``evaluate``, for generated code that imports it.
     """
 
-    evaluate: Callable[[Array, Array, Array], None]
+    evaluate: Callable[[Array, Array, Array, Array, float], None]
     values: Array
     module: str
 
@@ -328,7 +351,7 @@ def force_source(forces: Sequence[Force], precision: str) -> str:
     count = len(force_values(forces))
     found = generalised_forces(forces, lanes, [owner.input(f"value_{n}") for n in range(count)])
     row = {name: f"inputs[{k}, k]" for k, name in enumerate(INPUTS)}
-    row |= {f"value_{n}": f"values[{n}, k]" for n in range(count)}
+    row |= {f"value_{n}": f"values[{n}, k]" for n in range(count)} | {name: f"memory[{m}, k]" for m, name in enumerate(MEMORY)}
     place = {name: k for k, name in enumerate(COORDINATES)}
     body = emit(
         {name: found.get(name, 0.0) for name in COORDINATES},
@@ -338,21 +361,30 @@ def force_source(forces: Sequence[Force], precision: str) -> str:
         lambda value: f"F({value!r})",
         fused=True,
     )
-    head = ["@njit(cache=True, nogil=True, error_model='numpy')", "def evaluate(inputs, values, generalised):"]
+    for j in (j for j in range(8) if f"wind_up_{j}" in lanes.asked):
+        wound = row[f"wind_up_{j}"]
+        body += [
+            f"        way = {row[f'joint_velocity_{j}']} * (step / F({WIND_UP!r}))",
+            f"        {wound} += way - abs(way) * {wound}",
+        ]
+    body.append(f"        {row['time']} += step")
+    head = ["@njit(cache=True, nogil=True, error_model='numpy')", "def evaluate(inputs, values, memory, generalised, step):"]
     return "\n".join([f"F = np.{precision}", "", *head, "    for k in range(inputs.shape[1]):", *body, ""])
 
 
 class _GraphInputs(Mapping[str, Any]):
-    """All inputs as nodes of a graph, made when they are read."""
+    """All inputs and memories as nodes of a graph, made when they are asked for."""
 
     def __init__(self, owner: Graph) -> None:
         self._owner = owner
+        self.asked: set[str] = set()
 
     def __getitem__(self, name: str) -> Any:
+        self.asked.add(name)
         return self._owner.input(name)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(INPUTS)
+        return iter((*INPUTS, *MEMORY))
 
     def __len__(self) -> int:
-        return len(INPUTS)
+        return len(INPUTS) + len(MEMORY)

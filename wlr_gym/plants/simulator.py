@@ -50,6 +50,7 @@ class Simulator(ABC):
         self._truth = Truth(np.zeros((count, TRUTH_LAYOUT.width)))
         self._raw = np.zeros((count, RAW_LAYOUT.width))
         self._readings = Sensors(np.zeros((count, SENSOR_LAYOUT.width)))
+        self._time: Array = np.zeros(count)
         self._goals: Goals = GoalHistory(count, self.options.control_period)
         self._sensors = SensorModel(robot, self.options, count)
 
@@ -101,6 +102,7 @@ class Simulator(ABC):
             self._take_parameters(parameters, rows)
         start = standing_state(self.robot, self.parameters) if state is None else state
         self._write_state(start, rows)
+        self._time[rows] = 0.0 if start.time is None else start.time[rows]
         self._goals.reset(rows, start, self.parameters)
         self._look(rows)
         self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)

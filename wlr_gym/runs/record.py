@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -131,7 +132,7 @@ def record_simulation(
         plant.reset(seeds, parameters, state=standing_at(start_goals(motion, robot)[None], robot, parameters))
         for _ in range(round(SETTLE / motion.period)):
             plant.step(start_goals(motion, robot)[None], torque_on[:1])
-        start = plant.get_state()
+        start = replace(plant.get_state(), time=np.zeros(1))  # the run begins here
         sensors = plant.reset(seeds, parameters, state=start)
         for tick, goals in enumerate(motion.goals):
             rows[tick] = channels(sensors, 0)

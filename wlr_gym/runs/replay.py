@@ -12,7 +12,7 @@ times. Command delays shift the measured times of the goals, so that a segment s
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -237,7 +237,7 @@ def _simulate(
     offset = np.asarray(run.meta.marker_offset)
     values = np.empty((ticks + 1, plant.count, len(CHANNELS)))
     try:
-        sensors = plant.reset(parameters=parameters, state=state)
+        sensors = plant.reset(parameters=parameters, state=replace(state, time=begin - run["t"][0]))
         first_reading = sensors.joint_position[:, 4:].copy()
         for tick in range(ticks + 1):
             states += [plant.get_state() for _ in range(snapshots.count(tick))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -18,6 +18,7 @@ from wlr_gym.gap.rig.kernel import OUTPUTS
 from wlr_gym.gap.rig.model import QUANTITIES, model_of
 from wlr_gym.gap.rig.recording import Recording
 from wlr_gym.gap.rig.replay import Replay
+from wlr_gym.random import generator
 
 Array = NDArray[np.float64]
 
@@ -50,6 +51,7 @@ class RigProblem:
     steps = 20
     #: A replay costs milliseconds, and a joint that sticks answers far from linearly: every hypothesis is worth a whole fit.
     thorough, firmness, disagreement = True, 1.0, 0.0
+    turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})
     motions: Mapping[str, str] = MappingProxyType({})
 
     def __init__(
@@ -87,15 +89,19 @@ class RigProblem:
             )
         return found
 
-    def floor(self, setting: Setting, runs: Sequence[int]) -> float:
-        """Return the level that the model reaches on recordings it made itself, rounded to counts."""
-        made = [
-            replace(self.recordings[run], angle=np.round(angles[0, :, 0] / ENCODER_NOISE) * ENCODER_NOISE)
-            for run, angles in zip(runs, self.simulate([setting], runs), strict=True)
-        ]
-        twin = RigProblem(made, self.known, len(self.quantities) == len(QUANTITIES))
-        squares = [np.mean(r[0] ** 2) for r in twin.residuals([setting], range(len(made)))]
-        return float(np.sqrt(np.mean(squares)))
+    def remade(self, setting: Setting, runs: Sequence[int], count: int) -> Iterator[list[Array]]:
+        """Replay recordings that a model itself would have made; see :meth:`wlr_gym.gap.problem.Problem.remade`.
+
+        They are rounded to counts, and differ by where within a count the servo's zero lies.
+        """
+        clean = [angles[0, :, 0] for angles in self.simulate([setting], runs)]
+        for shift in (0.0, *generator(0, "gap", "zero of the encoder").uniform(-0.5, 0.5, count - 1)):
+            made = [
+                replace(self.recordings[run], angle=(np.round(angle / ENCODER_NOISE + shift) - shift) * ENCODER_NOISE)
+                for run, angle in zip(runs, clean, strict=True)
+            ]
+            twin = RigProblem(made, self.known, len(self.quantities) == len(QUANTITIES))
+            yield [residual[0] for residual in twin.residuals([setting], range(len(made)))]
 
     def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
         """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`."""

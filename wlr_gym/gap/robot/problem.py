@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from wlr_gym.effects import Patch, Source, apply_patch, load_patch
 from wlr_gym.errors import InputError
 from wlr_gym.gap.problem import Candidate, Probe, Quantity, Setting, Signal
-from wlr_gym.gap.prove import level, mean_squares
 from wlr_gym.gap.recommend import SHOWN_BY
 from wlr_gym.gap.robot.candidates import robot_candidates
 from wlr_gym.gap.robot.clock import RunClock
-from wlr_gym.gap.robot.formulas import formula_candidates
+from wlr_gym.gap.robot.formulas import formula_candidates, tried_effects
 from wlr_gym.gap.robot.quantities import Knob, knobs, write
 from wlr_gym.gap.robot.recorder import TRUTH, Replays
 from wlr_gym.gap.robot.simulate import PHYSICS_STEP, replay_batch
@@ -43,6 +42,8 @@ LOST = 1e3
 FIRMNESS = 3.0
 #: Two simulators of one robot found sizes that differed by so much (root mean square over eight development sets).
 DISAGREEMENT = 0.04
+#: Remade runs that are replayed at once: more need more memory.
+MOST_REMADE = 256
 
 
 class RobotProblem:
@@ -77,6 +78,9 @@ class RobotProblem:
         self.cap, self.steps, self.firmness = CAP, STEPS, FIRMNESS
         self.disagreement = DISAGREEMENT
         self.thorough, self.sealed, self.motions = False, (), SHOWN_BY
+        self.turning: Mapping[str, tuple[str, tuple[str, ...]]] = {
+            wheel: (f"joint_position[{wheel}]", tuple(f"{kind}_{wheel}" for kind in ("pos", "vel", "eff"))) for wheel in WHEELS
+        }
         self.robot = robot or robot_of(runs[0])
         self.known = load_patch(known)
         self.backend, self.threads = backend, threads
@@ -90,6 +94,7 @@ class RobotProblem:
         split = noise_parts(self.robot)
         self._analogue, self._count = (np.array([split[name][k] for name in CHANNELS]) for k in (0, 1))
         self._window = window
+        self._tried = _by_slot(Patch(tried_effects()).forces)
         self._base = profile_parameters(Parameters.nominal(self.robot), runs[0].meta.profile)
         self._measured = [
             np.stack([run[name] if name in run else np.full(len(run["t"]), np.nan) for name in CHANNELS], axis=1)
@@ -146,27 +151,39 @@ class RobotProblem:
         found[lost] = np.where(np.isfinite(found[lost]), LOST, np.nan)
         return found
 
-    def floor(self, setting: Setting, runs: Sequence[int]) -> float:
-        """Return the level that the model reaches on data it made itself, with the robot's sensors."""
-        made = [self._made(setting, r) for r in runs]
-        twin = RobotProblem(made, self.robot, self.known, self.backend, self._window, self.threads)
-        return level(mean_squares([r[0] for r in twin.residuals([setting], range(len(made)))], CAP))
-
-    def _made(self, setting: Setting, r: int) -> Run:
-        """Return run ``r`` as the model would have recorded it: whole, without anchors, noisy and rounded."""
-        clock = RunClock(self.clocks[r].run, window=math.inf)
+    def remade(self, setting: Setting, runs: Sequence[int], count: int) -> Iterator[list[Array]]:
+        """Replay data sets that a model itself would have recorded; see :meth:`wlr_gym.gap.problem.Problem.remade`."""
         forces, constants = self._forces([setting])
-        values = replay_batch(self.robot, [clock], self.parameters([setting]), self.backend, forces, constants)[0].values[0]
-        rng = generator(r, "gap", "floor")
-        table = clock.run.table.copy()
+        whole = [RunClock(self.clocks[r].run, window=math.inf) for r in runs]  # without anchors
+        table = self.parameters([setting])
+        clean = replay_batch(self.robot, whole, table, self.backend, forces, constants, threads=self.threads)
+        if not all(np.isfinite(replays.values).all() for replays in clean):
+            return
+        draws = [generator(r, "gap", "floor") for r in runs]
+        at_once = max(1, MOST_REMADE // len(runs))
+        for first in range(0, count, at_once):
+            sets = min(at_once, count - first)
+            made = [
+                self._read(r, replays.values[0], rng)
+                for _ in range(sets)
+                for r, replays, rng in zip(runs, clean, draws, strict=True)
+            ]
+            twin = RobotProblem(made, self.robot, self.known, self.backend, self._window, self.threads)
+            found = [residual[0] for residual in twin.residuals([setting], range(len(made)))]
+            yield from (found[k * len(runs) : (k + 1) * len(runs)] for k in range(sets))
+
+    def _read(self, r: int, values: Array, rng: np.random.Generator) -> Run:
+        """Return run ``r`` with ``values`` (rows, signals) in place of what was measured, noisy and rounded as sensors do."""
+        run = self.clocks[r].run
+        table = run.table.copy()
         for c, signal in enumerate(self.signals):
-            if signal.name not in clock.run:
+            if signal.name not in run:
                 continue
             noisy = values[:, c] + self._analogue[c] * rng.standard_normal(len(values))
             count = self._count[c]
             rounded = np.round(noisy / count) * count if count > 0.0 else noisy
             table[signal.name] = np.where(np.isfinite(self._measured[r][:, c]), rounded, np.nan)
-        return replace(clock.run, table=table)
+        return replace(run, table=table)
 
     def candidates(
         self, setting: Setting, residuals: Sequence[Array], runs: Sequence[int]
@@ -177,7 +194,7 @@ class RobotProblem:
         measured = [self._measured[r] for r in runs]
         drifting = {quantity.name for quantity in self.quantities if quantity.drifts}
         probes, candidates = robot_candidates(parameters, tolerances, measured, residuals, drifting)
-        more, formulas = formula_candidates()
+        more, formulas = formula_candidates([self.times(r) - self.times(r)[0] for r in runs], residuals)
         possible = [probe for probe in (*probes, *more) if self._possible(setting, probe)]
         keys = {probe.key for probe in possible} | set(tolerances)
         return possible, [usable for candidate in (*candidates, *formulas) if (usable := _with_starts(candidate, keys))]
@@ -198,17 +215,28 @@ class RobotProblem:
     def _forces(self, settings: Sequence[Setting]) -> tuple[tuple[Force, ...], Array]:
         """Every formula force that some setting has, and its constants per setting: zero, hence no force, where one lacks it.
 
-        The same formula twice at one place is one with the sum of the constants: the formulas tried are linear in them.
+        The same formula twice at one place is two forces: not all are linear in their constants. Where one of the formulas to
+        try is among them, all are: every other choice would be compiled anew, for longer than it runs.
         """
-        own = [Patch((*self.known.effects, *setting.effects)).forces for setting in settings]
-        samples = {(force.where, repr(force.formula)): force for forces in own for force in forces}
-        start = dict(zip(samples, np.cumsum([0, *(len(f.parameters) for f in samples.values())]).tolist(), strict=False))
-        constants = np.zeros((len(settings), sum(len(f.parameters) for f in samples.values())))
-        for row, forces in zip(constants, own, strict=True):
-            for force in forces:
-                first = start[force.where, repr(force.formula)]
-                row[first : first + len(force.parameters)] += list(force.parameters.values())
-        return tuple(samples.values()), constants
+        own = [_by_slot(Patch((*self.known.effects, *setting.effects)).forces) for setting in settings]
+        samples = {slot: force for forces in own for slot, force in forces.items()}
+        if not self._tried.keys().isdisjoint(samples):
+            samples = {**self._tried, **samples}
+        names = [(slot, name) for slot, force in samples.items() for name in force.parameters]
+        constants = [[forces[slot].parameters[name] if slot in forces else 0.0 for slot, name in names] for forces in own]
+        return tuple(samples.values()), np.array(constants).reshape(len(settings), len(names))
+
+
+#: Place and formula of a force, and how many alike came before.
+_Slot = tuple[tuple[str, ...], str, int]
+
+
+def _by_slot(forces: Sequence[Force]) -> dict[_Slot, Force]:
+    slots: dict[_Slot, Force] = {}
+    for force in forces:
+        alike = sum(key[:2] == (force.where, repr(force.formula)) for key in slots)
+        slots[force.where, repr(force.formula), alike] = force
+    return slots
 
 
 def _with_starts(candidate: Candidate, keys: set[str]) -> Candidate | None:

@@ -163,7 +163,7 @@ def _replay_chunk(
     delay = lanes["command.delay"].copy()
     lanes["command.delay"] = 0.0
     plant.use_goals(WrittenGoals(clocks, run_of, delay))
-    first = _join([_start(clock.run, robot, parameters) for clock in clocks])
+    first = _join([_start(clock.run, robot, parameters, clock.begin - clock.t[0]) for clock in clocks])
     try:
         recorder = Recorder(clocks, settings, first, delay, with_truth)
         readings = plant.reset(parameters=lanes, state=first)
@@ -245,8 +245,11 @@ def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.boo
     state.quaternion[mine] = quaternion(heading, pitch, roll)
 
 
-def _start(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
-    """State of every setting at the run's start: the measured one, moved by what a setting means for reading and height."""
+def _start(run: Run, robot: Robot, parameters: Parameters, begin: float) -> PlantState:
+    """State of every setting at the run's start: the measured one, moved by what a setting means for reading and height.
+
+    ``begin`` is the time (s) since the run's first row.
+    """
     base = profile_parameters(Parameters.nominal(robot), run.meta.profile)  # of no setting: results do not depend on company
     parameters = Parameters(np.vstack([base.values, parameters.values]))
     count = len(parameters)
@@ -262,6 +265,7 @@ def _start(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
     tension = state.reference_position[:, 4:] - state.joint_position[:, 4:]
     kp = parameters["servo.kp"][:, 4:]
     state.reference_position[:, 4:] = state.joint_position[:, 4:] + tension * base["servo.kp"][:, 4:] / np.maximum(kp, 1e-9)
+    state.time = np.full(count, begin)
     return PlantState(**{name: value[1:] for name, value in vars(state).items() if value is not None})
 
 

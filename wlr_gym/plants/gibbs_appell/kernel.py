@@ -155,7 +155,7 @@ _APPLY_FORMULAS = """
             sense(W)
             seen = W[{sensed} : {sensed} + {sensed_count} * {width}].reshape({sensed_count}, {width})
             pushes = W[{formula} : {formula} + {formula_count} * {width}].reshape({formula_count}, {width})
-            evaluate(seen, formula_values[tile], pushes)"""
+            evaluate(seen, formula_values[tile], memory[tile], pushes, step)"""
 _DRIVER = """
 {decorator}
 def scatter(W, TRUTH, RAW, tile, count):
@@ -170,7 +170,7 @@ def scatter(W, TRUTH, RAW, tile, count):
 
 {decorator}
 def tick(
-    X, P, goals, old_goals, switch_time, on, formula_values, TRUTH, RAW, first, last, count, step, substeps, sweeps
+    X, P, goals, old_goals, switch_time, on, formula_values, memory, TRUTH, RAW, first, last, count, step, substeps, sweeps
 ):
     W = np.zeros({scratch}, F)
     half = F(0.5) * step

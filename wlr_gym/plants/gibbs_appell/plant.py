@@ -19,7 +19,7 @@ from wlr_gym.plants.base import (
     PlantState,
     Sensors,
 )
-from wlr_gym.plants.forces import Force, compile_forces
+from wlr_gym.plants.forces import MEMORY, Force, compile_forces
 from wlr_gym.plants.gibbs_appell import kernel, packing
 from wlr_gym.plants.gibbs_appell.step import STORED
 from wlr_gym.plants.simulator import Simulator, refitted_lead
@@ -78,7 +78,8 @@ class GibbsAppellPlant(Simulator):
         self._pool = self._make_pool()
         self._formulas = compile_forces(forces, self.options.precision) if forces else None
         values = self._formulas.values if self._formulas else np.zeros(0)
-        self._formula_values = np.tile(values[:, None], (self._tiles, 1, self._width)).astype(self._float)
+        self.set_force_values(np.tile(values, (count, 1)))
+        self._memory = np.zeros((self._tiles, len(MEMORY), self._width), self._float)
         self._features: frozenset[str] | None = None
         self._start()
 
@@ -173,6 +174,8 @@ class GibbsAppellPlant(Simulator):
             values[:, _LANE[f"acceleration_{axis}"]] = still[:, k]
         _scatter(self._lanes, self._width, rows, values)
         self._pad(self._lanes)
+        wound = np.zeros((rows.size, 8)) if state.wind_up is None else state.wind_up[rows]
+        _scatter(self._memory, self._width, rows, wound, slice(1, None))
 
     def get_state(self) -> PlantState:
         """Return a copy of the mechanical and servo state."""
@@ -196,6 +199,8 @@ class GibbsAppellPlant(Simulator):
             rotor_lead=np.where(has_play, columns("rotor_lead{}", range(8)), 0.0),
             rotor_rate=np.where(has_play, columns("rotor_rate{}", range(8)), self._truth.joint_velocity),
             supply_drop=values[:, _LANE["supply_drop"]],
+            time=self._time.copy(),
+            wind_up=_gather(self._memory, self._width, self._all)[:, 1:].astype(np.float64),
         )
 
     def expect_all_effects(self) -> None:
@@ -223,7 +228,9 @@ class GibbsAppellPlant(Simulator):
         Raises:
             InputError: wrong shape or a non-finite goal of a motor that is on.
         """
-        inputs = (*self._take_goals(goals, torque_on, self._torque_on), self._torque_on, self._formula_values)
+        inputs = (*self._take_goals(goals, torque_on, self._torque_on), self._torque_on, self._formula_values, self._memory)
+        if self._formulas:  # in full precision: single precision would lose it step by step
+            _scatter(self._memory, self._width, self._all, self._time[:, None], slice(0, 1))
         arguments = (self._lanes, self._constants, *inputs, self._truth.values, self._raw)
         if self._pool is None:
             self._run(arguments, *self._chunks[0])
@@ -232,6 +239,7 @@ class GibbsAppellPlant(Simulator):
             self._run(arguments, *self._chunks[0])
             for future in waiting:
                 future.result()
+        self._time += self.options.control_period
         return self._readings
 
     def _run(self, arguments: tuple[Array, ...], first: int, last: int) -> None:
@@ -246,9 +254,9 @@ class GibbsAppellPlant(Simulator):
             self._chunks = [(0, self._tiles)]
 
 
-def _scatter(lanes: Array, width: int, rows: NDArray[np.intp], values: Array) -> None:
+def _scatter(lanes: Array, width: int, rows: NDArray[np.intp], values: Array, which: slice = slice(None)) -> None:
     tiles, places = np.divmod(rows, width)
-    lanes.reshape(lanes.shape[0], -1, width)[tiles, :, places] = values
+    lanes.reshape(lanes.shape[0], -1, width)[:, which][tiles, :, places] = values
 
 
 def _gather(lanes: Array, width: int, rows: NDArray[np.intp]) -> Array:

@@ -16,7 +16,7 @@ from wlr_gym.plants.base import (
     PlantState,
     Sensors,
 )
-from wlr_gym.plants.forces import COORDINATES, INPUTS, Force, compile_forces
+from wlr_gym.plants.forces import COORDINATES, INPUTS, MEMORY, Force, compile_forces
 from wlr_gym.plants.mujoco import packing
 from wlr_gym.plants.mujoco.batch import RobotBatch
 from wlr_gym.plants.mujoco.kernel import addresses, load_kernel
@@ -66,8 +66,9 @@ class MujocoPlant(Simulator):
         self._inputs = [np.zeros((count, 8)) for _ in range(4)]
         self._forces = compile_forces(forces) if forces else None
         self._force_inputs = np.zeros((len(INPUTS), count if forces else 1))
-        self._force_values = np.repeat(self._forces.values[:, None], count, axis=1) if self._forces else np.zeros((0, 1))
+        self.set_force_values(np.tile(self._forces.values if self._forces else np.zeros(0), (count, 1)))
         self._generalised = np.zeros((len(COORDINATES), count))
+        self._memory = np.zeros((len(MEMORY), count))
         self._kernel = load_kernel()
         batch = self._batch
         flat = (
@@ -126,6 +127,7 @@ class MujocoPlant(Simulator):
         speed = np.hstack([velocity, w, rates[:, np.argsort(_JOINT)]])
         if not (np.isfinite(values).all() and np.isfinite(position).all() and np.isfinite(speed).all()):
             raise InputError("state holds numbers that are not finite")
+        self._memory[1:, rows] = 0.0 if state.wind_up is None else state.wind_up[rows].T
         batch = self._batch
         self._state[rows], batch.qpos[rows], batch.qvel[rows], batch.warmstart[rows] = values, position, speed, 0.0
 
@@ -151,6 +153,8 @@ class MujocoPlant(Simulator):
             rotor_lead=np.where(has_play, self._state[:, _ROTOR_LEAD], 0.0),
             rotor_rate=np.where(has_play, self._state[:, _ROTOR_RATE], truth.joint_velocity),
             supply_drop=self._state[:, _LANE["supply_drop"]].copy(),
+            time=self._time.copy(),
+            wind_up=self._memory[1:].T.copy(),
         )
 
     # ---- stepping ----
@@ -174,16 +178,18 @@ class MujocoPlant(Simulator):
     def _tick(self) -> None:
         kernel, step, robots = self._kernel, self._step, (self._table, self._all)
         self._state[:, _SUMS] = 0.0
+        self._memory[0] = self._time
         kernel.drift(*robots, 0.5 * step)
         for substep in range(self.substeps):
             if self._forces:
                 kernel.features(*robots, self._force_inputs)
-                self._forces.evaluate(self._force_inputs, self._force_values, self._generalised)
+                self._forces.evaluate(self._force_inputs, self._force_values, self._memory, self._generalised, step)
             kernel.before(*robots, step, (substep + 0.5) * step)
             self._batch.step()
             kernel.after(*robots, step)
         kernel.drift(*robots, -0.5 * step)
         kernel.observe(*robots, self._truth.values, self._raw)
+        self._time += self.options.control_period
 
     def close(self) -> None:
         """Nothing to release."""
