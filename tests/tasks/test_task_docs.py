@@ -54,9 +54,11 @@ def test_every_key_of_an_event_is_explained():
         assert f"`{key}`" in section, key
 
 
-def test_the_example_loads():
-    (example,) = re.findall("```yaml\n(.*?)```", TEXT, re.S)
-    events = load_randomization(yaml.safe_load(example), load_robot()).config.events
+def test_the_examples_load():
+    late, whole = (yaml.safe_load(example) for example in re.findall("```yaml\n(.*?)```", TEXT, re.S))
+    delay = load_randomization(late, load_robot()).config.events["command_delay"]
+    assert (delay.low, delay.high) == (0.0, 0.03)
+    events = load_randomization(whole, load_robot()).config.events
     assert (events["floor_friction"].low, events["floor_friction"].high) == (0.2, 0.9)
     assert "body_mass" not in events
     assert {"wear", "gust", "wet_strip"} < set(events)
