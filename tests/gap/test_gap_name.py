@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap import judge
 from wlr_gym.gap import name as naming_module
 from wlr_gym.gap.analysis import NOT_EXCITED
-from wlr_gym.gap.fit import Fit, fit, linearise, nominal_model, total_cost
+from wlr_gym.gap.fit import Fit, fit, linearise, nominal_model, total_cost, untouched
 from wlr_gym.gap.hypothesis import Hypothesis
 from wlr_gym.gap.judge import Final, carries_over, finalists, looked_around, settle, told_by_others
 from wlr_gym.gap.likelihood import estimate_noise
@@ -104,6 +105,33 @@ def test_two_effects_are_both_named():
     naming = named(problem)
     assert sorted(labels(naming)) == ["decoy_4 body", "drag right"]
     assert [r.taken is None for r in naming.rounds] == [False, False, True]
+
+
+def test_looking_for_a_second_effect_starts_from_how_numbers_act_beside_the_first(monkeypatch):
+    """Also where the known numbers are as the file says."""
+    problem = Toy({}, [sized("play", 1.3), sized("decoy_4", -0.7)], error=0.5)
+    seen, refitting = [], naming_module.refit
+    monkeypatch.setattr(naming_module, "refit", lambda *args: seen.append((args[2], args[4])) or refitting(*args))
+    named(problem)
+    assert len(seen[-1][0].model.effects) == 2
+    for current, given in seen:
+        as_given = untouched(problem, current.model)
+        assert np.array_equal(given, linearise(problem, as_given, RUNS)[1])
+
+
+def test_sums_are_those_of_one_thread(monkeypatch):
+    """Those of several round otherwise, and a fit may end elsewhere."""
+    problem, threads = Toy({}, runs=8), set()
+    residuals = problem.residuals
+
+    def watched(settings, runs):
+        threads.update(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+        return residuals(settings, runs)
+
+    monkeypatch.setattr(problem, "residuals", watched)
+    with threadpool_limits(2, "blas"):
+        analyse_problem(problem, "toy")
+    assert threads == {1}
 
 
 def test_no_more_effects_than_an_analysis_may_have():

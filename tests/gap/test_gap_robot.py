@@ -21,7 +21,7 @@ from wlr_gym.gap.result import write_result
 from wlr_gym.gap.robot.candidates import ripple_order, robot_candidates
 from wlr_gym.gap.robot.formulas import formula_candidates, wave_frequency
 from wlr_gym.gap.robot.open import LEAST_RUNS, open_robot
-from wlr_gym.gap.robot.problem import LOST, RobotProblem
+from wlr_gym.gap.robot.problem import LOST, WORTH_APART, RobotProblem
 from wlr_gym.gap.robot.quantities import knobs, tolerance, write
 from wlr_gym.gap.robot.simulate import PHYSICS_STEP
 from wlr_gym.gap.workflow import found_effect
@@ -501,6 +501,22 @@ def test_known_effects_and_formulas_are_part_of_the_model(good):
     assert mixed[0] == pytest.approx(plain.residuals([setting], [0])[0][0], abs=1e-3, nan_ok=True)
     assert np.nanmax(np.abs(mixed[1] - mixed[0])) > 1.0
     assert np.nanmax(np.abs(mixed[2] - mixed[0])) > 1.0
+
+
+def test_company_does_not_change_a_bit(good):
+    """Alone, beside others like it, and beside effects for which another kernel is needed."""
+    problem = RobotProblem([good])
+    plain = nominal_model(problem).setting
+    weak = PatchEffect("slip_weakening", ("ground",), {"mu_k": 0.4, "slip_speed": 0.05})
+    special = [replace(plain, effects=(effect,)) for effect in (*load_patch([RESISTANCE]).effects, weak)]
+    alone = [problem.residuals([setting], [0])[0][0] for setting in (plain, *special)]
+    assert len({residual.tobytes() for residual in alone}) == 3
+    for many in (1, WORTH_APART):
+        among = problem.residuals([special[0], *[plain] * many, special[1]], [0])[0]
+        assert np.array_equal(among[0], alone[1], equal_nan=True)
+        assert np.array_equal(among[1], alone[0], equal_nan=True)
+        assert np.array_equal(among[many], alone[0], equal_nan=True)
+        assert np.array_equal(among[-1], alone[2], equal_nan=True)
 
 
 def test_a_formula_that_is_known_and_tried_again_is_two_forces(good):

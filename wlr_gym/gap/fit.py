@@ -81,6 +81,7 @@ class Fit:
             tolerances, unknowns in their steps), at or near the best model; unweighted, NaN as 0.
         hessian: (numbers, numbers) of half the cost, scaled numbers, tolerances included; numbers on their bounds are pinned.
         precision: (numbers, numbers) inverse covariance of the scaled numbers, tolerances counted once.
+        converged: whether new columns would hardly lead any further.
     """
 
     model: Model
@@ -90,6 +91,7 @@ class Fit:
     columns: list[NDArray[np.float32]] = field(repr=False)
     hessian: Array = field(repr=False)
     precision: Array = field(repr=False)
+    converged: bool = False
 
     def covariance(self) -> Array:
         """Covariance (numbers, numbers) of the scaled numbers: an imperfect simulator's word counts less, tolerances once."""
@@ -250,6 +252,7 @@ def fit(
         residuals, columns = linearise(problem, model, runs)
     else:
         residuals = [r[0] for r in problem.residuals([model.setting], runs)]
+    gained = np.inf
     for step in range(steps):
         model, residuals, gained = _descend(problem, runs, model, columns, residuals, memory, scatter)
         tell(f"step {step + 1} of {steps}: {gained:.0f} better")
@@ -262,7 +265,8 @@ def fit(
     pinned = np.diag(PINNED * on_bounds(problem, model))
     hessian = matrix + np.diag(prior_tightness(problem, model)) + pinned
     precision = matrix / problem.firmness + np.diag(_tightness_once(problem, model)) + pinned
-    return Fit(model, residuals, noise, total_cost(problem, model, residuals, noise.memory), columns, hessian, precision)
+    cost = total_cost(problem, model, residuals, noise.memory)
+    return Fit(model, residuals, noise, cost, columns, hessian, precision, bool(gained < RENEWED))
 
 
 def _descend(

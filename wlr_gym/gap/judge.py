@@ -228,7 +228,8 @@ def settle(problem: Problem, runs: Sequence[int], final: Final, bare: Fit, tell:
     """
     tell(f"settling {final.hypothesis.candidate.label}, also from the model as given")
     found = final.fit
-    starts = (looked_around(problem, runs, found), untouched(problem, found.model))
+    looked = looked_around(problem, runs, found)
+    starts = [model for model in (looked, untouched(problem, found.model)) if model is not found.model or not found.converged]
     more = [fit(problem, runs, start, scatter=found.noise.scatter, steps=SETTLING, tell=tell) for start in starts]
     best = cheapest(problem, (found, *more), found.noise.memory)
     memory = best.noise.memory

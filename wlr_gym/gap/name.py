@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.fit import Fit, Model, cheapest, fit, linearise, nominal_model, total_cost, widened
+from wlr_gym.gap.fit import Fit, Model, cheapest, fit, linearise, nominal_model, total_cost, untouched, widened
 from wlr_gym.gap.hypothesis import Hypothesis
 from wlr_gym.gap.judge import Final, accept, beside, finalists
 from wlr_gym.gap.likelihood import estimate_noise
@@ -123,6 +123,8 @@ def name_effects(
         if len(current.model.effects) >= MOST_EFFECTS or any(_same(current.model, earlier) for earlier in models):
             break
         models.append(current.model)
+        if given is not None:  # the columns beside the effects found: beside a strong one the known numbers do other things
+            given = linearise(problem, untouched(problem, current.model), runs)[1]
     return Naming(calibrated, current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
 
 

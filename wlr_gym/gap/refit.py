@@ -193,8 +193,6 @@ def _given_up(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list
 
 def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequence[NDArray[np.float32]]) -> list[_Trial]:
     """Where refits begin. The model as given keeps the effects found before."""
-    count = len(problem.quantities)
-    given = [np.vstack([column, now[count:]]) for column, now in zip(given, current.columns, strict=True)]
     as_given = untouched(problem, current.model)
     trials = [_Trial(-1, current.columns, current.columns, current.model)]
     for k, score in enumerate(scores):

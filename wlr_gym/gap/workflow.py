@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from wlr_gym.effects import Source, load_patch
 from wlr_gym.errors import InputError, unknown_name
@@ -118,6 +119,13 @@ def analyse_problem(
     tell: Tell = lambda stage, share: None,
 ) -> Analysis:
     """Analyse a problem that is open already; see :func:`analyse`."""
+    with threadpool_limits(1, "blas"):  # sums of several threads round otherwise, and a fit may end elsewhere
+        return _analysed(problem, data, findings, heldout, known, tell)
+
+
+def _analysed(
+    problem: Problem, data: str, findings: Sequence[IntakeFinding], heldout: Sequence[str], known: Source, tell: Tell
+) -> Analysis:
     clock = _Clock(tell)
     clock.start("choosing runs")
     fitted, sealed, columns = _choose_runs(problem, heldout)

@@ -65,6 +65,7 @@ def families(parameters: Parameters) -> set[str]:
     present = {
         "ground": has_patch.any() or (parameters["ground.kinetic_ratio"] != 1.0).any(),
         "creep": parameters["ground.creep_speed"].any(),
+        "rolling_resistance": parameters["ground.rolling_resistance"].any(),
     }
     return {name for name, is_present in present.items() if is_present}
 

@@ -18,7 +18,7 @@ from wlr_gym.gap.robot.clock import RunClock
 from wlr_gym.gap.robot.formulas import formula_candidates, tried_effects
 from wlr_gym.gap.robot.quantities import Knob, knobs, write
 from wlr_gym.gap.robot.recorder import TRUTH, Replays
-from wlr_gym.gap.robot.simulate import PHYSICS_STEP, replay_batch
+from wlr_gym.gap.robot.simulate import PHYSICS_STEP, replay_batch, special_effects
 from wlr_gym.gap.robot.windows import WINDOW, anchored_residuals
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import TRUTH_LAYOUT
@@ -42,6 +42,8 @@ LOST = 1e3
 FIRMNESS = 3.0
 #: Two simulators of one robot found sizes that differed by so much (root mean square over eight development sets).
 DISAGREEMENT = 0.04
+#: Settings without special effects that are worth a replay of their own.
+WORTH_APART = 12
 #: Remade runs that are replayed at once: more need more memory.
 MOST_REMADE = 256
 
@@ -122,16 +124,27 @@ class RobotProblem:
 
     def simulate(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
         """Return what the sensors would have read: (settings, rows, signals) per run, SI."""
-        plain = [k for k, setting in enumerate(settings) if not Patch((*self.known.effects, *setting.effects)).forces]
-        formulas = [k for k in range(len(settings)) if k not in set(plain)]
-        if not plain or not formulas:
+        groups = self._alike(settings)
+        if len(groups) == 1:
             return [replays.values for replays in self._replay(settings, runs)]
         results = [np.zeros((len(settings), len(self.times(r)), len(CHANNELS))) for r in runs]
-        for members in (plain, formulas):
+        for members in groups:
             chosen = [settings[k] for k in members]
             for result, replays in zip(results, self._replay(chosen, runs), strict=True):
                 result[members] = replays.values
         return results
+
+    def _alike(self, settings: Sequence[Setting]) -> list[list[int]]:
+        """Settings that one kernel serves best: those with formulas; of the others, if it is worth it, those without any effect
+        that the leanest kernel lacks apart from the rest. The bits do not depend on it."""
+        formulas = [k for k, setting in enumerate(settings) if Patch((*self.known.effects, *setting.effects)).forces]
+        others = [k for k in range(len(settings)) if k not in set(formulas)]
+        lean = [k for k in others if not special_effects(self.parameters([settings[k]]))]
+        if len(lean) >= WORTH_APART:
+            others = [k for k in others if k not in set(lean)]
+        else:
+            lean = []
+        return [group for group in (lean, others, formulas) if group]
 
     def _replay(self, settings: Sequence[Setting], runs: Sequence[int], with_truth: bool = False) -> list[Replays]:
         forces, constants = self._forces(settings)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
 from wlr_gym.gap.robot.recorder import POSE_TICKS, Recorder, Replays
 from wlr_gym.parameters import Parameters
-from wlr_gym.plants import make_plant
+from wlr_gym.plants import drive, ground, make_plant
 from wlr_gym.plants.base import PlantOptions, PlantState, Sensors, standing_state
 from wlr_gym.plants.forces import Force
 from wlr_gym.plants.sensors import rotation
@@ -141,6 +141,11 @@ def replay_batch(
     ]
 
 
+def special_effects(parameters: Parameters) -> set[str]:
+    """Return the families of effects, which the leanest kernel lacks, that some robot of the batch has."""
+    return drive.families(parameters) | ground.families(parameters)
+
+
 def _replay_chunk(
     robot: Robot,
     clocks: Sequence[RunClock],
@@ -157,7 +162,8 @@ def _replay_chunk(
     options = PlantOptions(CLOCK, PHYSICS_STEP, PRECISION.get(backend, "float64"), threads, sensor_noise=False)
     plant = make_plant(backend, robot, len(lanes), options, tuple(forces))
     assert isinstance(plant, Simulator)
-    plant.expect_all_effects()
+    if forces or special_effects(lanes):  # two kernels serve all: one for robots without any such effect, one for all others
+        plant.expect_all_effects()
     if constants is not None:
         plant.set_force_values(np.tile(constants, (runs, 1)))
     delay = lanes["command.delay"].copy()

@@ -117,8 +117,6 @@ class GibbsAppellPlant(Simulator):
 
     def _choose_kernel(self) -> None:
         features = drive.families(self.parameters) | ground.families(self.parameters)
-        if self.parameters["ground.rolling_resistance"].any():
-            features.add("rolling_resistance")
         if self._formulas:
             features.add("forces")
         if "creep" in features:  # its line search rounds otherwise beside rotors with play: the same bits with and without them
