@@ -115,6 +115,33 @@ def test_goes_on_where_it_stopped(finished):
     assert not any("to go" in line for line in said)
 
 
+def test_goes_on_from_the_answers_of_another_folder(finished, tmp_path):
+    first, report, _ = finished
+    plan = dataclasses.replace(first, out=tmp_path / "again")
+    answers = first.out / "answers.json"
+    assert gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, answers) == report
+    assert (plan.out / "answers.json").read_text() == answers.read_text()
+    longer = dataclasses.replace(plan, out=tmp_path / "longer", sets=3)
+    assert gap.run_blind_test(longer, "no_such_module:analyse", lambda line: None, answers)["failed"] == ["set_3002"]
+
+
+def test_answers_to_other_sets_are_refused(finished, tmp_path):
+    plan = dataclasses.replace(finished[0], out=tmp_path / "out", runs=(5, 6))
+    with pytest.raises(InputError, match=r"answers\.json: is about other runs \(\[6\]\)"):
+        gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, finished[0].out / "answers.json")
+    assert not list((plan.out / "results").iterdir())
+
+
+@pytest.mark.parametrize("text", [None, "{", "[]", '{"set_3000": {"effects": []}}'])
+def test_answers_that_are_none_are_refused(finished, tmp_path, text):
+    file = tmp_path / "answers.json"
+    if text is not None:
+        file.write_text(text)
+    plan = dataclasses.replace(finished[0], out=tmp_path / "out")
+    with pytest.raises(InputError, match=r"answers\.json: (cannot be read as answers|expected a mapping of sets to answers)"):
+        gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, file)
+
+
 def test_errors_of_the_workflow_are_its_answers(tmp_path, monkeypatch):
     monkeypatch.setattr(gap, "git_commit", lambda: "abc-dirty")
     plan = gap.Plan(tmp_path, sets=1, runs=(6,))

@@ -3,6 +3,7 @@
 The sets come from :mod:`wlr_gym.bench.blind`, which shares no code with the workflow. Results of finished sets stay in the
 output folder, so an interrupted test goes on where it stopped, and a longer one adds to a shorter one. Each says which
 truth and which runs it is about, and which commit made it: results of other data are refused, those of other commits counted.
+What the score is made of is also kept in one small file, from which a test goes on in another folder or on another machine.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ from wlr_gym.provenance import git_commit
 
 #: Folder of a data set, folder for the analysis' files -> contents of result.json.
 Analyser = Callable[[Path, Path], Mapping[str, Any]]
+#: Of a result: what the score is made of.
+_ANSWER = ("verdict", "message", "effects", "equivalent", "gap", "wall_seconds", "blind_test")
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -81,7 +84,10 @@ def analyse_folder(folder: Path, out: Path) -> Mapping[str, Any]:
 
 
 def run_blind_test(
-    plan: Plan, analyser: str = "wlr_gym.bench.gap:analyse_folder", say: Callable[[str], None] = print
+    plan: Plan,
+    analyser: str = "wlr_gym.bench.gap:analyse_folder",
+    say: Callable[[str], None] = print,
+    answers: Path | None = None,
 ) -> dict[str, Any]:
     """Make the data sets, analyse them, score them.
 
@@ -89,25 +95,61 @@ def run_blind_test(
         plan: what to do.
         analyser: what is tested, as ``module:function`` that other processes can import.
         say: shown progress.
+        answers: ``answers.json`` of another folder, whose sets are not analysed again.
 
     Returns:
         The score, as in ``score.json``.
 
     Raises:
-        InputError: the output folder cannot be written to, or holds results or truths of another test.
+        InputError: the output folder cannot be written to; it, or ``answers``, holds results or truths of another test.
     """
     for name in ("", "results", "data", "sealed", "work"):
         make_output_folder(plan.out / name)
     cases = plan.cases()
     say(f"truths sealed in {plan.out / 'sealed'}: sha256 {seal(plan, cases)}")
+    if answers is not None:
+        _take_over(plan, cases, answers)
     there = _kept(plan, cases)
     left = [one for one in cases if one.name not in there]
     if len(left) < len(cases):
         say(f"{len(cases) - len(left)} of {len(cases)} results are there already")
     _run(plan, left, analyser, say)
-    report = score(_kept(plan, cases), {one.name: one.as_dict() for one in cases})
+    results = _kept(plan, cases)
+    report = score(results, {one.name: one.as_dict() for one in cases})
     write_json(plan.out / "score.json", report)
+    _write_answers(plan.out / "answers.json", results)
     return report
+
+
+def _write_answers(path: Path, results: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write what the score is made of, a line per set."""
+    short = {name: {key: result[key] for key in _ANSWER if key in result} for name, result in results.items()}
+    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(answer)}" for name, answer in short.items())
+    replace_file(path, lambda temporary: temporary.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8"))
+
+
+def read_answers(path: Path) -> dict[str, dict[str, Any]]:
+    """Read what was found in each set, by its name.
+
+    Raises:
+        InputError: no such file, or it holds no answers.
+    """
+    try:
+        answers = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as answers of a blind test: {error}") from error
+    if not isinstance(answers, dict) or not all(isinstance(a, dict) and "verdict" in a for a in answers.values()):
+        raise InputError(f"{path}: expected a mapping of sets to answers, each with a verdict")
+    return answers
+
+
+def _take_over(plan: Plan, cases: Sequence[Case], path: Path) -> None:
+    """Keep the answers of sets that have no result yet, if they are about the sets of their names."""
+    answers = read_answers(path)
+    for one in cases:
+        if one.name in answers and not plan.result_file(one).is_file():
+            _check_origin(plan, one, answers[one.name], path)
+            write_json(plan.result_file(one), answers[one.name])
 
 
 def seal(plan: Plan, cases: Sequence[Case]) -> str:
@@ -159,17 +201,17 @@ def _kept(plan: Plan, cases: Sequence[Case]) -> dict[str, dict[str, Any]]:
     for one in cases:
         if plan.result_file(one).is_file():
             found[one.name] = read_result(plan.result_file(one))
-            _check_origin(plan, one, found[one.name])
+            _check_origin(plan, one, found[one.name], plan.result_file(one))
     return found
 
 
-def _check_origin(plan: Plan, one: Case, result: Mapping[str, Any]) -> None:
+def _check_origin(plan: Plan, one: Case, result: Mapping[str, Any], file: Path) -> None:
     """Refuse a result of other data; results that do not say what they are about are taken as they are."""
     made, now = result.get("blind_test") or {}, _subject(plan, one)
     for key, what in (("truth_sha256", "another hidden truth"), ("runs", "other runs")):
         if key in made and made[key] != now[key]:
             raise InputError(
-                f"{plan.result_file(one)}: is about {what} ({made[key]}) than set {one.name} has now ({now[key]}); "
+                f"{file}: is about {what} ({made[key]}) than set {one.name} has now ({now[key]}); "
                 "use another --out, or delete the file to analyse the set again"
             )
 

@@ -64,6 +64,8 @@ class Options:
     """gap: data sets."""
     processes: int = 2
     """gap: data sets at a time."""
+    answers: Path | None = None
+    """gap: answers.json of another folder; its sets are not analysed again."""
 
 
 def run(options: Options) -> int:
@@ -102,13 +104,15 @@ def _blind_test(options: Options, asked: tuple[str, ...]) -> int:
     if options.out is None:
         raise InputError(f"{BLIND_TEST} needs --out DIR: finished data sets are kept there, so that it can be interrupted")
     console = Console(soft_wrap=True)
-    report = gap.run_blind_test(gap.Plan(options.out, options.sets, options.processes), say=console.print)
+    report = gap.run_blind_test(
+        gap.Plan(options.out, options.sets, options.processes), say=console.print, answers=options.answers
+    )
     text = gap.markdown(report)
     (options.out / "score.md").write_text(text, encoding="utf-8")
     console.print(text, markup=False, highlight=False)
     if options.json is not None:
         write_json(options.json, report)
-    console.print(f"written: {options.out / 'score.json'}, {options.out / 'score.md'}")
+    console.print(f"written: {', '.join(str(options.out / name) for name in ('score.json', 'score.md', 'answers.json'))}")
     return OK
 
 
