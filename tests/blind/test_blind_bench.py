@@ -12,6 +12,7 @@ import yaml
 
 from wlr_gym.bench import gap
 from wlr_gym.bench.blind.cases import case
+from wlr_gym.bench.blind.score import score
 from wlr_gym.cli import main
 from wlr_gym.errors import InputError
 from wlr_gym.runs import read_dataset
@@ -123,23 +124,76 @@ def test_goes_on_from_the_answers_of_another_folder(finished, tmp_path):
     assert (plan.out / "answers.json").read_text() == answers.read_text()
     longer = dataclasses.replace(plan, out=tmp_path / "longer", sets=3)
     assert gap.run_blind_test(longer, "no_such_module:analyse", lambda line: None, answers)["failed"] == ["set_3002"]
+    one_more = dataclasses.replace(longer, out=tmp_path / "one_more")
+    failed = longer.out / "answers.json"  # not taken over: the reason may be the other machine's
+    assert gap.run_blind_test(one_more, "test_blind_bench:answers_nothing", lambda line: None, failed)["failed"] == []
 
 
-def test_answers_to_other_sets_are_refused(finished, tmp_path):
-    plan = dataclasses.replace(finished[0], out=tmp_path / "out", runs=(5, 6))
-    with pytest.raises(InputError, match=r"answers\.json: is about other runs \(\[6\]\)"):
-        gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, finished[0].out / "answers.json")
-    assert not list((plan.out / "results").iterdir())
+def test_a_result_that_is_there_is_not_replaced_by_an_answer(finished, tmp_path):
+    plan = dataclasses.replace(finished[0], out=tmp_path)
+    shutil.copytree(finished[0].out, tmp_path, dirs_exist_ok=True)
+    file, answers = plan.result_file(case(0)), json.loads((tmp_path / "answers.json").read_text())
+    file.write_text(json.dumps(gap.read_result(file) | {"verdict": "not_excited"}))
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps(answers))
+    gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, other)
+    assert gap.read_answers(tmp_path / "answers.json")["set_3000"]["verdict"] == "not_excited"
 
 
-@pytest.mark.parametrize("text", [None, "{", "[]", '{"set_3000": {"effects": []}}'])
-def test_answers_that_are_none_are_refused(finished, tmp_path, text):
+def test_answers_hold_all_that_the_score_reads(tmp_path):
+    estimate = {"value": 0.2, "ci95": [0.1, 0.3], "unit": "N m"}
+    effect = {"name": "coulomb_friction", "where": ["leg_lf"], "parameters": {"torque": estimate}, "confidence": 0.9}
+    numbers = {"reduction": 0.8, "reduction_ci95": [0.5, 0.9], "heldout_after": 1.2, "heldout_calibrated": 2.0}
+    result = {"verdict": "effect_found", "effects": [effect], "equivalent": [["coulomb_friction", "payload"]], "gap": numbers}
+    plan = gap.Plan(tmp_path, sets=24)
+    truths = {one.name: one.as_dict() for one in plan.cases()}
+    gap.make_output_folder(tmp_path / "results")
+    for one in plan.cases():
+        made = {"commit": "abc", **gap._subject(plan, one)}
+        plan.result_file(one).write_text(json.dumps(result | {"wall_seconds": 7.0, "evidence": [1], "blind_test": made}))
+    gap.write_answers(tmp_path)
+    answers = gap.read_answers(tmp_path / "answers.json")
+    assert "evidence" not in answers["set_3000"]
+    assert score(answers, truths) == score(
+        {name: gap.read_result(tmp_path / "results" / f"{name}.json") for name in truths}, truths
+    )
+
+
+def test_answers_to_other_sets_are_refused_whole(finished, tmp_path):
+    plan = dataclasses.replace(finished[0], out=tmp_path / "out")
+    answers = gap.read_answers(finished[0].out / "answers.json")
+    answers["set_3001"]["blind_test"]["runs"] = [5, 6]
+    file = tmp_path / "answers.json"
+    file.write_text(json.dumps(answers))
+    with pytest.raises(InputError, match=r"answers\.json: is about other runs \(\[5, 6\]\) than set set_3001"):
+        gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, file)
+    assert not plan.out.exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "cannot be read as answers"),
+        ("{", "cannot be read as answers"),
+        ("[]", "expected a mapping of sets to answers"),
+        ('{"set_3000": {"effects": []}}', "set_3000: expected a mapping with a verdict"),
+        ('{"set_3000": {"verdict": "effect_found", "effects": 5}}', "set_3000: effects: expected a list of mappings"),
+        ('{"set_3000": {"verdict": "nothing_missing"}}', "set_3000: blind_test: expected a mapping with truth_sha256"),
+    ],
+)
+def test_answers_that_are_none_are_refused(tmp_path, text, message):
     file = tmp_path / "answers.json"
     if text is not None:
         file.write_text(text)
-    plan = dataclasses.replace(finished[0], out=tmp_path / "out")
-    with pytest.raises(InputError, match=r"answers\.json: (cannot be read as answers|expected a mapping of sets to answers)"):
-        gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, file)
+    with pytest.raises(InputError, match=rf"answers\.json: {message}"):
+        gap.run_blind_test(gap.Plan(tmp_path / "out", 1), "no_such_module:analyse", lambda line: None, file)
+
+
+def test_the_command_goes_on_from_answers(finished, tmp_path, capsys):
+    answers = tmp_path / "answers.json"
+    answers.write_text("[]")
+    assert main(["bench", "gap", "--out", str(tmp_path / "out"), "--answers", str(answers)]) == 2
+    assert "expected a mapping of sets to answers" in capsys.readouterr().err
 
 
 def test_errors_of_the_workflow_are_its_answers(tmp_path, monkeypatch):

@@ -90,6 +90,32 @@ def test_columns_at_a_bound_are_taken_inwards():
     assert columns[0][0] == pytest.approx(-STRENGTH * problem.shape("gain")[0].ravel(), abs=1e-5)
 
 
+@pytest.mark.parametrize(("scatter", "simulated"), [(1.0, 5), (1e9, 2)])
+def test_idle_numbers_keep_their_columns(scatter, simulated):
+    """The data say nothing of the known numbers where the runs scatter that much; what an effect does is simulated anew."""
+    problem = Toy()
+    near = linearise(problem, nominal_model(problem), all_runs(problem))[1]
+    noise = estimate_noise(
+        [r[0] for r in problem.residuals([nominal_model(problem).setting], all_runs(problem))], None, scatter
+    )
+    marked = [columns + np.float32(1.0) for columns in near]
+    model = nominal_model(problem).with_effect(candidate(problem, "drag", ["left"]), (0.3,))
+    true, before = linearise(problem, model, all_runs(problem))[1], problem.calls
+    columns = linearise(problem, model, all_runs(problem), marked, noise)[1]
+    assert problem.calls - before == simulated
+    for found, kept, right in zip(columns, marked if scatter > 1.0 else true, true, strict=True):
+        assert np.array_equal(found[:3], kept[:3])
+        assert np.array_equal(found[3], right[3])
+
+
+def test_a_fit_has_converged_where_its_last_descent_led_nowhere():
+    problem = Toy({"gain": 2.0}, rows=400)
+    first = fit(problem, all_runs(problem), nominal_model(problem), steps=1)
+    assert not first.converged
+    assert fit(problem, all_runs(problem), first.model, steps=1).converged
+    assert not fit(problem, all_runs(problem), first.model, steps=0).converged
+
+
 def exact(problem, weight, columns, tight=(1.0,)):
     """Weighted least squares with priors that count ``tight`` times: scaled numbers away from nominal."""
     matrix, vector = np.eye(columns[0].shape[0]) * np.array(tight), np.zeros(columns[0].shape[0])

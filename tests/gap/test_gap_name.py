@@ -130,8 +130,11 @@ def test_sums_are_those_of_one_thread(monkeypatch):
 
     monkeypatch.setattr(problem, "residuals", watched)
     with threadpool_limits(2, "blas"):
+        before = threadpool_info()
         analyse_problem(problem, "toy")
+        assert threadpool_info() == before
     assert threads == {1}
+    assert 2 in [pool["num_threads"] for pool in before]
 
 
 def test_no_more_effects_than_an_analysis_may_have():
@@ -287,6 +290,19 @@ def test_effect_that_settles_looks_around_for_its_place(monkeypatch):
     assert settled.hypothesis.values[1] == pytest.approx(100.0, abs=2.0)
 
 
+@pytest.mark.parametrize(("converged", "fits"), [(True, 1), (False, 2)])
+def test_what_has_converged_is_not_fitted_from_there_again(monkeypatch, converged, fits):
+    problem = Toy({}, [sized("drag", 0.8, "right")], rows=400)
+    own = candidate(problem, "drag", ["right"])
+    base = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
+    whole = fit(problem, RUNS, nominal_model(problem).with_effect(own, (0.5,)), steps=problem.steps)
+    found = Hypothesis(own, whole.model, 1.0, np.ones(5), 1.0, whole.residuals, base.model, base.residuals)
+    starts = []
+    monkeypatch.setattr(judge, "fit", lambda *args, **options: starts.append(options["steps"]) or fit(*args, **options))
+    settle(problem, RUNS, Final(found, replace(whole, converged=converged)), base, lambda text: None)
+    assert starts.count(judge.SETTLING) == fits
+
+
 def test_known_numbers_that_a_whole_fit_finds_count_for_nothing():
     """The model without the effect was left at nominal; the whole fit has found the numbers, and there is no effect."""
     problem = Toy({"gain": 2.0, "offset": -2.0}, rows=400)
@@ -298,6 +314,24 @@ def test_known_numbers_that_a_whole_fit_finds_count_for_nothing():
     (final,), _ = finalists(problem, RUNS, stuck, [left], stuck)
     assert final.fit.model.quantities == pytest.approx(whole.model.quantities, abs=0.2 * SIGMA.min())
     assert abs(final.hypothesis.gain) < 0.5 * LEAST_GAIN
+
+
+@pytest.mark.parametrize(("promised", "is_fitted"), [(300.0, True), (90.0, False)])
+def test_hypothesis_that_got_stuck_short_of_its_promise_is_fitted_in_full(promised, is_fitted):
+    problem = Toy({}, [sized("drag", 0.8, "right")], rows=400)
+    current = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
+
+    def refitted(name, gain, screened, *where):
+        model = current.model.with_effect(candidate(problem, name, list(where) or None), (0.1,))
+        return Hypothesis(
+            model.effects[0][0], model, gain, np.ones(5), screened, current.residuals, current.model, current.residuals
+        )
+
+    hypotheses = [refitted("decoy_1", 60.0, 100.0), refitted("drag", -5.0, promised, "right")]
+    finals, _ = finalists(problem, RUNS, current, hypotheses, current)
+    assert len(finals) == 1 + is_fitted
+    assert (finals[0].hypothesis.candidate.label == "drag right") is is_fitted
+    assert (finals[0].hypothesis.gain > 100.0) is is_fitted
 
 
 def test_finalists_are_judged_against_the_same_model(monkeypatch):
@@ -358,6 +392,23 @@ def test_effect_of_one_run_does_not_carry_over(seen_in, carries):
     gain = total_cost(problem, bare.model, bare.residuals, memory) - whole.cost
     assert gain > LEAST_GAIN
     assert carries_over(problem, RUNS, bare, whole, memory) is carries
+
+
+@pytest.mark.parametrize(("thrown_off", "carries"), [([3], True), ([1, 3], False)])
+def test_one_run_of_five_may_be_thrown_off(monkeypatch, thrown_off, carries):
+    """A rough cost, as of play: next to the fit, one run is far from the data."""
+    problem = Toy({}, [sized("drag", 1.0, "right")], rows=400)
+    own = candidate(problem, "drag", ["right"])
+    bare = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
+    whole = fit(problem, RUNS, bare.model.with_effect(own, (0.5,)), steps=problem.steps)
+    true = problem.residuals
+
+    def rough(settings, runs):
+        far = 4.0 * np.array([bool(s.effects) for s in settings])[:, None, None] if runs[0] in thrown_off else 0.0
+        return [r + far for r in true(settings, runs)]
+
+    monkeypatch.setattr(problem, "residuals", rough)
+    assert carries_over(problem, RUNS, bare, whole, whole.noise.memory) is carries
 
 
 class Once(Toy):

@@ -25,7 +25,7 @@ from typing import Any, Literal
 import yaml
 
 from wlr_gym.bench.blind.cases import FIRST_SCORED_SEED, Case, case
-from wlr_gym.bench.blind.score import score
+from wlr_gym.bench.blind.score import FAILED, score
 from wlr_gym.errors import InputError
 from wlr_gym.files import make_output_folder, replace_file, write_json
 from wlr_gym.paths import data_directory
@@ -95,7 +95,7 @@ def run_blind_test(
         plan: what to do.
         analyser: what is tested, as ``module:function`` that other processes can import.
         say: shown progress.
-        answers: ``answers.json`` of another folder, whose sets are not analysed again.
+        answers: ``answers.json`` of another folder, whose sets are not analysed again, but for those that failed.
 
     Returns:
         The score, as in ``score.json``.
@@ -103,29 +103,31 @@ def run_blind_test(
     Raises:
         InputError: the output folder cannot be written to; it, or ``answers``, holds results or truths of another test.
     """
+    cases = plan.cases()
+    earlier = {} if answers is None else _answers_to(plan, cases, answers)
     for name in ("", "results", "data", "sealed", "work"):
         make_output_folder(plan.out / name)
-    cases = plan.cases()
     say(f"truths sealed in {plan.out / 'sealed'}: sha256 {seal(plan, cases)}")
-    if answers is not None:
-        _take_over(plan, cases, answers)
+    for one in cases:
+        if one.name in earlier and not plan.result_file(one).is_file():
+            write_json(plan.result_file(one), earlier[one.name])
     there = _kept(plan, cases)
     left = [one for one in cases if one.name not in there]
     if len(left) < len(cases):
         say(f"{len(cases) - len(left)} of {len(cases)} results are there already")
     _run(plan, left, analyser, say)
-    results = _kept(plan, cases)
-    report = score(results, {one.name: one.as_dict() for one in cases})
+    report = score(_kept(plan, cases), {one.name: one.as_dict() for one in cases})
     write_json(plan.out / "score.json", report)
-    _write_answers(plan.out / "answers.json", results)
+    write_answers(plan.out)
     return report
 
 
-def _write_answers(path: Path, results: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write what the score is made of, a line per set."""
+def write_answers(out: Path) -> None:
+    """Write what the score is made of, of all results in a test's folder, to ``answers.json`` there: a line per set."""
+    results = {file.stem: read_result(file) for file in sorted((out / "results").glob("*.json"))}
     short = {name: {key: result[key] for key in _ANSWER if key in result} for name, result in results.items()}
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(answer)}" for name, answer in short.items())
-    replace_file(path, lambda temporary: temporary.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8"))
+    replace_file(out / "answers.json", lambda temporary: temporary.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8"))
 
 
 def read_answers(path: Path) -> dict[str, dict[str, Any]]:
@@ -138,18 +140,36 @@ def read_answers(path: Path) -> dict[str, dict[str, Any]]:
         answers = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as answers of a blind test: {error}") from error
-    if not isinstance(answers, dict) or not all(isinstance(a, dict) and "verdict" in a for a in answers.values()):
-        raise InputError(f"{path}: expected a mapping of sets to answers, each with a verdict")
+    if not isinstance(answers, dict):
+        raise InputError(f"{path}: expected a mapping of sets to answers")
+    for name, answer in answers.items():
+        _check_answer(f"{path}: {name}", answer)
     return answers
 
 
-def _take_over(plan: Plan, cases: Sequence[Case], path: Path) -> None:
-    """Keep the answers of sets that have no result yet, if they are about the sets of their names."""
+def _check_answer(place: str, answer: Any) -> None:
+    if not isinstance(answer, dict) or not isinstance(answer.get("verdict"), str):
+        raise InputError(f"{place}: expected a mapping with a verdict")
+    effects = answer.get("effects", [])
+    if not isinstance(effects, list) or not all(isinstance(e, dict) and {"name", "parameters"} <= e.keys() for e in effects):
+        raise InputError(f"{place}: effects: expected a list of mappings with name and parameters")
+    made = answer.get("blind_test")
+    if not isinstance(made, dict) or not {"truth_sha256", "runs"} <= made.keys():
+        raise InputError(f"{place}: blind_test: expected a mapping with truth_sha256 and runs")
+
+
+def _answers_to(plan: Plan, cases: Sequence[Case], path: Path) -> dict[str, dict[str, Any]]:
+    """Read the answers to sets of a plan; those that failed are to be analysed again.
+
+    Raises:
+        InputError: no answers, or one is about another truth or other runs than the set of its name now.
+    """
     answers = read_answers(path)
+    there = {one.name: answers[one.name] for one in cases if one.name in answers}
     for one in cases:
-        if one.name in answers and not plan.result_file(one).is_file():
-            _check_origin(plan, one, answers[one.name], path)
-            write_json(plan.result_file(one), answers[one.name])
+        if one.name in there:
+            _check_origin(plan, one, there[one.name], path, "leave out --answers")
+    return {name: answer for name, answer in there.items() if answer["verdict"] != FAILED}
 
 
 def seal(plan: Plan, cases: Sequence[Case]) -> str:
@@ -201,19 +221,17 @@ def _kept(plan: Plan, cases: Sequence[Case]) -> dict[str, dict[str, Any]]:
     for one in cases:
         if plan.result_file(one).is_file():
             found[one.name] = read_result(plan.result_file(one))
-            _check_origin(plan, one, found[one.name], plan.result_file(one))
+            advice = "use another --out, or delete the file to analyse the set again"
+            _check_origin(plan, one, found[one.name], plan.result_file(one), advice)
     return found
 
 
-def _check_origin(plan: Plan, one: Case, result: Mapping[str, Any], file: Path) -> None:
+def _check_origin(plan: Plan, one: Case, result: Mapping[str, Any], file: Path, advice: str) -> None:
     """Refuse a result of other data; results that do not say what they are about are taken as they are."""
     made, now = result.get("blind_test") or {}, _subject(plan, one)
     for key, what in (("truth_sha256", "another hidden truth"), ("runs", "other runs")):
         if key in made and made[key] != now[key]:
-            raise InputError(
-                f"{file}: is about {what} ({made[key]}) than set {one.name} has now ({now[key]}); "
-                "use another --out, or delete the file to analyse the set again"
-            )
+            raise InputError(f"{file}: is about {what} ({made[key]}) than set {one.name} has now ({now[key]}); {advice}")
 
 
 def _plain(value: Any) -> Any:
@@ -240,6 +258,7 @@ def _run(plan: Plan, cases: Sequence[Case], analyser: str, say: Callable[[str], 
                 passed = time.monotonic() - begin
                 rest = passed / done * (len(cases) - done)
                 line = _outcome(plan, one, process.returncode)
+                write_answers(plan.out)
                 say(f"{done}/{len(cases)}  {line}  {_clock(passed)} passed, about {_clock(rest)} to go")
     finally:
         for _, process in working.values():

@@ -33,6 +33,8 @@ PINNED = 1e9
 #: A step that gains less than this (in minus two log posterior) is the last with its columns; new columns that gain less than
 #: RENEWED are the last of a fit.
 SETTLED, RENEWED = 0.5, 2.0
+#: A number of which the data say less than this share of what its tolerance says hardly moves: columns once simulated will do.
+IDLE = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,27 +168,53 @@ def moved(problem: Problem, model: Model, change: Array) -> Model:
     return Model(quantities, tuple(effects))
 
 
-def linearise(problem: Problem, model: Model, runs: Sequence[int]) -> tuple[list[Array], list[NDArray[np.float32]]]:
-    """Return the residuals of ``model`` and their columns, one per run; see :class:`Fit`."""
-    count = len(problem.quantities)
-    steps = np.where(np.arange(model.size) < count, STEP, 1.0)
-    models, taken = [model], np.zeros(model.size)
+def linearise(
+    problem: Problem,
+    model: Model,
+    runs: Sequence[int],
+    near: Sequence[NDArray[np.float32]] | None = None,
+    noise: Noise | None = None,
+) -> tuple[list[Array], list[NDArray[np.float32]]]:
+    """Return the residuals of ``model`` and their columns, one per run; see :class:`Fit`.
+
+    With ``near``, columns of the same numbers or of all but the last of them, and the noise there, idle numbers keep those.
+    """
+    idle = np.zeros(model.size, bool) if near is None or noise is None else idle_numbers(problem, model, near, noise)
+    wanted = np.flatnonzero(~idle)
+    models, taken = [model], np.zeros(len(wanted))
     here = scaled_numbers(problem, model)
-    for k in range(model.size):
+    for place, k in enumerate(wanted):
+        step = STEP if k < len(problem.quantities) else 1.0
         for direction in (1.0, -1.0):  # at a bound the other way
             change = np.zeros(model.size)
-            change[k] = direction * steps[k]
+            change[k] = direction * step
             other = moved(problem, model, change)
-            taken[k] = (scaled_numbers(problem, other) - here)[k]
-            if abs(taken[k]) > 0.5 * steps[k]:
+            taken[place] = (scaled_numbers(problem, other) - here)[k]
+            if abs(taken[place]) > 0.5 * step:
                 break
         models.append(other)
     found = problem.residuals([m.setting for m in models], runs)
     columns = []
-    for r in found:
+    for number, r in enumerate(found):
         change = (r[1:] - r[0]) / np.where(taken == 0.0, np.inf, taken)[:, None, None]
-        columns.append(np.nan_to_num(change).reshape(model.size, -1).astype(np.float32))
+        own = np.zeros((model.size, r[0].size), np.float32)
+        if near is not None:
+            own[idle] = near[number][np.flatnonzero(idle)]
+        own[wanted] = np.nan_to_num(change).reshape(len(wanted), r[0].size)
+        columns.append(own)
     return [r[0] for r in found], columns
+
+
+def idle_numbers(problem: Problem, model: Model, columns: Sequence[NDArray[np.float32]], noise: Noise) -> NDArray[np.bool_]:
+    """Return of which numbers (numbers) the data say little beside their tolerances; unknowns of effects never are."""
+    count, channels = len(problem.quantities), len(noise.weight)
+    told = np.zeros(count)
+    for column in columns:
+        known = column[:count].reshape(count, -1, channels)
+        told += np.einsum("krc,krc->kc", known, known) @ noise.weight
+    idle = np.zeros(model.size, bool)
+    idle[:count] = told < IDLE * prior_tightness(problem, model)[:count]
+    return idle
 
 
 def scaled_numbers(problem: Problem, model: Model) -> Array:
@@ -231,6 +259,7 @@ def fit(
     memory: Array | None = None,
     scatter: float = 1.0,
     columns: list[NDArray[np.float32]] | None = None,
+    near: Fit | None = None,
     steps: int = 4,
     renew: bool = True,
     tell: Callable[[str], None] = lambda text: None,
@@ -244,21 +273,24 @@ def fit(
         memory: of the residuals where it is known already, and must be the same; None = estimated where each descent begins.
         scatter: of the runs; see :class:`wlr_gym.gap.likelihood.Noise`.
         columns: responses near ``model`` where they are known.
+        near: a fit of the same numbers, or of all but the last of them, whose columns serve for idle ones.
         steps: at most this many Gauss-Newton steps.
-        renew: simulate the columns anew at every step; otherwise only once, where ``columns`` are missing.
+        renew: simulate the columns, but idle ones, anew at every step; otherwise only once, where ``columns`` are missing.
         tell: told of progress.
     """
-    if columns is None:
-        residuals, columns = linearise(problem, model, runs)
-    else:
+    if columns is not None:
         residuals = [r[0] for r in problem.residuals([model.setting], runs)]
+    elif near is not None:
+        residuals, columns = linearise(problem, model, runs, near.columns, near.noise)
+    else:
+        residuals, columns = linearise(problem, model, runs)
     gained = np.inf
     for step in range(steps):
         model, residuals, gained = _descend(problem, runs, model, columns, residuals, memory, scatter)
         tell(f"step {step + 1} of {steps}: {gained:.0f} better")
         if gained < RENEWED or not renew or step == steps - 1:
             break
-        residuals, columns = linearise(problem, model, runs)
+        residuals, columns = linearise(problem, model, runs, columns, estimate_noise(residuals, memory, scatter))
     model, residuals = _relaxed(problem, runs, model, columns, residuals, memory, scatter)
     noise = estimate_noise(residuals, memory, scatter)
     matrix, _ = normal_equations(columns, residuals, noise)

@@ -37,9 +37,13 @@ Tell = Callable[[str], None]
 FINALIST, FINALISTS = 0.75, 3
 #: Beside a set of places its best single place is fitted in full, if it buys at least this share.
 NARROWER = 0.4
+#: So many hypotheses that promised more than the best did, and got stuck on the way there, are fitted in full too.
+STUCK = 1
 #: Left out one after the other, the runs must gain together at least this share of what they gain when they are fitted; asked
 #: where so many are.
 LEAST_CARRIED, LEAST_RUNS = 0.3, 3
+#: Of so many runs, the one that loses most has no say: play and sticking make the cost rough, and a run may be thrown off.
+FORGIVING = 5
 #: Steps, at most, in which a model with an effect that is taken settles.
 SETTLING = 8
 #: Steps by which a settling effect looks for a better place, in every unknown that says where it is or over what it fades.
@@ -79,7 +83,8 @@ def finalists(
     chosen, wholes = _worth_a_fit(hypotheses), []
     for hypothesis in chosen:
         tell(f"fitting {hypothesis.candidate.label} in full")
-        near = fit(problem, runs, hypothesis.model, scatter=current.noise.scatter, steps=problem.steps, tell=tell)
+        scatter = current.noise.scatter
+        near = fit(problem, runs, hypothesis.model, scatter=scatter, near=current, steps=problem.steps, tell=tell)
         both = (near, *_afresh(problem, runs, hypothesis, near, tell))
         wholes.append(cheapest(problem, both, current.noise.memory))
     if not wholes:
@@ -100,7 +105,7 @@ def _far_apart(problem: Problem, one: Model, other: Model) -> bool:
 
 
 def _worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The best of every name that buys nearly as much as the best does, and the best's narrower self."""
+    """The best of every name that buys nearly as much as the best does, the best's narrower self, and what promised more."""
     best: dict[str, Hypothesis] = {}
     effects = [hypothesis for hypothesis in hypotheses if not hypothesis.tolerable]
     for hypothesis in effects:
@@ -111,7 +116,9 @@ def _worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
         narrower = len(leading.candidate.where) > 1 and len(hypothesis.candidate.where) == 1
         if narrower and hypothesis.candidate.name == leading.candidate.name and hypothesis.gain > NARROWER * leading.gain:
             best.setdefault("narrower", hypothesis)
-    return list(best.values())
+    promised = max([LEAST_GAIN, *(leading.screened for leading in effects[:1])])
+    stuck = [h for h in hypotheses if h.screened > max(h.gain, promised) and h not in best.values()]
+    return [*best.values(), *sorted(stuck, key=lambda h: -h.screened)[:STUCK]]
 
 
 def _judged(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, whole: Fit, bare: Fit, memory: Array) -> Final:
@@ -159,23 +166,28 @@ def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near:
     candidate = hypothesis.candidate
     given = untouched(problem, hypothesis.model.without_effect(-1))
     start = given.with_effect(candidate, candidate.probed(candidate.starts[0]))
-    return [fit(problem, runs, start, scatter=near.noise.scatter, steps=problem.steps, tell=tell)]
+    return [fit(problem, runs, start, scatter=near.noise.scatter, near=near, steps=problem.steps, tell=tell)]
 
 
 def carries_over(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit, memory: Array) -> bool:
     """Whether the runs, each with what the others tell of the effect, get better, by a share of what all fitted do.
 
-    Of the likelihood alone: what an effect spares the tolerances is its own evidence, and no run's. Two runs are not asked.
+    Of the likelihood alone: what an effect spares the tolerances is its own evidence, and no run's. Two runs are not asked; of
+    :data:`FORGIVING` and more one may say no.
     """
     if len(runs) < LEAST_RUNS:
         return True
     fitted = minus_two_log_likelihood(bare.residuals, memory) - minus_two_log_likelihood(whole.residuals, memory)
-    found = [
-        problem.residuals([without.setting, with_it.setting], [run])[0]
-        for run, without, with_it in zip(runs, told_by_others(problem, bare), told_by_others(problem, whole), strict=True)
-    ]
+    pairs = zip(runs, told_by_others(problem, bare), told_by_others(problem, whole), strict=True)
+    found = [problem.residuals([without.setting, with_it.setting], [run])[0] for run, without, with_it in pairs]
+    kept = [found[:k] + found[k + 1 :] for k in range(len(found))] if len(runs) >= FORGIVING else [found]
+    return max(_carried(some, memory) for some in kept) > max(LEAST_CARRIED * fitted, 0.0)
+
+
+def _carried(found: Sequence[Array], memory: Array) -> float:
+    """Fall of the likelihood from the first to the second of two residuals per run."""
     before, after = (minus_two_log_likelihood([r[k] for r in found], memory) for k in (0, 1))
-    return before - after > max(LEAST_CARRIED * fitted, 0.0)
+    return before - after
 
 
 def told_by_others(problem: Problem, found: Fit) -> list[Model]:
@@ -228,9 +240,12 @@ def settle(problem: Problem, runs: Sequence[int], final: Final, bare: Fit, tell:
     """
     tell(f"settling {final.hypothesis.candidate.label}, also from the model as given")
     found = final.fit
-    looked = looked_around(problem, runs, found)
-    starts = [model for model in (looked, untouched(problem, found.model)) if model is not found.model or not found.converged]
-    more = [fit(problem, runs, start, scatter=found.noise.scatter, steps=SETTLING, tell=tell) for start in starts]
+    scatter = found.noise.scatter
+    more = [
+        fit(problem, runs, start, scatter=scatter, near=found, steps=SETTLING, tell=tell)
+        for start in (looked_around(problem, runs, found), untouched(problem, found.model))
+        if start is not found.model or not found.converged  # else it is where it would end
+    ]
     best = cheapest(problem, (found, *more), found.noise.memory)
     memory = best.noise.memory
     bare = cheapest(problem, [bare, _left(problem, runs, best, final.hypothesis.candidate, memory)], memory)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.fit import Fit, Model, cheapest, fit, linearise, nominal_model, total_cost, untouched, widened
+from wlr_gym.gap.fit import Fit, Model, cheapest, fit, linearise, total_cost, untouched, widened
 from wlr_gym.gap.hypothesis import Hypothesis
 from wlr_gym.gap.judge import Final, accept, beside, finalists
 from wlr_gym.gap.likelihood import estimate_noise
@@ -83,10 +83,10 @@ def name_effects(
         runs: those that are fitted; no other has a say.
         start: the calibrated model.
         tell: told of progress.
-        given: columns of the model as its file says, where they are known.
+        given: columns of ``start`` without its calibration, where they are known: one (numbers, rows x channels) array per run.
     """
     if given is None and not problem.thorough:
-        given = linearise(problem, nominal_model(problem), runs)[1]
+        given = linearise(problem, untouched(problem, start.model), runs)[1]
     current, calibrated, rounds, again = start, start, [], None
     models = [start.model]
     while True:
@@ -112,6 +112,7 @@ def name_effects(
             anew = fit(problem, runs, bare.model, scatter=current.noise.scatter, steps=problem.steps)
             current = again = widened(problem, runs, anew)
             calibrated = calibrated if current.model.effects else current
+            given = _as_given(problem, runs, current, given)
             continue
         merged = _merged(problem, finals, hypotheses, bare, accepted or (finals[0] if finals else None))
         taken = None if accepted is None else _labelled(merged, accepted.hypothesis)
@@ -123,9 +124,17 @@ def name_effects(
         if len(current.model.effects) >= MOST_EFFECTS or any(_same(current.model, earlier) for earlier in models):
             break
         models.append(current.model)
-        if given is not None:  # the columns beside the effects found: beside a strong one the known numbers do other things
-            given = linearise(problem, untouched(problem, current.model), runs)[1]
+        given = _as_given(problem, runs, current, given)
     return Naming(calibrated, current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
+
+
+def _as_given(
+    problem: Problem, runs: Sequence[int], current: Fit, given: Sequence[NDArray[np.float32]] | None
+) -> Sequence[NDArray[np.float32]] | None:
+    """Columns of the model without its calibration: beside a strong effect known numbers do other things than without it."""
+    if given is None or not current.model.effects:
+        return given
+    return linearise(problem, untouched(problem, current.model), runs, current.columns, current.noise)[1]
 
 
 def _settled(model: Model, candidate: Candidate) -> bool:
@@ -145,7 +154,12 @@ def _without_more(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesi
     model, residuals = hypotheses[0].base, hypotheses[0].base_residuals
     noise = estimate_noise(residuals, scatter=current.noise.scatter)
     found = replace(
-        current, model=model, residuals=residuals, noise=noise, cost=total_cost(problem, model, residuals, noise.memory)
+        current,
+        model=model,
+        residuals=residuals,
+        noise=noise,
+        cost=total_cost(problem, model, residuals, noise.memory),
+        converged=False,
     )
     return cheapest(problem, (current, found), noise.memory)
 

@@ -77,6 +77,8 @@ def refit(
     calibration may have taken on what the effect does, and not let go of it. The responses of the known numbers are those of
     the two starts; those of each hypothesis' own unknowns are simulated anew. The model without an effect more is refitted too,
     in the end also from where the best hypotheses are.
+
+    ``given``: columns of ``current`` without its calibration, one (numbers, rows x channels) array per run.
     """
     if not scores:
         return []

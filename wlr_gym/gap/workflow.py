@@ -40,10 +40,13 @@ STAGES = {"reading": 0.0, "choosing runs": 0.02, "calibrating": 0.1, "naming": 0
 SCATTER = 5.0
 #: Kinds of rigs.
 RIGS = ("pendulum",)
+#: Sums of several threads round otherwise, and a fit may end elsewhere.
+_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 #: Share of the effects that must be visible within their plausible range for "nothing missing" to mean anything.
 LEAST_VISIBLE = 0.5
 
 
+@_one_thread
 def analyse(
     data: str | Path,
     out: str | Path | None = None,
@@ -109,6 +112,7 @@ def _bad_data(data: str, findings: Sequence[IntakeFinding]) -> Analysis:
     return Analysis(data, words.BAD_DATA, "", tuple(findings), provenance=provenance())
 
 
+@_one_thread
 def analyse_problem(
     problem: Problem,
     data: str,
@@ -119,13 +123,6 @@ def analyse_problem(
     tell: Tell = lambda stage, share: None,
 ) -> Analysis:
     """Analyse a problem that is open already; see :func:`analyse`."""
-    with threadpool_limits(1, "blas"):  # sums of several threads round otherwise, and a fit may end elsewhere
-        return _analysed(problem, data, findings, heldout, known, tell)
-
-
-def _analysed(
-    problem: Problem, data: str, findings: Sequence[IntakeFinding], heldout: Sequence[str], known: Source, tell: Tell
-) -> Analysis:
     clock = _Clock(tell)
     clock.start("choosing runs")
     fitted, sealed, columns = _choose_runs(problem, heldout)

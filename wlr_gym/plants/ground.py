@@ -1,8 +1,8 @@
 """Friction under a wheel, defined once for every simulator: grip, patches of floor, slip weakening, tyre creep.
 
 Scalar source over lanes (see :mod:`wlr_gym.plants.drive`), traced by each simulator into its own kernel. :func:`pack` fills
-the parameter lanes from the table. Families of effects that change what is traced: ``ground`` (patches, weakening) and
-``creep``; without them friction is a constant of each wheel, ``mu_x{i}`` and ``mu_y{i}``.
+the parameter lanes from the table. Families of effects that change what is traced: ``ground`` (patches, weakening),
+``creep`` and ``rolling_resistance``; without the first two friction is a constant of each wheel, ``mu_x{i}`` and ``mu_y{i}``.
 """
 
 from __future__ import annotations

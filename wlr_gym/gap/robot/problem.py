@@ -18,7 +18,7 @@ from wlr_gym.gap.robot.clock import RunClock
 from wlr_gym.gap.robot.formulas import formula_candidates, tried_effects
 from wlr_gym.gap.robot.quantities import Knob, knobs, write
 from wlr_gym.gap.robot.recorder import TRUTH, Replays
-from wlr_gym.gap.robot.simulate import PHYSICS_STEP, replay_batch, special_effects
+from wlr_gym.gap.robot.simulate import KERNELS, PHYSICS_STEP, kernel_of, replay_batch
 from wlr_gym.gap.robot.windows import WINDOW, anchored_residuals
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import TRUTH_LAYOUT
@@ -42,7 +42,7 @@ LOST = 1e3
 FIRMNESS = 3.0
 #: Two simulators of one robot found sizes that differed by so much (root mean square over eight development sets).
 DISAGREEMENT = 0.04
-#: Settings without special effects that are worth a replay of their own.
+#: Settings that are worth a replay of their own by a faster kernel.
 WORTH_APART = 12
 #: Remade runs that are replayed at once: more need more memory.
 MOST_REMADE = 256
@@ -135,16 +135,18 @@ class RobotProblem:
         return results
 
     def _alike(self, settings: Sequence[Setting]) -> list[list[int]]:
-        """Settings that one kernel serves best: those with formulas; of the others, if it is worth it, those without any effect
-        that the leanest kernel lacks apart from the rest. The bits do not depend on it."""
-        formulas = [k for k, setting in enumerate(settings) if Patch((*self.known.effects, *setting.effects)).forces]
-        others = [k for k in range(len(settings)) if k not in set(formulas)]
-        lean = [k for k in others if not special_effects(self.parameters([settings[k]]))]
-        if len(lean) >= WORTH_APART:
-            others = [k for k in others if k not in set(lean)]
-        else:
-            lean = []
-        return [group for group in (lean, others, formulas) if group]
+        """Which settings are replayed together: by the kernel they need; a few join those that need a slower one.
+
+        The bits do not depend on it.
+        """
+        groups: dict[str, list[int]] = {kernel: [] for kernel in (*KERNELS, "formulas")}
+        for k, setting in enumerate(settings):
+            has_formula = bool(Patch((*self.known.effects, *setting.effects)).forces)
+            groups["formulas" if has_formula else kernel_of(self.parameters([setting]))].append(k)
+        for place, kernel in enumerate(KERNELS[:-1], 1):
+            if len(groups[kernel]) < WORTH_APART and any(groups[slower] for slower in KERNELS[place:]):
+                groups[KERNELS[place]] += groups.pop(kernel)
+        return [sorted(group) for group in groups.values() if group]
 
     def _replay(self, settings: Sequence[Setting], runs: Sequence[int], with_truth: bool = False) -> list[Replays]:
         forces, constants = self._forces(settings)

@@ -45,6 +45,10 @@ PRECISION = {"gibbs_appell": "float32"}
 MOST_ROBOTS = 1024
 
 
+#: Kernels that replay all robots, the faster first: each further one would be compiled, for longer than it saves.
+KERNELS = ("without effects", "tyres that creep", "all effects")
+
+
 class WrittenGoals:
     """Goals that arrive at their measured times, each joint's late by its own ``command.delay``."""
 
@@ -141,9 +145,10 @@ def replay_batch(
     ]
 
 
-def special_effects(parameters: Parameters) -> set[str]:
-    """Return the families of effects, which the leanest kernel lacks, that some robot of the batch has."""
-    return drive.families(parameters) | ground.families(parameters)
+def kernel_of(parameters: Parameters) -> str:
+    """Return the leanest of :data:`KERNELS` that knows all effects of a batch."""
+    found = drive.families(parameters) | ground.families(parameters)
+    return KERNELS[0] if not found else KERNELS[1] if found == {"creep"} else KERNELS[-1]
 
 
 def _replay_chunk(
@@ -162,7 +167,7 @@ def _replay_chunk(
     options = PlantOptions(CLOCK, PHYSICS_STEP, PRECISION.get(backend, "float64"), threads, sensor_noise=False)
     plant = make_plant(backend, robot, len(lanes), options, tuple(forces))
     assert isinstance(plant, Simulator)
-    if forces or special_effects(lanes):  # two kernels serve all: one for robots without any such effect, one for all others
+    if forces or kernel_of(lanes) == KERNELS[-1]:
         plant.expect_all_effects()
     if constants is not None:
         plant.set_force_values(np.tile(constants, (runs, 1)))

@@ -55,7 +55,8 @@ def anchored_residuals(t: Array, measured: Array, simulated: Array, noise: Array
         residual[:, window, _WHEELS[0] : _WHEELS[-1] + 1] = wheels - np.nanmean(wheels, axis=1, keepdims=True)
         _calm(residual[:, window])
         _take_out_pose(measured[window], simulated[:, window], residual[:, window], noise)
-    return residual / noise
+    residual /= noise
+    return residual
 
 
 def _calm(residual: Array) -> None:
