@@ -15,6 +15,7 @@ def _parameters(env: gym.Env, name: str) -> np.ndarray:
     return env.unwrapped.core.plant.parameters[name][0]  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_the_page_makes_what_it_says(workplace):
     names = run_page(PAGE, slow=False)
     assert names["leg_rate_reward"] < 0.0

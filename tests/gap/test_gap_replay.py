@@ -70,6 +70,7 @@ def test_own_run_comes_back_to_sensor_noise():
     assert rms.max() < 2.5
 
 
+@pytest.mark.slow
 def test_model_that_lacks_the_effect_does_not_come_back():
     short = record(posture_and_turns, spaced(3.0), [RESISTANCE])
     assert worst(short, replayed(short, nominal([RESISTANCE]))) < 0.5

@@ -519,6 +519,7 @@ def test_company_does_not_change_a_bit(good):
         assert np.array_equal(among[-1], alone[2], equal_nan=True)
 
 
+@pytest.mark.slow
 def test_a_formula_that_is_known_and_tried_again_is_two_forces(good):
     """Frequencies do not add up, and constants go by their names, in whatever order a file has them."""
     units = {"a": "N", "b": "N", "w": "rad/s"}
@@ -535,6 +536,7 @@ def test_a_formula_that_is_known_and_tried_again_is_two_forces(good):
     assert np.nanmax(np.abs(plain - alone)) > 1.0
 
 
+@pytest.mark.slow
 def test_time_of_a_formula_is_that_of_the_run_however_it_is_replayed(tmp_path):
     """Recorded by the command's own code, replayed in segments and in the gap workflow's windows; 0.5 s off is another law."""
 
