@@ -65,7 +65,7 @@ class Options:
     processes: int = 2
     """gap: data sets at a time."""
     answers: Path | None = None
-    """gap: answers.json of another folder; its sets are not analysed again."""
+    """gap: answers.json of another folder; its sets are not analysed again, but for those that failed."""
 
 
 def run(options: Options) -> int:
