@@ -165,11 +165,10 @@ def _answers_to(plan: Plan, cases: Sequence[Case], path: Path) -> dict[str, dict
         InputError: no answers, or one is about another truth or other runs than the set of its name now.
     """
     answers = read_answers(path)
-    there = {one.name: answers[one.name] for one in cases if one.name in answers}
-    for one in cases:
-        if one.name in there:
-            _check_origin(plan, one, there[one.name], path, "leave out --answers")
-    return {name: answer for name, answer in there.items() if answer["verdict"] != FAILED}
+    asked = [one for one in cases if one.name in answers]
+    for one in asked:
+        _check_origin(plan, one, answers[one.name], path, "leave out --answers")
+    return {one.name: answers[one.name] for one in asked if answers[one.name]["verdict"] != FAILED}
 
 
 def seal(plan: Plan, cases: Sequence[Case]) -> str:

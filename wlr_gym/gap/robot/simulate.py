@@ -43,8 +43,6 @@ PHYSICS_STEP = 0.001
 PRECISION = {"gibbs_appell": "float32"}
 #: Robots simulated at once: more need more memory and are no faster.
 MOST_ROBOTS = 1024
-
-
 #: Kernels that replay all robots, the faster first: each further one would be compiled, for longer than it saves.
 KERNELS = ("without effects", "tyres that creep", "all effects")
 
