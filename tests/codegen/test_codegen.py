@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from llvmlite import binding
 
 from wlr_gym.codegen import Graph, emit, hoist, load_module, ops
 
@@ -45,6 +46,15 @@ def test_same_bits_at_every_width(table):
     compiled(1)(narrow)
     compiled(8)(wide)
     assert np.array_equal(narrow, wide)
+
+
+@pytest.mark.skipif(not binding.get_host_cpu_features().get("avx512f"), reason="no vector registers of 512 bits")
+def test_whole_registers_are_used_where_they_are_asked_for():
+    lines = ["@njit", "def run(x):", "    whole_registers()", "    w = numbers_of(x)"]
+    lines += ["    for k in range(256):", "        w[k] = fma(w[k + 256], w[k + 256], w[k])", ""]
+    run = load_module("test_registers", "\n".join(lines)).run
+    run(np.ones(512, np.float32))
+    assert "zmm" in "".join(run.inspect_asm().values())
 
 
 def test_hoist_separates_constants_and_keeps_the_value():

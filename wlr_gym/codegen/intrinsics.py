@@ -1,4 +1,4 @@
-"""What numba lacks: fused multiply-add, choice without a branch, arrays by address."""
+"""What numba lacks: fused multiply-add, choice without a branch, arrays by address, whole vector registers."""
 
 from __future__ import annotations
 
@@ -54,3 +54,18 @@ def numbers_of(typing_context: Any, array: Any) -> Any:
         return context.make_array(array)(context, builder, arguments[0]).data
 
     return kind(array), generate
+
+
+@intrinsic
+def whole_registers(typing_context: Any) -> Any:
+    """Let the function in which this stands use vector registers of 512 bits where there are any.
+
+    Left alone, LLVM uses half of them on most processors that have them, in case other code suffers from a slower clock.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        # llvmlite checks names against its own list, which lacks the attributes that are texts.
+        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+        return context.get_dummy_value()
+
+    return types.none(), generate

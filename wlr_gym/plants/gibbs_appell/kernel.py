@@ -107,7 +107,15 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
         used = {node.operands[0] for node in live_nodes(outputs.values()) if node.op == "input"}
         arguments = ", ".join(["W", *(name for name in _SCALARS if name in used)])
         body = emit(outputs, load, lambda name, text: f"w[{start[name]} + k] = {text}", " " * 8, constant, fused=True)
-        lines += [_DECORATOR, f"def {block}({arguments}):", "    w = numbers_of(W)", f"    for k in range({width}):", *body, ""]
+        lines += [
+            _DECORATOR,
+            f"def {block}({arguments}):",
+            "    whole_registers()",
+            "    w = numbers_of(W)",
+            f"    for k in range({width}):",
+            *body,
+            "",
+        ]
     return "\n".join(lines) + ("" if "forces" in features else _driver(start, width))
 
 
@@ -172,6 +180,7 @@ def scatter(W, TRUTH, RAW, tile, count):
 def tick(
     X, P, goals, old_goals, switch_time, on, formula_values, memory, TRUTH, RAW, first, last, count, step, substeps, sweeps
 ):
+    whole_registers()
     W = np.zeros({scratch}, F)
     half = F(0.5) * step
     for tile in range(first, last):
@@ -200,6 +209,7 @@ def tick(
 
 {decorator}
 def look(X, P, TRUTH, RAW, tiles, count, step):
+    whole_registers()
     W = np.zeros({scratch}, F)
     for tile in tiles:
         W[:{stored}] = X[tile]
