@@ -43,8 +43,8 @@ class Settings:
     Attributes:
         backend: which plant: ``gibbs_appell`` or ``mujoco``, or ``dynamixel``: the real robot, see ``docs/robot.md``.
         robot: name in ``configs/robot/``, path of a YAML file, or a :class:`wlr_gym.robot.Robot`; None = the task's.
-        randomization: name in ``configs/randomization/`` (none, nominal, wide, slippery, asymmetric, ice, split, patches, slope),
-            path of such a file or of a gap result (``.json``), or mapping; None = the task's.
+        randomization: name in ``configs/randomization/`` (none, nominal, wide, slippery, asymmetric, ice, split, patches,
+            slope), path of such a file or of a gap result (``.json``), or mapping; None = the task's.
         task: mapping laid over the task's file (``{"rewards": {"slip": {"weight": -2.0}}}``), or another task file.
         effects: what is added after randomisation: path of a patch file or name of one in ``configs/effects/``, an effect as a
             mapping (``{"name": "friction_level", "parameters": {"mu": 0.4}}``), or a list of any of these; None = nothing.

@@ -50,14 +50,14 @@ def velocity_error(signals: Signals, *, linear: Value = 0.02, angular: Value = 0
 
 @registered(REWARDS, lateral=POSITIVE, heading=POSITIVE)
 def path_error(signals: Signals, *, lateral: Value = 0.015, heading: Value = 0.2) -> Value:
-    """Distance from the path over ``lateral`` (m) plus heading error over ``heading`` (rad), each r as |r| / (1 + |r| / 8)."""
+    """Distance from the path over ``lateral`` (m), heading error over ``heading`` (rad), each r as |r| / (1 + |r| / 8)."""
     error = references.path_error(signals, true_motion(signals))
     return _levelling(error.lateral / lateral) + _levelling(error.heading / heading)
 
 
 @registered(REWARDS, lateral=POSITIVE, heading=POSITIVE)
 def course_error(signals: Signals, *, lateral: Value = 0.01, heading: Value = 0.025) -> Value:
-    """Distance from the start's line over ``lateral`` (m) plus heading over ``heading`` (rad), each r as |r| / (1 + |r| / 8)."""
+    """Distance from the start's line over ``lateral`` (m), heading over ``heading`` (rad), each r as |r| / (1 + |r| / 8)."""
     motion = true_motion(signals)
     return _levelling(motion.y / lateral) + _levelling(motion.yaw / heading)
 
