@@ -57,7 +57,8 @@ def trace(run, channel, size=1.0, seed=0):
     if COLUMNS[channel].may_be_nan:
         measured[rng.random(t.size) > 0.55] = np.nan
     before, calibrated = size * shape * 0.9, size * shape
-    return Trace(run, channel, COLUMNS[channel].unit, t, measured, before, calibrated, truth)
+    errors = (measured - calibrated, measured - truth)
+    return Trace(run, channel, COLUMNS[channel].unit, t, measured, before, calibrated, truth, *errors)
 
 
 ADEQUACY = Adequacy(

@@ -96,6 +96,7 @@ def test_missing_values_and_channels():
     assert places[0].name == "place"
     assert "torque" not in [p.name for p in places]
     assert np.isfinite(maps[0].values).all()
+    assert localised(residuals, problem, np.array([1.0, np.nan, 1.0]))[0] == places  # what no run measured has no level
 
 
 def test_one_lost_reading_does_not_hide_the_rest():

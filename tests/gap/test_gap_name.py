@@ -20,7 +20,7 @@ from wlr_gym.gap.refit import refit
 from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
 from wlr_gym.gap.sure import EQUIVALENT, equivalents
 from wlr_gym.gap.words import sentence
-from wlr_gym.gap.workflow import analyse_problem
+from wlr_gym.gap.workflow import analyse_problem, evidence_of
 
 RUNS = range(5)
 
@@ -577,3 +577,12 @@ def test_same_data_same_bits():
     one, two = named(problem), named(problem)
     assert one.fit.model.effects[0][1] == two.fit.model.effects[0][1]
     assert [h.gain for h in one.rounds[0].hypotheses] == [h.gain for h in two.rounds[0].hypotheses]
+
+
+def test_what_was_taken_and_dropped_again_is_not_told_as_taken():
+    problem = Toy({}, [sized("decoy_2", 1.0)], white=1.5)
+    look = named(problem).rounds[0]
+    assert look.taken is not None
+    for kept, outcome in (({look.taken.candidate.label}, "taken"), (set(), "dropped")):
+        entries = evidence_of(problem, 1, look, RUNS, kept)
+        assert [entry.outcome for entry in entries if entry.name == "decoy_2"] == [outcome]

@@ -427,6 +427,32 @@ def test_mirrored_joint(tmp_path, good, joint):
     assert [f.channel for f in findings if f.kind == "mirrored"] == [f"pos_{joint}"] * 3
 
 
+@pytest.mark.parametrize("rate", ["vel_wheel_lr", "gyro_z"])
+def test_a_rate_against_its_angle(tmp_path, good, rate):
+    def turning(table, k):  # half a radian to and fro, seen by the camera where it sees anything
+        yaw = 0.5 * np.sin(2.0 * table["t"])
+        return table.assign(cam_yaw=yaw.where(table["cam_yaw"].notna()), gyro_z=np.cos(2.0 * table["t"]))
+
+    assert kinds(open_robot(folder_of(tmp_path / "right", good, 3, turning))[1]) == set()
+    flipped = folder_of(
+        tmp_path / "wrong", good, 3, lambda table, k: turning(table, k).assign(**{rate: -turning(table, k)[rate]})
+    )
+    problem, findings = open_robot(flipped)
+    assert problem is None
+    assert [f.channel for f in findings if f.kind == "mirrored"] == [rate] * 3
+
+
+def test_angles_that_start_anew_after_a_turn(tmp_path, good):
+    def wrap(table, k):
+        return table.assign(pos_wheel_rf=(table["pos_wheel_rf"] + 3.0) % (2 * np.pi))
+
+    problem, findings = open_robot(folder_of(tmp_path, good, 3, wrap))
+    assert problem is None
+    (first, *_) = [f for f in findings if f.kind == "wrap"]
+    assert first.channel == "pos_wheel_rf"
+    assert "numpy.unwrap" in first.text
+
+
 def test_motors_that_were_never_on(tmp_path, good):
     def off(table, k):
         table[[c for c in table if c.startswith("cmd")]] = np.nan
@@ -615,7 +641,10 @@ def test_what_a_robot_cannot_have_beside_its_effects_is_not_tried(good):
     assert {("wheel_lr",), ("leg_lf",), ("leg_lf", "leg_rf")} <= left
     assert {candidate.name for candidate in candidates} == {c.name for c in problem.candidates(setting, residuals, [0])[1]}
     problem.parameters([replace(found, effects=(wheels, *probe.effects)) for probe in probes])
-    given = RobotProblem([good], known=Patch((wheels,)))
+    probed = replace(
+        wheels, parameters={"extra_static_torque": 0.1, "stribeck_speed": 0.1}
+    )  # as a probe's: no fit could move it
+    given = RobotProblem([good], known=Patch((probed,)))
     assert ("wheel_lf",) not in places_tried(given.candidates(setting, residuals, [0])[1], "stribeck_friction")
 
 

@@ -259,6 +259,8 @@ def test_detectable_severity_is_of_the_direction_that_shows_best_at_the_place_th
     told = detectable([score("front", 1.0, 400.0, 0.01), score("rear", 1.0, 100.0, 0.01)])["shift"]
     assert (told.parameter, told.unit) == ("y", "m")
     assert told.value == pytest.approx(0.005 * np.sqrt(least_gain(3) / 100.0))
+    hidden = replace(score("left", 1.0, 200.0, 0.01), visible=False)  # a size beyond all that is plausible is none
+    assert np.isnan(detectable([hidden, score("rear", 1.0, 100.0, 0.01)])["shift"].value)
 
 
 def test_what_is_left_hides_more_effects():

@@ -32,6 +32,13 @@ def drive(turn=0.8, bend=0.0):
     return values
 
 
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+def test_windows_hold_every_row(start):
+    windows = window_rows(start + T)
+    assert windows == WINDOWS
+    assert np.concatenate([np.arange(len(T))[window] for window in windows]).tolist() == list(range(len(T)))
+
+
 def moved(values, windows, seed=1):
     """Every window's pose moved rigidly, its wheel angles shifted."""
     rng = np.random.default_rng(seed)

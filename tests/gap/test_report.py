@@ -392,17 +392,11 @@ def test_pictures_show_the_numbers():
     left, below = found["overlays_1"].axes[:2]
     assert [line.get_label() for line in left.lines] == ["measured", "model as given", "calibrated", "effects added"]
     trace = small(examples.EFFECT_FOUND).traces[0]
-    assert np.array_equal(below.lines[1].get_ydata(), trace.measured - trace.after)
+    assert np.array_equal(below.lines[1].get_ydata(), trace.after_error)
     assert left.get_ylabel() == "rad/s"
     bare = figures(replace(small(examples.NOTHING_MISSING), evidence=()))
     assert widths(bare["gap"]) == [2.31, 1.04]
     assert "effects added" not in [line.get_label() for line in bare["overlays_1"].axes[0].lines]
-
-
-def test_headings_err_by_the_shorter_way_round():
-    trace = replace(examples.trace("run_03", "cam_yaw", True), measured=np.full(1000, 3.1), after=np.full(1000, -3.1))
-    (figure,) = figures(replace(examples.BAD_DATA, effects=examples.EFFECT_FOUND.effects, traces=(trace,))).values()
-    assert np.asarray(figure.axes[1].lines[1].get_ydata()) == pytest.approx(6.2 - 2 * np.pi)
 
 
 def test_what_has_no_numbers_is_not_drawn():
@@ -438,6 +432,7 @@ def test_an_earlier_analysis_is_replaced(tmp_path, quick):
     save_analysis(examples.BAD_DATA, tmp_path)
     assert json.loads((tmp_path / "result.json").read_text())["verdict"] == "bad_data"
     assert not (tmp_path / "plots" / "overlays_9.png").exists()
+    assert not (tmp_path / "config.yaml").exists()
 
 
 @pytest.mark.parametrize("name", ["run_01.parquet", "notes.txt", "result.json"])
@@ -446,6 +441,13 @@ def test_a_foreign_folder_is_refused(tmp_path, name, quick):
     with pytest.raises(InputError, match=rf"--out .*: '{name}' in it is not of an analysis"):
         save_analysis(examples.EFFECT_FOUND, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_files_of_the_same_names_are_not_an_analysis(tmp_path, quick):
+    (tmp_path / "patch.yaml").write_text("effects: []  # by hand")
+    with pytest.raises(InputError, match=r"'patch.yaml' in it is not of an analysis"):
+        save_analysis(examples.EFFECT_FOUND, tmp_path)
+    assert (tmp_path / "patch.yaml").read_text() == "effects: []  # by hand"
 
 
 def test_folders_that_cannot_be_are_refused(tmp_path):

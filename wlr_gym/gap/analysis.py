@@ -74,7 +74,7 @@ class Evidence:
         round: 1 for the first effect.
         gain: what adding it bought after a refit; ``screened`` what the first-order score had promised.
         outcome: ``taken``, ``equivalent``, ``weaker``, ``too little``, ``inconsistent``, ``does not carry over``,
-            ``implausible``, ``within tolerance`` or ``screened out``.
+            ``implausible``, ``within tolerance``, ``dropped`` or ``screened out``.
         reason: one sentence: why it won or lost.
         by_run: fall of the weighted squares per fit run; empty where it was only screened.
     """
@@ -122,7 +122,13 @@ class HeatMap:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """One channel of one held-out run: measured, and as three models replay it; SI."""
+    """One channel of one held-out run: measured, and as three models replay it; SI.
+
+    Attributes:
+        before, calibrated, after: replayed by the model as given, calibrated, with the effects.
+        calibrated_error, after_error: what counts of measured minus replayed (pose and wheel angles from each window's own
+            level); NaN where nothing does.
+    """
 
     run: str
     channel: str
@@ -132,6 +138,8 @@ class Trace:
     before: Array
     calibrated: Array
     after: Array
+    calibrated_error: Array
+    after_error: Array
 
 
 @dataclass(frozen=True)
@@ -191,7 +199,7 @@ class Calibrated:
 
 @dataclass(frozen=True)
 class Detectable:
-    """Smallest severity of an effect that these data would have shown."""
+    """Smallest severity of an effect that these data would have shown; NaN: none that is plausible."""
 
     parameter: str
     value: float

@@ -34,14 +34,15 @@ def localise(
     Args:
         problem: the system.
         calibrated: residuals of the calibrated model without effects, one (rows, signals) per run.
-        expected: (signals) mean squares that a complete model has: of the final model, or 1.
+        expected: (signals) mean squares that a complete model has: of the final model, or 1; NaN where nothing was measured.
         noise: of the residuals; its memory says how many rows count.
         features: what residuals may depend on, rows of the same runs.
     """
     squares = np.sum([np.nansum(np.minimum(r * r, problem.cap**2), axis=0) for r in calibrated], axis=0) / np.maximum(
         noise.rows, 1
     )
-    excess = np.maximum(squares / np.maximum(expected, 1.0) - 1.0, 0.0) * noise.rows / noise.memory
+    floor = np.where(np.isfinite(expected), np.maximum(expected, 1.0), 1.0)
+    excess = np.maximum(squares / floor - 1.0, 0.0) * noise.rows / noise.memory
     total = float(excess.sum())
     if total <= 0.0:
         return (), ()

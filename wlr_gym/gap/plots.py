@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import Analysis, ChannelGap, Evidence, GapFigures, HeatMap, RunGap, Trace
 from wlr_gym.gap.words import channel, error, feature, percent, places, plain
-from wlr_gym.runs.format import ANGLES_OF_THE_BODY
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -305,10 +304,12 @@ def _draw_trace(above: Axes, below: Axes, trace: Trace, noise: float | None, *, 
     dots = {"marker": ".", "markersize": 3.0, "linestyle": ""} if not known.all() else {"linewidth": 2.4}
     above.plot(t[known], trace.measured[known], color=MEASURED, label="measured", **dots)  # type: ignore[arg-type]
     above.plot(t, trace.before, color="black", linewidth=0.8, linestyle=":", label="model as given")
-    models = [(trace.calibrated, CALIBRATED, "calibrated")] + ([(trace.after, AFTER, "effects added")] if with_effects else [])
-    for values, colour, label in models:
+    models = [(trace.calibrated, trace.calibrated_error, CALIBRATED, "calibrated")]
+    models += [(trace.after, trace.after_error, AFTER, "effects added")] if with_effects else []
+    for values, left, colour, label in models:
+        counted = np.isfinite(left)
         above.plot(t, values, color=colour, linewidth=1.0, label=label)
-        below.plot(t[known], _error(trace, values)[known], color=colour, linewidth=0.8)
+        below.plot(t[counted], left[counted], color=colour, linewidth=0.8)
     if noise is not None:
         below.axhspan(-2.0 * noise, 2.0 * noise, color="#2e7d32", alpha=0.15, linewidth=0.0)
     below.axhline(0.0, color="black", linewidth=0.5)
@@ -319,9 +320,3 @@ def _draw_trace(above: Axes, below: Axes, trace: Trace, noise: float | None, *, 
     for axes in (above, below):
         _calm(axes)
         axes.margins(x=0.01)
-
-
-def _error(trace: Trace, values: Array) -> Array:
-    """Measured minus replayed; headings by the shorter way round."""
-    error: Array = trace.measured - values
-    return (error + np.pi) % (2 * np.pi) - np.pi if trace.channel in ANGLES_OF_THE_BODY else error

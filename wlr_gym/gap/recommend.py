@@ -8,6 +8,7 @@ from wlr_gym.gap.analysis import EFFECT_FOUND, Recommendation
 from wlr_gym.gap.judge import shown_by_some_runs_only
 from wlr_gym.gap.name import Naming
 from wlr_gym.runs.excitations import EXCITATIONS
+from wlr_gym.runs.format import Profile
 
 #: Motion of :data:`wlr_gym.runs.excitations.EXCITATIONS` that shows an effect best.
 SHOWN_BY: Mapping[str, str] = {
@@ -107,24 +108,25 @@ _SEPARATED_BY: Sequence[tuple[frozenset[str], frozenset[str], str, str]] = (
 )
 
 
-def separating_run(names: Iterable[str], motions: Mapping[str, str]) -> str:
-    """Return, in words, the run that would tell these explanations apart; the first is the chosen one.
+def separation(chosen: str, other: str, motions: Mapping[str, str]) -> tuple[str, str] | None:
+    """Return the excitation that tells two effects apart, and why it does; None where none is known.
 
     Args:
-        names: of effects.
+        chosen, other: names of effects.
         motions: effect -> motion of the system that shows it best; empty = it has no named motions.
     """
+    for one, two, excitation, why in _SEPARATED_BY if motions else ():
+        if (chosen in one and other in two) or (chosen in two and other in one):
+            return excitation, why
+    return (motions[chosen], f"the motion in which {chosen} shows best") if chosen in motions else None
+
+
+def separating_run(names: Iterable[str], motions: Mapping[str, str]) -> str:
+    """Return, in words, the run that tells explanations apart, the chosen one from the others; see :func:`separation`."""
     chosen, *others = names
-    texts = []
-    for other in others if motions else []:
-        for one, two, excitation, why in _SEPARATED_BY:
-            if (chosen in one and other in two) or (chosen in two and other in one):
-                texts.append(f"{excitation} ({EXCITATIONS[excitation].doc}): {why}")
-                break
-        else:
-            if chosen in motions:
-                texts.append(f"{motions[chosen]}: the motion in which {chosen} shows best")
-    return "; ".join(dict.fromkeys(texts)) or "more runs, of other kinds and at other loads"
+    found = dict.fromkeys(filter(None, (separation(chosen, other, motions) for other in others)))
+    texts = [f"{excitation} ({EXCITATIONS[excitation].doc}): {why}" for excitation, why in found]
+    return "; ".join(texts) or "more runs, of other kinds and at other loads"
 
 
 def recommend(
@@ -134,9 +136,9 @@ def recommend(
     found: dict[str, str] = {}
     for names in equivalent:
         for other in names[1:]:
-            if names[0] in motions:
-                why = separating_run((names[0], other), motions)
-                found.setdefault(motions[names[0]], f"separates {names[0]} from {other}: {why}")
+            apart = separation(names[0], other, motions)
+            if apart is not None:
+                found.setdefault(apart[0], f"separates {names[0]} from {other}: {apart[1]}")
     last = naming.rounds[-1]
     for hypothesis in last.hypotheses:
         name = hypothesis.candidate.name
@@ -153,3 +155,14 @@ def recommend(
         for excitation, names in blind.items():
             found.setdefault(excitation, f"would show {', '.join(sorted(names))}, of which these data show nothing")
     return tuple(Recommendation(excitation, why) for excitation, why in found.items())
+
+
+def record_commands(excitations: Iterable[str]) -> list[str]:
+    """Return the commands that record excitations: a folder of runs has one servo profile."""
+    alike: dict[Profile, list[str]] = {}
+    for name in excitations:
+        alike.setdefault(EXCITATIONS[name].profile, []).append(name)
+    folders = ["new_runs", *(f"new_runs_{k}" for k in range(2, len(alike) + 1))]
+    return [
+        f"wlr record --excitation {' '.join(names)} --out {out}" for out, names in zip(folders, alike.values(), strict=True)
+    ]

@@ -26,6 +26,7 @@ from wlr_gym.gap.analysis import (
     Analysis,
     Calibrated,
     ChannelGap,
+    Detectable,
     Evidence,
     FoundEffect,
     GapFigures,
@@ -35,6 +36,7 @@ from wlr_gym.gap.analysis import (
 from wlr_gym.gap.page import commands, document, folded, heading, pictures_of, section, table
 from wlr_gym.gap.plots import SCREENED_OUT, draw
 from wlr_gym.gap.prove import LEAST_FOR_INTERVAL
+from wlr_gym.gap.recommend import record_commands
 from wlr_gym.gap.result import PATCH_FILE, RESULT_FILE, patch_of, read_result, result_of, write_result
 from wlr_gym.gap.words import (
     adequacy,
@@ -72,8 +74,9 @@ _CAPTIONS = {
     "where": "In which states the calibrated model is wrong: each row a measured channel, each column a range of what is named "
     "below. The numbers are rms errors; about 1 is what sensor noise alone would leave, grey is a range without data.",
     "localisation": "Which measured channels hold the gap, and how much of it.",
-    "overlays": "Measured runs, and the same runs replayed by the model. Below each: what is left of the error; the green band "
-    "is two standard deviations of sensor noise.",
+    "overlays": "Measured runs, and the same runs replayed by the model. Below each: the error that counts (of pose "
+    "and wheel angles, what is new since the window of some 2 s began); the green band is two standard deviations of sensor "
+    "noise.",
     "gap": "Error of replayed runs. Left: over the runs kept aside, with the 95 % interval of what the effects bought. Right: "
     "run by run.",
     "channels": "The same for each measured channel, over the runs kept aside.",
@@ -101,14 +104,21 @@ def check_folder(folder: Path) -> None:
 
 
 def _require_own(folder: Path) -> None:
-    strange = sorted(path.name for path in folder.iterdir() if path.name not in _OWN)
-    if not strange and (folder / RESULT_FILE).exists():
-        try:
-            read_result(folder / RESULT_FILE)
-        except InputError:
-            strange = [RESULT_FILE]
+    there = sorted(path.name for path in folder.iterdir())
+    strange = [name for name in there if name not in _OWN] or ([] if _is_analysis(folder) else there)
     if strange:
         raise InputError(f"--out {folder}: '{strange[0]}' in it is not of an analysis; expected a new folder or an earlier one")
+
+
+def _is_analysis(folder: Path) -> bool:
+    """Whether an analysis wrote a folder: files of these names alone may be anybody's."""
+    if not (folder / RESULT_FILE).exists():
+        return (folder / PROVENANCE_FILE).exists()
+    try:
+        read_result(folder / RESULT_FILE)
+    except InputError:
+        return False
+    return True
 
 
 def save_analysis(analysis: Analysis, folder: Path) -> Path:
@@ -124,7 +134,8 @@ def save_analysis(analysis: Analysis, folder: Path) -> Path:
     pictures = draw(analysis)
     page = report(analysis, pictures, folder)
     make_output_folder(folder / PLOTS)
-    (folder / RESULT_FILE).unlink(missing_ok=True)
+    for stale in (RESULT_FILE, CONFIG_FILE):  # the provenance stays until there is a result: it tells whose the folder is
+        (folder / stale).unlink(missing_ok=True)
     for stale in (folder / PLOTS).glob("*.png"):
         stale.unlink()
     for name, picture in pictures.items():
@@ -350,13 +361,14 @@ def _how_sure(analysis: Analysis) -> str:
     if analysis.adequacy:
         parts += [heading("Is anything left?"), _adequacy(analysis.adequacy)]
     if analysis.detectable:
-        sizes = [
-            (plain(name), one.parameter, f"{number(one.value)}{unit_of(one.unit)}")
-            for name, one in sorted(analysis.detectable.items())
-        ]
+        sizes = [(plain(name), one.parameter, _smallest(one)) for name, one in sorted(analysis.detectable.items())]
         parts += [heading("What these runs would have shown"), _DETECTABLE]
         parts.append(table(("effect", "parameter", "smallest size"), sizes, {2}))
     return section("How sure", *parts)
+
+
+def _smallest(one: Detectable) -> str:
+    return f"{number(one.value)}{unit_of(one.unit)}" if math.isfinite(one.value) else "none that is plausible"
 
 
 def _adequacy(found: Adequacy) -> str:
@@ -402,7 +414,7 @@ def _next(analysis: Analysis) -> str:
         known = [name for name in dict.fromkeys(one.excitation for one in analysis.recommendations) if name in EXCITATIONS]
         if known:
             parts.append("<p>Drive them on the robot, or write their command files with <code>--commands-only</code>:</p>")
-            parts.append(commands([f"wlr record --excitation {' '.join(known)} --out new_runs"]))
+            parts.append(commands(record_commands(known)))
     items = [
         f"<li>{escape(group.separating_run)}: tells {escape(listed([plain(name) for name in group.names], 'from'))}.</li>"
         for group in analysis.equivalent
@@ -420,7 +432,7 @@ def _calibration(analysis: Analysis) -> str:
     text = (
         "<p>Numbers of the model that are known only to a tolerance were fitted before anything was called missing. "
         "<i>Moved</i> counts in tolerances: where a number has moved as far as it may (2.5; biases of sensors 4), doubt the "
-        "tolerance or the model; its interval is set to one tolerance, as the fit tells none.</p>"
+        "tolerance or the model; its interval is set to 1.96 tolerances, as the fit tells none.</p>"
     )
     headings, right = ("number", "unit", "nominal", "fitted", "± (95 %)", "tolerance (1 sigma)", "moved"), {2, 3, 4, 5, 6}
     ordered = sorted(analysis.calibration.items(), key=lambda pair: -abs(_shift(pair[1])))

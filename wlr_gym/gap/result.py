@@ -113,10 +113,10 @@ class RunsEntry(_Entry):
 
 
 class DetectableEntry(_Entry):
-    """Smallest severity of an effect that the data would have shown."""
+    """Smallest severity of an effect that the data would have shown; null: none that is plausible."""
 
     parameter: str
-    value: Number
+    value: MaybeNumber
     unit: str
 
 

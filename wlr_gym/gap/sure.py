@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +165,7 @@ def detectable(scores: Sequence[Score], cost: float = 0.0) -> dict[str, Detectab
 
     Of an effect with directions of its own (x, y, z of a displaced mass) it is the one that shows best: in another it may hide
     at any size. First order: the gain of an effect grows with the square of its severity. ``cost`` is that of the model without
-    it.
+    it. Where no plausible size would show, its size is NaN.
     """
     found: dict[str, tuple[float, Detectable]] = {}
     for score in scores:
@@ -175,8 +176,9 @@ def detectable(scores: Sequence[Score], cost: float = 0.0) -> dict[str, Detectab
         amplitude = least_amplitude(score.candidate, score.information, which, cost)
         steps = np.zeros(len(start.directions))
         steps[min(which, len(steps) - 1)] = amplitude
-        values = start.values(steps)
-        entry = _largest(score.candidate, values)
+        entry = _largest(score.candidate, start.values(steps))
+        if not score.visible:
+            amplitude, entry = np.inf, replace(entry, value=np.nan)
         if score.candidate.name not in found or amplitude > found[score.candidate.name][0]:
             found[score.candidate.name] = (amplitude, entry)
     return {name: entry for name, (_, entry) in sorted(found.items())}

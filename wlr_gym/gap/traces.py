@@ -32,7 +32,7 @@ def telling_traces(
     chosen = list(dict.fromkeys(wanted))[:MOST]
     settings = [model.setting for model in models]
     replayed = problem.simulate(settings, heldout)
-    residuals = problem.residuals(settings[1:2], heldout)
+    residuals = problem.residuals(settings[1:], heldout)
     found = []
     for name in chosen:
         c = names.index(name)
@@ -42,6 +42,7 @@ def telling_traces(
         if not np.isfinite(measured).any():
             continue
         lines = [replayed[k][m][:, c] for m in range(3)]
+        errors = [residuals[k][m][:, c] * problem.signals[c].noise for m in range(2)]
         run, unit = problem.runs[heldout[k]], problem.signals[c].unit
-        found.append(Trace(run, name, unit, problem.times(heldout[k]), measured, *lines))
+        found.append(Trace(run, name, unit, problem.times(heldout[k]), measured, *lines, *errors))
     return tuple(found)

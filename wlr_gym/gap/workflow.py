@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,23 @@ from threadpoolctl import threadpool_limits
 
 from wlr_gym.effects import Source, load_patch
 from wlr_gym.errors import InputError, unknown_name
-from wlr_gym.gap import analysis as words
 from wlr_gym.gap.adequacy import adequacy_of
-from wlr_gym.gap.analysis import Analysis, Calibrated, Equivalent, Estimate, Evidence, FoundEffect, IntakeFinding, Turning
+from wlr_gym.gap.analysis import (
+    BAD_DATA,
+    EFFECT_FOUND,
+    NOT_CARRIED,
+    NOT_EXCITED,
+    NOTHING_MISSING,
+    UNKNOWN,
+    Analysis,
+    Calibrated,
+    Equivalent,
+    Estimate,
+    Evidence,
+    FoundEffect,
+    IntakeFinding,
+    Turning,
+)
 from wlr_gym.gap.fit import Fit, fit, nominal_model, widened
 from wlr_gym.gap.hypothesis import Hypothesis
 from wlr_gym.gap.judge import shown_by_some_runs_only
@@ -71,8 +85,13 @@ def analyse(
         tell: told of progress.
 
     Raises:
-        InputError: data that cannot be read, a run, rig or backend that does not exist.
+        InputError: data that cannot be read, a run, rig or backend that does not exist, a folder that the results cannot go
+            into; the last before the work begins.
     """
+    if out is not None:
+        from wlr_gym.gap.report import check_folder
+
+        check_folder(Path(out))
     tell("reading", STAGES["reading"])
     if rig is None:
         from wlr_gym.gap.robot.open import open_robot
@@ -109,7 +128,7 @@ def _refuse_left_out(heldout: Sequence[str], findings: Sequence[IntakeFinding]) 
 
 
 def _bad_data(data: str, findings: Sequence[IntakeFinding]) -> Analysis:
-    return Analysis(data, words.BAD_DATA, "", tuple(findings), provenance=provenance())
+    return Analysis(data, BAD_DATA, "", tuple(findings), provenance=provenance())
 
 
 @_one_thread
@@ -149,32 +168,35 @@ def analyse_problem(
     shown = detectable(naming.rounds[-1].scores, naming.fit.cost)
     turned = turning(problem, naming.fit.residuals, features)
     effects = _effects(problem, naming) or _turned(turned)
+    kept = {candidate.label for candidate, _ in naming.fit.model.effects}
     verdict, groups = _verdict(naming, effects), _equivalent(problem, naming)
     clock.stop()
     return Analysis(
-        data,
-        verdict,
-        "",
-        tuple(findings),
-        tuple(problem.runs[k] for k in fitted),
-        tuple(problem.runs[k] for k in sealed),
-        effects,
-        groups,
-        _calibration(problem, naming.fit),
-        tuple(entry for number, look in enumerate(naming.rounds, 1) for entry in _evidence(problem, number, look, fitted)),
-        places,
-        maps,
-        telling_traces(problem, sealed, models, places),
-        gap,
-        run_gaps,
-        channel_gaps,
-        shown,
-        recommend(naming, [group.names for group in groups], verdict, problem.motions),
-        adequacy,
-        turned,
-        tuple(effect.content() for effect in load_patch(known).effects),
-        clock.seconds,
-        provenance(),
+        data=data,
+        verdict=verdict,
+        summary="",
+        intake=tuple(findings),
+        fit_runs=tuple(problem.runs[k] for k in fitted),
+        heldout_runs=tuple(problem.runs[k] for k in sealed),
+        effects=effects,
+        equivalent=groups,
+        calibration=_calibration(problem, naming.fit),
+        evidence=tuple(
+            entry for number, look in enumerate(naming.rounds, 1) for entry in evidence_of(problem, number, look, fitted, kept)
+        ),
+        localisation=places,
+        heat_maps=maps,
+        traces=telling_traces(problem, sealed, models, places),
+        gap=gap,
+        run_gaps=run_gaps,
+        channel_gaps=channel_gaps,
+        detectable=shown,
+        recommendations=recommend(naming, [group.names for group in groups], verdict, problem.motions),
+        adequacy=adequacy,
+        turning=turned,
+        known_effects=tuple(effect.content() for effect in load_patch(known).effects),
+        seconds=clock.seconds,
+        provenance=provenance(),
     )
 
 
@@ -208,15 +230,15 @@ class _Clock:
 
 def _verdict(naming: Naming, effects: Sequence[FoundEffect]) -> str:
     if effects:
-        return words.UNKNOWN if all(effect.name == words.UNKNOWN for effect in effects) else words.EFFECT_FOUND
+        return UNKNOWN if all(effect.name == UNKNOWN for effect in effects) else EFFECT_FOUND
     last = naming.rounds[-1]
     if any(shown_by_some_runs_only(h, last.cost) for h in last.hypotheses):
-        return words.NOT_EXCITED
+        return NOT_EXCITED
     scores = last.scores
     visible = {score.candidate.name: False for score in scores}
     for score in scores:
         visible[score.candidate.name] |= score.visible
-    return words.NOTHING_MISSING if sum(visible.values()) >= LEAST_VISIBLE * len(visible) else words.NOT_EXCITED
+    return NOTHING_MISSING if sum(visible.values()) >= LEAST_VISIBLE * len(visible) else NOT_EXCITED
 
 
 def _effects(problem: Problem, naming: Naming) -> tuple[FoundEffect, ...]:
@@ -240,7 +262,7 @@ def found_effect(candidate: Candidate, own: Mapping[str, Estimate], confidence: 
 
 def _turned(turned: Turning | None) -> tuple[FoundEffect, ...]:
     """An effect without name or formula, where nothing that has one explains what goes with a joint's turning."""
-    return () if turned is None else (FoundEffect(words.UNKNOWN, (turned.joint,), {}, turned.confidence, math.nan),)
+    return () if turned is None else (FoundEffect(UNKNOWN, (turned.joint,), {}, turned.confidence, math.nan),)
 
 
 def _equivalent(problem: Problem, naming: Naming) -> tuple[Equivalent, ...]:
@@ -265,8 +287,11 @@ def _calibration(problem: Problem, found: Fit) -> dict[str, Calibrated]:
     }
 
 
-def _evidence(problem: Problem, number: int, look: Round, fitted: Sequence[int]) -> list[Evidence]:
-    """Every candidate's fate in one round: the refitted ones, then the best place of every other name."""
+def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int], kept: Container[str]) -> list[Evidence]:
+    """Every candidate's fate in one round: the refitted ones, then the best place of every other name.
+
+    ``kept`` are the labels of what the final model has: what was taken may have been dropped again.
+    """
     equal = {h.candidate.label for h in equivalents(look.taken, look.hypotheses)} if look.taken else set()
     entries = [
         Evidence(
@@ -276,7 +301,7 @@ def _evidence(problem: Problem, number: int, look: Round, fitted: Sequence[int])
             h.candidate.parameters(h.values),
             h.gain,
             h.screened,
-            *_fate(h, look, equal),
+            *_fate(h, look, equal, kept),
             {problem.runs[k]: float(gain) for k, gain in zip(fitted, h.by_run, strict=True)},
         )
         for h in look.hypotheses
@@ -296,10 +321,10 @@ def _evidence(problem: Problem, number: int, look: Round, fitted: Sequence[int])
     return entries
 
 
-def _fate(hypothesis: Hypothesis, look: Round, equal: set[str]) -> tuple[str, str]:
+def _fate(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Container[str]) -> tuple[str, str]:
     best = look.taken
     if best is not None and hypothesis.candidate.label == best.candidate.label:
-        return "taken", "buys most"
+        return ("taken", "buys most") if best.candidate.label in kept else ("dropped", "what was found later makes it needless")
     if hypothesis.candidate.label in equal and best is not None:
         return "equivalent", f"buys {hypothesis.gain / best.gain:.0%} of what the taken one buys"
     if hypothesis.at_bound:
@@ -307,7 +332,7 @@ def _fate(hypothesis: Hypothesis, look: Round, equal: set[str]) -> tuple[str, st
     if hypothesis.tolerable:
         return "within tolerance", "the tolerances of known numbers allow as much"
     if not hypothesis.carries_over:
-        return words.NOT_CARRIED, "runs do not get better by what the others tell of it"
+        return NOT_CARRIED, "runs do not get better by what the others tell of it"
     if not hypothesis.consistent:
         return "inconsistent", "helps some runs and harms others"
     if best is None:

@@ -195,7 +195,7 @@ def _check_pair(table: Table, rate: str, angle: str, where: str) -> None:
     rows = np.flatnonzero(np.isfinite(table[angle]) & np.isfinite(table[rate]))
     if len(rows) < 20:
         return
-    turned, measured = _increments(table["t"][rows], table[angle][rows], table[rate][rows])
+    turned, measured = increments(table["t"][rows], table[angle][rows], table[rate][rows])
     energies = float(turned @ turned), float(measured @ measured)
     if min(energies) == 0.0:
         return
@@ -213,7 +213,7 @@ def _check_pair(table: Table, rate: str, angle: str, where: str) -> None:
         )
 
 
-def _increments(t: Array, angle: Array, rate: Array) -> tuple[Array, Array]:
+def increments(t: Array, angle: Array, rate: Array) -> tuple[Array, Array]:
     """Return how far ``angle`` and the integral of ``rate`` went over every window of :data:`_WINDOW` seconds."""
     integral = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
     starts = t[t <= t[-1] - _WINDOW]

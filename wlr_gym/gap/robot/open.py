@@ -11,6 +11,7 @@ from wlr_gym.errors import InputError
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.robot.problem import RobotProblem
 from wlr_gym.robot import JOINTS
+from wlr_gym.runs.check import increments
 from wlr_gym.runs.format import COMMANDS
 from wlr_gym.runs.read import Run, read_dataset
 
@@ -18,12 +19,14 @@ from wlr_gym.runs.read import Run, read_dataset
 LEAST_RUNS = 3
 #: s; shorter runs hold no window to compare.
 LEAST_SECONDS = 3.0
-#: Share of a run's rows that may lack encoder readings.
-MOST_MISSING = 0.2
 #: rad, rad/s; a joint asked to move more than this and showing nothing is dead.
 ASKED, SHOWN = 0.2, 0.02
 #: Ratio of measured to commanded wheel motion that means a turned sign.
 MIRRORED = -0.5
+#: Correlation of a rate with its angle's turning that means it; rad in half a second by which both must turn, 1 sigma; rows.
+OPPOSITE, TURNED, LEAST_ROWS = -0.8, 0.02, 100
+#: s between rows within which a joint cannot turn by half a turn.
+LONGEST_STEP = 0.1
 
 
 def open_robot(
@@ -59,13 +62,8 @@ def _look_at(run: Run) -> list[IntakeFinding]:
         text = f"{seconds:.1f} s long: a run needs at least {LEAST_SECONDS:g} s, better 15 to 25 s"
         return [IntakeFinding(run.name, "t", "short", text, fatal=True)]
     for joint in JOINTS:
-        position = run[f"pos_{joint}"]
-        missing = float(np.mean(~np.isfinite(position)))
-        if missing > MOST_MISSING:
-            text = f"{missing:.0%} of the readings are missing: the run is left out"
-            found.append(IntakeFinding(run.name, f"pos_{joint}", "missing", text, fatal=True))
-            continue
-        found += _motion(run, joint, position)
+        found += _wrap(run, joint) or _motion(run, joint) or _opposite(run, f"vel_{joint}", f"pos_{joint}")
+    found += _opposite(run, "gyro_z", "cam_yaw") + _opposite(run, "gyro_y", "cam_pitch")
     if not np.isfinite(np.stack([run[name] for name in COMMANDS])).any():
         found.append(
             IntakeFinding(run.name, "cmd", "missing", "no motor was on in the whole run: nothing to replay", fatal=True)
@@ -73,9 +71,35 @@ def _look_at(run: Run) -> list[IntakeFinding]:
     return found
 
 
-def _motion(run: Run, joint: str, position: np.ndarray) -> list[IntakeFinding]:
+def _wrap(run: Run, joint: str) -> list[IntakeFinding]:
+    """Whether an angle starts anew after a turn: no joint gets half a turn further between two rows."""
+    jumps = np.flatnonzero((np.abs(np.diff(run[f"pos_{joint}"])) > np.pi) & (np.diff(run["t"]) < LONGEST_STEP))
+    if not len(jumps):
+        return []
+    row = int(jumps[0]) + 1
+    jump = run[f"pos_{joint}"][row] - run[f"pos_{joint}"][row - 1]
+    text = f"jumps {len(jumps)} times, first by {jump:.3g} rad in row {row}: angles go on past a turn; numpy.unwrap mends it"
+    return [IntakeFinding(run.name, f"pos_{joint}", "wrap", text, fatal=True)]
+
+
+def _opposite(run: Run, rate: str, angle: str) -> list[IntakeFinding]:
+    """Whether a rate is against the turning of its angle."""
+    if rate not in run or angle not in run:
+        return []
+    rows = np.isfinite(run[rate]) & np.isfinite(run[angle])
+    if rows.sum() < LEAST_ROWS:
+        return []
+    turned, measured = (part - part.mean() for part in increments(run["t"][rows], run[angle][rows], run[rate][rows]))
+    sizes = float(np.std(turned)), float(np.std(measured))
+    if min(sizes) < TURNED or turned @ measured > OPPOSITE * len(turned) * sizes[0] * sizes[1]:
+        return []
+    text = f"turns against {angle}: one of the two has the wrong sign; check the hardware file, and the camera's axes"
+    return [IntakeFinding(run.name, rate, "mirrored", text, fatal=True)]
+
+
+def _motion(run: Run, joint: str) -> list[IntakeFinding]:
     """Whether a joint does what it is asked: dead or mirrored channels."""
-    command = run[f"cmd_{joint}"]
+    command, position = run[f"cmd_{joint}"], run[f"pos_{joint}"]
     on = np.isfinite(command) & np.isfinite(position)
     if on.sum() < 50:
         return []

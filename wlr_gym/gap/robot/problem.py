@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.effects import Patch, Source, apply_patch, load_patch
+from wlr_gym.effects import Patch, PatchEffect, Source, apply_patch, load_patch
 from wlr_gym.errors import InputError
 from wlr_gym.gap.problem import Candidate, Probe, Quantity, Setting, Signal
 from wlr_gym.gap.recommend import SHOWN_BY
@@ -215,7 +215,12 @@ class RobotProblem:
         return possible, [usable for candidate in (*candidates, *formulas) if (usable := _with_starts(candidate, keys))]
 
     def _possible(self, setting: Setting, probe: Probe) -> bool:
-        """Whether a robot can have a probe's effects beside those it has: it has one Stribeck speed per joint, for example."""
+        """Whether a robot can have a probe's effects beside those it has.
+
+        A joint has one Stribeck speed: beside another such effect a probe's may be the same, but no fit could move it.
+        """
+        if _stribeck_joints((*self.known.effects, *setting.effects)) & _stribeck_joints(probe.effects):
+            return False
         try:
             self.parameters([replace(setting, effects=(*setting.effects, *probe.effects))])
         except InputError:
@@ -252,6 +257,10 @@ def _by_slot(forces: Sequence[Force]) -> dict[_Slot, Force]:
         alike = sum(key[:2] == (force.where, repr(force.formula)) for key in slots)
         slots[force.where, repr(force.formula), alike] = force
     return slots
+
+
+def _stribeck_joints(effects: Iterable[PatchEffect]) -> set[str]:
+    return {joint for effect in effects if effect.name == "stribeck_friction" for joint in effect.where}
 
 
 def _with_starts(candidate: Candidate, keys: set[str]) -> Candidate | None:

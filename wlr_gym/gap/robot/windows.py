@@ -31,6 +31,7 @@ def window_rows(t: Array, length: float = WINDOW) -> list[slice]:
     """Cut a run into windows of equal length near ``length``."""
     count = max(1, round(float(t[-1] - t[0]) / length))  # one window where the length is infinite
     edges = np.searchsorted(t, np.linspace(t[0], t[-1] + 1e-9, count + 1))
+    edges[-1] = len(t)  # of seconds since 1970 a nanosecond is rounded away
     return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
 
