@@ -22,6 +22,7 @@ from wlr_gym.gap.analysis import (
     Place,
     Pulled,
     Recommendation,
+    Relation,
     RunGap,
     Statistic,
     Trace,
@@ -105,6 +106,12 @@ def evidence():
     return tuple(found)
 
 
+RELATIONS = (
+    Relation("contact of the left front wheel", "rolling_resistance", "", 2611.0),
+    Relation("torque in the left front wheel", "coulomb_friction", "", 2490.0),
+    Relation("force on the body", "external_force", "", 402.0),
+    Relation("body force x", "unknown_effect", "-k * velocity_x * absolute(velocity_x)", 57.0),
+)
 CALIBRATION = {
     "ground.mu": Calibrated(0.6, 0.652, "-", 0.09, 0.0157),
     "servo.kp[leg_lf]": Calibrated(15.3, 15.61, "V/rad", 0.77, 0.39),
@@ -136,6 +143,7 @@ EFFECT_FOUND = Analysis(
     ),
     calibration=CALIBRATION,
     evidence=evidence(),
+    relations=RELATIONS,
     localisation=(
         Place("eff_wheel_lf", 0.44, "opposes the motion, the same at every speed"),
         Place("eff_wheel_rf", 0.41, "opposes the motion, the same at every speed"),

@@ -107,6 +107,19 @@ class Place:
     dependence: str
 
 
+@dataclass(frozen=True)
+class Relation:
+    """A relation of the model, the law that explains most by acting there alone, and what it promises.
+
+    See :mod:`wlr_gym.gap.relations`.
+    """
+
+    name: str
+    law: str
+    formula: str
+    gain: float
+
+
 @dataclass(frozen=True, eq=False)
 class HeatMap:
     """Root mean square residual (noise units) of the calibrated model per channel and state bin: (channels, bins).
@@ -307,6 +320,7 @@ class Analysis:
     calibration: Mapping[str, Calibrated] = field(default_factory=dict)
     evidence: tuple[Evidence, ...] = ()
     localisation: tuple[Place, ...] = ()
+    relations: tuple[Relation, ...] = ()
     heat_maps: tuple[HeatMap, ...] = ()
     traces: tuple[Trace, ...] = ()
     gap: GapFigures | None = None

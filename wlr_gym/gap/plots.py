@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.analysis import Analysis, ChannelGap, Evidence, GapFigures, HeatMap, RunGap, Trace
+from wlr_gym.gap.analysis import Analysis, ChannelGap, Evidence, GapFigures, HeatMap, Relation, RunGap, Trace
 from wlr_gym.gap.words import channel, error, feature, percent, places, plain
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ _DPI = 110
 _PANELS, _OTHERS = 6, 6
 #: Errors that the heat map tells apart, in noise units.
 _COLDEST, _HOTTEST = 0.7, 10.0
+_MOST_RELATIONS = 12
 
 
 def draw(analysis: Analysis) -> dict[str, bytes]:
@@ -42,10 +43,12 @@ def draw(analysis: Analysis) -> dict[str, bytes]:
 
 
 def figures(analysis: Analysis) -> dict[str, Figure]:
-    """Return name -> figure; ``where_*``, ``localisation``, ``overlays_*``, ``gap``, ``channels`` and ``evidence``."""
+    """Return name -> figure, of what there is: localisation, relations, where_N, overlays_N, gap, channels, evidence."""
     found: dict[str, Figure] = {}
     if analysis.localisation:
         found["localisation"] = _localisation(analysis)
+    if analysis.relations:
+        found["relations"] = _relations(analysis.relations[:_MOST_RELATIONS])
     for index, heat_map in enumerate(analysis.heat_maps):
         if heat_map.values.size:
             found[f"where_{index + 1}"] = _heat_map(heat_map)
@@ -96,6 +99,19 @@ def _localisation(analysis: Analysis) -> Figure:
     axes.bar_label(bars, [percent(place.share) for place in found], padding=4, fontsize=8)
     axes.set_xlim(0.0, 115.0 * max(place.share for place in found) + 1.0)
     axes.set_xlabel("share of the gap of the calibrated model (%)", fontsize=9)
+    _calm(axes, "x")
+    return figure
+
+
+def _relations(shown: Sequence[Relation]) -> Figure:
+    figure = _new(9.0, 0.9 + 0.3 * len(shown))
+    axes = figure.subplots()
+    ordered = shown[::-1]
+    bars = axes.barh([one.name for one in ordered], [one.gain for one in ordered], color=CALIBRATED, height=0.6)
+    texts = [f"{one.gain:.0f}  {plain(one.law)}{f': {one.formula}' if one.formula else ''}" for one in ordered]
+    axes.bar_label(bars, texts, padding=4, fontsize=8)
+    axes.set_xlim(0.0, 1.7 * max(one.gain for one in shown))
+    axes.set_xlabel("promised by the best law there (fall of minus two log posterior)", fontsize=9)
     _calm(axes, "x")
     return figure
 

@@ -74,6 +74,8 @@ _CAPTIONS = {
     "where": "In which states the calibrated model is wrong: each row a measured channel, each column a range of what is named "
     "below. The numbers are rms errors; about 1 is what sensor noise alone would leave, grey is a range without data.",
     "localisation": "Which measured channels hold the gap, and how much of it.",
+    "relations": "Which relations of the model could hold the gap: what the best law that acts there alone promises. The true "
+    "place is among the longest bars; others are long because they move the robot in a similar way.",
     "overlays": "Measured runs, and the same runs replayed by the model. Below each: the error that counts (of pose "
     "and wheel angles, what is new since the window of some 2 s began); the green band is two standard deviations of sensor "
     "noise.",
@@ -217,7 +219,7 @@ def _tiles(analysis: Analysis) -> str:
 def _where(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
     ordered = sorted(analysis.localisation, key=lambda place: -place.share)
     rows = [(place.name, channel(place.name), percent(place.share), place.dependence) for place in ordered]
-    shown = [_pictures(kind, pictures) for kind in ("localisation", "overlays", "where")]
+    shown = [_pictures(kind, pictures) for kind in ("localisation", "relations", "overlays", "where")]
     if not any((rows, *shown)):
         return ""
     text = (

@@ -105,6 +105,15 @@ class GapEntry(_Entry):
     reduction_ci95: tuple[MaybeNumber, MaybeNumber] | None
 
 
+class RelationEntry(_Entry):
+    """A relation of the model and what the best law there promises, as a fall of minus two log posterior."""
+
+    name: str
+    law: str
+    formula: str
+    gain: Number
+
+
 class RunsEntry(_Entry):
     """Names of the runs that were fitted to, and of those kept aside."""
 
@@ -183,6 +192,7 @@ class Result(_Entry):
     separating_runs: list[str] = []
     calibration: dict[str, CalibrationEntry]
     localisation: dict[str, LocalisationEntry]
+    relations: list[RelationEntry] = []
     gap: GapEntry | None
     runs: RunsEntry
     patch: str
@@ -233,6 +243,7 @@ def result_of(analysis: Analysis, patch: Path | str = PATCH_FILE) -> Result:
         "separating_runs": [group.separating_run for group in analysis.equivalent],
         "calibration": {name: _calibrated(moved) for name, moved in analysis.calibration.items()},
         "localisation": {p.name: {"share_of_gap": p.share, "state_dependence": p.dependence} for p in places},
+        "relations": [dict(vars(one)) for one in analysis.relations],
         "gap": None if analysis.gap is None else _gap(analysis.gap),
         "runs": {"fit": list(analysis.fit_runs), "heldout": list(analysis.heldout_runs)},
         "patch": str(patch),

@@ -38,6 +38,7 @@ from wlr_gym.gap.name import Naming, Round, name_effects
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.prove import mean_of_runs, mean_squares, noise_floor, prove
 from wlr_gym.gap.recommend import recommend, separating_run
+from wlr_gym.gap.relations import relations
 from wlr_gym.gap.split import informative_split, named_split
 from wlr_gym.gap.sure import confidence, detectable, equivalents, estimates, half_widths
 from wlr_gym.gap.traces import telling_traces
@@ -185,6 +186,7 @@ def analyse_problem(
             entry for number, look in enumerate(naming.rounds, 1) for entry in evidence_of(problem, number, look, fitted, kept)
         ),
         localisation=places,
+        relations=relations(naming.rounds[0].scores),
         heat_maps=maps,
         traces=telling_traces(problem, sealed, models, places),
         gap=gap,
