@@ -27,6 +27,7 @@ from wlr_gym.gap.analysis import (
     Statistic,
     Trace,
 )
+from wlr_gym.gap.problem import Range
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.runs.format import CHANNELS, COLUMNS
 from wlr_gym.runs.noise import channel_noise
@@ -197,7 +198,7 @@ UNKNOWN_EFFECT = replace(
         FoundEffect(
             "unknown_effect", ("leg_lr",),
             {"k": Estimate(0.81, 0.74, 0.88, "N m/rad"), "a0": Estimate(1.21, 1.17, 1.25, "rad")}, 0.9, 2210.0,
-            "-k * (leg_angle - a0)", {"k": "N m/rad", "a0": "rad"},
+            "-k * (leg_angle - a0)", {"k": "N m/rad", "a0": "rad"}, {"leg_angle_lr": Range(0.9, 2.1, "rad")},
         ),
     ),
     equivalent=(),

@@ -37,6 +37,7 @@ def test_outcomes():
         "does not carry over",
         "implausible",
         "within tolerance",
+        "dropped",
         "screened out",
     }
     assert {one.outcome for one in EFFECT_FOUND.evidence} <= explained

@@ -648,6 +648,28 @@ def test_what_a_robot_cannot_have_beside_its_effects_is_not_tried(good):
     assert ("wheel_lf",) not in places_tried(given.candidates(setting, residuals, [0])[1], "stribeck_friction")
 
 
+def test_where_a_formula_was_tried(good):
+    problem = RobotProblem([good])
+    setting = nominal_model(problem).setting
+
+    def reach(where, formula, units):
+        return problem.reach(PatchEffect(UNKNOWN_EFFECT, where, dict.fromkeys(units, 0.1), formula, units), setting, [0])
+
+    spring = reach(("leg_lr",), "c - k * angle", {"c": "N m", "k": "N m/rad"})
+    angles = good["pos_leg_lr"]
+    assert list(spring) == ["angle_leg_lr"]
+    assert (spring["angle_leg_lr"].low, spring["angle_leg_lr"].high) == pytest.approx((angles.min(), angles.max()), abs=0.02)
+    assert spring["angle_leg_lr"].unit == "rad"
+    drag = reach(("body_force_x",), "-d * velocity_x * abs(yaw_rate)", {"d": "N s2/m/rad"})
+    assert set(drag) == {"velocity_x", "yaw_rate"}
+    gyro = good["gyro_z"]
+    assert (drag["yaw_rate"].low, drag["yaw_rate"].high) == pytest.approx((gyro.min(), gyro.max()), abs=0.05)
+    wave = reach(("floor_force_x",), "a * sin(w * time)", {"a": "N", "w": "rad/s"})
+    assert wave["time"].high == pytest.approx(good["t"][-1] - good["t"][0])
+    both = reach(("wheel_lf", "wheel_rf"), "-r * wheel_torque_opposite", {"r": "-"})
+    assert set(both) == {"wheel_torque_opposite_lf", "wheel_torque_opposite_rf"}
+
+
 def places_tried(candidates, name):
     return {candidate.where for candidate in candidates if candidate.name == name}
 

@@ -200,6 +200,7 @@ def test_a_patch_that_cannot_be_loaded_is_not_advertised(tmp_path):
 
 def test_an_unknown_effect_has_a_formula_or_says_that_it_has_none(tmp_path):
     assert "Law: -k * (leg_angle - a0)" in page_of(examples.UNKNOWN_EFFECT, tmp_path).text
+    assert "Tried where leg angle lr is 0.9 to 2.1 rad" in page_of(examples.UNKNOWN_EFFECT, tmp_path).text
     bare = replace(examples.UNKNOWN_EFFECT, effects=(FoundEffect("unknown_effect", ("leg_lr",), {}, 0.8, 900.0),))
     text = page_of(bare, tmp_path).text
     assert "No formula was found that holds." in text

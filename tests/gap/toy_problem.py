@@ -132,6 +132,9 @@ class Toy:
             rng = np.random.default_rng([k, 11])
             yield [rng.standard_normal((self.rows, len(CHANNELS))) for _ in runs]
 
+    def reach(self, effect, setting, runs) -> Any:
+        return {}
+
     def features(self, setting, runs) -> Any:
         return [{"shape of drag": self.shape("drag left")[r][:, 0], "time": self.times(r)} for r in runs]
 

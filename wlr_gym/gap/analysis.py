@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.gap.problem import Range
+
 Array = NDArray[np.float64]
 
 #: Verdicts, as in the result file.
@@ -55,6 +57,7 @@ class FoundEffect:
             name buys more; nothing is fitted anew.
         gain: fall of minus two log posterior on the fitted runs when it was added, beside the effects taken before it.
         formula, units: of an unknown effect; empty otherwise.
+        validity: where the formula was tried, by what it reads: no run says what is beyond.
     """
 
     name: str
@@ -64,6 +67,7 @@ class FoundEffect:
     gain: float
     formula: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
+    validity: Mapping[str, Range] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

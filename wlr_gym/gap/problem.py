@@ -190,6 +190,15 @@ class Signal:
     group: str
 
 
+@dataclass(frozen=True)
+class Range:
+    """Lowest and highest value of a quantity."""
+
+    low: float
+    high: float
+    unit: str
+
+
 class Problem(Protocol):
     """A system, its measured runs, and a simulator of it.
 
@@ -268,6 +277,10 @@ class Problem(Protocol):
                 a ripple, edges of a patch).
             runs: which runs those are.
         """
+        ...
+
+    def reach(self, effect: PatchEffect, setting: Setting, runs: Sequence[int]) -> Mapping[str, Range]:
+        """Return over which range of each feature a formula was tried: of what it reads, in replays of runs."""
         ...
 
     def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:

@@ -35,6 +35,7 @@ from wlr_gym.gap.analysis import (
 )
 from wlr_gym.gap.page import commands, document, folded, heading, pictures_of, section, table
 from wlr_gym.gap.plots import SCREENED_OUT, draw
+from wlr_gym.gap.problem import Range
 from wlr_gym.gap.prove import LEAST_FOR_INTERVAL
 from wlr_gym.gap.recommend import record_commands
 from wlr_gym.gap.result import PATCH_FILE, RESULT_FILE, patch_of, read_result, result_of, write_result
@@ -264,9 +265,15 @@ def _effect(effect: FoundEffect) -> str:
             f"<p>{escape(meaning)} In files: <code>{escape(effect.name)}</code>, where <code>{escape(', '.join(effect.where))}"
             f"</code>. Confidence {percent(effect.confidence)}.</p>",
             f"<p>Law: <code>{escape(law)}</code></p>" if law else unlawful,
+            *([f"<p>Tried where {_tried(effect.validity)}; beyond, nothing is known of it.</p>"] if effect.validity else []),
             table(("parameter", "value (95 % interval)"), rows),
         ]
     )
+
+
+def _tried(validity: Mapping[str, Range]) -> str:
+    texts = [f"{plain(name)} is {number(one.low)} to {number(one.high)}{unit_of(one.unit)}" for name, one in validity.items()]
+    return escape(listed(texts, "and"))
 
 
 def _evidence(evidence: Sequence[Evidence], turn: int) -> str:

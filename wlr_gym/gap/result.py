@@ -57,8 +57,15 @@ class ParameterEntry(_Entry):
         return self
 
 
+class RangeEntry(_Entry):
+    """Lowest and highest value of what a formula reads, in the fitted runs."""
+
+    range: Interval
+    unit: str
+
+
 class EffectEntry(_Entry):
-    """One missing effect; ``formula`` is text with units, of unknown effects only."""
+    """One missing effect; ``formula`` is text with units, of unknown effects only, ``validity`` where it was tried."""
 
     name: str
     where: list[str]
@@ -66,6 +73,7 @@ class EffectEntry(_Entry):
     confidence: Share
     gain: MaybeNumber = None
     formula: str | None = None
+    validity: dict[str, RangeEntry] = {}
 
 
 class CalibrationEntry(_Entry):
@@ -286,6 +294,7 @@ def _effect(effect: FoundEffect) -> dict[str, Any]:
         "confidence": effect.confidence,
         "gain": effect.gain,
         "formula": _formula(effect) if effect.formula else None,
+        "validity": {name: {"range": [one.low, one.high], "unit": one.unit} for name, one in effect.validity.items()},
     }
     return entry
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -168,7 +169,7 @@ def analyse_problem(
     adequacy = adequacy_of(problem, fitted, naming.fit)
     shown = detectable(naming.rounds[-1].scores, naming.fit.cost)
     turned = turning(problem, naming.fit.residuals, features)
-    effects = _effects(problem, naming) or _turned(turned)
+    effects = _effects(problem, naming, fitted) or _turned(turned)
     kept = {candidate.label for candidate, _ in naming.fit.model.effects}
     verdict, groups = _verdict(naming, effects), _equivalent(problem, naming)
     clock.stop()
@@ -243,14 +244,16 @@ def _verdict(naming: Naming, effects: Sequence[FoundEffect]) -> str:
     return NOTHING_MISSING if sum(visible.values()) >= LEAST_VISIBLE * len(visible) else NOT_EXCITED
 
 
-def _effects(problem: Problem, naming: Naming) -> tuple[FoundEffect, ...]:
+def _effects(problem: Problem, naming: Naming, fitted: Sequence[int]) -> tuple[FoundEffect, ...]:
     intervals = estimates(problem, naming.fit)
     found = []
-    for (candidate, _), own in zip(naming.fit.model.effects, intervals, strict=True):
+    setting = naming.fit.model.setting
+    for (candidate, values), own in zip(naming.fit.model.effects, intervals, strict=True):
         look = next(r for r in naming.rounds if r.taken is not None and r.taken.candidate.label == candidate.label)
         assert look.taken is not None
         sure = confidence(look.taken, look.hypotheses, look.cost)
-        found.append(found_effect(candidate, own, sure, look.taken.gain))
+        tried = problem.reach(candidate.effect(values), setting, fitted) if candidate.formula else {}
+        found.append(replace(found_effect(candidate, own, sure, look.taken.gain), validity=tried))
     return tuple(sorted(found, key=lambda effect: -effect.gain))
 
 

@@ -302,6 +302,13 @@ def generalised_forces(forces: Sequence[Force], inputs: Lanes, values: Sequence[
     return total
 
 
+def features_read(force: Force, inputs: Lanes) -> dict[str, tuple[str, Value]]:
+    """Return what a force depends on, of all its coordinates: full name of the feature -> unit, value."""
+    trees = [_placed(force.formula, coordinate) for coordinate in force.where]
+    names = dict.fromkeys(name for tree in trees for name in symbols(tree) if name not in force.parameters)
+    return {name: (_PLACED[name][0].unit, _value(name, inputs)) for name in names}
+
+
 def force_values(forces: Sequence[Force]) -> Array:
     """Return the constants of all forces, one after the other, in the order the kernel reads them."""
     return np.array([value for force in forces for value in force.parameters.values()], dtype=np.float64)

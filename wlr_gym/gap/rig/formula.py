@@ -11,7 +11,7 @@ from typing import Any
 
 from wlr_gym.effects.effect import PatchEffect
 from wlr_gym.errors import InputError
-from wlr_gym.plants.forces import Force, generalised_forces, make_force
+from wlr_gym.plants.forces import Force, features_read, generalised_forces, make_force
 
 Value = Any
 
@@ -34,6 +34,12 @@ def rig_force(effect: PatchEffect) -> Force:
 def total_force(forces: Sequence[Force], lanes: Mapping[str, Value], values: Sequence[Value]) -> Value:
     """Return the torque (N m) of all forces on the joint; ``values`` are their constants, one after the other."""
     return generalised_forces(forces, _Inputs(lanes), values)[_STAND_IN]
+
+
+def lanes_read(force: Force, lanes: Mapping[str, Value]) -> dict[str, tuple[str, Value]]:
+    """Return what a force depends on: name -> unit, value."""
+    read = features_read(force, _Inputs(lanes)).items()
+    return {name.removesuffix(f"_{_STAND_IN}"): found for name, found in read}
 
 
 class _Inputs(Mapping[str, Value]):

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from wlr_gym.effects.effect import PatchEffect
 from wlr_gym.errors import InputError
-from wlr_gym.gap.problem import Candidate, Probe, Quantity, Setting, Signal
+from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal
 from wlr_gym.gap.rig.candidates import rig_candidates
+from wlr_gym.gap.rig.formula import lanes_read, rig_force
 from wlr_gym.gap.rig.kernel import OUTPUTS
 from wlr_gym.gap.rig.model import QUANTITIES, model_of
 from wlr_gym.gap.rig.recording import Recording
@@ -122,6 +123,14 @@ class RigProblem:
         present = {effect.name for effect in (*self.known, *setting.effects)}
         present |= {quantity.name for quantity in self.quantities}
         return rig_candidates(present)
+
+    def reach(self, effect: PatchEffect, setting: Setting, runs: Sequence[int]) -> Mapping[str, Range]:
+        """Return over which range of each feature a formula was tried; see :meth:`wlr_gym.gap.problem.Problem.reach`."""
+        model = model_of(setting, self.quantities, self.known)
+        values = np.concatenate([self._replays[run].simulate([model])[0] for run in runs])
+        columns = dict(zip(OUTPUTS, values.T, strict=True))
+        read = lanes_read(rig_force(effect), {**columns, "supply": columns["voltage"]}).items()
+        return {name: Range(float(np.nanmin(found)), float(np.nanmax(found)), unit) for name, (unit, found) in read}
 
     def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
         """Return what residuals are mapped over, (rows,) each, units in the names."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.effects import Patch, PatchEffect, Source, apply_patch, load_patch
 from wlr_gym.errors import InputError
-from wlr_gym.gap.problem import Candidate, Probe, Quantity, Setting, Signal
+from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal
 from wlr_gym.gap.recommend import SHOWN_BY
 from wlr_gym.gap.robot.candidates import robot_candidates
 from wlr_gym.gap.robot.clock import RunClock
@@ -22,7 +22,7 @@ from wlr_gym.gap.robot.simulate import KERNELS, PHYSICS_STEP, kernel_of, replay_
 from wlr_gym.gap.robot.windows import WINDOW, anchored_residuals
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants.base import TRUTH_LAYOUT
-from wlr_gym.plants.forces import Force
+from wlr_gym.plants.forces import MEMORY, Force, features_read
 from wlr_gym.random import generator
 from wlr_gym.robot import JOINTS, WHEELS, Robot
 from wlr_gym.runs.format import CHANNELS, COLUMNS
@@ -227,6 +227,17 @@ class RobotProblem:
             return False
         return True
 
+    def reach(self, effect: PatchEffect, setting: Setting, runs: Sequence[int]) -> Mapping[str, Range]:
+        """Return over which range of each feature a formula was tried; see :meth:`wlr_gym.gap.problem.Problem.reach`."""
+        replayed = self._replay([setting], runs, with_truth=True)
+        inputs = _formula_inputs(np.concatenate([replays.truth[0] for replays in replayed if replays.truth is not None]))
+        inputs["supply_voltage"] = np.concatenate([replays.values[0, :, CHANNELS.index("volt")] for replays in replayed])
+        inputs["time"] = np.concatenate([self.times(run) - self.times(run)[0] for run in runs])
+        inputs |= {name: np.array([-1.0, 1.0]) for name in MEMORY if name != "time"}  # wound up either way
+        (force,) = Patch((effect,)).forces
+        read = features_read(force, inputs).items()
+        return {name: Range(float(np.min(values)), float(np.max(values)), unit) for name, (unit, values) in read}
+
     def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
         """Return joint speeds, loads, slip and place over the rows of each run."""
         found = self._replay([setting], runs, with_truth=True)
@@ -269,14 +280,30 @@ def _with_starts(candidate: Candidate, keys: set[str]) -> Candidate | None:
     return replace(candidate, starts=starts) if starts else None
 
 
+def _columns(truth: Array) -> dict[tuple[str, int], Array]:
+    """Columns of :data:`TRUTH` by channel and number."""
+    sizes = [(name, len(TRUTH_LAYOUT.channels[name].elements)) for name in TRUTH]
+    return dict(zip(((name, k) for name, size in sizes for k in range(size)), truth.T, strict=True))
+
+
+def _formula_inputs(truth: Array) -> dict[str, Array]:
+    """Columns of :data:`TRUTH` by the names that formulas read them under."""
+    columns = _columns(truth)
+    labels: dict[str, Iterable[object]] = {"position": "xyz", "quaternion": "wxyz"}
+    labels |= dict.fromkeys(("linear_velocity_in_body", "angular_velocity_in_body"), "xyz")
+    labels |= dict.fromkeys(("joint_position", "joint_velocity", "motor_torque"), range(8))
+    found = {f"{name}_{label}": columns[name, k] for name, own in labels.items() for k, label in enumerate(own)}
+    for wheel in range(4):
+        found[f"contact_force_{wheel}_z"] = columns["contact_force", 3 * wheel + 2]
+        found |= {f"slip_velocity_{wheel}_{axis}": columns["slip_velocity", 2 * wheel + k] for k, axis in enumerate("xy")}
+    return found
+
+
 def _features(truth: Array) -> Mapping[str, Array]:
     """Name the columns of :data:`TRUTH` by joint and wheel."""
-    features: dict[str, Array] = {}
-    at = 0
-    for name in TRUTH:
-        size = len(TRUTH_LAYOUT.channels[name].elements)
-        features |= {element: truth[:, at + k] for k, element in enumerate(TRUTH_LAYOUT.channels[name].elements)}
-        at += size
+    features = {
+        TRUTH_LAYOUT.channels[name].elements[k]: column for (name, k), column in _columns(truth).items() if name != "quaternion"
+    }
     for joint in JOINTS:
         rate = features[f"joint_velocity[{joint}]"]
         features[f"time_since_reversal[{joint}]"] = _since_reversal(rate)

@@ -20,7 +20,17 @@ Array = NDArray[np.float64]
 #: Ticks between two stored poses, from which the camera's are interpolated.
 POSE_TICKS = 3
 #: Truth channels that residuals are mapped over.
-TRUTH = ("joint_position", "joint_velocity", "motor_torque", "contact_force", "slip_velocity", "position")
+TRUTH = (
+    "joint_position",
+    "joint_velocity",
+    "motor_torque",
+    "contact_force",
+    "slip_velocity",
+    "position",
+    "quaternion",
+    "linear_velocity_in_body",
+    "angular_velocity_in_body",
+)
 #: Channels begin as the sensors do: joint positions and speeds, then what only motors and IMU know; the camera follows.
 _MOVED, _READ = SENSOR_LAYOUT.slices["joint_velocity"].stop, SENSOR_LAYOUT.slices["accelerometer"].stop
 _SENSED_VOLT, _VOLT = SENSOR_LAYOUT.slices["supply_voltage"].start, CHANNELS.index("volt")
