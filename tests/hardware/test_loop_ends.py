@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
@@ -17,12 +18,15 @@ from wlr_gym.cli import FAILED, OK, record, replay, run_command
 from wlr_gym.evaluation import make_core
 from wlr_gym.evaluation.deployment import deploy, loop_of
 from wlr_gym.evaluation.driving import drive_robot
+from wlr_gym.hardware.limits import Safety
 from wlr_gym.hardware.loop import stop_on_signals
 from wlr_gym.hardware.operator import Keys
 from wlr_gym.hardware.plant import RobotPlant
+from wlr_gym.paper.experiments import PROFILE
 from wlr_gym.plants.base import PlantOptions, RobotOptions
 from wlr_gym.policy import make_policy
 from wlr_gym.runs.excitations import excite
+from wlr_gym.runs.format import RunMeta
 
 ADVICE = "CUT THE POWER: torque is not confirmed off at wheel_lf, wheel_rf, wheel_lr, wheel_rr"
 
@@ -284,3 +288,51 @@ def test_a_fault_in_the_tick_of_a_request_is_no_good_end(rig):
     with pytest.raises(StoppedError, match=r"^tilt: "):
         rig.drive(3.0)
     assert not rig.loop.ended_well
+
+
+# ---- legs that do not follow -------------------------------------------------------------------------------------------
+
+
+def hold(rig, joint):
+    """Keep a leg about where it is: its servo's own limits let it go no farther."""
+    servo = rig.machine.servos[joint]
+    place = servo["present_position"]
+    servo.set("min_position_limit", place - 50)
+    servo.set("max_position_limit", place + 50)
+
+
+def test_a_leg_that_is_not_at_the_start_pose_stops_the_robot(rig):
+    hold(rig, "leg_rf")
+    words = r"^start pose: leg_rf is at 1\.\d\d rad, its goal is 1\.00 rad \(limit 0\.3 rad\)$"
+    with pytest.raises(StoppedError, match=words):
+        rig.loop.start([1.0] * 4)
+    assert rig.loop.phase is Phase.FAULT
+    assert not rig.torque().any()
+
+
+def test_a_leg_may_be_as_far_off_as_the_limit_says():
+    rig = Rig(start_error=0.6)
+    hold(rig, "leg_rf")
+    rig.loop.start([1.0] * 4)
+    assert rig.loop.phase is Phase.RUNNING
+    rig.loop.close()
+
+
+def test_a_dry_run_asks_no_leg_to_be_anywhere():
+    rig = Rig(dry_run=True)
+    rig.loop.start([1.0] * 4)
+    rig.loop.close()
+
+
+def test_the_way_to_the_start_pose_waits_for_slow_servos():
+    """The paper's profile is slower than the ramp would be."""
+    plant = RobotPlant(ROBOT, 1, PlantOptions(), RobotOptions(emulated=True), meta=RunMeta(robot=ROBOT.name, profile=PROFILE))
+    plant.loop.start([1.0, 1.0, 2.1, 2.1])
+    assert plant.loop.view is not None
+    np.testing.assert_allclose(plant.loop.view.position[:4], [1.0, 1.0, 2.1, 2.1], atol=0.05)
+    plant.close()
+
+
+def test_a_limit_of_nothing_is_refused():
+    with pytest.raises(ValidationError, match="start_error"):
+        Safety(start_error=0.0)

@@ -56,8 +56,8 @@ Array = NDArray[np.float64]
 
 #: Reads that are timed by the start-up checks; ticks between looks at voltage and temperature; s the IMU may take to speak.
 TIMED_READS, HEALTH_TICKS, IMU_TIME = 200, 5, 0.5
-#: s the shortest ramp takes.
-SHORTEST_RAMP = 0.5
+#: s the shortest ramp takes; fastest over mean speed of a minimum-jerk path.
+SHORTEST_RAMP, PEAK_SPEED = 0.5, 1.875
 #: Signals that stop the robot, where the system has them.
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
 #: What a servo, a bus or the IMU can raise while it is talked to.
@@ -195,6 +195,7 @@ class ControlLoop:
                 self._new_log()
             self._enter(Phase.RAMP)
             self._follow(target)
+            self._check_pose(target)
             assert self.view is not None
             self._wheel_zero = self.view.position[4:].copy()
             self._started = self.view.time
@@ -237,12 +238,27 @@ class ControlLoop:
     def _follow(self, target: Array) -> None:
         """Go to a start pose on a minimum-jerk path."""
         begin = self.goals[: len(LEGS)]
-        duration = max(SHORTEST_RAMP, float(np.abs(target - begin).max()) / self.limits.start_speed)
+        duration = max(SHORTEST_RAMP, float(np.abs(target - begin).max()) / self._ramp_speed())
         ticks = int(np.ceil(duration / self.pacer.period))
         for k in range(1, ticks + 1):
             s = k / ticks
             share = s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
             self._tick(np.concatenate([begin + share * (target - begin), np.zeros(4)]))
+
+    def _ramp_speed(self) -> float:
+        """Mean speed (rad/s) of the way to the start pose: one that legs with the servos' profile can follow."""
+        fastest = self._gate.profile.leg_velocity  # 0 = no profile
+        return min(self.limits.start_speed, fastest / PEAK_SPEED) if fastest > 0.0 else self.limits.start_speed
+
+    def _check_pose(self, target: Array) -> None:
+        """Stop where a leg has not come to the start pose: blocked, too weak, held by the safety gate."""
+        if self.dry_run:
+            return
+        position = self._seen().position[: len(LEGS)]
+        far = np.flatnonzero(np.abs(position - target) > self.limits.start_error)
+        if len(far):
+            found = "; ".join(f"{LEGS[k]} is at {position[k]:.2f} rad, its goal is {target[k]:.2f} rad" for k in far)
+            self._fail(f"start pose: {found} (limit {self.limits.start_error:g} rad)")
 
     def tick(self, wanted: object, torque_on: NDArray[np.bool_] | None = None) -> View:
         """Drive one control tick: send what the safety gate allows, wait for the deadline, look.
