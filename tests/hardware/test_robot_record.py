@@ -1,19 +1,20 @@
 """``wlr record``: runs from the emulated robot and from simulators, motions as files, what is refused."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from wlr_gym.cli import record
+from wlr_gym.cli import record, replay
 from wlr_gym.cli.robot_options import HardwareOption
 from wlr_gym.effects import load_patch
 from wlr_gym.errors import InputError
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.runs import read_dataset, read_run, simulate_again
 from wlr_gym.runs.compare import motion_of
-from wlr_gym.runs.excitations import EXCITATIONS, GENTLE, excite
+from wlr_gym.runs.excitations import EXCITATIONS, GENTLE, Motion, excite
 from wlr_gym.runs.format import COMMANDS, Profile
 from wlr_gym.runs.record import next_run, read_commands, record_simulation
 from wlr_gym.runs.simulation import SENSED
@@ -198,3 +199,59 @@ def test_a_real_robot_is_asked_for_first(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="nobody there to start the robot"):
         recorded(tmp_path, excitation=("straight",), emulated=False)
     assert list(tmp_path.iterdir()) == []
+
+
+class Operator:
+    """Presses Enter so often, and then is gone; what was asked."""
+
+    def __init__(self, times):
+        self.times, self.asked = times, []
+
+    def __call__(self, *_):
+        self.asked.append("")
+        if len(self.asked) > self.times:
+            raise EOFError
+        return ""
+
+
+@pytest.fixture
+def emulated_as_real(monkeypatch):
+    """What is connected is an emulated robot that the commands take for a real one."""
+    link_to = HardwareOption.link_to
+    monkeypatch.setattr(
+        HardwareOption, "link_to", lambda options, *given: link_to(replace(options, emulated=True, port=()), *given)
+    )
+
+
+def test_every_motion_of_a_real_robot_is_asked_for(tmp_path, monkeypatch, capsys, emulated_as_real):
+    operator = Operator(1)
+    monkeypatch.setattr("builtins.input", operator)
+    with pytest.raises(InputError, match="nobody there to start the robot"):
+        recorded(tmp_path, excitation=("s_curve", "turns", "straight"), emulated=False, seconds=0.2)
+    assert len(operator.asked) == 2
+    assert [run.path.name for run in read_dataset(tmp_path).runs] == ["run_01.csv"]
+    text = " ".join(capsys.readouterr().out.split())
+    assert "stand up and drive s_curve: 0 s; it rolls +0.0 m in all" in text
+    assert "stand up and drive turns" in text
+    assert "straight" not in text
+
+
+def test_every_repeated_run_of_a_real_robot_is_asked_for(tmp_path, monkeypatch, emulated_as_real):
+    recorded(tmp_path / "runs", excitation=("straight", "turns"), emulated=True, seconds=0.2)
+    operator = Operator(1)
+    monkeypatch.setattr("builtins.input", operator)
+    options = replay.Options(tmp_path / "runs", tmp_path / "out", backend="dynamixel", plots=False)
+    with pytest.raises(InputError, match="nobody there to start the robot"):
+        replay.run(options)
+    assert len(operator.asked) == 2
+    assert len(list((tmp_path / "out" / "robot").glob("*/run_01.csv"))) == 1
+
+
+def test_travel_is_what_the_wheels_roll():
+    goals = np.full((100, 8), np.pi / 2)
+    goals[:, 4:] = 2.0
+    goals[50:, 4:] = [-6.0, np.nan, np.nan, -2.0]
+    goals[99, 4:] = np.nan
+    travel = Motion("to and fro", goals, 0.02).travel(0.1)
+    assert travel.max() == pytest.approx(0.2)
+    assert travel[-1] == pytest.approx(0.2 - 49 * 0.02 * 4.0 * 0.1)

@@ -1,13 +1,15 @@
 """``wlr paper``: files, and refusals that leave nothing behind."""
 
 import json
+import os
+import signal
 
 import numpy as np
 import pytest
 
 from wlr_gym.cli import run_command
 from wlr_gym.errors import InputError
-from wlr_gym.hardware.loop import StoppedError
+from wlr_gym.hardware.loop import Phase, StoppedError
 from wlr_gym.paper.experiments import PROFILE, TESTS
 from wlr_gym.runs.record import read_commands
 
@@ -76,3 +78,33 @@ def test_bad_input_is_named_and_leaves_no_folder(tmp_path, arguments, words):
     with pytest.raises(InputError, match=words):
         run_command("paper", ["--out", str(out), *arguments])
     assert not out.exists()
+
+
+@pytest.mark.parametrize("signals", [0, 1])
+def test_a_robot_is_stopped_while_signals_are_looked_at(tmp_path, monkeypatch, capsys, signals):
+    """Not by closing it, when Ctrl-C would interrupt the stop."""
+    pytest.importorskip("dynamixel_sdk")
+    phases, handler = [], signal.getsignal(signal.SIGINT)
+
+    def drive(plant, *_):
+        phases.append(plant.loop.phase)
+        plant.reset()
+        plant.step(np.r_[[np.pi / 2] * 4, [0.0] * 4][None])
+        plant.loop.spare = lambda: phases.append((plant.loop.phase, signal.getsignal(signal.SIGINT) is not handler))
+        for _ in range(signals):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("wlr_gym.paper.experiments.drive_plant", drive)
+    monkeypatch.setattr("wlr_gym.cli.paper._search", lambda *_: (_ for _ in ()).throw(RuntimeError("both were driven")))
+    monkeypatch.setattr("wlr_gym.paper.claims.gather", lambda *_: None)
+    monkeypatch.setattr("wlr_gym.paper.claims.check_all", lambda *_: [])
+    arguments = ["--out", str(tmp_path / "out"), "--plant", "dynamixel", "--emulated", "--draws", "0"]
+    monkeypatch.setattr("wlr_gym.paper.experiments.drive_both", lambda *_: {})
+    if signals:
+        assert run_command("paper", arguments) == 1
+        assert "the test is over; SIGINT" in capsys.readouterr().out
+    else:
+        with pytest.raises(RuntimeError, match="both were driven"):
+            run_command("paper", arguments)
+    assert phases.count(Phase.LIMP) == 2 - signals
+    assert set(phases) == {Phase.LIMP, (Phase.STOPPING, True)}

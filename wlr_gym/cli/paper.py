@@ -7,6 +7,7 @@ robot also its runs. docs/paper.md explains them.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -127,13 +128,11 @@ def _drive_robot(robot: Robot, options: Options, console: Console) -> dict[str, 
     meta, records = RunMeta(robot=robot.name, profile=PROFILE, notes="the paper's tests"), {}
     for name, test in TESTS.items():
         if not (options.emulated or options.yes):
-            confirm([test.motion()], console)
+            confirm(test.motion(), robot, console)
         plant = options.plant_of(robot, options.out / "runs", meta, load_patch(None))
-        try:
-            with stop_on_signals(plant.loop):
-                records[name] = drive_plant(plant, test, Parameters.nominal(robot))
-        finally:
-            plant.close()
+        with stop_on_signals(plant.loop), contextlib.closing(plant):
+            records[name] = drive_plant(plant, test, Parameters.nominal(robot))
+            plant.loop.finish("the test is over")
     return records
 
 

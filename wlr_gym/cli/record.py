@@ -41,7 +41,7 @@ class Options(RobotOption, EffectsOption):
         list: show the excitations.
         ground: what the floor is like, for meta.yaml.
         notes: free text for meta.yaml.
-        yes: do not ask before the robot moves.
+        yes: do not ask before every motion of the robot.
     """
 
     excitation: tuple[str, ...] = ()
@@ -88,7 +88,7 @@ def run(options: Options) -> int:
         return OK
     meta = meta_of(motions[0], robot, RunMeta(ground=options.ground, notes=options.notes))
     if options.backend in REAL:
-        return _record_robot(options, motions, meta, console)
+        return _record_robot(options, motions, robot, meta, console)
     return _record_simulations(options, motions, robot, meta, console)
 
 
@@ -113,14 +113,15 @@ def read_motions(options: Options, robot: Robot) -> Sequence[Motion]:
 # ---- the robot -------------------------------------------------------------------------------------------------------
 
 
-def _record_robot(options: Options, motions: Sequence[Motion], meta: RunMeta, console: Console) -> int:
+def _record_robot(options: Options, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
+    """Guarded and logged; between the motions the operator carries the robot back."""
     from wlr_gym.evaluation.driving import drive_robot
 
     assert options.out is not None
-    if not options.emulated and not options.yes:
-        confirm(motions, console)
     well = True
     for motion in motions:
+        if not (options.emulated or options.yes):
+            confirm(motion, robot, console)
         plant = options.plant(options.out, meta, options.patch())
         try:
             drive = drive_robot(plant, motion)

@@ -44,7 +44,7 @@ class Options(HardwareOption, EffectsOption):
         plots: write overlay plots.
         video: file (.webp, .gif, .png, .mp4) for a film of the run beside its simulation; with several runs, one film each,
             named FILE_<run>.
-        yes: do not ask before the robot moves.
+        yes: do not ask before every motion of the robot.
     """
 
     runs: Annotated[Path, tyro.conf.Positional]
@@ -147,10 +147,10 @@ def _repeat_all(options: Options, runs: Sequence[Run], patch: Patch, console: Co
     from wlr_gym.runs.replay import robot_of
 
     motions = [motion_of(measured) for measured in runs]
-    if not options.emulated and not options.yes:
-        confirm(motions, console)
     for measured, motion in zip(runs, motions, strict=True):
         robot = robot_of(measured, options.robot)
+        if not (options.emulated or options.yes):
+            confirm(motion, robot, console)
         plant = options.plant_of(robot, options.out / "robot" / measured.name, meta_of(motion, robot), patch)
         try:
             drive = drive_robot(plant, motion)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -105,16 +104,16 @@ class RobotOption(HardwareOption):
         return self.plant_of(self.load()[0], log, meta, patch)
 
 
-def confirm(motions: Sequence[Motion], console: Console) -> None:
-    """Say what the robot is about to do, and wait for Enter.
+def confirm(motion: Motion, robot: Robot, console: Console) -> None:
+    """Say what the robot is about to do, and wait for Enter; before every motion: after one the robot stands elsewhere, limp.
 
     Raises:
         InputError: nobody there.
     """
-    seconds = sum(motion.duration for motion in motions)
-    names = ", ".join(motion.name for motion in motions)
-    console.print(f"The robot will drive {names}: {seconds:.0f} s in all, on about 2 m of free floor in front of it.")
-    wait_for_enter(console, "Hand on the switch?")
+    travel = motion.travel(robot.wheel.radius)
+    rolled = f"{travel[-1]:+.1f} m in all, from {travel.min():+.1f} to {travel.max():+.1f} m on the way (+ is forward)"
+    console.print(f"The robot will stand up and drive {motion.name}: {motion.duration:.0f} s; it rolls {rolled}.")
+    wait_for_enter(console, "Free floor? Hand on the switch?")
 
 
 def wait_for_enter(console: Console, question: str) -> None:

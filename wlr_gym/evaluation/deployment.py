@@ -35,7 +35,7 @@ class Deployment:
 
     Attributes:
         reason: why it ended; ``time is over`` when nothing happened.
-        well: it ended as it was asked to: time over, key or signal.
+        well: it ended as it was asked to: time over, key or signal; and torque is confirmed off.
         ticks: control ticks that the policy drove.
         run: its log; None = none was written.
         statistics: of the control loop.
@@ -77,7 +77,6 @@ def deploy(core: Core, policy: Policy, seed: int = 0, command: Mapping[str, floa
         policy.act(core.observation)
     policy.reset(core.everyone)
     inference: list[float] = []
-    reason, well = "time is over", True
     with _no_garbage_collection():
         try:
             core.begin_episodes(core.everyone, {"command": dict(command)} if command else None)
@@ -87,13 +86,13 @@ def deploy(core: Core, policy: Policy, seed: int = 0, command: Mapping[str, floa
                 inference.append(time.perf_counter() - start)
                 _log(core, loop, action)
                 core.step(action, core.everyone)
-            loop.stop(reason)
-        except StoppedError as error:
-            reason, well = str(error), loop.was_asked
+            loop.stop("time is over")
+        except StoppedError:
+            pass  # it is in the loop's reason
         finally:
             loop.stop("exception")
     run = loop.log.run if loop.log is not None and loop.log.run.is_file() else None
-    return Deployment(reason, well, len(inference), run, loop.statistics(), np.array(inference))
+    return Deployment(loop.reason, loop.ended_well, len(inference), run, loop.statistics(), np.array(inference))
 
 
 def _log(core: Core, loop: ControlLoop, action: NDArray[np.float32]) -> None:

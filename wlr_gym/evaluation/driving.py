@@ -22,8 +22,8 @@ class Drive:
 
     Attributes:
         run: its log, whole or up to where it stopped; None where nothing was logged.
-        reason: why it stopped early; empty = it did not.
-        well: it ended at the motion's end, or because somebody asked for it.
+        reason: why it stopped early, or not in good order; empty = neither. Drive no other motion then.
+        well: it ended at the motion's end, or because somebody asked for it; and torque is confirmed off.
         ticks: control ticks driven.
         statistics: of the control loop, with what the safety gate changed.
     """
@@ -45,7 +45,7 @@ def drive_robot(plant: RobotPlant, motion: Motion) -> Drive:
     loop, robot = plant.loop, plant.robot
     state = standing_state(robot, Parameters.nominal(robot))
     state.joint_position[0, :4] = start_goals(motion, robot)[:4]
-    reason, well, ticks = "", True, 0
+    reason, ticks = "", 0
     torque_on = np.isfinite(motion.goals)
     goals = np.nan_to_num(motion.goals)
     with stop_on_signals(loop):
@@ -54,10 +54,10 @@ def drive_robot(plant: RobotPlant, motion: Motion) -> Drive:
             for tick in range(len(goals)):
                 plant.step(goals[tick : tick + 1], torque_on[tick : tick + 1])
                 ticks += 1
-            loop.stop("the motion is over")
+            loop.finish("the motion is over")
         except StoppedError as error:
-            reason, well = str(error), loop.was_asked
+            reason = str(error)
         finally:
             loop.stop("exception")
     run = loop.log.run if loop.log is not None and loop.log.run.is_file() else None
-    return Drive(run, reason, well, ticks, loop.statistics())
+    return Drive(run, reason, loop.ended_well, ticks, loop.statistics())

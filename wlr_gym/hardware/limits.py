@@ -26,6 +26,7 @@ class Safety(BaseModel):
         patience: s an answer may take beyond its time on the wire.
         read_time: s that 99 of 100 reads of all joints may take at the start.
         start_speed: rad/s of the legs on the way to the start pose, on average.
+        start_error: rad that a leg may be away from the start pose when the way there is over.
         stop_time: s from wheels ordered to stop until torque goes off.
         off_time: s to go on trying to switch torque off where servos do not confirm it.
     """
@@ -59,6 +60,7 @@ class Safety(BaseModel):
     patience: float = Field(default=0.004, gt=0.0)
     read_time: float = Field(default=0.014, gt=0.0)
     start_speed: float = Field(default=1.0, gt=0.0)
+    start_error: float = Field(default=0.3, gt=0.0)
     stop_time: float = Field(default=0.6, ge=0.0)
     off_time: float = Field(default=2.0, ge=0.0)
 

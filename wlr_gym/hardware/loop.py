@@ -15,6 +15,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import signal
+import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -34,7 +35,19 @@ from wlr_gym.hardware.guard import Guard
 from wlr_gym.hardware.imu_driver import ImuGoneError, ImuReading
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.log import RunLog, sensors_of
-from wlr_gym.hardware.safety import STANDARD_GRAVITY, VERTICAL_BAND, Level, View, next_up, plausible, resting, tilt_of
+from wlr_gym.hardware.safety import (
+    FINE,
+    REQUESTS,
+    STANDARD_GRAVITY,
+    VERTICAL_BAND,
+    Level,
+    Verdict,
+    View,
+    next_up,
+    plausible,
+    resting,
+    tilt_of,
+)
 from wlr_gym.hardware.timing import Pacer
 from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.runs.format import RunMeta
@@ -43,8 +56,8 @@ Array = NDArray[np.float64]
 
 #: Reads that are timed by the start-up checks; ticks between looks at voltage and temperature; s the IMU may take to speak.
 TIMED_READS, HEALTH_TICKS, IMU_TIME = 200, 5, 0.5
-#: s the shortest ramp takes.
-SHORTEST_RAMP = 0.5
+#: s the shortest ramp takes; fastest over mean speed of a minimum-jerk path.
+SHORTEST_RAMP, PEAK_SPEED = 0.5, 1.875
 #: Signals that stop the robot, where the system has them.
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
 #: What a servo, a bus or the IMU can raise while it is talked to.
@@ -82,12 +95,14 @@ class ControlLoop:
     Attributes:
         phase: where it is.
         view: what was last seen.
-        reason: why it stopped.
+        reason: why it stopped; with what was asked for meanwhile, and with the servos whose torque is not confirmed off.
+        ended_well: nothing went wrong in the last run, which may have been stopped on request; torque is confirmed off.
         interventions: rule -> ticks in which the safety gate changed or stopped something.
         pacer: deadlines and statistics.
         log: of the present or last run.
         checks: what the start-up checks found.
-        spare: called in every tick between writing and waiting, while there is time (keys, display).
+        spare: called before torque comes on, and in every tick between writing and waiting, while there is time (keys,
+            display).
     """
 
     def __init__(
@@ -105,6 +120,7 @@ class ControlLoop:
         self.robot, self.hardware, self.limits = robot, hardware, hardware.safety
         self.phase = Phase.LIMP
         self.reason = ""
+        self.ended_well = True
         self.dry_run = dry_run
         self.clock = link.clock
         self.pacer = Pacer(link.clock, period)
@@ -146,9 +162,9 @@ class ControlLoop:
         return self._gate.interventions
 
     @property
-    def was_asked(self) -> bool:
-        """Whether somebody asked for the stop: a key, a signal."""
-        return bool(self._asked_to_stop or self._asked_off)
+    def asked(self) -> str:
+        """What somebody asked for that has not happened yet: a key, a signal; empty = nothing."""
+        return self._asked_off or self._asked_to_stop
 
     @property
     def goals(self) -> Array:
@@ -179,6 +195,7 @@ class ControlLoop:
                 self._new_log()
             self._enter(Phase.RAMP)
             self._follow(target)
+            self._check_pose(target)
             assert self.view is not None
             self._wheel_zero = self.view.position[4:].copy()
             self._started = self.view.time
@@ -190,8 +207,7 @@ class ControlLoop:
         if not self._is_open:
             self._link.open()
             self._is_open = True
-        if self.reason:  # of the run before; what was asked for since then counts
-            self.reason = self._asked_to_stop = self._asked_off = ""
+        self.reason = ""  # of the run before; what was asked for since then counts
         self._operator_at = self.clock.now()
         self.checks = self._gate.check(TIMED_READS)
         self._new_log()
@@ -201,8 +217,9 @@ class ControlLoop:
         if self._wants_guard and self._guard is None:
             self._guard = Guard(self.robot, self.hardware, self._log_folder)
         self.view = self._first_look()
-        if self.was_asked:
-            self._fail(self._asked_off or self._asked_to_stop, is_fault=False)
+        self._serve_operator()
+        if self.asked:
+            self._fail(self.asked, is_fault=False)
         atexit.register(self.close)
         self._gate.arm()
         self._idle = 0.0
@@ -221,12 +238,27 @@ class ControlLoop:
     def _follow(self, target: Array) -> None:
         """Go to a start pose on a minimum-jerk path."""
         begin = self.goals[: len(LEGS)]
-        duration = max(SHORTEST_RAMP, float(np.abs(target - begin).max()) / self.limits.start_speed)
+        duration = max(SHORTEST_RAMP, float(np.abs(target - begin).max()) / self._ramp_speed())
         ticks = int(np.ceil(duration / self.pacer.period))
         for k in range(1, ticks + 1):
             s = k / ticks
             share = s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
             self._tick(np.concatenate([begin + share * (target - begin), np.zeros(4)]))
+
+    def _ramp_speed(self) -> float:
+        """Mean speed (rad/s) of the way to the start pose: one that legs with the servos' profile can follow."""
+        fastest = self._gate.profile.leg_velocity  # 0 = no profile
+        return min(self.limits.start_speed, fastest / PEAK_SPEED) if fastest > 0.0 else self.limits.start_speed
+
+    def _check_pose(self, target: Array) -> None:
+        """Stop where a leg has not come to the start pose: blocked, too weak, held by the safety gate."""
+        if self.dry_run:
+            return
+        position = self._seen().position[: len(LEGS)]
+        far = np.flatnonzero(np.abs(position - target) > self.limits.start_error)
+        if len(far):
+            found = "; ".join(f"{LEGS[k]} is at {position[k]:.2f} rad, its goal is {target[k]:.2f} rad" for k in far)
+            self._fail(f"start pose: {found} (limit {self.limits.start_error:g} rad)")
 
     def tick(self, wanted: object, torque_on: NDArray[np.bool_] | None = None) -> View:
         """Drive one control tick: send what the safety gate allows, wait for the deadline, look.
@@ -246,16 +278,17 @@ class ControlLoop:
             return self._tick(wanted, torque_on)
 
     def _tick(self, wanted: object, torque_on: NDArray[np.bool_] | None = None) -> View:
-        level = self._exchange(wanted, torque_on)
-        if level >= Level.STOP:
-            self._fail(self.reason, is_fault=not self.was_asked, is_off=level == Level.OFF)
+        worst = self._exchange(wanted, torque_on)
+        if worst.level >= Level.STOP:
+            self._fail(self.reason, is_fault=worst.rule not in REQUESTS, is_off=worst.level == Level.OFF)
         assert self.view is not None
         return self.view
 
     def stop(self, reason: str = "end", is_fault: bool = False) -> None:
         """Stop the wheels, hold the legs, switch torque off. Does nothing when it has happened already.
 
-        Motors that are off stay off: somebody may hold them.
+        Motors that are off stay off: somebody may hold them. How it went is in ``reason`` and ``ended_well``; see also
+        :meth:`finish`.
 
         Args:
             reason: for the log.
@@ -267,14 +300,26 @@ class ControlLoop:
         try:
             self._enter(Phase.STOPPING)
             for _ in range(round(self.limits.stop_time / self.pacer.period)):
-                if self._exchange(resting(self.goals), self._gate.torque_on.copy()) == Level.OFF:
-                    is_fault = is_fault or not self._asked_off
+                worst = self._exchange(resting(self.goals), self._gate.torque_on.copy())
+                if worst.level == Level.OFF:
+                    is_fault = is_fault or worst.rule not in REQUESTS
                     break
         except HARDWARE_TROUBLE as error:
             is_fault = True
-            self.reason = f"{self.reason}; {error}"
+            self._note_reason(f"{type(error).__name__}: {error}")
         finally:
             self._off(is_fault)
+
+    def finish(self, reason: str) -> None:
+        """Stop, as :meth:`stop`, and let nothing else that ended the run go unnoticed.
+
+        Raises:
+            StoppedError: the run did not end for this reason alone: something failed, torque is not confirmed off, or somebody
+                asked for a stop meanwhile.
+        """
+        self.stop(reason)
+        if self.reason != reason:
+            raise StoppedError(self.reason)
 
     def close(self, reason: str = "") -> None:
         """Stop if need be, and close the ports. Does nothing the second time."""
@@ -297,13 +342,28 @@ class ControlLoop:
         try:
             left = self._gate.off()
         finally:
-            self._is_switching_off = False
+            self._note_end(not (is_fault or left))
             if left:
-                self.reason = f"{self.reason}; CUT THE POWER: torque is not confirmed off at {', '.join(left)}"
+                self._warn(f"CUT THE POWER: torque is not confirmed off at {', '.join(left)}")
+            self._is_switching_off = False
             self._enter(Phase.FAULT if is_fault or left else Phase.LIMP)
             self._finish_log()
             if not left:
                 self._release_guard()
+
+    def _note_end(self, is_well: bool) -> None:
+        """Remember how the run ended. What was asked for until now has happened, and does not stop the next run."""
+        self.ended_well = is_well
+        if asked := self.asked:
+            if asked not in self.reason:
+                self.reason = f"{self.reason}; {asked}"
+            self._asked_to_stop = self._asked_off = ""
+
+    def _warn(self, text: str) -> None:
+        """Add to the reason, and tell the operator at once: who ended the run may not look at the reason."""
+        self.reason = f"{self.reason}; {text}"
+        with contextlib.suppress(OSError, ValueError):  # the terminal may be gone
+            print(text, file=sys.stderr, flush=True)
 
     def _finish_log(self) -> None:
         if self.log is not None:
@@ -345,6 +405,7 @@ class ControlLoop:
         """Bring the robot to rest and raise :class:`StoppedError`."""
         self.reason = reason
         if not self._gate.armed:  # nothing was switched on, and what another program holds up must not be dropped
+            self._note_end(not is_fault)
             self._finish_log()
         elif is_off or self.phase is Phase.LIMP:
             self._off(is_fault)
@@ -380,8 +441,11 @@ class ControlLoop:
 
     # ---- one tick ----
 
-    def _exchange(self, wanted: object, torque_on: NDArray[np.bool_] | None = None) -> Level:
-        """Write through the gate, log, wait for the deadline, look. Returns at once when torque must go off."""
+    def _exchange(self, wanted: object, torque_on: NDArray[np.bool_] | None = None) -> Verdict:
+        """Write through the gate, log, wait for the deadline, look; return the worst verdict.
+
+        Returns at once when torque must go off.
+        """
         view = replace(
             self._seen(),
             late_ticks=self.pacer.late_ticks,
@@ -396,9 +460,11 @@ class ControlLoop:
             decision = self._gate.write(wanted, view, torque_on)
         if self.phase is Phase.RUNNING:
             self.pacer.note("latency", self.clock.now() - self._read_at)
-        self._note(view, decision)
-        if decision.level == Level.OFF:
-            return decision.level
+        # of equals, what was asked for: a stop in good order is one whatever else would have stopped the robot
+        worst = max(decision.verdicts, key=lambda verdict: (verdict.level, verdict.rule in REQUESTS, verdict), default=FINE)
+        self._note(view, decision, worst)
+        if worst.level == Level.OFF:
+            return worst
         sent = self.clock.now()
         self._serve_operator()
         self.pacer.wait()
@@ -406,7 +472,7 @@ class ControlLoop:
         with self.pacer.timed("read"):
             self.view = self._look()
         self._read_at = self.clock.now()
-        return decision.level
+        return worst
 
     def _serve_operator(self) -> None:
         if self.spare is None:
@@ -417,15 +483,17 @@ class ControlLoop:
             self.spare = None
             self._terminal_trouble = f"the operator's terminal is gone: {error}"
 
-    def _note(self, view: View, decision: Any) -> None:
+    def _note(self, view: View, decision: Any, worst: Verdict) -> None:
         """Log the row, and each rule that begins to act; remember why the worst stopped the robot."""
-        worst = max(decision.verdicts, default=None)
-        if worst is not None and worst.level >= Level.STOP and self.phase is not Phase.STOPPING:
-            self.reason = f"{worst.rule}: {worst.text}"
+        if worst.level >= (Level.OFF if self.phase is Phase.STOPPING else Level.STOP):
+            self._note_reason(f"{worst.rule}: {worst.text}")
         if self.log is None or self._log_trouble:
             return
         with self._logging():
             self._write_row(self.log, view, decision)
+
+    def _note_reason(self, reason: str) -> None:
+        self.reason = f"{reason} (while stopping: {self.reason})" if self.phase is Phase.STOPPING else reason
 
     def _write_row(self, log: RunLog, view: View, decision: Any) -> None:
         goals = np.where(self._gate.torque_on & (decision.level < Level.OFF), self._gate.written, np.nan)
@@ -565,12 +633,19 @@ def stop_on_signals(loop: ControlLoop) -> Iterator[None]:
 
     Nothing interrupts switching torque off. Ctrl-Z (SIGTSTP) and Ctrl-\\ (SIGQUIT) are stops like Ctrl-C: a program that sleeps
     would leave torque on.
+
+    Raises:
+        KeyboardInterrupt: for the second signal, and at the end for one that came when the loop did not look any more.
     """
+    heard = interrupted = False
 
     def take(number: int, _: object) -> None:
+        nonlocal heard, interrupted
         name = signal.Signals(number).name
-        if loop._asked_to_stop and not loop._is_switching_off:
+        if (heard or loop.asked) and not loop._is_switching_off:
+            interrupted = True
             raise KeyboardInterrupt(name)
+        heard = True
         loop.ask_to_stop(name)
 
     if threading.current_thread() is not threading.main_thread():
@@ -583,3 +658,5 @@ def stop_on_signals(loop: ControlLoop) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+    if heard and loop.asked and not interrupted:
+        raise KeyboardInterrupt(loop.asked)

@@ -47,6 +47,11 @@ class Verdict(NamedTuple):
     text: str
 
 
+#: What is found where nothing is; rules that somebody asks for, and that are no faults.
+FINE = Verdict(Level.DRIVE, "", "")
+REQUESTS = ("stop", "emergency stop")
+
+
 @dataclass(frozen=True)
 class View:
     """What is known of the robot at a tick. Arrays are in joint order.

@@ -208,6 +208,7 @@ def drive(
 
     Raises:
         InputError: unknown model, formula forces for the reduced model, a robot that cannot be reached.
+        StoppedError: a robot had to stop, or its torque is not confirmed off (wlr_gym.hardware.loop).
     """
     if model in REAL:
         return _drive_robot(test, robot, hardware, every)
@@ -231,7 +232,9 @@ def _drive_robot(test: PaperTest, robot: Robot, hardware: RobotOptions | None, e
     meta = RunMeta(robot=robot.name, profile=PROFILE, notes=f"paper, {test.title}")
     plant = RobotPlant(robot, 1, PlantOptions(PERIOD), hardware, meta=meta)
     try:
-        return drive_plant(plant, test, Parameters.nominal(robot), every)
+        record = drive_plant(plant, test, Parameters.nominal(robot), every)
+        plant.loop.finish("the test is over")
+        return record
     finally:
         plant.close()
 

@@ -1,7 +1,8 @@
 """Goals that bring out what a robot is made of: motions to drive on the real robot, and on simulators to compare them.
 
 Every excitation is a function of a seed, starts and ends at rest, keeps the legs within their limits and the wheels below
-their no-load speed, and needs about 2 m of floor in front of the robot. :data:`EXCITATIONS` says what each is good for.
+their no-load speed, and needs up to 2 m of floor in front of the robot or behind it. :data:`EXCITATIONS` says what each is
+good for.
 """
 
 from __future__ import annotations
@@ -51,6 +52,12 @@ class Motion:
     def duration(self) -> float:
         """Length in s."""
         return len(self.goals) * self.period
+
+    def travel(self, wheel_radius: float) -> Array:
+        """Return the way rolled after each tick (ticks,), m, forward positive: without slip, motors that are off left out."""
+        wheels = self.goals[:, _WHEELS]
+        driven = np.isfinite(wheels).sum(axis=1)
+        return wheel_radius * self.period * np.cumsum(np.nansum(wheels, axis=1) / np.maximum(driven, 1))
 
     def cut(self, seconds: float | None) -> Motion:
         """Return its first ``seconds``; None = all of it."""
