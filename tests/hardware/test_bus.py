@@ -8,7 +8,7 @@ import pytest
 
 from wlr_gym.errors import InputError
 from wlr_gym.hardware import protocol
-from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.config import load_hardware, with_ports
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.tables import load_table
@@ -18,8 +18,20 @@ sdk = pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware.bus import Block, BusGroup, NoAnswerError, RefusedError, TickClock, open_all  # noqa: E402
+from robot_rig import jabbering_port  # noqa: E402
+
+from wlr_gym.hardware import checks  # noqa: E402
+from wlr_gym.hardware.bus import (  # noqa: E402
+    Block,
+    BusGroup,
+    NoAnswerError,
+    RefusedError,
+    RestlessLineError,
+    TickClock,
+    open_all,
+)
 from wlr_gym.hardware.sdk import BusGoneError, GuardedHandler, GuardedPort  # noqa: E402
+from wlr_gym.hardware.servos import Servos  # noqa: E402
 
 TABLE = load_table("XM540-W150-R")
 FAST_BLOCK = Block(TABLE, "realtime_tick", "present_position")
@@ -352,6 +364,42 @@ def test_torque_off_gets_through_heavy_loss(server):
         left = group.torque_off(retries=30)
     assert left == set()
     assert not any(server.machine.servos[joint]["torque_enable"] for joint in ("leg_lf", "leg_rf", "leg_lr", "leg_rr"))
+
+
+# --- a line that never falls quiet: an open pair, another device's stream
+
+
+def test_torque_off_goes_out_on_a_line_that_never_falls_quiet():
+    with jabbering_port() as (path, sent), BusGroup("legs", path, 1_000_000, LEGS, 0.05) as group:
+        with pytest.raises(NoAnswerError, match=r"no answer$"):
+            group.ping(2)
+        start = time.monotonic()
+        with pytest.raises(RestlessLineError, match="never quiet: check wiring, are two ports swapped"):
+            group.ping(2)
+        sent()
+        group.write_all("torque_enable", dict.fromkeys(LEGS, 0))
+        assert time.monotonic() - start < 2.0
+        assert protocol.sync_write(64, dict.fromkeys(LEGS, b"\0")) in sent()
+        assert group.read_all(FAST_BLOCK) == {}
+        assert group.scan() == {}
+
+
+def test_a_line_that_never_falls_quiet_does_not_keep_the_other_bus_from_torque_off():
+    with jabbering_port() as (legs, to_legs), jabbering_port() as (wheels, to_wheels):
+        hardware = with_ports(load_hardware(), {"legs": legs, "wheels": wheels})
+        servos = Servos(load_robot(), hardware, 0.02)
+        servos.open()
+        assert not servos.read().answered.any()
+        to_legs(), to_wheels()
+        start = time.monotonic()
+        servos.shout_off()
+        assert time.monotonic() - start < 2.0
+        for sent, ids in ((to_legs, LEGS), (to_wheels, (6, 7, 5, 8))):
+            assert protocol.sync_write(64, dict.fromkeys(ids, b"\0")) in sent()
+        (check,) = checks.check_servos(servos, load_robot(), hardware, ["leg_lf"])
+        servos.close()
+    assert check.found == "none, the line is never quiet"
+    assert "Are two ports swapped" in check.remedy
 
 
 # --- the servo's clock

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.errors import InputError
-from wlr_gym.hardware.bus import NoAnswerError, RefusedError
+from wlr_gym.hardware.bus import NoAnswerError, RefusedError, RestlessLineError
 from wlr_gym.hardware.calibration import ACCEL_REST, GYRO_REST, motion
 from wlr_gym.hardware.config import Hardware, ImuPort
 from wlr_gym.hardware.imu import STANDARD_GRAVITY
@@ -131,6 +131,10 @@ def _check_servo(servos: Servos, robot: Robot, hardware: Hardware, joint: str) -
     id, table = robot.dynamixel_ids[joint], load_table(bus.model)
     try:
         number, firmware = servos.ping(joint)
+    except RestlessLineError:
+        remedy = f"Are two ports swapped (an IMU's stream never ends)? Check wiring and termination of {bus_name} ({bus.port})."
+        yield Check(joint, "answer", False, "none, the line is never quiet", f"one from id {id}", remedy)
+        return
     except NoAnswerError:
         remedy = f"Check power, cable and adapter of bus {bus_name} ({bus.port}), and the servo's id and baud rate with a scan."
         yield Check(joint, "answer", False, "none", f"one from id {id} at {bus.baud_rate} bit/s", remedy)

@@ -28,6 +28,8 @@ except ImportError:  # not on Windows
     _GONE = (OSError, serial.SerialException)
 
 _UNANSWERED = (Instruction.SYNC_WRITE, Instruction.BULK_WRITE)
+#: A line that never falls quiet is let talk for the patience and this many times more, yet no longer than these s more.
+_MORE_PATIENCE, _MORE_TIME = 3.0, 0.05
 SUCCESS, TIMEOUT, CORRUPT = sdk.COMM_SUCCESS, sdk.COMM_RX_TIMEOUT, sdk.COMM_RX_CORRUPT
 
 
@@ -58,6 +60,7 @@ class GuardedPort(sdk.PortHandler):
 
     Attributes:
         suspect: the last exchange did not end well; what still comes in belongs to it.
+        quiet: the line fell quiet when it was last waited for.
         gone: it has failed since it was opened.
     """
 
@@ -68,6 +71,7 @@ class GuardedPort(sdk.PortHandler):
         self.parser = Parser()
         self.queue: list[Packet] = []
         self.suspect = False
+        self.quiet = True
         self.gone = False
         self.discarded = 0
 
@@ -112,15 +116,28 @@ class GuardedPort(sdk.PortHandler):
         """Forget what came in. Defect 9: a late answer was taken for the next one; after a time-out, wait for a quiet line."""
         self.parser.clear()
         self.queue.clear()
-        while self.suspect and (data := self._wait_and_read(4096, self.patience)):
-            self.discarded += len(data)
+        self.quiet = not self.suspect or self._falls_quiet()
         try:
             super().clearPort()
         except (*_GONE, AttributeError) as error:
             raise self._lost(error) from None
 
+    def _falls_quiet(self) -> bool:
+        """Let pass what still comes. An end is set to it: on a line that always talks, torque-off must go out all the same."""
+        end = self.getCurrentTime() + (self.patience + min(_MORE_PATIENCE * self.patience, _MORE_TIME)) * 1e3
+        while self.getCurrentTime() < end:
+            data = self._wait_and_read(4096, self.patience)
+            if not data:
+                return True
+            self.discarded += len(data)
+        return False
+
     def readPort(self, length: int) -> bytes:  # noqa: N802
-        """Return bytes as soon as there are some. Defect 7: the SDK spins at full load until they come."""
+        """Return bytes as soon as there are some. Defect 7: the SDK spins at full load until they come.
+
+        Its scan counts what came down from what can come, and on a line that always talks asks for less than nothing.
+        """
+        length = max(1, length)
         return self._wait_and_read(length, max(0.0, self.packet_timeout - self.getTimeSinceStart()) * 1e-3)
 
     def _wait_and_read(self, length: int, seconds: float) -> bytes:
