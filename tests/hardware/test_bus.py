@@ -30,6 +30,7 @@ from wlr_gym.hardware.bus import (  # noqa: E402
     TickClock,
     open_all,
 )
+from wlr_gym.hardware.ports import PortInUseError  # noqa: E402
 from wlr_gym.hardware.sdk import BusGoneError, GuardedHandler, GuardedPort  # noqa: E402
 from wlr_gym.hardware.servos import Servos  # noqa: E402
 
@@ -292,16 +293,25 @@ def test_defect_10_unplugging_is_one_kind_of_error(server, group):
             act()
 
 
-def test_a_port_in_use_is_refused_until_it_is_closed():
+def test_defect_13_a_port_in_use_is_refused_untouched_until_it_is_closed():
+    import termios
+    import tty
+
     ours, theirs = os.openpty()
+    tty.setraw(theirs)
     try:
         first, second = (GuardedPort(os.ttyname(theirs), 1000000, 0.005) for _ in range(2))
         first.openPort()
-        with pytest.raises(InputError, match="in use by another program"):
+        os.write(ours, b"answer")
+        second.baudrate = 57600
+        with pytest.raises(PortInUseError, match="in use by another program"):
             second.openPort()
+        assert termios.tcgetattr(theirs)[4] == termios.B1000000  # and who has it is not disturbed
+        assert os.read(first.ser.fileno(), 99) == b"answer"
         first.closePort()
         second.openPort()
         second.closePort()
+        assert not second.is_open
     finally:
         os.close(ours)
         os.close(theirs)
@@ -390,7 +400,8 @@ def test_a_line_that_never_falls_quiet_does_not_keep_the_other_bus_from_torque_o
         servos = Servos(load_robot(), hardware, 0.02)
         servos.open()
         assert not servos.read().answered.any()
-        to_legs(), to_wheels()
+        for sent in (to_legs, to_wheels):
+            sent()
         start = time.monotonic()
         servos.shout_off()
         assert time.monotonic() - start < 2.0

@@ -18,6 +18,7 @@ from wlr_gym.hardware.calibration import ACCEL_REST, GYRO_REST, motion
 from wlr_gym.hardware.config import Hardware, ImuPort
 from wlr_gym.hardware.imu import STANDARD_GRAVITY
 from wlr_gym.hardware.imu_driver import Imu, ImuGoneError
+from wlr_gym.hardware.ports import PortInUseError
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.hardware.tables import ControlTable, load_table
 from wlr_gym.robot import JOINTS, LEGS, Robot
@@ -96,6 +97,9 @@ def open_ports(servos: Servos, imu: Imu, hardware: Hardware) -> list[Check]:
         try:
             open_port()
             checks.append(Check(name, "port", True, path, "", ""))
+        except PortInUseError as error:
+            remedy = f"End that program first (fuser {path} names it); if it holds the robot up, hold the robot."
+            checks.append(Check(name, "port", False, str(error), path, remedy))
         except InputError as error:
             if Path(path).exists():
                 found, remedy = str(error), "Join the group it belongs to (ls -l), often dialout, and log in again."

@@ -6,18 +6,18 @@ defect in the SDK and its absence here. Import only behind ``require_package``: 
 
 from __future__ import annotations
 
-import errno
 import os
 import select
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import dynamixel_sdk as sdk
 import serial
 
 from wlr_gym.errors import InputError
 from wlr_gym.hardware import protocol
+from wlr_gym.hardware.ports import open_serial
 from wlr_gym.hardware.protocol import BROADCAST, Instruction, Packet, Parser, Status
 
 try:
@@ -35,19 +35,6 @@ SUCCESS, TIMEOUT, CORRUPT = sdk.COMM_SUCCESS, sdk.COMM_RX_TIMEOUT, sdk.COMM_RX_C
 
 class BusGoneError(ConnectionError):
     """The port does not work any more: unplugged adapter, dead driver."""
-
-
-def _lock(descriptor: int) -> bool:
-    """Keep other programs of this library off a port until it is closed or its process ends; False if one has it already."""
-    try:
-        import fcntl
-    except ImportError:  # Windows opens a serial port for one program only
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)
-    return True
 
 
 class GuardedPort(sdk.PortHandler):
@@ -92,19 +79,17 @@ class GuardedPort(sdk.PortHandler):
 
     def openPort(self) -> bool:  # noqa: N802
         """Open the device. Defect 11: a missing one raised whatever pyserial had; now an InputError that names it."""
-        try:
-            opened = super().openPort()
-        except _GONE as error:
-            raise InputError(f"port {self.port_name}: cannot be opened: {error}") from None
-        if not opened:
+        if not super().openPort():
             raise InputError(f"port {self.port_name}: baud rate {self.baudrate} is not one dynamixel-sdk knows")
-        assert self.ser is not None  # the SDK made it: it opened
-        if not _lock(self.ser.fileno()):
-            self.closePort()
-            raise InputError(
-                f"port {self.port_name} is in use by another program: two readers would steal each other's answers"
-            )
         self.gone = False
+        return True
+
+    def setupPort(self, cflag_baud: int) -> Literal[True]:  # noqa: N802
+        """Set up the device. Defect 13: the SDK sets speed and throws input away, whoever drives servos on the port."""
+        self.closePort()
+        self.ser = open_serial(self.port_name, self.baudrate)
+        self.is_open = True
+        self.tx_time_per_byte = 10e3 / self.baudrate
         return True
 
     def closePort(self) -> None:  # noqa: N802
