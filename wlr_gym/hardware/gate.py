@@ -6,6 +6,7 @@ What is safe is decided in :mod:`wlr_gym.hardware.safety`, by pure functions; he
 from __future__ import annotations
 
 import contextlib
+import math
 from collections import Counter
 from collections.abc import Iterable
 
@@ -44,6 +45,8 @@ CALM_PATIENCE = 0.05
 CALM_SPEED = 2.0
 #: Reads before the timed ones: the bus finds out whether its servos know fast reads.
 _UNTIMED_READS = 5
+#: Times that the watchdogs are written and looked at.
+_ARM_TRIES = 10
 #: s between tries to switch off servos that do not confirm it.
 _OFF_PAUSE = 0.05
 
@@ -168,9 +171,20 @@ class Gate:
         self._confirm_goals()
         for joint in JOINTS:
             servos.set(joint, "torque_enable", 1)
-        for joint in JOINTS:
-            servos.set(joint, "bus_watchdog", max(1, round(self.limits.watchdog / WATCHDOG_UNIT)))
         self._set_patience(self.limits.patience)
+        self._arm_watchdogs()
+
+    def _arm_watchdogs(self) -> None:
+        """Arm all watchdogs at once, and see that they are: where one bus is waited for, those of the other one would trip."""
+        count = math.ceil(self.limits.watchdog / WATCHDOG_UNIT - 1e-9)  # up: what is judged by the limit has not tripped yet
+        wrong: list[str] = []
+        for _ in range(_ARM_TRIES):
+            self.__servos.write_item("bus_watchdog", dict.fromkeys(JOINTS, count))
+            held = self.__servos.get_all("bus_watchdog")
+            wrong = [joint for joint in JOINTS if held.get(joint) != count]
+            if not wrong:
+                return
+        raise NoAnswerError(f"the watchdog of {', '.join(wrong)} does not say that it is armed")
 
     def _set_patience(self, seconds: float) -> None:
         for group in self.__servos.groups.values():
