@@ -43,8 +43,6 @@ WATCHDOG_UNIT = 0.02
 CALM_PATIENCE = 0.05
 #: Fastest goals of legs on the way to the start pose, over ``start_speed``: a minimum-jerk path needs 1.9 of it.
 CALM_SPEED = 2.0
-#: Reads before the timed ones: the bus finds out whether its servos know fast reads.
-_UNTIMED_READS = 5
 #: Times that the watchdogs are written and looked at.
 _ARM_TRIES = 10
 #: s between tries to switch off servos that do not confirm it.
@@ -130,8 +128,6 @@ class Gate:
         found = checks.check_servos(self.__servos, self.robot, self.hardware)
         if all(check.ok or not check.is_fatal for check in found):
             self._set_patience(self.limits.patience)
-            for _ in range(_UNTIMED_READS):
-                self.read()
             found.append(checks.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
         return found
 
