@@ -92,6 +92,21 @@ def test_comments_and_limits_of_the_file_stay(monkeypatch, tmp_path):
     assert load_hardware(out) == find.with_mountings(NOMINAL, {"wheel_rf": Mounting(sign=1, zero=0)})
 
 
+def test_ports_of_the_command_line_are_not_written_and_comments_stay(monkeypatch, tmp_path):
+    machine = make_machine(TRUE, monkeypatch)
+    out = tmp_path / "mine.yaml"
+    options = JointsOptions(out=out, only=("wheel_rf",), port=("legs=/tmp/robot/legs", "imu=/tmp/robot/imu"))
+    calibrate_joints(options, Operator(machine))
+    assert load_hardware(out) == find.with_mountings(NOMINAL, {"wheel_rf": Mounting(sign=1, zero=0)})
+    assert out.read_text().count("#") == nominal_text().count("#") + 1  # its own note
+    machine = sensor(monkeypatch)
+    own = ImuOptions(hardware=str(out), out=out, seconds=2.0, mounting=True, port=("imu=/tmp/robot/imu",))
+    calibrate_imu(own, Turner(machine, [(0, 0, 1), (-0.3, 0, 0.95)]))
+    found = load_hardware(out)
+    assert (found.imu.port, found.buses) == (NOMINAL.imu.port, NOMINAL.buses)
+    assert "# Limits of the safety gate" in out.read_text()
+
+
 def test_notes_do_not_pile_up_and_odd_layouts_are_written_anew(monkeypatch, tmp_path):
     machine = make_machine(TRUE, monkeypatch)
     out = tmp_path / "mine.yaml"
