@@ -22,9 +22,11 @@ from wlr_gym.robot import JOINTS, LEGS, load_robot
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
+from wlr_gym.hardware.bus import BusGroup
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.link import emulated_link
+from wlr_gym.hardware.sdk import BusGoneError
 
 ROBOT, NOMINAL = load_robot(), load_hardware()
 #: How the robot at hand is really mounted: not as the file says.
@@ -365,6 +367,19 @@ def test_servos_that_are_not_the_one():
     ):
         with pytest.raises(InputError, match=words):
             check_new_servo(found, bus, "wheel_lf")
+
+
+def test_an_adapter_that_goes_while_servos_are_searched_is_told(bench, monkeypatch, capsys):
+    def gone(self):
+        raise BusGoneError("port is gone: Input/output error")
+
+    _, plug = bench
+    monkeypatch.setattr(BusGroup, "scan", gone)
+    ports = ["--port", *plug("wheel_lf")]
+    assert main(["calibrate", "servo", "wheel_lf", *ports]) == 2
+    assert "port is gone: Input/output error; see wlr doctor" in capsys.readouterr().err
+    code = main(["doctor", "--scan", *ports])
+    assert (code, "First: robot, bus: port is gone" in capsys.readouterr().out) == (1, True)
 
 
 def test_servos_that_cannot_be_set_up(bench):

@@ -117,7 +117,8 @@ def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
     print(f"searching {bus.port} ...")
     likely = (FACTORY_RATE, bus.baud_rate)
     others = [rate for rate in BAUD_RATES if rate not in likely]
-    found = find_servos(name, bus.port, likely) or find_servos(name, bus.port, others)
+    with _dialogue():
+        found = find_servos(name, bus.port, likely) or find_servos(name, bus.port, others)
     servo = check_new_servo(found, bus, options.joint)
     registers = ", ".join(f"{item} {count}" for item, count in bus.eeprom.items())
     print(f"found: {servo}\n{options.joint} gets id {id}, {bus.baud_rate} bit/s, {registers}")
