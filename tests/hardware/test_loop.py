@@ -195,6 +195,27 @@ def test_a_watchdog_that_cannot_be_armed_stops_the_start(rig):
     assert not rig.torque().any()
 
 
+def test_checks_that_fail_write_nothing(rig):
+    rig.machine.servos["leg_lf"].set("bus_watchdog", -1)
+    rig.machine.servos["wheel_rr"].set("drive_mode", 1)
+    before = {joint: bytes(servo._memory)[:120] for joint, servo in rig.machine.servos.items()}
+    with pytest.raises(StoppedError, match="drive_mode"):
+        rig.loop.start()
+    assert {joint: bytes(servo._memory)[:120] for joint, servo in rig.machine.servos.items()} == before
+
+
+def test_the_watchdog_of_a_servo_that_does_not_confirm_torque_off_stays_armed(tmp_path):
+    rig = Rig(tmp_path, off_time=0.0, stop_time=0.0)
+    rig.loop.start()
+    line = rig.machine.lines["legs"]
+    receive = line.receive
+    deaf = rig.machine.servos["leg_lf"]
+    line.receive = lambda data, now, baud=None: [] if data[4] == deaf["id"] else receive(data, now, baud)  # its answers
+    rig.loop.stop()
+    assert "not confirmed off at leg_lf" in rig.loop.reason
+    assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS] == [10] + [0] * 7
+
+
 def test_servo_limits_are_kept(rig):
     """Goals beyond a servo's registers would be ignored without a word; the gate reads the registers and stays inside."""
     for joint in JOINTS[4:]:

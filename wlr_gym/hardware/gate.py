@@ -121,22 +121,21 @@ class Gate:
             return False
 
     def check(self, reads: int) -> list[checks.Check]:
-        """Return all start-up checks. A watchdog that an earlier run left latched is cleared first: torque is off."""
+        """Return all start-up checks. A watchdog that an earlier run left latched is cleared, where nothing else is wrong."""
         self._set_patience(CALM_PATIENCE)
-        if not self.dry_run:
-            self._clear_watchdogs()
-        found = checks.check_servos(self.__servos, self.robot, self.hardware)
-        if all(check.ok or not check.is_fatal for check in found):
+        found = self._check_servos()
+        wrong = [check for check in found if not check.ok and check.is_fatal]
+        if wrong and not self.dry_run and all(check.what == "watchdog" for check in wrong):
+            checks.mend(self.__servos, wrong)
+            found = self._check_servos()
+            wrong = [check for check in found if not check.ok and check.is_fatal]
+        if not wrong:
             self._set_patience(self.limits.patience)
             found.append(checks.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
         return found
 
-    def _clear_watchdogs(self) -> None:
-        servos = self.__servos
-        for joint in JOINTS:
-            with contextlib.suppress(NoAnswerError, RefusedError):
-                if servos.get(joint, "bus_watchdog") < 0 and not servos.get(joint, "torque_enable"):
-                    servos.set(joint, "bus_watchdog", 0)
+    def _check_servos(self) -> list[checks.Check]:
+        return checks.check_servos(self.__servos, self.robot, self.hardware)
 
     # ---- life ----
 
@@ -293,5 +292,6 @@ class Gate:
             self._clock.wait_until(self._clock.now() + _OFF_PAUSE)
             servos.reopen_gone()
         with contextlib.suppress(ConnectionError):
-            servos.write_item("bus_watchdog", dict.fromkeys(JOINTS, 0))
+            # it goes on guarding a motor that may still be on
+            servos.write_item("bus_watchdog", {joint: 0 for joint in JOINTS if joint not in left})
         return left
