@@ -376,6 +376,20 @@ def test_torque_off_gets_through_heavy_loss(server):
     assert not any(server.machine.servos[joint]["torque_enable"] for joint in ("leg_lf", "leg_rf", "leg_lr", "leg_rr"))
 
 
+def test_a_packet_that_was_sent_in_part_does_not_count_as_sent(group, monkeypatch):
+    """The adapter is stuck: nobody heard the goal, or the torque-off, that it cut short."""
+    write = GuardedPort._write
+    monkeypatch.setattr(GuardedPort, "_write", lambda self, data: write(self, data[:-1]))
+    for act in (
+        lambda: group.write_all("torque_enable", {2: 0}),
+        lambda: group.ask_all(FAST_BLOCK),
+        lambda: group.ping(2),
+    ):
+        with pytest.raises(BusGoneError, match=r"is gone: it took \d+ of \d+ bytes"):
+            act()
+    assert group.gone
+
+
 # --- a line that never falls quiet: an open pair, another device's stream
 
 

@@ -139,15 +139,17 @@ class GuardedPort(sdk.PortHandler):
             raise self._lost(error) from None
 
     def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
-        """Send bytes. Defect 12: pyserial then waits, without end, until the device would take more."""
+        """Send all bytes. Defect 12: pyserial then waits, without end, until the device would take more."""
         try:
-            return self._write(bytes(packet))
+            if (sent := self._write(bytes(packet))) < len(packet):
+                raise OSError(f"it took {sent} of {len(packet)} bytes")
+            return sent
         except (*_GONE, TypeError, AttributeError) as error:  # the last: a port that was never opened
             raise self._lost(error) from None
 
     def _write(self, data: bytes) -> int:
         device: Any = self.ser
-        return os.write(device.fileno(), data)  # does not block: a full buffer is an OSError
+        return os.write(device.fileno(), data)  # does not block: a full buffer is an OSError, a nearly full one takes a part
 
     def getCurrentTime(self) -> float:  # noqa: N802
         """Return ms. Defect 7: the SDK's time-outs followed the wall clock, which may be set."""
@@ -169,7 +171,8 @@ class GuardedHandler(sdk.Protocol2PacketHandler):
         if is_answered or port.suspect:
             port.clearPort()
         port.suspect = is_answered
-        return SUCCESS if port.writePort(raw) == len(raw) else sdk.COMM_TX_FAIL
+        port.writePort(raw)
+        return SUCCESS
 
     def rxPacket(self, port: GuardedPort, fast_option: bool) -> tuple[list[int], Any]:  # noqa: N802
         """Receive one answer in the SDK's form. Defect 2: its removal of stuffing loses bytes in some patterns."""
