@@ -164,8 +164,8 @@ def test_watchdogs_are_armed_at_once_and_for_no_less_than_they_are_judged_by(tmp
     line, lost = rig.machine.lines["wheels"], []
     receive = line.receive
 
-    def lossy(data, now, baud=None):
-        answers = receive(data, now, baud)
+    def lossy(data, now, baud_rate=None):
+        answers = receive(data, now, baud_rate)
         arming = rig.torque().all() and b"\x62\0" in data and len(lost) < 3  # its address
         if arming and answers:
             lost.append(data)
@@ -183,8 +183,8 @@ def test_a_watchdog_that_cannot_be_armed_stops_the_start(rig):
     line, servo = rig.machine.lines["wheels"], rig.machine.servos["wheel_rf"]
     receive = line.receive
 
-    def trip(data, now, baud=None):
-        answers = receive(data, now, baud)
+    def trip(data, now, baud_rate=None):
+        answers = receive(data, now, baud_rate)
         if rig.torque().all():
             servo.set("bus_watchdog", -1)
         return answers
@@ -210,7 +210,7 @@ def test_the_watchdog_of_a_servo_that_does_not_confirm_torque_off_stays_armed(tm
     line = rig.machine.lines["legs"]
     receive = line.receive
     deaf = rig.machine.servos["leg_lf"]
-    line.receive = lambda data, now, baud=None: [] if data[4] == deaf["id"] else receive(data, now, baud)  # its answers
+    line.receive = lambda data, now, baud_rate=None: [] if data[4] == deaf["id"] else receive(data, now, baud_rate)  # its answers
     rig.loop.stop()
     assert "not confirmed off at leg_lf" in rig.loop.reason
     assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS] == [10] + [0] * 7
