@@ -123,18 +123,18 @@ class Gate:
     def check(self, reads: int) -> list[checks.Check]:
         """Return all start-up checks. A watchdog that an earlier run left latched is cleared, where nothing else is wrong."""
         self._set_patience(CALM_PATIENCE)
-        found = self._check_servos()
+        found = self._examine()
         wrong = [check for check in found if not check.ok and check.is_fatal]
         if wrong and not self.dry_run and all(check.what == "watchdog" for check in wrong):
             checks.mend(self.__servos, wrong)
-            found = self._check_servos()
+            found = self._examine()
             wrong = [check for check in found if not check.ok and check.is_fatal]
         if not wrong:
             self._set_patience(self.limits.patience)
             found.append(checks.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
         return found
 
-    def _check_servos(self) -> list[checks.Check]:
+    def _examine(self) -> list[checks.Check]:
         return checks.check_servos(self.__servos, self.robot, self.hardware)
 
     # ---- life ----
