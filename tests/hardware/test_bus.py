@@ -1,6 +1,7 @@
 """Bus groups on the emulator: each defect of dynamixel-sdk shown in the SDK and guarded here, faults, clocks, blocks."""
 
 import os
+import select
 import threading
 import time
 
@@ -310,6 +311,10 @@ def test_defect_13_a_port_in_use_is_refused_untouched_until_it_is_closed():
         assert os.read(first.ser.fileno(), 99) == b"answer"
         first.closePort()
         second.openPort()
+        os.write(ours, b"answer")
+        sdk.PortHandler(os.ttyname(theirs)).openPort()  # the SDK, while another one has it
+        assert termios.tcgetattr(theirs)[4] == termios.B1000000
+        assert not select.select([theirs], [], [], 0.0)[0]
         second.closePort()
         assert not second.is_open
     finally:

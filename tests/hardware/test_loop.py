@@ -209,8 +209,8 @@ def test_the_watchdog_of_a_servo_that_does_not_confirm_torque_off_stays_armed(tm
     rig.loop.start()
     line = rig.machine.lines["legs"]
     receive = line.receive
-    deaf = rig.machine.servos["leg_lf"]
-    line.receive = lambda data, now, baud_rate=None: [] if data[4] == deaf["id"] else receive(data, now, baud_rate)  # its answers
+    silent = rig.machine.servos["leg_lf"]["id"]
+    line.receive = lambda data, now, baud_rate=None: [] if data[4] == silent else receive(data, now, baud_rate)
     rig.loop.stop()
     assert "not confirmed off at leg_lf" in rig.loop.reason
     assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS] == [10] + [0] * 7
