@@ -343,7 +343,8 @@ def _explain(model: type[BaseModel], problem: Any, where: str) -> str:
         return f"{where}: unknown key '{field}'{nearest(location[-1], valid)}; valid: {', '.join(valid)}"
     if problem["type"] == "missing":
         return f"{where}: '{field}' is missing"
-    return f"{where}: {field} = {problem['input']!r}: {problem['msg']}"
+    value = f"{field} = {problem['input']!r}: " if field else ""  # what is about the whole file does not repeat it
+    return f"{where}: {value}{problem['msg']}"
 
 
 def _fields_at(model: Any, path: list[str]) -> list[str]:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +47,39 @@ def hardware_file(folder: Path, ports: dict[str, str], **safety) -> Path:
     return path
 
 
+@contextmanager
+def jabbering_port() -> Iterator[tuple[str, Callable[[], bytes]]]:
+    """A serial device on which something talks every 5 ms, for 5 s; yields its path, and what takes bytes sent to it."""
+    import tty  # not on Windows
+
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    os.set_blocking(master, False)
+    over = threading.Event()
+
+    def talk() -> None:
+        for _ in range(1000):
+            if over.wait(0.005):
+                return
+            with suppress(BlockingIOError):
+                os.write(master, b"\x55jabber")
+
+    def take() -> bytes:
+        with suppress(BlockingIOError):
+            return os.read(master, 65536)
+        return b""
+
+    talker = threading.Thread(target=talk, daemon=True)
+    talker.start()
+    try:
+        yield os.ttyname(slave), take
+    finally:
+        over.set()
+        talker.join()
+        os.close(master)
+        os.close(slave)
+
+
 def machine_of(core: Any) -> Any:
     """The emulated robot that a core drives."""
     return core.plant.loop.clock.machine
@@ -81,5 +118,5 @@ class Rig:
 
 __all__ = [
     "DRIVE", "HARDWARE", "JOINTS", "PATIENT", "PERIOD", "ROBOT", "Phase", "Rig", "StoppedError", "hardware_file",
-    "hardware_with", "machine_of",
+    "hardware_with", "jabbering_port", "machine_of",
 ]  # fmt: skip

@@ -1,6 +1,7 @@
 """Bus groups on the emulator: each defect of dynamixel-sdk shown in the SDK and guarded here, faults, clocks, blocks."""
 
 import os
+import select
 import threading
 import time
 
@@ -8,7 +9,7 @@ import pytest
 
 from wlr_gym.errors import InputError
 from wlr_gym.hardware import protocol
-from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.config import load_hardware, with_ports
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.tables import load_table
@@ -18,8 +19,21 @@ sdk = pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware.bus import Block, BusGroup, NoAnswerError, RefusedError, TickClock, open_all  # noqa: E402
+from robot_rig import jabbering_port  # noqa: E402
+
+from wlr_gym.hardware import checks  # noqa: E402
+from wlr_gym.hardware.bus import (  # noqa: E402
+    Block,
+    BusGroup,
+    NoAnswerError,
+    RefusedError,
+    RestlessLineError,
+    TickClock,
+    open_all,
+)
+from wlr_gym.hardware.ports import PortInUseError  # noqa: E402
 from wlr_gym.hardware.sdk import BusGoneError, GuardedHandler, GuardedPort  # noqa: E402
+from wlr_gym.hardware.servos import Servos  # noqa: E402
 
 TABLE = load_table("XM540-W150-R")
 FAST_BLOCK = Block(TABLE, "realtime_tick", "present_position")
@@ -280,16 +294,29 @@ def test_defect_10_unplugging_is_one_kind_of_error(server, group):
             act()
 
 
-def test_a_port_in_use_is_refused_until_it_is_closed():
+def test_defect_13_a_port_in_use_is_refused_untouched_until_it_is_closed():
+    import termios
+    import tty
+
     ours, theirs = os.openpty()
+    tty.setraw(theirs)
     try:
         first, second = (GuardedPort(os.ttyname(theirs), 1000000, 0.005) for _ in range(2))
         first.openPort()
-        with pytest.raises(InputError, match="in use by another program"):
+        os.write(ours, b"answer")
+        second.baudrate = 57600
+        with pytest.raises(PortInUseError, match="in use by another program"):
             second.openPort()
+        assert termios.tcgetattr(theirs)[4] == termios.B1000000  # and who has it is not disturbed
+        assert os.read(first.ser.fileno(), 99) == b"answer"
         first.closePort()
         second.openPort()
+        os.write(ours, b"answer")
+        sdk.PortHandler(os.ttyname(theirs)).openPort()  # the SDK, while another one has it
+        assert termios.tcgetattr(theirs)[4] == termios.B1000000
+        assert not select.select([theirs], [], [], 0.0)[0]
         second.closePort()
+        assert not second.is_open
     finally:
         os.close(ours)
         os.close(theirs)
@@ -352,6 +379,57 @@ def test_torque_off_gets_through_heavy_loss(server):
         left = group.torque_off(retries=30)
     assert left == set()
     assert not any(server.machine.servos[joint]["torque_enable"] for joint in ("leg_lf", "leg_rf", "leg_lr", "leg_rr"))
+
+
+def test_a_packet_that_was_sent_in_part_does_not_count_as_sent(group, monkeypatch):
+    """The adapter is stuck: nobody heard the goal, or the torque-off, that it cut short."""
+    write = GuardedPort._write
+    monkeypatch.setattr(GuardedPort, "_write", lambda self, data: write(self, data[:-1]))
+    for act in (
+        lambda: group.write_all("torque_enable", {2: 0}),
+        lambda: group.ask_all(FAST_BLOCK),
+        lambda: group.ping(2),
+    ):
+        with pytest.raises(BusGoneError, match=r"is gone: it took \d+ of \d+ bytes"):
+            act()
+    assert group.gone
+
+
+# --- a line that never falls quiet: an open pair, another device's stream
+
+
+def test_torque_off_goes_out_on_a_line_that_never_falls_quiet():
+    with jabbering_port() as (path, sent), BusGroup("legs", path, 1_000_000, LEGS, 0.05) as group:
+        with pytest.raises(NoAnswerError, match=r"no answer$"):
+            group.ping(2)
+        start = time.monotonic()
+        with pytest.raises(RestlessLineError, match="never quiet: check wiring, are two ports swapped"):
+            group.ping(2)
+        sent()
+        group.write_all("torque_enable", dict.fromkeys(LEGS, 0))
+        assert time.monotonic() - start < 2.0
+        assert protocol.sync_write(64, dict.fromkeys(LEGS, b"\0")) in sent()
+        assert group.read_all(FAST_BLOCK) == {}
+        assert group.scan() == {}
+
+
+def test_a_line_that_never_falls_quiet_does_not_keep_the_other_bus_from_torque_off():
+    with jabbering_port() as (legs, to_legs), jabbering_port() as (wheels, to_wheels):
+        hardware = with_ports(load_hardware(), {"legs": legs, "wheels": wheels})
+        servos = Servos(load_robot(), hardware, 0.02)
+        servos.open()
+        assert not servos.read().answered.any()
+        for sent in (to_legs, to_wheels):
+            sent()
+        start = time.monotonic()
+        servos.shout_off()
+        assert time.monotonic() - start < 2.0
+        for sent, ids in ((to_legs, LEGS), (to_wheels, (6, 7, 5, 8))):
+            assert protocol.sync_write(64, dict.fromkeys(ids, b"\0")) in sent()
+        (check,) = checks.check_servos(servos, load_robot(), hardware, ["leg_lf"])
+        servos.close()
+    assert check.found == "none, the line is never quiet"
+    assert "Are two ports swapped" in check.remedy
 
 
 # --- the servo's clock

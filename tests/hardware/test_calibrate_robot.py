@@ -22,9 +22,11 @@ from wlr_gym.robot import JOINTS, LEGS, load_robot
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
+from wlr_gym.hardware.bus import BusGroup
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.link import emulated_link
+from wlr_gym.hardware.sdk import BusGoneError
 
 ROBOT, NOMINAL = load_robot(), load_hardware()
 #: How the robot at hand is really mounted: not as the file says.
@@ -90,6 +92,21 @@ def test_comments_and_limits_of_the_file_stay(monkeypatch, tmp_path):
     assert [line for line in kept if line not in text.splitlines()] == []
     assert re.search(r"# Signs and zeros by wlr calibrate joints, \d{4}-\d\d-\d\d", text)
     assert load_hardware(out) == find.with_mountings(NOMINAL, {"wheel_rf": Mounting(sign=1, zero=0)})
+
+
+def test_ports_of_the_command_line_are_not_written_and_comments_stay(monkeypatch, tmp_path):
+    machine = make_machine(TRUE, monkeypatch)
+    out = tmp_path / "mine.yaml"
+    options = JointsOptions(out=out, only=("wheel_rf",), port=("legs=/tmp/robot/legs", "imu=/tmp/robot/imu"))
+    calibrate_joints(options, Operator(machine))
+    assert load_hardware(out) == find.with_mountings(NOMINAL, {"wheel_rf": Mounting(sign=1, zero=0)})
+    assert out.read_text().count("#") == nominal_text().count("#") + 1  # its own note
+    machine = sensor(monkeypatch)
+    own = ImuOptions(hardware=str(out), out=out, seconds=2.0, mounting=True, port=("imu=/tmp/robot/imu",))
+    calibrate_imu(own, Turner(machine, [(0, 0, 1), (-0.3, 0, 0.95)]))
+    found = load_hardware(out)
+    assert (found.imu.port, found.buses) == (NOMINAL.imu.port, NOMINAL.buses)
+    assert "# Limits of the safety gate" in out.read_text()
 
 
 def test_notes_do_not_pile_up_and_odd_layouts_are_written_anew(monkeypatch, tmp_path):
@@ -350,6 +367,19 @@ def test_servos_that_are_not_the_one():
     ):
         with pytest.raises(InputError, match=words):
             check_new_servo(found, bus, "wheel_lf")
+
+
+def test_an_adapter_that_goes_while_servos_are_searched_is_told(bench, monkeypatch, capsys):
+    def gone(self):
+        raise BusGoneError("port is gone: Input/output error")
+
+    _, plug = bench
+    monkeypatch.setattr(BusGroup, "scan", gone)
+    ports = ["--port", *plug("wheel_lf")]
+    assert main(["calibrate", "servo", "wheel_lf", *ports]) == 2
+    assert "port is gone: Input/output error; see wlr doctor" in capsys.readouterr().err
+    code = main(["doctor", "--scan", *ports])
+    assert (code, "First: robot, bus: port is gone" in capsys.readouterr().out) == (1, True)
 
 
 def test_servos_that_cannot_be_set_up(bench):

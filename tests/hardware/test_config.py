@@ -35,6 +35,14 @@ def edited(tmp_path, edit):
         (lambda d: d["joints"].pop("leg_lf"), "must name each of leg_lf"),
         (lambda d: d["joints"]["leg_lf"].update(sign=2), "joints.leg_lf.sign"),
         (lambda d: d["buses"]["legs"]["eeprom"].update(led=1), "led: not in the EEPROM"),
+        (
+            lambda d: d["buses"]["legs"]["eeprom"].update(operating_mode=16),
+            r"yaml: .*legs.eeprom.operating_mode is 16, expected 3",
+        ),
+        (
+            lambda d: d["buses"]["wheels"]["eeprom"].pop("operating_mode"),
+            r"yaml: .*eeprom.operating_mode is 3, expected 1",
+        ),
         (lambda d: d["buses"]["legs"].update(prot="x"), "did you mean 'port'"),
         (lambda d: d["imu"].update(gyro_range=300), "imu.gyro_range"),
     ],

@@ -22,7 +22,7 @@ from wlr_gym.evaluation import make_core, roll_out
 from wlr_gym.evaluation.deployment import REHEARSALS, act_again, loop_of, read_policy_log
 from wlr_gym.evaluation.deployment import deploy as drive
 from wlr_gym.hardware.link import MonotonicClock, emulated_robot
-from wlr_gym.hardware.log import read_events
+from wlr_gym.hardware.log import RunLog, read_events
 from wlr_gym.hardware.loop import StoppedError
 from wlr_gym.policy import make_policy
 from wlr_gym.runs.read import read_run
@@ -135,6 +135,19 @@ def test_a_stop_by_the_gate_is_reported_and_logged(tmp_path):
     assert len(read_run(result.run).table) == result.ticks
     rules = [event["rule"] for event in read_events(result.run) if event["event"] == "intervention"]
     assert "silence" in rules
+    core.close()
+
+
+def test_a_full_disk_under_the_policys_log_is_a_stop_in_good_order(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(RunLog, "policy", full)
+    core = robot_core(tmp_path)
+    result = drive(core, make_policy("pid", core.contract()))
+    assert not result.well
+    assert result.reason.startswith("computer: the log cannot be written: [Errno 28]")
+    assert result.ticks <= 2
     core.close()
 
 

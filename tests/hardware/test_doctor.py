@@ -67,6 +67,21 @@ def test_each_fault_is_named_first_with_its_remedy(machine, capsys, fault, first
     assert remedy in summary
 
 
+def test_servos_without_fast_reads_are_a_warning(monkeypatch, capsys):
+    machine = Machine(ROBOT, HARDWARE, MachineOptions(firmware=44))
+    monkeypatch.setattr(RobotOption, "link", lambda self: emulated_link(machine))
+    code, text = look(capsys)
+    assert (code, "0 faults, 8 warnings in" in text) == (0, True)
+
+
+def test_bus_speed_is_judged_by_the_hardware_files_read_time(machine, monkeypatch, capsys):
+    safety = HARDWARE.safety.model_copy(update={"read_time": 0.002})
+    hardware = HARDWARE.model_copy(update={"safety": safety})
+    monkeypatch.setattr(RobotOption, "load", lambda self: (ROBOT, hardware))
+    code, text = look(capsys)
+    assert (code, "First: robot, bus speed" in text, "expected p99 below 2 ms" in text) == (1, True, True)
+
+
 def test_a_tilted_robot_and_a_lossy_imu(machine, capsys):
     machine.inject("drop imu probability=0.1")
     code, text = look(capsys)

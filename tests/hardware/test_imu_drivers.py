@@ -1,5 +1,6 @@
 """IMU drivers: the chip on an emulated I2C bus, the stream on a pseudo-terminal and in memory; conversion and calibration."""
 
+import os
 import struct
 import time
 from dataclasses import replace
@@ -10,12 +11,16 @@ from pydantic import ValidationError
 
 from wlr_gym.errors import InputError
 from wlr_gym.hardware import calibration as calibrate
+from wlr_gym.hardware.checks import open_ports
 from wlr_gym.hardware.config import ImuCalibration, ImuPort, load_hardware, with_ports
 from wlr_gym.hardware.imu import STANDARD_GRAVITY, Frame, accel_per_count, encode_frame, gyro_per_count, to_counts
 from wlr_gym.hardware.imu_driver import Conversion, ImuGoneError, open_imu
-from wlr_gym.hardware.imu_mpu6050 import Mpu6050
+from wlr_gym.hardware.imu_mpu6050 import Mpu6050, open_bus
 from wlr_gym.hardware.imu_stream import ImuStream, StreamClock
+from wlr_gym.hardware.ports import PortInUseError
+from wlr_gym.hardware.servos import Servos
 from wlr_gym.plants.sensors import rotation
+from wlr_gym.robot import load_robot
 
 G = STANDARD_GRAVITY
 PORT = ImuPort(port="/dev/i2c-9", driver="i2c", rate=200.0)
@@ -315,6 +320,47 @@ def test_a_port_that_is_not_there():
     pytest.importorskip("serial")
     with pytest.raises(InputError, match=r"no_such_port: cannot be opened"):
         open_imu(ImuPort(port="/dev/no_such_port", rate=200.0))
+
+
+def test_a_stream_in_use_is_refused_and_the_doctor_says_what_to_do(tmp_path):
+    """Who looks at a robot that drives must not take its readings."""
+    pytest.importorskip("termios")
+    ours, theirs = os.openpty()
+    hardware = with_ports(load_hardware(), {name: os.ttyname(theirs) for name in ("legs", "imu")})
+    try:
+        with ImuStream(hardware.imu):
+            other = ImuStream(hardware.imu)
+            with pytest.raises(PortInUseError, match=r"IMU port .* is in use by another program"):
+                other.open()
+            servos = Servos(load_robot(), with_ports(hardware, {"wheels": str(tmp_path / "none")}))
+            found = {check.where: check for check in open_ports(servos, other, hardware)}
+        assert {where: "End that program first" in check.remedy for where, check in found.items()} == {
+            "legs": True, "wheels": False, "imu": True,
+        }  # fmt: skip
+        with other:
+            pass
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+def test_a_chip_in_use_is_refused(tmp_path, monkeypatch):
+    smbus2 = pytest.importorskip("smbus2")
+
+    class Bus:
+        def __init__(self, path):
+            self.fd = os.open(path, os.O_RDWR | os.O_CREAT)
+
+        def close(self):
+            os.close(self.fd)
+
+    monkeypatch.setattr(smbus2, "SMBus", Bus)
+    path = str(tmp_path / "i2c-1")
+    first = open_bus(path)
+    with pytest.raises(PortInUseError, match=r"IMU bus .*i2c-1 is in use by another program"):
+        open_bus(path)
+    first.close()
+    open_bus(path).close()
 
 
 def test_on_the_emulated_robots_port():

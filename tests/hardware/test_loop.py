@@ -158,6 +158,64 @@ def test_a_watchdog_left_latched_is_cleared(rig):
     again.loop.close()
 
 
+def test_watchdogs_are_armed_at_once_and_for_no_less_than_they_are_judged_by(tmp_path):
+    """Answers of one bus are lost while they are armed: those of the other one must not starve meanwhile."""
+    rig = Rig(tmp_path, watchdog=0.13)
+    line, lost = rig.machine.lines["wheels"], []
+    receive = line.receive
+
+    def lossy(data, now, baud_rate=None):
+        answers = receive(data, now, baud_rate)
+        arming = rig.torque().all() and b"\x62\0" in data and len(lost) < 3  # its address
+        if arming and answers:
+            lost.append(data)
+            return []
+        return answers
+
+    line.receive = lossy
+    rig.loop.start()
+    assert len(lost) == 3
+    assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS] == [7] * 8
+    rig.loop.close()
+
+
+def test_a_watchdog_that_cannot_be_armed_stops_the_start(rig):
+    line, servo = rig.machine.lines["wheels"], rig.machine.servos["wheel_rf"]
+    receive = line.receive
+
+    def trip(data, now, baud_rate=None):
+        answers = receive(data, now, baud_rate)
+        if rig.torque().all():
+            servo.set("bus_watchdog", -1)
+        return answers
+
+    line.receive = trip
+    with pytest.raises(StoppedError, match="the watchdog of wheel_rf does not say that it is armed"):
+        rig.loop.start()
+    assert not rig.torque().any()
+
+
+def test_checks_that_fail_write_nothing(rig):
+    rig.machine.servos["leg_lf"].set("bus_watchdog", -1)
+    rig.machine.servos["wheel_rr"].set("drive_mode", 1)
+    before = {joint: bytes(servo._memory)[:120] for joint, servo in rig.machine.servos.items()}
+    with pytest.raises(StoppedError, match="drive_mode"):
+        rig.loop.start()
+    assert {joint: bytes(servo._memory)[:120] for joint, servo in rig.machine.servos.items()} == before
+
+
+def test_the_watchdog_of_a_servo_that_does_not_confirm_torque_off_stays_armed(tmp_path):
+    rig = Rig(tmp_path, off_time=0.0, stop_time=0.0)
+    rig.loop.start()
+    line = rig.machine.lines["legs"]
+    receive = line.receive
+    silent = rig.machine.servos["leg_lf"]["id"]
+    line.receive = lambda data, now, baud_rate=None: [] if data[4] == silent else receive(data, now, baud_rate)
+    rig.loop.stop()
+    assert "not confirmed off at leg_lf" in rig.loop.reason
+    assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS] == [10] + [0] * 7
+
+
 def test_servo_limits_are_kept(rig):
     """Goals beyond a servo's registers would be ignored without a word; the gate reads the registers and stays inside."""
     for joint in JOINTS[4:]:

@@ -1,5 +1,6 @@
 """Trouble that is not the robot's: full disk, lost terminal, impatient operator, sleeping program; and legs out of place."""
 
+import io
 import os
 import signal
 
@@ -14,7 +15,7 @@ from robot_rig import DRIVE, HARDWARE, JOINTS, PERIOD, ROBOT, Phase, Rig, Stoppe
 from wlr_gym.errors import InputError
 from wlr_gym.hardware import checks
 from wlr_gym.hardware.gate import CALM_SPEED
-from wlr_gym.hardware.log import read_events
+from wlr_gym.hardware.log import Table, read_events
 from wlr_gym.hardware.loop import STOP_SIGNALS, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.plants.base import PlantOptions, RobotOptions
@@ -79,6 +80,27 @@ def test_a_full_disk_stops_the_robot_in_good_order(rig, phase):
     if phase != "ramp":
         assert np.abs(speeds[-1]).max() < 0.4  # of 3: the wheels were stopped before
     rig.loop.close()
+
+
+class FillingDisk(io.FileIO):
+    """A file on a disk with room for 30 bytes."""
+
+    def write(self, data, /):
+        room = 30 - self.tell()
+        if not room:
+            raise OSError(28, "No space left on device")
+        return super().write(data[:room])
+
+
+def test_a_log_ends_in_a_whole_row_when_the_disk_fills_up(tmp_path):
+    table = Table(tmp_path / "run_01.csv", ["t", "value"])
+    table._file.close()
+    table._file = FillingDisk(tmp_path / "partial_run_01.csv", "a")
+    table.add(np.array([0.0, 0.125]))
+    with pytest.raises(OSError, match="No space left"):
+        table.add(np.array([0.02, 0.123456789012]))
+    table.finish()
+    assert (tmp_path / "run_01.csv").read_text() == "t,value\n0.0,0.125\n"
 
 
 def test_a_terminal_that_is_gone_stops_the_robot_in_good_order(rig):

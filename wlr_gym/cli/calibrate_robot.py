@@ -117,7 +117,8 @@ def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
     print(f"searching {bus.port} ...")
     likely = (FACTORY_RATE, bus.baud_rate)
     others = [rate for rate in BAUD_RATES if rate not in likely]
-    found = find_servos(name, bus.port, likely) or find_servos(name, bus.port, others)
+    with _dialogue():
+        found = find_servos(name, bus.port, likely) or find_servos(name, bus.port, others)
     servo = check_new_servo(found, bus, options.joint)
     registers = ", ".join(f"{item} {count}" for item, count in bus.eeprom.items())
     print(f"found: {servo}\n{options.joint} gets id {id}, {bus.baud_rate} bit/s, {registers}")
@@ -166,7 +167,7 @@ def _calibrate_joints(options: JointsOptions, robot: Robot, hardware: Hardware, 
         old = hardware.joints[joint]
         print(f"{joint:9} sign {old.sign:+d} -> {new.sign:+d}, zero {old.zero} -> {new.zero}")
     note = f"Signs and zeros by wlr calibrate joints, {_today()}: count = zero + sign * angle / (2 pi / 4096)."
-    return _save(options.out, source, with_mountings(hardware, mountings), "joints", note, ask)
+    return _save(options.out, source, lambda file: with_mountings(file, mountings), "joints", note, ask)
 
 
 def _require_limp(servos: Servos, ask: Ask) -> None:
@@ -232,7 +233,7 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
         for name, value in calibration.model_dump(exclude_unset=True).items():
             print(f"{name:13} {value}")
         note = f"IMU calibrated by wlr calibrate imu, {_today()}: mounting * scale * (measured - offset), SI units."
-        return _save(options.out, source, with_imu_calibration(hardware, calibration), "imu", note, ask)
+        return _save(options.out, source, lambda file: with_imu_calibration(file, calibration), "imu", note, ask)
     except _StoppedError:
         return _stopped()
     finally:
@@ -335,12 +336,14 @@ def _source(hardware: str, out: Path) -> Path:
     return source
 
 
-def _save(out: Path, source: Path, hardware: Hardware, section: str, note: str, ask: Ask) -> int:
+def _save(out: Path, source: Path, change: Callable[[Hardware], Hardware], section: str, note: str, ask: Ask) -> int:
+    """Ask, and write the file with what was found: ``change`` is made to what it says, not to ports of the command line."""
     from wlr_gym.hardware.calibration import save_hardware
+    from wlr_gym.hardware.config import load_hardware
 
     if not _yes(ask, f"Write {out}?"):
         return _stopped()
-    save_hardware(out, source, hardware, section, note)
+    save_hardware(out, source, change(load_hardware(source)), section, note)
     print(f"written: {out}")
     return OK
 

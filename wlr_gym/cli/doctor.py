@@ -76,6 +76,7 @@ def run(options: Options) -> int:
 def examine(link: Link, robot: Robot, hardware: Hardware, options: Options, console: Console) -> list[Check]:
     """Return all checks of ports, adapters, servos, buses and IMU; mends and scans on the way, where that was asked for."""
     from wlr_gym.hardware import checks
+    from wlr_gym.hardware.loop import TIMED_READS
     from wlr_gym.hardware.sdk import BusGoneError
 
     ports = checks.open_ports(link.servos, link.imu, hardware)
@@ -83,9 +84,9 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: Options, cons
     open_here = {check.where for check in ports if check.ok}
     buses = [name for name in hardware.buses if name in open_here]
     joints = [joint for name in buses for joint in hardware.buses[name].joints]
-    if options.scan:
-        _scan(link, hardware, buses, console)
     try:
+        if options.scan:
+            _scan(link, hardware, buses, console)
         servos = checks.check_servos(link.servos, robot, hardware, joints)
         if options.mend:
             left = checks.mend(link.servos, servos)
@@ -93,8 +94,8 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: Options, cons
             servos = checks.check_servos(link.servos, robot, hardware, joints)
         found += servos
         if len(buses) == len(hardware.buses) and all(check.ok for check in servos if check.what == "answer"):
-            found.append(checks.check_bus_speed(link.servos, now=link.clock.now))
-    except BusGoneError as error:
+            found.append(checks.check_bus_speed(link.servos, TIMED_READS, hardware.safety.read_time, link.clock.now))
+    except (BusGoneError, InputError) as error:  # the latter: gone when a scan opens it again
         found.append(checks.Check("robot", "bus", False, str(error), "a bus that stays", "Check plugs and supply."))
     if "imu" in open_here:
         found += checks.check_imu(link.imu, hardware.imu, link.clock)

@@ -96,8 +96,7 @@ def deploy(core: Core, policy: Policy, seed: int = 0, command: Mapping[str, floa
 
 
 def _log(core: Core, loop: ControlLoop, action: NDArray[np.float32]) -> None:
-    if loop.log is not None:
-        loop.log.policy(policy_columns(core), np.concatenate([core.command[0], np.asarray(action, np.float64)[0]]))
+    loop.log_policy(policy_columns(core), np.concatenate([core.command[0], np.asarray(action, np.float64)[0]]))
 
 
 def policy_columns(core: Core) -> list[str]:

@@ -35,6 +35,10 @@ class NoAnswerError(TimeoutError):
     """A servo did not answer."""
 
 
+class RestlessLineError(NoAnswerError):
+    """A servo did not answer, or was not heard: the line never falls quiet."""
+
+
 class RefusedError(RuntimeError):
     """A servo refused an instruction.
 
@@ -278,6 +282,8 @@ class BusGroup:
         where = f"bus {self.name}, id {packet.id}: {what}"
         if status is None:
             self._count(self.statistics.missing, packet.id)
+            if not self._port.quiet:
+                raise RestlessLineError(f"{where}: no answer, the line is never quiet: check wiring, are two ports swapped?")
             raise NoAnswerError(f"{where}: no answer")
         if status.alert:
             self._count(self.statistics.alerts, packet.id)

@@ -236,15 +236,16 @@ def save_hardware(path: Path, source: Path, hardware: Hardware, section: str, no
     Args:
         path: file to write; may be the source.
         source: file the hardware was loaded from.
-        hardware: what it shall say.
-        section: ``joints`` or ``imu``: the part that changed.
+        hardware: what its section shall say.
+        section: ``joints`` or ``imu``: the only part that is changed.
         note: comment for the section.
 
     Raises:
         InputError: it cannot be written.
     """
-    content = hardware.model_dump(mode="json", exclude_unset=True)
-    patched = _replace_section(source.read_text(encoding="utf-8"), section, f"# {note}\n" + _yaml({section: content[section]}))
+    changed = hardware.model_dump(mode="json", exclude_unset=True)[section]
+    content = {**read_yaml(source), section: changed}
+    patched = _replace_section(source.read_text(encoding="utf-8"), section, f"# {note}\n" + _yaml({section: changed}))
 
     def write(temporary: Path) -> None:
         temporary.write_text(patched, encoding="utf-8")

@@ -11,7 +11,10 @@ from wlr_gym.errors import InputError
 from wlr_gym.hardware.limits import Safety
 from wlr_gym.hardware.tables import BAUD_RATES, load_table
 from wlr_gym.paths import find_config
-from wlr_gym.robot import JOINTS, Vector3, parse_config, read_yaml
+from wlr_gym.robot import JOINTS, LEGS, Vector3, parse_config, read_yaml
+
+#: Operating modes of legs and wheels: what the safety gate writes goals for. In another one a goal means something else.
+POSITION_MODE, VELOCITY_MODE = 3, 1
 
 
 class _Model(BaseModel):
@@ -106,6 +109,18 @@ class Hardware(_Model):
         wired = [joint for bus in self.buses.values() for joint in bus.joints]
         if sorted(wired) != sorted(JOINTS) or set(self.joints) != set(JOINTS):
             raise ValueError(f"buses and joints must name each of {', '.join(JOINTS)} once")
+        return self
+
+    @model_validator(mode="after")
+    def _goals_mean_what_is_written(self) -> Hardware:
+        for name, bus in self.buses.items():
+            found = bus.eeprom.get("operating_mode", load_table(bus.model)["operating_mode"].default)
+            for joint in bus.joints:
+                expected = POSITION_MODE if joint in LEGS else VELOCITY_MODE
+                if found != expected:
+                    raise ValueError(
+                        f"buses.{name}.eeprom.operating_mode is {found}, expected {expected}: {joint} is driven in that mode"
+                    )
         return self
 
 

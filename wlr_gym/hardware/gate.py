@@ -6,6 +6,7 @@ What is safe is decided in :mod:`wlr_gym.hardware.safety`, by pure functions; he
 from __future__ import annotations
 
 import contextlib
+import math
 from collections import Counter
 from collections.abc import Iterable
 
@@ -42,8 +43,8 @@ WATCHDOG_UNIT = 0.02
 CALM_PATIENCE = 0.05
 #: Fastest goals of legs on the way to the start pose, over ``start_speed``: a minimum-jerk path needs 1.9 of it.
 CALM_SPEED = 2.0
-#: Reads before the timed ones: the bus finds out whether its servos know fast reads.
-_UNTIMED_READS = 5
+#: Times that the watchdogs are written and looked at.
+_ARM_TRIES = 10
 #: s between tries to switch off servos that do not confirm it.
 _OFF_PAUSE = 0.05
 
@@ -120,24 +121,21 @@ class Gate:
             return False
 
     def check(self, reads: int) -> list[checks.Check]:
-        """Return all start-up checks. A watchdog that an earlier run left latched is cleared first: torque is off."""
+        """Return all start-up checks. A watchdog that an earlier run left latched is cleared, where nothing else is wrong."""
         self._set_patience(CALM_PATIENCE)
-        if not self.dry_run:
-            self._clear_watchdogs()
-        found = checks.check_servos(self.__servos, self.robot, self.hardware)
-        if all(check.ok or not check.is_fatal for check in found):
+        found = self._examine()
+        wrong = [check for check in found if not check.ok and check.is_fatal]
+        if wrong and not self.dry_run and all(check.what == "watchdog" for check in wrong):
+            checks.mend(self.__servos, wrong)
+            found = self._examine()
+            wrong = [check for check in found if not check.ok and check.is_fatal]
+        if not wrong:
             self._set_patience(self.limits.patience)
-            for _ in range(_UNTIMED_READS):
-                self.read()
             found.append(checks.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
         return found
 
-    def _clear_watchdogs(self) -> None:
-        servos = self.__servos
-        for joint in JOINTS:
-            with contextlib.suppress(NoAnswerError, RefusedError):
-                if servos.get(joint, "bus_watchdog") < 0 and not servos.get(joint, "torque_enable"):
-                    servos.set(joint, "bus_watchdog", 0)
+    def _examine(self) -> list[checks.Check]:
+        return checks.check_servos(self.__servos, self.robot, self.hardware)
 
     # ---- life ----
 
@@ -168,9 +166,20 @@ class Gate:
         self._confirm_goals()
         for joint in JOINTS:
             servos.set(joint, "torque_enable", 1)
-        for joint in JOINTS:
-            servos.set(joint, "bus_watchdog", max(1, round(self.limits.watchdog / WATCHDOG_UNIT)))
         self._set_patience(self.limits.patience)
+        self._arm_watchdogs()
+
+    def _arm_watchdogs(self) -> None:
+        """Arm all watchdogs at once, and see that they are: where one bus is waited for, those of the other one would trip."""
+        count = math.ceil(self.limits.watchdog / WATCHDOG_UNIT - 1e-9)  # up: what is judged by the limit has not tripped yet
+        wrong: list[str] = []
+        for _ in range(_ARM_TRIES):
+            self.__servos.write_item("bus_watchdog", dict.fromkeys(JOINTS, count))
+            held = self.__servos.get_all("bus_watchdog")
+            wrong = [joint for joint in JOINTS if held.get(joint) != count]
+            if not wrong:
+                return
+        raise NoAnswerError(f"the watchdog of {', '.join(wrong)} does not say that it is armed")
 
     def _set_patience(self, seconds: float) -> None:
         for group in self.__servos.groups.values():
@@ -283,5 +292,6 @@ class Gate:
             self._clock.wait_until(self._clock.now() + _OFF_PAUSE)
             servos.reopen_gone()
         with contextlib.suppress(ConnectionError):
-            servos.write_item("bus_watchdog", dict.fromkeys(JOINTS, 0))
+            # it goes on guarding a motor that may still be on
+            servos.write_item("bus_watchdog", {joint: 0 for joint in JOINTS if joint not in left})
         return left

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from wlr_gym.errors import InputError, require_package
 from wlr_gym.hardware.config import ImuPort
 from wlr_gym.hardware.imu_driver import Conversion, Counts, ImuGoneError, ImuReading, ImuStatistics
+from wlr_gym.hardware.ports import lock
 
 SAMPLE_RATE_DIVIDER, CONFIG, GYRO_CONFIG, ACCEL_CONFIG = 0x19, 0x1A, 0x1B, 0x1C
 INTERRUPT_ENABLE, INTERRUPT_STATUS, POWER_1, WHO_AM_I = 0x38, 0x3A, 0x6B, 0x75
@@ -29,7 +30,7 @@ _PATIENCE = 25
 
 
 class I2cBus(Protocol):
-    """What is used of ``smbus2.SMBus``. Failures are ``OSError``."""
+    """What is used of ``smbus2.SMBus`` once it is open. Failures are ``OSError``."""
 
     def read_byte_data(self, address: int, register: int) -> int: ...
     def write_byte_data(self, address: int, register: int, value: int) -> None: ...
@@ -53,7 +54,7 @@ def open_bus(path: str) -> I2cBus:
     """Open an I2C device such as ``/dev/i2c-1``.
 
     Raises:
-        InputError: it is not there, or cannot be opened.
+        InputError: it is not there, cannot be opened, or another program of this library has it.
     """
     require_package("smbus2", "robot")
     import smbus2
@@ -63,6 +64,11 @@ def open_bus(path: str) -> I2cBus:
     except (OSError, TypeError) as error:
         hint = "switch I2C on in the system's settings and join the group 'i2c'"
         raise InputError(f"IMU bus {path}: cannot be opened: {error}; {hint}") from None
+    try:
+        lock(bus.fd, path, "IMU bus")
+    except InputError:
+        bus.close()
+        raise
     return bus
 
 

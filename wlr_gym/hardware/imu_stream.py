@@ -6,10 +6,11 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from wlr_gym.errors import InputError, require_package
+from wlr_gym.errors import require_package
 from wlr_gym.hardware.config import ImuPort
 from wlr_gym.hardware.imu import Frame, FrameParser
 from wlr_gym.hardware.imu_driver import Conversion, ImuGoneError, ImuReading, ImuStatistics
+from wlr_gym.hardware.ports import open_serial
 
 #: Bytes taken at once; more than the system keeps for a port nobody reads.
 _CHUNK = 65536
@@ -27,15 +28,10 @@ def open_device(port: ImuPort) -> Device:
     """Open the serial port.
 
     Raises:
-        InputError: it is not there, or cannot be opened.
+        InputError: it is not there, cannot be opened, or another program has it.
     """
     require_package("serial", "robot")
-    import serial
-
-    try:
-        return serial.Serial(port.port, port.baud_rate, timeout=0)
-    except (OSError, serial.SerialException) as error:
-        raise InputError(f"IMU port {port.port}: cannot be opened: {error}") from None
+    return open_serial(port.port, port.baud_rate, "IMU port")
 
 
 class StreamClock:

@@ -1,12 +1,14 @@
 """Logs of runs on the robot: measured runs, written row by row while it moves, with what the safety gate did beside them.
 
-Each row and event is one write to the file, so that a process that is killed leaves all it saw. While a run is going on its
+Each row and event goes to the file at once, so that a process that is killed leaves all it saw. While a run is going on its
 files are called ``partial_run_01.csv`` and so on, which no data set takes for a run; they can be read all the same.
 """
 
 from __future__ import annotations
 
+import io
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,19 @@ _HEADER = [name for name in COLUMNS if name == "t" or name in COMMANDS or (name 
 _ORDER = [("t", *COMMANDS, *SENSED).index(name) for name in _HEADER]
 
 
+def _append(file: io.FileIO, line: str) -> None:
+    """Add a line, whole or not at all: a disk that fills up takes a part of it, and tells by the number alone."""
+    data, done = (line + "\n").encode(), 0
+    try:
+        while done < len(data):
+            done += file.write(data[done:])
+    except OSError:
+        if done:
+            file.seek(-done, os.SEEK_END)
+            file.truncate()
+        raise
+
+
 class Table:
     """A CSV file that grows row by row, under its partial name until it is finished.
 
@@ -39,12 +54,12 @@ class Table:
         self.rows = 0
         self._partial = path.with_name(PARTIAL + path.name)
         self._file = self._partial.open("xb", buffering=0)
-        self._file.write((",".join(header) + "\n").encode())
+        _append(self._file, ",".join(header))
 
     def add(self, values: np.ndarray) -> None:
         """Write one row; NaN is an empty cell. Numbers read back as the same float64."""
         cells = ("" if value != value else repr(value) for value in values.tolist())
-        self._file.write((",".join(cells) + "\n").encode())
+        _append(self._file, ",".join(cells))
         self.rows += 1
 
     def finish(self) -> None:
@@ -115,7 +130,7 @@ class RunLog:
         """Write what happened at ``time`` (s)."""
         if not self._events.closed:
             line = {"t": round(time, 6), "event": kind, **content}
-            self._events.write((json.dumps(line) + "\n").encode())
+            _append(self._events, json.dumps(line))
 
     def finish(self) -> None:
         """Close the files and give them their names."""

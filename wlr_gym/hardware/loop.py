@@ -380,6 +380,12 @@ class ControlLoop:
         except OSError as error:
             self._log_trouble = self._log_trouble or f"the log cannot be written: {error}"
 
+    def log_policy(self, names: list[str], values: Array) -> None:
+        """Log what the policy was commanded and answered for the row that comes next; a log that fails stops the robot."""
+        if self.log is not None and not self._log_trouble:
+            with self._logging():
+                self.log.policy(names, values)
+
     def _release_guard(self) -> None:
         if self._guard is not None:
             self._guard.release()

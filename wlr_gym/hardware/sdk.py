@@ -6,18 +6,18 @@ defect in the SDK and its absence here. Import only behind ``require_package``: 
 
 from __future__ import annotations
 
-import errno
 import os
 import select
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import dynamixel_sdk as sdk
 import serial
 
 from wlr_gym.errors import InputError
 from wlr_gym.hardware import protocol
+from wlr_gym.hardware.ports import open_serial
 from wlr_gym.hardware.protocol import BROADCAST, Instruction, Packet, Parser, Status
 
 try:
@@ -28,24 +28,13 @@ except ImportError:  # not on Windows
     _GONE = (OSError, serial.SerialException)
 
 _UNANSWERED = (Instruction.SYNC_WRITE, Instruction.BULK_WRITE)
+#: A line that never falls quiet is let talk for the patience and this many times more, yet no longer than these s more.
+_MORE_PATIENCE, _MORE_TIME = 3.0, 0.05
 SUCCESS, TIMEOUT, CORRUPT = sdk.COMM_SUCCESS, sdk.COMM_RX_TIMEOUT, sdk.COMM_RX_CORRUPT
 
 
 class BusGoneError(ConnectionError):
     """The port does not work any more: unplugged adapter, dead driver."""
-
-
-def _lock(descriptor: int) -> bool:
-    """Keep other programs of this library off a port until it is closed or its process ends; False if one has it already."""
-    try:
-        import fcntl
-    except ImportError:  # Windows opens a serial port for one program only
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)
-    return True
 
 
 class GuardedPort(sdk.PortHandler):
@@ -58,6 +47,7 @@ class GuardedPort(sdk.PortHandler):
 
     Attributes:
         suspect: the last exchange did not end well; what still comes in belongs to it.
+        quiet: the line fell quiet when it was last waited for.
         gone: it has failed since it was opened.
     """
 
@@ -68,6 +58,7 @@ class GuardedPort(sdk.PortHandler):
         self.parser = Parser()
         self.queue: list[Packet] = []
         self.suspect = False
+        self.quiet = True
         self.gone = False
         self.discarded = 0
 
@@ -88,19 +79,17 @@ class GuardedPort(sdk.PortHandler):
 
     def openPort(self) -> bool:  # noqa: N802
         """Open the device. Defect 11: a missing one raised whatever pyserial had; now an InputError that names it."""
-        try:
-            opened = super().openPort()
-        except _GONE as error:
-            raise InputError(f"port {self.port_name}: cannot be opened: {error}") from None
-        if not opened:
+        if not super().openPort():
             raise InputError(f"port {self.port_name}: baud rate {self.baudrate} is not one dynamixel-sdk knows")
-        assert self.ser is not None  # the SDK made it: it opened
-        if not _lock(self.ser.fileno()):
-            self.closePort()
-            raise InputError(
-                f"port {self.port_name} is in use by another program: two readers would steal each other's answers"
-            )
         self.gone = False
+        return True
+
+    def setupPort(self, cflag_baud: int) -> Literal[True]:  # noqa: N802
+        """Set up the device. Defect 13: the SDK sets speed and throws input away, whoever drives servos on the port."""
+        self.closePort()
+        self.ser = open_serial(self.port_name, self.baudrate)
+        self.is_open = True
+        self.tx_time_per_byte = 10e3 / self.baudrate
         return True
 
     def closePort(self) -> None:  # noqa: N802
@@ -112,15 +101,28 @@ class GuardedPort(sdk.PortHandler):
         """Forget what came in. Defect 9: a late answer was taken for the next one; after a time-out, wait for a quiet line."""
         self.parser.clear()
         self.queue.clear()
-        while self.suspect and (data := self._wait_and_read(4096, self.patience)):
-            self.discarded += len(data)
+        self.quiet = not self.suspect or self._falls_quiet()
         try:
             super().clearPort()
         except (*_GONE, AttributeError) as error:
             raise self._lost(error) from None
 
+    def _falls_quiet(self) -> bool:
+        """Let pass what still comes. An end is set to it: on a line that always talks, torque-off must go out all the same."""
+        end = self.getCurrentTime() + (self.patience + min(_MORE_PATIENCE * self.patience, _MORE_TIME)) * 1e3
+        while self.getCurrentTime() < end:
+            data = self._wait_and_read(4096, self.patience)
+            if not data:
+                return True
+            self.discarded += len(data)
+        return False
+
     def readPort(self, length: int) -> bytes:  # noqa: N802
-        """Return bytes as soon as there are some. Defect 7: the SDK spins at full load until they come."""
+        """Return bytes as soon as there are some. Defect 7: the SDK spins at full load until they come.
+
+        Its scan counts what came down from what can come, and on a line that always talks asks for less than nothing.
+        """
+        length = max(1, length)
         return self._wait_and_read(length, max(0.0, self.packet_timeout - self.getTimeSinceStart()) * 1e-3)
 
     def _wait_and_read(self, length: int, seconds: float) -> bytes:
@@ -137,15 +139,17 @@ class GuardedPort(sdk.PortHandler):
             raise self._lost(error) from None
 
     def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
-        """Send bytes. Defect 12: pyserial then waits, without end, until the device would take more."""
+        """Send all bytes. Defect 12: pyserial then waits, without end, until the device would take more."""
         try:
-            return self._write(bytes(packet))
+            if (sent := self._write(bytes(packet))) < len(packet):
+                raise OSError(f"it took {sent} of {len(packet)} bytes")
+            return sent
         except (*_GONE, TypeError, AttributeError) as error:  # the last: a port that was never opened
             raise self._lost(error) from None
 
     def _write(self, data: bytes) -> int:
         device: Any = self.ser
-        return os.write(device.fileno(), data)  # does not block: a full buffer is an OSError
+        return os.write(device.fileno(), data)  # does not block: a full buffer is an OSError, a nearly full one takes a part
 
     def getCurrentTime(self) -> float:  # noqa: N802
         """Return ms. Defect 7: the SDK's time-outs followed the wall clock, which may be set."""
@@ -167,7 +171,8 @@ class GuardedHandler(sdk.Protocol2PacketHandler):
         if is_answered or port.suspect:
             port.clearPort()
         port.suspect = is_answered
-        return SUCCESS if port.writePort(raw) == len(raw) else sdk.COMM_TX_FAIL
+        port.writePort(raw)
+        return SUCCESS
 
     def rxPacket(self, port: GuardedPort, fast_option: bool) -> tuple[list[int], Any]:  # noqa: N802
         """Receive one answer in the SDK's form. Defect 2: its removal of stuffing loses bytes in some patterns."""

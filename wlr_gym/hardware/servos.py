@@ -228,6 +228,16 @@ class Servos:
         """Write a count into a joint's control table item; see :meth:`BusGroup.write`. A lost answer is asked for again."""
         _persist(self._group(joint).write, self._id(joint), item, count)
 
+    def get_all(self, item: str) -> dict[str, int]:
+        """Return joint -> count of an item, of the joints that answered; the buses work at the same time.
+
+        Raises:
+            BusGoneError: a port is gone.
+        """
+        tables = {name: next(iter(group.servos.values())) for name, group in self.groups.items()}
+        readings = self._read({name: Block(table, item, item) for name, table in tables.items()})
+        return {joint: readings[id].counts[item] for joint, id in zip(JOINTS, self._ids, strict=True) if id in readings}
+
     def _id(self, joint: str) -> int:
         return self._ids[JOINTS.index(joint)]
 
