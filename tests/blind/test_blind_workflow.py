@@ -1,10 +1,15 @@
-"""The gap workflow on data with sealed truths. Minutes per set: ``WLR_BLIND_SETS`` says how many (240 = the full matrix)."""
+"""The gap workflow on data with hidden effects of another simulator: one set of three runs, and the sealed matrix.
+
+The matrix takes minutes per set: ``WLR_BLIND_SETS`` says how many (240 = all).
+"""
 
 import os
 
 import pytest
 
 from wlr_gym.bench import gap
+from wlr_gym.bench.blind.cases import case
+from wlr_gym.bench.blind.score import intervals_hold, size_error
 
 SETS = int(os.environ.get("WLR_BLIND_SETS", "1"))
 
@@ -18,3 +23,19 @@ def test_workflow_against_sealed_truths(tmp_path):
     assert report["false_alarms"]["refused_good_data"]["hits"] == 0
     if SETS >= 200:
         assert not [line for line in gap.lines(report) if line.met == "no"]
+
+
+def test_one_slippery_wheel_is_named_from_three_runs(tmp_path):
+    """A seed of development data: one wheel on mu 0.25, straight driving, skid turns and S-curves."""
+    plan, one = gap.Plan(tmp_path, sets=1, runs=(0, 2, 3)), case(72, first_seed=700)
+    (true,) = one.effects
+    assert true["name"] == "friction_asymmetry"
+    for folder in ("data", "results", "work"):
+        (tmp_path / folder).mkdir()
+    gap.run_case(plan, one, gap.analyse_folder)
+    result = gap.read_result(plan.result_file(one))
+    (found,) = result["effects"]
+    assert (result["verdict"], found["name"], found["where"]) == ("effect_found", true["name"], true["where"])
+    assert size_error(true, found) < 0.1
+    assert all(intervals_hold(true, found))
+    assert result["gap"]["reduction"] > 0.5
