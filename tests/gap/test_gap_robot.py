@@ -433,7 +433,11 @@ def test_a_rate_against_its_angle(tmp_path, good, rate):
         yaw = 0.5 * np.sin(2.0 * table["t"])
         return table.assign(cam_yaw=yaw.where(table["cam_yaw"].notna()), gyro_z=np.cos(2.0 * table["t"]))
 
+    def turned_round(table, k):  # the same about a heading of pi, told within a turn
+        return turning(table, k).assign(cam_yaw=lambda told: (told["cam_yaw"] + 2 * np.pi) % (2 * np.pi) - np.pi)
+
     assert kinds(open_robot(folder_of(tmp_path / "right", good, 3, turning))[1]) == set()
+    assert kinds(open_robot(folder_of(tmp_path / "round", good, 3, turned_round))[1]) == set()
     flipped = folder_of(
         tmp_path / "wrong", good, 3, lambda table, k: turning(table, k).assign(**{rate: -turning(table, k)[rate]})
     )

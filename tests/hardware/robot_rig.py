@@ -49,7 +49,7 @@ def hardware_file(folder: Path, ports: dict[str, str], **safety) -> Path:
 
 @contextmanager
 def jabbering_port() -> Iterator[tuple[str, Callable[[], bytes]]]:
-    """A serial device on which something talks every 5 ms, for 5 s; yields its path, and what takes bytes sent to it."""
+    """A serial device on which something talks every 5 ms, for 30 s; yields its path, and what takes bytes sent to it."""
     import tty  # not on Windows
 
     master, slave = os.openpty()
@@ -58,7 +58,7 @@ def jabbering_port() -> Iterator[tuple[str, Callable[[], bytes]]]:
     over = threading.Event()
 
     def talk() -> None:
-        for _ in range(1000):
+        for _ in range(6000):
             if over.wait(0.005):
                 return
             with suppress(BlockingIOError):

@@ -336,3 +336,28 @@ def test_the_way_to_the_start_pose_waits_for_slow_servos():
 def test_a_limit_of_nothing_is_refused():
     with pytest.raises(ValidationError, match="start_error"):
         Safety(start_error=0.0)
+
+
+def test_the_way_to_the_start_pose_waits_for_the_operator(tmp_path):
+    """A dead-man's hold is no blocked leg: the way goes on when somebody is there again."""
+    rig = Rig(tmp_path, deadman=0.3)
+    held = []
+
+    def look():
+        if rig.loop.phase is Phase.RAMP:
+            held.append(rig.loop.goals[0])
+            if len(held) >= 50:  # a second later
+                rig.loop.operator_is_there()
+
+    rig.loop.spare = look
+    rig.loop.start([1.0, 1.0, 2.1, 2.1])
+    assert rig.loop.view is not None
+    np.testing.assert_allclose(rig.loop.view.position[:4], [1.0, 1.0, 2.1, 2.1], atol=0.05)
+    assert np.ptp(held[20:49]) == 0.0
+    assert held[40] > 1.1
+    rig.loop.close()
+
+
+def test_the_way_to_the_start_pose_does_not_wait_for_ever():
+    with pytest.raises(StoppedError, match="held for 30 s on the way to the start pose: deadman: no sign of the operator"):
+        Rig(deadman=0.3).loop.start([1.0, 1.0, 2.1, 2.1])

@@ -143,8 +143,8 @@ class Trace:
 
     Attributes:
         before, calibrated, after: replayed by the model as given, calibrated, with the effects.
-        calibrated_error, after_error: what counts of measured minus replayed (pose and wheel angles from each window's own
-            level); NaN where nothing does.
+        calibrated_error, after_error: measured minus replayed as it is counted, residual times noise (of the robot:
+            :mod:`wlr_gym.gap.robot.windows`); NaN where nothing is.
     """
 
     run: str

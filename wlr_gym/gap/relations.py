@@ -48,7 +48,7 @@ def relation_of(candidate: Candidate) -> str | None:
     if len(candidate.where) != 1:
         return None
     where = places(candidate.where)
-    if candidate.formula and "".join(candidate.where).startswith("body"):
+    if candidate.formula and candidate.where[0] not in JOINTS:
         return where
     return _CHANGES.get(candidate.name, _TORQUE).format(where)
 

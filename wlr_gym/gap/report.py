@@ -77,9 +77,9 @@ _CAPTIONS = {
     "localisation": "Which measured channels hold the gap, and how much of it.",
     "relations": "Which relations of the model could hold the gap: what the best law that acts there alone promises. The true "
     "place is among the longest bars; others are long because they move the robot in a similar way.",
-    "overlays": "Measured runs, and the same runs replayed by the model. Below each: the error that counts (of pose "
-    "and wheel angles, what is new since the window of some 2 s began); the green band is two standard deviations of sensor "
-    "noise.",
+    "overlays": "Measured runs, and the same runs replayed by the model. Below each: the error as it is counted "
+    "(pose and wheel angles: since a window of some 2 s began, x and y along and across its heading; what shakes on the tyres: "
+    "averaged, noise keeps its size); the green band is two standard deviations of sensor noise.",
     "gap": "Error of replayed runs. Left: over the runs kept aside, with the 95 % interval of what the effects bought. Right: "
     "run by run.",
     "channels": "The same for each measured channel, over the runs kept aside.",
@@ -115,8 +115,8 @@ def _require_own(folder: Path) -> None:
 
 def _is_analysis(folder: Path) -> bool:
     """Whether an analysis wrote a folder: files of these names alone may be anybody's."""
-    if not (folder / RESULT_FILE).exists():
-        return (folder / PROVENANCE_FILE).exists()
+    if not (folder / RESULT_FILE).exists():  # one that was interrupted, before anything but pictures was there
+        return (folder / PROVENANCE_FILE).exists() or not any((folder / name).exists() for name in (PATCH_FILE, CONFIG_FILE))
     try:
         read_result(folder / RESULT_FILE)
     except InputError:
@@ -140,7 +140,8 @@ def save_analysis(analysis: Analysis, folder: Path) -> Path:
     for stale in (RESULT_FILE, CONFIG_FILE):  # the provenance stays until there is a result: it tells whose the folder is
         (folder / stale).unlink(missing_ok=True)
     for stale in (folder / PLOTS).glob("*.png"):
-        stale.unlink()
+        if stale.stem.rstrip("_0123456789") in _CAPTIONS:
+            stale.unlink()
     for name, picture in pictures.items():
         replace_file(folder / PLOTS / f"{name}.png", lambda temporary, picture=picture: temporary.write_bytes(picture))
     replace_file(folder / REPORT_FILE, lambda temporary: temporary.write_text(page, encoding="utf-8"))

@@ -58,6 +58,8 @@ Array = NDArray[np.float64]
 TIMED_READS, HEALTH_TICKS, IMU_TIME = 200, 5, 0.5
 #: s the shortest ramp takes; fastest over mean speed of a minimum-jerk path.
 SHORTEST_RAMP, PEAK_SPEED = 0.5, 1.875
+#: s in all that the way to the start pose may be held, by the operator's absence for one.
+LONGEST_HOLD = 30.0
 #: Signals that stop the robot, where the system has them.
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
 #: What a servo, a bus or the IMU can raise while it is talked to.
@@ -240,10 +242,17 @@ class ControlLoop:
         begin = self.goals[: len(LEGS)]
         duration = max(SHORTEST_RAMP, float(np.abs(target - begin).max()) / self._ramp_speed())
         ticks = int(np.ceil(duration / self.pacer.period))
-        for k in range(1, ticks + 1):
-            s = k / ticks
+        done = held = 0
+        while done < ticks:
+            s = (done + 1) / ticks
             share = s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
-            self._tick(np.concatenate([begin + share * (target - begin), np.zeros(4)]))
+            worst = self._advance(np.concatenate([begin + share * (target - begin), np.zeros(4)]))
+            if worst.level < Level.HOLD:
+                done += 1
+                continue
+            held += 1  # held legs wait where they are, and so does their way
+            if held * self.pacer.period > LONGEST_HOLD:
+                self._fail(f"held for {LONGEST_HOLD:g} s on the way to the start pose: {worst.rule}: {worst.text}")
 
     def _ramp_speed(self) -> float:
         """Mean speed (rad/s) of the way to the start pose: one that legs with the servos' profile can follow."""
@@ -278,11 +287,16 @@ class ControlLoop:
             return self._tick(wanted, torque_on)
 
     def _tick(self, wanted: object, torque_on: NDArray[np.bool_] | None = None) -> View:
+        self._advance(wanted, torque_on)
+        assert self.view is not None
+        return self.view
+
+    def _advance(self, wanted: object, torque_on: NDArray[np.bool_] | None = None) -> Verdict:
+        """Exchange; return the worst verdict, if it lets the run go on."""
         worst = self._exchange(wanted, torque_on)
         if worst.level >= Level.STOP:
             self._fail(self.reason, is_fault=worst.rule not in REQUESTS, is_off=worst.level == Level.OFF)
-        assert self.view is not None
-        return self.view
+        return worst
 
     def stop(self, reason: str = "end", is_fault: bool = False) -> None:
         """Stop the wheels, hold the legs, switch torque off. Does nothing when it has happened already.
@@ -648,7 +662,7 @@ def stop_on_signals(loop: ControlLoop) -> Iterator[None]:
     def take(number: int, _: object) -> None:
         nonlocal heard, interrupted
         name = signal.Signals(number).name
-        if (heard or loop.asked) and not loop._is_switching_off:
+        if loop.asked and not loop._is_switching_off:
             interrupted = True
             raise KeyboardInterrupt(name)
         heard = True

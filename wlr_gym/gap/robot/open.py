@@ -89,7 +89,8 @@ def _opposite(run: Run, rate: str, angle: str) -> list[IntakeFinding]:
     rows = np.isfinite(run[rate]) & np.isfinite(run[angle])
     if rows.sum() < LEAST_ROWS:
         return []
-    turned, measured = (part - part.mean() for part in increments(run["t"][rows], run[angle][rows], run[rate][rows]))
+    angles = np.unwrap(run[angle][rows])  # a camera may show a heading within a turn
+    turned, measured = (part - part.mean() for part in increments(run["t"][rows], angles, run[rate][rows]))
     sizes = float(np.std(turned)), float(np.std(measured))
     if min(sizes) < TURNED or turned @ measured > OPPOSITE * len(turned) * sizes[0] * sizes[1]:
         return []
