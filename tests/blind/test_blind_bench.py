@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -29,7 +30,7 @@ def refuses_and_fails(folder: Path, out: Path):
     """Stand-in: an input error for even seeds, a programming error for odd ones."""
     if int(folder.name[-1]) % 2:
         raise ZeroDivisionError("a bug")
-    raise InputError("this is not good")
+    raise InputError(f"{folder}: this is not good")
 
 
 @pytest.fixture(scope="module")
@@ -199,11 +200,12 @@ def test_the_command_goes_on_from_answers(finished, tmp_path, capsys):
 def test_errors_of_the_workflow_are_its_answers(tmp_path, monkeypatch):
     monkeypatch.setattr(gap, "git_commit", lambda: "abc-dirty")
     plan = gap.Plan(tmp_path, sets=1, runs=(6,))
-    for index, verdict in ((0, "refused"), (1, "failed")):
+    said = f"data/{case(0).name}: this is not good".replace("/", os.sep)  # without the folder of this machine
+    for index, verdict, message in ((0, "refused", said), (1, "failed", "ZeroDivisionError: a bug")):
         gap.make_output_folder(tmp_path / "results")
         gap.run_case(plan, case(index), refuses_and_fails)
         result = json.loads((tmp_path / "results" / f"{case(index).name}.json").read_text())
-        assert result["verdict"] == verdict
+        assert (result["verdict"], result["message"]) == (verdict, message)
         assert result["blind_test"]["commit"] == "abc-dirty"
         assert not (tmp_path / "data" / case(index).name).exists(), "data are not kept unless asked for"
 

@@ -316,14 +316,20 @@ def run_case(plan: Plan, one: Case, analyser: Analyser) -> None:
     try:
         result: dict[str, Any] = dict(analyser(folder, out))
     except InputError as error:
-        result = {"verdict": "refused", "message": str(error), "traceback": traceback.format_exc()}
+        result = {"verdict": "refused", "message": _without(plan.out, str(error)), "traceback": traceback.format_exc()}
     except Exception as error:
-        result = {"verdict": "failed", "message": f"{type(error).__name__}: {error}", "traceback": traceback.format_exc()}
+        message = _without(plan.out, f"{type(error).__name__}: {error}")
+        result = {"verdict": "failed", "message": message, "traceback": traceback.format_exc()}
     result |= {"wall_seconds": time.monotonic() - begin, "blind_test": origin}
     write_json(plan.result_file(one), _plain(result))
     if not plan.keep_data:
         shutil.rmtree(folder)
     shutil.rmtree(out, ignore_errors=True)
+
+
+def _without(out: Path, text: str) -> str:
+    """A message without the test's own folder: answers go from machine to machine."""
+    return text.replace(f"{out}{os.sep}", "")
 
 
 def make_data(folder: Path, one: Case, runs: Sequence[int] = range(8)) -> None:
