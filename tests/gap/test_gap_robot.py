@@ -518,6 +518,7 @@ def test_sensors_that_say_nothing_leave_finite_residuals(good):
 # ---- the problem -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_known_effects_and_formulas_are_part_of_the_model(good):
     problem = RobotProblem([good], known=[RESISTANCE])
     plain = RobotProblem([good])

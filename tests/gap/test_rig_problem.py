@@ -170,6 +170,16 @@ def test_a_simulation_that_breaks_down_is_as_far_off_as_can_be(loaded):
     assert np.abs(both[0]).max() < LOST
 
 
+def test_where_a_formula_was_tried(loaded):
+    setting = Setting(nominal(loaded))
+    formula = PatchEffect("unknown_effect", ("servo",), {"b": 0.004}, "-b * rate * abs(angle)", {"b": "N m s/rad2"})
+    found = loaded.reach(formula, setting, [0, 1])
+    assert {name: one.unit for name, one in found.items()} == {"rate": "rad/s", "angle": "rad"}
+    replayed = loaded.simulate([setting], [0, 1])
+    angles = np.concatenate([values[0][:, [s.name for s in loaded.signals].index("position")] for values in replayed])
+    assert (found["angle"].low, found["angle"].high) == pytest.approx((np.nanmin(angles), np.nanmax(angles)), abs=0.05)
+
+
 @pytest.mark.parametrize(
     ("formula", "message"),
     [("-b * rate * rate", "takes N m"), ("-b * normal_force", "reads angle, rate"), ("-b * (rate", "formula")],

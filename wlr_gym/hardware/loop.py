@@ -662,7 +662,7 @@ def stop_on_signals(loop: ControlLoop) -> Iterator[None]:
     def take(number: int, _: object) -> None:
         nonlocal heard, interrupted
         name = signal.Signals(number).name
-        if loop.asked and not loop._is_switching_off:
+        if (heard or loop.asked) and not loop._is_switching_off:
             interrupted = True
             raise KeyboardInterrupt(name)
         heard = True
