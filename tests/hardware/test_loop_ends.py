@@ -77,7 +77,8 @@ def lie_down(machine):
 
 def emulated_plant(folder):
     plant = RobotPlant(ROBOT, 1, PlantOptions(), RobotOptions(emulated=True, log=folder))
-    return plant, plant.loop.clock.machine  # type: ignore[attr-defined]
+    clock: Any = plant.loop.clock
+    return plant, clock.machine
 
 
 def short(name="straight"):

@@ -94,8 +94,7 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: Options, cons
             servos = checks.check_servos(link.servos, robot, hardware, joints)
         found += servos
         if len(buses) == len(hardware.buses) and all(check.ok for check in servos if check.what == "answer"):
-            for group in link.servos.groups.values():  # as while driving
-                group.patience = hardware.safety.patience
+            link.servos.set_patience(hardware.safety.patience)  # as while driving
             found.append(checks.check_bus_speed(link.servos, TIMED_READS, hardware.safety.read_time, link.clock.now))
     except (BusGoneError, InputError) as error:  # the latter: gone when a scan opens it again
         found.append(checks.Check("robot", "bus", False, str(error), "a bus that stays", "Check plugs and supply."))

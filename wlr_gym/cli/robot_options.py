@@ -95,8 +95,7 @@ class RobotOption(HardwareOption):
 
         robot, hardware = self.load()
         link = self.link_to(robot, changed or hardware)
-        for group in link.servos.groups.values():
-            group.patience = CALM_PATIENCE
+        link.servos.set_patience(CALM_PATIENCE)
         return link
 
     def plant(self, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:

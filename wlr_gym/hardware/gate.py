@@ -122,7 +122,7 @@ class Gate:
 
     def check(self, reads: int) -> list[checks.Check]:
         """Return all start-up checks. A watchdog that an earlier run left latched is cleared, where nothing else is wrong."""
-        self._set_patience(CALM_PATIENCE)
+        self.__servos.set_patience(CALM_PATIENCE)
         found = self._examine()
         wrong = [check for check in found if not check.ok and check.is_fatal]
         if wrong and not self.dry_run and all(check.what == "watchdog" for check in wrong):
@@ -130,7 +130,7 @@ class Gate:
             found = self._examine()
             wrong = [check for check in found if not check.ok and check.is_fatal]
         if not wrong:
-            self._set_patience(self.limits.patience)
+            self.__servos.set_patience(self.limits.patience)
             found.append(checks.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
         return found
 
@@ -151,7 +151,7 @@ class Gate:
             NoAnswerError, RefusedError, BusGoneError: a servo did not take it. Torque may be on: call :meth:`off`.
         """
         self._memory = Memory()
-        self._set_patience(CALM_PATIENCE)
+        self.__servos.set_patience(CALM_PATIENCE)
         self.frame = safety.make_frame(self.robot, self.frame.period, *self._register_limits())
         self._armed = True
         if not self.dry_run:
@@ -159,14 +159,14 @@ class Gate:
         self.goals = safety.resting(self._positions())
         self.torque_on[:] = True
         if self.dry_run:
-            self._set_patience(self.limits.patience)
+            self.__servos.set_patience(self.limits.patience)
             return
         servos = self.__servos
         servos.write_goals(self._within_registers(self.goals))
         self._confirm_goals()
         for joint in JOINTS:
             servos.set(joint, "torque_enable", 1)
-        self._set_patience(self.limits.patience)
+        self.__servos.set_patience(self.limits.patience)
         self._arm_watchdogs()
 
     def _arm_watchdogs(self) -> None:
@@ -180,10 +180,6 @@ class Gate:
             if not wrong:
                 return
         raise NoAnswerError(f"the watchdog of {', '.join(wrong)} does not say that it is armed")
-
-    def _set_patience(self, seconds: float) -> None:
-        for group in self.__servos.groups.values():
-            group.patience = seconds
 
     def _prepare(self) -> None:
         servos = self.__servos

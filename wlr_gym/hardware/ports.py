@@ -14,10 +14,11 @@ try:
     import fcntl
     import termios
 
-    _FAILURES: tuple[type[Exception], ...] = (OSError, termios.error)
+    #: What a port that fails raises; pyserial's own exceptions are OSErrors.
+    FAILURES: tuple[type[Exception], ...] = (OSError, termios.error)
 except ImportError:  # not on Windows
     fcntl = None
-    _FAILURES = (OSError,)
+    FAILURES = (OSError,)
 
 #: What a lock that is taken says, and a device that another program has opened for itself alone.
 _TAKEN = (errno.EWOULDBLOCK, errno.EBUSY)
@@ -43,7 +44,7 @@ def open_serial(path: str, baud_rate: int, name: str = "port") -> serial.Serial:
 
     try:
         return serial.Serial(path, baud_rate, timeout=0, exclusive=True)
-    except _FAILURES as error:  # pyserial's exceptions are OSErrors
+    except FAILURES as error:
         if getattr(error, "errno", None) in _TAKEN:
             raise _in_use(path, name) from None
         raise InputError(f"{name} {path}: cannot be opened: {error}") from None

@@ -13,19 +13,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import dynamixel_sdk as sdk
-import serial
 
 from wlr_gym.errors import InputError
 from wlr_gym.hardware import protocol
-from wlr_gym.hardware.ports import open_serial
+from wlr_gym.hardware.ports import FAILURES, open_serial
 from wlr_gym.hardware.protocol import BROADCAST, Instruction, Packet, Parser, Status
-
-try:
-    import termios
-
-    _GONE: tuple[type[Exception], ...] = (OSError, serial.SerialException, termios.error)
-except ImportError:  # not on Windows
-    _GONE = (OSError, serial.SerialException)
 
 _UNANSWERED = (Instruction.SYNC_WRITE, Instruction.BULK_WRITE)
 #: A line that never falls quiet is let talk for the patience and this many times more, yet no longer than these s more.
@@ -104,7 +96,7 @@ class GuardedPort(sdk.PortHandler):
         self.quiet = not self.suspect or self._falls_quiet()
         try:
             super().clearPort()
-        except (*_GONE, AttributeError) as error:
+        except (*FAILURES, AttributeError) as error:
             raise self._lost(error) from None
 
     def _falls_quiet(self) -> bool:
@@ -135,7 +127,7 @@ class GuardedPort(sdk.PortHandler):
             if data := os.read(number, length):
                 return data
             raise OSError("it is ready and has nothing: disconnected, or another program reads it")
-        except (*_GONE, ValueError, TypeError, AttributeError) as error:  # pyserial's, on a port that closed meanwhile
+        except (*FAILURES, ValueError, TypeError, AttributeError) as error:  # pyserial's, on a port that closed meanwhile
             raise self._lost(error) from None
 
     def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
@@ -144,7 +136,7 @@ class GuardedPort(sdk.PortHandler):
             if (sent := self._write(bytes(packet))) < len(packet):
                 raise OSError(f"it took {sent} of {len(packet)} bytes")
             return sent
-        except (*_GONE, TypeError, AttributeError) as error:  # the last: a port that was never opened
+        except (*FAILURES, TypeError, AttributeError) as error:  # the last: a port that was never opened
             raise self._lost(error) from None
 
     def _write(self, data: bytes) -> int:

@@ -147,6 +147,11 @@ class Servos:
         """
         open_all(self.groups.values())
 
+    def set_patience(self, seconds: float) -> None:
+        """Set how long (s) an answer may take beyond its bytes' time on the wire, on all buses."""
+        for group in self.groups.values():
+            group.patience = seconds
+
     def close(self) -> None:
         """Close all ports; servos stay as they are."""
         for group in self.groups.values():
