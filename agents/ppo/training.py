@@ -126,9 +126,10 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv) -> Path:
             if model.num_timesteps // config.checkpoint_every > before // config.checkpoint_every:
                 _save_checkpoint(training, config, env, model)
                 begin_episodes(model, env, config.seed)
-    if stop.requested:
+    if model.num_timesteps < config.total_steps:  # nothing is lost: --resume goes on from here
         place = _save_checkpoint(training, config, env, model)
-        raise KeyboardInterrupt(f"interrupted; saved {place}; go on with: wlr train --resume {folder}")
+        if stop.requested:
+            raise KeyboardInterrupt(f"interrupted; saved {place}; go on with: wlr train --resume {folder}")
     return checkpoint.save(folder / "policy", model, config, env.contract(), training.environment)
 
 

@@ -173,6 +173,7 @@ def test_time_limit_ends_in_good_order(tmp_path):
     request = Training(ENVIRONMENT, tmp_path / "short", SETTINGS | {"total_steps": 10**9}, max_seconds=0.0, progress=False)
     policy = load_agent("ppo").train(request)
     assert read_contract(policy)["training"]["steps"] == 0
+    assert [place.name for place in (tmp_path / "short" / "checkpoints").iterdir()] == ["step_000000000000"]  # to go on from
 
 
 def test_broken_model_file_is_refused(run, tmp_path):

@@ -467,7 +467,8 @@ def markdown(report: Mapping[str, Any]) -> str:
     for severity, shares in report["single"]["by_severity"].items():
         cells = [f"{shares[key]['share']:.0%}" for key in ("found", "top1", "in_set")]
         rows.append(f"| {severity} | {shares['found']['count']} | {' | '.join(cells)} |")
-    rows += ["", "| hidden | what the results say |", "|---|---|"]
+    rows += ["", "Single effects from severity 1 on; in brackets laws outside the library:", ""]
+    rows += ["| hidden | what the results say |", "|---|---|"]
     for hidden, said in sorted(report["confusion"].items()):
         ordered = sorted(said.items(), key=lambda item: (item[0] != hidden, -item[1], item[0]))
         rows.append(f"| {hidden} | {', '.join(f'{name} {count}' for name, count in ordered)} |")
