@@ -87,11 +87,11 @@ def test_a_formula_and_fatal_findings_are_printed(data, tmp_path, answer, capsys
 def test_options_reach_the_analysis(data, tmp_path, answer):
     asked = answer(examples.NOTHING_MISSING)
     out = tmp_path / "out"
-    options = ["--effects", "icy_patch", "--backend", "mujoco", "--heldout", "run_03", "run_06", "--threads", "2"]
+    options = ["--effects", "icy_patch", "--robot", "paper", "--backend", "mujoco", "--heldout", "run_03", "run_06", "--threads", "2"]
     assert main(["gap", str(data), "--out", str(out), *options]) == 0
     assert asked["data"] == data
     assert [effect.name for effect in asked["known"].effects] == ["friction_patch", "slip_weakening"]
-    assert (asked["backend"], asked["rig"], asked["threads"]) == ("mujoco", None, 2)
+    assert (asked["robot"], asked["backend"], asked["rig"], asked["threads"]) == ("paper", "mujoco", None, 2)
     assert asked["heldout"] == ("run_03", "run_06")
     settings = yaml.safe_load((out / "config.yaml").read_text())
     assert settings["heldout"] == ["run_03", "run_06"]
@@ -108,7 +108,8 @@ def test_options_reach_the_analysis(data, tmp_path, answer):
         (["--rig", "pendulm"], "unknown rig 'pendulm' (did you mean 'pendulum'?)"),
         (["--backend", "mujocco"], "--backend: unknown simulator 'mujocco' (did you mean 'mujoco'?)"),
         (["--backend", "dynamixel"], "unknown simulator 'dynamixel'; valid: gibbs_appell, mujoco"),
-        (["--rig", "pendulum", "--backend", "mujoco"], "the rig has a simulator of its own: leave --backend out"),
+        (["--rig", "pendulum", "--backend", "mujoco"], "the rig has a simulator of its own: leave --backend and"),
+        (["--rig", "pendulum", "--robot", "paper"], "the rig has a simulator of its own: leave --backend and"),
         (["--threads", "0"], "--threads 0: expected 1 or more"),
         (["--effects", "nothing_like_it"], "--effects: unknown effects config 'nothing_like_it'"),
         (["--effects", "knwon.yaml"], "--effects: effects config: no file 'knwon.yaml'"),
@@ -174,3 +175,13 @@ def test_effects_known_to_the_rig_are_read_as_the_rig_s(data, tmp_path, answer):
     options = ["--rig", "pendulum", "--effects", str(tmp_path / "patch.yaml")]
     assert main(["gap", str(data), "--out", str(tmp_path / "out"), *options]) == 0
     assert [effect.name for effect in asked["known"].effects] == ["torque_saturation"]
+
+
+def test_what_is_given_as_known_is_not_replaced(data, tmp_path, answer, capsys):
+    answer(examples.EFFECT_FOUND)
+    out = tmp_path / "out"
+    assert main(["gap", str(data), "--out", str(out)]) == 0
+    found = (out / "patch.yaml").read_text()
+    assert main(["gap", str(data), "--out", str(out), "--effects", str(out / "patch.yaml")]) == 2
+    assert "the results would replace it: give another --out" in " ".join(capsys.readouterr().err.split())
+    assert (out / "patch.yaml").read_text() == found

@@ -19,6 +19,7 @@ from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.prove import level, mean_squares, noise_floor
 from wlr_gym.gap.result import write_result
 from wlr_gym.gap.robot.candidates import ripple_order, robot_candidates
+from wlr_gym.gap.robot.clock import RunClock
 from wlr_gym.gap.robot.formulas import formula_candidates, wave_frequency
 from wlr_gym.gap.robot.open import LEAST_RUNS, open_robot
 from wlr_gym.gap.robot.problem import LOST, WORTH_APART, RobotProblem
@@ -86,6 +87,32 @@ def test_floor_and_latency_are_one_number_for_all():
     assert (table["ground.mu_x"][1] == 0.31).all()
     assert (table["ground.mu_y"][1] == 0.31).all()
     assert (table["servo.kp"][1] == NOMINAL["servo.kp"][0]).all()
+
+
+def test_a_floor_that_grips_less_across_stays_one():
+    less = ROBOT.model_copy(update={"ground": ROBOT.ground.model_copy(update={"mu_y": 0.5 * ROBOT.ground.mu_x})})
+    (floor,) = [knob for knob in knobs(less, PHYSICS_STEP) if knob.quantity.name == "ground.mu"]
+    table = Parameters.nominal(less)
+    write([floor], np.array([[0.4]]), table)
+    assert (table["ground.mu_x"] == 0.4).all()
+    assert (table["ground.mu_y"] == 0.2).all()
+
+
+def test_what_is_known_exactly_does_not_move():
+    sure = ROBOT.model_copy(update={"tolerances": {**ROBOT.tolerances, "body.mass": 0}})
+    assert {knob.quantity.name for knob in knobs(sure, PHYSICS_STEP)} == KNOBS.keys() - {"body.mass"}
+
+
+@pytest.mark.parametrize(
+    ("key", "amount", "message"),
+    [
+        ("servo.Kp", 0.05, r"robot 'wlr-nominal': unknown tolerance 'servo.Kp' \(did you mean 'servo.kp'"),
+        ("body.mass", -0.1, r"tolerances\.body\.mass = -0\.1: expected a number of 0 or more"),
+    ],
+)
+def test_tolerances_that_make_no_sense_are_refused(key, amount, message):
+    with pytest.raises(InputError, match=message):
+        knobs(ROBOT.model_copy(update={"tolerances": {key: amount}}), PHYSICS_STEP)
 
 
 def test_every_tolerance_of_the_file_is_used():
@@ -446,6 +473,24 @@ def test_a_rate_against_its_angle(tmp_path, good, rate):
     assert [f.channel for f in findings if f.kind == "mirrored"] == [rate] * 3
 
 
+@pytest.mark.parametrize("channel", ["eff_leg_rr", "acc_z"])
+def test_a_sensor_of_the_wrong_sign(tmp_path, good, channel):
+    problem, findings = open_robot(folder_of(tmp_path, good, 3, lambda table, k: table.assign(**{channel: -table[channel]})))
+    assert problem is None
+    assert [f.channel for f in findings if f.kind == "mirrored"] == [channel] * 3
+
+
+def test_a_robot_asked_for_is_used_and_a_sensor_without_noise_is_refused(tmp_path, good):
+    folder, heavy = folder_of(tmp_path / "runs", good), tmp_path / "heavy.yaml"
+    heavy.write_text("base: nominal\nname: heavy\nbody: {mass: 2.0}\n", encoding="utf-8")
+    problem, _ = open_robot(folder, robot=heavy)
+    assert problem is not None
+    assert (problem.robot.name, problem.robot.body.mass) == ("heavy", 2.0)
+    heavy.write_text("base: nominal\nname: deaf\nsensors: {camera: {position_noise: 0}}\n", encoding="utf-8")
+    with pytest.raises(InputError, match="robot 'deaf': sensors: 'cam_x' has no noise"):
+        open_robot(folder, robot=heavy)
+
+
 def test_angles_that_start_anew_after_a_turn(tmp_path, good):
     def wrap(table, k):
         return table.assign(pos_wheel_rf=(table["pos_wheel_rf"] + 3.0) % (2 * np.pi))
@@ -513,6 +558,23 @@ def test_sensors_that_say_nothing_leave_finite_residuals(good):
     assert np.isnan(residual[:, quiet]).all()
     others = np.sqrt(np.nanmean(np.delete(residual, quiet, axis=1) ** 2, axis=0))
     assert others.max() < 3.0
+
+
+def test_where_no_camera_saw_it_a_window_starts_from_the_simulation(good):
+    """The last frame half a second away tells nothing of a heading: a parabola through noise would."""
+    table = good.table.copy()
+    hidden = (table["t"] > 1.2) & (table["t"] < 2.8)
+    table.loc[hidden, [name for name in table if name.startswith("cam_")]] = np.nan
+    clock = RunClock(Run(table, META, Path("run_01.csv")))
+    assert np.isnan(clock.anchors.pose[0]).all()
+    assert np.isfinite(RunClock(good).anchors.pose).all()
+
+
+def test_a_hole_in_the_log_starts_no_window(good):
+    table = good.table[(good.table["t"] < 0.5) | (good.table["t"] > 3.5)].reset_index(drop=True)
+    clock = RunClock(Run(table, META, Path("run_01.csv")), window=0.5)
+    assert all(window.stop > window.start for window in clock.windows)
+    assert len(set(clock.anchors.tick.tolist())) == len(clock.windows) - 1
 
 
 # ---- the problem -----------------------------------------------------------------------------------------------------

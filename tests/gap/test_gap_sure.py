@@ -263,6 +263,19 @@ def test_detectable_severity_is_of_the_direction_that_shows_best_at_the_place_th
     assert np.isnan(detectable([hidden, score("rear", 1.0, 100.0, 0.01)])["shift"].value)
 
 
+def test_what_is_detectable_is_a_size():
+    """Not the speed over which a friction fades, however far from its neutral value a first guess puts it; and no formula."""
+    unknowns = (
+        Unknown("extra_static_torque", "N m", 0.0, 0.0, 1.0, 0.01),
+        Unknown("stribeck_speed", "rad/s", 0.1, 0.02, 3.0, 0.1),
+    )
+    start = Start((("probe",),), lambda a: (0.01 * float(a[0]), 1.0))
+    stribeck = Candidate("stribeck_friction", ("wheel_lf",), unknowns, (start,))
+    law = Candidate("unknown_effect", ("wheel_lf",), unknowns[:1], (start,), formula="-c * rate")
+    scores = [Score(one, (0.0, 1.0), 0.0, 1.0, np.diag([1.0]), start, True) for one in (stribeck, law)]
+    assert {name: found.parameter for name, found in detectable(scores).items()} == {"stribeck_friction": "extra_static_torque"}
+
+
 def test_what_is_left_hides_more_effects():
     """Two percent of what is left must be bought: what the screen calls visible asks that, too."""
     responded, candidates = screened(Toy(white=1.5))[1:]

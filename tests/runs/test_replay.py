@@ -22,7 +22,7 @@ from wlr_gym.runs import Profile, Run, RunMeta, read_dataset, read_run
 from wlr_gym.runs.anchor import euler_angles, local_fit, quaternion, rest_pose, rotation
 from wlr_gym.runs.format import CHANNELS
 from wlr_gym.runs.noise import channel_noise
-from wlr_gym.runs.replay import ReplayResult, held_goals, profile_parameters, replay, robot_of
+from wlr_gym.runs.replay import ReplayResult, held_goals, profile_parameters, replay, robot_entry, robot_of
 
 DATA = Path(__file__).parent / "data"
 TWIN = Path(__file__).parents[3] / "shared" / "data" / "twin_dev"
@@ -246,6 +246,10 @@ def test_the_robot_is_the_one_the_meta_data_name(tmp_path):
     assert robot_of(with_robot("heavy.yaml"), "nominal").name == "wlr-nominal"
     with pytest.raises(InputError, match=r"meta\.yaml: unknown robot 'wlr-nominall' \(did you mean 'wlr-nominal'"):
         robot_of(with_robot("wlr-nominall"))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "heavy.yaml").rename(tmp_path / "mine" / "heavy.yaml")
+    assert robot_of(with_robot(robot_entry(str(tmp_path / "mine" / "heavy.yaml"), tmp_path))).name == "heavy"
+    assert robot_entry("nominal", tmp_path) is None
 
 
 def test_legs_that_were_off_do_not_jump_when_torque_is_back():

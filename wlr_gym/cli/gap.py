@@ -35,6 +35,8 @@ class Options(EffectsOption):
     """Folder for the results; made if it is not there. Results of an earlier analysis are replaced."""
     rig: str | None = None
     """Recordings of a test rig instead of runs of the robot: pendulum (one servo that swings a weight)."""
+    robot: str | None = None
+    """Robot file or config name; default: the one meta.yaml names, else the nominal one."""
     backend: str = "gibbs_appell"
     """Simulator of the robot: gibbs_appell or mujoco."""
     heldout: tuple[str, ...] = ()
@@ -66,6 +68,7 @@ def run(options: Options) -> int:
             options.out,
             known=known,
             rig=options.rig,
+            robot=options.robot,
             backend=options.backend,
             heldout=options.heldout,
             threads=options.threads or os.cpu_count() or 1,
@@ -88,8 +91,11 @@ def _check(options: Options) -> None:
         raise unknown_name("simulator", options.backend, SIMULATORS, "--backend")
     if options.rig is not None and options.rig not in RIGS:
         raise unknown_name("rig", options.rig, RIGS)
-    if options.rig is not None and options.backend != Options.backend:
-        raise InputError(f"--rig {options.rig}: the rig has a simulator of its own: leave --backend out")
+    if options.rig is not None and (options.backend != Options.backend or options.robot is not None):
+        raise InputError(f"--rig {options.rig}: the rig has a simulator of its own: leave --backend and --robot out")
+    for name in options.effects:
+        if Path(name).resolve().parent == options.out.resolve() and Path(name).is_file():
+            raise InputError(f"--effects {name}: the results would replace it: give another --out")
     if options.threads is not None and options.threads < 1:
         raise InputError(f"--threads {options.threads}: expected 1 or more")
 

@@ -69,6 +69,7 @@ def run(options: Options) -> int:
     from wlr_gym.robot import load_robot
     from wlr_gym.runs.format import RunMeta
     from wlr_gym.runs.record import meta_of, same_profile, write_commands
+    from wlr_gym.runs.replay import robot_entry
 
     console = Console(soft_wrap=True, highlight=False)
     robot = load_robot(options.robot)
@@ -86,7 +87,8 @@ def run(options: Options) -> int:
         for motion in motions:
             console.print(f"written: {write_commands(options.out, motion)}")
         return OK
-    meta = meta_of(motions[0], robot, RunMeta(ground=options.ground, notes=options.notes))
+    named = robot_entry(options.robot, options.out)
+    meta = meta_of(motions[0], robot, RunMeta(robot=named, ground=options.ground, notes=options.notes))
     if options.backend in REAL:
         return _record_robot(options, motions, robot, meta, console)
     return _record_simulations(options, motions, robot, meta, console)
@@ -155,6 +157,7 @@ def _report(motion: Motion, drive: Drive, console: Console) -> None:
 
 def _record_simulations(options: Options, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
     from wlr_gym.files import make_output_folder
+    from wlr_gym.random import spawn_seeds
     from wlr_gym.runs.record import next_run, record_simulation
 
     assert options.out is not None
@@ -162,7 +165,8 @@ def _record_simulations(options: Options, motions: Sequence[Motion], robot: Robo
     patch = options.patch()
     for motion in motions:
         path = next_run(options.out)
-        record_simulation(path, motion, robot, options.backend, options.seed, patch, meta)
+        seed = int(spawn_seeds(options.seed, 1, path.stem)[0])  # no two runs of a folder have the same noise
+        record_simulation(path, motion, robot, options.backend, seed, patch, meta)
         console.print(f"{motion.name}: {motion.duration:.1f} s on {options.backend}; written: {path}")
     return OK
 

@@ -142,16 +142,19 @@ def _repeat_all(options: Options, runs: Sequence[Run], patch: Patch, console: Co
     from wlr_gym.evaluation.driving import drive_robot
     from wlr_gym.runs import read_run
     from wlr_gym.runs.compare import motion_of
+    from wlr_gym.runs.format import RunMeta
     from wlr_gym.runs.record import meta_of
     from wlr_gym.runs.repeat import compare_repeat
-    from wlr_gym.runs.replay import robot_of
+    from wlr_gym.runs.replay import robot_entry, robot_of
 
     motions = [motion_of(measured) for measured in runs]
     for measured, motion in zip(runs, motions, strict=True):
         robot = robot_of(measured, options.robot)
         if not (options.emulated or options.yes):
             confirm(motion, robot, console)
-        plant = options.plant_of(robot, options.out / "robot" / measured.name, meta_of(motion, robot), patch)
+        folder = options.out / "robot" / measured.name
+        named = robot_entry(options.robot or str(measured.path.parent / (measured.meta.robot or "")), folder)
+        plant = options.plant_of(robot, folder, meta_of(motion, robot, RunMeta(robot=named)), patch)
         try:
             drive = drive_robot(plant, motion)
         finally:

@@ -42,7 +42,7 @@ EFFECTS: tuple[Effect, ...] = (
         ("body",),
         {
             "mass": EffectParameter("kg", "extra mass", 0, 20, 0.0, (0, 2), 0.5),
-            **xyz("m", 0.5, 0.2, (0.08, 0.04, 0.05), "{axis} in the body frame"),
+            **xyz("m", 0.5, 0.2, (0.08, 0.04, 0.05), "{axis} in the body frame", is_size=False),
         },
         _add_payload,
     ),
@@ -72,8 +72,8 @@ EFFECTS: tuple[Effect, ...] = (
         ("body",),
         {
             "stiffness": EffectParameter("N/m", "of the spring", 0, 1e4, 0.0, (0, 20), 3.0),
-            "x": EffectParameter("m", "anchor, floor frame", -1e3, 1e3, 0.0, (-5, 5), -0.5, optional=True),
-            "y": EffectParameter("m", "anchor, floor frame", -1e3, 1e3, 0.0, (-5, 5), 0.3, optional=True),
+            "x": EffectParameter("m", "anchor, floor frame", -1e3, 1e3, 0.0, (-5, 5), -0.5, optional=True, is_size=False),
+            "y": EffectParameter("m", "anchor, floor frame", -1e3, 1e3, 0.0, (-5, 5), 0.3, optional=True, is_size=False),
         },
         _add_tether,
     ),

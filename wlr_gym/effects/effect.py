@@ -33,6 +33,7 @@ class EffectParameter:
         prior: range a real robot may plausibly have: what a search for missing effects covers and randomisation may draw.
         severity: a clear, realistic case, for tests and demonstrations.
         optional: may be left out, and is then neutral.
+        is_size: whether it says how large the effect is, not where it acts or over what it fades.
     """
 
     unit: str
@@ -43,6 +44,7 @@ class EffectParameter:
     prior: tuple[float, float]
     severity: float
     optional: bool = False
+    is_size: bool = True
 
     def neutral_for(self, robot: Robot) -> float:
         """Return the value that changes nothing about ``robot``."""
@@ -184,9 +186,11 @@ def add_shaped(size: str, size_target: str, shape: Mapping[str, str], what: str)
     return apply
 
 
-def xyz(unit: str, bound: float, prior: float, severity: Sequence[float], doc: str) -> dict[str, EffectParameter]:
+def xyz(
+    unit: str, bound: float, prior: float, severity: Sequence[float], doc: str, *, is_size: bool = True
+) -> dict[str, EffectParameter]:
     """Return three optional parameters x, y, z: bounds and prior symmetric about 0, docs ``{axis}`` filled in."""
     return {
-        axis: EffectParameter(unit, doc.format(axis=axis), -bound, bound, 0.0, (-prior, prior), chosen, optional=True)
+        axis: EffectParameter(unit, doc.format(axis=axis), -bound, bound, 0.0, (-prior, prior), chosen, True, is_size)
         for axis, chosen in zip("xyz", severity, strict=True)
     }

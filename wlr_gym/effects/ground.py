@@ -55,7 +55,7 @@ def _mu(neutral: float | str, severity: float, doc: str, low: float = 0.05) -> E
 
 
 def _edge(doc: str, neutral: float, severity: float, *, optional: bool = False) -> EffectParameter:
-    return EffectParameter("m", doc, -UNBOUNDED, UNBOUNDED, neutral, (-5, 5), severity, optional)
+    return EffectParameter("m", doc, -UNBOUNDED, UNBOUNDED, neutral, (-5, 5), severity, optional, is_size=False)
 
 
 EFFECTS: tuple[Effect, ...] = (
@@ -108,7 +108,9 @@ EFFECTS: tuple[Effect, ...] = (
         ("ground",),
         {
             "mu_k": _mu("ground.mu_x", 0.3, "coefficient along the heading at fast slip; a patch falls by the same factor"),
-            "slip_speed": EffectParameter("m/s", "slip speed over which it falls", 1e-3, 10, 0.1, (0.02, 1), 0.1),
+            "slip_speed": EffectParameter(
+                "m/s", "slip speed over which it falls", 1e-3, 10, 0.1, (0.02, 1), 0.1, is_size=False
+            ),
         },
         _set_weakening,
         "area or ratio",

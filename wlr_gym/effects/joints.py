@@ -31,7 +31,9 @@ EFFECTS: tuple[Effect, ...] = (
         JOINTS,
         {
             "extra_static_torque": EffectParameter("N m", "friction at rest beyond that in motion", 0, 50, 0.0, (0, 1), 0.3),
-            "stribeck_speed": EffectParameter("rad/s", "rate over which it fades", 1e-4, 20, 0.1, (0.02, 3), 0.1),
+            "stribeck_speed": EffectParameter(
+                "rad/s", "rate over which it fades", 1e-4, 20, 0.1, (0.02, 3), 0.1, is_size=False
+            ),
         },
         add_shaped(
             "extra_static_torque",
@@ -63,8 +65,8 @@ EFFECTS: tuple[Effect, ...] = (
         JOINTS,
         {
             "amplitude": EffectParameter("N m", "of the torque", 0, 10, 0.0, (0, 0.5), 0.15),
-            "order": EffectParameter("-", "periods per turn", 0, 1000, 1.0, (1, 64), 12.0),
-            "phase": EffectParameter("rad", "at angle 0", -10, 10, 0.0, (-math.pi, math.pi), 0.0, optional=True),
+            "order": EffectParameter("-", "periods per turn", 0, 1000, 1.0, (1, 64), 12.0, is_size=False),
+            "phase": EffectParameter("rad", "at angle 0", -10, 10, 0.0, (-math.pi, math.pi), 0.0, optional=True, is_size=False),
         },
         add_shaped(
             "amplitude",

@@ -286,3 +286,9 @@ class Problem(Protocol):
     def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
         """Return simulated quantities (rows,) that residuals are mapped over: speeds, loads, slip, place."""
         ...
+
+
+def since_reversal(time: Array, rate: Array) -> Array:
+    """Return the seconds (rows,) since a rate last changed its sign, or since the start: what systems map residuals over."""
+    turned = np.concatenate([[True], np.diff(np.sign(rate)) != 0])
+    return time - np.maximum.accumulate(np.where(turned, time, -np.inf))

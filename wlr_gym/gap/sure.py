@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from wlr_gym.effects import EFFECTS
+from wlr_gym.effects import EFFECTS, EffectParameter
 from wlr_gym.gap.analysis import Detectable, Estimate
 from wlr_gym.gap.fit import PINNED, Fit, equations_by_run, on_bounds, prior_tightness, scaled_nominal, scaled_numbers, scales
 from wlr_gym.gap.hypothesis import MOST_HARM, Hypothesis
@@ -165,14 +165,15 @@ def detectable(scores: Sequence[Score], cost: float = 0.0) -> dict[str, Detectab
 
     Of an effect with directions of its own (x, y, z of a displaced mass) it is the one that shows best: in another it may hide
     at any size. First order: the gain of an effect grows with the square of its severity. ``cost`` is that of the model without
-    it. Where no plausible size would show, its size is NaN.
+    it. Where no plausible size would show, its size is NaN. Formulas are left out: their laws have no size in common.
     """
     found: dict[str, tuple[float, Detectable]] = {}
     for score in scores:
-        if len(score.candidate.where) > 1:
+        if len(score.candidate.where) > 1 or score.candidate.formula:
             continue
         start = score.start
-        which = int(np.argmax(np.diag(score.information)))
+        shown = np.diag(score.information)
+        which = max((k for k in _sizes(score.candidate) if k < len(shown)), key=lambda k: float(shown[k]))
         amplitude = least_amplitude(score.candidate, score.information, which, cost)
         steps = np.zeros(len(start.directions))
         steps[min(which, len(steps) - 1)] = amplitude
@@ -184,16 +185,28 @@ def detectable(scores: Sequence[Score], cost: float = 0.0) -> dict[str, Detectab
     return {name: entry for name, (_, entry) in sorted(found.items())}
 
 
+def _vocabulary(candidate: Candidate) -> Mapping[str, EffectParameter]:
+    """An effect's parameters, where the library knows it."""
+    return EFFECTS[candidate.name].parameters if candidate.name in EFFECTS else {}
+
+
+def _sizes(candidate: Candidate) -> list[int]:
+    """Which unknowns are sizes in the vocabulary; all where none is in it, as of a wave's sine and cosine."""
+    own, unknowns = _vocabulary(candidate), candidate.unknowns
+    return [k for k, u in enumerate(unknowns) if u.name in own and own[u.name].is_size] or list(range(len(unknowns)))
+
+
 def _largest(candidate: Candidate, values: Sequence[float]) -> Detectable:
-    """The parameter that is farthest from neutral, in units of its range: an effect's own where the library knows it."""
-    parameters = candidate.parameters(values)
-    specs = {u.name: (u.neutral, u.high - u.low, u.unit) for u in candidate.unknowns}
-    if candidate.name in EFFECTS:
-        for name, spec in EFFECTS[candidate.name].parameters.items():
-            neutral = spec.neutral if isinstance(spec.neutral, float | int) else specs[name][0]
-            specs[name] = (neutral, spec.prior[1] - spec.prior[0], spec.unit)
-    if {"amplitude", "mass", "stiffness"} & set(parameters):  # an effect of one size, and of a shape or place
-        name = next(iter(parameters))
-    else:
-        name = max(parameters, key=lambda key: abs(parameters[key] - specs[key][0]) / max(specs[key][1], 1e-12))
-    return Detectable(name, parameters[name], specs[name][2])
+    """The size that is farthest from neutral, in units of its range."""
+    parameters, own = candidate.parameters(values), _vocabulary(candidate)
+    unknowns = {unknown.name: unknown for unknown in candidate.unknowns}
+
+    def distance(name: str) -> float:
+        if name not in own:
+            unknown = unknowns[name]
+            return abs(parameters[name] - unknown.neutral) / (unknown.high - unknown.low)
+        neutral, (low, high) = own[name].neutral, own[name].prior
+        return abs(parameters[name] - (unknowns[name].neutral if isinstance(neutral, str) else neutral)) / (high - low)
+
+    name = max((key for key in parameters if (own.get(key) or unknowns[key]).is_size), key=distance)
+    return Detectable(name, parameters[name], (own.get(name) or unknowns[name]).unit)

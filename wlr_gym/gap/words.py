@@ -67,7 +67,7 @@ _CHANNELS = {
 
 
 #: Units of states that the layout of the simulators' truth does not have.
-_FEATURES = {"slip_speed": "m/s", "time_since_reversal": "rows"}
+_FEATURES = {"slip_speed": "m/s", "time_since_reversal": "s"}
 
 
 def plain(name: str) -> str:

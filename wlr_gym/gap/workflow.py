@@ -69,6 +69,7 @@ def analyse(
     *,
     known: Source = None,
     rig: str | None = None,
+    robot: str | Path | None = None,
     backend: str = "gibbs_appell",
     heldout: Sequence[str] = (),
     threads: int = 1,
@@ -81,6 +82,7 @@ def analyse(
         out: where result, patch, pictures and report are written; None = nowhere.
         known: effects that are known already.
         rig: None = the robot; ``pendulum`` = one servo that swings a pendulum.
+        robot: file or config name; None = the one the runs' meta data name, else the nominal one.
         backend: simulator.
         heldout: names of the runs to keep sealed; empty = chosen by what they can tell.
         threads: worker threads; the result does not depend on it.
@@ -98,7 +100,8 @@ def analyse(
     if rig is None:
         from wlr_gym.gap.robot.open import open_robot
 
-        opened = open_robot(data, known, backend, threads)
+        known = load_patch(known)
+        opened = open_robot(data, known, backend, threads, robot)
     elif rig in RIGS:
         from wlr_gym.gap.rig.open import open_rig, rig_patch
 

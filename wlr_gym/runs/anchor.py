@@ -71,7 +71,7 @@ def start_state(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
 def measured_state(run: Run, times: Array, background: PlantState, parameters: Parameters, degree: int = 2) -> PlantState:
     """Return one state per time: measured where the run measures, else the background's.
 
-    Measured: joint angles and rates; x, y, yaw and their rates from the camera; body rates from the gyroscope. Height, pitch
+    Measured: joint angles and rates; x, y, yaw and their rates from the camera, where a frame is near; body rates from the gyroscope. Height, pitch
     and roll are the background's, moved by what the difference between measured and background leg angles means for a
     body on four wheels. Servo references are the background's; a wheel's moves along with its angle. Rotors keep their place
     in the play of their gears.
@@ -98,17 +98,18 @@ def measured_state(run: Run, times: Array, background: PlantState, parameters: P
         gyro = [local_fit(run["t"], run[f"gyro_{axis}"], times, JOINT_WINDOW, degree)[0] for axis in "xyz"]
         measured = np.stack(gyro, axis=1) - parameters["imu.gyro_bias"]
         state.angular_velocity_in_body = np.einsum("nij,nj->ni", imu_to_body(parameters), measured)
-    if has_camera(run):
-        (x, vx), (y, vy), (yaw, _) = _camera(run, times, parameters, degree)
-        state.position[:, 0], state.position[:, 1] = x, y
-        velocity[:, 0], velocity[:, 1] = vx, vy
+    seen = frame_near(run, times, parameters["camera.delay"][0]) if has_camera(run) else np.zeros(len(times), bool)
+    if seen.any():
+        (x, vx), (y, vy), (measured_yaw, _) = _camera(run, times, parameters, degree)
+        state.position[seen, :2] = np.stack([x, y], axis=1)[seen]
+        velocity[seen, :2] = np.stack([vx, vy], axis=1)[seen]
+        yaw = np.where(seen, measured_yaw, yaw)
     turn = rotation(yaw, pitch, roll)
     state.quaternion = quaternion(yaw, pitch, roll)
     state.linear_velocity_in_body = np.einsum("nji,nj->ni", turn, velocity)
-    if has_camera(run):
-        offset = np.asarray(run.meta.marker_offset)
-        state.position[:, :2] -= (turn @ offset)[:, :2]
-        state.linear_velocity_in_body -= np.cross(state.angular_velocity_in_body, offset)
+    offset = np.asarray(run.meta.marker_offset)
+    state.position[seen, :2] -= (turn @ offset)[seen, :2]
+    state.linear_velocity_in_body[seen] -= np.cross(state.angular_velocity_in_body, offset)[seen]
     return state
 
 
@@ -116,6 +117,13 @@ def has_camera(run: Run) -> bool:
     """Whether the run holds a floor pose with at least three frames."""
     columns = ("cam_x", "cam_y", "cam_yaw")
     return all(name in run and np.isfinite(run[name]).sum() > 2 for name in columns)
+
+
+def frame_near(run: Run, times: Array, delay: float = 0.0) -> NDArray[np.bool_]:
+    """Whether a frame was exposed near each time (K,): farther from all frames a fit of the camera's pose is a guess."""
+    exposed = run["t"][np.isfinite(run["cam_x"])] - delay
+    reach = max(CAMERA_WINDOW, float(np.median(np.diff(exposed))))
+    return np.abs(exposed[:, None] - times).min(axis=0) <= reach
 
 
 def _joints(run: Run, times: Array, parameters: Parameters, degree: int) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ times. Command delays shift the measured times of the goals, so that a segment s
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -89,7 +90,8 @@ class ReplayResult:
 def robot_of(run: Run, robot: Robot | str | Path | None = None) -> Robot:
     """Return the robot a run is of: the one asked for, else the one its meta data name, else the nominal one.
 
-    ``meta.yaml`` may name a robot file (relative to itself), a config, or the ``name`` inside a config.
+    ``meta.yaml`` may name a robot file (relative to itself), a config, or the ``name`` inside a config; see
+    :func:`robot_entry`.
 
     Raises:
         InputError: no such robot; the message lists the shipped ones.
@@ -104,8 +106,14 @@ def robot_of(run: Run, robot: Robot | str | Path | None = None) -> Robot:
     shipped = {str((read_yaml(path) or {}).get("name")): path for path in (data_directory("configs") / "robot").glob("*.yaml")}
     shipped |= {path.stem: path for path in shipped.values()}
     if named not in shipped:
-        raise unknown_name("robot", named, shipped, str(run.path.parent / META_FILE))
+        error = unknown_name("robot", named, shipped, str(run.path.parent / META_FILE))
+        raise InputError(f"{error}; a robot of your own is named by its file (a path from {META_FILE} on), or with --robot")
     return load_robot(shipped[named])
+
+
+def robot_entry(robot: str, folder: Path) -> str | None:
+    """Return how the ``meta.yaml`` of a folder names a robot given by file; None where its own name will do: a config's."""
+    return os.path.relpath(robot, folder) if Path(robot).suffix in {".yaml", ".yml"} else None
 
 
 def profile_parameters(parameters: Parameters, profile: Profile) -> Parameters:

@@ -16,6 +16,7 @@ from wlr_gym.gap.rig.replay import smoothed_state
 Array = NDArray[np.float64]
 
 _SUPPLY_SWING = 0.05  # share of the nominal voltage
+_LONGEST_PERIOD = 0.5  # s between rows: more is in another unit
 _JITTER = 0.1  # share of the usual period
 _GAP = 3.0  # usual periods
 _CONFOUNDED = 0.8  # correlation over runs
@@ -37,6 +38,11 @@ def _units(recording: Recording) -> Iterator[IntakeFinding]:
         if middle > 2.0 * np.pi:
             text = f"{middle:.3g} in the median: degrees, not rad? Write rad and run again"
             yield IntakeFinding(recording.name, column, "units", text, fatal=True)
+    period = float(np.median(np.diff(recording.time)))
+    if period > _LONGEST_PERIOD:
+        text = f"{period:.3g} s between rows: milliseconds, not s? Write s and run again"
+        yield IntakeFinding(recording.name, "timestamp", "units", text, fatal=True)
+        return
     slope = _speed_slope(recording)
     if slope is not None and not _SPEED_SLOPE[0] < slope < _SPEED_SLOPE[1]:
         reason = "the signs differ" if slope < 0 else "rad/s expected"

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from wlr_gym.effects.effect import PatchEffect
 from wlr_gym.errors import InputError
-from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal
+from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal, since_reversal
 from wlr_gym.gap.rig.candidates import rig_candidates
 from wlr_gym.gap.rig.formula import lanes_read, rig_force
 from wlr_gym.gap.rig.kernel import OUTPUTS
 from wlr_gym.gap.rig.model import QUANTITIES, model_of
 from wlr_gym.gap.rig.recording import Recording
 from wlr_gym.gap.rig.replay import Replay
+from wlr_gym.gap.split import SEALED_SHARE
 from wlr_gym.random import generator
 
 Array = NDArray[np.float64]
@@ -30,8 +31,6 @@ LOST = 1e4
 #: Signal -> s of free simulation before it starts again from the measured state; None = the whole run.
 HORIZONS: Mapping[str, float | None] = {"position": None, "position_within_0.2s": 0.2}
 _ANGLE = OUTPUTS.index("angle")
-#: Share of the runs that is held out.
-SEALED_SHARE = 0.3
 
 
 class RigProblem:
@@ -146,7 +145,7 @@ class RigProblem:
                     "rate [rad/s]": columns["rate"],
                     "motor torque [N m]": columns["motor_torque"],
                     "voltage [V]": columns["voltage"],
-                    "time since reversal [s]": _since_reversal(recording.time, columns["rate"]),
+                    "time since reversal [s]": since_reversal(recording.time, columns["rate"]),
                     "time [s]": recording.time,
                     "supply [V]": recording.supply,
                     "temperature [deg C]": recording.temperature,
@@ -170,9 +169,3 @@ def spread_over_conditions(recordings: Sequence[Recording], share: float = SEALE
         held = [recording.trajectory for recording in chosen]
         chosen.append(min(left, key=lambda recording: held.count(recording.trajectory)))
     return tuple(recording.name for recording in recordings if recording in chosen)
-
-
-def _since_reversal(time: Array, rate: Array) -> Array:
-    """Seconds since the rate last changed its sign, or since the start."""
-    turned = np.concatenate([[True], np.diff(np.sign(rate)) != 0])
-    return time - np.maximum.accumulate(np.where(turned, time, -np.inf))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.gap.robot.windows import WINDOW, window_rows
 from wlr_gym.robot import LEGS, WHEELS
-from wlr_gym.runs.anchor import CAMERA_WINDOW, JOINT_WINDOW, has_camera, local_fit, starts_at_rest, unwrapped
+from wlr_gym.runs.anchor import CAMERA_WINDOW, JOINT_WINDOW, frame_near, has_camera, local_fit, starts_at_rest, unwrapped
 from wlr_gym.runs.format import COMMANDS
 from wlr_gym.runs.read import Run
 from wlr_gym.runs.replay import held_goals
@@ -65,6 +65,6 @@ class RunClock:
         pose = np.full((2, 3, len(rows)), np.nan)
         if has_camera(run):
             fits = [local_fit(self.t, unwrapped(run[f"cam_{name}"]), times, CAMERA_WINDOW) for name in ("x", "y", "yaw")]
-            pose = np.stack(fits, axis=1)
+            pose = np.where(frame_near(run, times), np.stack(fits, axis=1), np.nan)
         tick = np.floor((times - self.begin) / CLOCK + 1e-9).astype(int)
         return Anchors(tick, np.transpose(legs), effort.T, pose[0].T, pose[1].T)

@@ -7,30 +7,41 @@ from pathlib import Path
 import numpy as np
 
 from wlr_gym.effects import Source
-from wlr_gym.errors import InputError
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.robot.problem import RobotProblem
-from wlr_gym.robot import JOINTS
+from wlr_gym.robot import JOINTS, LEGS
 from wlr_gym.runs.check import increments
 from wlr_gym.runs.format import COMMANDS
 from wlr_gym.runs.read import Run, read_dataset
+from wlr_gym.runs.replay import robot_of
 
 #: Runs that an analysis needs: two to fit, one for the proof.
 LEAST_RUNS = 3
 #: s; shorter runs hold no window to compare.
 LEAST_SECONDS = 3.0
+#: Rows of all runs from which on the memory that an analysis needs is said; GB per row (eight runs of 20 s: 1.4 GB).
+MANY_ROWS, MEMORY_PER_ROW = 20_000, 1.8e-4
 #: rad, rad/s; a joint asked to move more than this and showing nothing is dead.
 ASKED, SHOWN = 0.2, 0.02
 #: Ratio of measured to commanded wheel motion that means a turned sign.
 MIRRORED = -0.5
 #: Correlation of a rate with its angle's turning that means it; rad in half a second by which both must turn, 1 sigma; rows.
 OPPOSITE, TURNED, LEAST_ROWS = -0.8, 0.02, 100
+#: Mean product of a leg's effort and its lag behind the goal, over the product of their rms, that means a turned sign of the
+#: effort. A servo pushes towards its goal: with the right sign 0.99 in the median, and 0.10 with 0.35 N m of dry friction.
+PUSHES_AWAY = -0.5
+#: m/s2; the accelerometer's z reads about +9.8 at rest, so that half of all readings below this hang upside down.
+UPSIDE_DOWN = -5.0
 #: s between rows within which a joint cannot turn by half a turn.
 LONGEST_STEP = 0.1
 
 
 def open_robot(
-    data: str | Path, known: Source = None, backend: str = "gibbs_appell", threads: int = 1
+    data: str | Path,
+    known: Source = None,
+    backend: str = "gibbs_appell",
+    threads: int = 1,
+    robot: str | Path | None = None,
 ) -> tuple[RobotProblem | None, list[IntakeFinding]]:
     """Return the problem, and what was noticed about the data; None where the data are too bad to go on.
 
@@ -48,10 +59,11 @@ def open_robot(
             "Record more, of different kinds: wlr record --list"
         )
         return None, [*findings, IntakeFinding("", "", "few_runs", text, fatal=True)]
-    try:
-        return RobotProblem(good, known=known, backend=backend, threads=threads), findings
-    except InputError as error:
-        raise InputError(f"{data}: {error}") from None
+    rows = sum(len(run["t"]) for run in good)
+    if rows > MANY_ROWS:
+        text = f"{rows} rows in all: needs about {rows * MEMORY_PER_ROW:.0f} GB of memory; eight runs of 20 s tell as much"
+        findings.append(IntakeFinding("", "", "long", text))
+    return RobotProblem(good, robot_of(good[0], robot), known, backend, threads=threads), findings
 
 
 def _look_at(run: Run) -> list[IntakeFinding]:
@@ -61,9 +73,11 @@ def _look_at(run: Run) -> list[IntakeFinding]:
     if seconds < LEAST_SECONDS:
         text = f"{seconds:.1f} s long: a run needs at least {LEAST_SECONDS:g} s, better 15 to 25 s"
         return [IntakeFinding(run.name, "t", "short", text, fatal=True)]
+    for leg in LEGS:
+        found += _pushes_away(run, leg)
     for joint in JOINTS:
         found += _wrap(run, joint) or _motion(run, joint) or _opposite(run, f"vel_{joint}", f"pos_{joint}")
-    found += _opposite(run, "gyro_z", "cam_yaw") + _opposite(run, "gyro_y", "cam_pitch")
+    found += _opposite(run, "gyro_z", "cam_yaw") + _opposite(run, "gyro_y", "cam_pitch") + _upside_down(run)
     if not np.isfinite(np.stack([run[name] for name in COMMANDS])).any():
         found.append(
             IntakeFinding(run.name, "cmd", "missing", "no motor was on in the whole run: nothing to replay", fatal=True)
@@ -96,6 +110,30 @@ def _opposite(run: Run, rate: str, angle: str) -> list[IntakeFinding]:
         return []
     text = f"turns against {angle}: one of the two has the wrong sign; check the hardware file, and the camera's axes"
     return [IntakeFinding(run.name, rate, "mirrored", text, fatal=True)]
+
+
+def _pushes_away(run: Run, leg: str) -> list[IntakeFinding]:
+    """Whether a leg's effort points away from its goal."""
+    if f"eff_{leg}" not in run:
+        return []
+    lag, effort = run[f"cmd_{leg}"] - run[f"pos_{leg}"], run[f"eff_{leg}"]
+    rows = np.isfinite(lag) & np.isfinite(effort)
+    size = float(np.linalg.norm(lag[rows]) * np.linalg.norm(effort[rows]))
+    if rows.sum() < LEAST_ROWS or float(lag[rows] @ effort[rows]) >= PUSHES_AWAY * size:
+        return []
+    text = "pushes away from its goal: its sign is turned; it goes with the leg's angle"
+    return [IntakeFinding(run.name, f"eff_{leg}", "mirrored", text, fatal=True)]
+
+
+def _upside_down(run: Run) -> list[IntakeFinding]:
+    """Whether the accelerometer shows gravity itself, or its z axis points down."""
+    if "acc_z" not in run or not np.isfinite(run["acc_z"]).any():
+        return []
+    middle = float(np.nanmedian(run["acc_z"]))
+    if middle > UPSIDE_DOWN:
+        return []
+    text = f"reads {middle:.1f} m/s2 (median): at rest it reads +9.8, the push of the floor; check its mounting"
+    return [IntakeFinding(run.name, "acc_z", "mirrored", text, fatal=True)]
 
 
 def _motion(run: Run, joint: str) -> list[IntakeFinding]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.effects import Patch, PatchEffect, Source, apply_patch, load_patch
 from wlr_gym.errors import InputError
-from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal
+from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal, since_reversal
 from wlr_gym.gap.recommend import SHOWN_BY
 from wlr_gym.gap.robot.candidates import robot_candidates
 from wlr_gym.gap.robot.clock import RunClock
@@ -60,7 +60,7 @@ class RobotProblem:
         threads: worker threads.
 
     Raises:
-        InputError: no runs, or runs with different servo profiles.
+        InputError: no runs, runs with different servo profiles, or a robot whose file has a sensor without noise.
     """
 
     def __init__(
@@ -93,6 +93,11 @@ class RobotProblem:
         noise = channel_noise(self.robot)
         self.signals = tuple(Signal(name, COLUMNS[name].unit, noise[name], COLUMNS[name].group) for name in CHANNELS)
         self._noise = np.array([signal.noise for signal in self.signals])
+        if not self._noise.all():
+            name = self.signals[int(np.argmin(self._noise))].name
+            raise InputError(
+                f"robot '{self.robot.name}': sensors: '{name}' has no noise and no count, and errors are counted in them"
+            )
         split = noise_parts(self.robot)
         self._analogue, self._count = (np.array([split[name][k] for name in CHANNELS]) for k in (0, 1))
         self._window = window
@@ -241,7 +246,8 @@ class RobotProblem:
     def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
         """Return joint speeds, loads, slip and place over the rows of each run."""
         found = self._replay([setting], runs, with_truth=True)
-        return [_features(replays.truth[0]) for replays in found if replays.truth is not None]
+        features = zip(runs, found, strict=True)
+        return [_features(replays.truth[0], self.times(run)) for run, replays in features if replays.truth is not None]
 
     def _forces(self, settings: Sequence[Setting]) -> tuple[tuple[Force, ...], Array]:
         """Every formula force that some setting has, and its constants per setting: zero, hence no force, where one lacks it.
@@ -299,23 +305,15 @@ def _formula_inputs(truth: Array) -> dict[str, Array]:
     return found
 
 
-def _features(truth: Array) -> Mapping[str, Array]:
-    """Name the columns of :data:`TRUTH` by joint and wheel."""
+def _features(truth: Array, t: Array) -> Mapping[str, Array]:
+    """Name the columns of :data:`TRUTH` (rows at ``t``, s) by joint and wheel."""
     features = {
         TRUTH_LAYOUT.channels[name].elements[k]: column for (name, k), column in _columns(truth).items() if name != "quaternion"
     }
     for joint in JOINTS:
         rate = features[f"joint_velocity[{joint}]"]
-        features[f"time_since_reversal[{joint}]"] = _since_reversal(rate)
+        features[f"time_since_reversal[{joint}]"] = since_reversal(t, rate)
     for wheel in WHEELS:
         along, across = features[f"slip_velocity[{wheel},x]"], features[f"slip_velocity[{wheel},y]"]
         features[f"slip_speed[{wheel}]"] = np.hypot(along, across)
     return features
-
-
-def _since_reversal(rate: Array) -> Array:
-    """Rows since the sign of a rate last changed."""
-    changed = np.flatnonzero(np.diff(np.sign(rate)) != 0) + 1
-    last = np.zeros(len(rate))
-    last[changed] = changed
-    return np.arange(len(rate), dtype=np.float64) - np.maximum.accumulate(last)

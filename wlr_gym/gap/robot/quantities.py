@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.errors import InputError
+from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.gap.problem import Quantity
 from wlr_gym.parameters import SPECS, TABLE, Parameters
 from wlr_gym.plants.simulator import most_damping
@@ -46,10 +46,17 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Knob:
-    """A quantity, and the elements of the parameter table that it sets."""
+    """A quantity, and the elements of the parameter table that it sets.
+
+    Attributes:
+        quantity: what is fitted.
+        elements: what it sets.
+        shares: of the quantity that each element gets; a robot's floor may grip less across than along.
+    """
 
     quantity: Quantity
     elements: tuple[str, ...]
+    shares: tuple[float, ...] = ()
 
 
 #: Share of the contact damping that the physics step still resolves to which calibration may go.
@@ -64,8 +71,12 @@ def knobs(robot: Robot, physics_step: float) -> tuple[Knob, ...]:
         physics_step: s, with which it will be simulated.
 
     Raises:
-        InputError: a tolerance that cannot be read.
+        InputError: a tolerance that cannot be read, or of no number.
     """
+    known = {spec.tolerance for spec in TABLE if spec.tolerance} | SHARED.keys()
+    for key in robot.tolerances:
+        if key not in known:
+            raise unknown_name("tolerance", key, known, f"robot '{robot.name}'")
     nominal = Parameters.nominal(robot)
     found: list[Knob] = []
     for key, elements in SHARED.items():
@@ -88,7 +99,7 @@ def knobs(robot: Robot, physics_step: float) -> tuple[Knob, ...]:
     for name, sigma in (("imu.gyro_bias", imu.gyro_bias), ("imu.accel_bias", imu.accel_bias)):
         spec = SPECS[name]
         found += [Knob(replace(_quantity(e, name, 0.0, sigma, REACH_OF_BIAS), drifts=True), (e,)) for e in spec.elements]
-    return tuple(found)
+    return tuple(knob for knob in found if knob.quantity.sigma > 0.0)  # what is known exactly does not move
 
 
 def _knob(key: str, elements: tuple[str, ...], nominal: Parameters, robot: Robot) -> Knob:
@@ -96,8 +107,11 @@ def _knob(key: str, elements: tuple[str, ...], nominal: Parameters, robot: Robot
     spec = SPECS[elements[0].partition("[")[0]]
     value = float(nominal[elements[0]][0])
     label = elements[0].partition("[")[2].rstrip("]")
-    sigma = tolerance(robot.tolerances[key], value, "legs" if label in LEGS else "wheels", f"tolerances.{key}")
-    return Knob(_quantity(name, spec.name, value, sigma), elements)
+    sigma = tolerance(
+        robot.tolerances[key], value, "legs" if label in LEGS else "wheels", f"robot '{robot.name}': tolerances.{key}"
+    )
+    shares = tuple(float(nominal[element][0]) / value if value else 1.0 for element in elements)
+    return Knob(_quantity(name, spec.name, value, sigma), elements, shares)
 
 
 def _quantity(name: str, parameter: str, nominal: float, sigma: float, reach: float = REACH) -> Quantity:
@@ -111,18 +125,18 @@ def tolerance(entry: float | str, nominal: float, kind: str, place: str) -> floa
     """Return one sigma: a number is relative; a text has a unit, and may differ between legs and wheels.
 
     Raises:
-        InputError: neither.
+        InputError: neither, or less than 0.
     """
-    if not isinstance(entry, str):
+    if not isinstance(entry, str) and entry >= 0.0:
         return float(entry) * abs(nominal)
-    for amount, unit, group in _AMOUNT.findall(entry):
+    for amount, unit, group in _AMOUNT.findall(str(entry)):
         if group in ("", kind) and unit in _UNITS:
             return float(amount) * _UNITS[unit]
-    raise InputError(f"{place} = {entry!r}: expected a number, or a number with its unit ({', '.join(_UNITS)})")
+    raise InputError(f"{place} = {entry!r}: expected a number of 0 or more, or a number with its unit ({', '.join(_UNITS)})")
 
 
 def write(knobs: Sequence[Knob], values: Array, parameters: Parameters) -> None:
     """Write quantities (settings, len(knobs)) into a batch of parameters."""
     for knob, column in zip(knobs, values.T, strict=True):
-        for element in knob.elements:
-            parameters[element] = column
+        for element, share in zip(knob.elements, knob.shares or [1.0] * len(knob.elements), strict=True):
+            parameters[element] = column * share

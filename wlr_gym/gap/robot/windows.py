@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 #: s; length of a window, and of its beginning in which the camera's frames are not compared.
 WINDOW, BLIND = 2.0, 0.05
 _X, _Y, _YAW, _PITCH = (CHANNELS.index(f"cam_{name}") for name in ("x", "y", "yaw", "pitch"))
-#: Rows (0.14 s) over which bouncing is averaged, and the channels that show it.
+#: Rows (0.14 s at 50 Hz) over which bouncing is averaged, and the channels that show it.
 BOUNCE = 7
 _BOUNCING = [CHANNELS.index(name) for name in ("gyro_x", "gyro_y", "acc_z")]
 _CAMERA = [CHANNELS.index(name) for name in CHANNELS if name.startswith("cam_")]
@@ -28,11 +28,11 @@ _WHEELS = [CHANNELS.index(f"pos_{joint}") for joint in JOINTS[4:]]
 
 
 def window_rows(t: Array, length: float = WINDOW) -> list[slice]:
-    """Cut a run into windows of equal length near ``length``."""
+    """Cut a run into windows of equal length near ``length``; where the log has a hole there is none."""
     count = max(1, round(float(t[-1] - t[0]) / length))  # one window where the length is infinite
     edges = np.searchsorted(t, np.linspace(t[0], t[-1] + 1e-9, count + 1))
     edges[-1] = len(t)  # of seconds since 1970 a nanosecond is rounded away
-    return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges) if a < b]
 
 
 def anchored_residuals(t: Array, measured: Array, simulated: Array, noise: Array, windows: list[slice]) -> Array:
