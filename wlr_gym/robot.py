@@ -289,6 +289,15 @@ def overlay(base: Any, changes: Mapping[str, Any]) -> Any:
     return merged
 
 
+def merge_changes(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the changes that say what ``first`` says and, over it, ``second``: mappings merge key by key, None stays."""
+    merged = {**first, **second}
+    for key, value in second.items():
+        if isinstance(value, Mapping) and isinstance(first.get(key), Mapping):
+            merged[key] = merge_changes(first[key], value)
+    return merged
+
+
 def read_yaml(path: str | Path) -> Any:
     """Read a YAML file; a broken one is an :class:`InputError` naming file, line and column."""
     try:

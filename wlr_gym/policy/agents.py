@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.paths import config_names, data_directory, find_config
-from wlr_gym.robot import read_yaml
+from wlr_gym.robot import merge_changes, read_yaml
 
 Contract = Mapping[str, Any]
 Config = Mapping[str, Any]
@@ -141,14 +141,14 @@ def _read_config(name: str | Path, task: str | None, above: tuple[Path, ...] = (
         raise InputError(f"{path}: expected a mapping, got {type(config).__name__}")
     base = config.pop("base", None)
     if task is not None:
-        config = _merged(config, _of_task(path, config.pop("tasks", None) or {}, task))
+        config = merge_changes(config, _of_task(path, config.pop("tasks", None) or {}, task))
     if base is None:
         return config
     if not isinstance(base, str):
         raise InputError(f"{path}: base = {base!r}: expected a name in configs/agent/, or a path")
     if path in above:
         raise InputError(f"{path}: is its own base")
-    return _merged(_read_config(base, task, (*above, path)), config)
+    return merge_changes(_read_config(base, task, (*above, path)), config)
 
 
 def _of_task(path: Path, tasks: Mapping[str, Any], task: str) -> dict[str, Any]:
@@ -157,16 +157,6 @@ def _of_task(path: Path, tasks: Mapping[str, Any], task: str) -> dict[str, Any]:
         if Path(name).suffix not in {".yaml", ".yml"} and name not in config_names("task"):
             raise unknown_name("task", name, config_names("task"), f"{path}: tasks")
     return tasks.get(task) or {}
-
-
-def _merged(base: dict[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``config`` laid over ``base``; groups merge key by key."""
-    groups = {key: _merged(base[key], value) for key, value in config.items() if _both_groups(base.get(key), value)}
-    return {**base, **config, **groups}
-
-
-def _both_groups(base: Any, value: Any) -> bool:
-    return isinstance(base, dict) and isinstance(value, dict)
 
 
 def _apply(config: dict[str, Any], change: str) -> None:
