@@ -57,6 +57,14 @@ def test_straight_ahead_the_wheels_roll_at_the_commanded_speed(contracts):
     np.testing.assert_allclose(goal[:4], ROBOT.home.leg_angle, atol=1e-6)
 
 
+def test_the_newest_reading_of_a_history_counts():
+    core = make_core(ENVIRONMENT, 1, {"task": {"observations": {"command": {"history": 3}}}})
+    contract = core.contract()
+    core.close()
+    goal = act(contract, "constant_command", {}, {"command[linear_velocity_x]": 0.1})  # the first of that name
+    np.testing.assert_allclose(goal[4:] * ROBOT.wheel.radius, 0.1, rtol=1e-5)
+
+
 def test_a_left_turn_drives_the_right_wheels_faster(contracts):
     goal = act(contracts["Velocity"], "constant_command", {"steering": 2.0}, {"command[yaw_rate]": 0.3})
     speed = 2.0 * 0.3 * ROBOT.hip_position.y / ROBOT.wheel.radius
