@@ -83,6 +83,11 @@ def test_rounding_beyond_one_is_accepted(fake):
     assert env.core.action.max() == 1.0
 
 
+def test_free_wheels_may_come_from_an_iterator(fake):
+    env = make(free_wheels=iter(["wheel_lf", "wheel_rr"]))
+    assert env.core.torque_on[0, 4:].tolist() == [False, True, True, False]
+
+
 def test_free_wheels_spin_free(fake):
     env = make(free_wheels=["wheel_lf", "wheel_rr"], randomization="none")
     env.reset(seed=0)

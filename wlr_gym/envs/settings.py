@@ -84,6 +84,7 @@ class Settings:
             raise unknown_name("observation", str(self.observation), OBSERVATIONS, "environment")
         if isinstance(self.free_wheels, str):
             raise InputError(f"free_wheels = {self.free_wheels!r}: expected a list of wheels, such as ['wheel_lf']")
+        object.__setattr__(self, "free_wheels", tuple(self.free_wheels))  # an iterator can be read once
         for wheel in self.free_wheels:
             if wheel not in WHEELS:
                 raise unknown_name("wheel", str(wheel), WHEELS, "free_wheels")
