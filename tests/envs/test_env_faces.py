@@ -220,6 +220,22 @@ def test_step_before_reset(fake, env):
         made.step(made.action_space.sample())
 
 
+@pytest.mark.parametrize("face", ["single", "vector"])
+def test_a_refused_first_reset_begins_nothing(fake, face):
+    env = make() if face == "single" else make_vec(2)
+    with pytest.raises(InputError, match="did you mean 'command'"):
+        env.reset(seed=0, options={"comand": {}})
+    with pytest.raises(gym.error.ResetNeeded, match="no episode of robot 0"):
+        env.step(env.action_space.sample())
+
+
+def test_robots_left_out_of_the_first_reset_are_named(fake):
+    env = make_vec(3)
+    env.reset(seed=0, options={"reset_mask": np.array([True, False, True])})
+    with pytest.raises(gym.error.ResetNeeded, match="no episode of robot 1"):
+        env.step(env.action_space.sample())
+
+
 # ---- vector = single ----
 
 

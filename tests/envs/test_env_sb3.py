@@ -119,6 +119,11 @@ def test_pickle_builds_a_fresh_environment(fake):
     assert np.array_equal(copy.core.parameters.values, env.core.parameters.values)
 
 
+def test_step_before_reset(fake):
+    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
+        Sb3VecEnv(ID, 2, seed=0).step(np.zeros((2, 8), np.float32))
+
+
 def test_bad_input(fake):
     with pytest.raises(InputError, match="did you mean 'WLR-Velocity-v0'"):
         Sb3VecEnv("WLR-Velocty-v0", 2)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym import plants
@@ -74,6 +75,7 @@ class Core:
         observer: the slip observer, None where the task needs no estimate; its ``values`` are the present estimate.
         sensors: last readings, noise and all. state: where the robots of the present episodes started.
         changed: (N,) whether randomisation changed the robot's parameters at the end of the last step.
+        begun: (N,) whether the robot's first episode has begun.
         unmeasured: rewards and terminations of the task that are left out because a real robot cannot measure them.
     """
 
@@ -110,6 +112,7 @@ class Core:
         self._make_buffers()
         self.everyone: Mask = np.ones(self.count, dtype=bool)
         self.seeded: Mask = np.zeros(self.count, dtype=bool)
+        self.begun: Mask = np.zeros(self.count, dtype=bool)
         if settings.is_real:
             self._load_kernels()
 
@@ -274,6 +277,16 @@ class Core:
         if fixed_command:
             self._hold_command(rows, fixed_command)
         self._observe(mask, True)
+        self.begun |= mask
+
+    def require_begun(self, what: str) -> None:
+        """Refuse what needs the episodes of all robots to have begun.
+
+        Raises:
+            gymnasium.error.ResetNeeded: one has not.
+        """
+        if not self.begun.all():
+            raise ResetNeeded(f"call reset() before {what}: no episode of robot {int(np.argmin(self.begun))} has begun")
 
     def _draw_parameters(
         self,
@@ -354,7 +367,9 @@ class Core:
 
         Raises:
             InputError: wrong shape, or an action that is not finite or out of [-1, 1]; names robot and joint.
+            gymnasium.error.ResetNeeded: a robot's first episode has not begun.
         """
+        self.require_begun("step()")
         self._take_action(actions, mask)
         self.sensors = self.plant.step(self.goals, self.torque_on)
         self._update_observer(mask)

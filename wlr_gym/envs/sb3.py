@@ -76,7 +76,12 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, NDArray[np.float32], Mask, list[dict[str, Any]]]:
-        """Advance one control tick."""
+        """Advance one control tick.
+
+        Raises:
+            InputError: wrong shape, or an action that is not finite or out of [-1, 1].
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
         core = self.core
         any_done = core.step(self._actions, core.everyone)
         reward = core.reward.astype(np.float32)

@@ -101,8 +101,6 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
             gymnasium.error.ResetNeeded: before the first reset, or (``Disabled``) on an ended episode.
         """
         core = self.core
-        if not core.seeded.all():
-            raise ResetNeeded("call reset() before step()")
         if self.autoreset_mode is AutoresetMode.DISABLED and self._over.any():
             raise ResetNeeded(
                 f"the episode of robot {int(np.argmax(self._over))} is over: reset it with options={{'reset_mask': ...}}"
