@@ -208,6 +208,10 @@ def test_bad_seeds_and_masks(fake):
     for seed, expected in (([1, 2], "2 seeds for 3 robots"), ([1, -2, 3], "seed = -2"), ([1, 2.5, 3], "seed = 2.5")):
         with pytest.raises(InputError, match=expected):
             env.reset(seed=seed)
+    for seed in (-1, 1.5, True):
+        for face in (env, make()):
+            with pytest.raises(InputError, match=f"seed = {seed!r}: expected a whole number of 0 or more"):
+                face.reset(seed=seed)
     for mask in (np.zeros(3, bool), np.ones(2, bool), np.ones(3)):
         with pytest.raises(InputError, match="reset_mask"):
             env.reset(options={"reset_mask": mask})

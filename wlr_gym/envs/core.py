@@ -235,8 +235,12 @@ class Core:
     # ---- episodes ----
 
     def seed(self, row: int, seed: int) -> None:
-        """Give a robot its seed; its next episode is its first."""
-        self.robot_seeds[row] = seed % 2**64
+        """Give a robot its seed; its next episode is its first.
+
+        Raises:
+            InputError: see :func:`read_seed`.
+        """
+        self.robot_seeds[row] = read_seed(seed) % 2**64
         self.episodes[row] = -1
         self.seeded[row] = True
 
@@ -541,6 +545,17 @@ def read_actions(actions: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float
     if given.shape != shape:
         raise InputError(f"action has shape {given.shape}, expected {shape}; joints {', '.join(JOINTS)}")
     return given
+
+
+def read_seed(seed: Any) -> int:
+    """Return a seed.
+
+    Raises:
+        InputError: no whole number of 0 or more.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError(f"seed = {seed!r}: expected a whole number of 0 or more")
+    return int(seed)
 
 
 def read_options(options: Any, valid: tuple[str, ...] = OPTIONS) -> Mapping[str, Any]:

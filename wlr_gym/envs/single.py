@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import EzPickle
 
-from wlr_gym.envs.core import Core, read_actions
+from wlr_gym.envs.core import Core, read_actions, read_seed
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
 from wlr_gym.envs.settings import read_settings
@@ -40,10 +40,13 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
             seed: whole number; starts a new, reproducible series of episodes. None goes on with the present series.
             options: ``command`` {name: value} held for the whole episode; ``parameters`` {name or element: value} set
                 after randomisation.
+
+        Raises:
+            InputError: a seed or an option that is none.
         """
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else read_seed(seed))
         if seed is not None or not self.core.seeded[0]:
-            self.core.seed(0, self.np_random_seed if seed is None else seed)
+            self.core.seed(0, self.np_random_seed % 2**64 if seed is None else seed)  # -1 where the user set np_random
         self.core.begin_episodes(self._everyone, options)
         self.pictures.after_tick()
         return self.core.observation_of(0), _first_rows(self.core.reset_info())
