@@ -250,14 +250,14 @@ class Core:
         Args:
             mask: (N,) which robots; all must have been seeded.
             options: ``command`` {name: value} held for the whole episode, ``parameters`` {name or element: value} set after
-                randomisation and effects.
+                randomisation and effects; each value is that of every robot in ``mask``.
 
         Raises:
             InputError: unknown option, command or parameter, or a value of the wrong type or out of bounds.
         """
         options = read_options(options)
         fixed_command = self._read_command(_mapping("command", options.get("command")))
-        overrides = dict(_mapping("parameters", options.get("parameters")))
+        overrides = self._read_parameters(_mapping("parameters", options.get("parameters")))
         rows = np.flatnonzero(mask)
         seeds = episode_seeds(self.robot_seeds[rows], self.episodes[rows] + 1)
         robots = self._draw_parameters(rows, seeds, np.full(len(rows), self._spread))
@@ -336,6 +336,18 @@ class Core:
                 raise InputError(f"command {name} = {value!r}: expected {term.least:g} {term.unit} or more")
             values[self.task.commands.index(name)] = float(value)
         return values
+
+    def _read_parameters(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return values that fit one robot: they are set again, robot by robot, whenever its parameters are redrawn."""
+        for name, value in given.items():
+            one = self.parameters[str(name)][:1]
+            try:
+                np.broadcast_to(value, one.shape)
+            except ValueError:
+                raise InputError(
+                    f"parameters: {name} of shape {np.shape(value)}: expected shape {one.shape[1:]}, the same for every robot"
+                ) from None
+        return dict(given)
 
     def _hold_command(self, rows: NDArray[np.intp], values: Mapping[int, float]) -> None:
         self._command_until[rows] = FOREVER

@@ -39,7 +39,7 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
         Args:
             seed: whole number; starts a new, reproducible series of episodes. None goes on with the present series.
             options: ``command`` {name: value} held for the whole episode; ``parameters`` {name or element: value} set
-                after randomisation.
+                after randomisation and effects.
 
         Raises:
             InputError: a seed or an option that is none.
