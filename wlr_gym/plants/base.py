@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -110,6 +111,10 @@ TRUTH_LAYOUT = Layout(
 )
 
 
+class UnknownChannelError(InputError, AttributeError):
+    """A channel that does not exist. Also an AttributeError: that is what ``hasattr`` and ``getattr`` ask for."""
+
+
 class _Signals:
     layout: Layout
     __slots__ = ("values",)
@@ -120,7 +125,10 @@ class _Signals:
     def __getattr__(self, name: str) -> Array:
         if name.startswith("__"):
             raise AttributeError(name)
-        return self.layout.view(self.values, name)
+        try:
+            return self.layout.view(self.values, name)
+        except InputError as error:
+            raise UnknownChannelError(str(error)) from None
 
     def __getitem__(self, name: str) -> Array:
         return self.layout.view(self.values, name)
@@ -246,11 +254,14 @@ class PlantOptions:
     sensor_noise: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("control_period", "physics_step"):
-            if isinstance(value := getattr(self, name), bool) or not isinstance(value, int | float):
-                raise InputError(f"{name} = {value!r}, expected a number of seconds")
-        if isinstance(self.threads, bool) or not isinstance(self.threads, int):
-            raise InputError(f"threads = {self.threads!r}, expected a whole number")
+        for name, kind, expected in (
+            ("control_period", Real, "a number of seconds"),
+            ("physics_step", Real, "a number of seconds"),
+            ("threads", Integral, "a whole number"),
+        ):
+            if isinstance(value := getattr(self, name), bool) or not isinstance(value, kind):
+                raise InputError(f"{name} = {value!r}, expected {expected}")
+            object.__setattr__(self, name, int(value) if kind is Integral else float(value))
         if not isinstance(self.precision, str):
             raise InputError(f"precision = {self.precision!r}, expected 'float64' or 'float32'")
         if not (0.0 < self.physics_step <= self.control_period):
