@@ -101,8 +101,8 @@ class Settings:
         read_robot_options(self.hardware)
         if self.observation == "dict":
             raise InputError("observation = 'dict': a real robot has no privileged observation")
-        for keyword, harmless in (("randomization", "none"), ("effects", None)):
-            if getattr(self, keyword) not in (None, harmless):
+        for keyword, harmful in (("randomization", self.randomization not in (None, "none")), ("effects", self.effects)):
+            if harmful:
                 raise InputError(
                     f"{keyword} = {getattr(self, keyword)!r}: a real robot is what it is; only a simulator takes that"
                 )
