@@ -240,7 +240,7 @@ def test_command_line_dry_run(tmp_path):
         (["--deadman", "0"], "--deadman 0"),
         (["--deadman", "nan"], "--deadman nan"),
         (["--command", "yaw_rate=nan"], "expected name=number"),
-        (["--command", "speed"], "--command speed: expected name=value"),
+        (["--command", "speed"], "--command speed: expected name=value, such as yaw_rate=0.1"),
         (["--command", "yaw_rate=fast"], "expected name=number"),
         (["--command", "yaw=1"], "unknown command 'yaw'"),
         (["--port", "legs=/dev/x"], "brings its own ports"),
