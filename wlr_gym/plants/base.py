@@ -254,14 +254,13 @@ class PlantOptions:
     sensor_noise: bool = True
 
     def __post_init__(self) -> None:
-        for name, kind, expected in (
-            ("control_period", Real, "a number of seconds"),
-            ("physics_step", Real, "a number of seconds"),
-            ("threads", Integral, "a whole number"),
-        ):
-            if isinstance(value := getattr(self, name), bool) or not isinstance(value, kind):
-                raise InputError(f"{name} = {value!r}, expected {expected}")
-            object.__setattr__(self, name, int(value) if kind is Integral else float(value))
+        for name in ("control_period", "physics_step"):
+            if isinstance(value := getattr(self, name), bool) or not isinstance(value, Real):
+                raise InputError(f"{name} = {value!r}, expected a number of seconds")
+            object.__setattr__(self, name, float(value))
+        if isinstance(self.threads, bool) or not isinstance(self.threads, Integral):
+            raise InputError(f"threads = {self.threads!r}, expected a whole number")
+        object.__setattr__(self, "threads", int(self.threads))
         if not isinstance(self.precision, str):
             raise InputError(f"precision = {self.precision!r}, expected 'float64' or 'float32'")
         if not (0.0 < self.physics_step <= self.control_period):
