@@ -9,7 +9,16 @@ import yaml
 
 from wlr_gym.errors import InputError
 from wlr_gym.paths import data_directory
-from wlr_gym.robot import JOINTS, Robot, load_robot, physical_faults, read_yaml, standing_height
+from wlr_gym.robot import (
+    JOINTS,
+    Robot,
+    load_robot,
+    merge_changes,
+    overlay,
+    physical_faults,
+    read_yaml,
+    standing_height,
+)
 
 NOMINAL = data_directory("configs") / "robot" / "nominal.yaml"
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "robot.yaml"
@@ -220,6 +229,14 @@ def test_a_bad_base_is_named(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(InputError, match=re.escape(message)):
         load_robot(path)
+
+
+def test_merged_changes_say_what_both_say_one_after_the_other():
+    first, second = {"a": {"b": None, "c": 1}, "d": 1}, {"a": {"c": None, "e": 2}, "d": None}
+    merged = merge_changes(first, second)
+    assert merged == {"a": {"b": None, "c": None, "e": 2}, "d": None}
+    base = {"a": {"b": 0, "c": 0, "f": 0}, "d": 0}
+    assert overlay(base, merged) == overlay(overlay(base, first), second)
 
 
 def test_a_robot_that_is_its_own_base_is_refused(tmp_path):

@@ -32,6 +32,15 @@ def find_config(kind: str, name: str | Path) -> Path:
     raise unknown_name(f"{kind} config", str(name), config_names(kind))
 
 
+def named_in(file: str | Path, name: str | Path) -> Path:
+    """Return what ``file`` means by ``name``: a file seen from its own folder, else ``name`` itself, for :func:`find_config`.
+
+    A file has one absolute path, by whatever way it is named.
+    """
+    beside = Path(file).parent / name
+    return beside.resolve() if beside.is_file() else Path(name)
+
+
 def config_names(kind: str) -> list[str]:
     """Return the names of the files in ``configs/<kind>/``."""
     return sorted(path.stem for path in (data_directory("configs") / kind).glob("*.yaml"))

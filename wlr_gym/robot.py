@@ -19,7 +19,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from wlr_gym.errors import InputError, nearest
-from wlr_gym.paths import find_config
+from wlr_gym.paths import find_config, named_in
 
 CORNERS = ("lf", "rf", "lr", "rr")
 LEGS = tuple(f"leg_{corner}" for corner in CORNERS)
@@ -269,8 +269,7 @@ def _resolved(path: Path, above: tuple[Path, ...] = ()) -> Any:
     base = data.pop("base")
     if not isinstance(base, str):
         raise InputError(f"{path}: base = {base!r}: expected the name or the path of a robot file")
-    beside = path.parent / base
-    place = beside if beside.is_file() else find_config("robot", base)
+    place = find_config("robot", named_in(path, base))
     lower = _resolved(place, (*above, path))
     parse_config(Robot, lower, str(place))  # what is wrong in a base is said with its own name
     return overlay({key: value for key, value in lower.items() if key != "name"}, data)
@@ -289,16 +288,34 @@ def overlay(base: Any, changes: Mapping[str, Any]) -> Any:
     return merged
 
 
+def merge_changes(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the changes that say what ``first`` says and, over it, ``second``: mappings merge key by key, None stays."""
+    merged = {**first, **second}
+    for key, value in second.items():
+        if isinstance(value, Mapping) and isinstance(first.get(key), Mapping):
+            merged[key] = merge_changes(first[key], value)
+    return merged
+
+
 def read_yaml(path: str | Path) -> Any:
     """Read a YAML file; a broken one is an :class:`InputError` naming file, line and column."""
     try:
-        return yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_Loader)
+        return parse_yaml(Path(path).read_text(encoding="utf-8"))
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         raise InputError(f"{path}{place}: broken YAML: {getattr(error, 'problem', error)}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def parse_yaml(text: str) -> Any:
+    """Return what YAML text says, as a file of ours is read: 1e-3 is a number.
+
+    Raises:
+        yaml.YAMLError: broken, or a key given twice.
+    """
+    return yaml.load(text, Loader=_Loader)
 
 
 class _Loader(yaml.SafeLoader):

@@ -125,6 +125,35 @@ def test_settings_of_a_task_that_does_not_exist_are_refused(tmp_path):
         load_agent_config(path, task="path")
 
 
+def test_settings_of_a_task_file_are_found_by_whatever_way_it_is_named(tmp_path, monkeypatch):
+    """A registered task is known by the absolute path of its file."""
+    (tmp_path / "tasks").mkdir()
+    (tmp_path / "tasks" / "hill.yaml").write_text("")
+    path = tmp_path / "mine.yaml"
+    for name in ("tasks/hill.yaml", "./tasks/../tasks/hill.yaml", tmp_path / "tasks" / "hill.yaml"):
+        path.write_text(f"{{gamma: 0.9, tasks: {{{name}: {{gamma: 0.99}}}}}}")
+        assert load_agent_config(path, task=str(tmp_path / "tasks" / "hill.yaml")) == {"gamma": 0.99}
+        assert load_agent_config(path, task="path") == {"gamma": 0.9}
+
+
+@pytest.mark.parametrize(("tasks", "where"), [("5", "tasks = 5"), ("{path: 5}", "tasks.path = 5")])
+def test_settings_of_a_task_that_are_none_are_refused(tmp_path, tasks, where):
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"tasks: {tasks}")
+    with pytest.raises(InputError, match=rf"mine\.yaml: {where}: expected a mapping"):
+        load_agent_config(path, task="path")
+
+
+def test_a_base_is_looked_for_beside_the_file(tmp_path):
+    (tmp_path / "base.yaml").write_text("{gamma: 0.9, seed: 1}")
+    path = tmp_path / "mine.yaml"
+    path.write_text("{base: base.yaml, seed: 2}")
+    assert load_agent_config(path) == {"gamma": 0.9, "seed": 2}
+    (tmp_path / "base.yaml").write_text(f"base: ../{tmp_path.name}/mine.yaml")
+    with pytest.raises(InputError, match="is its own base"):
+        load_agent_config(path)
+
+
 def test_what_a_file_says_lies_over_its_base_for_every_task(tmp_path):
     base, path = tmp_path / "base.yaml", tmp_path / "mine.yaml"
     base.write_text("{gamma: 0.9, seed: 1, tasks: {path: {gamma: 0.99, seed: 2}}}")
@@ -216,6 +245,6 @@ def test_bad_changes_are_named(change, message):
 
 
 def test_changes_reach_nested_settings():
-    config = load_agent_config("ppo", ("environment.precision=float64", "learning_rate=2.5e-4"))
+    config = load_agent_config("ppo", ("environment.precision=float64", "learning_rate=5e-4"))
     assert config["environment"]["precision"] == "float64"
-    assert float(config["learning_rate"]) == 2.5e-4
+    assert config["learning_rate"] == 5e-4

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from wlr_gym.errors import InputError
-from wlr_gym.evaluation import make_core
+from wlr_gym.evaluation import make_core, roll_out, score
+from wlr_gym.evaluation.tuning import tracking_score
 from wlr_gym.paper import corrected
 from wlr_gym.paper.quantities import Constants, State
 from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
@@ -55,6 +56,14 @@ def test_straight_ahead_the_wheels_roll_at_the_commanded_speed(contracts):
     goal = act(contracts["Velocity"], "constant_command", {}, {"command[linear_velocity_x]": 0.1})
     np.testing.assert_allclose(goal[4:] * ROBOT.wheel.radius, 0.1, rtol=1e-5)
     np.testing.assert_allclose(goal[:4], ROBOT.home.leg_angle, atol=1e-6)
+
+
+def test_the_newest_reading_of_a_history_counts():
+    core = make_core(ENVIRONMENT, 1, {"task": {"observations": {"command": {"history": 3}}}})
+    contract = core.contract()
+    core.close()
+    goal = act(contract, "constant_command", {}, {"command[linear_velocity_x]": 0.1})  # the first of that name
+    np.testing.assert_allclose(goal[4:] * ROBOT.wheel.radius, 0.1, rtol=1e-5)
 
 
 def test_a_left_turn_drives_the_right_wheels_faster(contracts):
@@ -184,6 +193,30 @@ def test_search_finds_what_scores_better_and_is_reproducible(tmp_path):
     assert read_contract(none)["training"]["score"] > 1.2 * scores[0]
     policy = load_policy(folder, content["environment"])
     assert policy.config.steering == content["config"]["steering"]  # type: ignore[attr-defined]
+
+
+def test_a_search_scores_as_the_card_does():
+    limits = {"velocity_error": {"rms": 0.02, "max": 0.03}, "yaw_rate_error": {"max": 0.1}}
+    core = make_core(ENVIRONMENT, 3, {"episode_length": 1.0, "task": {"success": limits}})
+    policy = make_policy("pid", core.contract())
+    found = tracking_score(core, policy, 5)
+    expected = score(roll_out(core, policy, 5))["tracking_error"].mean
+    core.close()
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"search": {"steps": {"stering": 0.4}}}, "agent 'pid': search.steps: unknown setting 'stering'.*'steering'"),
+        ({"search": {"steps": {"robot": 0.4}}}, "unknown setting 'robot'"),
+        ({"search": {"episodes": 1}, "environment": {"task": {"success": None}}}, "limits of a task's success, and 'velocity'"),
+    ],
+)
+def test_what_cannot_be_searched_is_refused_before_anything_is_written(tmp_path, settings, message):
+    with pytest.raises(InputError, match=message):
+        load_agent("pid").train(Training(ENVIRONMENT, tmp_path / "run", settings, progress=False))
+    assert not (tmp_path / "run").exists()
 
 
 def test_search_is_not_resumed(tmp_path):

@@ -89,6 +89,7 @@ def test_a_path_is_where_the_robot_went_and_where_it_was_told_to_go():
         (["--video", "film.webp", "--command", "0,0; 3:-1,0"], "linear_velocity_x = -1 m/s: the wheels"),
         (["--video", "film.webp", "--agent", "pdi"], "did you mean 'pid'"),
         (["--video", "film.webp", "--backend", "mujocoo"], "unknown backend 'mujocoo'"),
+        (["--video", "film.webp", "--backend", "dynamixel"], "--backend dynamixel: a real robot is driven with wlr deploy"),
         (["--video", "film.webp", "--effects", "nothing.yaml"], "nothing.yaml"),
         (["--video", "film.webp", "--gamepad"], "--gamepad drives in the window"),
         (["WLR-Velocty-v0", "--video", "film.webp"], "did you mean 'WLR-Velocity-v0'"),

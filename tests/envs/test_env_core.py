@@ -83,6 +83,11 @@ def test_rounding_beyond_one_is_accepted(fake):
     assert env.core.action.max() == 1.0
 
 
+def test_free_wheels_may_come_from_an_iterator(fake):
+    env = make(free_wheels=iter(["wheel_lf", "wheel_rr"]))
+    assert env.core.torque_on[0, 4:].tolist() == [False, True, True, False]
+
+
 def test_free_wheels_spin_free(fake):
     env = make(free_wheels=["wheel_lf", "wheel_rr"], randomization="none")
     env.reset(seed=0)
@@ -495,6 +500,22 @@ def test_interval_events_strike_each_in_its_own_time_and_leave_reset_options_alo
     strikes = [np.flatnonzero(np.diff(force[:, robot])) for robot in range(4)]
     assert len({tuple(ticks.tolist()) for ticks in strikes}) == 4
     assert all(np.diff(ticks).min() >= 2 and np.diff(ticks).max() <= 10 for ticks in strikes)
+
+
+def test_reset_options_are_alike_for_all_robots_of_a_batch(fake):
+    """A value per robot would not fit the one robot whose parameters an event redraws."""
+    env = make_vec(3, randomization={"events": {"drift": interval_event("ground.mu_x", 0.3, 0.9, [0.04, 0.04])}})
+    for name, given, expected in (
+        ("body.mass", [2.9, 3.0, 3.1], r"body\.mass of shape \(3,\): expected shape \(\), the same"),
+        ("ground.mu_x", np.full((3, 4), 0.5), r"ground\.mu_x of shape \(3, 4\): expected shape \(4,\)"),
+    ):
+        with pytest.raises(InputError, match=expected):
+            env.reset(seed=0, options={"parameters": {name: given}})
+    env.reset(seed=0, options={"parameters": {"ground.mu_x": [0.1, 0.2, 0.3, 0.4], "body.mass": [3.0]}})
+    for _ in range(4):
+        env.step(np.zeros((3, 8)))
+    assert fake["plants"][-1].parameters["ground.mu_x"].tolist() == [[0.1, 0.2, 0.3, 0.4]] * 3
+    assert fake["plants"][-1].parameters["body.mass"].tolist() == [3.0] * 3
 
 
 def test_interval_events_reach_the_plant_in_mid_episode(fake):

@@ -208,6 +208,10 @@ def test_bad_seeds_and_masks(fake):
     for seed, expected in (([1, 2], "2 seeds for 3 robots"), ([1, -2, 3], "seed = -2"), ([1, 2.5, 3], "seed = 2.5")):
         with pytest.raises(InputError, match=expected):
             env.reset(seed=seed)
+    for seed in (-1, 1.5, True):
+        for face in (env, make()):
+            with pytest.raises(InputError, match=f"seed = {seed!r}: expected a whole number of 0 or more"):
+                face.reset(seed=seed)
     for mask in (np.zeros(3, bool), np.ones(2, bool), np.ones(3)):
         with pytest.raises(InputError, match="reset_mask"):
             env.reset(options={"reset_mask": mask})
@@ -218,6 +222,22 @@ def test_step_before_reset(fake, env):
     made = env()
     with pytest.raises(gym.error.ResetNeeded):
         made.step(made.action_space.sample())
+
+
+@pytest.mark.parametrize("face", ["single", "vector"])
+def test_a_refused_first_reset_begins_nothing(fake, face):
+    env = make() if face == "single" else make_vec(2)
+    with pytest.raises(InputError, match="did you mean 'command'"):
+        env.reset(seed=0, options={"comand": {}})
+    with pytest.raises(gym.error.ResetNeeded, match="no episode of robot 0"):
+        env.step(env.action_space.sample())
+
+
+def test_robots_left_out_of_the_first_reset_are_named(fake):
+    env = make_vec(3)
+    env.reset(seed=0, options={"reset_mask": np.array([True, False, True])})
+    with pytest.raises(gym.error.ResetNeeded, match="no episode of robot 1"):
+        env.step(env.action_space.sample())
 
 
 # ---- vector = single ----

@@ -119,11 +119,23 @@ def test_pickle_builds_a_fresh_environment(fake):
     assert np.array_equal(copy.core.parameters.values, env.core.parameters.values)
 
 
+def test_an_id_may_name_its_module(fake):
+    assert Sb3VecEnv(f"wlr_gym:{ID}", 2).spec == gym.spec(ID)
+
+
+def test_step_before_reset(fake):
+    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
+        Sb3VecEnv(ID, 2, seed=0).step(np.zeros((2, 8), np.float32))
+
+
 def test_bad_input(fake):
     with pytest.raises(InputError, match="did you mean 'WLR-Velocity-v0'"):
         Sb3VecEnv("WLR-Velocty-v0", 2)
     with pytest.raises(InputError, match="did you mean 'randomization'"):
         Sb3VecEnv(ID, 2, randomisation="none")
+    for seed in (-1, 0.5):
+        with pytest.raises(InputError, match=f"seed = {seed}: expected a whole number of 0 or more"):
+            Sb3VecEnv(ID, 2, seed=seed)  # type: ignore[arg-type]
     env = Sb3VecEnv(ID, 2, seed=0)
     env.reset()
     with pytest.raises(InputError, match="leg_lf of robot 1"):

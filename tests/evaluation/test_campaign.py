@@ -7,6 +7,7 @@ from wlr_gym.errors import InputError
 from wlr_gym.evaluation import Condition, Subject, identity, play, read_subjects, work
 from wlr_gym.evaluation import subjects as subjects_module
 from wlr_gym.evaluation.campaign import BLOCK
+from wlr_gym.evaluation.subjects import make_player
 from wlr_gym.evaluation.sweeps import SWEEPS, read_sweep, sweeps_for
 
 ID = "WLR-Velocity-v0"
@@ -57,6 +58,14 @@ def test_a_condition_on_the_task_holds_for_a_policy_with_a_task_of_its_own(monke
     turned = []
     play(ID, SUBJECTS, [Condition("main", wide, episodes=4)], watch=lambda *given: turned.append(given[-1].command[:, :, 1]))
     assert all(np.abs(turns).max() <= 0.01 for turns in turned)
+
+
+def test_what_a_policy_is_not_fed_stays_away_under_a_condition_on_the_task():
+    core, _ = make_player(ID, "pid", 1, {**SHORT, "task": {"commands": {"terms": {"yaw_rate": [-0.01, 0.01]}}}})
+    contract = core.contract()
+    core.close()
+    assert contract["observer"] is None
+    assert not [column["name"] for column in contract["observation"] if column["source"] == "estimate"]
 
 
 @pytest.mark.parametrize(

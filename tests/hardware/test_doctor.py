@@ -127,7 +127,7 @@ def test_on_ports_with_a_scan(capsys, monkeypatch):
 def test_what_cannot_be_asked_for(tmp_path):
     with pytest.raises(InputError, match="--scan: the emulated robot"):
         doctor.run(doctor.Options(emulated=True, scan=True))
-    with pytest.raises(InputError, match="expected NAME=PATH"):
+    with pytest.raises(InputError, match="--port legs: expected name=value, such as legs=/dev/ttyUSB1"):
         doctor.run(doctor.Options(port=("legs",)))
     with pytest.raises(InputError, match="one or the other"):
         doctor.run(doctor.Options(port=("legs=/dev/x",), emulated=True))

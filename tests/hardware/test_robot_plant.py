@@ -12,7 +12,9 @@ pytest.importorskip("serial")
 from robot_rig import ROBOT, Phase, StoppedError, machine_of
 
 import wlr_gym  # noqa: F401  (registers the environments)
+from wlr_gym.effects import Patch
 from wlr_gym.envs.measured import MEASURED, measured_truth
+from wlr_gym.envs.settings import Settings
 from wlr_gym.errors import InputError
 from wlr_gym.evaluation import make_core, roll_out
 from wlr_gym.parameters import Parameters
@@ -224,6 +226,11 @@ def test_a_stopped_robot_says_so(env):
 def test_what_only_a_simulator_can_do_is_refused(keywords, words):
     with pytest.raises(InputError, match=words):
         gym.make(ID, **{"backend": "dynamixel", "hardware": EMULATED, **keywords})
+
+
+@pytest.mark.parametrize("effects", [[], (), Patch(), None])
+def test_no_effects_are_none(effects):
+    assert Settings(backend="dynamixel", hardware=EMULATED, effects=effects).is_real
 
 
 def test_a_robot_is_not_scored(env):

@@ -1,5 +1,9 @@
 """What only the Gibbs-Appell plant promises; the contract all plants keep is in test_conformance.py."""
 
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
 import pytest
 from simulators import ROBOT
 
@@ -47,6 +51,16 @@ def test_unknown_precision_is_refused_with_the_nearest():
 def test_impossible_options_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         PlantOptions(**options)
+
+
+def test_options_are_numbers_of_any_kind():
+    """The kinds that ``Settings`` takes; a step in single precision is another number than it looks."""
+    kinds: Any = {"control_period": Fraction(1, 50), "physics_step": np.float64(0.002), "threads": np.int64(2)}
+    options = PlantOptions(**kinds)
+    assert options == PlantOptions(physics_step=0.002, threads=2)
+    assert [type(getattr(options, name)) for name in kinds] == [float, float, int]
+    with pytest.raises(InputError, match=r"physics_step 0\.00100000004\d+ s does not divide"):
+        PlantOptions(physics_step=np.float32(0.001))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("options", [{"threads": 1.5}, {"physics_step": "a"}, {"precision": 64}])

@@ -289,6 +289,15 @@ def test_control_period_sets_the_camera_pattern():
     assert new.all()
 
 
+def test_channels_that_do_not_exist_can_be_asked_for():
+    sensors = Sensors(np.zeros((1, SENSOR_LAYOUT.width)))
+    assert not hasattr(sensors, "gyr")
+    assert getattr(sensors, "gyr", None) is None
+    for look in (lambda: sensors.gyr, lambda: sensors["gyr"]):
+        with pytest.raises(InputError, match=r"unknown channel 'gyr' \(did you mean 'gyro'"):
+            look()
+
+
 def test_wrong_shapes_are_refused():
     model = SensorModel(ROBOT, PlantOptions(), 2)
     raw, out = buffers(3)

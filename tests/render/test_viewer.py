@@ -158,6 +158,18 @@ def test_arrow_keys():
     assert not keys.wants_reset()
 
 
+@pytest.mark.parametrize(("bounds", "way"), [((0.08, 0.1), 1), ((-0.1, -0.08), -1)])
+def test_who_drives_can_slow_down_and_stop_where_the_task_never_does(bounds, way):
+    keys = Keyboard({"linear_velocity_x": bounds})
+    faster, slower = (UP, DOWN) if way > 0 else (DOWN, UP)
+    for key in (faster, faster, faster, slower):
+        keys.press(key)
+    assert keys.command(0.0) == pytest.approx({"linear_velocity_x": way * 0.02})
+    keys.press(SPACE)
+    assert keys.command(0.0) == {"linear_velocity_x": 0.0}
+    assert Gamepad({"linear_velocity_x": bounds}, pad([0.0, 0.0])).command(0.0) == {"linear_velocity_x": 0.0}
+
+
 def test_keys_of_a_task_without_such_commands():
     with pytest.raises(InputError, match="the arrow keys steer others: unknown command 'height'"):
         Keyboard({"height": (0.0, 1.0)})

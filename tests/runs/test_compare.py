@@ -10,7 +10,8 @@ import pytest
 from wlr_gym.effects import EFFECTS, apply_patch
 from wlr_gym.errors import InputError
 from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
+from wlr_gym.plants import make_plant
+from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.runs import Profile, Run, RunMeta
 from wlr_gym.runs import compare as module
@@ -25,6 +26,7 @@ from wlr_gym.runs.compare import (
     parse_contender,
     resolutions,
     severe_patch,
+    standing_at,
 )
 from wlr_gym.runs.compare_report import markdown, summary_table
 from wlr_gym.runs.excitations import excite
@@ -153,6 +155,23 @@ def test_every_motion_is_driven_by_its_own_goals_and_profile():
     other = excite("straight", 0, ROBOT, seconds=2.0)
     together, alone = drive(ENGINE, [MOTION, other], ROBOT), drive(ENGINE, [other], ROBOT)
     assert np.array_equal(together.truth[: len(other.goals) + 1, 1], alone.truth[:, 0])
+
+
+def test_whose_zeros_are_off_begins_at_its_goals():
+    """References are true angles: a servo that stands where its reading says has no way to go."""
+    parameters = Parameters.nominal(ROBOT)
+    parameters["joint.zero_offset"] = 0.1
+    goals = np.array([[*[1.5] * 4, *[0.0] * 4]])
+    state = standing_at(goals, ROBOT, parameters)
+    np.testing.assert_allclose(state.reference_position[:, :4], 1.4)
+    np.testing.assert_array_equal(state.reference_position, state.joint_position)
+    for contender in (ENGINE, Contender("mujoco")):
+        plant = make_plant(contender.backend, ROBOT, 1, PlantOptions(sensor_noise=False))
+        plant.reset(np.zeros(1, np.uint64), parameters, state=state)
+        plant.step(goals)
+        moved = plant.get_state().reference_position[:, :4]
+        plant.close()
+        np.testing.assert_allclose(moved, 1.4, atol=1e-9)
 
 
 def test_effects_act_on_both():

@@ -1,6 +1,7 @@
 """Tasks as data: bad data is refused with the nearest valid name; tables and contract tell the truth."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from wlr_gym.errors import InputError
 from wlr_gym.robot import load_robot
 from wlr_gym.tasks import contract, describe, load_task
 from wlr_gym.tasks.task import bounds, overlay
+from wlr_gym.tasks.terms import TERMINATIONS
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +39,33 @@ def robot():
         ({"episode_length": 0.03}, "whole number of control periods"),
         ({"episode_lenght": 10.0}, "did you mean 'episode_length'"),
         ({"observations": None}, "'observations' is missing"),
+        (
+            {"observations": {"estimated_slip_velcity": None}},
+            "unknown observation term.*did you mean 'estimated_slip_velocity'",
+        ),
+        ({"privileged": {"positoin": None}}, "did you mean 'position'"),
+        ({"rewards": {"slipp": None}}, "did you mean 'slip'"),
+        ({"terminations": {"tillt": None}}, "did you mean 'tilt'"),
+        ({"measures": {"velocity_eror": None}}, "did you mean 'velocity_error'"),
     ],
 )
 def test_bad_data_names_the_place_and_the_nearest_valid_name(robot, overrides, expected):
     with pytest.raises(InputError, match=expected.replace("(", r"\(")):
         load_task("velocity", robot, overrides)
+
+
+def test_a_known_term_that_is_not_there_may_be_removed(robot):
+    """One set of changes serves several tasks."""
+    assert load_task("velocity", robot, {"observations": {"path_error": None}}) == load_task("velocity", robot)
+
+
+def test_a_termination_needs_its_commands(robot, monkeypatch):
+    def far_off(signals):
+        return signals.command("path_offset") - 1.0
+
+    monkeypatch.setitem(TERMINATIONS, "tilt", replace(TERMINATIONS["tilt"], function=far_off))
+    with pytest.raises(InputError, match="termination term 'tilt' needs the command 'path_offset'"):
+        load_task("velocity", robot)
 
 
 def test_unknown_task_and_broken_file(robot, tmp_path):

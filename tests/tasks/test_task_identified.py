@@ -122,6 +122,12 @@ def test_bad_results_are_refused(robot, result, content, expected):
         load_randomization(result(**content), robot)
 
 
+def test_a_result_is_looked_for_beside_the_file(robot, result, tmp_path):
+    path = result(calibration={"body.mass": {"fitted": 2.5}})
+    (tmp_path / "mine.yaml").write_text("result: result.json\n")
+    assert load_randomization(tmp_path / "mine.yaml", robot).config.events == load_randomization(path, robot).config.events
+
+
 def test_unreadable_results(robot, tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         load_randomization(tmp_path / "none.json", robot)

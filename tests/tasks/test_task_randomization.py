@@ -280,6 +280,17 @@ def test_initial_states_out_of_reach_are_refused(robot, key, value):
         load_randomization({"initial_state": {key: value}}, robot)
 
 
+def test_a_base_is_looked_for_beside_the_file(robot, tmp_path):
+    (tmp_path / "lower.yaml").write_text("base: nominal\ninitial_state: {yaw: 0.5}\n")
+    (tmp_path / "upper.yaml").write_text("base: lower.yaml\n")
+    config = load_randomization(tmp_path / "upper.yaml", robot).config
+    assert config.initial_state.yaw == 0.5
+    assert config.events.keys() == load_randomization("nominal", robot).config.events.keys()
+    (tmp_path / "lower.yaml").write_text(f"base: ../{tmp_path.name}/upper.yaml\n")
+    with pytest.raises(InputError, match="is its own base"):
+        load_randomization(tmp_path / "upper.yaml", robot)
+
+
 def test_errors_name_event_and_file_it_stands_in(robot, tmp_path):
     lower, upper = tmp_path / "lower.yaml", tmp_path / "upper.yaml"
     bad = "{parameters: [ground.mu], distribution: uniform, operation: set, low: 0.1, high: 0.2}"

@@ -18,8 +18,8 @@ import tyro
 from rich.console import Console
 
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.options import EffectsOption, environment_of
-from wlr_gym.cli.robot_options import wait_for_enter
+from wlr_gym.cli.options import EffectsOption, environment_of, pairs
+from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def run(options: Options) -> int:
     fed = policy_environment(options.policy)
     console = Console()
     with contextlib.ExitStack() as stack:
-        ports = _pairs("--port", options.port)
+        ports = port_pairs(options.port)
         if options.emulated and not options.stepped:
             ports |= stack.enter_context(_emulator(options, console))
         robot_options = {
@@ -127,7 +127,7 @@ def _check(options: Options) -> dict[str, float]:
     options.patch()  # a bad one is refused before a robot is started for it
     if options.emulated and options.port:
         raise InputError("--port: the emulated robot brings its own ports")
-    commands = _pairs("--command", options.command)
+    commands = pairs("--command", options.command, "yaw_rate=0.1")
     try:
         numbers = {name: float(text) for name, text in commands.items()}
     except ValueError:
@@ -135,16 +135,6 @@ def _check(options: Options) -> dict[str, float]:
     if not all(map(math.isfinite, numbers.values())):
         raise InputError(f"--command {' '.join(options.command)}: expected name=number")
     return numbers
-
-
-def _pairs(option: str, words: tuple[str, ...]) -> dict[str, str]:
-    pairs = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not (name and equals and value):
-            raise InputError(f"{option} {word}: expected name=value")
-        pairs[name] = value
-    return pairs
 
 
 def _machine_of(loop: ControlLoop) -> Any:

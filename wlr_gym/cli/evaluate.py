@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.options import EffectsOption, environment_of
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.settings import read_settings
@@ -133,7 +133,7 @@ def _complete(options: Options) -> Options:
     """Return the options with nothing left open that --full and the policy decide."""
     full = options.full
     policy = read_subjects([options.policy])[0].sources[0]
-    environment = options.env or trained_environment(policy) or "WLR-Velocity-v0"
+    environment = environment_of(options.env, policy)
     task = task_name_of(environment)
     chosen = {
         "env": environment,

@@ -70,16 +70,14 @@ def _write_card(source: str, evaluation: Path) -> None:
 
 def real_observations(source: Path) -> NDArray[np.float32]:
     """Return the observations (M, D) of a policy that drives robots in the environment it was trained in."""
-    from wlr_gym.evaluation import make_core
+    from wlr_gym.evaluation import make_core, start_episodes
     from wlr_gym.policy import make_policy, policy_environment
 
     core = make_core(environment_of(None, source), ROBOTS, {"episode_length": SECONDS} | policy_environment(source))
     seen = []
     try:
         policy = make_policy(source, core.contract())
-        for row in range(core.count):
-            core.seed(row, row)
-        core.begin_episodes(core.everyone)
+        start_episodes(core, policy, 0)
         active = core.everyone.copy()
         while active.any():
             seen.append(core.observation[active])

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
     from wlr_gym.effects import Patch
@@ -26,6 +29,21 @@ class EffectsOption:
         from wlr_gym.effects import load_patch
 
         return load_patch(list(self.effects))
+
+
+def pairs(option: str, words: Sequence[str], example: str) -> dict[str, str]:
+    """Return name -> value of the words of an option, each ``name=value``.
+
+    Raises:
+        InputError: another word; the message names the option and the example.
+    """
+    found = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (name and equals and value):
+            raise InputError(f"{option} {word}: expected name=value, such as {example}")
+        found[name] = value
+    return found
 
 
 def environment_of(env: str | None, policy: str | Path) -> str:

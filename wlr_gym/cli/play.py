@@ -89,8 +89,11 @@ def run(options: Options) -> int:
 
 
 def _check(options: Options) -> None:
+    from wlr_gym.plants import REAL
     from wlr_gym.render.video import check_video
 
+    if options.backend in REAL:
+        raise InputError(f"--backend {options.backend}: a real robot is driven with wlr deploy; wlr play takes a simulator")
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
     if options.seconds is not None and not 0 < options.seconds < float("inf"):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wlr_gym.cli.options import pairs
 from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,11 +37,11 @@ class HardwareOption:
         """Return the hardware, with the ports asked for.
 
         Raises:
-            InputError: unknown or broken file, a port that is not NAME=PATH, or a name that is no bus.
+            InputError: unknown or broken file, a port that is not name=value, or a name that is no bus.
         """
         from wlr_gym.hardware.config import load_hardware, with_ports
 
-        ports = dict(_pair(text) for text in self.port)
+        ports = port_pairs(self.port)
         if ports and self.emulated:
             raise InputError("--port and --emulated: one or the other; the emulated robot of this process has no ports")
         return with_ports(load_hardware(self.hardware), ports)
@@ -68,7 +70,7 @@ class HardwareOption:
         from wlr_gym.plants.base import PlantOptions, RobotOptions
 
         hardware = self.load_hardware()
-        options = RobotOptions(hardware=self.hardware, ports=dict(_pair(text) for text in self.port), log=log)
+        options = RobotOptions(hardware=self.hardware, ports=port_pairs(self.port), log=log)
         return RobotPlant(robot, 1, PlantOptions(), options, link=self.link_to(robot, hardware, patch), meta=meta)
 
 
@@ -127,8 +129,10 @@ def wait_for_enter(console: Console, question: str) -> None:
         raise InputError("nobody there to start the robot: run it on a terminal, or say --yes") from None
 
 
-def _pair(text: str) -> tuple[str, str]:
-    name, equals, path = text.partition("=")
-    if not (name and equals and path):
-        raise InputError(f"--port {text}: expected NAME=PATH, such as legs=/dev/ttyUSB1")
-    return name, path
+def port_pairs(words: Sequence[str]) -> dict[str, str]:
+    """Return bus name or ``imu`` -> device of ``--port``.
+
+    Raises:
+        InputError: a word that is not ``name=value``.
+    """
+    return pairs("--port", words, "legs=/dev/ttyUSB1")

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym import plants
@@ -74,6 +75,7 @@ class Core:
         observer: the slip observer, None where the task needs no estimate; its ``values`` are the present estimate.
         sensors: last readings, noise and all. state: where the robots of the present episodes started.
         changed: (N,) whether randomisation changed the robot's parameters at the end of the last step.
+        begun: (N,) whether the robot's first episode has begun.
         unmeasured: rewards and terminations of the task that are left out because a real robot cannot measure them.
     """
 
@@ -110,6 +112,7 @@ class Core:
         self._make_buffers()
         self.everyone: Mask = np.ones(self.count, dtype=bool)
         self.seeded: Mask = np.zeros(self.count, dtype=bool)
+        self.begun: Mask = np.zeros(self.count, dtype=bool)
         if settings.is_real:
             self._load_kernels()
 
@@ -232,8 +235,12 @@ class Core:
     # ---- episodes ----
 
     def seed(self, row: int, seed: int) -> None:
-        """Give a robot its seed; its next episode is its first."""
-        self.robot_seeds[row] = seed % 2**64
+        """Give a robot its seed; its next episode is its first.
+
+        Raises:
+            InputError: see :func:`read_seed`.
+        """
+        self.robot_seeds[row] = read_seed(seed) % 2**64
         self.episodes[row] = -1
         self.seeded[row] = True
 
@@ -243,14 +250,14 @@ class Core:
         Args:
             mask: (N,) which robots; all must have been seeded.
             options: ``command`` {name: value} held for the whole episode, ``parameters`` {name or element: value} set after
-                randomisation and effects.
+                randomisation and effects; each value is that of every robot in ``mask``.
 
         Raises:
             InputError: unknown option, command or parameter, or a value of the wrong type or out of bounds.
         """
         options = read_options(options)
         fixed_command = self._read_command(_mapping("command", options.get("command")))
-        overrides = dict(_mapping("parameters", options.get("parameters")))
+        overrides = self._read_parameters(_mapping("parameters", options.get("parameters")))
         rows = np.flatnonzero(mask)
         seeds = episode_seeds(self.robot_seeds[rows], self.episodes[rows] + 1)
         robots = self._draw_parameters(rows, seeds, np.full(len(rows), self._spread))
@@ -274,6 +281,16 @@ class Core:
         if fixed_command:
             self._hold_command(rows, fixed_command)
         self._observe(mask, True)
+        self.begun |= mask
+
+    def require_begun(self, what: str) -> None:
+        """Refuse what needs the episodes of all robots to have begun.
+
+        Raises:
+            gymnasium.error.ResetNeeded: one has not.
+        """
+        if not self.begun.all():
+            raise ResetNeeded(f"call reset() before {what}: no episode of robot {int(np.argmin(self.begun))} has begun")
 
     def _draw_parameters(
         self,
@@ -320,6 +337,18 @@ class Core:
             values[self.task.commands.index(name)] = float(value)
         return values
 
+    def _read_parameters(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return values that fit one robot: they are set again, robot by robot, whenever its parameters are redrawn."""
+        for name, value in given.items():
+            one = self.parameters[str(name)][:1]
+            try:
+                np.broadcast_to(value, one.shape)
+            except ValueError:
+                raise InputError(
+                    f"parameters: {name} of shape {np.shape(value)}: expected shape {one.shape[1:]}, the same for every robot"
+                ) from None
+        return dict(given)
+
     def _hold_command(self, rows: NDArray[np.intp], values: Mapping[int, float]) -> None:
         self._command_until[rows] = FOREVER
         for column, value in values.items():
@@ -354,7 +383,9 @@ class Core:
 
         Raises:
             InputError: wrong shape, or an action that is not finite or out of [-1, 1]; names robot and joint.
+            gymnasium.error.ResetNeeded: a robot's first episode has not begun.
         """
+        self.require_begun("step()")
         self._take_action(actions, mask)
         self.sensors = self.plant.step(self.goals, self.torque_on)
         self._update_observer(mask)
@@ -526,6 +557,17 @@ def read_actions(actions: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float
     if given.shape != shape:
         raise InputError(f"action has shape {given.shape}, expected {shape}; joints {', '.join(JOINTS)}")
     return given
+
+
+def read_seed(seed: Any) -> int:
+    """Return a seed.
+
+    Raises:
+        InputError: no whole number of 0 or more.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError(f"seed = {seed!r}: expected a whole number of 0 or more")
+    return int(seed)
 
 
 def read_options(options: Any, valid: tuple[str, ...] = OPTIONS) -> Mapping[str, Any]:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from wlr_gym.envs.core import Core
@@ -64,11 +63,6 @@ class Pictures:
         if self.render_mode == "human":
             self.show()
 
-    def require_reset(self) -> None:
-        """Raise before the first reset, when there is nothing to see."""
-        if not self.core.seeded.all():
-            raise ResetNeeded("call reset() before render()")
-
     def warn_without_mode(self) -> None:
         """Say, as Gymnasium's own environments do, that there is no render mode."""
         gym.logger.warn("render() without a render mode shows nothing: make the environment with render_mode='rgb_array'")
@@ -79,7 +73,7 @@ class Pictures:
         Raises:
             InputError: no OpenGL on this machine.
         """
-        self.require_reset()
+        self.core.require_begun("render()")
         if self._scene is None:
             from wlr_gym.render import Scene
 
@@ -88,7 +82,7 @@ class Pictures:
 
     def show(self) -> None:
         """Show the first robot in a window, in real time. Once the user has closed it, nothing happens."""
-        self.require_reset()
+        self.core.require_begun("render()")
         if self._viewer is None:
             from wlr_gym.render import Viewer
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from wlr_gym.envs.core import Core, Mask
+from wlr_gym.envs.core import Core, Mask, read_seed
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
 from wlr_gym.envs.registry import task_name_of
@@ -49,13 +49,21 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         check_render_mode(render_mode)
         self.render_mode = render_mode
         self.core = Core(task_name_of(env_id), read_settings(keywords), num_envs)
-        self.spec = gym.spec(env_id)
+        self.spec = gym.spec(env_id.rpartition(":")[2])  # gym.make takes an id with its module, gym.spec does not
         super().__init__(self.core.count, self.core.observation_space, self.core.action_space)
         self.metadata = metadata(self.core.task.config.control_period)
         self.pictures = Pictures(self.core, render_mode)
         self._actions: Any = None
         if seed is not None:
             self.seed(seed)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Give robot i the seed ``seed + i`` from the next reset on; None draws one.
+
+        Raises:
+            InputError: no whole number of 0 or more.
+        """
+        return super().seed(None if seed is None else read_seed(seed))
 
     def reset(self) -> Any:
         """Start new episodes with the seeds and options given before."""
@@ -76,7 +84,12 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, NDArray[np.float32], Mask, list[dict[str, Any]]]:
-        """Advance one control tick."""
+        """Advance one control tick.
+
+        Raises:
+            InputError: wrong shape, or an action that is not finite or out of [-1, 1].
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
         core = self.core
         any_done = core.step(self._actions, core.everyone)
         reward = core.reward.astype(np.float32)

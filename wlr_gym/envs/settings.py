@@ -84,6 +84,7 @@ class Settings:
             raise unknown_name("observation", str(self.observation), OBSERVATIONS, "environment")
         if isinstance(self.free_wheels, str):
             raise InputError(f"free_wheels = {self.free_wheels!r}: expected a list of wheels, such as ['wheel_lf']")
+        object.__setattr__(self, "free_wheels", tuple(self.free_wheels))  # an iterator can be read once
         for wheel in self.free_wheels:
             if wheel not in WHEELS:
                 raise unknown_name("wheel", str(wheel), WHEELS, "free_wheels")
@@ -100,8 +101,8 @@ class Settings:
         read_robot_options(self.hardware)
         if self.observation == "dict":
             raise InputError("observation = 'dict': a real robot has no privileged observation")
-        for keyword, harmless in (("randomization", "none"), ("effects", None)):
-            if getattr(self, keyword) not in (None, harmless):
+        for keyword, harmful in (("randomization", self.randomization not in (None, "none")), ("effects", self.effects)):
+            if harmful:
                 raise InputError(
                     f"{keyword} = {getattr(self, keyword)!r}: a real robot is what it is; only a simulator takes that"
                 )

@@ -6,10 +6,9 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.error import ResetNeeded
 from gymnasium.utils import EzPickle
 
-from wlr_gym.envs.core import Core, read_actions
+from wlr_gym.envs.core import Core, read_actions, read_seed
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
 from wlr_gym.envs.settings import read_settings
@@ -33,7 +32,6 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
         self._everyone = self.core.everyone
         self._shape = self.core.action_space.shape
         self._rewards = self.core.task.rewards
-        self._ready = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode.
@@ -41,13 +39,15 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
         Args:
             seed: whole number; starts a new, reproducible series of episodes. None goes on with the present series.
             options: ``command`` {name: value} held for the whole episode; ``parameters`` {name or element: value} set
-                after randomisation.
+                after randomisation and effects.
+
+        Raises:
+            InputError: a seed or an option that is none.
         """
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else read_seed(seed))
         if seed is not None or not self.core.seeded[0]:
-            self.core.seed(0, self.np_random_seed if seed is None else seed)
+            self.core.seed(0, self.np_random_seed % 2**64 if seed is None else seed)  # -1 where the user set np_random
         self.core.begin_episodes(self._everyone, options)
-        self._ready = True
         self.pictures.after_tick()
         return self.core.observation_of(0), _first_rows(self.core.reset_info())
 
@@ -56,9 +56,8 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
 
         Raises:
             InputError: wrong shape, or an action that is not finite or out of [-1, 1].
+            gymnasium.error.ResetNeeded: before the first reset.
         """
-        if not self._ready:
-            raise ResetNeeded("call reset() before step()")
         core = self.core
         done = core.step(read_actions(action, self._shape)[None], self._everyone)
         info: dict[str, Any] = {"reward_terms": dict(zip(self._rewards, core.terms[0].tolist(), strict=True))}

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from wlr_gym.envs.core import OPTIONS, Core, Mask, read_options
+from wlr_gym.envs.core import OPTIONS, Core, Mask, read_options, read_seed
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
 from wlr_gym.envs.settings import read_settings
@@ -76,7 +76,10 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
 
         Args:
             seed: one number s (robot i gets s + i), or one number or None per robot. None goes on with the present series.
-            options: as in the single environment, and ``reset_mask`` (N,) bool: only these robots.
+            options: as in the single environment, alike for all robots that begin, and ``reset_mask`` (N,) bool: only these.
+
+        Raises:
+            InputError: an option, a mask or a seed that is none.
         """
         given = dict(read_options(options, (*OPTIONS, "reset_mask")))
         mask = _read_mask(given.pop("reset_mask", None), self.num_envs)
@@ -101,8 +104,6 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
             gymnasium.error.ResetNeeded: before the first reset, or (``Disabled``) on an ended episode.
         """
         core = self.core
-        if not core.seeded.all():
-            raise ResetNeeded("call reset() before step()")
         if self.autoreset_mode is AutoresetMode.DISABLED and self._over.any():
             raise ResetNeeded(
                 f"the episode of robot {int(np.argmax(self._over))} is over: reset it with options={{'reset_mask': ...}}"
@@ -179,13 +180,10 @@ def seed_robots(core: Core, seeds: Sequence[int | None], mask: Mask) -> None:
 def _read_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
     if seed is None:
         return [None] * count
-    seeds = [int(seed) + i for i in range(count)] if isinstance(seed, (int, np.integer)) else list(seed)
+    seeds = list(seed) if np.iterable(seed) else [read_seed(seed) + i for i in range(count)]
     if len(seeds) != count:
         raise InputError(f"{len(seeds)} seeds for {count} robots")
-    for value in seeds:
-        if value is not None and (not isinstance(value, (int, np.integer)) or value < 0):
-            raise InputError(f"seed = {value!r}: expected a whole number of 0 or more")
-    return [None if value is None else int(value) for value in seeds]
+    return [None if value is None else read_seed(value) for value in seeds]
 
 
 def _read_mask(given: Any, count: int) -> Mask:

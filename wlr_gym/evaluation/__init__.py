@@ -5,7 +5,7 @@ from wlr_gym.evaluation.card import MAIN, OTHER_PLANT, Card, score
 from wlr_gym.evaluation.curve import read_curve
 from wlr_gym.evaluation.metrics import Metric, Played, metrics_of, summarise
 from wlr_gym.evaluation.record import Recorder, record_episodes, write_samples
-from wlr_gym.evaluation.rollout import Measure, Rollout, make_core, roll_out
+from wlr_gym.evaluation.rollout import Measure, Rollout, make_core, roll_out, start_episodes
 from wlr_gym.evaluation.statistics import Estimate
 from wlr_gym.evaluation.subjects import Subject, identity, make_player, read_subjects
 from wlr_gym.evaluation.sweeps import Sweep, read_sweep, sweeps_for
@@ -46,6 +46,7 @@ __all__ = [
     "roll_out",
     "rows",
     "score",
+    "start_episodes",
     "summarise",
     "sweep_comparison_rows",
     "sweep_rows",

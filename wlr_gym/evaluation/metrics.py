@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +75,11 @@ def metrics_of(measures: Sequence[Measure]) -> tuple[Metric, ...]:
     )
 
 
+def has_limits(measures: Sequence[Measure]) -> bool:
+    """Return whether there is a limit to track within."""
+    return any(_limits(measure) for measure in measures)
+
+
 def _limits(measure: Measure) -> dict[str, float]:
     return {kind: limit for kind in ("rms", "max") if (limit := getattr(measure, kind)) is not None}
 
@@ -115,9 +120,7 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
     """Return metric -> (N, 2): numerator and denominator of every episode."""
     active, period = rollout.active, rollout.control_period
     ticks = active.sum(axis=0).astype(np.float64)
-    errors = _errors(rollout)
-    limits = {(m.name, kind): limit for m in rollout.measures for kind, limit in _limits(m).items()}
-    shares = np.array([errors[which] / limit for which, limit in limits.items()]).reshape(len(limits), rollout.episodes)
+    errors = errors_of(rollout.measures, rollout.measured, active)
     slip = np.linalg.norm(rollout.slip_velocity, axis=-1).mean(axis=-1)
     energy = _sum(rollout.energy, active)
     travel = travelled(rollout)
@@ -130,8 +133,8 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
     values = {
         **{name if kind == "rms" else f"{name}_{kind}": error for (name, kind), error in errors.items()},
         "tracking_error": (
-            np.sqrt((shares**2).sum(axis=0) / max(1, len(limits))) + FALL * rollout.fell,
-            ones if limits else 0.0 * ones,
+            tracking_error(rollout.measures, errors, rollout.fell),
+            ones if has_limits(rollout.measures) else 0.0 * ones,
         ),
         "success": 100.0 * rollout.succeeded,
         "falls": 100.0 * rollout.fell,
@@ -148,14 +151,33 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
     return {key: np.stack(value if isinstance(value, tuple) else (value, ones), axis=1) for key, value in values.items()}
 
 
-def _errors(rollout: Rollout) -> dict[tuple[str, str], Array]:
-    """Return (measure, ``rms`` or ``max``) -> (N,)."""
+def errors_of(measures: Sequence[Measure], measured: Array, active: Mask) -> dict[tuple[str, str], Array]:
+    """Return (measure, ``rms`` or ``max``) -> (N,), in SI units; ``max`` where it is limited.
+
+    Args:
+        measures: of the task.
+        measured: (T, N, M).
+        active: (T, N) the robot's episode was still going on in this tick.
+    """
     errors = {}
-    for k, measure in enumerate(rollout.measures):
-        errors[measure.name, "rms"] = episode_rms(rollout.measured[:, :, k], rollout.active)
+    for k, measure in enumerate(measures):
+        errors[measure.name, "rms"] = episode_rms(measured[:, :, k], active)
         if measure.max is not None:
-            errors[measure.name, "max"] = episode_max(rollout.measured[:, :, k], rollout.active)
+            errors[measure.name, "max"] = episode_max(measured[:, :, k], active)
     return errors
+
+
+def tracking_error(measures: Sequence[Measure], errors: Mapping[tuple[str, str], Array], fell: Mask) -> Array:
+    """Return the tracking error of each episode (N,): rms of what is reached of every limit; a fall adds :data:`FALL`.
+
+    Args:
+        measures: of the task; without a limit among them the rms is 0.
+        errors: see :func:`errors_of`.
+        fell: (N,) a termination term ended the episode.
+    """
+    limits = {(m.name, kind): limit for m in measures for kind, limit in _limits(m).items()}
+    shares = np.array([errors[which] / limit for which, limit in limits.items()]).reshape(len(limits), len(fell))
+    return np.sqrt((shares**2).sum(axis=0) / max(1, len(limits))) + FALL * fell
 
 
 def travelled(rollout: Rollout) -> Array:

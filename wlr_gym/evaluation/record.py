@@ -43,7 +43,7 @@ class Recorder:
     """
 
     def __init__(self, core: Core, robot: int = 0) -> None:
-        if not core.seeded[robot] or core.ticks[robot] != 0:
+        if not core.begun[robot] or core.ticks[robot] != 0:
             raise InputError(f"robot {robot} of the batch: a recorder starts right after a reset")
         self.core, self.robot = core, robot
         self._parameters = core.parameters.values[robot].copy()

@@ -116,6 +116,18 @@ def make_core(environment: str, episodes: int, keywords: Mapping[str, Any]) -> C
     return Core(task_name_of(environment), read_settings(keywords), episodes)
 
 
+def start_episodes(core: Core, policy: Policy, first_seed: int, options: Mapping[str, Any] | None = None) -> None:
+    """Begin an episode with every robot of ``core``, robot i with seed ``first_seed + i``; the policy has forgotten the past.
+
+    Raises:
+        InputError: see :meth:`wlr_gym.envs.core.Core.begin_episodes`.
+    """
+    for row in range(core.count):
+        core.seed(row, first_seed + row)
+    core.begin_episodes(core.everyone, options)
+    policy.reset(core.everyone)
+
+
 def roll_out(
     core: Core,
     policy: Policy,
@@ -141,13 +153,9 @@ def roll_out(
     """
     if not core.plant.capabilities.has_truth:
         raise InputError(f"backend '{core.settings.backend}' has no truth to score by; to drive the robot: wlr deploy")
-    seeds = first_seed + np.arange(core.count)
-    for row, seed in enumerate(seeds.tolist()):
-        core.seed(row, seed)
-    core.begin_episodes(core.everyone, {"parameters": dict(parameters or {}), "command": dict(commands or {})})
+    start_episodes(core, policy, first_seed, {"parameters": dict(parameters or {}), "command": dict(commands or {})})
     table = core.parameters.values.copy()
     start = np.concatenate([v.reshape(core.count, -1) for v in vars(core.state).values() if v is not None], axis=1)
-    policy.reset(core.everyone)
     if on_start is not None:
         on_start()
     active = core.everyone.copy()
@@ -164,7 +172,7 @@ def roll_out(
     friction = stacked.pop("friction")[0]
     return Rollout(
         control_period=core.task.config.control_period,
-        seeds=seeds,
+        seeds=first_seed + np.arange(core.count),
         measures=measures_of(core),
         command_names=core.task.commands,
         fell=core.terminated.copy(),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from wlr_gym.errors import InputError
 from wlr_gym.evaluation.rollout import make_core
 from wlr_gym.policy import agent_names, find_policy, load_agent_config, make_policy, policy_environment
-from wlr_gym.robot import overlay
+from wlr_gym.robot import merge_changes
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
@@ -81,7 +81,7 @@ def make_player(environment: str, source: str | Path, episodes: int, keywords: M
     """
     own = dict(policy_environment(source))
     if isinstance(own.get("task"), Mapping) and isinstance(keywords.get("task"), Mapping):
-        own["task"] = overlay(keywords["task"], own["task"])
+        own["task"] = merge_changes(keywords["task"], own["task"])
     core = make_core(environment, episodes, {**keywords, **own})
     try:
         return core, make_policy(source, core.contract())

@@ -2,8 +2,8 @@
 
 Every setting in turn goes up and down by its step; what scores best stays, and a step that brought nothing is halved. All
 candidates drive the same robots on the same floors, so the result depends on the settings at the start and the seed only.
-The score is what the task's success is judged by: the rms of each measure over an episode as a share of its limit, the
-quadratic mean of these shares, mean over episodes; a fall counts like errors of ten times the limits.
+The score is the card's tracking error (:func:`wlr_gym.evaluation.metrics.tracking_error`), mean over episodes: how much of
+each limit of the task's success is reached; a fall counts like errors of ten times the limits.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wlr_gym.errors import InputError
-from wlr_gym.evaluation.metrics import FALL
-from wlr_gym.evaluation.rollout import make_core
+from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.evaluation.metrics import errors_of, has_limits, tracking_error
+from wlr_gym.evaluation.rollout import make_core, measures_of, start_episodes
 from wlr_gym.files import make_output_folder
 from wlr_gym.policy import Policy, Training, write_contract
 from wlr_gym.policy.control import PidConfig, task_settings
@@ -33,15 +33,19 @@ def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[Pi
     """Search from the settings of ``training``, and return the folder of the policy with the best ones.
 
     Raises:
-        InputError: bad settings, or ``resume``: a search takes minutes and is not continued.
+        InputError: bad settings, a task without limits to score by, or ``resume``: a search takes minutes and is not continued.
     """
     if training.resume:
         raise InputError(f"agent '{agent}' is tuned by a search of a few minutes, which cannot be resumed: start it anew")
     config = dict(training.config)
-    episodes = task_settings(model, {"task": ""}, config, agent).search.episodes
+    general = task_settings(model, {"task": ""}, config, agent)
+    _check_steps(general, agent)
+    episodes = general.search.episodes
     core = make_core(training.environment, episodes, config.get("environment", {}))
     try:
         contract = core.contract()
+        if not has_limits(measures_of(core)):
+            raise InputError(f"agent '{agent}' is tuned by the limits of a task's success, and '{contract['task']}' has none")
         start = task_settings(model, contract, config, agent)
         make_output_folder(training.folder)
         record_provenance(
@@ -56,6 +60,13 @@ def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[Pi
     origin = {"environment": training.environment, "score": score, "episodes": episodes, "seed": start.seed}
     write_contract(folder, agent, best, contract, origin)
     return folder
+
+
+def _check_steps(settings: PidConfig, agent: str) -> None:
+    tunable = [name for name, value in settings if isinstance(value, float)]
+    for name in settings.search.steps:
+        if name not in tunable:
+            raise unknown_name("setting", name, tunable, f"agent '{agent}': search.steps")
 
 
 def search(core: Core, make_policy: MakePolicy, start: PidConfig, say: Say) -> tuple[dict[str, Any], float]:
@@ -95,19 +106,14 @@ def _changed(settings: Mapping[str, Any], name: str, step: float, model: type[Pi
 
 def tracking_score(core: Core, policy: Policy, first_seed: int) -> float:
     """Return the score of whole episodes, one per robot of ``core`` (see the module); less is better."""
-    for row in range(core.count):
-        core.seed(row, first_seed + row)
-    core.begin_episodes(core.everyone)
-    policy.reset(core.everyone)
+    start_episodes(core, policy, first_seed)
+    going, measured = [], []
     active = core.everyone.copy()
-    squares, ticks = np.zeros_like(core.measures), np.zeros(core.count)
     while active.any():
         core.step(policy.act(core.observation), active)
-        squares[active] += core.measures[active] ** 2
-        ticks += active
+        going.append(active.copy())
+        measured.append(core.measures.copy())
         active &= ~(core.terminated | core.truncated)
-    rms = np.sqrt(squares / ticks[:, None])
-    names = list(core.task.measures)
-    limits = {name: limit.rms or limit.max for name, limit in core.task.config.success.items()}
-    shares = np.stack([rms[:, names.index(name)] / limit for name, limit in limits.items()])
-    return float(np.mean(np.sqrt((shares**2).mean(axis=0)) + FALL * core.terminated))
+    measures = measures_of(core)
+    errors = errors_of(measures, np.stack(measured), np.stack(going))
+    return float(tracking_error(measures, errors, core.terminated).mean())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -110,6 +111,10 @@ TRUTH_LAYOUT = Layout(
 )
 
 
+class UnknownChannelError(InputError, AttributeError):
+    """A channel that does not exist. Also an AttributeError: that is what ``hasattr`` and ``getattr`` ask for."""
+
+
 class _Signals:
     layout: Layout
     __slots__ = ("values",)
@@ -120,7 +125,10 @@ class _Signals:
     def __getattr__(self, name: str) -> Array:
         if name.startswith("__"):
             raise AttributeError(name)
-        return self.layout.view(self.values, name)
+        try:
+            return self.layout.view(self.values, name)
+        except InputError as error:
+            raise UnknownChannelError(str(error)) from None
 
     def __getitem__(self, name: str) -> Array:
         return self.layout.view(self.values, name)
@@ -247,10 +255,12 @@ class PlantOptions:
 
     def __post_init__(self) -> None:
         for name in ("control_period", "physics_step"):
-            if isinstance(value := getattr(self, name), bool) or not isinstance(value, int | float):
+            if isinstance(value := getattr(self, name), bool) or not isinstance(value, Real):
                 raise InputError(f"{name} = {value!r}, expected a number of seconds")
-        if isinstance(self.threads, bool) or not isinstance(self.threads, int):
+            object.__setattr__(self, name, float(value))
+        if isinstance(self.threads, bool) or not isinstance(self.threads, Integral):
             raise InputError(f"threads = {self.threads!r}, expected a whole number")
+        object.__setattr__(self, "threads", int(self.threads))
         if not isinstance(self.precision, str):
             raise InputError(f"precision = {self.precision!r}, expected 'float64' or 'float32'")
         if not (0.0 < self.physics_step <= self.control_period):

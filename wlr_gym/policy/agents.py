@@ -15,8 +15,8 @@ import yaml
 from numpy.typing import NDArray
 
 from wlr_gym.errors import InputError, unknown_name
-from wlr_gym.paths import config_names, data_directory, find_config
-from wlr_gym.robot import read_yaml
+from wlr_gym.paths import config_names, data_directory, find_config, named_in
+from wlr_gym.robot import merge_changes, parse_yaml, read_yaml
 
 Contract = Mapping[str, Any]
 Config = Mapping[str, Any]
@@ -119,7 +119,7 @@ def load_agent_config(name: str | Path, changes: tuple[str, ...] = (), task: str
 
     A name without a file is an agent without settings: empty. ``base: NAME`` in a file lays it over another. With a ``task``
     the settings are that task's: those in ``tasks: {TASK: ...}`` lie over the file's general ones, what the file says lies over
-    both of its base's, and changes over all.
+    both of its base's, and changes over all. A base or task given by a path is looked for beside the file first.
 
     Raises:
         InputError: no such file, broken YAML, a base or a task that is none, or a change that is not ``key=value``.
@@ -141,32 +141,32 @@ def _read_config(name: str | Path, task: str | None, above: tuple[Path, ...] = (
         raise InputError(f"{path}: expected a mapping, got {type(config).__name__}")
     base = config.pop("base", None)
     if task is not None:
-        config = _merged(config, _of_task(path, config.pop("tasks", None) or {}, task))
+        config = merge_changes(config, _of_task(path, config.pop("tasks", None), task))
     if base is None:
         return config
     if not isinstance(base, str):
         raise InputError(f"{path}: base = {base!r}: expected a name in configs/agent/, or a path")
     if path in above:
         raise InputError(f"{path}: is its own base")
-    return _merged(_read_config(base, task, (*above, path)), config)
+    return merge_changes(_read_config(named_in(path, base), task, (*above, path)), config)
 
 
-def _of_task(path: Path, tasks: Mapping[str, Any], task: str) -> dict[str, Any]:
+def _of_task(path: Path, tasks: Any, task: str) -> Mapping[str, Any]:
     """Return what a file's ``tasks`` says of one task; a task is a name in ``configs/task/`` or the path of a file."""
-    for name in tasks:
+    found: Mapping[str, Any] = {}
+    for name, given in _settings(tasks, f"{path}: tasks").items():
         if Path(name).suffix not in {".yaml", ".yml"} and name not in config_names("task"):
             raise unknown_name("task", name, config_names("task"), f"{path}: tasks")
-    return tasks.get(task) or {}
+        settings = _settings(given, f"{path}: tasks.{name}")
+        if name == task or named_in(path, name).resolve() == Path(task).resolve():  # a registered task is an absolute path
+            found = settings
+    return found
 
 
-def _merged(base: dict[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``config`` laid over ``base``; groups merge key by key."""
-    groups = {key: _merged(base[key], value) for key, value in config.items() if _both_groups(base.get(key), value)}
-    return {**base, **config, **groups}
-
-
-def _both_groups(base: Any, value: Any) -> bool:
-    return isinstance(base, dict) and isinstance(value, dict)
+def _settings(value: Any, where: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping | None):
+        raise InputError(f"{where} = {value!r}: expected a mapping")
+    return {str(key): entry for key, entry in (value or {}).items()}
 
 
 def _apply(config: dict[str, Any], change: str) -> None:
@@ -179,6 +179,6 @@ def _apply(config: dict[str, Any], change: str) -> None:
         if not isinstance(config, dict):
             raise InputError(f"setting '{change}': '{parent}' is a value, not a group")
     try:
-        config[last] = yaml.safe_load(text)
+        config[last] = parse_yaml(text)
     except yaml.YAMLError:
         raise InputError(f"setting '{change}': '{text}' is not a YAML value") from None

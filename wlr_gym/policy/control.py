@@ -44,7 +44,7 @@ def known_robot(contract: Mapping[str, Any], name: str, agent: str) -> Robot:
 
 
 class Readings:
-    """Quantities of an observation by their names in the contract.
+    """Quantities of an observation by their names in the contract; of a term with a history, the newest reading.
 
     Args:
         contract: of the environment.
@@ -52,7 +52,8 @@ class Readings:
     """
 
     def __init__(self, contract: Mapping[str, Any], agent: str) -> None:
-        self.columns = {column["name"]: (index, column) for index, column in enumerate(contract["observation"])}
+        numbered = enumerate(contract["observation"])
+        self.columns = {column["name"]: (index, column) for index, column in numbered if column["lag"] == 0}
         self.agent = agent
 
     def __contains__(self, name: str) -> bool:

@@ -12,7 +12,7 @@ from wlr_gym.errors import InputError, unknown_name
 
 #: Key codes of GLFW, which the viewer reports.
 UP, DOWN, LEFT, RIGHT, SPACE, RESET = 265, 264, 263, 262, 32, 82
-#: A tap changes a command by this share of its range, towards the named side.
+#: A tap changes a command by this share of its range on the named side, of the other where it has none there.
 TAP = 0.1
 #: What the arrow keys and sticks steer: command -> (more, less).
 KEYS = {"linear_velocity_x": (UP, DOWN), "yaw_rate": (LEFT, RIGHT)}
@@ -94,7 +94,7 @@ class Keyboard:
                 self._reset = self._reset or key == RESET
             for name, (low, high) in self._ranges.items():
                 more, less = KEYS[name]
-                change = TAP * ((key == more) * high + (key == less) * low)
+                change = TAP * ((key == more) * (high or -low) + (key == less) * (low or -high))
                 self._values[name] = round(min(max(self._values[name] + change, low), high), 9)
 
     def command(self, time: float) -> Mapping[str, float]:
@@ -164,7 +164,8 @@ def _glfw() -> Any:
 
 
 def _steered(ranges: Ranges, known: Mapping[str, object], what: str) -> dict[str, tuple[float, float]]:
-    steered = {name: bounds for name, bounds in ranges.items() if name in known}
+    """Return the ranges that can be steered, each as far as standing still: who drives must be able to stop."""
+    steered = {name: (min(low, 0.0), max(high, 0.0)) for name, (low, high) in ranges.items() if name in known}
     if not steered:
         raise unknown_name("command", ", ".join(ranges), known, f"{what} steer others")
     return steered

@@ -300,7 +300,7 @@ def standing_at(goals: Array, robot: Robot, parameters: Parameters) -> PlantStat
     state = standing_state(robot, parameters)
     level = rest_pose(parameters, state.joint_position[:, :4])
     state.joint_position[:, :4] = goals[:, :4] - parameters["joint.zero_offset"]
-    state.reference_position[:, :4] = goals[:, :4]
+    state.reference_position[:, :4] = state.joint_position[:, :4]  # true angles both; goals are in terms of the reading
     pose = rest_pose(parameters, state.joint_position[:, :4])
     state.position[:, 2] += pose[:, 0] - level[:, 0]
     state.quaternion = quaternion(np.zeros(len(pose)), pose[:, 1], pose[:, 2])

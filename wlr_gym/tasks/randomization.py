@@ -17,7 +17,7 @@ from pydantic import Field
 
 from wlr_gym.errors import InputError, nearest
 from wlr_gym.parameters import ELEMENTS, TABLE, XYZ, Parameters
-from wlr_gym.paths import find_config
+from wlr_gym.paths import find_config, named_in
 from wlr_gym.plants.base import PlantState, standing_state
 from wlr_gym.robot import LEGS, Robot, overlay, parse_config, read_yaml
 from wlr_gym.tasks.draws import stream_numbers, uniforms
@@ -49,7 +49,7 @@ class RandomizationConfig(Data):
     Attributes:
         base: name or path of the randomisation that this one is laid over, key by key; a key that is null is removed.
         result: path of a gap result (``result.json``) between this and ``base`` (then ``nominal`` unless named): what was
-            identified replaces what ``base`` sets.
+            identified replaces what ``base`` sets. Both paths are looked for beside this file first.
         sensor_noise: False switches off the sensors' noise and quantisation, and the task's observation noise and bias.
         latency: False fixes every latency in the middle of its range.
         initial_state: spread of the state an episode starts from.
@@ -103,14 +103,15 @@ def _resolved(data: Any, robot: Robot, where: str, above: tuple[str, ...] = ()) 
     lower: Any = {}
     places: dict[str, str] = {}
     if base is not None:
-        below, place = _read(base)
+        below, place = _read(named_in(where, base))
         lower, places = _resolved(below, robot, place, (*above, where))
         parse_config(RandomizationConfig, lower, place)  # what is wrong in a base is said with its own name
     if result is not None:
         events = parse_config(RandomizationConfig, lower, where).events
-        found = identified_events(result, robot)
+        place = named_in(where, result)
+        found = identified_events(place, robot)
         lower = {**lower, "events": _with_result(events, found, robot)}
-        places |= dict.fromkeys(found, str(result))
+        places |= dict.fromkeys(found, str(place))
     own = {key: value for key, value in data.items() if key not in ("base", "result")}
     merged = overlay(lower, own) if lower else own
     events = _mapping(merged.get("events"))

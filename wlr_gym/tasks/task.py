@@ -27,6 +27,15 @@ from wlr_gym.tasks.terms import (
     ScalarTerm,
 )
 
+#: Group of a task's data -> what its terms are called, and those there are.
+_TERMS: dict[str, tuple[str, Mapping[str, Any]]] = {
+    "observations": ("observation term", POLICY_TERMS),
+    "privileged": ("privileged term", PRIVILEGED_TERMS),
+    "rewards": ("reward term", REWARDS),
+    "terminations": ("termination term", TERMINATIONS),
+    "measures": ("measure", MEASURES),
+}
+
 
 class _Data(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -254,23 +263,19 @@ def read_task(source: str | Path | Mapping[str, Any], overrides: Mapping[str, An
 
     Args:
         source: name in ``configs/task/``, path of a YAML file, or a mapping with the same keys.
-        overrides: nested mapping laid over it; a term set to None is removed.
+        overrides: nested mapping laid over it; a term set to None is removed, if it is there.
 
     Raises:
         InputError: unknown or wrong key, term, parameter or value, with the nearest valid name.
     """
     data, where = _task_data(source)
     if overrides:
-        data, where = overlay(data, overrides), f"{where} with overrides"
+        where = f"{where} with overrides"
+        _check_names(overrides, where)
+        data = overlay(data, overrides)
     config = parse_config(TaskConfig, data, where)
     _check_ranges(config, where)
-    for kind, chosen, registry in (
-        ("observation term", config.observations, POLICY_TERMS),
-        ("privileged term", config.privileged, PRIVILEGED_TERMS),
-    ):
-        for name in chosen:
-            if name not in registry:
-                raise unknown_name(kind, name, registry, where)
+    _check_names(vars(config), where)
     _check_scalars("reward term", config.rewards, REWARDS, {"weight"}, where)
     _check_scalars("termination term", config.terminations, TERMINATIONS, set(), where)
     _check_scalars("measure", config.measures, MEASURES, set(), where)
@@ -295,6 +300,15 @@ def _task_data(source: Any) -> tuple[Any, str]:
         raise InputError(f"task = {source!r}: expected a name, a path or a mapping")
     path = find_config("task", source)
     return read_yaml(path), str(path)
+
+
+def _check_names(data: Mapping[str, Any], where: str) -> None:
+    """Refuse a term that does not exist, in changes also one that is to be removed."""
+    for group, (kind, registry) in _TERMS.items():
+        names = data.get(group)
+        for name in names if isinstance(names, Mapping) else ():
+            if name not in registry:
+                raise unknown_name(kind, str(name), registry, where)
 
 
 def _check_ranges(config: TaskConfig, where: str) -> None:
@@ -331,8 +345,6 @@ def _check_scalars(
     kind: str, chosen: Mapping[str, Mapping[str, float]], registry: Mapping[str, ScalarTerm], required: set[str], where: str
 ) -> None:
     for name, values in chosen.items():
-        if name not in registry:
-            raise unknown_name(kind, name, registry, where)
         valid = required | set(registry[name].parameters)
         for key in values:
             if key not in valid:
@@ -362,6 +374,7 @@ def signals_of(function: Callable[..., Any], parameters: Mapping[str, float] | N
 def _check_commands(config: TaskConfig, where: str) -> None:
     """Refuse a term that reads a command which the task does not give."""
     functions = {f"reward term '{name}'": REWARDS[name].function for name in config.rewards}
+    functions |= {f"termination term '{name}'": TERMINATIONS[name].function for name in config.terminations}
     functions |= {f"measure '{name}'": MEASURES[name].function for name in config.measures}
     used = [name for name in (*config.observations, *config.privileged) if name in COMPUTED]
     functions |= {f"observation term '{name}'": COMPUTED[name].function for name in used}
