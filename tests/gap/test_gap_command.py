@@ -87,7 +87,8 @@ def test_a_formula_and_fatal_findings_are_printed(data, tmp_path, answer, capsys
 def test_options_reach_the_analysis(data, tmp_path, answer):
     asked = answer(examples.NOTHING_MISSING)
     out = tmp_path / "out"
-    options = ["--effects", "icy_patch", "--robot", "paper", "--backend", "mujoco", "--heldout", "run_03", "run_06", "--threads", "2"]
+    options = ["--effects", "icy_patch", "--backend", "mujoco", "--heldout", "run_03", "run_06", "--threads", "2"]
+    options += ["--robot", "paper"]
     assert main(["gap", str(data), "--out", str(out), *options]) == 0
     assert asked["data"] == data
     assert [effect.name for effect in asked["known"].effects] == ["friction_patch", "slip_weakening"]

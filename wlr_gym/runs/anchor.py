@@ -71,10 +71,10 @@ def start_state(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
 def measured_state(run: Run, times: Array, background: PlantState, parameters: Parameters, degree: int = 2) -> PlantState:
     """Return one state per time: measured where the run measures, else the background's.
 
-    Measured: joint angles and rates; x, y, yaw and their rates from the camera, where a frame is near; body rates from the gyroscope. Height, pitch
-    and roll are the background's, moved by what the difference between measured and background leg angles means for a
-    body on four wheels. Servo references are the background's; a wheel's moves along with its angle. Rotors keep their place
-    in the play of their gears.
+    Measured: joint angles and rates; x, y, yaw and their rates from the camera, where a frame is near; body rates from the
+    gyroscope. Height, pitch and roll are the background's, moved by what the difference between measured and background leg
+    angles means for a body on four wheels. Servo references are the background's; a wheel's moves along with its angle.
+    Rotors keep their place in the play of their gears.
 
     Args:
         run: the run.
