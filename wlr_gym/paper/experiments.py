@@ -18,11 +18,12 @@ from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.paper import reduced
 from wlr_gym.parameters import Parameters
 from wlr_gym.plants import REAL, SIMULATORS, check_backend, make_plant
-from wlr_gym.plants.base import Plant, PlantOptions, PlantState, RobotOptions, Sensors, standing_state
+from wlr_gym.plants.base import Plant, PlantOptions, RobotOptions, Sensors
 from wlr_gym.plants.forces import Force
 from wlr_gym.plants.sensors import rotation
 from wlr_gym.robot import Robot
-from wlr_gym.runs.anchor import euler_angles, quaternion, rest_pose
+from wlr_gym.runs.anchor import euler_angles
+from wlr_gym.runs.compare import standing_at
 from wlr_gym.runs.excitations import Motion
 from wlr_gym.runs.format import Profile, RunMeta
 from wlr_gym.runs.replay import profile_parameters
@@ -247,7 +248,7 @@ def drive_plant(plant: Plant, test: PaperTest, parameters: Parameters, every: in
     goals = test.motion().goals
     torque_on = np.isfinite(goals)
     count = plant.count
-    state = starting_state(plant.robot, parameters, goals[0, :4])
+    state = standing_at(np.tile(goals[0], (count, 1)), plant.robot, parameters)
     seeds = np.arange(count, dtype=np.uint64)
     readings = plant.reset(seeds=seeds, parameters=parameters if plant.capabilities.can_set_state else None, state=state)
     look = _look_at_truth if plant.capabilities.has_truth else _look_at_sensors
@@ -265,18 +266,6 @@ def drive_plant(plant: Plant, test: PaperTest, parameters: Parameters, every: in
     if not plant.capabilities.has_truth:  # a robot without a camera does not know where it is
         record.position[:, ~seen], record.attitude[:, ~seen] = np.nan, np.nan
     return record
-
-
-def starting_state(robot: Robot, parameters: Parameters, legs: Array) -> PlantState:
-    """Return robots standing on the floor with legs that READ the angles (4,), as level as their parameters let them."""
-    state = standing_state(robot, parameters)
-    level = rest_pose(parameters, state.joint_position[:, :4])
-    state.joint_position[:, :4] = legs - parameters["joint.zero_offset"]
-    state.reference_position[:, :4] = legs
-    pose = rest_pose(parameters, state.joint_position[:, :4])
-    state.position[:, 2] += pose[:, 0] - level[:, 0]
-    state.quaternion = quaternion(np.zeros(len(pose)), pose[:, 1], pose[:, 2])
-    return state
 
 
 Row = dict[str, Array]
