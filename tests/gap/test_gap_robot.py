@@ -442,6 +442,17 @@ def test_dead_encoder(tmp_path, good):
     assert [f.channel for f in findings if f.kind == "dead"] == ["pos_leg_rf"] * 3
 
 
+def test_dead_encoder_in_runs_that_do_not_ask_it_to_move(tmp_path, good):
+    def die(table, k):
+        held = {} if k == 0 else {"cmd_leg_rf": table["cmd_leg_rf"].iloc[0]}
+        return table.assign(pos_leg_rf=table["pos_leg_rf"].iloc[0], vel_leg_rf=0.0, **held)
+
+    problem, findings = open_robot(folder_of(tmp_path, good, 4, die))
+    assert problem is None
+    assert {(f"run_0{k}", "dead") for k in range(1, 5)} <= kinds(findings)
+    assert "dead in run_01" in next(f.text for f in findings if (f.run, f.kind) == ("run_03", "dead"))
+
+
 @pytest.mark.parametrize("joint", ["leg_lr", "wheel_rf"])
 def test_mirrored_joint(tmp_path, good, joint):
     def turn(table, k):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,7 @@ def open_robot(
     findings = [IntakeFinding(run.name, found.column, found.kind, found.message) for run in runs for found in run.findings]
     for run in runs:
         findings += _look_at(run)
+    findings += _dead_elsewhere(runs, findings)
     good = [run for run in runs if not any(f.fatal and f.run == run.name for f in findings)]
     if len(good) < LEAST_RUNS:
         text = (
@@ -83,6 +85,18 @@ def _look_at(run: Run) -> list[IntakeFinding]:
             IntakeFinding(run.name, "cmd", "missing", "no motor was on in the whole run: nothing to replay", fatal=True)
         )
     return found
+
+
+def _dead_elsewhere(runs: Sequence[Run], findings: Sequence[IntakeFinding]) -> list[IntakeFinding]:
+    """Runs in which a channel that another run shows to be dead is constant, as nobody asked its joint to move."""
+    dead = {finding.channel: finding.run for finding in findings if finding.kind == "dead"}
+    told = {(finding.run, finding.channel) for finding in findings if finding.fatal}
+    return [
+        IntakeFinding(run.name, channel, "dead", f"constant, and dead in {first}", fatal=True)
+        for run in runs
+        for channel, first in dead.items()
+        if (run.name, channel) not in told and np.nanmin(run[channel]) == np.nanmax(run[channel])
+    ]
 
 
 def _wrap(run: Run, joint: str) -> list[IntakeFinding]:
