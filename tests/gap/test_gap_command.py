@@ -88,11 +88,11 @@ def test_options_reach_the_analysis(data, tmp_path, answer):
     asked = answer(examples.NOTHING_MISSING)
     out = tmp_path / "out"
     options = ["--effects", "icy_patch", "--backend", "mujoco", "--heldout", "run_03", "run_06", "--threads", "2"]
-    options += ["--robot", "paper"]
+    options += ["--robot", "nominal"]
     assert main(["gap", str(data), "--out", str(out), *options]) == 0
     assert asked["data"] == data
     assert [effect.name for effect in asked["known"].effects] == ["friction_patch", "slip_weakening"]
-    assert (asked["robot"], asked["backend"], asked["rig"], asked["threads"]) == ("paper", "mujoco", None, 2)
+    assert (asked["robot"], asked["backend"], asked["rig"], asked["threads"]) == ("nominal", "mujoco", None, 2)
     assert asked["heldout"] == ("run_03", "run_06")
     settings = yaml.safe_load((out / "config.yaml").read_text())
     assert settings["heldout"] == ["run_03", "run_06"]
@@ -111,6 +111,7 @@ def test_options_reach_the_analysis(data, tmp_path, answer):
         (["--backend", "dynamixel"], "unknown simulator 'dynamixel'; valid: gibbs_appell, mujoco"),
         (["--rig", "pendulum", "--backend", "mujoco"], "the rig has a simulator of its own: leave --backend and"),
         (["--rig", "pendulum", "--robot", "paper"], "the rig has a simulator of its own: leave --backend and"),
+        (["--robot", "papr"], "unknown robot config 'papr' (did you mean 'paper'?)"),
         (["--threads", "0"], "--threads 0: expected 1 or more"),
         (["--effects", "nothing_like_it"], "--effects: unknown effects config 'nothing_like_it'"),
         (["--effects", "knwon.yaml"], "--effects: effects config: no file 'knwon.yaml'"),

@@ -83,6 +83,7 @@ def run(options: Options) -> int:
 def _check(options: Options) -> None:
     from wlr_gym.gap.workflow import RIGS
     from wlr_gym.plants import SIMULATORS
+    from wlr_gym.robot import load_robot
 
     if not options.data.is_dir():
         what = "is a file" if options.data.exists() else "no such folder"
@@ -93,6 +94,8 @@ def _check(options: Options) -> None:
         raise unknown_name("rig", options.rig, RIGS)
     if options.rig is not None and (options.backend != Options.backend or options.robot is not None):
         raise InputError(f"--rig {options.rig}: the rig has a simulator of its own: leave --backend and --robot out")
+    if options.robot is not None:
+        load_robot(options.robot)
     for name in options.effects:
         if Path(name).resolve().parent == options.out.resolve() and Path(name).is_file():
             raise InputError(f"--effects {name}: the results would replace it: give another --out")

@@ -73,7 +73,7 @@ def _look_at(run: Run) -> list[IntakeFinding]:
     found: list[IntakeFinding] = []
     seconds = float(run["t"][-1] - run["t"][0])
     if seconds < LEAST_SECONDS:
-        text = f"{seconds:.1f} s long: a run needs at least {LEAST_SECONDS:g} s, better 15 to 25 s"
+        text = f"{seconds:.2f} s long: a run needs at least {LEAST_SECONDS:g} s, better 15 to 25 s"
         return [IntakeFinding(run.name, "t", "short", text, fatal=True)]
     for leg in LEGS:
         found += _pushes_away(run, leg)
