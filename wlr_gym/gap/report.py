@@ -137,11 +137,8 @@ def save_analysis(analysis: Analysis, folder: Path) -> Path:
     pictures = draw(analysis)
     page = report(analysis, pictures, folder)
     make_output_folder(folder / PLOTS)
-    for stale in (
-        RESULT_FILE,
-        PATCH_FILE,
-        CONFIG_FILE,
-    ):  # the provenance stays until there is a result: it tells whose the folder is
+    # the provenance stays until there is a result: it tells whose the folder is
+    for stale in (RESULT_FILE, PATCH_FILE, CONFIG_FILE):
         (folder / stale).unlink(missing_ok=True)
     for stale in (folder / PLOTS).glob("*.png"):
         if stale.stem.rstrip("_0123456789") in _CAPTIONS:
