@@ -35,7 +35,7 @@ def test_heavy_packages_are_not_touched(code):
 
 def test_the_package_adds_nothing_to_gymnasium():
     own = modules_after("import wlr_gym") - modules_after("import gymnasium")
-    assert own == {"wlr_gym", "wlr_gym.envs", "wlr_gym.envs.registry", "wlr_gym.errors"}
+    assert own == {"wlr_gym", "wlr_gym.envs", "wlr_gym.envs.registry", "wlr_gym.base", "wlr_gym.base.errors"}
 
 
 def test_import_takes_less_than_a_third_of_a_second():

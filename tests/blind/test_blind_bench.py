@@ -11,12 +11,12 @@ import pandas as pd
 import pytest
 import yaml
 
-from wlr_gym.bench import gap
-from wlr_gym.bench.blind.cases import case
-from wlr_gym.bench.blind.score import score
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.errors import InputError
-from wlr_gym.runs import read_dataset
+from wlr_gym.data import read_dataset
+from wlr_gym.studies.bench import gap
+from wlr_gym.studies.bench.blind.cases import case
+from wlr_gym.studies.bench.blind.score import score
 
 
 def answers_nothing(folder: Path, out: Path):

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from wlr_gym.bench.blind.copies import read_robot
-from wlr_gym.bench.blind.dataset import simulate_runs, write
-from wlr_gym.bench.blind.spoil import SPOIL
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import data_directory
 from wlr_gym.gap import workflow
-from wlr_gym.paths import data_directory
+from wlr_gym.studies.bench.blind.copies import read_robot
+from wlr_gym.studies.bench.blind.dataset import simulate_runs, write
+from wlr_gym.studies.bench.blind.spoil import SPOIL
 
 ROBOT = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
 

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from wlr_gym.bench.blind.cases import named
-from wlr_gym.bench.blind.copies import Copy, read_robot
-from wlr_gym.bench.blind.dataset import simulate_runs, write
-from wlr_gym.bench.blind.truth import NAMED
-from wlr_gym.parameters import Parameters
-from wlr_gym.paths import data_directory
+from wlr_gym.base.paths import data_directory
+from wlr_gym.data import read_run
+from wlr_gym.data.replay import replay
 from wlr_gym.robot import load_robot
-from wlr_gym.runs import read_run
-from wlr_gym.runs.replay import replay
+from wlr_gym.robot.parameters import Parameters
+from wlr_gym.studies.bench.blind.cases import named
+from wlr_gym.studies.bench.blind.copies import Copy, read_robot
+from wlr_gym.studies.bench.blind.dataset import simulate_runs, write
+from wlr_gym.studies.bench.blind.truth import NAMED
 
 ROBOT = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
 SHARP = ("vel_leg", "vel_wheel", "eff_wheel", "gyro", "acc", "cam_x", "cam_y", "cam_z", "cam_pitch", "cam_yaw", "volt")

@@ -5,11 +5,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from wlr_gym.bench.blind import score as scoring
-from wlr_gym.bench.blind.cases import SEVERITIES, case, named, strange
-from wlr_gym.bench.blind.copies import nominal, read_robot
-from wlr_gym.bench.blind.truth import NAMED, STRANGE, hide
-from wlr_gym.paths import data_directory
+from wlr_gym.base.paths import data_directory
+from wlr_gym.studies.bench.blind import score as scoring
+from wlr_gym.studies.bench.blind.cases import SEVERITIES, case, named, strange
+from wlr_gym.studies.bench.blind.copies import nominal, read_robot
+from wlr_gym.studies.bench.blind.truth import NAMED, STRANGE, hide
 
 
 def truth(name, kind="effect", severity=2.0, *effects):

@@ -4,11 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from wlr_gym.bench.blind import sensors
-from wlr_gym.bench.blind.copies import JOINTS, nominal, read_robot
-from wlr_gym.bench.blind.drive import WIDTH
-from wlr_gym.bench.blind.truth import hide
-from wlr_gym.paths import data_directory
+from wlr_gym.base.paths import data_directory
+from wlr_gym.studies.bench.blind import sensors
+from wlr_gym.studies.bench.blind.copies import JOINTS, nominal, read_robot
+from wlr_gym.studies.bench.blind.drive import WIDTH
+from wlr_gym.studies.bench.blind.truth import hide
 
 ROBOT = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
 

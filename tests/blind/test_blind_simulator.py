@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-import wlr_gym.bench.blind as blind
-from wlr_gym.bench.blind import cases, drive
-from wlr_gym.bench.blind.copies import Copy, draw, nominal, read_robot
-from wlr_gym.bench.blind.truth import NAMED, STRANGE, hide
-from wlr_gym.bench.blind.world import build
-from wlr_gym.paths import data_directory
+import wlr_gym.studies.bench.blind as blind
+from wlr_gym.base.paths import data_directory
+from wlr_gym.studies.bench.blind import cases, drive
+from wlr_gym.studies.bench.blind.copies import Copy, draw, nominal, read_robot
+from wlr_gym.studies.bench.blind.truth import NAMED, STRANGE, hide
+from wlr_gym.studies.bench.blind.world import build
 
 ROBOT = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
 DOWN = np.full(4, np.pi / 2)

@@ -7,9 +7,9 @@ import os
 
 import pytest
 
-from wlr_gym.bench import gap
-from wlr_gym.bench.blind.cases import case
-from wlr_gym.bench.blind.score import intervals_hold, size_error
+from wlr_gym.studies.bench import gap
+from wlr_gym.studies.bench.blind.cases import case
+from wlr_gym.studies.bench.blind.score import intervals_hold, size_error
 
 SETS = int(os.environ.get("WLR_BLIND_SETS", "1"))
 

@@ -10,11 +10,11 @@ from functools import partial
 import pytest
 
 from wlr_gym.cli import INTERRUPTED, main
-from wlr_gym.demo import lanes
-from wlr_gym.demo.settings import Demo
-from wlr_gym.demo.stage import SKIPPED
-from wlr_gym.effects import load_patch
-from wlr_gym.runs import read_dataset
+from wlr_gym.data import read_dataset
+from wlr_gym.physics.effects import load_patch
+from wlr_gym.studies.demo import workers as lanes
+from wlr_gym.studies.demo.settings import Demo
+from wlr_gym.studies.demo.stage import SKIPPED
 
 COMMAND = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "demo", "--quick"]
 TITLES = [stage.title for stages in lanes.LANES.values() for stage in stages]

@@ -1,9 +1,9 @@
 """What the demo's robot hides, and how an answer is judged."""
 
-from wlr_gym.demo.answer import judge
-from wlr_gym.demo.secret import hide
-from wlr_gym.effects import load_patch
-from wlr_gym.gap.result import EffectEntry, ParameterEntry
+from wlr_gym.gap.report.result import EffectEntry, ParameterEntry
+from wlr_gym.physics.effects import load_patch
+from wlr_gym.studies.demo.answer import judge
+from wlr_gym.studies.demo.secret import hide
 
 
 def found(name, where, **values):

@@ -9,8 +9,8 @@ from rich.console import Console
 
 import wlr_gym
 from wlr_gym import cli
+from wlr_gym.base.errors import InputError, MissingPackageError
 from wlr_gym.cli import deploy
-from wlr_gym.errors import InputError, MissingPackageError
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from wlr_gym.cli import main
-from wlr_gym.effects import EFFECTS
+from wlr_gym.physics.effects import EFFECTS
 
 ICE = "effects: [{name: friction_level, parameters: {mu: 0.1}}]\n"
 

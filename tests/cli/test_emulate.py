@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import emulate
-from wlr_gym.errors import InputError
 
 pytest.importorskip("termios")
 

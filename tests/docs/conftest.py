@@ -9,10 +9,10 @@ import pytest
 @pytest.fixture
 def workplace(tmp_path, monkeypatch):
     """An empty folder to run a page in; what the page imports from it, registers and sets is undone afterwards."""
-    from wlr_gym.effects import EFFECTS
     from wlr_gym.envs.registry import ENVIRONMENTS
-    from wlr_gym.plants import BACKENDS
-    from wlr_gym.tasks.terms import COMPUTED, MEASURES, POLICY_TERMS, PRIVILEGED_TERMS, REWARDS, TERMINATIONS
+    from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, POLICY_TERMS, PRIVILEGED_TERMS, REWARDS, TERMINATIONS
+    from wlr_gym.physics.effects import EFFECTS
+    from wlr_gym.physics.plants import BACKENDS
 
     registries: tuple[Any, ...] = (
         EFFECTS, ENVIRONMENTS, gymnasium.registry, BACKENDS, COMPUTED, POLICY_TERMS, PRIVILEGED_TERMS, REWARDS, TERMINATIONS,

@@ -7,7 +7,7 @@ import yaml
 from blocks import ROOT, blocks
 
 from wlr_gym.cli import main
-from wlr_gym.runs import read_dataset
+from wlr_gym.data import read_dataset
 
 
 def test_the_meta_file_of_run_format_md_is_read(tmp_path):

@@ -9,8 +9,8 @@ from types import ModuleType
 import pytest
 from blocks import ROOT
 
-from wlr_gym.bench.measure import Measurement, machine
 from wlr_gym.cli.bench import MEASUREMENTS
+from wlr_gym.studies.bench.measure import Measurement, machine
 
 
 def _load() -> ModuleType:

@@ -1,7 +1,7 @@
 import pytest
 from fake_plant import FakePlant
 
-from wlr_gym import plants
+from wlr_gym.physics import plants
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import (
+from wlr_gym.base.random import fill_normals, stream_number
+from wlr_gym.physics.plants.base import (
     SENSOR_LAYOUT,
     TRUTH_LAYOUT,
     Capabilities,
@@ -18,8 +18,8 @@ from wlr_gym.plants.base import (
     check_goals,
     standing_state,
 )
-from wlr_gym.random import fill_normals, stream_number
 from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import Parameters
 
 NOISE = stream_number("fake sensors")
 

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 import wlr_gym  # noqa: F401
+from wlr_gym.base.errors import InputError
 from wlr_gym.envs.core import make_task
-from wlr_gym.envs.evaluation import (
+from wlr_gym.envs.settings import Settings
+from wlr_gym.envs.tasks.compiled import (
     MATRICES,
     compile_computation,
     compile_evaluation,
@@ -16,12 +18,10 @@ from wlr_gym.envs.evaluation import (
     expressions,
     reader,
 )
-from wlr_gym.envs.settings import Settings
-from wlr_gym.errors import InputError
-from wlr_gym.observer import ESTIMATE_LAYOUT
-from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
-from wlr_gym.tasks.describe import column_name
-from wlr_gym.tasks.terms import COMMANDS, COMPUTED, MEASURES, REWARDS, TERMINATIONS
+from wlr_gym.envs.tasks.describe import column_name
+from wlr_gym.envs.tasks.terms import COMMANDS, COMPUTED, MEASURES, REWARDS, TERMINATIONS
+from wlr_gym.perception.observer import ESTIMATE_LAYOUT
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
 
 ID = "WLR-Velocity-v0"
 

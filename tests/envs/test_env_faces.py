@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import wlr_gym
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
 
 ID = "WLR-Velocity-v0"
 

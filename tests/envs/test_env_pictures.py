@@ -11,8 +11,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import AddRenderObservation, RenderCollection
 
 import wlr_gym  # noqa: F401
+from wlr_gym.base.errors import InputError
 from wlr_gym.envs import pictures as pictures_module
-from wlr_gym.errors import InputError
 
 ID = "WLR-Velocity-v0"
 SMALL = {"view": {"size": [96, 64]}, "randomization": "none"}

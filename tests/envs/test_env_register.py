@@ -5,10 +5,10 @@ import pickle
 import gymnasium as gym
 import pytest
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.envs import register_task
 from wlr_gym.envs.registry import ENVIRONMENTS, title_of
-from wlr_gym.errors import InputError
-from wlr_gym.tasks.task import read_task
+from wlr_gym.envs.tasks.task import read_task
 
 TASK = """
 name: {name}

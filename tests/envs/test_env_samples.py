@@ -10,10 +10,10 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from test_env_faces import same_where_masked
 
 import wlr_gym  # noqa: F401
-from wlr_gym.plants import make_plant
-from wlr_gym.plants.base import PlantOptions
+from wlr_gym.envs.tasks import load_randomization
+from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.robot import CORNER_SIGNS, load_robot
-from wlr_gym.tasks import load_randomization
 
 ID = "WLR-Velocity-v0"
 PUSH = {

@@ -16,8 +16,8 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.envs import Sb3VecEnv
-from wlr_gym.errors import InputError
 
 ID = "WLR-Velocity-v0"
 SHORT = {"episode_length": 0.4, "randomization": "wide"}

@@ -9,8 +9,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import wlr_gym  # noqa: F401
+from wlr_gym.base.errors import InputError
 from wlr_gym.envs.registry import ENVIRONMENTS
-from wlr_gym.errors import InputError
 
 ESTIMATES = (
     "estimated_linear_velocity_in_body",

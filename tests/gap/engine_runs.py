@@ -5,18 +5,18 @@ from pathlib import Path
 import numpy as np
 import pandas
 
-from wlr_gym.effects import apply_patch, load_patch
+from wlr_gym.data import Profile, Run, RunMeta
+from wlr_gym.data.anchor import euler_angles
+from wlr_gym.data.format import CHANNELS, COMMANDS
+from wlr_gym.data.noise import noise_parts
+from wlr_gym.data.replay import profile_parameters
 from wlr_gym.gap.robot.clock import CLOCK
 from wlr_gym.gap.robot.simulate import PHYSICS_STEP
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants import make_plant
-from wlr_gym.plants.base import PlantOptions, standing_state
+from wlr_gym.physics.effects import apply_patch, load_patch
+from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import PlantOptions, standing_state
 from wlr_gym.robot import load_robot
-from wlr_gym.runs import Profile, Run, RunMeta
-from wlr_gym.runs.anchor import euler_angles
-from wlr_gym.runs.format import CHANNELS, COMMANDS
-from wlr_gym.runs.noise import noise_parts
-from wlr_gym.runs.replay import profile_parameters
+from wlr_gym.robot.parameters import Parameters
 
 ROBOT = load_robot()
 META = RunMeta(profile=Profile(wheel_acceleration=11.0, leg_velocity=1.5, leg_acceleration=15.0))

@@ -5,7 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from wlr_gym.effects import EFFECTS
+from wlr_gym.data.format import CHANNELS, COLUMNS
+from wlr_gym.data.noise import channel_noise
 from wlr_gym.gap.analysis import (
     Adequacy,
     Analysis,
@@ -28,9 +29,8 @@ from wlr_gym.gap.analysis import (
     Trace,
 )
 from wlr_gym.gap.problem import Range
+from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.robot import JOINTS, load_robot
-from wlr_gym.runs.format import CHANNELS, COLUMNS
-from wlr_gym.runs.noise import channel_noise
 
 FIT = tuple(f"run_{k:02d}" for k in (1, 2, 4, 5, 7, 8))
 HELDOUT = ("run_03", "run_06", "run_09")

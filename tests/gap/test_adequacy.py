@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from toy_problem import CHANNELS, NOISE, Toy
 
-from wlr_gym.gap.adequacy import REPLICATES, adequacy_of, compared
-from wlr_gym.gap.fit import fit, nominal_model
-from wlr_gym.gap.prove import noise_floor
-from wlr_gym.gap.words import adequacy
+from wlr_gym.gap.estimation.fit import fit, nominal_model
+from wlr_gym.gap.report.text import adequacy
+from wlr_gym.gap.validation.held_out import noise_floor
+from wlr_gym.gap.validation.residual_tests import REPLICATES, adequacy_of, compared
 from wlr_gym.gap.workflow import analyse_problem
 
 RUNS = [0, 1, 2, 3, 4]

@@ -8,9 +8,9 @@ import gap_examples as examples
 import pytest
 import yaml
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.errors import InputError
-from wlr_gym.gap import report as module
+from wlr_gym.gap.report import report as module
 
 workflow = importlib.import_module("wlr_gym.gap.workflow")
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from gap_examples import EFFECT_FOUND
 from toy_problem import Toy
 
-from wlr_gym.gap.prove import LEAST_FOR_INTERVAL
-from wlr_gym.gap.result import Result, result_of
-from wlr_gym.gap.split import informative_split
-from wlr_gym.gap.words import TITLES
+from wlr_gym.gap.report.result import Result, result_of
+from wlr_gym.gap.report.text import TITLES
+from wlr_gym.gap.validation.data_split import informative_split
+from wlr_gym.gap.validation.held_out import LEAST_FOR_INTERVAL
 
 PAGE = (Path(__file__).parents[2] / "docs" / "gap.md").read_text(encoding="utf-8")
 

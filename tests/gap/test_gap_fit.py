@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toy_problem import NOMINAL, QUANTITIES, REACH, SIGMA, STRENGTH, Toy, candidate, coloured
 
-from wlr_gym.gap.fit import (
+from wlr_gym.gap.estimation.fit import (
     Model,
     corrected,
     fit,
@@ -19,7 +19,7 @@ from wlr_gym.gap.fit import (
     total_cost,
     untouched,
 )
-from wlr_gym.gap.likelihood import LONGEST, estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.estimation.likelihood import LONGEST, estimate_noise, minus_two_log_likelihood
 
 
 def all_runs(problem):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from toy_problem import CHANNELS, Toy
 
-from wlr_gym.gap.likelihood import estimate_noise
-from wlr_gym.gap.localise import BINS, localise
+from wlr_gym.gap.estimation.likelihood import estimate_noise
+from wlr_gym.gap.report.localisation import BINS, localise
 
 RUNS = 4
 

@@ -7,19 +7,19 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
-from wlr_gym.gap import judge
-from wlr_gym.gap import name as naming_module
 from wlr_gym.gap.analysis import NOT_EXCITED
-from wlr_gym.gap.fit import Fit, fit, linearise, nominal_model, total_cost, untouched
-from wlr_gym.gap.hypothesis import Hypothesis
-from wlr_gym.gap.judge import Final, carries_over, finalists, looked_around, settle, told_by_others
-from wlr_gym.gap.likelihood import estimate_noise
-from wlr_gym.gap.name import MOST_EFFECTS, PER_NAME, SHORTLIST, drop_idle, name_effects, shortlist
+from wlr_gym.gap.estimation.fit import Fit, fit, linearise, nominal_model, total_cost, untouched
+from wlr_gym.gap.estimation.likelihood import estimate_noise
+from wlr_gym.gap.estimation.refit import refit
+from wlr_gym.gap.estimation.uncertainty import EQUIVALENT, equivalents
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
-from wlr_gym.gap.refit import refit
-from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
-from wlr_gym.gap.sure import EQUIVALENT, equivalents
-from wlr_gym.gap.words import sentence
+from wlr_gym.gap.report.text import sentence
+from wlr_gym.gap.selection import cross_validation as judge
+from wlr_gym.gap.selection import search as naming_module
+from wlr_gym.gap.selection.cross_validation import Final, carries_over, finalists, looked_around, settle, told_by_others
+from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
+from wlr_gym.gap.selection.search import MOST_EFFECTS, PER_NAME, SHORTLIST, drop_idle, name_effects, shortlist
 from wlr_gym.gap.workflow import analyse_problem, evidence_of
 
 RUNS = range(5)

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from engine_runs import META, ROBOT, abrupt, free_rear_wheels, nominal, posture_and_turns, record, spaced
 
+from wlr_gym.data import RunMeta
+from wlr_gym.data.format import CHANNELS
+from wlr_gym.data.noise import channel_noise
 from wlr_gym.gap.robot import simulate
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
 from wlr_gym.gap.robot.recorder import TRUTH
 from wlr_gym.gap.robot.simulate import WrittenGoals, replay_batch
 from wlr_gym.gap.robot.windows import anchored_residuals
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
 from wlr_gym.robot import JOINTS
-from wlr_gym.runs import RunMeta
-from wlr_gym.runs.format import CHANNELS
-from wlr_gym.runs.noise import channel_noise
+from wlr_gym.robot.parameters import Parameters
 
 NOISE = np.array([channel_noise(ROBOT)[name] for name in CHANNELS])
 RESISTANCE = {"name": "rolling_resistance", "where": ["wheel_lf", "wheel_lr"], "parameters": {"coefficient": 0.1}}

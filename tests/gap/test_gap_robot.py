@@ -10,14 +10,17 @@ import pytest
 from engine_runs import META, ROBOT, posture_and_turns, record, spaced
 from gap_examples import EFFECT_FOUND
 
-from wlr_gym.effects import EFFECTS, UNKNOWN_EFFECT, Patch, PatchEffect, apply_patch, load_patch
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
+from wlr_gym.data import Run, read_run
+from wlr_gym.data.excitations import excite
+from wlr_gym.data.format import CHANNELS
+from wlr_gym.data.record import record_simulation
+from wlr_gym.data.replay import replay
+from wlr_gym.data.write import write_run
 from wlr_gym.gap.analysis import Estimate
-from wlr_gym.gap.fit import Model, nominal_model
-from wlr_gym.gap.hypothesis import within_tolerance
+from wlr_gym.gap.estimation.fit import Model, nominal_model
 from wlr_gym.gap.problem import Setting
-from wlr_gym.gap.prove import level, mean_squares, noise_floor
-from wlr_gym.gap.result import write_result
+from wlr_gym.gap.report.result import write_result
 from wlr_gym.gap.robot.candidates import ripple_order, robot_candidates
 from wlr_gym.gap.robot.clock import RunClock
 from wlr_gym.gap.robot.formulas import formula_candidates, wave_frequency
@@ -25,15 +28,12 @@ from wlr_gym.gap.robot.open import LEAST_RUNS, open_robot
 from wlr_gym.gap.robot.problem import LOST, WORTH_APART, RobotProblem
 from wlr_gym.gap.robot.quantities import knobs, tolerance, write
 from wlr_gym.gap.robot.simulate import PHYSICS_STEP
+from wlr_gym.gap.selection.hypothesis import within_tolerance
+from wlr_gym.gap.validation.held_out import level, mean_squares, noise_floor
 from wlr_gym.gap.workflow import found_effect
-from wlr_gym.parameters import Parameters
+from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Patch, PatchEffect, apply_patch, load_patch
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
-from wlr_gym.runs import Run, read_run
-from wlr_gym.runs.excitations import excite
-from wlr_gym.runs.format import CHANNELS
-from wlr_gym.runs.record import record_simulation
-from wlr_gym.runs.replay import replay
-from wlr_gym.runs.write import write_run
+from wlr_gym.robot.parameters import Parameters
 
 NOMINAL = Parameters.nominal(ROBOT)
 KNOBS = {knob.quantity.name: knob for knob in knobs(ROBOT, PHYSICS_STEP)}
@@ -123,7 +123,7 @@ def test_every_tolerance_of_the_file_is_used():
 
 
 def test_ranges_are_a_few_tolerances_within_what_the_simulator_accepts():
-    from wlr_gym.parameters import SPECS
+    from wlr_gym.robot.parameters import SPECS
 
     for knob in KNOBS.values():
         quantity, spec = knob.quantity, SPECS[knob.elements[0].partition("[")[0]]
@@ -683,8 +683,8 @@ def test_features_are_rows_of_the_run(good):
 
 @pytest.mark.slow
 def test_rolling_resistance_is_found_in_four_runs(tmp_path):
+    from wlr_gym.data.excitations import excite
     from wlr_gym.gap.workflow import analyse
-    from wlr_gym.runs.excitations import excite
 
     for k, kind in enumerate(("straight", "turns", "stop_and_go", "s_curve")):
         motion = excite(kind, k, seconds=6.0)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from toy_problem import CHANNELS, DECOYS, NOMINAL, REACH, SIGMA, STRENGTH, Toy, candidate, sized
 
-from wlr_gym.gap.fit import fit, nominal_model
+from wlr_gym.gap.estimation.fit import fit, nominal_model
 from wlr_gym.gap.problem import Candidate, Start, Unknown
-from wlr_gym.gap.screen import LEAST_GAIN, responses, screen
+from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
 
 RUNS = range(5)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from toy_problem import QUANTITIES, Toy
 
-from wlr_gym.errors import InputError
-from wlr_gym.gap.split import LEAST_FITTED, MEMORY, informative_split, named_split
+from wlr_gym.base.errors import InputError
+from wlr_gym.gap.validation.data_split import LEAST_FITTED, MEMORY, informative_split, named_split
 
 NAMES = ("run_1", "run_2", "run_3", "run_4")
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
-from wlr_gym.gap.fit import fit, nominal_model, normal_equations, on_bounds
-from wlr_gym.gap.hypothesis import Hypothesis
-from wlr_gym.gap.name import name_effects
+from wlr_gym.gap.estimation.fit import fit, nominal_model, normal_equations, on_bounds
+from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95, confidence, detectable, estimates, half_widths, two_sided_95
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
-from wlr_gym.gap.screen import LEAST_GAIN, Score, least_gain, responses, screen
-from wlr_gym.gap.sure import TWO_SIDED_95, confidence, detectable, estimates, half_widths, two_sided_95
+from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, least_gain, responses, screen
+from wlr_gym.gap.selection.search import name_effects
 
 RUNS = range(5)
 TRUTH = {"gain": 0.8, "offset": -1.2, "mass": 0.4}

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from wlr_gym.effects import EFFECTS
 from wlr_gym.gap.workflow import analyse
+from wlr_gym.physics.effects import EFFECTS
 
 TWINS = Path(__file__).resolve().parents[3] / "shared" / "data" / "twin_dev"
 LABELS = yaml.safe_load((TWINS / "labels.yaml").read_text(encoding="utf-8")) if TWINS.is_dir() else {}

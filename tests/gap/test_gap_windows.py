@@ -5,10 +5,10 @@ import warnings
 import numpy as np
 import pytest
 
+from wlr_gym.data.format import CHANNELS
+from wlr_gym.data.noise import channel_noise
 from wlr_gym.gap.robot.windows import BLIND, BOUNCE, anchored_residuals, window_rows
 from wlr_gym.robot import JOINTS, load_robot
-from wlr_gym.runs.format import CHANNELS
-from wlr_gym.runs.noise import channel_noise
 
 NOISE = np.array([channel_noise(load_robot())[name] for name in CHANNELS])
 T = 0.02 * np.arange(400, dtype=np.float64)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from wlr_gym.gap.recommend import SHOWN_BY, record_commands, separating_run, separation
-from wlr_gym.runs.excitations import EXCITATIONS
+from wlr_gym.data.excitations import EXCITATIONS
+from wlr_gym.gap.report.recommendation import SHOWN_BY, record_commands, separating_run, separation
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from wlr_gym.effects import EFFECTS
 from wlr_gym.gap.problem import Candidate, Start, Unknown
-from wlr_gym.gap.relations import relation_of, relations
-from wlr_gym.gap.screen import LEAST_GAIN, Score
+from wlr_gym.gap.report.relations import relation_of, relations
+from wlr_gym.gap.selection.screening import LEAST_GAIN, Score
+from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.robot import JOINTS
 
 START = Start((("probe",),), lambda a: (float(a[0]),))

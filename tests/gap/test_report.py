@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from wlr_gym.errors import InputError
-from wlr_gym.gap import report as module
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.format import CHANNELS, COLUMNS
 from wlr_gym.gap.analysis import Analysis, ChannelGap, Estimate, Evidence, FoundEffect, HeatMap, IntakeFinding, Place
-from wlr_gym.gap.plots import draw, figures
-from wlr_gym.gap.report import check_folder, report, save_analysis
-from wlr_gym.gap.result import result_of
-from wlr_gym.gap.words import (
+from wlr_gym.gap.report import report as module
+from wlr_gym.gap.report.plots import draw, figures
+from wlr_gym.gap.report.report import check_folder, report, save_analysis
+from wlr_gym.gap.report.result import result_of
+from wlr_gym.gap.report.text import (
     _GROUPS,
     channel,
     closure,
@@ -31,7 +32,6 @@ from wlr_gym.gap.words import (
     sentence,
     title,
 )
-from wlr_gym.runs.format import CHANNELS, COLUMNS
 
 EVERY = pytest.mark.parametrize("analysis", examples.ALL.values(), ids=list(examples.ALL))
 PICTURE = {"gap": b"\x89PNG"}

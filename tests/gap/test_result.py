@@ -7,15 +7,15 @@ from dataclasses import replace
 import gap_examples as examples
 import pytest
 
-from wlr_gym.effects import load_patch
-from wlr_gym.errors import InputError
-from wlr_gym.gap import result as module
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.format import CHANNELS
+from wlr_gym.envs.tasks.identified import identified_events
 from wlr_gym.gap.analysis import Calibrated, Equivalent, Estimate, FoundEffect, RunGap
-from wlr_gym.gap.result import patch_of, read_result, result_of, write_result
+from wlr_gym.gap.report import result as module
+from wlr_gym.gap.report.result import patch_of, read_result, result_of, write_result
 from wlr_gym.gap.robot.quantities import knobs
+from wlr_gym.physics.effects import load_patch
 from wlr_gym.robot import load_robot
-from wlr_gym.runs.format import CHANNELS
-from wlr_gym.tasks.identified import identified_events
 
 #: What every result file holds, by the format's description.
 KEYS = {"verdict", "effects", "equivalent", "calibration", "localisation", "gap", "runs", "patch"}

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from rig_bench import Bench, write
 
-from wlr_gym.effects.effect import PatchEffect
-from wlr_gym.errors import InputError
-from wlr_gym.gap.fit import Model, fit, nominal_model
-from wlr_gym.gap.name import name_effects
+from wlr_gym.base.errors import InputError
+from wlr_gym.gap.estimation.fit import Model, fit, nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.rig import RIG_EFFECTS, RigProblem, read_recordings
 from wlr_gym.gap.rig.candidates import rig_candidates
 from wlr_gym.gap.rig.problem import ENCODER_NOISE, LOST
-from wlr_gym.gap.split import named_split
+from wlr_gym.gap.selection.search import name_effects
+from wlr_gym.gap.validation.data_split import named_split
+from wlr_gym.physics.effects.effect import PatchEffect
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "xl330_pendulum"
 LOADED = Bench(load_ratio=0.15)

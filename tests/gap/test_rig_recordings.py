@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from rig_bench import Bench, contents, write
 
-from wlr_gym.effects import Patch, save_patch
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
 from wlr_gym.gap.analysis import Analysis, Estimate, FoundEffect
-from wlr_gym.gap.fit import nominal_model
+from wlr_gym.gap.estimation.fit import nominal_model
 from wlr_gym.gap.problem import Setting
-from wlr_gym.gap.result import patch_of
+from wlr_gym.gap.report.result import patch_of
 from wlr_gym.gap.rig import RigProblem, findings, open_rig, read_recordings, rig_patch
 from wlr_gym.gap.rig.candidates import rig_candidates
 from wlr_gym.gap.rig.recording import decode_load, read_recording
 from wlr_gym.gap.rig.replay import GOAL_LEAD, STEP, Replay, smoothed_state
 from wlr_gym.gap.workflow import analyse
+from wlr_gym.physics.effects import Patch, save_patch
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "xl330_pendulum"
 

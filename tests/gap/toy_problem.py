@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from wlr_gym.effects import PatchEffect
 from wlr_gym.gap.problem import Candidate, Probe, Quantity, Signal, Start, Unknown
+from wlr_gym.physics.effects import PatchEffect
 
 NOISE = np.array([0.1, 2.0, 0.001])
 CHANNELS = ("speed", "torque", "place")

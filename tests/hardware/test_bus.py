@@ -7,12 +7,12 @@ import time
 
 import pytest
 
-from wlr_gym.errors import InputError
-from wlr_gym.hardware import protocol
+from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import load_hardware, with_ports
+from wlr_gym.hardware.dynamixel import protocol
+from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.tables import load_table
 from wlr_gym.robot import load_robot
 
 sdk = pytest.importorskip("dynamixel_sdk")
@@ -21,8 +21,7 @@ pytest.importorskip("termios")
 
 from robot_rig import jabbering_port  # noqa: E402
 
-from wlr_gym.hardware import checks  # noqa: E402
-from wlr_gym.hardware.bus import (  # noqa: E402
+from wlr_gym.hardware.dynamixel.bus import (  # noqa: E402
     Block,
     BusGroup,
     NoAnswerError,
@@ -31,9 +30,10 @@ from wlr_gym.hardware.bus import (  # noqa: E402
     TickClock,
     open_all,
 )
+from wlr_gym.hardware.dynamixel.sdk import BusGoneError, GuardedHandler, GuardedPort  # noqa: E402
+from wlr_gym.hardware.dynamixel.servos import Servos  # noqa: E402
 from wlr_gym.hardware.ports import PortInUseError  # noqa: E402
-from wlr_gym.hardware.sdk import BusGoneError, GuardedHandler, GuardedPort  # noqa: E402
-from wlr_gym.hardware.servos import Servos  # noqa: E402
+from wlr_gym.hardware.safety import preflight as checks  # noqa: E402
 
 TABLE = load_table("XM540-W150-R")
 FAST_BLOCK = Block(TABLE, "realtime_tick", "present_position")

@@ -2,16 +2,16 @@
 
 import pytest
 
-from wlr_gym.bench.measure import Size
 from wlr_gym.hardware.config import load_hardware, with_ports
 from wlr_gym.robot import load_robot
+from wlr_gym.studies.bench.measure import Size
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.bench import bus
-from wlr_gym.hardware.servos import Servos
+from wlr_gym.hardware.dynamixel.servos import Servos
+from wlr_gym.studies.bench import bus
 
 
 def test_both_read_the_same():

@@ -8,25 +8,25 @@ import numpy as np
 import pytest
 import yaml
 
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import main
 from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions, calibrate_imu, calibrate_joints, set_up_servo
 from wlr_gym.cli.robot_options import RobotOption
-from wlr_gym.errors import InputError
 from wlr_gym.hardware import calibration as find
 from wlr_gym.hardware.config import ImuCalibration, Mounting, load_hardware
-from wlr_gym.hardware.imu_driver import to_body
-from wlr_gym.hardware.setup import FoundServo, check_new_servo
-from wlr_gym.paths import data_directory
+from wlr_gym.hardware.dynamixel.setup import FoundServo, check_new_servo
+from wlr_gym.hardware.imu.driver import to_body
 from wlr_gym.robot import JOINTS, LEGS, load_robot
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
-from wlr_gym.hardware.bus import BusGroup
+from wlr_gym.hardware.dynamixel.bus import BusGroup
+from wlr_gym.hardware.dynamixel.sdk import BusGoneError
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.link import emulated_link
-from wlr_gym.hardware.sdk import BusGoneError
 
 ROBOT, NOMINAL = load_robot(), load_hardware()
 #: How the robot at hand is really mounted: not as the file says.

@@ -3,9 +3,9 @@
 import pytest
 import yaml
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import find_config
 from wlr_gym.hardware.config import load_hardware, with_ports
-from wlr_gym.paths import find_config
 from wlr_gym.robot import LEGS, WHEELS
 
 

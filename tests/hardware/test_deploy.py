@@ -17,17 +17,17 @@ pytest.importorskip("serial")
 
 from robot_rig import HARDWARE, PERIOD, Phase, hardware_file, machine_of
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK, run_command
-from wlr_gym.errors import InputError
-from wlr_gym.evaluation import make_core, roll_out
-from wlr_gym.evaluation.deployment import REHEARSALS, act_again, loop_of, read_policy_log
-from wlr_gym.evaluation.deployment import deploy as drive
+from wlr_gym.data.read import read_run
+from wlr_gym.data.replay import replay
+from wlr_gym.hardware.deployment import REHEARSALS, act_again, loop_of, read_policy_log
+from wlr_gym.hardware.deployment import deploy as drive
 from wlr_gym.hardware.link import MonotonicClock, emulated_robot
 from wlr_gym.hardware.log import RunLog, read_events
 from wlr_gym.hardware.loop import StoppedError
+from wlr_gym.learning.evaluation import make_core, roll_out
 from wlr_gym.policy import make_policy
-from wlr_gym.runs.read import read_run
-from wlr_gym.runs.replay import replay
 
 ID = "WLR-Velocity-v0"
 COMMAND = {"linear_velocity_x": 0.08, "yaw_rate": 0.15}

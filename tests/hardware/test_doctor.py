@@ -5,9 +5,9 @@ from functools import partial
 
 import pytest
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import doctor
 from wlr_gym.cli.robot_options import RobotOption
-from wlr_gym.errors import InputError
 from wlr_gym.hardware.config import load_hardware
 from wlr_gym.robot import load_robot
 
@@ -15,10 +15,11 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware import checks, setup
+from wlr_gym.hardware.dynamixel import setup
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.link import emulated_link
+from wlr_gym.hardware.safety import preflight as checks
 
 ROBOT, HARDWARE = load_robot(), load_hardware()
 
@@ -147,7 +148,7 @@ def test_ports_that_are_there_are_named(tmp_path):
 
 
 def write_policy(folder, **changes):
-    from wlr_gym.evaluation.rollout import make_core
+    from wlr_gym.learning.evaluation.rollout import make_core
     from wlr_gym.policy.file import write_contract
 
     core = make_core("WLR-Velocity-v0", 1, {})

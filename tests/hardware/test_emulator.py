@@ -7,17 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wlr_gym.errors import InputError
-from wlr_gym.hardware import imu, protocol
+from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.dynamixel import protocol
+from wlr_gym.hardware.dynamixel.protocol import BROADCAST, Error, Instruction, Packet, Parser, Status
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
-from wlr_gym.hardware.protocol import BROADCAST, Error, Instruction, Packet, Parser, Status
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants import make_plant
-from wlr_gym.plants.base import PlantOptions
+from wlr_gym.hardware.imu import frames as imu
+from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import PlantOptions
+from wlr_gym.physics.servo import motor_constants
 from wlr_gym.robot import JOINTS, load_robot
-from wlr_gym.servo import motor_constants
+from wlr_gym.robot.parameters import Parameters
 
 ROBOT = load_robot()
 HARDWARE = load_hardware()

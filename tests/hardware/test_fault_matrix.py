@@ -14,12 +14,12 @@ pytest.importorskip("serial")
 
 from robot_rig import DRIVE, HARDWARE, JOINTS, PERIOD, Phase, Rig, StoppedError
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.read import read_run
 from wlr_gym.hardware.emulator import FAULTS, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.log import read_events
-from wlr_gym.runs.read import read_run
-from wlr_gym.servo import REGISTER_UNITS
+from wlr_gym.physics.servo import REGISTER_UNITS
 
 _COUNTS = (REGISTER_UNITS["XM540-W150-R"]["position"].per_count, REGISTER_UNITS["XL430-W250-T"]["velocity"].per_count)
 #: (8,) counts that a goal may change by in a tick, and one for rounding.

@@ -14,18 +14,18 @@ pytest.importorskip("termios")
 
 from robot_rig import HARDWARE, ROBOT, hardware_file
 
-from wlr_gym.hardware.bus import BusGroup
+from wlr_gym.data.read import read_run
+from wlr_gym.hardware.dynamixel.bus import BusGroup
+from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.guard import Guard, switch_off
-from wlr_gym.hardware.tables import load_table
-from wlr_gym.runs.read import read_run
+from wlr_gym.hardware.safety.watchdog import Guard, switch_off
 
 DRIVER = """
 import sys, numpy as np
 from pathlib import Path
-from wlr_gym.plants import make_plant
-from wlr_gym.plants.base import PlantOptions, RobotOptions
+from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 from wlr_gym.hardware.loop import StoppedError, stop_on_signals
 from wlr_gym.robot import load_robot
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from wlr_gym.hardware import imu
-from wlr_gym.hardware.imu import Frame, FrameParser, encode_frame
+from wlr_gym.hardware.imu import frames as imu
+from wlr_gym.hardware.imu.frames import Frame, FrameParser, encode_frame
 
 
 def random_frames(count, seed=1):

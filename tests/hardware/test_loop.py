@@ -12,12 +12,12 @@ pytest.importorskip("serial")
 
 from robot_rig import DRIVE, JOINTS, PERIOD, Phase, Rig, StoppedError
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.read import read_dataset, read_run
 from wlr_gym.hardware.log import read_events
 from wlr_gym.hardware.loop import stop_on_signals
 from wlr_gym.hardware.operator import Keys
 from wlr_gym.hardware.timing import Pacer
-from wlr_gym.runs.read import read_dataset, read_run
 
 #: What one count of a goal register is: rad of a leg, rad/s of a wheel (e-manuals: 4096 per turn, 0.229 rpm).
 ANGLE_COUNT, SPEED_COUNT = 2.0 * np.pi / 4096, 0.229 * 2.0 * np.pi / 60.0

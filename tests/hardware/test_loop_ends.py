@@ -15,18 +15,18 @@ pytest.importorskip("serial")
 from robot_rig import ROBOT, Phase, Rig, StoppedError, machine_of
 
 from wlr_gym.cli import FAILED, OK, record, replay, run_command
-from wlr_gym.evaluation import make_core
-from wlr_gym.evaluation.deployment import deploy, loop_of
-from wlr_gym.evaluation.driving import drive_robot
-from wlr_gym.hardware.limits import Safety
+from wlr_gym.data.excitations import excite
+from wlr_gym.data.format import RunMeta
+from wlr_gym.hardware.deployment import deploy, loop_of
+from wlr_gym.hardware.driving import drive_robot
 from wlr_gym.hardware.loop import stop_on_signals
 from wlr_gym.hardware.operator import Keys
 from wlr_gym.hardware.plant import RobotPlant
-from wlr_gym.paper.experiments import PROFILE
-from wlr_gym.plants.base import PlantOptions, RobotOptions
+from wlr_gym.hardware.safety.limits import Safety
+from wlr_gym.learning.evaluation import make_core
+from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 from wlr_gym.policy import make_policy
-from wlr_gym.runs.excitations import excite
-from wlr_gym.runs.format import RunMeta
+from wlr_gym.studies.paper.experiments import PROFILE
 
 ADVICE = "CUT THE POWER: torque is not confirmed off at wheel_lf, wheel_rf, wheel_lr, wheel_rr"
 
@@ -150,7 +150,7 @@ def unplugged_at_the_end(monkeypatch):
         before_off(plant.loop, lambda: unplug(plant.loop))
         return drive_robot(plant, motion)
 
-    monkeypatch.setattr("wlr_gym.evaluation.driving.drive_robot", drive)
+    monkeypatch.setattr("wlr_gym.hardware.driving.drive_robot", drive)
     return driven
 
 
@@ -202,7 +202,7 @@ def test_a_stop_in_the_last_motion_tick_starts_no_other(tmp_path, monkeypatch):
         in_phase(plant.loop, Phase.STOPPING, interrupt)
         return drive_robot(plant, motion)
 
-    monkeypatch.setattr("wlr_gym.evaluation.driving.drive_robot", drive)
+    monkeypatch.setattr("wlr_gym.hardware.driving.drive_robot", drive)
     options = record.Options(excitation=("straight", "turns"), out=tmp_path, emulated=True, seconds=0.2)
     assert record.run(options) == OK
     assert driven == ["straight"]

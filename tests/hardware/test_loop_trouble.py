@@ -12,14 +12,14 @@ pytest.importorskip("serial")
 
 from robot_rig import DRIVE, HARDWARE, JOINTS, PERIOD, ROBOT, Phase, Rig, StoppedError
 
-from wlr_gym.errors import InputError
-from wlr_gym.hardware import checks
-from wlr_gym.hardware.gate import CALM_SPEED
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.read import read_run
 from wlr_gym.hardware.log import Table, read_events
 from wlr_gym.hardware.loop import STOP_SIGNALS, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
-from wlr_gym.plants.base import PlantOptions, RobotOptions
-from wlr_gym.runs.read import read_run
+from wlr_gym.hardware.safety import preflight as checks
+from wlr_gym.hardware.safety.limiter import CALM_SPEED
+from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wlr_gym.hardware import protocol
-from wlr_gym.hardware.protocol import Instruction, Packet, Parser, Status
+from wlr_gym.hardware.dynamixel import protocol
+from wlr_gym.hardware.dynamixel.protocol import Instruction, Packet, Parser, Status
 
 #: (bytes built, bytes printed in the e-manual's Protocol 2.0 examples)
 MANUAL = {

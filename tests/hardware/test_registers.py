@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
+from wlr_gym.hardware.dynamixel.protocol import Error
+from wlr_gym.hardware.dynamixel.tables import TABLE_SIZE, load_table
 from wlr_gym.hardware.emulator.servo import EmulatedServo
-from wlr_gym.hardware.protocol import Error
-from wlr_gym.hardware.tables import TABLE_SIZE, load_table
 
 MODELS = ("XM540-W150-R", "XL430-W250-T")
 ROWS = [(model, item.name) for model in MODELS for item in load_table(model).items.values()]

@@ -6,15 +6,15 @@ import numpy as np
 import pandas
 import pytest
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import record, replay
 from wlr_gym.cli.robot_options import HardwareOption
-from wlr_gym.errors import InputError
+from wlr_gym.data import read_run
+from wlr_gym.data.excitations import excite
+from wlr_gym.data.format import COMMANDS
+from wlr_gym.data.record import record_simulation
+from wlr_gym.data.repeat import compare_repeat
 from wlr_gym.robot import load_robot
-from wlr_gym.runs import read_run
-from wlr_gym.runs.excitations import excite
-from wlr_gym.runs.format import COMMANDS
-from wlr_gym.runs.record import record_simulation
-from wlr_gym.runs.repeat import compare_repeat
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")

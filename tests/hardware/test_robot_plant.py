@@ -12,15 +12,15 @@ pytest.importorskip("serial")
 from robot_rig import ROBOT, Phase, StoppedError, machine_of
 
 import wlr_gym  # noqa: F401  (registers the environments)
-from wlr_gym.effects import Patch
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.read import read_run
 from wlr_gym.envs.measured import MEASURED, measured_truth
 from wlr_gym.envs.settings import Settings
-from wlr_gym.errors import InputError
-from wlr_gym.evaluation import make_core, roll_out
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants import REAL, SIMULATORS, make_plant
-from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, RobotOptions, Sensors, read_robot_options
-from wlr_gym.runs.read import read_run
+from wlr_gym.learning.evaluation import make_core, roll_out
+from wlr_gym.physics.effects import Patch
+from wlr_gym.physics.plants import REAL, SIMULATORS, make_plant
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, RobotOptions, Sensors, read_robot_options
+from wlr_gym.robot.parameters import Parameters
 
 QUIET = PlantOptions(sensor_noise=False)
 ID = "WLR-Velocity-v0"

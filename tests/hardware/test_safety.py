@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from wlr_gym.hardware import safety
-from wlr_gym.hardware.limits import Safety
-from wlr_gym.hardware.safety import Level, Memory, View
+from wlr_gym.hardware.safety import rules as safety
+from wlr_gym.hardware.safety.limits import Safety
+from wlr_gym.hardware.safety.rules import Level, Memory, View
 from wlr_gym.robot import JOINTS, load_robot
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -375,7 +375,7 @@ def test_only_the_gate_and_the_guard_write_goals_and_torque():
 
 
 def test_the_gate_does_not_hand_out_the_servos():
-    from wlr_gym.hardware import gate
+    from wlr_gym.hardware.safety import limiter as gate
 
     assert not [name for name in dir(gate.Gate) if "servos" in name.lower() and not name.startswith("_Gate__")]
     assert "dry_run" in gate.Gate.__init__.__code__.co_varnames

@@ -5,11 +5,11 @@ import time
 
 import pytest
 
-from wlr_gym.errors import InputError
-from wlr_gym.hardware import imu
+from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import load_hardware
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
+from wlr_gym.hardware.imu import frames as imu
 from wlr_gym.robot import load_robot
 
 sdk = pytest.importorskip("dynamixel_sdk")

@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import load_hardware, with_ports
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
+from wlr_gym.physics.servo import effort_counts
 from wlr_gym.robot import JOINTS, load_robot
-from wlr_gym.servo import effort_counts
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware.servos import JointMap, Servos
+from wlr_gym.hardware.dynamixel.servos import JointMap, Servos
 
 ROBOT = load_robot()
 HARDWARE = load_hardware()

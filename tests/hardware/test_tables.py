@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from wlr_gym.errors import InputError
-from wlr_gym.hardware.tables import TABLE_SIZE, load_table
-from wlr_gym.servo import REGISTER_UNITS
+from wlr_gym.base.errors import InputError
+from wlr_gym.hardware.dynamixel.tables import TABLE_SIZE, load_table
+from wlr_gym.physics.servo import REGISTER_UNITS
 
 MODELS = {"XM540-W150-R": "xm540_w150", "XL430-W250-T": "xl430_w250"}
 #: Names that differ between the SDK's model files and the e-manual's tables.

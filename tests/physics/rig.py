@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import PlantOptions, PlantState, Truth, standing_state
-from wlr_gym.plants.forces import Force
-from wlr_gym.plants.gibbs_appell.plant import SWEEPS, GibbsAppellPlant
+from wlr_gym.physics.plants.base import PlantOptions, PlantState, Truth, standing_state
+from wlr_gym.physics.plants.forces import Force
+from wlr_gym.physics.plants.gibbs_appell.plant import SWEEPS, GibbsAppellPlant
 from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import Parameters
 
 ROBOT = load_robot()
 G = ROBOT.gravity

@@ -1,6 +1,6 @@
 """Without contacts, the Gibbs-Appell equations and MuJoCo's recursive algorithms must agree to rounding.
 
-MuJoCo's model is built from the parameters without any code of ``wlr_gym.model``.
+MuJoCo's model is built from the parameters without any code of ``wlr_gym.physics.model``.
 """
 
 from dataclasses import dataclass
@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from wlr_gym.errors import InputError
-from wlr_gym.model import dynamics
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import standing_state
+from wlr_gym.base.errors import InputError
+from wlr_gym.physics.model import dynamics
+from wlr_gym.physics.plants.base import standing_state
 from wlr_gym.robot import LEGS, WHEELS, load_robot
+from wlr_gym.robot.parameters import Parameters
 
 mujoco = pytest.importorskip("mujoco")
-mjcf = pytest.importorskip("wlr_gym.plants.mujoco.mjcf")
+mjcf = pytest.importorskip("wlr_gym.physics.plants.mujoco.mjcf")
 
 COUNT = 1000
 ROBOT = load_robot()

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from two_plants import BACKENDS, ROBOT
 
-from wlr_gym.effects import EFFECTS, apply_patch
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants import make_plant
-from wlr_gym.plants.base import PlantOptions, standing_state
-from wlr_gym.runs.compare import severe_patch
-from wlr_gym.runs.excitations import EXCITATIONS, Motion, excite
-from wlr_gym.runs.replay import profile_parameters
+from wlr_gym.data.compare import severe_patch
+from wlr_gym.data.excitations import EXCITATIONS, Motion, excite
+from wlr_gym.data.replay import profile_parameters
+from wlr_gym.physics.effects import EFFECTS, apply_patch
+from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import PlantOptions, standing_state
+from wlr_gym.robot.parameters import Parameters
 
 #: Effects that act on the readings alone, which both plants take from the same sensor model.
 ON_SENSORS = ("gyro_bias", "imu_misalignment", "camera_misalignment", "camera_delay")

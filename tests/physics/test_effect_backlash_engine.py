@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rig import LEGS_DOWN, RADIUS, ROBOT, drive, float_in_space, gears, lift, lock, make_plant, record, wheels_off
 
-from wlr_gym.model import dynamics
-from wlr_gym.servo import motor_constants
+from wlr_gym.physics.model import dynamics
+from wlr_gym.physics.servo import motor_constants
 
 WHEEL = ROBOT.servo.wheel
 V0 = ROBOT.servo.supply_voltage

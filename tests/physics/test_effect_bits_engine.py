@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from rig import ROBOT
 
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import PlantOptions
-from wlr_gym.plants.gibbs_appell.plant import GibbsAppellPlant
+from wlr_gym.physics.plants.base import PlantOptions
+from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
+from wlr_gym.robot.parameters import Parameters
 
 FAMILIES = {
     "rolling_resistance": ("ground.rolling_resistance", 0.01),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rig import ROBOT, drive, float_in_space, lift, make_plant, record, wheels_off
 
-from wlr_gym.plants.base import Truth
-from wlr_gym.servo import motor_constants
+from wlr_gym.physics.plants.base import Truth
+from wlr_gym.physics.servo import motor_constants
 
 WHEEL = ROBOT.servo.wheel
 V0 = ROBOT.servo.supply_voltage

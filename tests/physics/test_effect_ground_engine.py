@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rig import HOME, ROBOT, STEPS, WEIGHT, G, contact_force, drive, lock, make_plant, record, turn
 
-from wlr_gym.plants.base import Truth
+from wlr_gym.physics.plants.base import Truth
 
 MASS = WEIGHT / G
 

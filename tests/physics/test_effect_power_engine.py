@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from rig import LEGS_DOWN, ROBOT, drive, float_in_space, gears, lift, lock, make_plant
 
-from wlr_gym.model import dynamics
-from wlr_gym.plants.base import Truth
-from wlr_gym.plants.forces import make_force
+from wlr_gym.physics.model import dynamics
+from wlr_gym.physics.plants.base import Truth
+from wlr_gym.physics.plants.forces import make_force
 
 STEP = 1e-3
 TETHER = 20.0

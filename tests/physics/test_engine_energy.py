@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rig import make_plant
 
-from wlr_gym.model import dynamics
-from wlr_gym.plants.base import Truth
+from wlr_gym.physics.model import dynamics
+from wlr_gym.physics.plants.base import Truth
 
 COUNT = 4
 STEP = 1e-3

@@ -6,9 +6,9 @@ import numpy as np
 from rig import ROBOT, make_plant
 from test_contact_free_mujoco import random_parameters
 
-from wlr_gym import servo
-from wlr_gym.model import dynamics
-from wlr_gym.plants.base import PlantState
+from wlr_gym.physics import servo
+from wlr_gym.physics.model import dynamics
+from wlr_gym.physics.plants.base import PlantState
 
 COUNT = 200
 

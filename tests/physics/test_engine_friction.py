@@ -19,7 +19,7 @@ from rig import (
     wheels_off,
 )
 
-from wlr_gym import servo
+from wlr_gym.physics import servo
 
 MASS = ROBOT.total_mass
 AXIS_SIGN = ((0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0))

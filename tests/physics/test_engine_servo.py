@@ -16,7 +16,7 @@ from rig import (
     wheels_off,
 )
 
-from wlr_gym import servo
+from wlr_gym.physics import servo
 
 LEG = ROBOT.servo.leg
 WHEEL = ROBOT.servo.wheel

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from two_plants import ROBOT, make
 
-from wlr_gym.model import dynamics
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import Truth
-from wlr_gym.plants.mujoco.batch import RobotBatch
-from wlr_gym.plants.mujoco.mjcf import build_model
+from wlr_gym.physics.model import dynamics
+from wlr_gym.physics.plants.base import Truth
+from wlr_gym.physics.plants.mujoco.batch import RobotBatch
+from wlr_gym.physics.plants.mujoco.mjcf import build_model
+from wlr_gym.robot.parameters import Parameters
 
 INERTIAL = (
     "body_mass", "body_ipos", "body_iquat", "body_inertia", "body_pos", "body_quat", "body_subtreemass", "body_invweight0",

@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants import make_plant
-from wlr_gym.plants.base import Plant, PlantOptions, PlantState, standing_state
+from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, standing_state
 from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import Parameters
 
 BACKENDS = ("gibbs_appell", "mujoco")
 ROBOT = load_robot()

@@ -5,8 +5,8 @@ import json
 
 import pytest
 
-from wlr_gym.errors import InputError
-from wlr_gym.evaluation import make_core
+from wlr_gym.base.errors import InputError
+from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import check_contract, load_policy, make_policy, read_contract, write_contract
 
 

@@ -4,9 +4,9 @@ import shutil
 
 import pytest
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.errors import InputError
-from wlr_gym.evaluation import make_core
+from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import (
     check_model_card,
     contract_of,

@@ -16,9 +16,9 @@ pytest.importorskip("stable_baselines3")
 
 import onnx
 
+from wlr_gym.base.errors import InputError, MissingPackageError
 from wlr_gym.cli import main
-from wlr_gym.errors import InputError, MissingPackageError
-from wlr_gym.evaluation import make_core
+from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import contract_of, export_policy, load_agent, load_policy, make_policy, read_contract, write_contract
 from wlr_gym.policy.export import compare
 from wlr_gym.policy.onnx_file import CONTRACT_KEY, FINGERPRINT_KEY, open_policy, seal
@@ -200,7 +200,7 @@ def test_a_graph_that_answers_differently_is_not_written(trained, environment, t
     import torch
 
     load_agent("ppo")
-    module = importlib.import_module("wlr_gym_agents_ppo.export")
+    module = importlib.import_module("wlr_gym.learning.ppo.export")
     to_onnx = module.to_onnx
     monkeypatch.setattr(module, "to_onnx", lambda actor, width: to_onnx(torch.nn.Sequential(actor, torch.nn.Tanh()), width))
     (tmp_path / "p.onnx").write_bytes(b"old")

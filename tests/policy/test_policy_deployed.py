@@ -6,8 +6,8 @@ import pytest
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
-from wlr_gym.evaluation import make_core
-from wlr_gym.evaluation.deployment import act_again, deploy
+from wlr_gym.hardware.deployment import act_again, deploy
+from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import make_policy
 
 ID = "WLR-Velocity-v0"

@@ -5,8 +5,8 @@ import shutil
 import numpy as np
 import pytest
 
-from wlr_gym.errors import InputError
-from wlr_gym.evaluation import make_core
+from wlr_gym.base.errors import InputError
+from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import (
     contract_of,
     find_policy,

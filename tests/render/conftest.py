@@ -1,9 +1,9 @@
 import pytest
 from standing import PLAIN
 
-from wlr_gym.parameters import Parameters
 from wlr_gym.render.scene import Scene
 from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import Parameters
 
 
 @pytest.fixture

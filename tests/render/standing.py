@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wlr_gym.plants.base import TRUTH_LAYOUT, Truth, standing_state
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT, Truth, standing_state
 from wlr_gym.render.view import View
 from wlr_gym.robot import load_robot
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from standing import PLAIN, truth_of
 
-from wlr_gym.errors import InputError
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants import SIMULATORS, PlantOptions, make_plant
+from wlr_gym.base.errors import InputError
+from wlr_gym.physics.plants import SIMULATORS, PlantOptions, make_plant
 from wlr_gym.render import camera, gl, marks
 from wlr_gym.render.stage import Stage
 from wlr_gym.render.view import View, read_view
+from wlr_gym.robot.parameters import Parameters
 
 
 def at(picture, scene, point):
@@ -266,8 +266,8 @@ def test_slip_arrow_is_seen_at_its_place(new_scene, parameters):
 
 
 def test_contact_frames_of_a_tilted_robot_are_the_slip_definitions(robot, parameters):
-    """Points and axes against wlr_gym.slip: the contact's velocity in a pure turn about a known axis."""
-    from wlr_gym.slip import contact_slip_velocity
+    """Points and axes against wlr_gym.robot.slip: the contact's velocity in a pure turn about a known axis."""
+    from wlr_gym.robot.slip import contact_slip_velocity
 
     half = 0.5 * np.array([0.1, -0.08, 0.6])
     (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
@@ -324,7 +324,7 @@ def test_on_a_slope_gravity_points_down_in_the_picture(new_scene, parameters):
 
 
 def test_up_is_against_the_gravity_of_the_plants(robot, parameters):
-    from wlr_gym.plants.mujoco.mjcf import build_model
+    from wlr_gym.physics.plants.mujoco.mjcf import build_model
 
     parameters["ground.slope"][0] = [0.2, -0.1]
     gravity = build_model(robot, parameters).opt.gravity
@@ -386,8 +386,8 @@ def test_a_scene_left_open_does_not_disturb_the_end_of_the_program(new_scene):
     code = (
         "import mujoco\n"  # whoever imports it first
         "from wlr_gym.robot import load_robot\n"
-        "from wlr_gym.parameters import Parameters\n"
-        "from wlr_gym.plants.base import Truth, TRUTH_LAYOUT\n"
+        "from wlr_gym.robot.parameters import Parameters\n"
+        "from wlr_gym.physics.plants.base import Truth, TRUTH_LAYOUT\n"
         "from wlr_gym.render import Scene, View\n"
         "import numpy as np\n"
         "truth = Truth(np.zeros((1, TRUTH_LAYOUT.width))); truth['quaternion'][:, 0] = 1\n"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from wlr_gym.errors import InputError, MissingPackageError
+from wlr_gym.base.errors import InputError, MissingPackageError
 from wlr_gym.render.compare import GAP, side_by_side
 from wlr_gym.render.video import check_video, write_video
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from standing import truth_of
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
 from wlr_gym.render import viewer as viewer_module
 from wlr_gym.render.teleop import DOWN, LEFT, RESET, RIGHT, SPACE, UP, Gamepad, Keyboard, Script
 from wlr_gym.render.view import View

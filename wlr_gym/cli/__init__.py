@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from wlr_gym import __version__
-from wlr_gym.errors import InputError, MissingPackageError, unknown_name
+from wlr_gym.base.errors import InputError, MissingPackageError, unknown_name
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 

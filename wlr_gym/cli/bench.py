@@ -12,29 +12,29 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from wlr_gym.bench.measure import Measurement, Size, machine
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.files import write_json
 from wlr_gym.cli import OK
-from wlr_gym.errors import InputError, unknown_name
-from wlr_gym.files import write_json
+from wlr_gym.studies.bench.measure import Measurement, Size, machine
 
 if TYPE_CHECKING:
-    from wlr_gym.bench.convergence import Deviation
-    from wlr_gym.bench.vision import Result
+    from wlr_gym.studies.bench.convergence import Deviation
+    from wlr_gym.studies.bench.vision import Result
 
 #: Measurement -> function. Imported when it is run.
 MEASUREMENTS = {
-    "engine": "wlr_gym.bench.speed:measure_engine",
-    "mujoco": "wlr_gym.bench.mujoco_plant:measure_mujoco",
-    "env_step": "wlr_gym.bench.speed:measure_env_step",
-    "ppo": "wlr_gym.bench.training:measure_ppo",
-    "learning": "wlr_gym.bench.training:measure_learning",
-    "import": "wlr_gym.bench.speed:measure_import",
-    "start": "wlr_gym.bench.speed:measure_start",
-    "batch": "wlr_gym.bench.speed:measure_batch",
-    "convergence": "wlr_gym.bench.convergence:measure_convergence",
-    "vision": "wlr_gym.bench.vision:measure_vision",
-    "bus": "wlr_gym.bench.bus:measure_bus",
-    "sysid": "wlr_gym.bench.sysid:measure_sysid",
+    "engine": "wlr_gym.studies.bench.speed:measure_engine",
+    "mujoco": "wlr_gym.studies.bench.mujoco_plant:measure_mujoco",
+    "env_step": "wlr_gym.studies.bench.speed:measure_env_step",
+    "ppo": "wlr_gym.studies.bench.training:measure_ppo",
+    "learning": "wlr_gym.studies.bench.training:measure_learning",
+    "import": "wlr_gym.studies.bench.speed:measure_import",
+    "start": "wlr_gym.studies.bench.speed:measure_start",
+    "batch": "wlr_gym.studies.bench.speed:measure_batch",
+    "convergence": "wlr_gym.studies.bench.convergence:measure_convergence",
+    "vision": "wlr_gym.studies.bench.vision:measure_vision",
+    "bus": "wlr_gym.studies.bench.bus:measure_bus",
+    "sysid": "wlr_gym.studies.bench.sysid:measure_sysid",
 }
 #: Measurements with rows of their own kind; each has its list in the report.
 _OWN_ROWS = ("convergence", "vision")
@@ -97,7 +97,7 @@ def run(options: Options) -> int:
 
 def _blind_test(options: Options, asked: tuple[str, ...]) -> int:
     """Test the gap workflow on data sets with sealed truths; print and write its score."""
-    from wlr_gym.bench import gap
+    from wlr_gym.studies.bench import gap
 
     if len(asked) > 1:
         raise InputError(f"{BLIND_TEST} takes hours and is run alone, not with {', '.join(set(asked) - {BLIND_TEST})}")

@@ -8,16 +8,9 @@ from typing import Annotated
 
 import tyro
 
+from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.cli import OK
-from wlr_gym.cli.calibrate_robot import (
-    ImuOptions,
-    JointsOptions,
-    ServoOptions,
-    calibrate_imu,
-    calibrate_joints,
-    set_up_servo,
-)
-from wlr_gym.errors import InputError, require_package
+from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions, calibrate_imu, calibrate_joints, set_up_servo
 
 
 @dataclass(frozen=True)
@@ -78,9 +71,9 @@ def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions |
 
 
 def _camera(options: CameraOptions) -> int:
-    from wlr_gym.vision.camera import calibrate, save_camera
-    from wlr_gym.vision.sheets import Board
-    from wlr_gym.vision.video import Frames
+    from wlr_gym.perception.markers.camera import calibrate, save_camera
+    from wlr_gym.perception.vision.sheets import Board
+    from wlr_gym.perception.vision.video import Frames
 
     if not 0.001 < options.square < 0.5:
         raise InputError(f"--square {options.square:g}: expected metres, as measured on the print (28 mm = 0.028)")
@@ -110,9 +103,9 @@ def _camera(options: CameraOptions) -> int:
 
 
 def _targets(options: TargetsOptions) -> int:
-    from wlr_gym.files import make_output_folder
-    from wlr_gym.vision.sheets import Board, board_page, target_pages, write_pages
-    from wlr_gym.vision.targets import load_target
+    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.perception.markers.targets import load_target
+    from wlr_gym.perception.vision.sheets import Board, board_page, target_pages, write_pages
 
     body, floor = load_target(options.markers), load_target(options.floor)
     make_output_folder(options.out)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import numpy as np
 import tyro
 
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.robot_options import RobotOption
-from wlr_gym.errors import InputError, unknown_name
 from wlr_gym.robot import JOINTS, LEGS
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from wlr_gym.hardware.calibration import Pose
     from wlr_gym.hardware.config import Hardware, ImuCalibration, Mounting
+    from wlr_gym.hardware.dynamixel.servos import Servos
     from wlr_gym.hardware.link import Link
-    from wlr_gym.hardware.servos import Servos
     from wlr_gym.robot import Robot
 
 #: Shows a text, waits for Enter, returns what was typed.
@@ -104,8 +104,8 @@ def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
     Raises:
         InputError: unknown joint, none or several servos, another model, a servo that does not take it.
     """
-    from wlr_gym.hardware.setup import FACTORY_RATE, check_new_servo, find_servos, set_up
-    from wlr_gym.hardware.tables import BAUD_RATES
+    from wlr_gym.hardware.dynamixel.setup import FACTORY_RATE, check_new_servo, find_servos, set_up
+    from wlr_gym.hardware.dynamixel.tables import BAUD_RATES
 
     if options.joint not in JOINTS:
         raise unknown_name("joint", options.joint, JOINTS)
@@ -242,7 +242,7 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
 
 def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, ask: Ask) -> ImuCalibration:
     from wlr_gym.hardware import calibration as find
-    from wlr_gym.hardware.imu_driver import to_body
+    from wlr_gym.hardware.imu.driver import to_body
 
     level = "Stand the robot level on its wheels and let go of it, then Enter."
     if options.poses == 6:
@@ -274,7 +274,7 @@ def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, as
 
 def _pose(options: ImuOptions, link: Link, ask: Ask, text: str) -> Pose:
     from wlr_gym.hardware.calibration import rest_pose
-    from wlr_gym.hardware.checks import sample_imu
+    from wlr_gym.hardware.safety.preflight import sample_imu
 
     def look() -> Pose:
         _answer(ask, text)
@@ -291,7 +291,7 @@ def _dialogue() -> Iterator[None]:
     Raises:
         InputError: a servo or the IMU does not answer as it should.
     """
-    from wlr_gym.hardware.bus import NoAnswerError, RefusedError
+    from wlr_gym.hardware.dynamixel.bus import NoAnswerError, RefusedError
 
     try:
         yield
@@ -326,7 +326,7 @@ def _yes(ask: Ask, text: str) -> bool:
 
 def _source(hardware: str, out: Path) -> Path:
     """Return the file the hardware comes from; refuse to write over another one."""
-    from wlr_gym.paths import find_config
+    from wlr_gym.base.paths import find_config
 
     source = find_config("hardware", hardware)
     if out.suffix not in {".yaml", ".yml"} or not out.parent.is_dir():

@@ -12,17 +12,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli.options import EffectsOption
-from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from wlr_gym.effects import Patch
+    from wlr_gym.data.compare import Comparison, Contender
+    from wlr_gym.data.compare_report import Table
+    from wlr_gym.data.excitations import Motion
+    from wlr_gym.physics.effects import Patch
     from wlr_gym.robot import Robot
-    from wlr_gym.runs.compare import Comparison, Contender
-    from wlr_gym.runs.compare_report import Table
-    from wlr_gym.runs.excitations import Motion
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,11 @@ def run(options: Options) -> int:
     """
     from rich.console import Console
 
+    from wlr_gym.base.files import make_output_folder, replace_file, write_json
+    from wlr_gym.base.provenance import record_provenance
     from wlr_gym.cli import FAILED, OK
-    from wlr_gym.files import make_output_folder, replace_file, write_json
-    from wlr_gym.provenance import record_provenance
-    from wlr_gym.runs.compare import parse_contender
-    from wlr_gym.runs.compare_report import markdown, summary_table
+    from wlr_gym.data.compare import parse_contender
+    from wlr_gym.data.compare_report import markdown, summary_table
 
     first, second = (parse_contender(text, options.physics_step) for text in options.plants)
     if not options.threshold > 0.0:
@@ -96,11 +96,11 @@ def run(options: Options) -> int:
 
 
 def _motions(options: Options) -> tuple[list[Motion], Robot]:
+    from wlr_gym.data import read_dataset, read_run
+    from wlr_gym.data.compare import motion_of
+    from wlr_gym.data.excitations import EXCITATIONS, excite
+    from wlr_gym.data.replay import robot_of
     from wlr_gym.robot import load_robot
-    from wlr_gym.runs import read_dataset, read_run
-    from wlr_gym.runs.compare import motion_of
-    from wlr_gym.runs.excitations import EXCITATIONS, excite
-    from wlr_gym.runs.replay import robot_of
 
     if options.seconds is not None and not options.seconds > 0.0:
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
@@ -118,9 +118,9 @@ def _motions(options: Options) -> tuple[list[Motion], Robot]:
 
 def _patches(options: Options, motions: Sequence[Motion], robot: Robot) -> list[Patch]:
     """Return what to compare with, each tried on the parameters first so that a refusal leaves no folder behind."""
-    from wlr_gym.effects import EFFECTS, apply_patch, compose
-    from wlr_gym.parameters import Parameters
-    from wlr_gym.runs.compare import severe_patch
+    from wlr_gym.data.compare import severe_patch
+    from wlr_gym.physics.effects import EFFECTS, apply_patch, compose
+    from wlr_gym.robot.parameters import Parameters
 
     given = options.patch()
     patches = [given]
@@ -141,8 +141,8 @@ def _compare_all(
 ) -> Iterator[Comparison]:
     from rich.progress import track
 
-    from wlr_gym.runs.compare import compare
-    from wlr_gym.runs.compare_report import save_map, save_motion_plot
+    from wlr_gym.data.compare import compare
+    from wlr_gym.data.compare_report import save_map, save_motion_plot
 
     for patch in track(patches, description="comparing", console=console, disable=len(patches) == 1):
         found = compare(
@@ -169,7 +169,7 @@ def _resolved(options: Options, motions: Sequence[Motion], robot: Robot, patch: 
 
 
 def _print_all(console: Console, comparison: Comparison) -> None:
-    from wlr_gym.runs.compare_report import tables
+    from wlr_gym.data.compare_report import tables
 
     for table in tables(comparison):
         _print(console, table)

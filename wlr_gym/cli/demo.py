@@ -15,15 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.provenance import PROVENANCE_FILE, record_provenance
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
 from wlr_gym.cli.progress import progress
-from wlr_gym.errors import InputError
-from wlr_gym.files import make_output_folder
-from wlr_gym.provenance import PROVENANCE_FILE, record_provenance
 
 if TYPE_CHECKING:
-    from wlr_gym.demo.settings import Demo
-    from wlr_gym.demo.stage import Section
+    from wlr_gym.studies.demo.settings import Demo
+    from wlr_gym.studies.demo.stage import Section
 
 STEPS, QUICK_STEPS = 3_000_000, 16_384
 
@@ -50,9 +50,9 @@ def run(options: Options) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.demo.lanes import LANES, run_lanes
-    from wlr_gym.demo.page import write_page
-    from wlr_gym.gap.words import duration
+    from wlr_gym.gap.report.text import duration
+    from wlr_gym.studies.demo.page import write_page
+    from wlr_gym.studies.demo.workers import LANES, run_lanes
 
     demo = _demo(options)
     _clear(demo.out)
@@ -70,7 +70,7 @@ def run(options: Options) -> int:
 
 
 def _demo(options: Options) -> Demo:
-    from wlr_gym.demo.settings import Demo
+    from wlr_gym.studies.demo.settings import Demo
 
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
@@ -82,7 +82,7 @@ def _demo(options: Options) -> Demo:
 
 
 def _code(sections: list[Section]) -> int:
-    from wlr_gym.demo import stage
+    from wlr_gym.studies.demo import stage
 
     return FAILED if any(one.verdict == stage.FAILED for one in sections) else OK
 

@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any
 import tyro
 from rich.console import Console
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import EffectsOption, environment_of, pairs
 from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
-from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
-    from wlr_gym.evaluation.deployment import Deployment
+    from wlr_gym.hardware.deployment import Deployment
     from wlr_gym.hardware.loop import ControlLoop
 
 #: Ticks between two looks of the live status.
@@ -71,9 +71,9 @@ def run(options: Options) -> int:
     Raises:
         InputError: bad options, a policy that does not fit, ports that cannot be opened.
     """
-    from wlr_gym.evaluation import make_core
-    from wlr_gym.evaluation.deployment import deploy, loop_of
+    from wlr_gym.hardware.deployment import deploy, loop_of
     from wlr_gym.hardware.operator import Keys
+    from wlr_gym.learning.evaluation import make_core
     from wlr_gym.policy import make_policy, policy_environment
 
     command = _check(options)
@@ -218,7 +218,7 @@ def status_table(loop: ControlLoop, core: Core) -> Any:
     """Return what a driver wants to see now."""
     from rich.table import Table
 
-    from wlr_gym.hardware.safety import tilt_of
+    from wlr_gym.hardware.safety.rules import tilt_of
     from wlr_gym.robot import JOINTS
 
     table = Table(

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.robot_options import RobotOption
-from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from wlr_gym.hardware.checks import Check
     from wlr_gym.hardware.config import Hardware
     from wlr_gym.hardware.link import Link
+    from wlr_gym.hardware.safety.preflight import Check
     from wlr_gym.robot import Robot
 
 
@@ -52,7 +52,7 @@ def run(options: Options) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.files import write_json
+    from wlr_gym.base.files import write_json
 
     if options.json is not None and not options.json.parent.is_dir():
         raise InputError(f"--json {options.json}: folder {options.json.parent} does not exist")
@@ -75,9 +75,9 @@ def run(options: Options) -> int:
 
 def examine(link: Link, robot: Robot, hardware: Hardware, options: Options, console: Console) -> list[Check]:
     """Return all checks of ports, adapters, servos, buses and IMU; mends and scans on the way, where that was asked for."""
-    from wlr_gym.hardware import checks
+    from wlr_gym.hardware.dynamixel.sdk import BusGoneError
     from wlr_gym.hardware.loop import TIMED_READS
-    from wlr_gym.hardware.sdk import BusGoneError
+    from wlr_gym.hardware.safety import preflight as checks
 
     ports = checks.open_ports(link.servos, link.imu, hardware)
     found = ports if options.emulated else ports + checks.check_latency_timers(hardware)
@@ -105,8 +105,8 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: Options, cons
 
 def check_policy(source: str, robot: str) -> list[Check]:
     """Return whether a policy was made for this robot, its observations and its control period, and does without a camera."""
-    from wlr_gym.evaluation.rollout import make_core
-    from wlr_gym.hardware.checks import Check
+    from wlr_gym.hardware.safety.preflight import Check
+    from wlr_gym.learning.evaluation.rollout import make_core
     from wlr_gym.policy import check_contract, contract_of, needs_camera, policy_environment
 
     remedy = "Choose another policy, train it for this robot, or name the robot file it was trained with (--robot)."
@@ -128,7 +128,7 @@ def check_policy(source: str, robot: str) -> list[Check]:
 
 
 def _scan(link: Link, hardware: Hardware, buses: Sequence[str], console: Console) -> None:
-    from wlr_gym.hardware.setup import find_servos
+    from wlr_gym.hardware.dynamixel.setup import find_servos
 
     for name in buses:
         link.servos.groups[name].close()

@@ -13,14 +13,14 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.paths import config_names
 from wlr_gym.cli import OK
-from wlr_gym.effects import EFFECTS, UNKNOWN_EFFECT, Effect, Patch, PatchEffect, apply_patch, load_patch
-from wlr_gym.effects.document import places
-from wlr_gym.errors import InputError, unknown_name
-from wlr_gym.parameters import ELEMENTS, Parameters, spec_of
-from wlr_gym.paths import config_names
-from wlr_gym.plants.forces import COORDINATES, FEATURES
+from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Effect, Patch, PatchEffect, apply_patch, load_patch
+from wlr_gym.physics.effects.document import places
+from wlr_gym.physics.plants.forces import COORDINATES, FEATURES
 from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import ELEMENTS, Parameters, spec_of
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import EffectsOption
-from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
     from wlr_gym.hardware.emulator import Server
@@ -62,12 +62,12 @@ def run(options: Options) -> int:
     Raises:
         InputError: unknown robot, hardware, backend or fault; ports that cannot be made.
     """
-    from wlr_gym.effects import apply_patch
     from wlr_gym.hardware.config import load_hardware
     from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
     from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
-    from wlr_gym.parameters import Parameters
+    from wlr_gym.physics.effects import apply_patch
     from wlr_gym.robot import load_robot
+    from wlr_gym.robot.parameters import Parameters
 
     for name in ("tick", "usb_latency", "seconds"):
         if getattr(options, name) < 0 or (name == "tick" and options.tick == 0):

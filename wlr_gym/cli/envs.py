@@ -9,13 +9,13 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder
 from wlr_gym.cli import OK
 from wlr_gym.envs.registry import ENVIRONMENTS, task_name_of
-from wlr_gym.errors import InputError
-from wlr_gym.files import make_output_folder
+from wlr_gym.envs.tasks import Randomization, Task, describe, describe_randomization, load_randomization
+from wlr_gym.envs.tasks.task import build_task, read_task
 from wlr_gym.robot import load_robot
-from wlr_gym.tasks import Randomization, Task, describe, describe_randomization, load_randomization
-from wlr_gym.tasks.task import build_task, read_task
 
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -54,7 +54,7 @@ def run(options: Options) -> int:
 
 
 def _draw(path: Path, randomization: Randomization) -> None:
-    from wlr_gym.evaluation.floors import draw_floors
+    from wlr_gym.learning.evaluation.floors import draw_floors
 
     if path.suffix not in PICTURES:
         raise InputError(f"--picture {path}: expected a file that ends in {', '.join(PICTURES)}")

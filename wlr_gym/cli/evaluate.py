@@ -15,13 +15,15 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import EffectsOption, environment_of
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.settings import read_settings
-from wlr_gym.errors import InputError, unknown_name
-from wlr_gym.evaluation import (
+from wlr_gym.learning.evaluation import (
     FIRST_SEED,
     MAIN,
     OTHER_PLANT,
@@ -46,9 +48,7 @@ from wlr_gym.evaluation import (
     write_episodes,
     write_samples,
 )
-from wlr_gym.files import make_output_folder
 from wlr_gym.policy import shipped_names, trained_environment
-from wlr_gym.provenance import record_provenance
 from wlr_gym.render.video import check_video
 
 BACKENDS = ("gibbs_appell", "mujoco")
@@ -222,7 +222,7 @@ def progress(total: int, shown: bool) -> Iterator[Callable[[str, int], None]]:
 
 
 def _write(folder: Path, card: Card, samples: Rollout, seed: int) -> None:
-    from wlr_gym.evaluation.card_plots import draw_card
+    from wlr_gym.learning.evaluation.card_plots import draw_card
 
     pictures = draw_card(folder, card)
     write_card(folder, card, pictures)
@@ -244,7 +244,7 @@ def _record(options: Options, subject: Subject, folder: Path, keywords: Mapping[
 
 def _film(options: Options, subjects: Sequence[Subject], path: Path, keywords: Mapping[str, Any]) -> None:
     """Write the first episode of up to two subjects, side by side."""
-    from wlr_gym.evaluation.film import film_beside
+    from wlr_gym.learning.evaluation.film import film_beside
 
     with Progress(transient=True, disable=not options.progress) as bar:
 

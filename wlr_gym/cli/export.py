@@ -13,10 +13,10 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import environment_of
-from wlr_gym.errors import InputError
-from wlr_gym.files import make_output_folder
 
 #: Robots and s of the episodes whose observations are compared.
 ROBOTS, SECONDS = 16, 4.0
@@ -70,7 +70,7 @@ def _write_card(source: str, evaluation: Path) -> None:
 
 def real_observations(source: Path) -> NDArray[np.float32]:
     """Return the observations (M, D) of a policy that drives robots in the environment it was trained in."""
-    from wlr_gym.evaluation import make_core, start_episodes
+    from wlr_gym.learning.evaluation import make_core, start_episodes
     from wlr_gym.policy import make_policy, policy_environment
 
     core = make_core(environment_of(None, source), ROBOTS, {"episode_length": SECONDS} | policy_environment(source))
@@ -90,9 +90,9 @@ def real_observations(source: Path) -> NDArray[np.float32]:
 
 def training_facts(folder: Path) -> dict[str, Any]:
     """Return what the run folder around a policy says of its training, as far as it does: command, git commit, wall time."""
-    from wlr_gym.evaluation import read_curve
-    from wlr_gym.provenance import PROVENANCE_FILE
-    from wlr_gym.robot import read_yaml
+    from wlr_gym.base.provenance import PROVENANCE_FILE
+    from wlr_gym.base.settings import read_yaml
+    from wlr_gym.learning.evaluation import read_curve
 
     facts: dict[str, Any] = {}
     origin, curve = folder.parent / PROVENANCE_FILE, folder.parent / "learning_curve.csv"

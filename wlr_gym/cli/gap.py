@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import EffectsOption
 from wlr_gym.cli.progress import progress
-from wlr_gym.errors import InputError, unknown_name
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from wlr_gym.effects import Patch
     from wlr_gym.gap.analysis import Analysis
+    from wlr_gym.physics.effects import Patch
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,10 @@ def run(options: Options) -> int:
     """
     from rich.console import Console
 
+    from wlr_gym.base.provenance import record_provenance
     from wlr_gym.gap.analysis import BAD_DATA
-    from wlr_gym.gap.report import check_folder
+    from wlr_gym.gap.report.report import check_folder
     from wlr_gym.gap.workflow import analyse
-    from wlr_gym.provenance import record_provenance
 
     _check(options)
     known = _known(options)
@@ -82,7 +82,7 @@ def run(options: Options) -> int:
 
 def _check(options: Options) -> None:
     from wlr_gym.gap.workflow import RIGS
-    from wlr_gym.plants import SIMULATORS
+    from wlr_gym.physics.plants import SIMULATORS
     from wlr_gym.robot import load_robot
 
     if not options.data.is_dir():
@@ -119,9 +119,9 @@ def _known(options: Options) -> Patch:
 
 
 def _print(analysis: Analysis, out: Path, console: Console) -> None:
-    from wlr_gym.gap.report import REPORT_FILE
-    from wlr_gym.gap.result import PATCH_FILE, RESULT_FILE
-    from wlr_gym.gap.words import closure, sentence, title
+    from wlr_gym.gap.report.report import REPORT_FILE
+    from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
+    from wlr_gym.gap.report.text import closure, sentence, title
 
     colours = {"bad_data": "red", "not_excited": "yellow", "nothing_missing": "green"}
     console.print(title(analysis), style=f"bold {colours.get(analysis.verdict, 'blue')}")
@@ -139,7 +139,7 @@ def _findings(analysis: Analysis) -> Iterator[str]:
 
 
 def _numbers(analysis: Analysis) -> Iterator[str]:
-    from wlr_gym.gap.words import error, estimate, percent, places, plain, removed
+    from wlr_gym.gap.report.text import error, estimate, percent, places, plain, removed
 
     for effect in analysis.effects:
         values = ", ".join(f"{name} {estimate(found)}" for name, found in effect.parameters.items())
@@ -155,7 +155,7 @@ def _numbers(analysis: Analysis) -> Iterator[str]:
 
 
 def _advice(analysis: Analysis) -> Iterator[str]:
-    from wlr_gym.gap.words import listed, plain
+    from wlr_gym.gap.report.text import listed, plain
 
     for group in analysis.equivalent:
         yield f"  cannot tell {listed([plain(name) for name in group.names], 'from')}; this run would: {group.separating_run}"

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
 
 if TYPE_CHECKING:
-    from wlr_gym.effects import Patch
+    from wlr_gym.physics.effects import Patch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,9 +24,9 @@ class EffectsOption:
         """Return all given patches as one.
 
         Raises:
-            InputError: see :func:`wlr_gym.effects.load_patch`.
+            InputError: see :func:`wlr_gym.physics.effects.load_patch`.
         """
-        from wlr_gym.effects import load_patch
+        from wlr_gym.physics.effects import load_patch
 
         return load_patch(list(self.effects))
 

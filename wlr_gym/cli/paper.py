@@ -13,15 +13,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli.robot_options import HardwareOption, confirm
-from wlr_gym.errors import InputError, unknown_name
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from wlr_gym.paper.experiments import Record
-    from wlr_gym.paper.open_question import Finding
     from wlr_gym.robot import Robot
+    from wlr_gym.studies.paper.experiments import Record
+    from wlr_gym.studies.paper.open_question import Finding
 
 
 @dataclass(frozen=True)
@@ -54,14 +54,14 @@ def run(options: Options) -> int:
     """
     from rich.console import Console
 
+    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.base.provenance import record_provenance
     from wlr_gym.cli import FAILED, OK
-    from wlr_gym.files import make_output_folder
     from wlr_gym.hardware.loop import StoppedError
-    from wlr_gym.paper import report
-    from wlr_gym.paper.claims import check_all, gather
-    from wlr_gym.paper.experiments import write_tests
-    from wlr_gym.provenance import record_provenance
     from wlr_gym.robot import load_robot
+    from wlr_gym.studies.paper import report
+    from wlr_gym.studies.paper.claims import check_all, gather
+    from wlr_gym.studies.paper.experiments import write_tests
 
     _check(options)
     robot = load_robot(options.robot) if options.robot else load_robot()
@@ -91,8 +91,8 @@ def run(options: Options) -> int:
 
 
 def _check(options: Options) -> None:
-    from wlr_gym.paper.experiments import MODELS
-    from wlr_gym.plants import REAL
+    from wlr_gym.physics.plants import REAL
+    from wlr_gym.studies.paper.experiments import MODELS
 
     if not options.plant:
         raise InputError("--plant: expected at least one model")
@@ -110,8 +110,8 @@ def _check(options: Options) -> None:
 
 
 def _drive(model: str, robot: Robot, options: Options, console: Console) -> dict[str, Record]:
-    from wlr_gym.paper.experiments import drive_both
-    from wlr_gym.plants import REAL
+    from wlr_gym.physics.plants import REAL
+    from wlr_gym.studies.paper.experiments import drive_both
 
     console.print(f"both tests: {model}")
     return _drive_robot(robot, options, console) if model in REAL else drive_both(model, robot)
@@ -119,11 +119,11 @@ def _drive(model: str, robot: Robot, options: Options, console: Console) -> dict
 
 def _drive_robot(robot: Robot, options: Options, console: Console) -> dict[str, Record]:
     """Guarded and logged; between the tests the operator carries the robot back."""
-    from wlr_gym.effects import load_patch
+    from wlr_gym.data.format import RunMeta
     from wlr_gym.hardware.loop import stop_on_signals
-    from wlr_gym.paper.experiments import PROFILE, TESTS, drive_plant
-    from wlr_gym.parameters import Parameters
-    from wlr_gym.runs.format import RunMeta
+    from wlr_gym.physics.effects import load_patch
+    from wlr_gym.robot.parameters import Parameters
+    from wlr_gym.studies.paper.experiments import PROFILE, TESTS, drive_plant
 
     meta, records = RunMeta(robot=robot.name, profile=PROFILE, notes="the paper's tests"), {}
     for name, test in TESTS.items():
@@ -137,7 +137,7 @@ def _drive_robot(robot: Robot, options: Options, console: Console) -> dict[str, 
 
 
 def _search(robot: Robot, options: Options, console: Console) -> list[Finding]:
-    from wlr_gym.paper.open_question import search
+    from wlr_gym.studies.paper.open_question import search
 
     if options.draws == 0:
         return []
@@ -149,7 +149,7 @@ def _show(console: Console, claims: Sequence[object]) -> None:
     from rich import box
     from rich.table import Table
 
-    from wlr_gym.paper.claims import FAILS, CheckedClaim
+    from wlr_gym.studies.paper.claims import FAILS, CheckedClaim
 
     table = Table(title="The paper's claims", title_justify="left", title_style="bold", box=box.SIMPLE)
     for heading in ("#", "claim", "paper", "here", "verdict"):

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import EffectsOption, environment_of
-from wlr_gym.errors import InputError
 from wlr_gym.render.display import require_display
 from wlr_gym.render.view import View
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
-    from wlr_gym.evaluation.film import Driver
+    from wlr_gym.learning.evaluation.film import Driver
     from wlr_gym.policy import Policy
     from wlr_gym.render.teleop import Ranges, Script
     from wlr_gym.render.viewer import OpenWindow
@@ -67,7 +67,7 @@ class Options(EffectsOption):
 
 def run(options: Options) -> int:
     """Play, until the window is closed or the video is written."""
-    from wlr_gym.evaluation import make_core
+    from wlr_gym.learning.evaluation import make_core
     from wlr_gym.policy import make_policy, policy_environment
 
     _check(options)
@@ -89,7 +89,7 @@ def run(options: Options) -> int:
 
 
 def _check(options: Options) -> None:
-    from wlr_gym.plants import REAL
+    from wlr_gym.physics.plants import REAL
     from wlr_gym.render.video import check_video
 
     if options.backend in REAL:
@@ -132,7 +132,7 @@ def _driver(options: Options, core: Core) -> Driver | None:
 
 def _check_speed(script: Script, ranges: Ranges, robot: Robot) -> None:
     """Refuse a forward speed that the wheels cannot turn at; warn of commands that policies were not trained on."""
-    from wlr_gym.tasks.terms import COMMANDS
+    from wlr_gym.envs.tasks.terms import COMMANDS
 
     fastest = robot.servo.wheel.no_load_speed * robot.wheel.radius
     for name, value in script.outside(dict.fromkeys(ranges, (-fastest, fastest))).items():
@@ -150,7 +150,7 @@ def _check_speed(script: Script, ranges: Ranges, robot: Robot) -> None:
 def _film(options: Options, core: Core, policy: Policy, driver: Driver | None) -> None:
     from rich.progress import track
 
-    from wlr_gym.evaluation.film import film, film_length
+    from wlr_gym.learning.evaluation.film import film, film_length
     from wlr_gym.render import write_video
 
     assert options.video is not None
@@ -165,8 +165,8 @@ def _film(options: Options, core: Core, policy: Policy, driver: Driver | None) -
 def _film_beside(options: Options, keywords: dict[str, Any]) -> None:
     from rich.progress import track
 
-    from wlr_gym.evaluation import read_subjects
-    from wlr_gym.evaluation.film import film_beside
+    from wlr_gym.learning.evaluation import read_subjects
+    from wlr_gym.learning.evaluation.film import film_beside
 
     assert options.video is not None
     assert options.beside is not None
@@ -187,7 +187,7 @@ def _film_beside(options: Options, keywords: dict[str, Any]) -> None:
 
 def show(options: Options, core: Core, policy: Policy, driver: Driver | None, open: OpenWindow | None = None) -> None:
     """Play in a window until it is closed, or for ``options.seconds``; ``open`` is how it is opened (tests)."""
-    from wlr_gym.evaluation.film import commands, drive, present_time
+    from wlr_gym.learning.evaluation.film import commands, drive, present_time
     from wlr_gym.render.teleop import HELP, Keyboard
     from wlr_gym.render.viewer import Viewer, open_window
 

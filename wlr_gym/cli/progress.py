@@ -46,6 +46,6 @@ def progress(console: Console, lanes: Sequence[str] = ("",), shown: bool = True)
 
 def time_left(passed: float, share: float) -> str:
     """Return the remaining time in words; empty while nobody can know."""
-    from wlr_gym.gap.words import duration
+    from wlr_gym.gap.report.text import duration
 
     return f"about {duration(passed * (1.0 - share) / share)} left" if LEAST_SHARE <= share < 1.0 and passed > 1.0 else ""

@@ -12,18 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import EffectsOption
 from wlr_gym.cli.robot_options import RobotOption, confirm
-from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from wlr_gym.evaluation.driving import Drive
+    from wlr_gym.data.excitations import Motion
+    from wlr_gym.data.format import RunMeta
+    from wlr_gym.hardware.driving import Drive
     from wlr_gym.robot import Robot
-    from wlr_gym.runs.excitations import Motion
-    from wlr_gym.runs.format import RunMeta
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,11 @@ def run(options: Options) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.plants import REAL, check_backend
+    from wlr_gym.data.format import RunMeta
+    from wlr_gym.data.record import meta_of, same_profile, write_commands
+    from wlr_gym.data.replay import robot_entry
+    from wlr_gym.physics.plants import REAL, check_backend
     from wlr_gym.robot import load_robot
-    from wlr_gym.runs.format import RunMeta
-    from wlr_gym.runs.record import meta_of, same_profile, write_commands
-    from wlr_gym.runs.replay import robot_entry
 
     console = Console(soft_wrap=True, highlight=False)
     robot = load_robot(options.robot)
@@ -100,8 +100,8 @@ def read_motions(options: Options, robot: Robot) -> Sequence[Motion]:
     Raises:
         InputError: none, or one that cannot be read.
     """
-    from wlr_gym.runs.excitations import excite
-    from wlr_gym.runs.record import read_commands
+    from wlr_gym.data.excitations import excite
+    from wlr_gym.data.record import read_commands
 
     if options.seconds is not None and not options.seconds > 0.0:
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
@@ -117,7 +117,7 @@ def read_motions(options: Options, robot: Robot) -> Sequence[Motion]:
 
 def _record_robot(options: Options, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
     """Guarded and logged; between the motions the operator carries the robot back."""
-    from wlr_gym.evaluation.driving import drive_robot
+    from wlr_gym.hardware.driving import drive_robot
 
     assert options.out is not None
     well = True
@@ -137,7 +137,7 @@ def _record_robot(options: Options, motions: Sequence[Motion], robot: Robot, met
 
 
 def _report(motion: Motion, drive: Drive, console: Console) -> None:
-    from wlr_gym.runs import read_run
+    from wlr_gym.data import read_run
 
     ended = drive.reason or "to its end"
     console.print(
@@ -156,9 +156,9 @@ def _report(motion: Motion, drive: Drive, console: Console) -> None:
 
 
 def _record_simulations(options: Options, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
-    from wlr_gym.files import make_output_folder
-    from wlr_gym.random import spawn_seeds
-    from wlr_gym.runs.record import next_run, record_simulation
+    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.base.random import spawn_seeds
+    from wlr_gym.data.record import next_run, record_simulation
 
     assert options.out is not None
     make_output_folder(options.out)
@@ -175,7 +175,7 @@ def _list(console: Console, robot: Robot) -> None:
     from rich import box
     from rich.table import Table
 
-    from wlr_gym.runs.excitations import EXCITATIONS, excite
+    from wlr_gym.data.excitations import EXCITATIONS, excite
 
     table = Table("excitation", "seconds", "what the robot does", "what it shows", box=box.SIMPLE)
     for name, excitation in EXCITATIONS.items():

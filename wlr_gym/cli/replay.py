@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import EffectsOption
 from wlr_gym.cli.robot_options import HardwareOption, confirm
-from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from wlr_gym.effects import Patch
-    from wlr_gym.runs import Run
-    from wlr_gym.runs.replay import ChannelError, ReplayResult
+    from wlr_gym.data import Run
+    from wlr_gym.data.replay import ChannelError, ReplayResult
+    from wlr_gym.physics.effects import Patch
 
 ERRORS_FILE = "errors.json"
 
@@ -65,12 +65,12 @@ def run(options: Options) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.files import make_output_folder, write_json
-    from wlr_gym.plants import REAL, check_backend
-    from wlr_gym.provenance import record_provenance
+    from wlr_gym.base.files import make_output_folder, write_json
+    from wlr_gym.base.provenance import record_provenance
+    from wlr_gym.data.plot import save_plots
+    from wlr_gym.data.replay import prepare
+    from wlr_gym.physics.plants import REAL, check_backend
     from wlr_gym.render.video import check_video
-    from wlr_gym.runs.plot import save_plots
-    from wlr_gym.runs.replay import prepare
 
     console = Console()
     check_backend(options.backend)
@@ -106,9 +106,9 @@ def run(options: Options) -> int:
 def _film(options: Options, path: Path, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
     from rich.progress import track
 
+    from wlr_gym.data.film import FPS, film_length, replay_film
+    from wlr_gym.data.replay import prepare
     from wlr_gym.render import write_video
-    from wlr_gym.runs.film import FPS, film_length, replay_film
-    from wlr_gym.runs.replay import prepare
 
     for result in results:
         _, parameters = prepare(result.run, options.robot, effects=patch, segment=options.segment)
@@ -121,7 +121,7 @@ def _film(options: Options, path: Path, results: Sequence[ReplayResult], patch: 
 
 
 def _read(path: Path) -> Sequence[Run]:
-    from wlr_gym.runs import read_dataset, read_run
+    from wlr_gym.data import read_dataset, read_run
 
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; expected a run (CSV or Parquet) or a folder of runs")
@@ -131,7 +131,7 @@ def _read(path: Path) -> Sequence[Run]:
 def _replay_all(options: Options, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
     from rich.progress import track
 
-    from wlr_gym.runs.replay import replay
+    from wlr_gym.data.replay import replay
 
     for measured in track(runs, description=f"replaying on {options.backend}", console=console):
         yield replay(measured, options.backend, options.robot, effects=patch, segment=options.segment)
@@ -139,13 +139,13 @@ def _replay_all(options: Options, runs: Sequence[Run], patch: Patch, console: Co
 
 def _repeat_all(options: Options, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
     """Drive the robot with each run's commands, log to ``out/robot``, compare; ends with the first run that is stopped."""
-    from wlr_gym.evaluation.driving import drive_robot
-    from wlr_gym.runs import read_run
-    from wlr_gym.runs.compare import motion_of
-    from wlr_gym.runs.format import RunMeta
-    from wlr_gym.runs.record import meta_of
-    from wlr_gym.runs.repeat import compare_repeat
-    from wlr_gym.runs.replay import robot_entry, robot_of
+    from wlr_gym.data import read_run
+    from wlr_gym.data.compare import motion_of
+    from wlr_gym.data.format import RunMeta
+    from wlr_gym.data.record import meta_of
+    from wlr_gym.data.repeat import compare_repeat
+    from wlr_gym.data.replay import robot_entry, robot_of
+    from wlr_gym.hardware.driving import drive_robot
 
     motions = [motion_of(measured) for measured in runs]
     for measured, motion in zip(runs, motions, strict=True):
@@ -207,8 +207,8 @@ def _table(title: str, headings: Sequence[str]) -> Table:
 
 def _grouped(errors: Sequence[tuple[str, ChannelError]]) -> dict[str, list[ChannelError]]:
     """Put the errors of a joint group (``pos_leg``) together, and those of every other channel by themselves."""
+    from wlr_gym.data.format import CHANNELS, COLUMNS
     from wlr_gym.robot import JOINTS
-    from wlr_gym.runs.format import CHANNELS, COLUMNS
 
     groups: dict[str, list[ChannelError]] = {}
     for name, error in sorted(errors, key=lambda pair: CHANNELS.index(pair[0])):
@@ -218,13 +218,13 @@ def _grouped(errors: Sequence[tuple[str, ChannelError]]) -> dict[str, list[Chann
 
 
 def _in_noise_units(errors: Sequence[ChannelError]) -> str:
-    from wlr_gym.runs.replay import pooled
+    from wlr_gym.data.replay import pooled
 
     return f"{pooled(errors, lambda error: error.segment_rms / error.noise):.1f}" if errors else "-"
 
 
 def _error_table(errors: Sequence[tuple[str, ChannelError]], title: str) -> Table:
-    from wlr_gym.runs.replay import pooled
+    from wlr_gym.data.replay import pooled
 
     headings = ("channel", "unit", "noise", "segment", "full run", "segment\n/noise", "full run\n/noise")
     table = _table(title, headings)
@@ -237,8 +237,8 @@ def _error_table(errors: Sequence[tuple[str, ChannelError]], title: str) -> Tabl
 
 
 def _joint_table(errors: Sequence[tuple[str, ChannelError]]) -> Table:
+    from wlr_gym.data.format import COLUMNS
     from wlr_gym.robot import CORNERS
-    from wlr_gym.runs.format import COLUMNS
 
     table = _table("Segment error of each joint, in units of sensor noise", ("channel", *CORNERS))
     for group in ("pos_leg", "vel_leg", "eff_leg", "pos_wheel", "vel_wheel", "eff_wheel"):
@@ -250,7 +250,7 @@ def _joint_table(errors: Sequence[tuple[str, ChannelError]]) -> Table:
 
 
 def _run_table(results: Sequence[ReplayResult]) -> Table:
-    from wlr_gym.runs.format import COLUMNS
+    from wlr_gym.data.format import COLUMNS
 
     def kind(name: str) -> str:
         group = COLUMNS[name].group

@@ -7,19 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.cli.options import pairs
-from wlr_gym.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from wlr_gym.effects import Patch
+    from wlr_gym.data.excitations import Motion
+    from wlr_gym.data.format import RunMeta
     from wlr_gym.hardware.config import Hardware
     from wlr_gym.hardware.link import Link
     from wlr_gym.hardware.plant import RobotPlant
+    from wlr_gym.physics.effects import Patch
     from wlr_gym.robot import Robot
-    from wlr_gym.runs.excitations import Motion
-    from wlr_gym.runs.format import RunMeta
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ class HardwareOption:
     def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
         """Return the robot as a plant, limp; every start is logged in a new run of ``log``."""
         from wlr_gym.hardware.plant import RobotPlant
-        from wlr_gym.plants.base import PlantOptions, RobotOptions
+        from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 
         hardware = self.load_hardware()
         options = RobotOptions(hardware=self.hardware, ports=port_pairs(self.port), log=log)
@@ -93,7 +93,7 @@ class RobotOption(HardwareOption):
         Args:
             changed: hardware instead of the one of :meth:`load`.
         """
-        from wlr_gym.hardware.gate import CALM_PATIENCE
+        from wlr_gym.hardware.safety.limiter import CALM_PATIENCE
 
         robot, hardware = self.load()
         link = self.link_to(robot, changed or hardware)

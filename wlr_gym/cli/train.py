@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.provenance import CONFIG_FILE
+from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import EffectsOption
 from wlr_gym.envs.registry import task_name_of
-from wlr_gym.errors import InputError
 from wlr_gym.policy import Training, load_agent_config
 from wlr_gym.policy.agents import agent_function
-from wlr_gym.provenance import CONFIG_FILE
-from wlr_gym.robot import read_yaml
 
 if TYPE_CHECKING:
-    from wlr_gym.effects import Patch
+    from wlr_gym.physics.effects import Patch
 
 
 @dataclass(frozen=True)

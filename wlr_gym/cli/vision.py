@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.cli import OK
-from wlr_gym.errors import InputError, require_package
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from wlr_gym.runs import Run
-    from wlr_gym.vision import Analysis, Camera, Frame, Sample, Target
+    from wlr_gym.data import Run
+    from wlr_gym.perception.vision import Analysis, Camera, Frame, Sample, Target
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ def run(options: Options) -> int:
     require_package("cv2", "vision")
     from rich.console import Console
 
-    from wlr_gym.files import make_output_folder
-    from wlr_gym.provenance import record_provenance
-    from wlr_gym.runs import read_run
-    from wlr_gym.vision import load_camera, load_target, save
+    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.base.provenance import record_provenance
+    from wlr_gym.data import read_run
+    from wlr_gym.perception.vision import load_camera, load_target, save
 
     if options.rate is not None and not options.rate > 0:
         raise InputError(f"--rate {options.rate:g}: expected more than 0")
@@ -103,7 +103,7 @@ def run(options: Options) -> int:
 
 def _filmed(options: Options, camera: Camera, console: Console) -> Options:
     """Film, and say how to analyse the film (again); returns the options for that."""
-    from wlr_gym.vision import film
+    from wlr_gym.perception.vision import film
 
     if options.times is not None or options.rate is not None:
         raise InputError("--times, --rate: a live camera's frames have the times at which they come")
@@ -117,8 +117,8 @@ def _filmed(options: Options, camera: Camera, console: Console) -> Options:
 def _analyse(options: Options, measured: Run, camera: Camera, body: Target, floor: Target, console: Console) -> Analysis:
     from contextlib import nullcontext
 
-    from wlr_gym.vision import Frames, analyse
-    from wlr_gym.vision.video import AnnotatedVideo
+    from wlr_gym.perception.vision import Frames, analyse
+    from wlr_gym.perception.vision.video import AnnotatedVideo
 
     frames = Frames(options.video, options.rate, options.times, options.seconds)
     writer = AnnotatedVideo(options.out / "annotated.mp4", body) if options.annotate else nullcontext()

@@ -6,13 +6,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import find_config
 from wlr_gym.envs.document import class_document
 from wlr_gym.envs.registry import ENVIRONMENTS, enter, title_of
 from wlr_gym.envs.single import WlrEnv
+from wlr_gym.envs.tasks.task import read_task
 from wlr_gym.envs.vector import WlrVectorEnv
-from wlr_gym.errors import InputError
-from wlr_gym.paths import find_config
-from wlr_gym.tasks.task import read_task
 
 _FACES = {"VectorEnv": WlrVectorEnv, "Env": WlrEnv}
 

@@ -15,26 +15,26 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym import plants
-from wlr_gym.effects import apply_patch, load_patch
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.random import stream_number
 from wlr_gym.envs import kernels
-from wlr_gym.envs.evaluation import compile_computation, compile_evaluation
 from wlr_gym.envs.measured import measurable, measured_truth
 from wlr_gym.envs.settings import Settings
-from wlr_gym.errors import InputError, unknown_name
-from wlr_gym.observer import ESTIMATE_LAYOUT, SlipObserver
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, PlantState, Sensors
-from wlr_gym.random import stream_number
+from wlr_gym.envs.tasks.compiled import compile_computation, compile_evaluation
+from wlr_gym.envs.tasks.describe import contract, describe
+from wlr_gym.envs.tasks.draws import episode_seeds, stream_numbers, uniforms
+from wlr_gym.envs.tasks.randomization import DRIFT_PERIOD, load_randomization
+from wlr_gym.envs.tasks.signals import START
+from wlr_gym.envs.tasks.task import ObservationColumn, RampConfig, Task, TaskConfig, bounds, build_task, read_task
+from wlr_gym.envs.tasks.terms import COMMANDS
+from wlr_gym.envs.tasks.terms.events import normal
+from wlr_gym.envs.tasks.terms.geometry import yaw_of
+from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver
+from wlr_gym.physics import plants
+from wlr_gym.physics.effects import apply_patch, load_patch
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, PlantState, Sensors
 from wlr_gym.robot import JOINTS, load_robot
-from wlr_gym.tasks.describe import contract, describe
-from wlr_gym.tasks.draws import episode_seeds, stream_numbers, uniforms
-from wlr_gym.tasks.randomization import DRIFT_PERIOD, load_randomization
-from wlr_gym.tasks.signals import START
-from wlr_gym.tasks.task import ObservationColumn, RampConfig, Task, TaskConfig, bounds, build_task, read_task
-from wlr_gym.tasks.terms import COMMANDS
-from wlr_gym.tasks.terms.events import normal
-from wlr_gym.tasks.terms.geometry import yaw_of
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -530,7 +530,7 @@ class Core:
         return describe(self.task)
 
     def contract(self) -> dict[str, Any]:
-        """Return what a policy must be fed and what its output means (see :func:`wlr_gym.tasks.describe.contract`)."""
+        """Return what a policy must be fed and what its output means (see :func:`wlr_gym.envs.tasks.describe.contract`)."""
         return contract(self.task, self.randomization.config.model_dump(mode="json", exclude_none=True))
 
     def close(self) -> None:

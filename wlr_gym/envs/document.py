@@ -5,9 +5,9 @@ from __future__ import annotations
 import inspect
 
 from wlr_gym.envs.settings import Settings
+from wlr_gym.envs.tasks.describe import describe
+from wlr_gym.envs.tasks.task import build_task, read_task
 from wlr_gym.robot import load_robot
-from wlr_gym.tasks.describe import describe
-from wlr_gym.tasks.task import build_task, read_task
 
 _INFO = """**Info** ``reset``: ``randomization`` {parameter element: value}. ``step``: ``reward_terms`` {term: weighted value},
 ``slip_velocity`` (4, 2) m/s along each wheel's heading and axle, ``effective_friction`` (4, 2) along them; in an episode's

@@ -11,8 +11,8 @@ from typing import Any
 
 from numba import njit
 
-from wlr_gym.random import normals4
-from wlr_gym.tasks.draws import uniform
+from wlr_gym.base.random import normals4
+from wlr_gym.envs.tasks.draws import uniform
 
 #: Sources of an observation column, as numbered in the index tables.
 SOURCES = ("sensors", "command", "action", "estimate", "computed", "truth")

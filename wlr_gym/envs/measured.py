@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.errors import InputError
-from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Sensors
-from wlr_gym.tasks.task import Task, signals_of
-from wlr_gym.tasks.terms import COMPUTED, MEASURES, REWARDS, TERMINATIONS
+from wlr_gym.base.errors import InputError
+from wlr_gym.envs.tasks.task import Task, signals_of
+from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, TERMINATIONS
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Sensors
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.envs.core import Core
-from wlr_gym.errors import InputError
 from wlr_gym.render.display import has_display, require_display
 
 if TYPE_CHECKING:

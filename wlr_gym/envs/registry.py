@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from wlr_gym.errors import unknown_name
+from wlr_gym.base.errors import unknown_name
 
 #: id -> (task: name in ``configs/task/`` or path, class of the single and of the vector environment).
 ENVIRONMENTS: dict[str, tuple[str, str, str]] = {}

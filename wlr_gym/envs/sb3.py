@@ -10,13 +10,13 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.envs.core import Core, Mask, read_seed
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.settings import read_settings
 from wlr_gym.envs.vector import seed_robots
-from wlr_gym.errors import InputError, require_package
 
 require_package("stable_baselines3", "train")
 

@@ -12,11 +12,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.envs.core import OPTIONS, Core, Mask, read_options, read_seed
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
 from wlr_gym.envs.settings import read_settings
-from wlr_gym.errors import InputError, nearest
 
 
 class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):

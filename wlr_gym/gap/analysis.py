@@ -115,7 +115,7 @@ class Place:
 class Relation:
     """A relation of the model, the law that explains most by acting there alone, and what it promises.
 
-    See :mod:`wlr_gym.gap.relations`.
+    See :mod:`wlr_gym.gap.report.relations`.
     """
 
     name: str
@@ -261,7 +261,7 @@ class Pulled:
 
 @dataclass(frozen=True)
 class Adequacy:
-    """What the final model leaves in the fitted runs; see :mod:`wlr_gym.gap.adequacy`.
+    """What the final model leaves in the fitted runs; see :mod:`wlr_gym.gap.validation.residual_tests`.
 
     Attributes:
         replicates: how many sets of runs the model made.
@@ -283,7 +283,7 @@ class Adequacy:
 
 @dataclass(frozen=True)
 class Turning:
-    """What is left of a signal goes with the turning of its joint; see :mod:`wlr_gym.gap.turning`.
+    """What is left of a signal goes with the turning of its joint; see :mod:`wlr_gym.gap.validation.turning`.
 
     Attributes:
         joint, signal: whose.

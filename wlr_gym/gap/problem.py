@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.effects import PatchEffect
+from wlr_gym.physics.effects import PatchEffect
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from wlr_gym.effects import Source, load_patch
-from wlr_gym.errors import InputError, unknown_name
-from wlr_gym.gap.adequacy import adequacy_of
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.provenance import provenance
 from wlr_gym.gap.analysis import (
     BAD_DATA,
     EFFECT_FOUND,
@@ -31,20 +30,21 @@ from wlr_gym.gap.analysis import (
     IntakeFinding,
     Turning,
 )
-from wlr_gym.gap.fit import Fit, fit, nominal_model, widened
-from wlr_gym.gap.hypothesis import Hypothesis
-from wlr_gym.gap.judge import shown_by_some_runs_only
-from wlr_gym.gap.localise import localise
-from wlr_gym.gap.name import Naming, Round, name_effects
+from wlr_gym.gap.estimation.fit import Fit, fit, nominal_model, widened
+from wlr_gym.gap.estimation.uncertainty import confidence, detectable, equivalents, estimates, half_widths
 from wlr_gym.gap.problem import Candidate, Problem
-from wlr_gym.gap.prove import mean_of_runs, mean_squares, noise_floor, prove
-from wlr_gym.gap.recommend import recommend, separating_run
-from wlr_gym.gap.relations import relations
-from wlr_gym.gap.split import informative_split, named_split
-from wlr_gym.gap.sure import confidence, detectable, equivalents, estimates, half_widths
-from wlr_gym.gap.traces import telling_traces
-from wlr_gym.gap.turning import turning
-from wlr_gym.provenance import provenance
+from wlr_gym.gap.report.localisation import localise
+from wlr_gym.gap.report.recommendation import recommend, separating_run
+from wlr_gym.gap.report.relations import relations
+from wlr_gym.gap.report.traces import telling_traces
+from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
+from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.search import Naming, Round, name_effects
+from wlr_gym.gap.validation.data_split import informative_split, named_split
+from wlr_gym.gap.validation.held_out import mean_of_runs, mean_squares, noise_floor, prove
+from wlr_gym.gap.validation.residual_tests import adequacy_of
+from wlr_gym.gap.validation.turning import turning
+from wlr_gym.physics.effects import Source, load_patch
 
 Array = NDArray[np.float64]
 #: Told of the present stage and of the share of the whole work that is done.
@@ -93,7 +93,7 @@ def analyse(
             into; the last before the work begins.
     """
     if out is not None:
-        from wlr_gym.gap.report import check_folder
+        from wlr_gym.gap.report.report import check_folder
 
         check_folder(Path(out))
     tell("reading", STAGES["reading"])
@@ -117,7 +117,7 @@ def analyse(
         else analyse_problem(problem, str(data), findings, heldout=heldout, tell=tell, known=known)
     )
     if out is not None:
-        from wlr_gym.gap.report import save_analysis
+        from wlr_gym.gap.report.report import save_analysis
 
         tell("drawing", STAGES["drawing"])
         save_analysis(done, Path(out))

@@ -11,11 +11,12 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.errors import InputError
-from wlr_gym.files import replace_file
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import replace_file
+from wlr_gym.base.settings import read_yaml
 from wlr_gym.hardware.config import Hardware, ImuCalibration, Mounting
-from wlr_gym.hardware.imu import STANDARD_GRAVITY
-from wlr_gym.robot import JOINTS, read_yaml
+from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
+from wlr_gym.robot import JOINTS
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]

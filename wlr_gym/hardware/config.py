@@ -7,11 +7,12 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from wlr_gym.errors import InputError
-from wlr_gym.hardware.limits import Safety
-from wlr_gym.hardware.tables import BAUD_RATES, load_table
-from wlr_gym.paths import find_config
-from wlr_gym.robot import JOINTS, LEGS, Vector3, parse_config, read_yaml
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import find_config
+from wlr_gym.base.settings import parse_config, read_yaml
+from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, load_table
+from wlr_gym.hardware.safety.limits import Safety
+from wlr_gym.robot import JOINTS, LEGS, Vector3
 
 #: Operating modes of legs and wheels: what the safety gate writes goals for. In another one a goal means something else.
 POSITION_MODE, VELOCITY_MODE = 3, 1

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.imu_driver import Imu
-from wlr_gym.hardware.servos import Servos
+from wlr_gym.hardware.dynamixel.servos import Servos
+from wlr_gym.hardware.imu.driver import Imu
 from wlr_gym.robot import Robot
 
 if TYPE_CHECKING:
-    from wlr_gym.effects.patch import Source
     from wlr_gym.hardware.emulator.machine import Machine
+    from wlr_gym.physics.effects.patch import Source
 
 
 class Clock(Protocol):
@@ -89,7 +89,7 @@ class Link:
 
 def serial_link(robot: Robot, hardware: Hardware) -> Link:
     """Return a link over the hardware file's ports."""
-    from wlr_gym.hardware.imu_driver import make_imu
+    from wlr_gym.hardware.imu.driver import make_imu
 
     clock = MonotonicClock()
     servos = Servos(robot, hardware, hardware.safety.patience, clock.now)
@@ -124,10 +124,10 @@ def emulated_robot(robot: Robot, hardware: Hardware, effects: Source = None, *, 
     Raises:
         InputError: effects that cannot be read or that this robot cannot have.
     """
-    from wlr_gym.effects import apply_patch, load_patch
     from wlr_gym.hardware.emulator.line import NO_TIME
     from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
-    from wlr_gym.parameters import Parameters
+    from wlr_gym.physics.effects import apply_patch, load_patch
+    from wlr_gym.robot.parameters import Parameters
 
     patch = load_patch(effects)
     options = MachineOptions(timing=NO_TIME, sensor_noise=sensor_noise)

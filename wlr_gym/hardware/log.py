@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from wlr_gym.errors import InputError
-from wlr_gym.files import make_output_folder
-from wlr_gym.hardware.safety import View
-from wlr_gym.plants.base import SENSOR_LAYOUT, Sensors
-from wlr_gym.runs.format import CAMERA, COLUMNS, COMMANDS, RunMeta
-from wlr_gym.runs.simulation import SENSED, channels
-from wlr_gym.runs.write import write_meta
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder
+from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, RunMeta
+from wlr_gym.data.simulation import SENSED, channels
+from wlr_gym.data.write import write_meta
+from wlr_gym.hardware.safety.rules import View
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
 
 PARTIAL = "partial_"
 _HEADER = [name for name in COLUMNS if name == "t" or name in COMMANDS or (name in SENSED and name not in CAMERA)]

@@ -27,15 +27,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.errors import InputError
-from wlr_gym.hardware.bus import NoAnswerError, RefusedError
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.gate import Gate
-from wlr_gym.hardware.guard import Guard
-from wlr_gym.hardware.imu_driver import ImuGoneError, ImuReading
+from wlr_gym.hardware.dynamixel.bus import NoAnswerError, RefusedError
+from wlr_gym.hardware.imu.driver import ImuGoneError, ImuReading
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.log import RunLog, sensors_of
-from wlr_gym.hardware.safety import (
+from wlr_gym.hardware.safety.limiter import Gate
+from wlr_gym.hardware.safety.rules import (
     FINE,
     REQUESTS,
     STANDARD_GRAVITY,
@@ -48,9 +48,9 @@ from wlr_gym.hardware.safety import (
     resting,
     tilt_of,
 )
+from wlr_gym.hardware.safety.watchdog import Guard
 from wlr_gym.hardware.timing import Pacer
 from wlr_gym.robot import JOINTS, LEGS, Robot
-from wlr_gym.runs.format import RunMeta
 
 Array = NDArray[np.float64]
 

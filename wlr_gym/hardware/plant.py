@@ -5,21 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.config import Hardware, load_hardware, with_ports
 from wlr_gym.hardware.link import Link, emulated_robot, serial_link
 from wlr_gym.hardware.log import sensors_of
 from wlr_gym.hardware.loop import ControlLoop
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import Capabilities, PlantOptions, PlantState, RobotOptions, Sensors, Truth
+from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, RobotOptions, Sensors, Truth
 from wlr_gym.robot import JOINTS, Robot
-from wlr_gym.runs.format import RunMeta
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
 
 class RobotPlant:
-    """One robot behind the safety gate; see :class:`wlr_gym.plants.base.Plant`.
+    """One robot behind the safety gate; see :class:`wlr_gym.physics.plants.base.Plant`.
 
     Making it moves nothing. ``reset`` (or the first ``step``) makes the start-up checks, switches torque on and brings the
     robot to its start pose; ``close`` stops it and switches torque off. A robot that the safety gate has stopped raises
@@ -109,7 +109,7 @@ class RobotPlant:
         return self._readings()
 
     def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
-        """Send goals through the safety gate, wait for the deadline, read; see :meth:`wlr_gym.plants.base.Plant.step`.
+        """Send goals through the safety gate, wait for the deadline, read; see :meth:`wlr_gym.physics.plants.base.Plant.step`.
 
         Goals that are no numbers are the gate's business: they stop the robot.
 
@@ -140,7 +140,7 @@ class RobotPlant:
             raise InputError(f"parameters hold {len(parameters)} robots, the plant 1")
         different = np.flatnonzero(parameters.values[0] != self.parameters.values[0])
         if len(different):
-            from wlr_gym.parameters import ELEMENTS
+            from wlr_gym.robot.parameters import ELEMENTS
 
             raise InputError(
                 f"{ELEMENTS[different[0]]}: parameters of a real robot cannot be set (no randomisation, no effects)"

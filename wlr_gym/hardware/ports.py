@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 from typing import TYPE_CHECKING
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
 
 if TYPE_CHECKING:
     import serial

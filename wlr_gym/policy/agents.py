@@ -14,9 +14,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from wlr_gym.errors import InputError, unknown_name
-from wlr_gym.paths import config_names, data_directory, find_config, named_in
-from wlr_gym.robot import merge_changes, parse_yaml, read_yaml
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.paths import config_names, data_directory, find_config, named_in
+from wlr_gym.base.settings import merge_changes, parse_yaml, read_yaml
 
 Contract = Mapping[str, Any]
 Config = Mapping[str, Any]

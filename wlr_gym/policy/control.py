@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from wlr_gym.errors import InputError, unknown_name
-from wlr_gym.robot import CORNER_SIGNS, LEGS, Robot, load_robot, parse_config, robot_hash
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.settings import parse_config
+from wlr_gym.robot import CORNER_SIGNS, LEGS, Robot, load_robot, robot_hash
 
 Array = NDArray[np.float64]
 #: Reads one quantity in its own unit (N,) from observations (N, D).
@@ -106,7 +107,7 @@ class Chassis:
     def wheel_rate(self, rolling_speed: Array, leg_angle: Array, leg_rate: Array) -> Array:
         """Return the wheel rates (N, 4) in rad/s, relative to the legs, that move the hips ahead at ``rolling_speed`` (N, 4).
 
-        A turning leg carries its wheel along at -l sin(angle) * rate and turns it by its own rate (``wlr_gym/slip.py``).
+        A turning leg carries its wheel along at -l sin(angle) * rate and turns it by its own rate (``wlr_gym/robot/slip.py``).
         """
         wheel, leg = self.robot.wheel.radius, self.robot.leg.length
         return (rolling_speed - leg * np.sin(leg_angle) * leg_rate) / wheel - leg_rate
@@ -118,7 +119,7 @@ class Chassis:
 
 
 class SearchConfig(BaseModel):
-    """How gains are searched (``wlr_gym/evaluation/tuning.py``).
+    """How gains are searched (``wlr_gym/learning/evaluation/tuning.py``).
 
     Attributes:
         steps: setting -> its first step.

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.errors import InputError, require_package
-from wlr_gym.files import replace_file
+from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.files import replace_file
+from wlr_gym.base.provenance import versions
 from wlr_gym.policy.agents import Contract, Policy, agent_function
 from wlr_gym.policy.file import read_contract
 from wlr_gym.policy.onnx_file import SUFFIX, open_policy, seal
 from wlr_gym.policy.sources import find_policy
-from wlr_gym.provenance import versions
 
 #: Random observations that are compared.
 RANDOM = 1000

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.errors import InputError
-from wlr_gym.files import write_json
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import write_json
+from wlr_gym.base.provenance import versions
 from wlr_gym.policy.agents import Config, Contract
-from wlr_gym.provenance import versions
 
 FORMAT = 1
 CONTRACT_FILE = "contract.json"

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.errors import InputError
-from wlr_gym.files import replace_file
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import replace_file
 from wlr_gym.policy.file import needs_camera
 from wlr_gym.policy.onnx_file import open_policy
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.errors import InputError, require_package
+from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.policy.file import check_content
 
 if TYPE_CHECKING:

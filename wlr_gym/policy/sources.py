@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.errors import InputError, nearest
-from wlr_gym.paths import data_directory
+from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.paths import data_directory
 from wlr_gym.policy.agents import Contract, Policy, agent_function, agent_names, load_agent_config
 from wlr_gym.policy.file import CONTRACT_FILE, check_contract, read_contract
 from wlr_gym.policy.onnx_file import SUFFIX, open_policy

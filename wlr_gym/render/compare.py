@@ -8,7 +8,7 @@ from itertools import zip_longest
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
 from wlr_gym.render.overlay import banner
 
 Picture = NDArray[np.uint8]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
 
 
 def has_display() -> bool:

@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
 from wlr_gym.render.display import has_display
 
 #: System -> contexts that can draw into memory there, the preferred first. On Linux EGL needs no display.

@@ -10,14 +10,14 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.errors import InputError
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import Truth
+from wlr_gym.base.errors import InputError
+from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render import camera, marks, overlay
 from wlr_gym.render.gl import Canvas
 from wlr_gym.render.stage import Stage
 from wlr_gym.render.view import View
 from wlr_gym.robot import Robot
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]

@@ -1,4 +1,4 @@
-"""The robot as MuJoCo draws it: the model of :mod:`wlr_gym.plants.mujoco.mjcf` without contacts, dressed up.
+"""The robot as MuJoCo draws it: the model of :mod:`wlr_gym.physics.plants.mujoco.mjcf` without contacts, dressed up.
 
 Only shapes and joints are used; poses come from a plant's truth, so every plant looks the same. Nothing here needs OpenGL.
 """
@@ -14,11 +14,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import Truth
-from wlr_gym.plants.mujoco.mjcf import build_model
+from wlr_gym.physics.plants.base import Truth
+from wlr_gym.physics.plants.mujoco.mjcf import build_model
 from wlr_gym.render.colours import friction_colour
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

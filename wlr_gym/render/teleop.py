@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
-from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, unknown_name
 
 #: Key codes of GLFW, which the viewer reports.
 UP, DOWN, LEFT, RIGHT, SPACE, RESET = 265, 264, 263, 262, 32, 82

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from wlr_gym.errors import InputError, require_package
-from wlr_gym.files import replace_file
+from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.files import replace_file
 
 Picture = NDArray[np.uint8]
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.render.camera import CAMERAS
 
 #: Pixels: smallest and largest width and height.

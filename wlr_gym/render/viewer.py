@@ -17,9 +17,8 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from wlr_gym.errors import InputError
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import Truth
+from wlr_gym.base.errors import InputError
+from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render import marks
 from wlr_gym.render.camera import CAMERAS, LOOK_HEIGHT
 from wlr_gym.render.display import require_display
@@ -27,6 +26,7 @@ from wlr_gym.render.scene import describe, marks_of
 from wlr_gym.render.stage import Stage
 from wlr_gym.render.view import View
 from wlr_gym.robot import Robot
+from wlr_gym.robot.parameters import Parameters
 
 KeyCallback = Callable[[int], None]
 

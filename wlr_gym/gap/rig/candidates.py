@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.effects.effect import PatchEffect
 from wlr_gym.gap.problem import Candidate, Probe, Start, Unknown
 from wlr_gym.gap.rig.model import JOINT, NO_TORQUE_LIMIT, RIG_EFFECTS, unknowns
+from wlr_gym.physics.effects.effect import PatchEffect
 
 Array = NDArray[np.float64]
 

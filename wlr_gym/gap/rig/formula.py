@@ -1,4 +1,4 @@
-"""Formula effects on the rig: the force formulas of the simulators (:mod:`wlr_gym.plants.forces`) on its one joint.
+"""Formula effects on the rig: the force formulas of the simulators (:mod:`wlr_gym.physics.plants.forces`) on its one joint.
 
 A formula may read what one joint of the robot could: ``angle`` (rad), ``rate`` (rad/s), ``motor_torque`` (N m, of the substep
 before) and ``supply_voltage`` (V). The rig's joint stands in for a joint of the robot, so the checks and units are the same.
@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from wlr_gym.effects.effect import PatchEffect
-from wlr_gym.errors import InputError
-from wlr_gym.plants.forces import Force, features_read, generalised_forces, make_force
+from wlr_gym.base.errors import InputError
+from wlr_gym.physics.effects.effect import PatchEffect
+from wlr_gym.physics.plants.forces import Force, features_read, generalised_forces, make_force
 
 Value = Any
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.codegen import Graph, emit, load_module
 from wlr_gym.gap.rig import law
 from wlr_gym.gap.rig.formula import total_force
-from wlr_gym.plants.forces import Force, force_values
+from wlr_gym.physics.codegen import Graph, emit, load_module
+from wlr_gym.physics.plants.forces import Force, force_values
 
 Array = NDArray[np.float64]
 

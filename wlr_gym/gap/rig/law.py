@@ -1,9 +1,9 @@
-"""Servo and pendulum, one substep: the drive law of the simulators (:mod:`wlr_gym.plants.drive`) on one joint with one link.
+"""Servo and pendulum, one substep: the simulators' drive law (:mod:`wlr_gym.physics.plants.drive`) on one joint with one link.
 
-Scalar source over lanes, written with :mod:`wlr_gym.codegen.ops`; :mod:`wlr_gym.gap.rig.kernel` compiles it. Gear, motor and
-friction are :func:`wlr_gym.plants.drive.push` itself, so an effect found on the rig is the effect of the library. Laws of the
-rig alone (torque that falls behind the current, a torque limit, friction quadratic in load, a warm winding) act through the
-strength of the motor and the ratio of load-dependent friction that the drive law reads.
+Scalar source over lanes, written with :mod:`wlr_gym.physics.codegen.ops`; :mod:`wlr_gym.gap.rig.kernel` compiles it. Gear,
+motor and friction are :func:`wlr_gym.physics.plants.drive.push` itself, so an effect found on the rig is the effect of the
+library. Laws of the rig alone (torque that falls behind the current, a torque limit, friction quadratic in load, a warm
+winding) act through the strength of the motor and the ratio of load-dependent friction that the drive law reads.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from wlr_gym.codegen import ops
-from wlr_gym.plants import drive
+from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.plants import drive
 
 Value = Any
 Lanes = Mapping[str, Value]

@@ -13,16 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym import servo
-from wlr_gym.effects.effect import EffectParameter, PatchEffect
-from wlr_gym.effects.registry import EFFECTS, UNKNOWN_EFFECT
-from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.gap.problem import Quantity, Setting, Unknown
 from wlr_gym.gap.rig import law
 from wlr_gym.gap.rig.formula import rig_force
 from wlr_gym.gap.rig.recording import FULL_DUTY, Recording
-from wlr_gym.plants import drive
-from wlr_gym.plants.forces import Force
+from wlr_gym.physics import servo
+from wlr_gym.physics.effects.effect import EffectParameter, PatchEffect
+from wlr_gym.physics.effects.registry import EFFECTS, UNKNOWN_EFFECT
+from wlr_gym.physics.plants import drive
+from wlr_gym.physics.plants.forces import Force
 
 Array = NDArray[np.float64]
 Numbers = dict[str, float]
@@ -41,8 +41,9 @@ TEETH_STIFFNESS = 50.0
 #: N m; a limit that no torque reaches.
 NO_TORQUE_LIMIT = 10.0
 
-#: What calibration may move. The motor is given as in its data sheet (:func:`wlr_gym.servo.motor_constants` makes torque
-#: constant and resistance of it), which says nothing of friction, rotor and delay: wide tolerances about a small servo's.
+#: What calibration may move. The motor is given as in its data sheet (:func:`wlr_gym.physics.servo.motor_constants` makes
+#: torque constant and resistance of it), which says nothing of friction, rotor and delay: wide tolerances about a small
+#: servo's.
 QUANTITIES: tuple[Quantity, ...] = (
     Quantity("stall_torque", "N m", STALL_TORQUE, 0.25 * STALL_TORQUE, 0.1, 2.0),
     Quantity("no_load_speed", "rad/s", NO_LOAD_SPEED, 0.15 * NO_LOAD_SPEED, 3.0, 40.0),

@@ -6,18 +6,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.codegen.expression import finite_number
-from wlr_gym.effects import UNKNOWN_EFFECT, EffectParameter, Patch, PatchEffect, Source, compose
-from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.paths import find_config
+from wlr_gym.base.settings import read_yaml
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.rig.formula import rig_force
 from wlr_gym.gap.rig.intake import findings
 from wlr_gym.gap.rig.model import JOINT, RIG_EFFECTS
 from wlr_gym.gap.rig.problem import RigProblem
 from wlr_gym.gap.rig.recording import read_recordings
-from wlr_gym.parameters import range_in_words
-from wlr_gym.paths import find_config
-from wlr_gym.robot import read_yaml
+from wlr_gym.physics.codegen.expression import finite_number
+from wlr_gym.physics.effects import UNKNOWN_EFFECT, EffectParameter, Patch, PatchEffect, Source, compose
+from wlr_gym.robot.parameters import range_in_words
 
 #: Recordings that an analysis needs: two to fit, one for the proof.
 LEAST_RUNS = 3
@@ -49,7 +49,7 @@ def rig_patch(source: Source) -> Patch:
     """Load a patch of the rig, as its analyses write it: effects of :data:`RIG_EFFECTS` at its joint.
 
     Args:
-        source: as for :func:`wlr_gym.effects.load_patch`.
+        source: as for :func:`wlr_gym.physics.effects.load_patch`.
 
     Raises:
         InputError: naming file, effect, key and the nearest valid name.

@@ -10,8 +10,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.effects.effect import PatchEffect
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.random import generator
 from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal, since_reversal
 from wlr_gym.gap.rig.candidates import rig_candidates
 from wlr_gym.gap.rig.formula import lanes_read, rig_force
@@ -19,8 +19,8 @@ from wlr_gym.gap.rig.kernel import OUTPUTS
 from wlr_gym.gap.rig.model import QUANTITIES, model_of
 from wlr_gym.gap.rig.recording import Recording
 from wlr_gym.gap.rig.replay import Replay
-from wlr_gym.gap.split import SEALED_SHARE
-from wlr_gym.random import generator
+from wlr_gym.gap.validation.data_split import SEALED_SHARE
+from wlr_gym.physics.effects.effect import PatchEffect
 
 Array = NDArray[np.float64]
 

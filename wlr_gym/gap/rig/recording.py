@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.errors import InputError, nearest
+from wlr_gym.base.errors import InputError, nearest
 
 Array = NDArray[np.float64]
 

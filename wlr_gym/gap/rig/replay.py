@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from wlr_gym.gap.rig import kernel
 from wlr_gym.gap.rig.model import REFERENCE_TEMPERATURE, Model, pack
 from wlr_gym.gap.rig.recording import Recording
-from wlr_gym.plants.forces import force_values
+from wlr_gym.physics.plants.forces import force_values
 
 Array = NDArray[np.float64]
 

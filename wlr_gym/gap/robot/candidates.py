@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.effects import EFFECTS, PatchEffect
+from wlr_gym.data.format import CHANNELS
 from wlr_gym.gap.problem import Candidate, Probe, Start, Tolerance, Unknown
 from wlr_gym.gap.robot.quantities import REACH
-from wlr_gym.parameters import Parameters
+from wlr_gym.physics.effects import EFFECTS, PatchEffect
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
-from wlr_gym.runs.format import CHANNELS
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

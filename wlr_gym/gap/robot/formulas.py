@@ -12,10 +12,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.effects import UNKNOWN_EFFECT, PatchEffect
+from wlr_gym.data.format import CHANNELS
 from wlr_gym.gap.problem import Candidate, Probe, Start, Unknown
+from wlr_gym.physics.effects import UNKNOWN_EFFECT, PatchEffect
 from wlr_gym.robot import CORNERS, LEGS, WHEELS
-from wlr_gym.runs.format import CHANNELS
 
 Array = NDArray[np.float64]
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from wlr_gym.effects import Source
+from wlr_gym.data.check import increments
+from wlr_gym.data.format import COMMANDS
+from wlr_gym.data.read import Run, read_dataset
+from wlr_gym.data.replay import robot_of
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.robot.problem import RobotProblem
+from wlr_gym.physics.effects import Source
 from wlr_gym.robot import JOINTS, LEGS
-from wlr_gym.runs.check import increments
-from wlr_gym.runs.format import COMMANDS
-from wlr_gym.runs.read import Run, read_dataset
-from wlr_gym.runs.replay import robot_of
 
 #: Runs that an analysis needs: two to fit, one for the proof.
 LEAST_RUNS = 3

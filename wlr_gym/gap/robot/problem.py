@@ -9,10 +9,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.effects import Patch, PatchEffect, Source, apply_patch, load_patch
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.random import generator
+from wlr_gym.data.format import CHANNELS, COLUMNS
+from wlr_gym.data.noise import channel_noise, noise_parts
+from wlr_gym.data.read import Run
+from wlr_gym.data.replay import profile_parameters, robot_of
 from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal, since_reversal
-from wlr_gym.gap.recommend import SHOWN_BY
+from wlr_gym.gap.report.recommendation import SHOWN_BY
 from wlr_gym.gap.robot.candidates import robot_candidates
 from wlr_gym.gap.robot.clock import RunClock
 from wlr_gym.gap.robot.formulas import formula_candidates, tried_effects
@@ -20,15 +24,11 @@ from wlr_gym.gap.robot.quantities import Knob, knobs, write
 from wlr_gym.gap.robot.recorder import TRUTH, Replays
 from wlr_gym.gap.robot.simulate import KERNELS, PHYSICS_STEP, kernel_of, replay_batch
 from wlr_gym.gap.robot.windows import WINDOW, anchored_residuals
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import TRUTH_LAYOUT
-from wlr_gym.plants.forces import MEMORY, Force, features_read
-from wlr_gym.random import generator
+from wlr_gym.physics.effects import Patch, PatchEffect, Source, apply_patch, load_patch
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT
+from wlr_gym.physics.plants.forces import MEMORY, Force, features_read
 from wlr_gym.robot import JOINTS, WHEELS, Robot
-from wlr_gym.runs.format import CHANNELS, COLUMNS
-from wlr_gym.runs.noise import channel_noise, noise_parts
-from wlr_gym.runs.read import Run
-from wlr_gym.runs.replay import profile_parameters, robot_of
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.gap.problem import Quantity
-from wlr_gym.parameters import SPECS, TABLE, Parameters
-from wlr_gym.plants.simulator import most_damping
+from wlr_gym.physics.plants.simulator import most_damping
 from wlr_gym.robot import LEGS, Robot
+from wlr_gym.robot.parameters import SPECS, TABLE, Parameters
 
 Array = NDArray[np.float64]
 

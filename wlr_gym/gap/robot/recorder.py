@@ -10,10 +10,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.data.format import CHANNELS
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, Sensors, Truth
-from wlr_gym.runs.format import CHANNELS
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, Sensors, Truth
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

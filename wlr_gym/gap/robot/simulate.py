@@ -16,24 +16,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.data.anchor import euler_angles, quaternion, rest_pose, start_state
+from wlr_gym.data.read import Run
+from wlr_gym.data.replay import profile_parameters
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
 from wlr_gym.gap.robot.recorder import POSE_TICKS, Recorder, Replays
-from wlr_gym.parameters import Parameters
-from wlr_gym.plants import drive, ground, make_plant
-from wlr_gym.plants.base import PlantOptions, PlantState, Sensors, standing_state
-from wlr_gym.plants.forces import Force
-from wlr_gym.plants.sensors import rotation
-from wlr_gym.plants.simulator import Simulator
+from wlr_gym.physics.plants import drive, ground, make_plant
+from wlr_gym.physics.plants.base import PlantOptions, PlantState, Sensors, standing_state
+from wlr_gym.physics.plants.forces import Force
+from wlr_gym.physics.plants.sensors import rotation
+from wlr_gym.physics.plants.simulator import Simulator
+from wlr_gym.physics.servo import motor_constants
 from wlr_gym.robot import Robot
-from wlr_gym.runs.anchor import (
-    euler_angles,
-    quaternion,
-    rest_pose,
-    start_state,
-)
-from wlr_gym.runs.read import Run
-from wlr_gym.runs.replay import profile_parameters
-from wlr_gym.servo import motor_constants
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.data.format import CHANNELS
 from wlr_gym.robot import JOINTS
-from wlr_gym.runs.format import CHANNELS
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wlr_gym.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, unknown_name
 
 
 class FaultKind(NamedTuple):

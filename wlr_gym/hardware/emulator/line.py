@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from wlr_gym.hardware import protocol
+from wlr_gym.hardware.dynamixel import protocol
+from wlr_gym.hardware.dynamixel.protocol import BROADCAST, Error, Instruction, Packet, Parser, Status
 from wlr_gym.hardware.emulator.faults import FaultBoard
 from wlr_gym.hardware.emulator.servo import EmulatedServo
-from wlr_gym.hardware.protocol import BROADCAST, Error, Instruction, Packet, Parser, Status
 
 #: First firmware that knows fast reads.
 FAST_READ_FIRMWARE = 45

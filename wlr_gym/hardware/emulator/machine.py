@@ -17,10 +17,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym import servo as law
-from wlr_gym.errors import InputError, unknown_name
-from wlr_gym.hardware import imu
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.hardware.config import Bus, Hardware
+from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, HARDWARE_ERRORS, ControlTable, load_table
 from wlr_gym.hardware.emulator.faults import FAULTS, Fault, FaultBoard, parse_fault
 from wlr_gym.hardware.emulator.line import Emission, Line, LineTiming
 from wlr_gym.hardware.emulator.servo import (
@@ -36,13 +35,14 @@ from wlr_gym.hardware.emulator.servo import (
     Drive,
     EmulatedServo,
 )
-from wlr_gym.hardware.imu_driver import Conversion
-from wlr_gym.hardware.tables import BAUD_RATES, HARDWARE_ERRORS, ControlTable, load_table
-from wlr_gym.parameters import SPECS, Parameters
-from wlr_gym.plants import make_plant
-from wlr_gym.plants.base import Plant, PlantOptions, PlantState
-from wlr_gym.plants.forces import Force
+from wlr_gym.hardware.imu import frames as imu
+from wlr_gym.hardware.imu.driver import Conversion
+from wlr_gym.physics import servo as law
+from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState
+from wlr_gym.physics.plants.forces import Force
 from wlr_gym.robot import JOINTS, LEGS, Robot
+from wlr_gym.robot.parameters import SPECS, Parameters
 
 Array = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import heapq
 from typing import Any
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import ImuPort
+from wlr_gym.hardware.dynamixel.sdk import GuardedPort
 from wlr_gym.hardware.emulator.line import Emission
 from wlr_gym.hardware.emulator.machine import Machine
-from wlr_gym.hardware.imu_driver import ImuGoneError
-from wlr_gym.hardware.imu_stream import ImuStream
-from wlr_gym.hardware.sdk import GuardedPort
+from wlr_gym.hardware.imu.driver import ImuGoneError
+from wlr_gym.hardware.imu.stream import ImuStream
 
 
 class World:

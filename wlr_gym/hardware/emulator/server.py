@@ -19,7 +19,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 
-from wlr_gym.errors import InputError
+from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.emulator.machine import Machine
 
 #: Emulated time may fall behind by this much (s); beyond, it slips, as on a computer that was suspended.

@@ -11,9 +11,9 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from wlr_gym.errors import InputError
-from wlr_gym.hardware.protocol import ALERT, Error
-from wlr_gym.hardware.tables import BAUD_RATES, TABLE_SIZE, ControlTable, Item
+from wlr_gym.base.errors import InputError
+from wlr_gym.hardware.dynamixel.protocol import ALERT, Error
+from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, TABLE_SIZE, ControlTable, Item
 
 VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_POSITION_MODE, CURRENT_MODE, PWM_MODE = 1, 3, 4, 5, 0, 16
 POSITION_MODES = (POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_POSITION_MODE)

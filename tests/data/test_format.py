@@ -1,0 +1,413 @@
+"""Reading, checking, writing and converting runs: every refusal and warning of the format, with broken files."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.data import COLUMNS, Profile, RunMeta, check_table, convert, read_dataset, read_meta, read_run, write_run
+from wlr_gym.data.format import CAMERA, REQUIRED
+from wlr_gym.robot import JOINTS, LEGS, WHEELS
+
+DATA = Path(__file__).parent / "data"
+DEGREES = 180 / np.pi
+
+
+@pytest.fixture
+def table() -> dict[str, np.ndarray]:
+    """A real measured run of 6 s, columns by name."""
+    run = read_run(DATA / "run_01.parquet")
+    return {name: run[name].copy() for name in run.table}
+
+
+def write_raw(path: Path, table: dict[str, np.ndarray]) -> Path:
+    """Write a table as CSV or Parquet without any check, as a careless user would."""
+    import pandas
+
+    frame = pandas.DataFrame(table)
+    frame.to_csv(path, index=False) if path.suffix == ".csv" else frame.to_parquet(path)
+    return path
+
+
+def refused(path: Path, *words: str) -> None:
+    with pytest.raises(InputError) as error:
+        read_run(path)
+    for word in (path.name, *words):
+        assert word in str(error.value)
+
+
+def findings_of(table: dict[str, np.ndarray], kind: str) -> dict[str, tuple[int, ...]]:
+    return {finding.column: finding.rows for finding in check_table(table, "run.csv") if finding.kind == kind}
+
+
+# --- honest data ------------------------------------------------------------------------------------------------------
+
+
+def test_a_real_run_is_read_and_only_its_gaps_are_reported():
+    run = read_run(DATA / "run_01.parquet")
+    assert list(run.table.columns) == list(COLUMNS)
+    assert len(run.table) == 300
+    assert run.meta.profile.leg_velocity == pytest.approx(1.438849)
+    assert {finding.kind for finding in run.findings} <= {"gap"}
+
+
+def test_minimal_run_has_only_the_required_columns(tmp_path, table):
+    path = write_run(tmp_path / "run_01.csv", {name: table[name] for name in REQUIRED})
+    assert set(read_run(path).table.columns) == set(REQUIRED)
+
+
+def test_torque_off_is_no_error(tmp_path, table):
+    table["cmd_wheel_lr"][:] = np.nan
+    assert np.isnan(read_run(write_run(tmp_path / "run_01.csv", table))["cmd_wheel_lr"]).all()
+
+
+def test_a_robot_at_rest_gives_no_findings(table):
+    rest = {name: np.full(100, values[0]) for name, values in table.items()}
+    noise = np.random.default_rng(0)
+    rest["t"] = 0.02 * np.arange(100)
+    for name in ("gyro_x", "gyro_y", "gyro_z", "acc_x", "acc_y", "acc_z", "volt", *[f"eff_{joint}" for joint in JOINTS]):
+        rest[name] = rest[name] + noise.normal(0, 0.01, 100)
+    for name in CAMERA:
+        rest[name] = np.where(np.arange(100) % 2, np.nan, noise.normal(0, 0.001, 100))
+    assert check_table(rest, "run.csv") == []
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize("column", ["t", "cmd_leg_lf", "pos_wheel_rr"])
+def test_missing_required_column(tmp_path, table, column, suffix):
+    del table[column]
+    refused(write_raw(tmp_path / f"run_01{suffix}", table), "missing required column", f"'{column}'")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_unknown_column_names_the_nearest(tmp_path, table, suffix):
+    table["gyro_zz"] = table.pop("gyro_z")
+    refused(write_raw(tmp_path / f"run_01{suffix}", table), "unknown column 'gyro_zz'", "did you mean 'gyro_z'")
+
+
+def test_repeated_column(tmp_path, table):
+    path = write_raw(tmp_path / "run_01.csv", table)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0] + ",volt", *[line + ",12.0" for line in lines[1:]]]))
+    refused(path, "'volt' occurs twice")
+
+
+@pytest.mark.parametrize(("value", "word"), [(0.0, "does not come after"), (-1.0, "does not come after")])
+def test_clock_that_does_not_increase(tmp_path, table, value, word):
+    table["t"][17] = table["t"][16] + value
+    refused(write_raw(tmp_path / "run_01.csv", table), "row 17", "'t'", word)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize(("column", "row"), [("pos_leg_rf", 5), ("t", 7), ("cmd_wheel_lf", 0), ("cam_x", 0), ("volt", 299)])
+def test_infinity(tmp_path, table, column, row, suffix):
+    table[column][row] = np.inf
+    refused(write_raw(tmp_path / f"run_01{suffix}", table), f"row {row}", f"'{column}'", "inf")
+
+
+@pytest.mark.parametrize("column", ["t", "pos_leg_lf", "pos_wheel_rr"])
+def test_missing_value_in_a_required_column(tmp_path, table, column):
+    table[column][9] = np.nan
+    refused(write_raw(tmp_path / "run_01.csv", table), "row 9", f"'{column}'", "no value")
+
+
+def test_short_row(tmp_path, table):
+    path = write_raw(tmp_path / "run_01.csv", table)
+    lines = path.read_text().splitlines()
+    lines[4] = lines[4].rpartition(",")[0]
+    path.write_text("\n".join(lines))
+    refused(path, "row 3", "44 values", "45 columns")
+
+
+def test_unequal_columns(tmp_path, table):
+    table["volt"] = table["volt"][:-1]
+    with pytest.raises(InputError, match=r"'volt' has shape \(299,\), 't' has 300 rows"):
+        write_run(tmp_path / "run_01.csv", table)
+
+
+def test_text_in_a_cell(tmp_path, table):
+    path = write_raw(tmp_path / "run_01.csv", table)
+    lines = path.read_text().splitlines()
+    cells = lines[6].split(",")
+    cells[3] = "n/a"
+    lines[6] = ",".join(cells)
+    path.write_text("\n".join(lines))
+    refused(path, "row 5", "'cmd_leg_lr'", "'n/a' is not a number")
+
+
+def test_text_column_in_parquet(tmp_path, table):
+    table["volt"] = np.array(["twelve"] * 300)
+    refused(write_raw(tmp_path / "run_01.parquet", table), "'volt'", "string")
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe\x00junk"])
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_not_a_table_at_all(tmp_path, content, suffix):
+    path = tmp_path / f"run_01{suffix}"
+    path.write_bytes(content)
+    refused(path)
+
+
+def test_header_without_rows(tmp_path):
+    path = tmp_path / "run_01.csv"
+    path.write_text(",".join(COLUMNS))
+    refused(path, "0 rows")
+
+
+@pytest.mark.parametrize("path", ["run_01.txt", "nothing_here.csv"])
+def test_file_that_is_no_run(tmp_path, path):
+    refused(tmp_path / path)
+
+
+# --- unit mistakes ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize(
+    ("column", "factor", "looks_like"),
+    [
+        ("pos_leg_lf", DEGREES, "degrees"),
+        ("cmd_leg_rr", DEGREES, "degrees"),
+        ("pos_wheel_lf", DEGREES, "degrees"),
+        ("cmd_wheel_rf", DEGREES, "degrees"),
+        ("vel_leg_lr", DEGREES, "degrees"),
+        ("vel_wheel_rr", DEGREES, "degrees"),
+        ("gyro_z", DEGREES, "degrees"),
+        ("cam_yaw", DEGREES, "degrees"),
+        ("cam_pitch", DEGREES, "degrees"),
+        ("cam_x", 1000, "millimetres"),
+        ("cam_y", 1000, "millimetres"),
+        ("cam_z", 1000, "millimetres"),
+        ("eff_leg_lf", 1000, "mN m"),
+        ("eff_wheel_lf", 1000, "mN m"),
+        ("volt", 1000, "millivolts"),
+        ("t", 1000, "milliseconds"),
+    ],
+)
+def test_wrong_unit_in_one_column(tmp_path, table, column, factor, looks_like, suffix):
+    table[column] = table[column] * factor
+    refused(write_raw(tmp_path / f"run_01{suffix}", table), f"'{column}'", "row ", looks_like)
+
+
+@pytest.mark.parametrize("kind", ["pos", "vel", "cmd"])
+def test_wrong_unit_in_a_whole_kind(tmp_path, table, kind):
+    for joint in JOINTS:
+        table[f"{kind}_{joint}"] = table[f"{kind}_{joint}"] * DEGREES
+    refused(write_raw(tmp_path / "run_01.csv", table), f"'{kind}_", "degrees")
+
+
+def test_everything_in_degrees(tmp_path, table):
+    for name in table:
+        if COLUMNS[name].unit.startswith("rad"):
+            table[name] = table[name] * DEGREES
+    refused(write_raw(tmp_path / "run_01.csv", table), "degrees")
+
+
+def test_acceleration_in_g(tmp_path, table):
+    for axis in "xyz":
+        table[f"acc_{axis}"] = table[f"acc_{axis}"] / 9.81
+    refused(write_raw(tmp_path / "run_01.csv", table), "'acc_z'", "multiples of g")
+
+
+def test_outliers_are_no_unit_mistake(table):
+    table["cam_x"][np.flatnonzero(np.isfinite(table["cam_x"]))[::15]] += 3.0  # misdetections
+    table["vel_wheel_lf"][::30] = 40.0  # broken packets
+    table["gyro_z"][::40] = 34.0
+    check_table(table, "run.csv")
+
+
+def test_fast_driving_is_no_unit_mistake(table):
+    for wheel in WHEELS:
+        table[f"cmd_{wheel}"] = np.full(300, 6.4)
+        table[f"pos_{wheel}"] = 6.4 * table["t"]
+        table[f"vel_{wheel}"] = np.full(300, 6.4)
+    check_table(table, "run.csv")
+
+
+# --- findings ---------------------------------------------------------------------------------------------------------
+
+
+def test_gaps_are_reported_with_their_rows(table):
+    keep = np.ones(300, dtype=bool)
+    keep[40:50] = keep[200] = False
+    before = findings_of(table, "gap").get("t", ())
+    rows = findings_of({name: values[keep] for name, values in table.items()}, "gap")["t"]
+    assert {39, 189} <= set(rows)
+    assert len(rows) == len(before) + 2
+
+
+def test_another_rate_is_reported(table):
+    table["t"] = table["t"] / 2
+    assert "t" in findings_of(table, "rate")
+
+
+def test_duplicate_camera_frames(table):
+    frames = np.flatnonzero(np.isfinite(table["cam_x"]))
+    for name in CAMERA:
+        table[name][frames[[20, 40]]] = table[name][frames[[19, 39]]]
+    assert findings_of(table, "duplicate") == {"cam_x": (frames[20], frames[40])}
+
+
+def test_duplicate_rows(table):
+    for name in table:
+        if name != "t" and not name.startswith("cam"):
+            table[name][50] = table[name][49]
+    assert 50 in next(iter(findings_of(table, "duplicate").values()))
+
+
+@pytest.mark.parametrize(
+    "column", ["gyro_x", "acc_z", "eff_leg_lf", "cam_y", "volt", "pos_leg_lf", "vel_leg_lf", "vel_wheel_lf"]
+)
+def test_dead_channel(table, column):
+    table[column] = np.where(np.isnan(table[column]), np.nan, table[column][0])
+    assert column in findings_of(table, "constant")
+
+
+def test_channel_that_dies_half_way(table):
+    table["gyro_y"][150:] = table["gyro_y"][150]
+    assert findings_of(table, "constant") == {"gyro_y": (150,)}
+
+
+@pytest.mark.parametrize(("column", "share"), [("gyro_z", 0.5), ("gyro_y", 0.5), ("acc_x", 0.5), ("eff_leg_lf", 0.7)])
+def test_clipped_channel(table, column, share):
+    limit = share * np.abs(table[column]).max()
+    table[column] = np.clip(table[column], -limit, limit)
+    assert column in findings_of(table, "clipped")
+
+
+def test_missing_values(table):
+    table["eff_leg_rf"][[3, 8]] = np.nan
+    table["volt"][:] = np.nan
+    assert findings_of(table, "missing") == {"eff_leg_rf": (3, 8), "volt": (0,)}
+
+
+# --- meta and data sets -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("profil: {}", ["unknown key 'profil'", "did you mean 'profile'"]),
+        ("profile: {leg_velocty: 1.0}", ["profile.leg_velocty", "did you mean 'leg_velocity'"]),
+        ("profile: {leg_velocity: -1}", ["profile.leg_velocity", "-1"]),
+        ("marker_offset: [0, 0]", ["marker_offset"]),
+        ("marker_offset: [0, 0, 85]", ["marker_offset", "millimetres"]),
+        ("robot: [", ["broken YAML", "line 1"]),
+        ("just text", ["expected a mapping"]),
+    ],
+)
+def test_bad_meta_is_refused(tmp_path, text, words):
+    (tmp_path / "meta.yaml").write_text(text)
+    with pytest.raises(InputError) as error:
+        read_meta(tmp_path)
+    for word in ("meta.yaml", *words):
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize("text", [None, "", "{}"])
+def test_meta_is_optional(tmp_path, text):
+    if text is not None:
+        (tmp_path / "meta.yaml").write_text(text)
+    assert read_meta(tmp_path) == RunMeta(profile=Profile(wheel_acceleration=0, leg_velocity=0, leg_acceleration=0))
+
+
+def test_dataset_is_read_in_the_order_of_the_numbers(tmp_path, table):
+    for number in (10, 2, 1):
+        write_run(tmp_path / f"run_{number}.parquet", table, RunMeta(ground="mat"))
+    data = read_dataset(tmp_path)
+    assert [run.name for run in data.runs] == ["run_1", "run_2", "run_10"]
+    assert data.meta.ground == "mat"
+
+
+def test_a_policys_log_beside_a_run_is_no_run(tmp_path, table):
+    write_run(tmp_path / "run_01.csv", table)
+    (tmp_path / "run_01.policy.csv").write_text("command_yaw_rate,action_leg_lf\n0.1,0.2\n")
+    assert [run.name for run in read_dataset(tmp_path).runs] == ["run_01"]
+
+
+def test_dataset_refuses_what_is_no_data_set(tmp_path, table):
+    with pytest.raises(InputError, match="no such folder"):
+        read_dataset(tmp_path / "nowhere")
+    write_run(tmp_path / "inside" / "run_01.csv", table)
+    with pytest.raises(InputError, match="its folders inside have some"):
+        read_dataset(tmp_path)
+    write_run(tmp_path / "inside" / "run_01.parquet", table)
+    with pytest.raises(InputError, match="same run"):
+        read_dataset(tmp_path / "inside")
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def test_writing_refuses_what_reading_refuses(tmp_path, table):
+    table["gyro_x"][4] = np.inf
+    with pytest.raises(InputError, match="row 4, column 'gyro_x'"):
+        write_run(tmp_path / "run_01.csv", table)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_writing_does_not_overwrite_other_meta_data(tmp_path, table):
+    write_run(tmp_path / "run_01.csv", table, RunMeta(ground="mat"))
+    write_run(tmp_path / "run_02.csv", table, RunMeta(ground="mat"))
+    with pytest.raises(InputError, match="says something else"):
+        write_run(tmp_path / "run_03.csv", table, RunMeta(ground="tiles"))
+
+
+def test_a_broken_write_leaves_the_old_file(tmp_path, table, monkeypatch):
+    path = write_run(tmp_path / "run_01.csv", table)
+    before = path.read_bytes()
+    monkeypatch.setattr("wlr_gym.data.write._write_csv", lambda path, columns: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        write_run(path, table)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def bits(values: np.ndarray) -> np.ndarray:
+    """The bits of floats, with every NaN alike."""
+    return np.where(np.isnan(values), np.nan, values).view(np.int64)
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.data(), suffix=st.sampled_from([".csv", ".parquet"]))
+def test_round_trip_keeps_every_bit(tmp_path_factory, data, suffix):
+    rows = data.draw(st.integers(2, 12))
+    finite = hnp.arrays(np.float64, rows, elements=st.floats(-3, 3, allow_nan=False))
+    with_nan = hnp.arrays(np.float64, rows, elements=st.floats(-3, 3) | st.just(np.nan))
+    steps = data.draw(hnp.arrays(np.float64, rows, elements=st.floats(1e-3, 0.9)))
+    table = {name: data.draw(with_nan if column.may_be_nan else finite) for name, column in COLUMNS.items() if column.required}
+    table["t"] = np.cumsum(steps)
+    table["volt"] = data.draw(finite)
+    path = write_run(tmp_path_factory.mktemp("runs") / f"run_01{suffix}", table)
+    run = read_run(path)
+    assert set(run.table.columns) == set(table)
+    for name, values in table.items():
+        np.testing.assert_array_equal(bits(run[name]), bits(values))
+
+
+def test_convert_there_and_back(tmp_path):
+    shutil.copytree(DATA, tmp_path / "a")
+    written = convert(tmp_path / "a", tmp_path / "b", ".csv")
+    assert [path.name for path in written] == ["run_01.csv"]
+    convert(written[0], tmp_path / "c" / "run_01.parquet")
+    first, last = read_run(tmp_path / "a" / "run_01.parquet"), read_run(tmp_path / "c" / "run_01.parquet")
+    np.testing.assert_array_equal(first.table.to_numpy().view(np.int64), last.table.to_numpy().view(np.int64))
+    assert first.meta == last.meta
+    with pytest.raises(InputError, match="format of a data set"):
+        convert(tmp_path / "a", tmp_path / "d", ".mat")
+
+
+def test_every_joint_has_its_columns():
+    for joint in JOINTS:
+        assert {f"cmd_{joint}", f"pos_{joint}"} <= set(REQUIRED)
+        assert COLUMNS[f"cmd_{joint}"].unit == ("rad" if joint in LEGS else "rad/s")

@@ -1,0 +1,73 @@
+"""docs/randomization.md says what the code does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from wlr_gym.envs.registry import ENVIRONMENTS
+from wlr_gym.envs.tasks import load_randomization, load_task
+from wlr_gym.envs.tasks.describe import randomization_table
+from wlr_gym.envs.tasks.entries import AreaConfig, EventConfig
+from wlr_gym.envs.tasks.markdown import task_tables
+from wlr_gym.robot import load_robot
+
+ROOT = Path(__file__).parents[3]
+TEXT = (ROOT / "docs" / "randomization.md").read_text(encoding="utf-8")
+
+
+def config(name):
+    return load_randomization(name, load_robot()).config
+
+
+@pytest.mark.parametrize(
+    ("name", "base"),
+    [("nominal", None), ("wide", None)]
+    + [(name, "nominal") for name in ("ice", "split", "patches", "slippery", "asymmetric", "slope")],
+)
+def test_tables_are_those_of_the_code(name, base):
+    block = TEXT.split(f"<!-- {name}: ")[1].split(f"<!-- end of {name} -->")[0]
+    assert block.splitlines()[1:] == randomization_table(config(name), None if base is None else config(base))
+
+
+@pytest.mark.parametrize(("env_id", "name"), [(env_id, name) for env_id, (name, _, _) in ENVIRONMENTS.items()])
+def test_tables_of_environments_are_those_of_the_code(env_id, name):
+    text = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
+    section = text.split(f"## {env_id}\n")[1]
+    block = section.split(f"<!-- {name}: ")[1].split(f"<!-- end of {name} -->")[0]
+    assert block.splitlines()[1:] == task_tables(load_task(name, load_robot()))
+    assert (ROOT / "docs" / "figures" / f"environment_{name}.png").is_file()
+
+
+def test_every_preset_is_named():
+    section = TEXT.split("## Presets")[1].split("![")[0]
+    shipped = {path.stem for path in (ROOT / "configs" / "randomization").glob("*.yaml")}
+    assert set(re.findall(r"^\| `(\w+)`", section, re.M)) == shipped
+
+
+def test_every_key_of_an_event_is_explained():
+    section = TEXT.split("| key of an event |")[1].split("## From a gap result")[0]
+    for key in (*EventConfig.model_fields, *AreaConfig.model_fields):
+        assert f"`{key}`" in section, key
+
+
+def test_the_examples_load():
+    late, whole = (yaml.safe_load(example) for example in re.findall("```yaml\n(.*?)```", TEXT, re.S))
+    delay = load_randomization(late, load_robot()).config.events["command_delay"]
+    assert (delay.low, delay.high) == (0.0, 0.03)
+    events = load_randomization(whole, load_robot()).config.events
+    assert (events["floor_friction"].low, events["floor_friction"].high) == (0.2, 0.9)
+    assert "body_mass" not in events
+    assert {"wear", "gust", "wet_strip"} < set(events)
+
+
+def test_the_recording_example_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    example = re.findall("```python\n(.*?)```", TEXT, re.S)[-1]
+    names: dict = {}
+    exec("import gymnasium as gym, wlr_gym\n" + example, names)
+    assert names["again"]["pos_leg_lf"].tolist() == names["run"]["pos_leg_lf"].tolist()
+    assert (tmp_path / "runs" / "run_01.simulation.yaml").is_file()

@@ -1,0 +1,232 @@
+"""What tasks ask for, against closed forms: paths, leg sweeps, climbing; and what counts as a success."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.envs.tasks import load_task
+from wlr_gym.envs.tasks.signals import Signals
+from wlr_gym.envs.tasks.success import succeeded
+from wlr_gym.envs.tasks.terms import MEASURES, REWARDS, references
+from wlr_gym.envs.tasks.terms.geometry import Motion, true_motion
+from wlr_gym.robot import load_robot
+from wlr_gym.studies.paper.experiments import LEG_SPEED, TESTS
+
+POSTURE_COMMANDS = ("front_leg_first", "front_leg_second", "rear_leg_first", "rear_leg_second")
+LINE, CURVE, CIRCLE = 0.5, 1.5, 2.5
+
+
+def signals(**values: Any) -> Signals:
+    return Signals(lambda name: values[name.removeprefix("command.").removeprefix("robot.").replace(".", "_")])
+
+
+def error(shape, x, y, yaw: Any = 0.0, *, bend=1.0, wavelength=1.5, offset=0.0, turn=0.0) -> references.PathError:
+    given = {"path_shape": shape, "path_curvature": bend, "path_wavelength": wavelength}
+    motion = Motion(np.asarray(x), np.asarray(y), np.asarray(yaw))
+    return references.path_error(signals(**given, path_offset=offset, path_heading=turn), motion)
+
+
+def test_line():
+    found = error(LINE, [1.0, 1.0], [0.02, -0.03], [0.1, -0.1])
+    assert found.lateral == pytest.approx([0.02, -0.03])
+    assert found.heading == pytest.approx([0.1, -0.1])
+    assert np.all(np.array(found.curvature) == 0.0)
+
+
+def test_line_that_begins_aside_and_turned():
+    distance, turn = 0.7, 0.2
+    x, y = distance * math.cos(turn) - 0.01 * math.sin(turn), 0.05 + distance * math.sin(turn) + 0.01 * math.cos(turn)
+    found = error(LINE, x, y, turn + 0.03, offset=0.05, turn=turn)
+    assert found.lateral == pytest.approx(0.01)
+    assert found.heading == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize("bend", [1.6, -1.6, 0.2, -0.01])
+def test_circle(bend):
+    """On the circle nothing is wrong; inside a left turn is left of the path."""
+    angle = np.linspace(0.05, 0.8, 9)
+    for inside in (0.0, 0.03, -0.04):
+        radius = 1.0 / abs(bend) - inside
+        x, y = radius * np.sin(angle), np.sign(bend) * (1.0 / abs(bend) - radius * np.cos(angle))
+        found = error(CIRCLE, x, y, np.sign(bend) * angle, bend=bend)
+        assert found.lateral == pytest.approx(np.sign(bend) * inside, abs=1e-12)
+        assert found.heading == pytest.approx(0.0, abs=1e-12)
+        assert np.all(found.curvature[2] == bend)
+
+
+@pytest.mark.parametrize(("bend", "wavelength"), [(1.6, 1.0), (1.6, 2.0), (-1.6, 1.3), (0.1, 1.0)])
+def test_s_curve(bend, wavelength):
+    """Points put at a known distance to the side of a point of the curve are found there."""
+    k = 2 * math.pi / wavelength
+    amplitude = bend / k**2
+    s = np.linspace(0.0, 2.5, 60)
+    slope = amplitude * k * np.sin(k * s)
+    stretch = np.sqrt(1 + slope**2)
+    for side in (0.0, 0.02, -0.05):
+        x, y = s - side * slope / stretch, amplitude * (1 - np.cos(k * s)) + side / stretch
+        found = error(CURVE, x, y, np.arctan(slope) + 0.1, bend=bend, wavelength=wavelength)
+        assert found.lateral == pytest.approx(side, abs=2e-6)
+        assert found.heading == pytest.approx(0.1, abs=1e-4)
+        assert found.curvature[0] == pytest.approx(bend * np.cos(k * s) / stretch**3, abs=1e-3)
+    ahead = error(CURVE, 0.0, 0.0, bend=bend, wavelength=wavelength).curvature[1]
+    assert ahead == pytest.approx(bend * math.cos(k * 0.1), rel=0.05)
+
+
+def test_paths_can_be_driven():
+    """Wheels that turn the robot as sharply as any path asks stay below their no-load speed (with the slip skids need)."""
+    robot = load_robot()
+    terms = load_task("path", robot).config.commands.terms
+    speed, bend = terms["linear_velocity_x"][1], terms["path_curvature"][1]
+    hip = robot.hip_position
+    rim = speed + speed * bend * (hip.y + hip.x**2 / hip.y)
+    assert rim / robot.wheel.radius < 0.9 * robot.servo.wheel.no_load_speed
+
+
+def sweep(time, first, second, rate):
+    given = {
+        "front_leg_first": first[0],
+        "front_leg_second": second[0],
+        "rear_leg_first": first[1],
+        "rear_leg_second": second[1],
+    }
+    home = load_robot().home.leg_angle
+    found = references.leg_references(signals(**given, leg_rate=rate, time=time, home_leg_angle=home))
+    return np.array([angle for angle, _ in found]), np.array([rate for _, rate in found])
+
+
+@pytest.mark.parametrize("name", TESTS)
+def test_the_papers_tests_are_among_the_sweeps(name):
+    test = TESTS[name]
+    task = load_task("posture", load_robot())
+    terms = task.config.commands.terms
+    for limits in (terms["front_leg_first"], terms["rear_leg_second"]):
+        assert limits == pytest.approx((math.radians(30), math.radians(150)), abs=1e-4)
+    assert terms["leg_rate"][0] < LEG_SPEED < terms["leg_rate"][1]
+    first, second = np.repeat(test.start, 2), np.repeat(test.end, 2)
+    begins = references.SWEEP_BEGINS
+    assert sweep(begins, test.start, test.end, LEG_SPEED)[0] == pytest.approx(first)
+    angle, rate = sweep(begins + 1.0, test.start, test.end, LEG_SPEED)
+    assert angle == pytest.approx(first + np.sign(second - first) * LEG_SPEED)
+    assert rate == pytest.approx(np.sign(second - first) * LEG_SPEED)
+    angle, rate = sweep(task.config.episode_length, test.start, test.end, LEG_SPEED)
+    assert angle == pytest.approx(second)
+    assert rate == pytest.approx(0.0)
+
+
+def test_leg_rates_are_the_slopes_of_the_leg_angles():
+    step = 1e-6
+    for time in (0.5, 2.9, 3.5, 4.5, 6.0, 15.0):
+        angle, rate = sweep(time, (0.6, 2.5), (2.4, 1.0), 0.4)
+        later, _ = sweep(time + step, (0.6, 2.5), (2.4, 1.0), 0.4)
+        assert (later - angle) / step == pytest.approx(rate, abs=1e-5)
+
+
+def test_climbing_ends_when_its_time_is_over():
+    for time, speed in ((0.0, 0.0), (0.3, 0.03), (0.5, 0.05), (7.0, 0.05), (7.2, 0.03), (7.5, 0.0), (9.0, 0.0)):
+        assert references.climb_speed(signals(climb_speed=0.05, climb_time=7.0, time=time)) == pytest.approx(speed, abs=1e-12)
+
+
+def test_motion_is_seen_from_the_start():
+    """A robot that stood at (2, 1) turned by 2 rad and drove 0.5 m ahead and 0.1 m to its left."""
+    yaw0, yaw = 2.0, 2.0 + 1.5
+    values = {"start[x]": 2.0, "start[y]": 1.0, "start[yaw]": yaw0}
+    values["truth.position[x]"] = 2.0 + 0.5 * math.cos(yaw0) - 0.1 * math.sin(yaw0)
+    values["truth.position[y]"] = 1.0 + 0.5 * math.sin(yaw0) + 0.1 * math.cos(yaw0)
+    values |= {"truth.quaternion[w]": math.cos(yaw / 2), "truth.quaternion[z]": math.sin(yaw / 2)}
+    motion = true_motion(Signals(lambda name: values.get(name, 0.0)))
+    assert (motion.x, motion.y, motion.yaw) == pytest.approx((0.5, 0.1, 1.5))
+
+
+def test_success_is_staying_within_the_limits_to_the_end():
+    config = load_task(
+        "velocity", load_robot(), {"success": {"velocity_error": {"rms": 0.1}, "yaw_rate_error": {"rms": None, "max": 1.0}}}
+    ).config
+    assert list(config.measures)[:2] == ["velocity_error", "yaw_rate_error"]
+    measures = np.zeros((4, 5, len(config.measures)))
+    active = np.ones((4, 5), bool)
+    measures[0, 1, 0] = 0.3  # rms 0.15
+    measures[0, 2, 1] = -1.1
+    measures[:, 3, 0] = -0.09
+    measures[3, 4, :] = 9.0
+    active[3, 4] = False  # over by then
+    fell = np.zeros(5, bool)
+    assert succeeded(config, measures, active, fell).tolist() == [True, False, False, True, True]
+    fell[0] = True
+    assert not succeeded(config, measures, active, fell)[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "expected"),
+    [
+        ("velocity", {"measures": {"path_lateral_error": {}}}, "needs the command 'path_curvature'"),
+        ("velocity", {"observations": {"leg_reference": {}}}, "needs the command 'front_leg_first'"),
+        ("velocity", {"rewards": {"track_climb_speed": {"weight": 1.0}}}, "needs the command 'climb_speed'"),
+        ("path", {"success": {"path_lateral_eror": {"rms": 0.1}}}, "did you mean 'path_lateral_error'"),
+        ("path", {"success": {"path_lateral_error": {"rms": 0.0}}}, "path_lateral_error.rms"),
+        ("velocity", {"measures": {"velocity_eror": {}}}, "did you mean 'velocity_error'"),
+        ("velocity", {"commands": {"ramp": {"yaw": 1.0}}}, "did you mean 'yaw_rate'"),
+        ("path", {"commands": {"terms": {"path_wavelength": [0.0, 1.0]}}}, r"path_wavelength = \[0.0, 1.0\]: expected 0.1 m"),
+        ("velocity", {"curriculum": {"commands": {"start": 0.0, "steps": 1}}}, "curriculum.commands.start"),
+        ("velocity", {"observations": {"estimated_slip": {}}}, "did you mean 'estimated_slip"),
+    ],
+)
+def test_terms_that_cannot_work_are_refused(name, changes, expected):
+    with pytest.raises(InputError, match=expected):
+        load_task(name, load_robot(), changes)
+
+
+def still(given: dict[str, float]) -> Signals:
+    """Signals of a robot that stands where it started, legs at home, but for those given."""
+    home = load_robot().home.leg_angle
+    legs = ("truth.joint_position[leg_{}]", ("lf", "rf", "lr", "rr")), ("command.{}", POSTURE_COMMANDS)
+    table = {pattern.format(name): home for pattern, names in legs for name in names}
+    table |= {"truth.quaternion[w]": 1.0, "robot.home.leg_angle": home, "time": 3.5, **given}
+    return Signals(lambda signal: table.get(signal, 0.0))
+
+
+def cost(name: str, given: dict[str, float], **parameters: float) -> float:
+    return float(REWARDS[name].function(still(given), **parameters))
+
+
+def test_measures_by_hand():
+    """What is too much is positive: speed, turning and aside to the left."""
+
+    def measure(name: str, given: dict[str, float]) -> float:
+        return float(MEASURES[name].function(still(given)))
+
+    home, ahead = load_robot().home.leg_angle, {"truth.linear_velocity_in_body[x]": 0.07}
+    assert measure("velocity_error", ahead | {"command.linear_velocity_x": 0.1}) == pytest.approx(-0.03)
+    assert measure("climb_speed_error", ahead) == pytest.approx(0.07)
+    turning = {"truth.angular_velocity_in_body[z]": 0.2, "command.yaw_rate": -0.1}
+    assert measure("yaw_rate_error", turning) == pytest.approx(0.3)
+    aside = {"truth.position[y]": 0.02, "truth.quaternion[w]": math.cos(0.05), "truth.quaternion[z]": math.sin(0.05)}
+    assert measure("lateral_error", aside) == pytest.approx(0.02)
+    assert measure("heading_error", aside) == pytest.approx(0.1)
+    on_line = aside | {"command.path_wavelength": 1.0, "command.path_offset": 0.05}
+    assert measure("path_lateral_error", on_line) == pytest.approx(-0.03)
+    assert measure("path_heading_error", on_line) == pytest.approx(0.1)
+    bent = {"truth.joint_position[leg_lf]": home + 0.2, "truth.joint_position[leg_rr]": home - 0.2}
+    assert measure("leg_error", bent) == pytest.approx(0.2 / math.sqrt(2.0))
+    slip = {"truth.slip_displacement[wheel_lf,x]": 0.003, "truth.slip_displacement[wheel_lf,y]": -0.004}
+    assert measure("slip_speed", slip | {"task.control_period": 0.02}) == pytest.approx(0.005 / 0.02 / 4)
+
+
+def test_costs_by_hand():
+    ahead, turning = "truth.linear_velocity_in_body[x]", "truth.angular_velocity_in_body[z]"
+    assert cost("velocity_error", {ahead: -0.04, turning: 0.03}) == pytest.approx(2.0 + 0.5)
+    assert cost("velocity_error", {"command.linear_velocity_x": 0.1, ahead: 0.1}) == 0.0
+    aside = {"truth.position[y]": -0.02}
+    assert cost("course_error", aside, lateral=0.01) == pytest.approx(2.0 / 1.25)
+    assert cost("course_error", {"truth.position[y]": 1e6}) == pytest.approx(8.0, rel=1e-3)
+    assert cost("path_error", aside | {"command.path_wavelength": 1.0}, lateral=0.02) == pytest.approx(1.0 / 1.125)
+    bent = {"truth.joint_position[leg_lf]": load_robot().home.leg_angle + 0.2}
+    assert cost("leg_error", bent, scale=0.1) == pytest.approx(0.5)
+    assert cost("climb_speed_error", {ahead: -0.03}, scale=0.015) == pytest.approx(2.0)
+    climbing = {"command.climb_speed": 0.05, "command.climb_time": 9.0, ahead: 0.05}
+    assert cost("track_climb_speed", climbing) == pytest.approx(1.0)
+    assert cost("track_climb_speed", climbing | {ahead: 0.02}, width=0.03) == pytest.approx(math.exp(-1.0))

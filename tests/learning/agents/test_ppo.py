@@ -1,0 +1,246 @@
+"""PPO training: reproducible, survives interruptions, stops at numbers that are not finite."""
+
+import importlib
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import yaml
+from ppo_runs import ENVIRONMENT, SETTINGS, assert_same_weights, curve, train
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.cli import main
+from wlr_gym.learning.evaluation import make_core
+from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
+
+torch = pytest.importorskip("torch")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Folder of one uninterrupted run."""
+    folder = tmp_path_factory.mktemp("ppo") / "run"
+    train(folder)
+    return folder
+
+
+def test_run_folder_is_complete(run):
+    assert yaml.safe_load((run / "config.yaml").read_text())["settings"]["num_envs"] == 8
+    origin = yaml.safe_load((run / "provenance.yaml").read_text())
+    assert origin["seed"] == 0
+    assert {"python", "numpy", "torch", "stable-baselines3"} <= origin["versions"].keys()
+    assert list((run / "tensorboard").glob("events.*"))
+    assert [row["steps"] for row in curve(run)] == [64.0 * k for k in range(1, 7)]
+    assert any(row["episodes"] > 0 for row in curve(run))
+    contract = read_contract(run / "policy")
+    assert contract["training"] == {"environment": ENVIRONMENT, "steps": 384, "updates": 12, "seed": 0}
+
+
+def test_same_seed_gives_the_same_run_bit_for_bit(run, tmp_path):
+    again = train(tmp_path / "again")
+    assert curve(tmp_path / "again") == curve(run)
+    assert_same_weights(again, run / "policy")
+
+
+def test_another_seed_gives_another_run(run, tmp_path):
+    train(tmp_path / "other", seed=1)
+    assert curve(tmp_path / "other") != curve(run)
+
+
+def test_training_changes_the_policy(run):
+    core = make_core(ENVIRONMENT, 4, {})
+    readings = np.random.default_rng(0).normal(0, 1, (4, core.observation.shape[1])).astype(np.float32)
+    trained = load_policy(run, core.contract()).act(readings)
+    untrained = load_agent("ppo").make_policy(core.contract(), SETTINGS).act(readings)
+    core.close()
+    assert not np.array_equal(trained, untrained)
+
+
+def test_plain_stable_baselines_loads_the_model(run):
+    code = "import sys, warnings; warnings.simplefilter('error'); from stable_baselines3 import PPO; PPO.load(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", code, str(run / "policy" / "model.zip")], check=True)
+
+
+def test_killed_run_resumes_exactly(run, tmp_path):
+    """kill -9 at an arbitrary moment after the first checkpoint; the resumed run ends as the uninterrupted one."""
+    folder = tmp_path / "killed"
+    changes = [f"{key}={value}" for key, value in SETTINGS.items() if key != "environment"]
+    changes += ["environment.episode_length=0.2", "final_learning_rate=0.001", "total_steps=100000000"]
+    blank = tmp_path / "blank.yaml"
+    blank.write_text("{}\n")
+    command = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "train", ENVIRONMENT]
+    options = ["--config", str(blank), "--out", str(folder), "--no-progress", "--set", *changes]
+    process = subprocess.Popen([*command, *options], stdout=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 120
+        while not list(folder.glob("checkpoints/step_*")) and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+    finally:
+        process.kill()
+        process.wait()
+    newest = max(folder.glob("checkpoints/step_*"))
+    steps = read_contract(newest)["training"]["steps"]
+    total = steps + 192
+    train(folder, resume=True, total_steps=total, final_learning_rate=1e-3)
+    train(tmp_path / "whole", total_steps=total, final_learning_rate=1e-3)
+    shared = [row for row in curve(folder) if row["steps"] > steps]
+    assert shared == [row for row in curve(tmp_path / "whole") if row["steps"] > steps]
+    assert [row["steps"] for row in curve(folder)] == [64.0 * k for k in range(1, total // 64 + 1)]
+
+
+def test_resuming_from_any_checkpoint_ends_the_same(run, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(run, folder)
+    for late in sorted(folder.glob("checkpoints/step_*"))[1:]:
+        shutil.rmtree(late)
+    (folder / "checkpoints" / ".step_000000000256.part").mkdir()  # what a killed write leaves
+    resumed = train(folder, resume=True)
+    assert curve(folder) == curve(run)
+    assert_same_weights(resumed, run / "policy")
+
+
+def test_every_stretch_between_checkpoints_has_new_episodes(tmp_path, monkeypatch):
+    from wlr_gym.envs import Sb3VecEnv
+
+    seeds = []
+    seed = Sb3VecEnv.seed
+    monkeypatch.setattr(Sb3VecEnv, "seed", lambda env, value: (seeds.append(value), seed(env, value))[1])
+    train(tmp_path / "run")
+    assert len(set(seeds)) == len(seeds) >= 4
+
+
+def test_the_environment_is_told_how_far_training_is(run, tmp_path, monkeypatch):
+    """Before the first episodes and every update, after a resume too: curricula follow it."""
+    from wlr_gym.envs import Sb3VecEnv
+
+    told = []
+    monkeypatch.setattr(Sb3VecEnv, "set_progress", lambda env, steps: told.append(steps))
+    train(tmp_path / "run")
+    assert told == [0, 0, 64, 128, 128, 192, 256, 256, 320, 384]
+    shutil.rmtree(tmp_path / "run" / "checkpoints" / "step_000000000384")
+    told.clear()
+    train(tmp_path / "run", resume=True)
+    assert told == [256, 256, 320, 384]
+
+
+def test_a_run_with_a_curriculum_resumes_exactly(tmp_path):
+    curriculum = {"commands": {"start": 0.1, "steps": 384}, "randomization": {"start": 0.1, "steps": 384}}
+    settings = {"environment": SETTINGS["environment"] | {"task": {"curriculum": curriculum}}}
+    folder = tmp_path / "run"
+    whole = train(folder, **settings)
+    shutil.copytree(folder, tmp_path / "copy")
+    for late in sorted((tmp_path / "copy").glob("checkpoints/step_*"))[1:]:
+        shutil.rmtree(late)
+    resumed = train(tmp_path / "copy", resume=True, **settings)
+    assert curve(tmp_path / "copy") == curve(folder)
+    assert_same_weights(resumed, whole)
+
+
+def test_ctrl_c_saves_a_checkpoint_and_says_how_to_go_on(tmp_path, monkeypatch):
+    folder, handler = tmp_path / "interrupted", signal.getsignal(signal.SIGINT)
+    load_agent("ppo")
+    training = importlib.import_module("wlr_gym.learning.ppo.training")
+    update = training.update
+
+    def interrupting(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        return update(*arguments)
+
+    monkeypatch.setattr(training, "update", interrupting)
+    with pytest.raises(KeyboardInterrupt, match=r"wlr train --resume"):
+        train(folder)
+    (saved,) = folder.glob("checkpoints/step_*")
+    assert read_contract(saved)["training"]["steps"] == 64
+    monkeypatch.setattr(training, "update", update)
+    train(folder, resume=True)
+    assert read_contract(folder / "policy")["training"]["steps"] == 384
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_weights_that_are_not_finite_stop_the_run_with_a_dump(tmp_path):
+    with pytest.raises(RuntimeError, match=r"failure\.npz"):
+        train(tmp_path / "nan", learning_rate=1e30, final_learning_rate=1e30)
+    with np.load(tmp_path / "nan" / "failure.npz") as dump:
+        assert dump["new_obs"].shape[0] == 8
+        assert "parameters" in dump
+
+
+def test_time_limit_ends_in_good_order(tmp_path):
+    request = Training(ENVIRONMENT, tmp_path / "short", SETTINGS | {"total_steps": 10**9}, max_seconds=0.0, progress=False)
+    policy = load_agent("ppo").train(request)
+    assert read_contract(policy)["training"]["steps"] == 0
+    assert [place.name for place in (tmp_path / "short" / "checkpoints").iterdir()] == ["step_000000000000"]  # to go on from
+
+
+def test_broken_model_file_is_refused(run, tmp_path):
+    shutil.copytree(run / "policy", tmp_path / "policy")
+    (tmp_path / "policy" / "model.zip").write_bytes(b"not a zip")
+    with pytest.raises(InputError, match=r"model\.zip: not a readable model"):
+        load_policy(tmp_path / "policy", read_contract(tmp_path / "policy")["environment"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "WLR-Velocity-v1"], "did you mean 'WLR-Velocity-v0'"),
+        (["train", "--agent", "pop"], "unknown agent"),
+        (["train", "--agent", "do_nothing"], "has no 'train'; agents that have: pid, ppo"),
+        (["train", "--set", "epochs=0"], "epochs = 0"),
+        (["train", "--set", "environment.precison=float32"], "did you mean 'precision'"),
+        (["train", "--resume", "/nowhere"], "not a run folder"),
+        (["train", "--resume", ".", "--seed", "1"], "leave out"),
+    ],
+)
+def test_bad_input_exits_with_2(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())  # nothing is left that would be in the way of the next try
+
+
+def test_runs_of_different_settings_have_different_folders(tmp_path, monkeypatch):
+    from wlr_gym.cli import train as command
+
+    monkeypatch.chdir(tmp_path)
+    for config, folder in ((None, "WLR-Velocity-v0_ppo_0"), ("ppo_blind", "WLR-Velocity-v0_ppo_blind_0")):
+        assert command._new(command.Options(config=config))[1].folder.name == folder
+
+
+def test_a_full_folder_is_not_overwritten(run, capsys):
+    assert main(["train", ENVIRONMENT, "--out", str(run)]) == 2
+    assert "not empty" in capsys.readouterr().err
+
+
+def test_a_start_from_a_controller_drives_like_it_and_is_reproducible(tmp_path):
+    """Before any update of PPO the actor does nearly what its teacher does; resuming does not teach again."""
+    changes = {"teacher": "pid", "total_steps": 64, "checkpoint_every": 64, "num_envs": 64}
+    changes["environment"] = {"episode_length": 4.0, "randomization": "none"}
+    first = load_agent("ppo").train(Training(ENVIRONMENT, tmp_path / "a", SETTINGS | changes, max_seconds=0.0, progress=False))
+    again = load_agent("ppo").train(Training(ENVIRONMENT, tmp_path / "b", SETTINGS | changes, max_seconds=0.0, progress=False))
+    assert_same_weights(first, again)
+    core = make_core(ENVIRONMENT, 8, changes["environment"])
+    taught, teacher = load_policy(first, core.contract()), make_policy("pid", core.contract())
+    rng = np.random.default_rng(1)
+    for row in range(8):
+        core.seed(row, 100 + row)
+    core.begin_episodes(core.everyone)
+    actions = []
+    for _ in range(100):
+        actions.append((teacher.act(core.observation), taught.act(core.observation)))
+        core.step(np.clip(actions[-1][0] + 0.03 * rng.standard_normal((8, 8)), -1, 1), core.everyone)
+    core.close()
+    wanted, done = np.array(actions).swapaxes(0, 1)
+    assert np.abs(done - wanted)[..., 4:].mean() < 0.3 * np.abs(wanted[..., 4:]).mean()
+
+
+def test_the_learning_rate_falls_as_it_is_told_to():
+    training = importlib.import_module("wlr_gym.learning.ppo.training")
+    config = importlib.import_module("wlr_gym.learning.ppo.config").PpoConfig(learning_rate=4e-3, final_learning_rate=1e-3)
+    linearly = training.learning_rate(config)
+    exponentially = training.learning_rate(config.model_copy(update={"learning_rate_falls": "exponentially"}))
+    np.testing.assert_allclose([linearly(share) for share in (1.0, 0.5, 0.0)], [4e-3, 2.5e-3, 1e-3])
+    np.testing.assert_allclose([exponentially(share) for share in (1.0, 0.5, 0.0)], [4e-3, 2e-3, 1e-3])

@@ -1,0 +1,116 @@
+"""What an episode is scored by, against hand-made episodes whose scores are known."""
+
+import numpy as np
+import pytest
+from evaluation_examples import EPISODES, MEASURES, PERIOD, TICKS, measured, rollout
+
+from wlr_gym.learning.evaluation import Measure, metrics_of, score, summarise
+from wlr_gym.learning.evaluation.metrics import spectrum
+
+
+def test_perfect_driving():
+    card = score(rollout())
+    assert card["tracking_error"].mean == card["velocity_error"].mean == 0.0
+    assert card["success"].mean == 100.0
+    nothing = ("falls", "slip_speed", "excess_slip", "slip_per_metre", "saturation", "action_saturation", "action_jitter")
+    assert [card[key].mean for key in nothing] == [0.0] * len(nothing)
+    assert card["reward"].mean == pytest.approx(0.5 * TICKS)
+    assert card["power"].mean == pytest.approx(1.0)
+    travelled = 0.1 * PERIOD * (TICKS - 1)
+    assert card["energy_per_metre"].mean == pytest.approx(1.0 * PERIOD * TICKS / travelled)
+    assert list(card) != []
+    assert {metric.key for metric in metrics_of(MEASURES)} == set(card)
+
+
+def test_tracking_error_is_what_is_reached_of_every_limit():
+    assert score(rollout(measured=measured(0.02, 0.06)))["tracking_error"].mean == pytest.approx(1.0)
+    assert score(rollout(measured=measured(-0.01, 0.0)))["tracking_error"].mean == pytest.approx(0.5 / np.sqrt(2))
+
+
+def test_a_limit_on_the_largest_error():
+    errors = measured(0.0)
+    errors[7, :, 0] = -0.3
+    limited = rollout(measured=errors, measures=(Measure("lateral_error", "m", "aside", max=0.1), MEASURES[1]))
+    card = score(limited)
+    assert card["lateral_error_max"].mean == pytest.approx(0.3)
+    assert card["lateral_error"].mean == pytest.approx(0.3 / np.sqrt(TICKS))
+    assert card["tracking_error"].mean == pytest.approx(3.0 / np.sqrt(2))
+    assert "max of lateral_error 0.1 m, rms of yaw_rate_error" in metrics_of(limited.measures)[0].doc
+
+
+def test_a_task_without_limits_has_no_tracking_error():
+    card = score(rollout(measures=(Measure("a", "m", ""), Measure("b", "m", ""))))
+    assert np.isnan(card["tracking_error"].mean)
+
+
+def test_slip_is_the_length_of_its_vector_averaged_over_wheels():
+    slip = np.zeros((TICKS, EPISODES, 4, 2))
+    slip[:, :, 0] = (0.03, 0.04)
+    card = score(rollout(slip_velocity=slip))
+    assert card["slip_speed"].mean == pytest.approx(0.05 / 4)
+    assert card["slip_per_metre"].mean == pytest.approx(0.05 / 4 / 0.1, rel=0.03)
+
+
+def test_ticks_after_the_end_do_not_count():
+    active = np.ones((TICKS, EPISODES), bool)
+    active[10:, 0] = False
+    wild = np.where(active, 0.0, np.nan)
+    errors = measured(0.0) + wild[:, :, None]
+    fallen = np.array([True, False, False, False])
+    card = score(rollout(active=active, measured=errors, energy=PERIOD + wild, fell=fallen, succeeded=~fallen))
+    assert card["velocity_error"].mean == 0.0
+    assert card["tracking_error"].mean == pytest.approx(10.0 / 4)  # one fall of four
+    assert card["power"].mean == pytest.approx(1.0)
+    assert card["falls"].mean == 25.0
+    assert card["success"].mean == 75.0
+
+
+def test_figures_per_metre_need_metres():
+    assert np.isnan(score(rollout(position=np.zeros((TICKS, EPISODES, 2))))["slip_per_metre"].mean)
+
+
+def wave(frequency, ticks=400, phase=0.0):
+    """An action of amplitude 0.5 in one of eight joints; phase in half turns."""
+    action = np.zeros((ticks, EPISODES, 8))
+    action[:, :, 3] = 0.5 * np.sin(np.pi * (2 * frequency * PERIOD * np.arange(ticks) + phase))[:, None]
+    return rollout(ticks, action=action)
+
+
+def test_the_spectrum_holds_the_power_of_the_action_at_its_frequency():
+    frequency, power = spectrum(wave(10.0))
+    assert power.shape == (EPISODES, frequency.size)
+    assert frequency[np.argmax(power[0])] == pytest.approx(10.0, abs=frequency[1])
+    assert power[0].sum() * frequency[1] == pytest.approx(0.5**2 / 2 / 8, rel=0.02)
+
+
+def test_an_action_that_alternates_every_tick_counts_once():
+    assert score(wave(25.0, phase=0.5))["action_jitter"].mean == pytest.approx(0.5 / np.sqrt(8), rel=0.01)
+
+
+def test_jitter_is_what_is_faster_than_5_hz():
+    fast, slow = score(wave(10.0))["action_jitter"], score(wave(2.0))["action_jitter"]
+    assert fast.mean == pytest.approx(0.5 / np.sqrt(2 * 8), rel=0.01)
+    assert slow.mean < 0.01 * fast.mean
+
+
+def test_an_episode_without_a_whole_window_has_no_spectrum():
+    both = wave(10.0)
+    active = both.active.copy()
+    active[100:, 1] = False
+    short = rollout(400, action=both.action, active=active)
+    _, power = spectrum(short)
+    assert np.isnan(power[1]).all()
+    assert np.isfinite(power[[0, 2, 3]]).all()
+    assert score(short)["action_jitter"].mean == pytest.approx(score(both)["action_jitter"].mean)
+
+
+def test_an_action_at_its_limit_counts():
+    action = np.zeros((TICKS, EPISODES, 8))
+    action[:, :, 4:6] = (1.0, -1.0)
+    assert score(rollout(action=action))["action_saturation"].mean == pytest.approx(25.0)
+
+
+def test_blocks_are_stacked():
+    kept = summarise([rollout(), rollout(measured=measured(0.02))])
+    assert kept.pairs["velocity_error"].shape == (2, EPISODES, 2)
+    np.testing.assert_allclose(kept.pairs["velocity_error"][:, :, 0].mean(axis=1), [0.0, 0.02])

@@ -1,0 +1,23 @@
+"""Fixtures of the tests of vision. Without OpenCV (the extra ``vision``) they are left out."""
+
+import pytest
+
+pytest.importorskip("cv2")
+
+from vision_studio import Studio
+
+from wlr_gym.perception.vision import Camera
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread():
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+@pytest.fixture(scope="session")
+def studio() -> Studio:
+    """Overhead at 2 m, with some lens distortion."""
+    lens = (-0.1, 0.02, 0.001, -0.001, 0.0)
+    return Studio(Camera(width=1280, height=720, focal=(800.0, 805.0), centre=(630.0, 365.0), distortion=lens))

@@ -1,0 +1,204 @@
+"""From poses to clocks, slip and run columns: simulated drives, camera samples made from the truth, no pictures."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.data import Run, read_run
+from wlr_gym.perception.vision import Sample, align, measure_slip
+from wlr_gym.perception.vision.analyse import Analysis, _findings, camera_columns, save
+from wlr_gym.perception.vision.smooth import smooth
+from wlr_gym.perception.vision.track import LOST, OK, angles
+from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import Parameters
+from wlr_gym.studies.bench.vision import true_slip
+from wlr_gym.studies.bench.vision_drives import paper_test, pose_at, skid_turn
+
+STD = np.array([5e-5, 5e-5, 1.4e-4, 5e-5, 7e-4, 7e-4])  # of a pose from 2 m above
+OFFSET = 0.137
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot()
+
+
+@pytest.fixture(scope="module")
+def turn(robot):
+    return skid_turn(robot)
+
+
+def samples_of(drive, offset=OFFSET, seed=0, gap=()):
+    rng, result = np.random.default_rng(seed), []
+    for index in range(int((drive.time[-1] - 0.1) * 30)):
+        time = 0.011 + index / 30
+        pose = pose_at(drive, time)
+        values = np.concatenate([pose.position, angles(pose.rotation)]) + STD * rng.standard_normal(6)
+        seen = not any(start < time < stop for start, stop in gap)
+        values, covariance = (values, np.diag(STD**2)) if seen else (np.full(6, np.nan), np.full((6, 6), np.nan))
+        result.append(Sample(index, time - offset, OK if seen else LOST, values, covariance, 4 * seen, 0.02, np.zeros((4, 2))))
+    return result
+
+
+def aligned(drive, samples, around=0.0):
+    time, poses = np.array([s.time for s in samples]), np.stack([s.pose for s in samples])
+    return align(time, poses, drive.run, drive.robot, Parameters.nominal(drive.robot), around)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_clocks_are_aligned_within_2_ms(turn, seed):
+    found = aligned(turn, samples_of(turn, seed=seed))
+    assert found.offset == pytest.approx(OFFSET, abs=0.002)
+    assert found.std < 0.002
+    assert "yaw" in found.parts
+
+
+@pytest.mark.parametrize("offset", [1.2, 2.0, 3.0, -2.5])
+def test_clocks_far_apart_are_refused_and_found_around_a_guess(turn, offset):
+    samples = samples_of(turn, offset=offset)
+    with pytest.raises(InputError, match="--around"):
+        aligned(turn, samples)
+    assert aligned(turn, samples, around=round(offset)).offset == pytest.approx(offset, abs=0.003)
+
+
+def test_slip_is_within_a_millimetre_and_its_sigma_is_honest(turn):
+    """Six draws of the frames' noise, clocks aligned anew each time, all errors over their own sigma.
+
+    Lateral errors are alike for all wheels, so six independent ones are left: if sigma is right, their rms is below 0.25 or
+    above 1.93 once in 500 times (chi square).
+    """
+    assert np.abs(turn.slip[-1]).max() > 0.1  # there is slip to be found
+    normalised = []
+    for seed in range(6):
+        samples = samples_of(turn, seed=seed)
+        clocks = aligned(turn, samples)
+        found = measure_slip(samples, clocks.offset, turn.run, turn.robot, Parameters.nominal(turn.robot), clocks.std)
+        error = found.slip - true_slip(turn, found.time)
+        assert np.abs(error).max() < 1e-3
+        normalised.append(error[-1] / found.slip_std[-1])
+    spread = np.sqrt(np.mean(np.square(normalised), axis=(0, 1)))
+    assert np.all((spread > 0.25) & (spread < 1.93))
+
+
+def test_sigma_of_slip_grows_with_what_is_known_less(turn):
+    """Clocks count while it moves, tilts of the body and the layout of its markers always."""
+    samples, nominal = samples_of(turn), Parameters.nominal(turn.robot)
+    tilted = [replace(s, covariance=s.covariance * np.diag([1, 1, 1, 1, 9, 9])) for s in samples]
+    plain = measure_slip(samples, OFFSET, turn.run, turn.robot, nominal)
+    late = measure_slip(samples, OFFSET, turn.run, turn.robot, nominal, 0.004)
+    rough = measure_slip(tilted, OFFSET, turn.run, turn.robot, nominal, 0.0, 0.001)
+    fast, end = np.abs(plain.rate[:, 0]) > 0.1, -1
+    assert np.median(late.slip_std[fast, :, 0]) > 2 * np.median(plain.slip_std[fast, :, 0])
+    assert np.all(late.slip_std[end] < 1.6 * plain.slip_std[end])
+    assert np.all(rough.slip_std[end] > 1.2 * plain.slip_std[end])
+    scaled = [replace(s, pose=s.pose * [1.001, 1.001, 1, 1, 1, 1]) for s in samples]
+    turned = [replace(s, pose=s.pose + np.array([0, 0, 0, 0.001, 0, 0])) for s in samples]
+    errors = [measure_slip(s, OFFSET, turn.run, turn.robot, nominal).slip[end] - plain.slip[end] for s in (scaled, turned)]
+    assert np.linalg.norm(errors, axis=0) == pytest.approx(np.repeat(rough.slip_layout_std[end][:, None], 2, axis=1), rel=0.15)
+    assert not plain.slip_layout_std.any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 2])
+def test_paper_tests_from_poses(number, robot):
+    drive = paper_test(number, robot)
+    samples = samples_of(drive)
+    found = aligned(drive, samples)
+    assert found.offset == pytest.approx(OFFSET, abs=0.004)
+    slip = measure_slip(samples, found.offset, drive.run, robot, Parameters.nominal(robot))
+    assert np.abs(slip.slip - true_slip(drive, slip.time)).max() < 1e-3
+
+
+def test_a_robot_that_stands_still_cannot_be_aligned(turn):
+    still = [s for s in samples_of(turn) if s.time + OFFSET < 0.95]
+    still = still * 3
+    time = np.arange(len(still)) / 30
+    poses = np.stack([s.pose for s in still])
+    rows = turn.run.table[turn.run.table["t"] < 0.95].reset_index(drop=True)
+    table = rows.loc[np.tile(np.arange(len(rows)), 3)].reset_index(drop=True).assign(t=np.arange(3 * len(rows)) * 0.02)
+    run = Run(table, turn.run.meta, turn.run.path)
+    with pytest.raises(InputError, match="clocks cannot be aligned"):
+        align(time, poses, run, turn.robot, Parameters.nominal(turn.robot))
+
+
+def test_a_video_of_something_else_is_refused(turn):
+    late = samples_of(turn, offset=-500.0)
+    with pytest.raises(InputError, match="does the video belong"):
+        aligned(turn, late)
+    with pytest.raises(InputError, match="does it belong to this run"):
+        measure_slip(late, 0.0, turn.run, turn.robot, Parameters.nominal(turn.robot))
+
+
+def test_gaps_are_flagged(turn):
+    samples = samples_of(turn, gap=[(4.0, 4.6)])
+    found = measure_slip(samples, OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+    gap = (found.time > 4.2) & (found.time < 4.4)
+    assert not found.covered[gap].any()
+    assert found.covered[found.time < 3.8].all()
+    assert found.pose_std[gap, 0].min() > 5 * np.median(found.pose_std[:, 0])
+
+
+def test_a_wild_sample_is_left_out(turn):
+    samples = samples_of(turn)
+    bad = samples[100]
+    wild = Sample(bad.index, bad.time, OK, bad.pose + np.array([0.05, 0, 0, 0, 0, 0]), bad.covariance, 4, 0.02, bad.centres)
+    found = measure_slip([*samples[:100], wild, *samples[101:]], OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+    assert np.flatnonzero(found.outliers).tolist() == [100]
+    assert np.abs(found.slip - true_slip(turn, found.time)).max() < 1e-3
+
+
+def test_a_video_that_starts_in_mid_drive_is_told(turn):
+    samples = samples_of(turn)
+    for first, told in ((0, False), (60, True)):
+        slip = measure_slip(samples[first:], OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+        assert any("already moves" in finding for finding in _findings(samples[first:], slip, 0.0)) == told
+
+
+def test_a_video_that_is_cut_off_is_told(turn):
+    samples = samples_of(turn)[:30]
+    slip = measure_slip(samples, OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+    told = list(_findings(samples, slip, 0.0, 12))
+    assert any("announces 42 frames, of which 30 could be decoded" in finding for finding in told)
+    assert not any("announces" in finding for finding in _findings(samples, slip, 0.0))
+
+
+@pytest.mark.parametrize("origin", ["start", "floor"])
+def test_columns_are_the_pose_at_the_row(turn, origin):
+    table = camera_columns(samples_of(turn), OFFSET, turn.run, origin, np.zeros(len(samples_of(turn)), bool))
+    rows = np.flatnonzero(np.isfinite(table["cam_x"]))
+    assert len(rows) == len(samples_of(turn))
+    truth = np.array([[*pose_at(turn, t).position[:2], angles(pose_at(turn, t).rotation)[0]] for t in table["t"][rows]])
+    if origin == "start":
+        truth -= truth[0]  # it starts with heading 0
+    found = table.loc[rows, ["cam_x", "cam_y", "cam_yaw"]].to_numpy()
+    assert np.abs(found - truth).max() < 6e-4
+
+
+def test_results_are_written_and_the_run_reads_back(turn, tmp_path):
+    samples = samples_of(turn)
+    slip = measure_slip(samples, OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+    table = camera_columns(samples, OFFSET, turn.run, "start", slip.outliers)
+    run = Run(table, turn.run.meta, tmp_path / "run_01.parquet")
+    analysis = Analysis(run, tuple(samples), None, OFFSET, slip, turn.robot, "start", 0.0, 3, ())
+    names = {path.name for path in save(analysis, tmp_path)}
+    assert names == {"run_01.parquet", "slip.csv", "frames.csv", "summary.json", "pose.png", "slip.png"}
+    again = read_run(tmp_path / "run_01.parquet")
+    assert np.isfinite(again["cam_x"]).sum() == len(samples)
+    assert analysis.summary()["missing_frames"] == 3
+    assert analysis.summary()["body_lateral_slip_m"] == pytest.approx(float(slip.slip[-1, :, 1].mean()))
+
+
+def test_smoother_gives_value_rate_and_honest_deviations():
+    rng, t = np.random.default_rng(1), np.arange(0, 8, 1 / 30)
+    values = 0.1 * np.sin(1.5 * t) + 1e-3 * rng.standard_normal(len(t))
+    values[60:70] = np.nan
+    at = np.linspace(0.5, 7.5, 200)
+    found = smooth(t, values, 1e-3, at)
+    error, slope = found.value - 0.1 * np.sin(1.5 * at), found.rate - 0.15 * np.cos(1.5 * at)
+    assert np.sqrt(np.mean(error**2)) < 0.6e-3
+    assert 0.4 < np.sqrt(np.mean((error / found.value_std) ** 2)) < 2
+    assert 0.3 < np.sqrt(np.mean((slope / found.rate_std) ** 2)) < 2
+    assert math.isfinite(found.value[70])

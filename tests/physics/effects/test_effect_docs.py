@@ -1,0 +1,50 @@
+"""docs/effects.md says what the code does, and its examples work."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from wlr_gym.physics.codegen.expression import UNITS
+from wlr_gym.physics.effects import EFFECTS, load_patch
+from wlr_gym.physics.effects.document import coordinate_table, effect_table, feature_table
+
+ROOT = Path(__file__).parents[3]
+TEXT = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("name", "table"),
+    [("effects", effect_table), ("coordinates", coordinate_table), ("features", feature_table)],
+)
+def test_tables_are_those_of_the_code(name, table):
+    block = TEXT.split(f"<!-- {name}: ")[1].split(f"<!-- end of {name} -->")[0]
+    assert block.splitlines()[1:] == table()
+
+
+def test_every_table_has_whole_rows():
+    for table in (effect_table(), coordinate_table(), feature_table()):
+        assert len({line.count("|") for line in table}) == 1
+
+
+@pytest.mark.parametrize("number", range(len(re.findall("```yaml", TEXT))))
+def test_yaml_examples_load(number):
+    assert load_patch(yaml.safe_load(re.findall("```yaml\n(.*?)```", TEXT, re.S)[number])).effects
+
+
+def test_ready_patches_and_units_are_all_named():
+    assert f"`configs/effects/`: {', '.join(f'`{path.stem}`' for path in ready_patches())}." in TEXT
+    assert f"SI symbols without prefixes ({', '.join(UNITS)})" in TEXT
+
+
+def test_prose_names_only_effects_and_parameters_that_exist():
+    prose = TEXT.split("## Conventions")[1].split("## Patch files")[0]
+    known = {*EFFECTS, *(parameter for effect in EFFECTS.values() for parameter in effect.parameters), "cam_yaw", "mu"}
+    assert [name for name in re.findall(r"`([a-z_]+)`", prose) if name not in known] == []
+
+
+def ready_patches() -> list[Path]:
+    return sorted((ROOT / "configs" / "effects").glob("*.yaml"))

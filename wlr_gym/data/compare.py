@@ -1,0 +1,513 @@
+"""Compare two plants: same goals, same parameters, same start; where and when do they part, and by how much?
+
+Differences are given in units of what the robot's own sensors resolve (:func:`resolutions`), so that a difference below one
+could not be measured on the robot at all. With ``halve`` everything is repeated at half the physics step: a difference that
+comes from the steps shrinks with them, and each plant's own step error tells whose it is; what stays is a difference between
+the models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.data.anchor import euler_angles, quaternion, rest_pose
+from wlr_gym.data.excitations import Motion
+from wlr_gym.data.noise import channel_noise
+from wlr_gym.data.read import Run
+from wlr_gym.data.replay import held_goals, profile_parameters
+from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
+from wlr_gym.physics.effects.patch import Source
+from wlr_gym.physics.plants import check_backend, make_plant
+from wlr_gym.physics.plants.base import PlantOptions, PlantState, Sensors, Truth, standing_state
+from wlr_gym.robot import CORNER_SIGNS, JOINTS, LEGS, WHEELS, Robot, load_robot
+from wlr_gym.robot.parameters import Parameters
+
+Array = NDArray[np.float64]
+
+#: s at the first goals before time 0, not compared: until the bounce of being set down has died out.
+SETTLE = 0.5
+#: s; the pose is compared after this long (or at the end of a shorter motion).
+HORIZON = 10.0
+#: What two plants are asked for: distance of the poses at the horizon over the travel (-), yaw (rad), rms torque (-).
+BOUNDS = {"position": 0.02, "yaw": float(np.deg2rad(2.0)), "leg_torque": 0.05, "wheel_torque": 0.05}
+_CONTROL_PERIOD = 0.02
+_LEGS, _WHEELS = slice(0, 4), slice(4, 8)
+
+
+# ---- what is compared ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A plant and the numerical options it is run with.
+
+    Attributes:
+        backend: of :data:`wlr_gym.physics.plants.BACKENDS`.
+        physics_step: s.
+        precision: ``float64`` or ``float32``.
+    """
+
+    backend: str
+    physics_step: float = 0.001
+    precision: str = "float64"
+
+    @property
+    def label(self) -> str:
+        """Short name, with what is not usual: ``gibbs_appell, 0.5 ms``."""
+        precision = "" if self.precision == "float64" else f", {self.precision}"
+        return f"{self.backend}, {1e3 * self.physics_step:g} ms{precision}"
+
+    @property
+    def halved(self) -> Contender:
+        """The same at half the step."""
+        return replace(self, physics_step=0.5 * self.physics_step)
+
+
+def parse_contender(text: str, physics_step: float = 0.001) -> Contender:
+    """Read ``BACKEND`` or ``BACKEND:option=value,...`` with the options ``physics_step`` (s) and ``precision``.
+
+    Raises:
+        InputError: unknown backend or option, a step that does not divide the control period, an unknown precision.
+    """
+    backend, _, options = text.partition(":")
+    check_backend(backend)
+    contender = Contender(backend, physics_step)
+    for option in filter(None, options.split(",")):
+        name, _, value = option.partition("=")
+        if name == "physics_step":
+            contender = replace(contender, physics_step=_seconds(value, text))
+        elif name == "precision":
+            contender = replace(contender, precision=value)
+        else:
+            raise unknown_name("option", name, ("physics_step", "precision"), f"plant '{text}'")
+    if contender.precision not in (precisions := ("float64", "float32")):
+        raise unknown_name("precision", contender.precision, precisions, f"plant '{text}'")
+    PlantOptions(control_period=_CONTROL_PERIOD, physics_step=contender.physics_step)
+    return contender
+
+
+def _seconds(value: str, text: str) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        raise InputError(f"plant '{text}': physics_step = {value!r}: expected a number of seconds") from None
+
+
+def motion_of(run: Run) -> Motion:
+    """Return the commands of a measured run at the control rate, each row's from its time on; NaN = torque off."""
+    t = run["t"] - run["t"][0]
+    ticks = round(t[-1] / _CONTROL_PERIOD) + 1
+    rows = np.searchsorted(t, _CONTROL_PERIOD * (np.arange(ticks) + 0.5), side="right") - 1
+    commanded = np.stack([np.isfinite(run[f"cmd_{joint}"]) for joint in JOINTS], axis=1)
+    goals = np.where(commanded, held_goals(run), np.nan)[rows]
+    return Motion(run.name, goals, _CONTROL_PERIOD, run.meta.profile)
+
+
+def severe_patch(name: str) -> Patch:
+    """Return one effect of the library at its default severity; of joints and wheels it acts on one of each kind.
+
+    Which: the right front leg, the left rear wheel: nothing a symmetric mistake could hide behind.
+
+    Raises:
+        InputError: no such effect.
+    """
+    if name not in EFFECTS:
+        raise unknown_name("effect", name, EFFECTS)
+    effect = EFFECTS[name]
+    chosen = [place for place in effect.where if place in (LEGS[1], WHEELS[2])]
+    values = {parameter: spec.severity for parameter, spec in effect.parameters.items()}
+    return load_patch({"name": name, "where": chosen or list(effect.where), "parameters": values})
+
+
+# ---- driving ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Traces:
+    """What one plant did: one row per control tick from time 0 on, first axis ticks + 1, second axis motions.
+
+    Attributes:
+        contender, robot: the plant, and which robot.
+        sensors: (ticks + 1, motions, SENSOR_LAYOUT.width) without noise. truth: likewise, TRUTH_LAYOUT.width.
+    """
+
+    contender: Contender
+    robot: Robot
+    sensors: Array
+    truth: Array
+
+    @cached_property
+    def signals(self) -> dict[str, Array]:
+        """Every signal of :func:`resolutions`, each (ticks + 1, motions, elements)."""
+        shape = self.sensors.shape[:2]
+        sensors = Sensors(self.sensors.reshape(-1, self.sensors.shape[2]))
+        truth = Truth(self.truth.reshape(-1, self.truth.shape[2]))
+        yaw, pitch, roll = euler_angles(truth.quaternion)
+        force, slip = truth.contact_force.reshape(-1, 4, 3), truth.slip_velocity.reshape(-1, 4, 2)
+        signs, hip = np.array(CORNER_SIGNS), self.robot.hip_position
+        x, y = signs[:, 0] * hip.x + self.robot.leg.length * np.cos(truth.joint_position[:, _LEGS]), signs[:, 1] * hip.y
+        flat = {
+            "pos_leg": sensors.joint_position[:, _LEGS],
+            "pos_wheel": sensors.joint_position[:, _WHEELS],
+            "vel_leg": sensors.joint_velocity[:, _LEGS],
+            "vel_wheel": sensors.joint_velocity[:, _WHEELS],
+            "eff_leg": sensors.joint_effort[:, _LEGS],
+            "eff_wheel": sensors.joint_effort[:, _WHEELS],
+            "gyro": sensors.gyro,
+            "acc": sensors.accelerometer,
+            "cam_xy": sensors.camera_pose[:, :2],
+            "cam_yaw": sensors.camera_pose[:, 2:],
+            "volt": sensors.supply_voltage[:, None],
+            "true_xy": truth.position[:, :2],
+            "true_z": truth.position[:, 2:],
+            "true_yaw": yaw[:, None],
+            "true_tilt": np.stack([pitch, roll], axis=1),
+            "motor_torque_leg": truth.motor_torque[:, _LEGS],
+            "motor_torque_wheel": truth.motor_torque[:, _WHEELS],
+            "normal_force": force[:, :, 2],
+            "total_along": force[:, :, 0].sum(axis=1, keepdims=True),
+            "total_across": force[:, :, 1].sum(axis=1, keepdims=True),
+            "total_turn": (x * force[:, :, 1] - y * force[:, :, 0]).sum(axis=1, keepdims=True),
+            "friction_along": force[:, :, 0],
+            "friction_across": force[:, :, 1],
+            "slip_along": slip[:, :, 0],
+            "slip_across": slip[:, :, 1],
+        }
+        return {name: values.reshape(*shape, -1) for name, values in flat.items()}
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One compared signal.
+
+    Attributes:
+        unit, doc: SI unit, meaning. resolution: what the robot's sensors resolve of it, in ``unit``.
+        turns: an angle that may jump by a whole turn.
+        shared: how wheels that all stick share a load, which rigid bodies leave open: each plant has an answer of its own,
+            and it moves nothing. Their total force and moment are not open.
+    """
+
+    unit: str
+    resolution: float
+    doc: str
+    turns: bool = False
+    shared: bool = False
+
+
+def resolutions(robot: Robot) -> dict[str, Signal]:
+    """Return every compared signal with what the robot's sensors resolve of it: one sigma of noise and rounding.
+
+    What no sensor measures directly is given what follows from one that does: forces along the floor from a wheel's effort
+    over its radius, slip from its velocity reading times the radius, normal forces from the accelerometer times the mass.
+    """
+    noise = channel_noise(robot)
+    radius, mass = robot.wheel.radius, robot.body.mass + 4 * ((robot.leg.mass or 0.0) + (robot.wheel.mass or 0.0))
+    leg, wheel = LEGS[0], WHEELS[0]
+    tread, slip = noise[f"eff_{wheel}"] / radius, noise[f"vel_{wheel}"] * radius
+    return {
+        "pos_leg": Signal("rad", noise[f"pos_{leg}"], "encoder of a leg"),
+        "pos_wheel": Signal("rad", noise[f"pos_{wheel}"], "encoder of a wheel"),
+        "vel_leg": Signal("rad/s", noise[f"vel_{leg}"], "velocity reading of a leg"),
+        "vel_wheel": Signal("rad/s", noise[f"vel_{wheel}"], "velocity reading of a wheel"),
+        "eff_leg": Signal("N m", noise[f"eff_{leg}"], "effort reading of a leg"),
+        "eff_wheel": Signal("N m", noise[f"eff_{wheel}"], "effort reading of a wheel"),
+        "gyro": Signal("rad/s", noise["gyro_x"], "gyroscope"),
+        "acc": Signal("m/s2", noise["acc_x"], "accelerometer"),
+        "cam_xy": Signal("m", noise["cam_x"], "camera x, y"),
+        "cam_yaw": Signal("rad", noise["cam_yaw"], "camera yaw", turns=True),
+        "volt": Signal("V", noise["volt"], "supply voltage"),
+        "true_xy": Signal("m", noise["cam_x"], "body origin on the floor"),
+        "true_z": Signal("m", noise["cam_z"], "height of the body origin"),
+        "true_yaw": Signal("rad", noise["cam_yaw"], "heading", turns=True),
+        "true_tilt": Signal("rad", noise["cam_pitch"], "pitch and roll"),
+        "motor_torque_leg": Signal("N m", noise[f"eff_{leg}"], "motor torque of a leg"),
+        "motor_torque_wheel": Signal("N m", noise[f"eff_{wheel}"], "motor torque of a wheel"),
+        "normal_force": Signal("N", mass * noise["acc_z"], "floor on a wheel, normal"),
+        "total_along": Signal("N", tread, "floor on all wheels, along their heading"),
+        "total_across": Signal("N", tread, "floor on all wheels, along their axles"),
+        "total_turn": Signal("N m", tread * robot.hip_position.y, "friction of all wheels about the body's vertical"),
+        "friction_along": Signal("N", tread, "floor on a wheel, along its heading", shared=True),
+        "friction_across": Signal("N", tread, "floor on a wheel, along its axle", shared=True),
+        "slip_along": Signal("m/s", slip, "slip velocity along a wheel's heading"),
+        "slip_across": Signal("m/s", slip, "slip velocity along a wheel's axle"),
+    }
+
+
+def drive(
+    contender: Contender,
+    motions: Sequence[Motion],
+    robot: Robot,
+    parameters: Parameters | None = None,
+    patch: Patch | None = None,
+    threads: int = 1,
+) -> Traces:
+    """Drive all motions on one plant, one robot of a batch each; a shorter motion stays at its last goals.
+
+    Args:
+        contender: the plant.
+        motions: of one period.
+        robot: the robot.
+        parameters: (1) physical parameters; None = nominal. Each motion's servo profile is written into them.
+        patch: effects to add.
+        threads: of the plant.
+    """
+    patch = patch or Patch()
+    batch = _parameters(motions, robot, parameters, patch)
+    goals, torque_on = _goals(motions)
+    options = PlantOptions(motions[0].period, contender.physics_step, contender.precision, threads, sensor_noise=False)
+    plant = make_plant(contender.backend, robot, len(motions), options, patch.forces)
+    sensors, truth = [], []
+    try:
+        readings = plant.reset(np.arange(len(motions), dtype=np.uint64), batch, state=standing_at(goals[0], robot, batch))
+        for _ in range(round(SETTLE / motions[0].period)):
+            readings = plant.step(goals[0], torque_on[0])
+        for tick in range(len(goals) + 1):
+            sensors.append(readings.values.copy())
+            truth.append(plant.truth().values.copy())
+            if tick < len(goals):
+                readings = plant.step(goals[tick], torque_on[tick])
+    finally:
+        plant.close()
+    return Traces(contender, robot, np.array(sensors), np.array(truth))
+
+
+def _parameters(motions: Sequence[Motion], robot: Robot, parameters: Parameters | None, patch: Patch) -> Parameters:
+    one = Parameters.nominal(robot) if parameters is None else parameters
+    rows = [apply_patch(patch, profile_parameters(one, motion.profile)).values for motion in motions]
+    return Parameters(np.concatenate(rows))
+
+
+def _goals(motions: Sequence[Motion]) -> tuple[Array, NDArray[np.bool_]]:
+    """Goals (ticks, motions, 8) and torque switches; a motor that is off is told to stay as it was."""
+    ticks = max(len(motion.goals) for motion in motions)
+    goals = np.stack([np.pad(m.goals, ((0, ticks - len(m.goals)), (0, 0)), mode="edge") for m in motions], axis=1)
+    torque_on = np.isfinite(goals)
+    for tick in range(1, ticks):
+        goals[tick] = np.where(torque_on[tick], goals[tick], goals[tick - 1])
+    goals[..., _LEGS] = np.where(np.isnan(goals[..., _LEGS]), np.pi / 2, goals[..., _LEGS])
+    return np.nan_to_num(goals), torque_on
+
+
+def standing_at(goals: Array, robot: Robot, parameters: Parameters) -> PlantState:
+    """Return every robot standing on the floor at its first leg goals, level where its parameters let it."""
+    state = standing_state(robot, parameters)
+    level = rest_pose(parameters, state.joint_position[:, :4])
+    state.joint_position[:, :4] = goals[:, :4] - parameters["joint.zero_offset"]
+    state.reference_position[:, :4] = state.joint_position[:, :4]  # true angles both; goals are in terms of the reading
+    pose = rest_pose(parameters, state.joint_position[:, :4])
+    state.position[:, 2] += pose[:, 0] - level[:, 0]
+    state.quaternion = quaternion(np.zeros(len(pose)), pose[:, 1], pose[:, 2])
+    return state
+
+
+# ---- comparing -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How far two plants are apart in one signal of one motion: over all its elements, and over time.
+
+    Attributes:
+        rms, largest: in ``unit``. resolution: one sensor's, in ``unit``.
+        parted: s; when it first exceeded the threshold; None = never.
+    """
+
+    rms: float
+    largest: float
+    unit: str
+    resolution: float
+    parted: float | None
+
+    @property
+    def rms_in_noise(self) -> float:
+        """Root mean square in units of the resolution."""
+        return self.rms / self.resolution
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields, and both sizes in units of the resolution."""
+        return {**vars(self), "rms_in_noise_units": self.rms_in_noise, "largest_in_noise_units": self.largest / self.resolution}
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """The figures that :data:`BOUNDS` bounds.
+
+    Attributes:
+        travel: m; path of the body origin up to the horizon. apart: m; distance of the positions there.
+        position: apart/travel. yaw: rad.
+        leg_torque, wheel_torque: rms difference of the motors' torques over their own rms, or over the nominal dry friction of
+            their gears where they stay below it: motors that hardly work have nothing to agree on.
+    """
+
+    travel: float
+    apart: float
+    position: float
+    yaw: float
+    leg_torque: float
+    wheel_torque: float
+
+    @property
+    def broken(self) -> tuple[str, ...]:
+        """Names of the bounds that are not kept."""
+        return tuple(name for name, bound in BOUNDS.items() if not getattr(self, name) <= bound)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures and the broken bounds."""
+        return {**vars(self), "broken": list(self.broken)}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One motion on two plants.
+
+    Attributes:
+        motion: its name. agreement: the figures that are bounded. differences: by signal.
+        first: the signal that parts first, of those that are not open, and when, s; None where none does.
+    """
+
+    motion: str
+    agreement: Agreement
+    differences: Mapping[str, Difference]
+    first: tuple[str, float] | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain JSON types."""
+        return {
+            "motion": self.motion, "agreement": self.agreement.as_dict(), "parts_first_in": self.first,
+            "differences": {name: difference.as_dict() for name, difference in self.differences.items()},
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two plants on a set of motions under one patch.
+
+    Attributes:
+        effects: what was added. threshold: in units of resolution, for ``parted``.
+        motions, first, second: goals and traces. cases: one per motion. signals: what was compared.
+        half: cases at half of both steps. own: each plant against itself at half its step. None without ``halve``.
+    """
+
+    effects: str
+    threshold: float
+    motions: tuple[Motion, ...]
+    first: Traces
+    second: Traces
+    cases: tuple[Case, ...]
+    signals: Mapping[str, Signal]
+    half: tuple[Case, ...] | None = None
+    own: tuple[tuple[Case, ...], tuple[Case, ...]] | None = None
+
+    @property
+    def broken(self) -> bool:
+        """Whether any motion breaks a bound; at half the steps where that was run."""
+        return any(case.agreement.broken for case in self.half or self.cases)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain JSON types."""
+        content: dict[str, Any] = {
+            "effects": self.effects, "plants": [vars(traces.contender) for traces in (self.first, self.second)],
+            "threshold": self.threshold, "cases": [case.as_dict() for case in self.cases],
+        }  # fmt: skip
+        if self.half and self.own:
+            content["half_step"] = [case.as_dict() for case in self.half]
+            content["own_step_error"] = [[case.as_dict() for case in cases] for cases in self.own]
+        return content
+
+
+def compare(
+    motions: Sequence[Motion],
+    plants: tuple[Contender, Contender],
+    robot: Robot | None = None,
+    parameters: Parameters | None = None,
+    effects: Source = None,
+    threshold: float = 5.0,
+    halve: bool = False,
+    threads: int = 1,
+) -> Comparison:
+    """Drive the same motions on two plants and compare all they show.
+
+    Args:
+        motions: what to drive (:func:`wlr_gym.data.excitations.excite`, :func:`motion_of`), all of one period.
+        plants: the two.
+        robot: None = nominal.
+        parameters: (1) physical parameters; None = the robot's nominal ones.
+        effects: patch to add.
+        threshold: two signals have parted when they differ by more than this many units of resolution.
+        halve: repeat at half of both steps.
+        threads: of each plant.
+
+    Raises:
+        InputError: no motions or of different periods, a threshold that is not positive, an unknown effect.
+    """
+    if not motions:
+        raise InputError("nothing to compare: expected at least one motion")
+    if len({motion.period for motion in motions}) > 1:
+        raise InputError("the motions have different periods; expected one")
+    if not threshold > 0.0:
+        raise InputError(f"threshold = {threshold:g}: expected more than 0 units of sensor noise")
+    robot, patch = robot or load_robot(), load_patch(effects)
+    signals = resolutions(robot)
+
+    def driven(contender: Contender) -> Traces:
+        return drive(contender, motions, robot, parameters, patch, threads)
+
+    def between(a: Traces, b: Traces) -> tuple[Case, ...]:
+        return tuple(_case(motion, k, a, b, signals, robot, threshold) for k, motion in enumerate(motions))
+
+    first, second = (driven(contender) for contender in plants)
+    cases = between(first, second)
+    half, own = None, None
+    if halve:
+        halves = [driven(contender.halved) for contender in plants]
+        half, own = between(*halves), (between(first, halves[0]), between(second, halves[1]))
+    return Comparison(patch.summary(), threshold, tuple(motions), first, second, cases, signals, half, own)
+
+
+def difference(first: Traces, second: Traces, name: str, signal: Signal, motion: Motion, index: int) -> Array:
+    """Return second minus first of one signal over one motion, (ticks + 1, elements)."""
+    a, b = (traces.signals[name][: len(motion.goals) + 1, index] for traces in (first, second))
+    return np.angle(np.exp(1j * (b - a))) if signal.turns else b - a
+
+
+def _case(motion: Motion, k: int, a: Traces, b: Traces, signals: Mapping[str, Signal], robot: Robot, threshold: float) -> Case:
+    differences = {}
+    for name, signal in signals.items():
+        error = np.abs(difference(a, b, name, signal, motion, k))
+        beyond = (error > threshold * signal.resolution).any(axis=1)
+        parted = float(np.argmax(beyond) * motion.period) if beyond.any() else None
+        differences[name] = Difference(_rms(error), float(error.max()), signal.unit, signal.resolution, parted)
+    parted = [
+        (found.parted, name) for name, found in differences.items() if found.parted is not None and not signals[name].shared
+    ]
+    first = min(parted)[::-1] if parted else None
+    return Case(motion.name, _agreement(motion, k, a, b, signals, robot), differences, first)
+
+
+def _agreement(motion: Motion, k: int, a: Traces, b: Traces, signals: Mapping[str, Signal], robot: Robot) -> Agreement:
+    rows = len(motion.goals) + 1
+    horizon = min(round(HORIZON / motion.period), rows - 1)
+    path = a.signals["true_xy"][: horizon + 1, k]
+    travel = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    apart = float(np.linalg.norm(b.signals["true_xy"][horizon, k] - path[-1]))
+    yaw = float(np.abs(difference(a, b, "true_yaw", signals["true_yaw"], motion, k)[horizon, 0]))
+    torque = {}
+    for kind in ("leg", "wheel"):
+        own, other = (traces.signals[f"motor_torque_{kind}"][:rows, k] for traces in (a, b))
+        torque[f"{kind}_torque"] = _ratio(_rms(other - own), max(_rms(own), getattr(robot.servo, kind).coulomb_friction))
+    return Agreement(travel, apart, _ratio(apart, travel), yaw, **torque)
+
+
+def _ratio(a: float, b: float) -> float:
+    return a / b if b > 0.0 else 0.0 if a == 0.0 else float("inf")
+
+
+def _rms(error: Array) -> float:
+    return float(np.sqrt(np.mean(error**2)))

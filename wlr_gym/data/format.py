@@ -1,0 +1,129 @@
+"""The measured-run format as data: columns with unit, meaning and sensor noise, and the ``meta.yaml`` model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from wlr_gym.robot import JOINTS, LEGS, Vector3
+from wlr_gym.robot.parameters import XYZ
+
+#: File suffixes a run may have.
+SUFFIXES = (".csv", ".parquet")
+META_FILE = "meta.yaml"
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a run.
+
+    Attributes:
+        name: as in the file's header.
+        group: columns of one kind share it (``pos_leg``, ``gyro``, ``cam_xy``); limits and tables go by group.
+        unit: SI unit.
+        doc: meaning.
+        required: a run without it is refused.
+        may_be_nan: single values may be missing by design.
+        noisy: carries analogue noise well above its resolution, so that exactly repeated values are suspicious.
+    """
+
+    name: str
+    group: str
+    unit: str
+    doc: str
+    required: bool = False
+    may_be_nan: bool = False
+    noisy: bool = False
+
+
+def _joint_columns(kind: str, unit: tuple[str, str], doc: str, **flags: bool) -> list[Column]:
+    """One column per joint; ``unit`` holds the unit for legs and for wheels."""
+    groups = [("leg", unit[0]) if joint in LEGS else ("wheel", unit[1]) for joint in JOINTS]
+    return [
+        Column(f"{kind}_{joint}", f"{kind}_{type_}", joint_unit, doc, **flags)
+        for joint, (type_, joint_unit) in zip(JOINTS, groups, strict=True)
+    ]
+
+
+_TABLE: list[Column] = [
+    Column(
+        "t", "t", "s", "host clock when the row's sensors were read; strictly increasing, nominally 20 ms apart", required=True
+    ),
+    *_joint_columns(
+        "cmd",
+        ("rad", "rad/s"),
+        "goal written to the servo in this tick, after the row's sensors were read; NaN = torque off (free-spinning)",
+        required=True,
+        may_be_nan=True,
+    ),
+    *_joint_columns(
+        "pos", ("rad", "rad"), "encoder; wheels unwrapped, relative to their leg, zero at the run's start", required=True
+    ),
+    *_joint_columns("vel", ("rad/s", "rad/s"), "the servo's own velocity reading"),
+    *_joint_columns(
+        "eff",
+        ("N m", "N m"),
+        "motor torque estimate: current (legs) or load (wheels) times the nominal torque constant at the output shaft, "
+        "before gear friction",
+    ),
+    *[Column(f"gyro_{axis}", "gyro", "rad/s", "angular velocity, body frame", noisy=True) for axis in XYZ],
+    *[Column(f"acc_{axis}", "acc", "m/s2", "specific force, body frame (+9.81 on z at rest)", noisy=True) for axis in XYZ],
+    Column(
+        "cam_x",
+        "cam_xy",
+        "m",
+        "vision position of the marker's centre in the floor frame; NaN without a new frame",
+        may_be_nan=True,
+    ),
+    Column(
+        "cam_y",
+        "cam_xy",
+        "m",
+        "vision position of the marker's centre in the floor frame; NaN without a new frame",
+        may_be_nan=True,
+    ),
+    Column("cam_yaw", "cam_yaw", "rad", "vision heading in the floor frame; NaN without a new frame", may_be_nan=True),
+    Column("cam_z", "cam_z", "m", "side view: height of the marker's centre; NaN without a new frame", may_be_nan=True),
+    Column("cam_pitch", "cam_pitch", "rad", "side view: pitch, nose down positive; NaN without a new frame", may_be_nan=True),
+    Column("volt", "volt", "V", "supply voltage"),
+]
+
+#: All columns by name, in the order files are written.
+COLUMNS: dict[str, Column] = {column.name: column for column in _TABLE}
+REQUIRED = tuple(name for name, column in COLUMNS.items() if column.required)
+COMMANDS = tuple(f"cmd_{joint}" for joint in JOINTS)
+#: What the robot measured: everything but the clock and the commands.
+CHANNELS = tuple(name for name in COLUMNS if name != "t" and name not in COMMANDS)
+CAMERA = ("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch")
+ANGLES_OF_THE_BODY = ("cam_yaw", "cam_pitch")
+
+
+class _Meta(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Profile(_Meta):
+    """Servo profile registers: 0 = no profile, step references."""
+
+    wheel_acceleration: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    leg_velocity: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    leg_acceleration: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+
+
+class RunMeta(_Meta):
+    """What ``meta.yaml`` says about the runs beside it.
+
+    Attributes:
+        robot: path of a robot file (relative to the meta file) or name of a robot.
+        profile: servo profile, rad/s2 and rad/s.
+        ground: what the operator noted about the floor.
+        marker_offset: marker centre in the body frame, m.
+        notes: free text.
+    """
+
+    robot: str | None = None
+    profile: Profile = Profile()
+    ground: str | None = None
+    marker_offset: Vector3 = (0.0, 0.0, 0.0)
+    notes: str | None = None

@@ -1,0 +1,182 @@
+"""Motions as files, and runs of a simulator that was driven through one: what the robot's own log would hold."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder, replace_file
+from wlr_gym.data.compare import SETTLE, standing_at
+from wlr_gym.data.excitations import Motion
+from wlr_gym.data.format import COMMANDS, Profile, RunMeta
+from wlr_gym.data.read import read_meta
+from wlr_gym.data.replay import profile_parameters
+from wlr_gym.data.simulation import SENSED, Simulation, channels, departures, start_of
+from wlr_gym.data.write import write_meta, write_run
+from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
+from wlr_gym.physics.plants import SIMULATORS, make_plant
+from wlr_gym.physics.plants.base import PlantOptions
+from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot.parameters import Parameters
+
+Array = NDArray[np.float64]
+
+#: rad, rad/s: goals beyond are in another unit.
+_LARGEST = np.repeat([2.0 * np.pi, 30.0], 4)
+
+
+# ---- motions as files ------------------------------------------------------------------------------------------------
+
+
+def write_commands(folder: Path, motion: Motion) -> Path:
+    """Write the goals of a motion as ``folder/<name>.csv`` (``t`` and ``cmd_*``; empty = torque off), profile in ``meta.yaml``.
+
+    Raises:
+        InputError: the folder cannot be written to, or its ``meta.yaml`` says something else.
+    """
+    make_output_folder(folder)
+    write_meta(folder, RunMeta(profile=motion.profile))
+    lines = [",".join(["t", *COMMANDS])]
+    for tick, goals in enumerate(motion.goals.tolist()):
+        lines.append(",".join([repr(round(tick * motion.period, 9)), *("" if goal != goal else repr(goal) for goal in goals)]))
+    path = folder / f"{motion.name}.csv"
+    replace_file(path, lambda temporary: temporary.write_text("\n".join(lines) + "\n", encoding="utf-8"))
+    return path
+
+
+def read_commands(path: Path, period: float = 0.02) -> Motion:
+    """Read a motion from the goals in a command file or a whole run; its profile from the ``meta.yaml`` beside it.
+
+    Args:
+        path: file with the columns ``t`` and ``cmd_*``; others are not looked at. Each row's goals hold until the next row.
+        period: s per control tick.
+
+    Raises:
+        InputError: no such file, a column that is missing, times that do not increase, goals that are not rad and rad/s.
+    """
+    import pandas
+
+    if not path.is_file() or path.suffix.lower() not in (".csv", ".parquet"):
+        raise InputError(f"{path}: expected a .csv or .parquet file with the columns t and cmd_*")
+    try:
+        table = pandas.read_csv(path) if path.suffix.lower() == ".csv" else pandas.read_parquet(path)
+        wanted = ("t", *COMMANDS)
+        missing = [name for name in wanted if name not in table.columns]
+        if missing:
+            raise InputError(f"{path}: column '{missing[0]}' is missing")
+        columns = table[list(wanted)].to_numpy(np.float64)
+    except (OSError, UnicodeDecodeError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: cannot be read: {error}") from None
+    t, goals = columns[:, 0], columns[:, 1:]
+    if len(t) < 2 or not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
+        raise InputError(f"{path}: column 't': expected two rows or more, finite and increasing")
+    if (beyond := np.abs(np.nan_to_num(goals)) > _LARGEST).any() or np.isinf(goals).any():
+        row, joint = np.argwhere(beyond | np.isinf(goals))[0]
+        raise InputError(f"{path}: row {row}, column 'cmd_{JOINTS[joint]}': {goals[row, joint]:g}: expected rad and rad/s")
+    ticks = round((t[-1] - t[0]) / period) + 1
+    rows = np.searchsorted(t - t[0], period * (np.arange(ticks) + 0.5), side="right") - 1
+    return Motion(path.stem, goals[rows], period, read_meta(path.parent).profile)
+
+
+# ---- runs ------------------------------------------------------------------------------------------------------------
+
+
+def next_run(folder: Path, suffix: str = ".parquet") -> Path:
+    """Return the path of the next run of a folder: ``run_01.parquet``, ``run_02.parquet``, ..."""
+    numbers = [int(found.group(1)) for path in folder.glob("run_*") if (found := re.match(r"run_(\d+)\.", path.name))]
+    return folder / f"run_{max(numbers, default=0) + 1:02d}{suffix}"
+
+
+def record_simulation(
+    path: Path,
+    motion: Motion,
+    robot: Robot,
+    backend: str,
+    seed: int = 0,
+    patch: Patch | None = None,
+    meta: RunMeta | None = None,
+) -> Path:
+    """Drive a simulator through a motion and write the run, its ``meta.yaml`` and the record that repeats it bit for bit.
+
+    The robot stands at the first goals until it has settled; a leg without a goal stands at home.
+
+    Args:
+        path: of the run.
+        motion: goals; NaN = torque off.
+        robot: what is driven.
+        backend: one of :data:`wlr_gym.physics.plants.SIMULATORS`.
+        seed: of the sensors' noise.
+        patch: effects that are added.
+        meta: for ``meta.yaml``; its profile is the motion's.
+
+    Raises:
+        InputError: unknown backend, or a folder whose ``meta.yaml`` says something else.
+    """
+    if backend not in SIMULATORS:
+        raise InputError(f"backend '{backend}' is no simulator; expected {', '.join(SIMULATORS)}")
+    patch = patch or load_patch(None)
+    parameters = apply_patch(patch, profile_parameters(Parameters.nominal(robot), motion.profile))
+    options, seeds = PlantOptions(control_period=motion.period), np.array([seed], np.uint64)
+    torque_on = np.isfinite(motion.goals)
+    plant = make_plant(backend, robot, 1, options, patch.forces)
+    rows = np.empty((len(motion.goals), len(SENSED)))
+    try:
+        plant.reset(seeds, parameters, state=standing_at(start_goals(motion, robot)[None], robot, parameters))
+        for _ in range(round(SETTLE / motion.period)):
+            plant.step(start_goals(motion, robot)[None], torque_on[:1])
+        start = replace(plant.get_state(), time=np.zeros(1))  # the run begins here
+        sensors = plant.reset(seeds, parameters, state=start)
+        for tick, goals in enumerate(motion.goals):
+            rows[tick] = channels(sensors, 0)
+            on = torque_on[tick : tick + 1]
+            sensors = plant.step(np.nan_to_num(goals)[None], None if on.all() else on)
+    finally:
+        plant.close()
+    record = Simulation(
+        backend=backend,
+        control_period=options.control_period,
+        physics_step=options.physics_step,
+        precision=options.precision,
+        sensor_noise=options.sensor_noise,
+        seed=seed,
+        parameters=departures(parameters.values[0], Parameters.nominal(robot).values[0]),
+        formulas=[effect.content() for effect in patch.effects if effect.name not in EFFECTS],
+        start=start_of(start, 0),
+    )
+    table = {"t": motion.period * np.arange(len(rows)), **dict(zip(COMMANDS, motion.goals.T, strict=True))}
+    table |= dict(zip(SENSED, rows.T, strict=True))
+    return write_run(path, table, meta_of(motion, robot, meta), record)
+
+
+def start_goals(motion: Motion, robot: Robot) -> Array:
+    """Return the goals (8,) a motion starts from: a leg without one at home, wheels at rest."""
+    goals = motion.goals[0].copy()
+    goals[4:] = 0.0
+    return np.where(np.isnan(goals), robot.home.leg_angle, goals)
+
+
+def meta_of(motion: Motion, robot: Robot, meta: RunMeta | None = None) -> RunMeta:
+    """Return the meta data of runs of a motion: robot and servo profile filled in."""
+    given = meta or RunMeta()
+    return given.model_copy(update={"robot": given.robot or robot.name, "profile": motion.profile})
+
+
+def same_profile(motions: Sequence[Motion]) -> Profile:
+    """Return the servo profile of all motions.
+
+    Raises:
+        InputError: they have different ones; runs of one folder share ``meta.yaml``, and so the profile.
+    """
+    for motion in motions:
+        if motion.profile != motions[0].profile:
+            names = f"{motions[0].name} and {motion.name}"
+            raise InputError(f"{names} are driven with different servo profiles: record them into different folders")
+    return motions[0].profile

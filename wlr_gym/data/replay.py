@@ -1,0 +1,365 @@
+"""Replay a measured run: write its commands to a plant and compare what the plant's sensors say with what was measured.
+
+Two comparisons per run. *Full run*: from the measured start, open loop, to the end; small errors add up, as in any dead
+reckoning. *Segments*: the run is cut into pieces of about a second, each started anew from the measured state, so that
+drift does not swamp what is missing in the model. All segments of a run are one batch.
+
+The plant ticks on its own clock (2 ms by default). A goal acts from the row it was written in until the next row's, at the
+measured times, so jitter and lost ticks are replayed as they happened; simulated channels are interpolated to the rows'
+times. Command delays shift the measured times of the goals, so that a segment starts with the goals that were under way.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.paths import data_directory
+from wlr_gym.base.settings import read_yaml
+from wlr_gym.data.anchor import euler_angles, measured_state, rotation, start_state, starts_at_rest
+from wlr_gym.data.format import ANGLES_OF_THE_BODY, CHANNELS, COLUMNS, COMMANDS, META_FILE, Profile
+from wlr_gym.data.noise import channel_noise
+from wlr_gym.data.read import Run
+from wlr_gym.physics.effects import Source, apply_patch, load_patch
+from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors, Truth
+from wlr_gym.robot import JOINTS, Robot, load_robot
+from wlr_gym.robot.parameters import Parameters
+
+Array = NDArray[np.float64]
+
+#: s; the plant's tick in a replay: the goals' times are kept to half of it.
+CLOCK = 0.002
+#: s; a segment, and a run that starts at rest, is simulated this long before it is compared: until the bounce of being set
+#: down has died out.
+LEAD = 0.1
+
+
+@dataclass(frozen=True)
+class ChannelError:
+    """How far a replay is from one measured channel.
+
+    Attributes:
+        segment_rms, full_run_rms: root mean square error over the rows compared, in ``unit``.
+        unit: SI unit.
+        noise: one sigma of the sensor, quantisation included, in ``unit``.
+    """
+
+    segment_rms: float
+    full_run_rms: float
+    unit: str
+    noise: float
+
+    def as_dict(self) -> dict[str, float | str]:
+        """Return the fields, and both errors in units of the sensor's noise."""
+        return {
+            **vars(self),
+            "segment_in_noise_units": self.segment_rms / self.noise,
+            "full_run_in_noise_units": self.full_run_rms / self.noise,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayResult:
+    """A run beside its replay. Arrays have one value per row of the run.
+
+    Attributes:
+        run: the measured run.
+        full: simulated channels of the replay from start to end.
+        segments: simulated channels of the re-anchored replay; NaN in the first rows, before the first lead is over.
+        starts: rows at which the segments were anchored.
+        errors: per channel.
+        robot, clock, physics_step: what it was replayed with.
+    """
+
+    run: Run
+    full: Mapping[str, Array]
+    segments: Mapping[str, Array]
+    starts: tuple[int, ...]
+    errors: Mapping[str, ChannelError]
+    robot: Robot
+    clock: float
+    physics_step: float
+
+
+def robot_of(run: Run, robot: Robot | str | Path | None = None) -> Robot:
+    """Return the robot a run is of: the one asked for, else the one its meta data name, else the nominal one.
+
+    ``meta.yaml`` may name a robot file (relative to itself), a config, or the ``name`` inside a config; see
+    :func:`robot_entry`.
+
+    Raises:
+        InputError: no such robot; the message lists the shipped ones.
+    """
+    if robot is not None:
+        return load_robot(robot)
+    named = run.meta.robot
+    if named is None:
+        return load_robot()
+    if Path(named).suffix in {".yaml", ".yml"}:
+        return load_robot(run.path.parent / named)
+    shipped = {str((read_yaml(path) or {}).get("name")): path for path in (data_directory("configs") / "robot").glob("*.yaml")}
+    shipped |= {path.stem: path for path in shipped.values()}
+    if named not in shipped:
+        error = unknown_name("robot", named, shipped, str(run.path.parent / META_FILE))
+        raise InputError(f"{error}; a robot of your own is named by its file (a path from {META_FILE} on), or with --robot")
+    return load_robot(shipped[named])
+
+
+def robot_entry(robot: str, folder: Path) -> str | None:
+    """Return how the ``meta.yaml`` of a folder names a robot given by file; None where its own name will do: a config's."""
+    return os.path.relpath(robot, folder) if Path(robot).suffix in {".yaml", ".yml"} else None
+
+
+def profile_parameters(parameters: Parameters, profile: Profile) -> Parameters:
+    """Return ``parameters`` with the servo profile of a run."""
+    result = parameters.copy()
+    result["servo.profile_velocity"][:, :4] = profile.leg_velocity
+    result["servo.profile_acceleration"][:, :4] = profile.leg_acceleration
+    result["servo.profile_acceleration"][:, 4:] = profile.wheel_acceleration
+    return result
+
+
+def replay(
+    run: Run,
+    backend: str = "gibbs_appell",
+    robot: Robot | str | Path | None = None,
+    parameters: Parameters | None = None,
+    effects: Source = None,
+    segment: float = 1.0,
+    clock: float = CLOCK,
+    physics_step: float = 0.001,
+) -> ReplayResult:
+    """Replay one run and compare.
+
+    Args:
+        run: the run, with its meta data.
+        backend: a simulator of :data:`wlr_gym.physics.plants.BACKENDS`.
+        robot: None = the one the run's meta data name.
+        parameters: (1) physical parameters; None = nominal. The run's servo profile is written into them.
+        effects: patch to add: to the parameters, and formulas to the plant.
+        segment: s between anchors.
+        clock: s per tick of the plant.
+        physics_step: s per physics step.
+
+    Raises:
+        InputError: unknown backend, robot or effect, a segment shorter than its lead, a run shorter than half a segment.
+    """
+    patch = load_patch(effects)
+    robot, parameters = prepare(run, robot, parameters, patch, segment)
+    t = run["t"]
+    starts = segment_starts(t, segment)
+    options = PlantOptions(control_period=clock, physics_step=physics_step, sensor_noise=False)
+
+    first = start_state(run, robot, parameters)
+    begin = t[:1] - (LEAD if starts_at_rest(run) else 0.0)
+    plant = make_plant(backend, robot, 1, options, patch.forces)
+    full, passed = _simulate(run, plant, parameters, first, begin, t[-1] - begin[0], t[starts])
+    many = Parameters(np.repeat(parameters.values, len(starts), axis=0))
+    anchors = measured_state(run, t[starts], passed, many)
+    ends = np.append(t[starts[1:]] + LEAD, t[-1])
+    duration = float(np.max(ends - t[starts]))
+    plant = make_plant(backend, robot, len(starts), options, patch.forces)
+    pieces, _ = _simulate(run, plant, many, anchors, t[starts], duration)
+    full_rows = {name: full.at(0, name, t) for name in CHANNELS if name in run}
+    segment_rows = {name: _join(pieces, name, t, starts, ends) for name in full_rows}
+    errors = channel_errors(run, full_rows, segment_rows, channel_noise(robot))
+    return ReplayResult(run, full_rows, segment_rows, tuple(map(int, starts)), errors, robot, clock, physics_step)
+
+
+def prepare(
+    run: Run,
+    robot: Robot | str | Path | None = None,
+    parameters: Parameters | None = None,
+    effects: Source = None,
+    segment: float = 1.0,
+) -> tuple[Robot, Parameters]:
+    """Check what :func:`replay` is given, without simulating; return the robot and its patched parameters.
+
+    Raises:
+        InputError: as :func:`replay`.
+    """
+    if not segment > LEAD:
+        raise InputError(f"segment = {segment:g} s: expected more than {LEAD:g} s")
+    robot = robot_of(run, robot)
+    parameters = Parameters.nominal(robot) if parameters is None else parameters
+    parameters = apply_patch(load_patch(effects), profile_parameters(parameters, run.meta.profile))
+    t = run["t"]
+    if t[-1] - t[0] < 0.5 * segment:
+        raise InputError(f"{run.path}: {t[-1] - t[0]:.2f} s long: too short for segments of {segment:g} s")
+    return robot, parameters
+
+
+def segment_starts(t: Array, segment: float) -> NDArray[np.intp]:
+    """Return the rows nearest to whole multiples of ``segment``; a rest shorter than half of one joins the last."""
+    count = max(1, int((t[-1] - t[0]) / segment + 0.5))
+    return np.unique(np.searchsorted(t, t[0] + segment * np.arange(count) - 1e-9))
+
+
+# --- simulation -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Traces:
+    """Simulated channels on the plant's clock: values (ticks + 1, robots, channels), clocks (robots) start at ``begin``."""
+
+    begin: Array
+    clock: float
+    values: Array
+    camera_delay: float
+
+    def at(self, robot: int, name: str, times: Array) -> Array:
+        """Return one channel of one robot at the run's ``times``; what the camera shows is ``camera_delay`` old."""
+        delay = self.camera_delay if name.startswith("cam_") else 0.0
+        ticks = self.begin[robot] + self.clock * np.arange(len(self.values))
+        return np.interp(times - delay, ticks, self.values[:, robot, CHANNELS.index(name)])
+
+
+def _simulate(
+    run: Run,
+    plant: Plant,
+    parameters: Parameters,
+    state: PlantState,
+    begin: Array,
+    duration: float,
+    passing: Array | None = None,
+) -> tuple[_Traces, PlantState]:
+    """Run the batch from ``state`` for ``duration``, robot i with the goals from time ``begin[i]`` on.
+
+    Returns:
+        The traces, and the states (of robot 0, one per time) at the times ``passing``.
+    """
+    clock = plant.options.control_period
+    ticks = int(np.ceil(duration / clock))
+    goals, torque_on = _goals(run, parameters, begin, ticks, clock)
+    parameters = parameters.copy()
+    parameters["command.delay"] = 0.0  # the goals come delayed
+    snapshots = np.array([] if passing is None else np.rint((passing - begin[0]) / clock), dtype=int).tolist()
+    states: list[PlantState] = []
+    wheels = state.joint_position[:, 4:]
+    offset = np.asarray(run.meta.marker_offset)
+    values = np.empty((ticks + 1, plant.count, len(CHANNELS)))
+    try:
+        sensors = plant.reset(parameters=parameters, state=replace(state, time=begin - run["t"][0]))
+        first_reading = sensors.joint_position[:, 4:].copy()
+        for tick in range(ticks + 1):
+            states += [plant.get_state() for _ in range(snapshots.count(tick))]
+            values[tick] = _readings(sensors, plant.truth(), wheels - first_reading, offset)
+            if tick < ticks:
+                sensors = plant.step(goals[tick], torque_on[tick])
+    finally:
+        plant.close()
+    _to_camera_frame(values, parameters)
+    return _Traces(begin, clock, values, float(parameters["camera.delay"][0])), _stacked(states)
+
+
+def _goals(run: Run, parameters: Parameters, begin: Array, ticks: int, clock: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Goals (ticks, robots, 8) and torque switches on the plant's clock: each row's goal holds until the next row's.
+
+    Goals are delayed, switching the torque is not: as in :class:`wlr_gym.physics.plants.goals.GoalHistory`.
+    """
+    commands = np.stack([run[name] for name in COMMANDS], axis=1)
+    written = held_goals(run)
+    now = begin + clock * (np.arange(ticks)[:, None] + 0.5)  # nearest tick, on average neither early nor late
+
+    def row(time: Array) -> NDArray[np.intp]:
+        return np.maximum(np.searchsorted(run["t"], time, side="right") - 1, 0)
+
+    torque_on = np.isfinite(commands[row(now)])
+    goals = np.stack([written[row(now - parameters["command.delay"][:, j]), j] for j in range(8)], axis=2)
+    return goals, torque_on
+
+
+def held_goals(run: Run) -> Array:
+    """Goals (rows, 8) that the servos hold: a motor that is off gets no new goal, so it keeps the one before.
+
+    Before its first goal a joint has the first one; a joint without any stays: a leg at its first measured angle, a wheel at
+    speed 0.
+    """
+    import pandas
+
+    commands = pandas.DataFrame({name: run[name] for name in COMMANDS}).ffill().bfill().to_numpy()
+    measured = np.stack([run[f"pos_{joint}"] for joint in JOINTS], axis=1)
+    stay = np.zeros(8)
+    for joint in np.flatnonzero(np.isnan(commands[:, :4]).all(axis=0)):
+        angles = measured[np.isfinite(measured[:, joint]), joint]
+        stay[joint] = angles[0] if angles.size else 0.0
+    return np.where(np.isnan(commands), stay, commands)
+
+
+def _readings(sensors: Sensors, truth: Truth, wheel_shift: Array, marker_offset: Array) -> Array:
+    """One row of every channel (robots, len(CHANNELS)); wheel angles count on from their anchor. Camera: see below."""
+    joints = [sensors.joint_position, sensors.joint_velocity, sensors.joint_effort]
+    joints[0] = joints[0] + np.hstack([np.zeros_like(wheel_shift), wheel_shift])
+    yaw, pitch, roll = euler_angles(truth.quaternion)
+    marker = truth.position + rotation(yaw, pitch, roll) @ marker_offset
+    camera = [marker[:, 0], marker[:, 1], yaw, marker[:, 2], pitch]
+    return np.column_stack([*joints, sensors.gyro, sensors.accelerometer, *camera, sensors.supply_voltage])
+
+
+def _to_camera_frame(values: Array, parameters: Parameters) -> None:
+    """Turn x and y into the camera's floor frame and make yaw continuous, in place.
+
+    The camera channels come from the true pose, not from the plant's own camera: frames of a simulated camera would fall on
+    other times than the measured ones.
+    """
+    x, y, yaw = (CHANNELS.index(name) for name in ("cam_x", "cam_y", "cam_yaw"))
+    mount, scale = parameters["camera.mount_yaw"], parameters["camera.scale"]
+    cosine, sine = scale * np.cos(mount), scale * np.sin(mount)
+    values[:, :, x], values[:, :, y] = (
+        cosine * values[:, :, x] + sine * values[:, :, y],
+        cosine * values[:, :, y] - sine * values[:, :, x],
+    )
+    values[:, :, yaw] = np.unwrap(values[:, :, yaw], axis=0)
+
+
+def _stacked(states: list[PlantState]) -> PlantState:
+    if not states:
+        return PlantState(*(np.zeros((0, size)) for size in (3, 4, 3, 3, 8, 8, 8, 8)))
+    known = [name for name, value in vars(states[0]).items() if value is not None]
+    return PlantState(**{name: np.concatenate([getattr(state, name) for state in states]) for name in known})
+
+
+# --- comparison -------------------------------------------------------------------------------------------------------
+
+
+def _join(pieces: _Traces, name: str, t: Array, starts: NDArray[np.intp], ends: Array) -> Array:
+    """Lay the segments end to end: each from its lead on, until the lead of the next is over."""
+    joined = np.full(len(t), np.nan)
+    for k, start in enumerate(starts):
+        rows = np.flatnonzero((t > t[start] + LEAD) & (t <= ends[k]))
+        joined[rows] = pieces.at(k, name, t[rows])
+    return joined
+
+
+def channel_errors(
+    run: Run, full: Mapping[str, Array], segments: Mapping[str, Array], noise: Mapping[str, float]
+) -> dict[str, ChannelError]:
+    """Return how far both comparisons are from each channel of the run; a channel without a row in common is left out."""
+    errors = {}
+    for name in full:
+        if np.isfinite(run[name] + segments[name]).any():
+            segment, whole = (_rms(difference(name, run[name], simulated[name])) for simulated in (segments, full))
+            errors[name] = ChannelError(segment, whole, COLUMNS[name].unit, noise[name])
+    return errors
+
+
+def difference(name: str, measured: Array, simulated: Array) -> Array:
+    """Return measured minus simulated; angles of the body within half a turn."""
+    error = measured - simulated
+    return np.angle(np.exp(1j * error)) if name in ANGLES_OF_THE_BODY else error
+
+
+def _rms(error: Array) -> float:
+    return float(np.sqrt(np.nanmean(error**2)))
+
+
+def pooled(errors: Sequence[ChannelError], value: Callable[[ChannelError], float]) -> float:
+    """Root mean square of one figure over several channels or runs."""
+    return float(np.sqrt(np.mean([value(error) ** 2 for error in errors])))

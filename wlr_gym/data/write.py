@@ -1,0 +1,83 @@
+"""Write runs: the same format that is read, checked before and moved into place when complete."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike, NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import replace_file
+from wlr_gym.data.check import check_table
+from wlr_gym.data.format import COLUMNS, META_FILE, SUFFIXES, RunMeta
+from wlr_gym.data.read import read_meta
+from wlr_gym.data.simulation import Simulation, write_simulation
+
+if TYPE_CHECKING:
+    import pandas
+
+
+def write_run(
+    path: str | Path,
+    table: pandas.DataFrame | Mapping[str, ArrayLike],
+    meta: RunMeta | None = None,
+    simulation: Simulation | None = None,
+) -> Path:
+    """Write one run as CSV or Parquet, by the suffix of ``path``; with ``meta`` also the ``meta.yaml`` beside it.
+
+    A simulated run also gets its record, ``<run>.simulation.yaml``; the record of a run that was there before goes with it.
+
+    Parquet keeps every bit; CSV holds the shortest text that reads back as the same float64.
+
+    Raises:
+        InputError: another suffix, a table that a reader would refuse, or a ``meta.yaml`` that says something else.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path}: a run is written as {' or '.join(SUFFIXES)}")
+    columns = {str(name): np.asarray(table[name], dtype=np.float64) for name in table}
+    check_table(columns, str(path))
+    columns = {name: columns[name] for name in COLUMNS if name in columns}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if meta is not None:
+        write_meta(path.parent, meta)
+    write = _write_csv if path.suffix.lower() == ".csv" else _write_parquet
+    replace_file(path, lambda temporary: write(temporary, columns))
+    write_simulation(path, simulation)
+    return path
+
+
+def write_meta(folder: str | Path, meta: RunMeta) -> Path:
+    """Write ``meta.yaml``; one that is there and says the same is left alone.
+
+    Raises:
+        InputError: the one that is there says something else (it holds for all runs of the folder).
+    """
+    path = Path(folder) / META_FILE
+    if path.is_file():
+        if read_meta(folder) != meta:
+            raise InputError(f"{path}: says something else than the meta data of the new run; write it to another folder")
+        return path
+    text = yaml.safe_dump(meta.model_dump(mode="json", exclude_none=True), sort_keys=False, allow_unicode=True)
+    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    return path
+
+
+def _write_csv(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+        writer.writerows(["" if value != value else value for value in row] for row in rows)
+
+
+def _write_parquet(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    pyarrow.parquet.write_table(pyarrow.table(columns), path, compression="zstd")

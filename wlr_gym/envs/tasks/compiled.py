@@ -1,0 +1,205 @@
+"""Rewards, terminations, measures and computed observations of a task, traced from their terms into compiled loops over robots.
+
+Weights, parameters and the robot's numbers are run-time inputs: changing them compiles nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.envs.tasks.signals import START, Signals, Value
+from wlr_gym.envs.tasks.task import Task
+from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, TERMINATIONS
+from wlr_gym.perception.observer import ESTIMATE_LAYOUT
+from wlr_gym.physics.codegen import Graph, emit, load_module, ops
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
+from wlr_gym.robot import JOINTS
+
+Array = NDArray[np.float64]
+
+
+#: Matrices that terms read, one row per robot, in the order kernels take them; ``clock`` has the one column ``time``.
+MATRICES = ("sensors", "estimate", "truth", "command", "action", "previous_action", "start", "clock")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Compiled rewards, terminations and measures.
+
+    Attributes:
+        run: ``run(active, *MATRICES, numbers, terms, total, over, sums, measures)``; ``active`` (N,) tells whose rows to do.
+            Writes the weighted reward terms (N, T), their total (N,), the termination terms (N, K) and the measures (N, M),
+            and adds the terms to ``sums`` (N, T). Returns the first robot whose reward is not finite, or -1.
+        numbers: (P,) weights, parameters and robot numbers in the order the kernel reads them.
+    """
+
+    run: Callable[..., int]
+    numbers: Array
+
+
+@dataclass(frozen=True)
+class Computation:
+    """Compiled computed observations.
+
+    Attributes:
+        run: ``run(active, *MATRICES, numbers, computed)`` writes (N, ``task.computed``).
+        numbers: (P,) robot numbers in the order the kernel reads them.
+    """
+
+    run: Callable[..., None]
+    numbers: Array
+
+
+def expressions(task: Task, read: Callable[[str], Value]) -> dict[str, Value]:
+    """Return ``over.<term>``, ``term.<term>``, ``total`` and ``measure.<measure>`` for signals read by ``read`` (numpy arrays
+    or trace nodes)."""
+    signals = Signals(read)
+    outputs: dict[str, Value] = {}
+    for name in task.terminations:
+        outputs[f"over.{name}"] = _value(signals, read, "termination", TERMINATIONS[name])
+    for value in list(outputs.values()):
+        signals.terminated = ops.maximum(signals.terminated, ops.where_positive(value, 1.0, 0.0))
+    total: Value = 0.0
+    for name in task.rewards:
+        weight = read(f"reward.{name}.weight") * signals.control_period
+        outputs[f"term.{name}"] = weight * _value(signals, read, "reward", REWARDS[name])
+        total = total + outputs[f"term.{name}"]
+    measures = {f"measure.{name}": _value(signals, read, "measure", MEASURES[name]) for name in task.measures}
+    return {**outputs, "total": total, **measures}
+
+
+def computed_expressions(task: Task, read: Callable[[str], Value]) -> dict[str, Value]:
+    """Return the computed observations by element for signals read by ``read``."""
+    signals = Signals(read)
+    terms = [COMPUTED[name] for name in task.computed_terms]
+    return {element: value for term in terms for element, value in zip(term.elements, term.function(signals), strict=True)}
+
+
+def _value(signals: Signals, read: Callable[[str], Value], kind: str, term: Any) -> Value:
+    return term.function(signals, **{name: read(f"{kind}.{term.name}.{name}") for name in term.parameters})
+
+
+def constants(task: Task) -> Mapping[str, float]:
+    """Return the run-time numbers of a task by name, without those of the robot."""
+    values = {"task.control_period": task.config.control_period}
+    groups = (
+        ("reward", task.config.rewards, REWARDS),
+        ("termination", task.config.terminations, TERMINATIONS),
+        ("measure", task.config.measures, MEASURES),
+    )
+    for kind, chosen, registry in groups:
+        for name, given in chosen.items():
+            merged = {**registry[name].parameters, **given}
+            values |= {f"{kind}.{name}.{key}": float(value) for key, value in merged.items()}
+    return values
+
+
+def number(task: Task, name: str) -> float:
+    """Return the run-time number ``name`` (``reward.slip.weight``, ``robot.leg.length``)."""
+    if not name.startswith("robot."):
+        return constants(task)[name]
+    value: Any = task.robot
+    for part in name.split(".")[1:]:
+        value = getattr(value, part)
+    return float(value)
+
+
+def matrix_columns(task: Task) -> dict[str, tuple[str, int]]:
+    """Return signal name -> (matrix, column) for everything that differs from robot to robot and tick to tick."""
+    groups = {
+        "sensors": ("sensors.{}", SENSOR_LAYOUT.elements),
+        "estimate": ("estimate.{}", ESTIMATE_LAYOUT.elements),
+        "truth": ("truth.{}", TRUTH_LAYOUT.elements),
+        "command": ("command.{}", task.commands),
+        "action": ("action[{}]", JOINTS),
+        "previous_action": ("previous_action[{}]", JOINTS),
+        "start": ("start[{}]", START),
+        "clock": ("{}", ("time",)),
+    }
+    return {
+        pattern.format(element): (matrix, column)
+        for matrix, (pattern, elements) in groups.items()
+        for column, element in enumerate(elements)
+    }
+
+
+def reader(task: Task, matrices: Mapping[str, Array]) -> Callable[[str], Value]:
+    """Return a ``read`` on numpy matrices: the reference that the compiled kernel is tested against."""
+    columns = matrix_columns(task)
+
+    def read(name: str) -> Value:
+        if name in columns:
+            matrix, column = columns[name]
+            return matrices[matrix][:, column]
+        return number(task, name)
+
+    return read
+
+
+def compile_evaluation(task: Task) -> Evaluation:
+    """Trace and compile the rewards, terminations and measures of a task."""
+    stores = {"total": "total[i]"}
+    stores |= {f"over.{name}": f"over[i, {k}]" for k, name in enumerate(task.terminations)}
+    stores |= {f"term.{name}": f"terms[i, {k}]" for k, name in enumerate(task.rewards)}
+    stores |= {f"measure.{name}": f"measures[i, {k}]" for k, name in enumerate(task.measures)}
+    outputs = expressions(task, Graph().input)
+    return Evaluation(*_compile(task, "evaluation", outputs, stores, _EVALUATION_HEAD, _EVALUATION_TAIL))
+
+
+def compile_computation(task: Task) -> Computation:
+    """Trace and compile the computed observations of a task."""
+    outputs = computed_expressions(task, Graph().input)
+    stores = {element: f"computed[i, {k}]" for k, element in enumerate(task.computed)}
+    return Computation(*_compile(task, "computation", outputs, stores, _COMPUTATION_HEAD, ()))
+
+
+def _compile(
+    task: Task, kind: str, outputs: Mapping[str, Value], stores: Mapping[str, str], head: Sequence[str], tail: Sequence[str]
+) -> tuple[Callable[..., Any], Array]:
+    columns = matrix_columns(task)
+    numbers: dict[str, int] = {}
+
+    def load(name: str) -> str:
+        if name in columns:
+            matrix, column = columns[name]
+            return f"{matrix}[i, {column}]"
+        return f"numbers[{numbers.setdefault(name, len(numbers))}]"
+
+    lines = emit(outputs, load, lambda name, value: f"{stores[name]} = {value}", "        ")
+    source = "\n".join([_DECORATOR, *head, *lines, *tail, ""])
+    name = task.config.name
+    module = load_module(f"{kind}_{name}", source, f"wlr_gym: compiling the {kind} of task '{name}' (once)")
+    return module.run, np.array([number(task, name) for name in numbers], dtype=np.float64)
+
+
+_DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
+_ARGUMENTS = f"active, {', '.join(MATRICES)}, numbers"
+_EVALUATION_HEAD = (
+    f"def run({_ARGUMENTS}, terms, total, over, sums, measures):",
+    "    bad = -1",
+    "    for i in range(total.shape[0]):",
+    "        if not active[i]:",
+    "            total[i] = 0.0",
+    "            terms[i, :] = 0.0",
+    "            over[i, :] = 0.0",
+    "            measures[i, :] = 0.0",
+    "            continue",
+)
+_EVALUATION_TAIL = (
+    "        for k in range(terms.shape[1]):",
+    "            sums[i, k] += terms[i, k]",
+    "        if bad < 0 and not math.isfinite(total[i]):",
+    "            bad = i",
+    "    return bad",
+)
+_COMPUTATION_HEAD = (
+    f"def run({_ARGUMENTS}, computed):",
+    "    for i in range(computed.shape[0]):",
+    "        if not active[i]:",
+    "            continue",
+)

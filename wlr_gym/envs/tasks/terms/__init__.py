@@ -1,0 +1,27 @@
+"""Building blocks of tasks: small documented units that a task's YAML lists by name, with weights and parameters.
+
+``registered`` and ``computed`` make a function such a unit, here or in a module of one's own (docs/extending.md).
+"""
+
+from wlr_gym.envs.tasks.terms.commands import COMMANDS
+from wlr_gym.envs.tasks.terms.computed import COMPUTED, computed
+from wlr_gym.envs.tasks.terms.measures import MEASURES
+from wlr_gym.envs.tasks.terms.observations import POLICY_TERMS, PRIVILEGED_TERMS, ObservationTerm
+from wlr_gym.envs.tasks.terms.rewards import REWARDS
+from wlr_gym.envs.tasks.terms.scalar import POSITIVE, ScalarTerm, registered
+from wlr_gym.envs.tasks.terms.terminations import TERMINATIONS
+
+__all__ = [
+    "COMMANDS",
+    "COMPUTED",
+    "MEASURES",
+    "POLICY_TERMS",
+    "POSITIVE",
+    "PRIVILEGED_TERMS",
+    "REWARDS",
+    "TERMINATIONS",
+    "ObservationTerm",
+    "ScalarTerm",
+    "computed",
+    "registered",
+]

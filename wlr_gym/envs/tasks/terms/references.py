@@ -1,0 +1,128 @@
+"""What a task asks for beyond constant speeds: paths on the floor, leg angles that change with time, climbing and holding.
+
+Everything is a closed function of the held commands, the time and the pose, so nothing is stored from tick to tick.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from wlr_gym.envs.tasks.signals import Signals, Value
+from wlr_gym.envs.tasks.terms.geometry import Motion, wrapped
+from wlr_gym.physics.codegen import ops
+from wlr_gym.robot import CORNER_SIGNS
+
+#: m along the path from the robot to where its curvature is previewed.
+PREVIEW = (0.0, 0.1, 0.2)
+#: Newton steps to the nearest point of an S-curve.
+NEWTON_STEPS = 4
+#: s in which the legs go from home to the first posture; s at which the sweep to the second one begins.
+POSTURE_READY, SWEEP_BEGINS = 3.0, 4.0
+#: m/s2 on a slope: less than what is left 1.5 degrees below the friction limit, g sin 1.5 = 0.26.
+CLIMB_RAMP = 0.1
+
+
+@dataclass(frozen=True)
+class PathError:
+    """Where the robot is against its path.
+
+    Attributes:
+        lateral: distance from the path, positive to its left, m.
+        heading: body's x axis against the path's direction, positive to the left, in (-pi, pi], rad.
+        curvature: of the path at the distances :data:`PREVIEW` ahead of its nearest point, positive to the left, 1/m.
+    """
+
+    lateral: Value
+    heading: Value
+    curvature: tuple[Value, ...]
+
+
+def path_error(signals: Signals, motion: Motion) -> PathError:
+    """Return the error from the commanded path: a line, an S-curve or a circle.
+
+    The path begins ``path_offset`` to the left of where the robot stood at the start, turned left by ``path_heading``.
+    ``path_shape`` below 1 is a line, below 2 an S-curve, above a circle of ``path_curvature``; the S-curve
+    y = A (1 - cos k x), k = 2 pi/``path_wavelength``, has that curvature at its start: A = curvature/k^2.
+    """
+    shape, bend = signals.command("path_shape"), signals.command("path_curvature")
+    turn = signals.command("path_heading")
+    cos, sin = ops.cos(turn), ops.sin(turn)
+    away = motion.y - signals.command("path_offset")
+    x, y = cos * motion.x + sin * away, cos * away - sin * motion.x
+    is_circle, is_curve = shape - 2.0, shape - 1.0
+    circle = _circle(x, y, ops.where_positive(is_circle, bend, 0.0))  # a line is a circle without curvature
+    curve = _s_curve(x, y, bend, 2.0 * math.pi / signals.command("path_wavelength"))
+
+    def chosen(of_circle: Value, of_curve: Value) -> Value:
+        return ops.where_positive(is_circle, of_circle, ops.where_positive(is_curve, of_curve, of_circle))
+
+    lateral, direction = (chosen(a, b) for a, b in zip(circle[:2], curve[:2], strict=True))
+    curvature = tuple(chosen(a, b) for a, b in zip(circle[2], curve[2], strict=True))
+    return PathError(lateral, wrapped(motion.yaw - turn - direction), curvature)
+
+
+def _circle(x: Value, y: Value, bend: Value) -> tuple[Value, Value, list[Value]]:
+    """Distance, direction and curvature of a circle through the origin, tangent to x; without a division by its curvature."""
+    along, across = bend * x, 1.0 - bend * y
+    lateral = (2.0 * y - bend * (x * x + y * y)) / (1.0 + ops.sqrt(along * along + across * across))
+    return lateral, ops.arctan2(along, across), [bend for _ in PREVIEW]
+
+
+def _s_curve(x: Value, y: Value, bend: Value, k: Value) -> tuple[Value, Value, list[Value]]:
+    """Distance, direction and curvature of y = A (1 - cos k x) at its point nearest to (x, y)."""
+    amplitude = bend / (k * k)
+    nearest = x
+    for _ in range(NEWTON_STEPS):
+        sin, cos = ops.sin_cos(k * nearest)
+        slope, gap = amplitude * k * sin, amplitude * (1.0 - cos) - y
+        change = 1.0 + slope * slope + gap * (bend * cos)
+        nearest = nearest - (nearest - x + gap * slope) / ops.maximum(change, 0.5)
+    sin, cos = ops.sin_cos(k * nearest)
+    slope = amplitude * k * sin
+    stretch = ops.sqrt(1.0 + slope * slope)
+    lateral = (y - amplitude * (1.0 - cos) - slope * (x - nearest)) / stretch
+    curvature = [_s_curvature(nearest + distance / stretch, bend, k, amplitude) for distance in PREVIEW]
+    return lateral, ops.arctan2(slope, 1.0), curvature
+
+
+def _s_curvature(x: Value, bend: Value, k: Value, amplitude: Value) -> Value:
+    sin, cos = ops.sin_cos(k * x)
+    slope = amplitude * k * sin
+    stretch = 1.0 + slope * slope
+    return bend * cos / (stretch * ops.sqrt(stretch))
+
+
+def leg_references(signals: Signals) -> list[tuple[Value, Value]]:
+    """Return angle (rad) and rate (rad/s) asked of each leg, in joint order.
+
+    From home to ``front_leg_first`` and ``rear_leg_first`` within :data:`POSTURE_READY`; from :data:`SWEEP_BEGINS` on to
+    ``..._second`` at ``leg_rate``, and there they stay.
+    """
+    front, rear = _leg_reference(signals, "front"), _leg_reference(signals, "rear")
+    return [front if ahead > 0 else rear for ahead, _ in CORNER_SIGNS]
+
+
+def _leg_reference(signals: Signals, axle: str) -> tuple[Value, Value]:
+    home, rate, time = signals.robot("home.leg_angle"), signals.command("leg_rate"), signals.time
+    first, second = signals.command(f"{axle}_leg_first"), signals.command(f"{axle}_leg_second")
+    getting_ready = (first - home) * (1.0 / POSTURE_READY)
+    way = second - first
+    swept = ops.clip(rate * (time - SWEEP_BEGINS), 0.0, ops.absolute(way))
+    angle = home + getting_ready * ops.minimum(time, POSTURE_READY) + ops.sign(way) * swept
+    sweeping = ops.where_positive(swept, ops.where_positive(ops.absolute(way) - swept, ops.sign(way) * rate, 0.0), 0.0)
+    return angle, ops.where_positive(POSTURE_READY - time, getting_ready, sweeping)
+
+
+def leg_errors(signals: Signals) -> list[Value]:
+    """Return the true leg angles minus those asked for, rad."""
+    angles = signals.truth("joint_position")[:4]
+    return [angle - asked for angle, (asked, _) in zip(angles, leg_references(signals), strict=True)]
+
+
+def climb_speed(signals: Signals) -> Value:
+    """Return the forward speed asked for on a slope, m/s: ``climb_speed`` until ``climb_time``, then 0; no faster than
+    :data:`CLIMB_RAMP` allows."""
+    speed, time = signals.command("climb_speed"), signals.time
+    rising, falling = CLIMB_RAMP * time, speed - CLIMB_RAMP * (time - signals.command("climb_time"))
+    return ops.clip(ops.minimum(rising, falling), 0.0, speed)

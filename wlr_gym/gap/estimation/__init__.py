@@ -1,0 +1,1 @@
+"""Estimation: fit models to runs, with the uncertainty of what was fitted."""

@@ -1,0 +1,323 @@
+"""Refit hypotheses beside all known numbers: many at once, with responses that are there or follow from the steps taken."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.gap.estimation.fit import (
+    SETTLED,
+    Fit,
+    Model,
+    constrained_step,
+    cross_products,
+    fit,
+    moved,
+    normal_equations,
+    scaled_numbers,
+    total_cost,
+    untouched,
+)
+from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.problem import Candidate, Problem, Setting
+from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
+from wlr_gym.gap.selection.screening import LEAST_GAIN, Score
+
+Array = NDArray[np.float64]
+
+#: Rounds of refitting.
+ROUNDS = 6
+#: Shares of a step that a refit tries.
+TRIED = (2.0, 1.0, 0.5, 0.2)
+#: Share of what the best hypothesis buys by which one start may be behind another of the same before it is given up.
+BEHIND = 0.5
+#: A hypothesis that has bought less than this share of the best after so many steps is not improved any further.
+HOPELESS, PATIENCE = 0.4, 2
+#: Hypotheses whose known numbers the model without an effect more tries too.
+NUDGES = 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """One start of a hypothesis' refit, and how far it got.
+
+    Attributes:
+        of: which hypothesis; -1 = none, the model without an effect more.
+        known: columns of the numbers that all hypotheses share, where the trial started; what its effect replaces does nothing.
+        whole: the same, with those that its effect replaces.
+        model, residuals: the best so far.
+        corrections: of ``known``, one per step taken (Broyden): a direction (numbers) of these numbers, and by what residuals
+            change more along it, one (rows, channels) per run.
+        settled: whether another step gains nothing.
+    """
+
+    of: int
+    known: Sequence[NDArray[np.float32]] = field(repr=False)
+    whole: Sequence[NDArray[np.float32]] = field(repr=False)
+    model: Model
+    residuals: list[Array] = field(default_factory=list, repr=False)
+    corrections: tuple[tuple[Array, list[Array]], ...] = field(default=(), repr=False)
+    settled: bool = False
+
+
+def refit(
+    problem: Problem,
+    runs: Sequence[int],
+    current: Fit,
+    scores: Sequence[Score],
+    given: Sequence[NDArray[np.float32]],
+    rounds: int = ROUNDS,
+) -> list[Hypothesis]:
+    """Refit every hypothesis together with all known numbers; best first.
+
+    Each starts twice: from the calibrated model with its first guess, and from the model as given with its probe, as
+    calibration may have taken on what the effect does, and not let go of it. The responses of the known numbers are those of
+    the two starts; those of each hypothesis' own unknowns are simulated anew. The model without an effect more is refitted too,
+    in the end also from where the best hypotheses are.
+
+    ``given``: columns of ``current`` without its calibration, one (numbers, rows x channels) array per run.
+    """
+    if not scores:
+        return []
+    trials = _simulated(problem, _starts(problem, current, scores, given), runs)
+    trials = _descended(problem, runs, current, trials, rounds)
+    for plain in _simulated(problem, _without_effect(problem, current, trials), runs):
+        trials += _descended(problem, runs, current, [plain], rounds)
+    memory = _best_memory(problem, current, trials)
+    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
+    best = [
+        trials[min((k for k, t in enumerate(trials) if t.of == of), key=lambda k: costs[k])] for of in (*range(len(scores)), -1)
+    ]
+    return _ranked(problem, scores, [t.model for t in best], [t.residuals for t in best], memory)
+
+
+def _descended(problem: Problem, runs: Sequence[int], current: Fit, trials: list[_Trial], rounds: int) -> list[_Trial]:
+    """The trials after so many steps; those that are far behind are dropped or no longer improved."""
+    for done in range(rounds):
+        memory = _best_memory(problem, current, trials)
+        if done >= PATIENCE:
+            trials = _given_up(problem, trials, memory)
+        noise = estimate_noise(min((t.residuals for t in trials), key=lambda r: minus_two_log_likelihood(r, memory)), memory)
+        going = [trial for trial in trials if not trial.settled]
+        if not going:
+            break
+        moved_on = _improved(problem, runs, current, going, noise)
+        trials = _hopeful(problem, [*(trial for trial in trials if trial.settled), *moved_on], memory)
+    return trials
+
+
+def _without_effect(problem: Problem, current: Fit, trials: Sequence[_Trial]) -> list[_Trial]:
+    """The model without an effect more, where the best hypotheses have moved the known numbers.
+
+    The cost is rough: what lets go of a minimum may be any nudge, and then it is no evidence for the effect that gave it.
+    """
+    memory = _best_memory(problem, current, trials)
+    best: dict[int, _Trial] = {}
+    for trial in sorted(trials, key=lambda t: total_cost(problem, t.model, t.residuals, memory)):
+        if trial.of >= 0:
+            best.setdefault(trial.of, trial)
+    free = [replace(t, of=-1, model=t.model.without_effect(-1), settled=False) for t in list(best.values())[:NUDGES]]
+    return [t if t.known is t.whole else replace(t, known=t.whole, corrections=()) for t in free]
+
+
+def _improved(problem: Problem, runs: Sequence[int], current: Fit, trials: Sequence[_Trial], noise: Noise) -> list[_Trial]:
+    """The trials one Gauss-Newton step on."""
+    bases = {id(trial.known): trial.known for trial in trials}
+    matrices = {key: normal_equations(known, current.residuals, noise)[0] for key, known in bases.items()}
+    tries, owns = [], _own_columns(problem, trials, runs)
+    for trial, own in zip(trials, owns, strict=True):
+        equations = _equations(matrices[id(trial.known)], trial, own, noise)
+        change = constrained_step(problem, trial.model, *equations)
+        tries += [replace(trial, model=moved(problem, trial.model, share * change)) for share in TRIED]
+    tries = _simulated(problem, tries, runs)
+    costs = [total_cost(problem, t.model, t.residuals, noise.memory) for t in tries]
+    improved = []
+    for k, (trial, own) in enumerate(zip(trials, owns, strict=True)):
+        best = min(range(len(TRIED) * k, len(TRIED) * (k + 1)), key=lambda i: costs[i])
+        gained = total_cost(problem, trial.model, trial.residuals, noise.memory) - costs[best]
+        better = _corrected(problem, trial, own, tries[best]) if gained > 0.0 else trial
+        improved.append(replace(better, settled=gained < SETTLED))
+    return improved
+
+
+def _equations(matrix: Array, trial: _Trial, own: Sequence[Array], noise: Noise) -> tuple[Array, Array]:
+    """Normal equations of a trial's numbers: the known ones' matrix is given, its corrections are so many columns more."""
+    size, more = len(matrix), len(trial.corrections)
+    runs = range(len(trial.residuals))
+    columns = [np.concatenate([own[r], *(missed[r][None] for _, missed in trial.corrections)]) for r in runs]
+    wide, push = _bordered(matrix, trial.known, columns, trial.residuals, noise)
+    mix = np.eye(len(wide) - more, len(wide))
+    for k, (direction, _) in enumerate(trial.corrections):
+        mix[:size, len(wide) - more + k] = direction
+    return mix @ wide @ mix.T, mix @ push
+
+
+def _corrected(problem: Problem, before: _Trial, own: Sequence[Array], after: _Trial) -> _Trial:
+    """The trial after a step, its known columns corrected by what the step did beyond what they and its own had promised."""
+    taken = scaled_numbers(problem, after.model) - scaled_numbers(problem, before.model)
+    size = len(before.known[0])
+    known, rest = taken[:size], taken[size:]
+    length = float(known @ known)
+    if length < 1e-9:
+        return after
+    shares = [known @ direction for direction, _ in before.corrections]
+    missed = []
+    for r, (old, new) in enumerate(zip(before.residuals, after.residuals, strict=True)):
+        promised = (known.astype(np.float32) @ before.known[r]).reshape(old.shape) + np.tensordot(rest, own[r], 1)
+        for share, (_, beyond) in zip(shares, before.corrections, strict=True):
+            promised += share * beyond[r]
+        missed.append((np.nan_to_num(new - old) - promised) / length)
+    return replace(after, corrections=(*before.corrections, (known, missed)))
+
+
+def _least_costs(problem: Problem, trials: Sequence[_Trial], memory: Array) -> tuple[list[float], dict[int, float]]:
+    """Costs of the trials, and of the best trial of each hypothesis."""
+    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
+    return costs, {of: min(c for c, t in zip(costs, trials, strict=True) if t.of == of) for of in {t.of for t in trials}}
+
+
+def _hopeful(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[_Trial]:
+    """Of two starts of a hypothesis the better one, if the other is far behind."""
+    costs, least = _least_costs(problem, trials, memory)
+    room = max(max(least.values()) - min(least.values()), LEAST_GAIN)
+    return [t for c, t in zip(costs, trials, strict=True) if c - least[t.of] < BEHIND * room]
+
+
+def _given_up(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[_Trial]:
+    """The trials; those of hypotheses that are far behind the best are settled."""
+    _, least = _least_costs(problem, trials, memory)
+    enough = HOPELESS * (least[-1] - min(least.values()))
+    return [replace(t, settled=t.settled or (t.of >= 0 and least[-1] - least[t.of] < enough)) for t in trials]
+
+
+def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequence[NDArray[np.float32]]) -> list[_Trial]:
+    """Where refits begin. The model as given keeps the effects found before."""
+    as_given = untouched(problem, current.model)
+    trials = [_Trial(-1, current.columns, current.columns, current.model)]
+    for k, score in enumerate(scores):
+        candidate = score.candidate
+        near, anew = (_without_replaced(problem, candidate, known) for known in (current.columns, given))
+        trials.append(_Trial(k, near, current.columns, current.model.with_effect(candidate, score.values)))
+        probed = as_given.with_effect(candidate, candidate.probed(candidate.starts[0]))
+        trials.append(_Trial(k, anew, given, probed))
+    return trials
+
+
+def _without_replaced(
+    problem: Problem, candidate: Candidate, known: Sequence[NDArray[np.float32]]
+) -> Sequence[NDArray[np.float32]]:
+    """Columns of the known numbers; those whose place a candidate takes do nothing beside it."""
+    replaced = candidate.replaced
+    if not replaced:
+        return known
+    rows = [k for k, quantity in enumerate(problem.quantities) if quantity.name in replaced]
+    silent = [column.copy() for column in known]
+    for column in silent:
+        column[rows] = 0.0
+    return silent
+
+
+def _simulated(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) -> list[_Trial]:
+    """The trials with the residuals of their models."""
+    found = problem.residuals([trial.model.setting for trial in trials], runs)
+    return [replace(trial, residuals=[r[k] for r in found]) for k, trial in enumerate(trials)]
+
+
+def refit_thoroughly(problem: Problem, runs: Sequence[int], current: Fit, scores: Sequence[Score]) -> list[Hypothesis]:
+    """Fit every hypothesis in full, from its first guess and from its probes; best first."""
+    memory, scatter = current.noise.memory, current.noise.scatter
+    fits = [
+        min(
+            (
+                fit(
+                    problem,
+                    runs,
+                    current.model.with_effect(score.candidate, values),
+                    memory=memory,
+                    scatter=scatter,
+                    steps=problem.steps,
+                )
+                for values in _starting_values(score)
+            ),
+            key=lambda found: found.cost,
+        )
+        for score in scores
+    ]
+    fits.append(fit(problem, runs, current.model, memory=memory, scatter=scatter, steps=problem.steps))
+    trials = [_Trial(k, found.columns, found.columns, found.model, found.residuals) for k, found in enumerate(fits)]
+    memory = _best_memory(problem, current, trials)
+    return _ranked(problem, scores, [t.model for t in trials], [t.residuals for t in trials], memory)
+
+
+def _starting_values(score: Score) -> list[tuple[float, ...]]:
+    """The first guess, and the first two probes."""
+    candidate = score.candidate
+    return list(dict.fromkeys((score.values, *(candidate.probed(start) for start in candidate.starts[:2]))))
+
+
+def _bordered(
+    matrix: Array, known: Sequence[NDArray[np.float32]], own: Sequence[Array], residuals: Sequence[Array], noise: Noise
+) -> tuple[Array, Array]:
+    """Normal equations of the known numbers, whose matrix is given, and a candidate's own unknowns."""
+    both = [np.concatenate([columns, residual[None]]) for columns, residual in zip(own, residuals, strict=True)]
+    across = cross_products(known, both, noise)
+    root = np.sqrt(noise.weight)
+    flat = [np.nan_to_num(part * root).reshape(len(part), -1) for part in both]
+    inner = np.sum([part @ part.T for part in flat], axis=0)
+    whole = np.block([[matrix, across[:, :-1]], [across[:, :-1].T, inner[:-1, :-1]]])
+    return whole, np.concatenate([across[:, -1], inner[:-1, -1]])
+
+
+def _ranked(
+    problem: Problem, scores: Sequence[Score], models: Sequence[Model], residuals: Sequence[list[Array]], memory: Array
+) -> list[Hypothesis]:
+    """Hypotheses from refitted models, the last of which has no effect more; best first."""
+    base = total_cost(problem, models[-1], residuals[-1], memory)
+    found = []
+    for score, model, residual in zip(scores, models[:-1], residuals[:-1], strict=True):
+        by_run = fall_by_run(residuals[-1], residual, estimate_noise(residual, memory))
+        gain = base - total_cost(problem, model, residual, memory)
+        hypothesis = Hypothesis(score.candidate, model, gain, by_run, score.gain, residual, models[-1], residuals[-1])
+        found.append(replace(hypothesis, tolerable=within_tolerance(problem, model)))
+    return sorted(found, key=lambda hypothesis: -hypothesis.gain)
+
+
+def _best_memory(problem: Problem, current: Fit, trials: Sequence[_Trial]) -> Array:
+    """Memory of the residuals of the best model so far: the same for all that are compared."""
+    memory = current.noise.memory
+    best = min(trials, key=lambda t: total_cost(problem, t.model, t.residuals, memory))
+    if total_cost(problem, best.model, best.residuals, memory) >= current.cost:
+        return memory
+    return estimate_noise(best.residuals, scatter=current.noise.scatter).memory
+
+
+def _own_columns(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) -> list[list[Array]]:
+    """Responses of each trial's last effect's unknowns, scaled by their steps: per trial, per run, (unknowns, rows, channels).
+
+    Only those of the last effect are simulated anew: the others' are among the known columns.
+    """
+    settings: list[Setting] = []
+    taken: list[list[float]] = []
+    for trial in trials:
+        taken.append([])
+        if trial.of < 0:
+            continue
+        candidate, values = trial.model.effects[-1]
+        for k, unknown in enumerate(candidate.unknowns):
+            step = unknown.step if values[k] + unknown.step <= unknown.high else -unknown.step
+            changed = tuple(v + step * (i == k) for i, v in enumerate(values))
+            settings.append(replace(trial.model, effects=(*trial.model.effects[:-1], (candidate, changed))).setting)
+            taken[-1].append(step / unknown.step)
+    if not settings:
+        return [[np.zeros((0, *residual.shape)) for residual in trial.residuals] for trial in trials]
+    found = problem.residuals(settings, runs)
+    columns, at = [], 0
+    for trial, steps in zip(trials, taken, strict=True):
+        mine = [r[at : at + len(steps)] for r in found]
+        scale = np.array(steps)[:, None, None]
+        columns.append([np.nan_to_num((r - base) / scale) for r, base in zip(mine, trial.residuals, strict=True)])
+        at += len(steps)
+    return columns

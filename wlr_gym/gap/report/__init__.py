@@ -1,0 +1,1 @@
+"""Report: result file, page, pictures and text of an analysis."""

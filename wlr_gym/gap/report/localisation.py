@@ -1,0 +1,97 @@
+"""Where the gap is: which channels, and in which states of the robot."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.gap.analysis import HeatMap, Place
+from wlr_gym.gap.estimation.likelihood import Noise
+from wlr_gym.gap.problem import Problem
+
+Array = NDArray[np.float64]
+
+#: Bins of a feature, by its quantiles, and maps drawn.
+BINS, MAPS = 5, 4
+#: Channels named, and the least share worth naming.
+MOST_PLACES, LEAST_SHARE = 8, 0.02
+#: Variance of the squared residual that a feature must explain before the text mentions it.
+LEAST_DEPENDENCE = 0.05
+
+
+def localise(
+    problem: Problem,
+    calibrated: Sequence[Array],
+    expected: Array,
+    noise: Noise,
+    features: Sequence[Mapping[str, Array]],
+) -> tuple[tuple[Place, ...], tuple[HeatMap, ...]]:
+    """Return the channels that hold the gap, strongest first, and heat maps of the states it depends on.
+
+    Args:
+        problem: the system.
+        calibrated: residuals of the calibrated model without effects, one (rows, signals) per run.
+        expected: (signals) mean squares that a complete model has: of the final model, or 1; NaN where nothing was measured.
+        noise: of the residuals; its memory says how many rows count.
+        features: what residuals may depend on, rows of the same runs.
+    """
+    squares = np.sum([np.nansum(np.minimum(r * r, problem.cap**2), axis=0) for r in calibrated], axis=0) / np.maximum(
+        noise.rows, 1
+    )
+    floor = np.where(np.isfinite(expected), np.maximum(expected, 1.0), 1.0)
+    excess = np.maximum(squares / floor - 1.0, 0.0) * noise.rows / noise.memory
+    total = float(excess.sum())
+    if total <= 0.0:
+        return (), ()
+    order = [int(c) for c in np.argsort(-excess) if excess[c] > LEAST_SHARE * total][:MOST_PLACES]
+    pooled = {name: np.concatenate([f[name] for f in features]) for name in (features[0] if features else {})}
+    rows = np.concatenate(list(calibrated))
+    places, chosen = [], []
+    for c in order:
+        text, feature = _dependence(np.clip(rows[:, c], -problem.cap, problem.cap), pooled)
+        places.append(Place(problem.signals[c].name, float(excess[c] / total), text))
+        chosen += [feature] if feature and feature not in chosen else []
+    maps = tuple(_heat_map(problem, rows, order, name, pooled[name]) for name in chosen[:MAPS])
+    return tuple(places), maps
+
+
+def _dependence(residual: Array, features: Mapping[str, Array]) -> tuple[str, str]:
+    """In which states a channel's residual is large: the feature whose bins explain most of its square."""
+    seen = np.isfinite(residual)
+    square = residual[seen] ** 2
+    best, best_share, text = "", LEAST_DEPENDENCE, "no clear dependence on the state"
+    for name, values in features.items():
+        edges = _edges(values[seen])
+        if len(edges) < 3:
+            continue
+        bins = np.clip(np.searchsorted(edges, values[seen], side="right") - 1, 0, len(edges) - 2)
+        means = np.array([square[bins == b].mean() if (bins == b).any() else 0.0 for b in range(len(edges) - 1)])
+        share = float(np.var(means[bins]) / max(np.var(square), 1e-12))
+        if share > best_share:
+            top, low = int(np.argmax(means)), int(np.argmin(means))
+            best, best_share = name, share
+            text = (
+                f"largest for {name} in [{edges[top]:.3g}, {edges[top + 1]:.3g}] ({np.sqrt(means[top]):.1f} noise units), "
+                f"smallest in [{edges[low]:.3g}, {edges[low + 1]:.3g}] ({np.sqrt(means[low]):.1f})"
+            )
+    return text, best
+
+
+def _edges(values: Array) -> Array:
+    return np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1))) if values.size else np.zeros(0)
+
+
+def _heat_map(problem: Problem, rows: Array, channels: Sequence[int], name: str, values: Array) -> HeatMap:
+    edges = _edges(values)
+    bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+    cells = np.full((len(channels), len(edges) - 1), np.nan)
+    for k, c in enumerate(channels):
+        for b in range(len(edges) - 1):
+            inside = rows[bins == b, c]
+            if np.isfinite(inside).any():
+                cells[k, b] = np.sqrt(np.nanmean(np.minimum(inside**2, problem.cap**2)))
+    labels = tuple(f"{a:.3g} .. {b:.3g}" for a, b in itertools.pairwise(edges))
+    return HeatMap(tuple(problem.signals[c].name for c in channels), labels, cells, name)

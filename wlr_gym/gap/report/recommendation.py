@@ -1,0 +1,168 @@
+"""What to record next: the excitation that shows what these data could not, or separates what they could not tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from wlr_gym.data.excitations import EXCITATIONS
+from wlr_gym.data.format import Profile
+from wlr_gym.gap.analysis import EFFECT_FOUND, Recommendation
+from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
+from wlr_gym.gap.selection.search import Naming
+
+#: Motion of :data:`wlr_gym.data.excitations.EXCITATIONS` that shows an effect best.
+SHOWN_BY: Mapping[str, str] = {
+    "coulomb_friction": "random",
+    "viscous_friction": "straight",
+    "stribeck_friction": "stop_and_go",
+    "load_dependent_friction": "rear_legs",
+    "backlash": "stop_and_go",
+    "torque_ripple": "straight",
+    "weak_motor": "rear_legs",
+    "supply_sag": "steps",
+    "command_delay": "chirp",
+    "joint_zero_offset": "all_legs",
+    "friction_level": "turns",
+    "friction_asymmetry": "turns",
+    "friction_anisotropy": "turns",
+    "friction_patch": "straight",
+    "slip_weakening": "turns",
+    "tyre_creep": "straight",
+    "rolling_resistance": "straight",
+    "wheel_radius_error": "straight",
+    "payload": "all_legs",
+    "com_offset": "all_legs",
+    "floor_slope": "turns",
+    "external_force": "turns",
+    "tether": "straight",
+    "gyro_bias": "random",
+    "imu_misalignment": "random",
+    "camera_misalignment": "s_curve",
+    "camera_delay": "chirp",
+}
+
+_FRICTION = frozenset({"coulomb_friction", "viscous_friction", "stribeck_friction", "load_dependent_friction"})
+_PULL = frozenset({"floor_slope", "external_force", "tether"})
+#: One of the first and one of the second -> excitation that separates them, and why it does.
+_SEPARATED_BY: Sequence[tuple[frozenset[str], frozenset[str], str, str]] = (
+    (
+        frozenset({"rolling_resistance"}),
+        _FRICTION,
+        "straight",
+        "repeat it with extra weight on the body: rolling resistance grows with the load on a wheel, gear friction does not",
+    ),
+    (
+        frozenset({"rolling_resistance"}),
+        _PULL,
+        "turns",
+        "turn round and drive back: a pull keeps its direction on the floor, resistance turns with the robot",
+    ),
+    (
+        _PULL,
+        frozenset({"com_offset", "payload", "imu_misalignment"}),
+        "turns",
+        "a full turn on the spot: what belongs to the floor changes sign with the heading, what belongs to the body does not",
+    ),
+    (
+        frozenset({"com_offset"}),
+        frozenset({"payload"}),
+        "chirp",
+        "an extra mass also slows every acceleration down, a displaced centre does not",
+    ),
+    (
+        frozenset({"command_delay"}),
+        frozenset({"camera_delay", "backlash", "viscous_friction"}),
+        "chirp",
+        "the phase of a delay grows with frequency at full amplitude; friction and play lose amplitude",
+    ),
+    (
+        frozenset({"backlash"}),
+        frozenset({"stribeck_friction", "coulomb_friction"}),
+        "stop_and_go",
+        "reversals at two loads: play is constant in angle and vanishes under a steady load, friction is constant in torque",
+    ),
+    (
+        frozenset({"weak_motor"}),
+        frozenset({"supply_sag", "load_dependent_friction"}),
+        "rear_legs",
+        "drive and be driven: friction changes its sign with the speed, a weak motor does not; sag needs a high total current",
+    ),
+    (
+        frozenset({"wheel_radius_error"}),
+        frozenset({"camera_misalignment", "tyre_creep"}),
+        "turns",
+        "a wrong radius turns the robot where wheels differ; a wrong camera scale does not",
+    ),
+    (
+        frozenset({"friction_anisotropy", "slip_weakening"}),
+        frozenset({"friction_level", "friction_asymmetry", "tyre_creep"}),
+        "turns",
+        "spins in place at several speeds beside straight braking: lateral and longitudinal grip are used apart",
+    ),
+    (
+        frozenset({"coulomb_friction"}),
+        frozenset({"viscous_friction", "stribeck_friction"}),
+        "straight",
+        "several steady speeds, one of them near zero",
+    ),
+)
+
+
+def separation(chosen: str, other: str, motions: Mapping[str, str]) -> tuple[str, str] | None:
+    """Return the excitation that tells two effects apart, and why it does; None where none is known.
+
+    Args:
+        chosen, other: names of effects.
+        motions: effect -> motion of the system that shows it best; empty = it has no named motions.
+    """
+    for one, two, excitation, why in _SEPARATED_BY if motions else ():
+        if (chosen in one and other in two) or (chosen in two and other in one):
+            return excitation, why
+    return (motions[chosen], f"the motion in which {chosen} shows best") if chosen in motions else None
+
+
+def separating_run(names: Iterable[str], motions: Mapping[str, str]) -> str:
+    """Return, in words, the run that tells explanations apart, the chosen one from the others; see :func:`separation`."""
+    chosen, *others = names
+    found = dict.fromkeys(filter(None, (separation(chosen, other, motions) for other in others)))
+    texts = [f"{excitation} ({EXCITATIONS[excitation].doc}): {why}" for excitation, why in found]
+    return "; ".join(texts) or "more runs, of other kinds and at other loads"
+
+
+def recommend(
+    naming: Naming, equivalent: Sequence[Sequence[str]], verdict: str, motions: Mapping[str, str]
+) -> tuple[Recommendation, ...]:
+    """Return runs worth recording: to separate equivalents, then to show effects that these data would have missed."""
+    found: dict[str, str] = {}
+    for names in equivalent:
+        for other in names[1:]:
+            apart = separation(names[0], other, motions)
+            if apart is not None:
+                found.setdefault(apart[0], f"separates {names[0]} from {other}: {apart[1]}")
+    last = naming.rounds[-1]
+    for hypothesis in last.hypotheses:
+        name = hypothesis.candidate.name
+        if name in motions and shown_by_some_runs_only(hypothesis, last.cost):
+            found.setdefault(motions[name], f"some runs show {name} and the others do not bear it out")
+    if verdict != EFFECT_FOUND:
+        visible: dict[str, bool] = {}
+        for score in naming.rounds[-1].scores:
+            visible[score.candidate.name] = visible.get(score.candidate.name, False) or score.visible
+        blind: dict[str, list[str]] = {}
+        for name, shown in visible.items():
+            if not shown and name in motions:
+                blind.setdefault(motions[name], []).append(name)
+        for excitation, names in blind.items():
+            found.setdefault(excitation, f"would show {', '.join(sorted(names))}, of which these data show nothing")
+    return tuple(Recommendation(excitation, why) for excitation, why in found.items())
+
+
+def record_commands(excitations: Iterable[str]) -> list[str]:
+    """Return the commands that record excitations: a folder of runs has one servo profile."""
+    alike: dict[Profile, list[str]] = {}
+    for name in excitations:
+        alike.setdefault(EXCITATIONS[name].profile, []).append(name)
+    folders = ["new_runs", *(f"new_runs_{k}" for k in range(2, len(alike) + 1))]
+    return [
+        f"wlr record --excitation {' '.join(names)} --out {out}" for out, names in zip(folders, alike.values(), strict=True)
+    ]

@@ -1,0 +1,384 @@
+"""The result file of an analysis, ``result.json``, and the patch that adds what was found to the model, ``patch.yaml``.
+
+The models below are the format: what is written has passed them, and :func:`read_result` checks a file against them. Keys that
+other versions add are kept.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from wlr_gym import __version__
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import write_json
+from wlr_gym.gap.analysis import Adequacy, Analysis, Calibrated, Estimate, Evidence, FoundEffect, GapFigures, Statistic
+from wlr_gym.gap.report.text import closure, sentence, unit_of
+from wlr_gym.physics.effects import Patch, PatchEffect, save_patch
+from wlr_gym.physics.plants.forces import COORDINATES
+
+RESULT_FILE, PATCH_FILE = "result.json", "patch.yaml"
+MADE_BY = "wlr gap"
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN: a number that is none becomes null."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+MaybeNumber = Annotated[float | None, BeforeValidator(_finite)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Interval = tuple[Number, Number]
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+
+class ParameterEntry(_Entry):
+    """A fitted parameter of an effect; ``ci95`` is null where the data give none."""
+
+    value: Number
+    ci95: Interval | None
+    unit: str
+
+    @model_validator(mode="after")
+    def _inside(self) -> ParameterEntry:
+        if self.ci95 is not None and not self.ci95[0] <= self.value <= self.ci95[1]:
+            raise ValueError(f"value {self.value:g} is not within its ci95 {list(self.ci95)}")
+        return self
+
+
+class RangeEntry(_Entry):
+    """Lowest and highest value of what a formula reads, in the fitted runs."""
+
+    range: Interval
+    unit: str
+
+
+class EffectEntry(_Entry):
+    """One missing effect; ``formula`` is text with units, of unknown effects only, ``validity`` where it was tried."""
+
+    name: str
+    where: list[str]
+    parameters: dict[str, ParameterEntry]
+    confidence: Share
+    gain: MaybeNumber = None
+    formula: str | None = None
+    validity: dict[str, RangeEntry] = {}
+
+
+class CalibrationEntry(_Entry):
+    """A known number that calibration moved; ``sigma`` is its tolerance."""
+
+    nominal: Number
+    fitted: Number
+    unit: str
+    sigma: MaybeNumber = None
+    ci95: Interval | None = None
+
+
+class LocalisationEntry(_Entry):
+    """Where the gap is."""
+
+    share_of_gap: Share
+    state_dependence: str
+
+
+class GapEntry(_Entry):
+    """The gap: rms error of replayed runs, 1.0 = sensor noise.
+
+    ``reduction`` lies in 0..1; ``reduction_signed`` is negative where the effects make held-out runs worse, and null where
+    calibration leaves nothing to remove and in results of versions that did not tell it. The interval is that of
+    ``reduction_signed``, null where held-out runs are too few.
+    """
+
+    metric: str
+    fit_before: MaybeNumber
+    fit_after: MaybeNumber
+    heldout_before: MaybeNumber
+    heldout_calibrated: MaybeNumber
+    heldout_after: MaybeNumber
+    noise_floor: MaybeNumber
+    reduction: Share
+    reduction_signed: Annotated[float | None, Field(le=1.0), BeforeValidator(_finite)] = None
+    reduction_ci95: tuple[MaybeNumber, MaybeNumber] | None
+
+
+class RelationEntry(_Entry):
+    """A relation of the model and what the best law there promises, as a fall of minus two log posterior."""
+
+    name: str
+    law: str
+    formula: str
+    gain: Number
+
+
+class RunsEntry(_Entry):
+    """Names of the runs that were fitted to, and of those kept aside."""
+
+    fit: list[str]
+    heldout: list[str]
+
+
+class DetectableEntry(_Entry):
+    """Smallest severity of an effect that the data would have shown; null: none that is plausible."""
+
+    parameter: str
+    value: MaybeNumber
+    unit: str
+
+
+class StatisticEntry(_Entry):
+    """A statistic of what the final model leaves in the fitted runs, beside the same of runs that it made itself.
+
+    ``expected`` is their median, ``limit`` their 95 % quantile, ``p`` the share of them, the observed ones counted in, that is
+    as large, ``ratio`` value over expected.
+    """
+
+    value: MaybeNumber
+    expected: MaybeNumber
+    limit: MaybeNumber
+    p: MaybeNumber
+    ratio: MaybeNumber
+
+
+class ByChannelEntry(StatisticEntry):
+    """A statistic over all channels, and of each."""
+
+    channels: dict[str, StatisticEntry]
+
+
+class PulledEntry(StatisticEntry):
+    """By how many standard errors one run pulls a number away from the other runs: the largest there is."""
+
+    number: str
+    run: str
+
+
+class ConstancyEntry(StatisticEntry):
+    """How many times more than their rows promise the runs differ in where they pull the model's numbers."""
+
+    pulled_most: PulledEntry
+
+
+class TurningEntry(_Entry):
+    """What the final model leaves of a signal goes with its joint's turning; ``amplitude`` in noise units."""
+
+    joint: str
+    signal: str
+    order: int
+    share: float
+    amplitude: float
+    confidence: float
+
+
+class AdequacyEntry(_Entry):
+    """Whether the final model is adequate: information, no decision. ``replicates`` sets of runs were made by it."""
+
+    replicates: int
+    level: ByChannelEntry
+    whiteness: ByChannelEntry
+    constancy: ConstancyEntry
+
+
+class Result(_Entry):
+    """Contents of ``result.json``."""
+
+    verdict: Literal["bad_data", "not_excited", "nothing_missing", "effect_found", "unknown_effect"]
+    summary: str = ""
+    effects: list[EffectEntry]
+    equivalent: list[list[str]]
+    separating_runs: list[str] = []
+    calibration: dict[str, CalibrationEntry]
+    localisation: dict[str, LocalisationEntry]
+    relations: list[RelationEntry] = []
+    gap: GapEntry | None
+    runs: RunsEntry
+    patch: str
+    detectable: dict[str, DetectableEntry] = {}
+    closure: str = ""
+    turning: TurningEntry | None = None
+    adequacy: AdequacyEntry | dict[str, MaybeNumber] | None = None  # earlier versions: the level of each channel
+
+
+# ---- writing ---------------------------------------------------------------------------------------------------------
+
+
+def patch_of(analysis: Analysis) -> Patch:
+    """Return the effects that were found, as a patch; an unknown effect without a formula cannot be added.
+
+    Neither the effects that were given as known nor calibrated numbers are in it.
+    """
+    effects = tuple(
+        PatchEffect(
+            effect.name,
+            tuple(effect.where),
+            {name: float(found.value) for name, found in effect.parameters.items()},
+            effect.formula,
+            dict(effect.units),
+        )
+        for effect in analysis.added
+    )
+    origin = {"made_by": MADE_BY, "data": [analysis.data], "date": _today(), "version": __version__}
+    return Patch(effects, {**origin, "verdict": analysis.verdict}, source=PATCH_FILE)
+
+
+def result_of(analysis: Analysis, patch: Path | str = PATCH_FILE) -> Result:
+    """Return what the result file says of an analysis.
+
+    Args:
+        analysis: what was found.
+        patch: where its patch is.
+
+    Raises:
+        ValueError: a number that makes no sense, such as a share above 1.
+    """
+    places = sorted(analysis.localisation, key=lambda place: -place.share)
+    content = {
+        "verdict": analysis.verdict,
+        "summary": sentence(analysis),
+        "effects": [_effect(effect) for effect in analysis.effects],
+        "equivalent": [list(group.names) for group in analysis.equivalent],
+        "separating_runs": [group.separating_run for group in analysis.equivalent],
+        "calibration": {name: _calibrated(moved) for name, moved in analysis.calibration.items()},
+        "localisation": {p.name: {"share_of_gap": p.share, "state_dependence": p.dependence} for p in places},
+        "relations": [dict(vars(one)) for one in analysis.relations],
+        "gap": None if analysis.gap is None else _gap(analysis.gap),
+        "runs": {"fit": list(analysis.fit_runs), "heldout": list(analysis.heldout_runs)},
+        "patch": str(patch),
+        "detectable": {name: dict(vars(one)) for name, one in analysis.detectable.items()},
+        "closure": closure(analysis),
+        "turning": None if analysis.turning is None else dict(vars(analysis.turning)),
+        "evidence": [_evidence(one) for one in analysis.evidence],
+        "run_gaps": [dict(vars(one)) for one in analysis.run_gaps],
+        "channel_gaps": [dict(vars(one)) for one in analysis.channel_gaps],
+        "intake": [dict(vars(one)) for one in analysis.intake],
+        "recommendations": [dict(vars(one)) for one in analysis.recommendations],
+        "adequacy": None if analysis.adequacy is None else _adequacy(analysis.adequacy),
+        "known_effects": [dict(known) for known in analysis.known_effects],
+        "seconds": dict(analysis.seconds),
+        "provenance": {
+            "made_by": MADE_BY, "data": analysis.data, "date": _today(), "version": __version__, **analysis.provenance
+        },
+    }  # fmt: skip
+    return Result.model_validate(_plain(content))
+
+
+def write_result(analysis: Analysis, folder: Path) -> Path:
+    """Write ``patch.yaml`` and then ``result.json`` into a folder that is there, each in one step; return the latter's path.
+
+    The result names the patch by its absolute path.
+    """
+    patch = folder.resolve() / PATCH_FILE
+    result = result_of(analysis, patch)
+    save_patch(patch_of(analysis), patch)
+    path = folder / RESULT_FILE
+    write_json(path, result.model_dump(mode="json", exclude_none=False))
+    return path
+
+
+def _effect(effect: FoundEffect) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "name": effect.name,
+        "where": list(effect.where),
+        "parameters": {name: _parameter(found) for name, found in effect.parameters.items()},
+        "confidence": effect.confidence,
+        "gain": effect.gain,
+        "formula": _formula(effect) if effect.formula else None,
+        "validity": {name: {"range": [one.low, one.high], "unit": one.unit} for name, one in effect.validity.items()},
+    }
+    return entry
+
+
+def _parameter(found: Estimate) -> dict[str, Any]:
+    known = math.isfinite(found.low) and math.isfinite(found.high)
+    interval = [min(found.low, found.value), max(found.high, found.value)] if known else None
+    return {"value": found.value, "ci95": interval, "unit": found.unit}
+
+
+def _formula(effect: FoundEffect) -> str:
+    """Return the formula with the units of its force and its constants: ``-k * leg_angle N m; k in N m/rad``."""
+    force = unit_of(COORDINATES.get(effect.where[0], "")) if effect.where else ""
+    constants = [f"{name} in {'1' if unit == '-' else unit}" for name, unit in effect.units.items()]
+    return "; ".join([effect.formula + force, *constants])
+
+
+def _calibrated(moved: Calibrated) -> dict[str, Any]:
+    half = moved.uncertainty
+    interval = [moved.fitted - half, moved.fitted + half] if math.isfinite(half) else None
+    return {
+        "nominal": moved.nominal, "fitted": moved.fitted, "unit": moved.unit, "sigma": moved.sigma, "ci95": interval
+    }  # fmt: skip
+
+
+def _gap(gap: GapFigures) -> dict[str, Any]:
+    known = all(map(math.isfinite, gap.reduction_ci95))
+    share = min(max(gap.reduction, 0.0), 1.0) if math.isfinite(gap.reduction) else 0.0
+    interval = list(gap.reduction_ci95) if known else None
+    return {**vars(gap), "reduction": share, "reduction_signed": gap.reduction, "reduction_ci95": interval}
+
+
+def _adequacy(found: Adequacy) -> dict[str, Any]:
+    pulled = {"number": found.pulled.number, "run": found.pulled.run, **_statistic(found.pulled.errors)}
+    by_channel = [{name: _statistic(both[k]) for name, both in found.channels.items()} for k in (0, 1)]
+    return {
+        "replicates": found.replicates,
+        "level": {**_statistic(found.level), "channels": by_channel[0]},
+        "whiteness": {**_statistic(found.whiteness), "channels": by_channel[1]},
+        "constancy": {**_statistic(found.constancy), "pulled_most": pulled},
+    }
+
+
+def _statistic(found: Statistic) -> dict[str, float]:
+    return {**vars(found), "ratio": found.ratio}
+
+
+def _evidence(one: Evidence) -> dict[str, Any]:
+    return {**vars(one), "where": list(one.where), "values": dict(one.values), "by_run": dict(one.by_run)}
+
+
+def _plain(value: Any) -> Any:
+    """Return nested mappings and sequences of plain JSON types; what is not finite becomes null outside required numbers."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float):
+        return _finite(float(value))  # NumPy's are floats, too
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    return value if isinstance(value, str | bool | int | type(None)) else str(value)
+
+
+def _today() -> str:
+    return datetime.now(UTC).date().isoformat()
+
+
+# ---- reading ---------------------------------------------------------------------------------------------------------
+
+
+def read_result(path: str | Path) -> Result:
+    """Read and check a result file.
+
+    Raises:
+        InputError: no such file, broken JSON, or contents that are not those of a result; the message names the place.
+    """
+    try:
+        return Result.model_validate(json.loads(Path(path).read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}, line {error.lineno}, column {error.colno}: broken JSON: {error.msg}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "content"
+        raise InputError(f"{path}: {place}: {first['msg']}") from None

@@ -1,0 +1,324 @@
+"""What an analysis says in plain words: places, channels, effects, numbers, and the verdict as one sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from wlr_gym.gap.analysis import (
+    BAD_DATA,
+    EFFECT_FOUND,
+    NOT_CARRIED,
+    NOT_EXCITED,
+    NOTHING_MISSING,
+    UNKNOWN,
+    Adequacy,
+    Analysis,
+    ChannelGap,
+    Estimate,
+    FoundEffect,
+    Statistic,
+    Turning,
+)
+from wlr_gym.gap.selection.screening import LEAST_GAIN
+from wlr_gym.physics.effects import UNKNOWN_EFFECT
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT
+from wlr_gym.robot import CORNERS, LEGS, WHEELS
+
+#: Verdict -> title of the report.
+TITLES = {
+    BAD_DATA: "Data cannot be used",
+    NOT_EXCITED: "Runs show too little",
+    NOTHING_MISSING: "Nothing missing",
+    EFFECT_FOUND: "Missing effect found",
+    UNKNOWN: "Something unknown is missing",
+}
+#: Title where nothing was named, and yet something is left.
+NOTHING_CLEAR = "Nothing clear enough to be named"
+_CORNERS: dict[str, str] = dict(zip(CORNERS, ("left front", "right front", "left rear", "right rear"), strict=True))
+_SIDES = {
+    frozenset(CORNERS): "all four",
+    frozenset(("lf", "rf")): "both front",
+    frozenset(("lr", "rr")): "both rear",
+    frozenset(("lf", "lr")): "both left",
+    frozenset(("rf", "rr")): "both right",
+}
+#: Times what a model without error would reach, from which on there is something left that has no name.
+UNEXPLAINED = 1.5
+#: Groups of channels in words; others as they are.
+_GROUPS = {
+    "pos_leg": "the angles of the legs", "pos_wheel": "the angles of the wheels", "vel_leg": "the speeds of the legs",
+    "vel_wheel": "the speeds of the wheels", "eff_leg": "the motor torques of the legs", "gyro": "the turning rates",
+    "eff_wheel": "the motor torques of the wheels", "acc": "the accelerations", "volt": "the supply voltage",
+    "cam_xy": "the camera's position", "cam_yaw": "the camera's heading", "position": "the angle",
+    "cam_z": "the camera's height", "cam_pitch": "the camera's pitch",
+}  # fmt: skip
+_PLACES = {"ground": "floor", "sensor": "sensors"}
+_MEASURED = {
+    "pos_leg": "angle", "pos_wheel": "angle", "vel_leg": "speed", "vel_wheel": "speed",
+    "eff_leg": "motor torque", "eff_wheel": "motor torque", "cmd_leg": "goal angle", "cmd_wheel": "goal speed",
+}  # fmt: skip
+_CHANNELS = {
+    "cam_x": "camera: position x", "cam_y": "camera: position y", "cam_yaw": "camera: heading", "cam_z": "camera: height",
+    "cam_pitch": "camera: pitch", "volt": "supply voltage",
+    **{f"gyro_{axis}": f"turning rate about {axis}" for axis in "xyz"},
+    **{f"acc_{axis}": f"acceleration along {axis}" for axis in "xyz"},
+}  # fmt: skip
+
+
+#: Units of states that the layout of the simulators' truth does not have.
+_FEATURES = {"slip_speed": "m/s", "time_since_reversal": "s"}
+
+
+def plain(name: str) -> str:
+    """Return an effect's name as words."""
+    return name.replace("_", " ")
+
+
+def places(where: Sequence[str]) -> str:
+    """Return where an effect acts: ``both front wheels``, ``left rear leg``, ``floor``."""
+    for kind, members in (("leg", LEGS), ("wheel", WHEELS)):
+        if where and all(place in members for place in where):
+            corners = [place.removeprefix(f"{kind}_") for place in where]
+            group = _SIDES.get(frozenset(corners))
+            return f"{group} {kind}s" if group else listed([f"{_CORNERS[corner]} {kind}" for corner in corners])
+    if set(where) == {*LEGS, *WHEELS}:
+        return "all legs and wheels"
+    return listed([_place(name) for name in where])
+
+
+def _place(name: str) -> str:
+    kind, _, corner = name.rpartition("_")
+    return f"{_CORNERS[corner]} {kind}" if corner in _CORNERS else _PLACES.get(name, name.replace("_", " "))
+
+
+def channel(name: str) -> str:
+    """Return a measured channel in words: ``motor torque, left front leg``."""
+    kind, _, corner = name.rpartition("_")
+    if kind in _MEASURED and corner in _CORNERS:
+        return f"{_MEASURED[kind]}, {_CORNERS[corner]} {kind.partition('_')[2]}"
+    return _CHANNELS.get(name, name.replace("_", " "))
+
+
+def feature(name: str) -> str:
+    """Return the name of a state of the robot with its unit: ``motor_torque[leg_lf] (N m)``; others as they are."""
+    quantity = name.partition("[")[0]
+    unit = TRUTH_LAYOUT.channels[quantity].unit if quantity in TRUTH_LAYOUT.channels else _FEATURES.get(quantity, "")
+    return f"{name} ({unit})" if unit else name
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """Return ``a, b and c``."""
+    return f" {last} ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+
+
+# ---- numbers ---------------------------------------------------------------------------------------------------------
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits; ``-`` if it is none."""
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.0f}" if 10**digits <= abs(value) < 1e7 else f"{value:.{digits}g}"
+
+
+def error(value: float) -> str:
+    """Return an error in units of noise, with as many decimals as one can care for."""
+    return f"{value:.{2 if value < 9.995 else 1 if value < 99.95 else 0}f}" if math.isfinite(value) else "-"
+
+
+def percent(share: float) -> str:
+    """Return a share as ``87 %``."""
+    return f"{round(100.0 * share)} %" if math.isfinite(share) else "-"
+
+
+def interval(analysis: Analysis) -> str:
+    """Return ``95 % interval 91 to 97 %`` of the reduction; where the runs are too few for one, each run's own."""
+    low, high = analysis.gap.reduction_ci95 if analysis.gap is not None else (math.nan, math.nan)
+    if math.isfinite(low) and math.isfinite(high):
+        return f"95 % interval {round(100.0 * low)} to {round(100.0 * high)} %"
+    single = [percent(one.reduction) for one in analysis.run_gaps if one.heldout and math.isfinite(one.reduction)]
+    return f"run by run {listed(single)}; no interval" if single else "no interval"
+
+
+def unit_of(unit: str) -> str:
+    """Return a unit with the space before it; nothing for a pure number."""
+    return "" if unit in ("", "-") else f" {unit}"
+
+
+def estimate(found: Estimate) -> str:
+    """Return ``0.041 (0.038 to 0.045) N m``; angles in degrees, too."""
+    known = math.isfinite(found.low) and math.isfinite(found.high)
+    digits = _digits(found.value, 0.5 * (found.high - found.low)) if known else 3
+    between = f" ({number(found.low, digits)} to {number(found.high, digits)})" if known else ""
+    degrees = f" = {number(math.degrees(found.value))}°" if found.unit == "rad" else ""
+    return f"{number(found.value, digits)}{between}{unit_of(found.unit)}{degrees}"
+
+
+def _digits(value: float, uncertainty: float) -> int:
+    """Significant digits that show a value down to its uncertainty, three at least: a scale of 1.022, known to 0.004."""
+    if not 0.0 < uncertainty < abs(value):
+        return 3
+    return max(3, math.ceil(math.log10(abs(value) / uncertainty)) + 1)
+
+
+def duration(seconds: float) -> str:
+    """Return ``3 min 20 s``."""
+    whole = round(seconds)
+    return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
+
+
+# ---- the verdict -----------------------------------------------------------------------------------------------------
+
+
+def title(analysis: Analysis) -> str:
+    """Return the title of a report."""
+    return NOTHING_CLEAR if _leaves_something(analysis) else TITLES[analysis.verdict]
+
+
+def _leaves_something(analysis: Analysis) -> bool:
+    """Whether nothing was named although the error of runs kept aside is well above what a model without error would leave."""
+    return analysis.verdict == NOTHING_MISSING and bool(closure(analysis))
+
+
+def closure(analysis: Analysis) -> str:
+    """Return what is left in the runs kept aside, and where, in one sentence; empty if that is hardly more than noise."""
+    gap = analysis.gap
+    if gap is None or not gap.heldout_after >= UNEXPLAINED * gap.noise_floor:
+        return ""
+    above: dict[str, float] = {}
+    for one in analysis.channel_gaps:
+        above[one.group] = above.get(one.group, 0.0) + _above(one, gap.noise_floor)
+    most = max(above, key=lambda group: above[group], default="")
+    share = above[most] / sum(above.values()) if above and sum(above.values()) > 0.0 else math.nan
+    where = f"; {percent(share)} of it is in {_GROUPS.get(most, most.replace('_', ' '))}" if math.isfinite(share) else ""
+    return (
+        f"Not all is explained: in runs kept aside an error of {error(gap.heldout_after)} is left, where a model without error "
+        f"would reach {error(gap.noise_floor)}{where}."
+    )
+
+
+def _above(gap: ChannelGap, floor: float) -> float:
+    """Mean square of a channel above the noise floor."""
+    return max(gap.after**2 - floor**2, 0.0) if math.isfinite(gap.after) else 0.0
+
+
+def adequacy(found: Adequacy) -> str:
+    """Return what the final model leaves in the fitted runs: what chance does not explain, and how large it is."""
+    told = {
+        f"an error of {error(found.level.value)} times the sensor noise": found.level,
+        f"{error(found.whiteness.value)} rows on end that say the same": found.whiteness,
+        "runs that differ in what they say of the model's numbers": found.constancy,
+    }
+    beyond = [f"{text} ({error(one.ratio)} times what is expected)" for text, one in told.items() if one.rejected]
+    compared = f"Compared with {found.replicates} sets of runs that the final model made itself"
+    untold = "" if math.isfinite(found.constancy.p) else " Whether the runs agree could not be tested."
+    if not beyond:
+        return f"{compared}, it leaves nothing in the fitted runs that chance does not explain.{untold}"
+    levels = {name: level for name, (level, _) in found.channels.items() if level.rejected}
+    most = sorted(levels, key=lambda name: -_excess(levels[name]))[:3]
+    where = f" Most of the error that is not expected is in {listed(most)}." if found.level.rejected and most else ""
+    apart = found.pulled.errors.rejected
+    pulled = f" {found.pulled.run} pulls {found.pulled.number} farthest from the others." if apart else ""
+    return f"{compared}, more than chance explains is left in the fitted runs: {listed(beyond)}.{where}{pulled}{untold}"
+
+
+def _excess(level: Statistic) -> float:
+    """Mean square above what is expected."""
+    return level.value**2 - level.expected**2
+
+
+def sentence(analysis: Analysis) -> str:
+    """Return the verdict in one sentence: the analysis' own, or one made from its numbers."""
+    return analysis.summary or _SENTENCES[analysis.verdict](analysis)
+
+
+def _bad_data(analysis: Analysis) -> str:
+    causes = [finding.text.rstrip(".") for finding in analysis.intake if finding.fatal]
+    more = f" (and {len(causes) - 1} more reason{'s' if len(causes) > 2 else ''})" if len(causes) > 1 else ""
+    return f"These data cannot be used: {causes[0]}{more}." if causes else "These data cannot be used."
+
+
+def _not_excited(analysis: Analysis) -> str:
+    wanted = listed([recommendation.excitation for recommendation in analysis.recommendations])
+    alone = [e for e in analysis.evidence if e.outcome == NOT_CARRIED and e.gain > LEAST_GAIN and e.by_run]
+    if alone:
+        shown = max(alone, key=lambda evidence: evidence.gain)
+        run = max(shown.by_run, key=lambda name: shown.by_run[name])
+        what = f"{plain(shown.name)} ({places(shown.where)})"
+        more = f", and {wanted}" if wanted else ""
+        return f"{run} shows {what}, the other runs do not bear it out: record more such runs{more}."
+    return f"These runs move too little to tell whether the model lacks anything{f'; record {wanted}' if wanted else ''}."
+
+
+def _nothing_missing(analysis: Analysis) -> str:
+    gap = analysis.gap
+    calibrated = " once its known numbers are calibrated" if analysis.calibration else ""
+    if gap is None:
+        return f"The model lacks nothing that these runs could show{calibrated}."
+    rest = f"it replays runs kept aside to within {error(gap.heldout_calibrated)} times the sensor noise"
+    if not _leaves_something(analysis):
+        return f"The model lacks nothing that these runs could show: {rest}{calibrated}."
+    return (
+        f"No effect of the library is clear enough in these runs to be named: the model {rest.removeprefix('it ')}{calibrated}."
+    )
+
+
+def _effect_found(analysis: Analysis) -> str:
+    names = [
+        f"{'an ' if effect.name == UNKNOWN_EFFECT else ''}{plain(effect.name)} ({places(effect.where)})"
+        for effect in analysis.effects
+    ]
+    lost = names[0] if len(names) == 1 else f"{len(names)} effects: {listed(names)}"
+    others = [_others(group.names, analysis.effects) for group in analysis.equivalent]
+    doubt = f"; these data cannot tell it from {listed([name for name in others if name], 'or')}" if any(others) else ""
+    return f"The model lacks {lost}{_bought(analysis)}{doubt}."
+
+
+def _unknown(analysis: Analysis) -> str:
+    acts = f" ({places(analysis.effects[0].where)})" if analysis.effects else ""
+    lacks = f"The model lacks something{acts} that no effect of the library explains"
+    if any(effect.formula for effect in analysis.effects):
+        return f"{lacks}; a formula describes it{_bought(analysis)}."
+    return f"{lacks}; no formula describes it, either{f': {turned(analysis.turning)}' if analysis.turning else ''}."
+
+
+def turned(turning: Turning) -> str:
+    """Say what goes with a joint's turning."""
+    times = {1: "once", 2: "twice"}.get(turning.order, f"{turning.order} times")
+    return (
+        f"{percent(turning.share)} of what is left of {turning.signal} comes and goes {times} per turn of the "
+        f"{places((turning.joint,))} ({error(turning.amplitude)} times the sensor noise), as with a wheel out of round or an "
+        "encoder off its centre"
+    )
+
+
+def _bought(analysis: Analysis) -> str:
+    if analysis.gap is None or not analysis.added:
+        return ""
+    share, one = analysis.gap.reduction, len(analysis.added) == 1
+    if not math.isfinite(share):
+        return "; the error of runs kept aside is as small without it"
+    if share < 0.0:
+        does = "makes" if one else "make"
+        return f"; added, {'it' if one else 'they'} {does} the error of runs kept aside larger: {removed(analysis)}"
+    return f"; added, {'it removes' if one else 'they remove'} {removed(analysis)} of the avoidable error of runs kept aside"
+
+
+def removed(analysis: Analysis) -> str:
+    """Return ``95 % (95 % interval 91 to 97 %)``: what the effects remove of the avoidable error; negative = they add to it."""
+    return f"{percent(analysis.gap.reduction if analysis.gap else math.nan)} ({interval(analysis)})"
+
+
+def _others(names: Sequence[str], effects: Sequence[FoundEffect]) -> str:
+    chosen = {effect.name for effect in effects}
+    return listed([plain(name) for name in names if name not in chosen], "or")
+
+
+_SENTENCES: dict[str, Callable[[Analysis], str]] = {
+    BAD_DATA: _bad_data,
+    NOT_EXCITED: _not_excited,
+    NOTHING_MISSING: _nothing_missing,
+    EFFECT_FOUND: _effect_found,
+    UNKNOWN: _unknown,
+}

@@ -1,0 +1,1 @@
+"""Selection: screen candidate effects, compare the best, keep what is missing."""

@@ -1,0 +1,98 @@
+"""A candidate effect after its fit, and whether it may be what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.gap.estimation.fit import Model
+from wlr_gym.gap.estimation.likelihood import Noise
+from wlr_gym.gap.problem import Candidate, Problem
+
+Array = NDArray[np.float64]
+
+#: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
+MOST_HARM = 0.2
+#: Of an unknown that meets no known number, what counts as an effect, in its steps.
+NOTICED = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One candidate after its refit.
+
+    Attributes:
+        candidate: the effect.
+        model: with the effect.
+        gain: fall of minus two log posterior.
+        by_run: (runs) fall of the weighted squares in each run.
+        screened: what the first-order score had promised.
+        residuals: of the model.
+        base, base_residuals: the model without the effect, refitted as long.
+        carries_over: whether each run agrees with what the others tell (checked for finalists only).
+        tolerable: whether the tolerances of known numbers allow as much.
+    """
+
+    candidate: Candidate
+    model: Model
+    gain: float
+    by_run: Array
+    screened: float
+    residuals: list[Array] = field(repr=False)
+    base: Model = field(repr=False)
+    base_residuals: list[Array] = field(repr=False)
+    carries_over: bool = True
+    tolerable: bool = False
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Values of the candidate's unknowns."""
+        return self.model.effects[-1][1]
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether an unknown ended at the edge of its plausible range (other than its neutral value)."""
+        return any(
+            (value >= u.high - 1e-9 * abs(u.high) and u.high != u.neutral)
+            or (value <= u.low + 1e-9 * abs(u.low) and u.low != u.neutral)
+            for u, value in zip(self.candidate.unknowns, self.values, strict=True)
+        )
+
+    @property
+    def plausible(self) -> bool:
+        """Whether its value says that the effect is there, at a size that a robot may have, and the runs agree."""
+        return not self.at_bound and not self.tolerable and self.consistent and self.carries_over
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the runs agree that it is there."""
+        help_, harm = self.by_run.clip(min=0.0).sum(), -self.by_run.clip(max=0.0).sum()
+        return bool(harm <= MOST_HARM * help_)
+
+
+def within_tolerance(problem: Problem, model: Model) -> bool:
+    """Whether the tolerances of the numbers that the last effect meets allow what number and effect do together."""
+    candidate, values = model.effects[-1]
+    if not any(candidate.tolerances):
+        return False
+    known = {q.name: (q, value) for q, value in zip(problem.quantities, model.quantities, strict=True)}
+    for unknown, value, tolerance in zip(candidate.unknowns, values, candidate.tolerances, strict=True):
+        if tolerance is None:
+            if abs(value - unknown.neutral) > NOTICED * unknown.step:
+                return False
+            continue
+        for quantity, now in (known[name] for name in tolerance.quantities):
+            shift = (value - quantity.nominal) / tolerance.size
+            if not tolerance.replaces:
+                shift = (now - quantity.nominal) / quantity.sigma + (value - unknown.neutral) / tolerance.size
+            if abs(shift) > tolerance.reach:
+                return False
+    return True
+
+
+def fall_by_run(before: Sequence[Array], after: Sequence[Array], noise: Noise) -> Array:
+    """Fall of the weighted squares in each run."""
+    return np.array([np.nansum((b * b - a * a) * noise.weight) for b, a in zip(before, after, strict=True)])

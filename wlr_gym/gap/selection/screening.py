@@ -1,0 +1,177 @@
+"""Score every candidate at once, to first order: what would adding it buy after all known numbers have been refitted?
+
+The score test of statistics with nuisance parameters projected out. One simulation per probe serves all candidates; a
+candidate whose response the known numbers can imitate within their tolerances gets nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.gap.estimation.fit import (
+    Fit,
+    bounded_minimum,
+    normal_equations,
+    prior_tightness,
+    room,
+    scaled_nominal,
+    scaled_numbers,
+)
+from wlr_gym.gap.problem import Candidate, Probe, Problem, Setting, Start
+
+Array = NDArray[np.float64]
+
+#: Fall of minus two log posterior below which an effect is not accepted.
+LEAST_GAIN = 16.0
+#: What an effect must buy more for every unknown beyond the first; also at least this share of minus two log posterior.
+PER_UNKNOWN, LEAST_SHARE = 3.0, 0.02
+#: A response of which less than this share is left after the known numbers have imitated it cannot be told from them.
+LEAST_OWN = 1e-4
+
+
+def least_gain(unknowns: int, cost: float = 0.0) -> float:
+    """Return what an effect with so many unknowns must buy; ``cost`` is minus two log posterior of the model without it."""
+    return max(LEAST_GAIN + PER_UNKNOWN * (unknowns - 1), LEAST_SHARE * cost)
+
+
+def least_amplitude(candidate: Candidate, information: Array, k: int, cost: float = 0.0) -> float:
+    """Return the smallest amplitude of direction ``k`` that would be accepted: clear, and beyond what a tolerance allows."""
+    clear = float(np.sqrt(least_gain(len(candidate.unknowns), cost) / max(float(information[k, k]), 1e-12)))
+    tolerance = candidate.tolerances[k] if k < len(candidate.tolerances) else None
+    return clear if tolerance is None else max(clear, tolerance.reach)
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """A candidate's score.
+
+    Attributes:
+        candidate: the effect.
+        values: first guess of its unknowns.
+        gain: expected fall of minus two log likelihood.
+        own: share of its response that no known number can imitate.
+        information: of the amplitudes of its best start (k, k), known numbers projected out; 1 = the probe.
+        start: that best start.
+        visible: whether the data would show it somewhere in its plausible range.
+    """
+
+    candidate: Candidate
+    values: tuple[float, ...]
+    gain: float
+    own: float
+    information: Array
+    start: Start
+    visible: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """Normal equations of the fitted numbers and all probes: what :func:`screen` scores candidates with.
+
+    Attributes:
+        keys: row of a quantity or probe.
+        response, push: ``C W C^T`` and ``C W r`` of all, tolerances not added.
+        tight, away: (fitted numbers) weight of their tolerance, and how far they are from nominal.
+        information: ``response`` with the fitted numbers projected out.
+        low, high: (fitted numbers) how far they may still move.
+    """
+
+    keys: dict[str, int]
+    response: Array
+    push: Array
+    tight: Array
+    away: Array
+    information: Array
+    low: Array
+    high: Array
+
+
+def responses(problem: Problem, fit: Fit, runs: Sequence[int], probes: Sequence[Probe]) -> Responses:
+    """Simulate all probes on top of a fitted model and project the fitted numbers out."""
+    settings = [Setting(fit.model.quantities, (*fit.model.patch, *probe.effects)) for probe in probes]
+    found = problem.residuals(settings, runs)
+    columns = []
+    for r, base, known in zip(found, fit.residuals, fit.columns, strict=True):
+        own = np.nan_to_num(r - base).reshape(len(probes), -1).astype(np.float32)
+        columns.append(np.vstack([known, own]))
+    return project(problem, fit, columns, [probe.key for probe in probes])
+
+
+def project(problem: Problem, fit: Fit, columns: Sequence[NDArray[np.float32]], keys: Sequence[str]) -> Responses:
+    """Project the fitted numbers out of the probes' columns, which follow theirs."""
+    known = fit.model.size
+    response, push = normal_equations(columns, fit.residuals, fit.noise)
+    tight = prior_tightness(problem, fit.model)
+    away = scaled_numbers(problem, fit.model) - scaled_nominal(problem, fit.model)
+    imitation = np.linalg.solve(fit.hessian, response[:known])  # how the fitted numbers would follow each column
+    information = response - response[:known].T @ imitation
+    names = [*(quantity.name for quantity in problem.quantities)]
+    places = {name: k for k, name in enumerate(names)} | {key: known + k for k, key in enumerate(keys)}
+    return Responses(places, response, push, tight, away, information, *room(problem, fit.model))
+
+
+def screen(candidates: Sequence[Candidate], found: Responses, cost: float = 0.0) -> list[Score]:
+    """Return the score of every candidate, best first; ``cost`` is that of the model without it."""
+    nothing = _fall(found, np.zeros((0, len(found.push))))[0]
+    scores = [score for candidate in candidates if (score := _score(candidate, found, nothing, cost)) is not None]
+    return sorted(scores, key=lambda score: -score.gain)
+
+
+def _score(candidate: Candidate, found: Responses, nothing: float, cost: float) -> Score | None:
+    best: Score | None = None
+    for start in candidate.starts:
+        mix = np.zeros((len(start.directions), len(found.push)))
+        for row, names in zip(mix, start.directions, strict=True):
+            row[[found.keys[name] for name in names]] = 1.0
+        information = mix @ found.information @ mix.T
+        raw = np.diag(mix @ found.response @ mix.T)
+        own = float(np.max(np.diag(information) / np.maximum(raw, 1e-12)))
+        fall, amplitude = _fall(found, mix)
+        values, share = _plausible(candidate, start.values, amplitude)
+        gain = (fall - nothing) * (2.0 * share - share**2)  # along the way to the minimum of a parabola
+        if best is None or gain > best.gain:
+            best = Score(candidate, values, gain, own, information, start, _visible(candidate, start, information, cost))
+    return best
+
+
+def _fall(found: Responses, mix: Array) -> tuple[float, Array]:
+    """Fall of the cost if the known numbers, within their bounds, and the directions ``mix`` move together; amplitudes."""
+    known = len(found.low)
+    rows = np.vstack([np.eye(known, len(found.push)), mix])
+    matrix, gradient = rows @ found.response @ rows.T, rows @ found.push
+    # tolerances hold the quantities, not a direction that is the same response without its tolerance
+    matrix[np.arange(known), np.arange(known)] += found.tight
+    gradient[:known] += found.tight * found.away
+    own = np.arange(known, len(rows))
+    matrix[own, own] += LEAST_OWN * matrix[own, own] + 1e-9  # a probe that does nothing gets nothing
+    free = np.full(len(mix), np.inf)
+    x = bounded_minimum(matrix, gradient, np.concatenate([found.low, -free]), np.concatenate([found.high, free]))
+    return -float(2.0 * gradient @ x + x @ matrix @ x), x[known:]
+
+
+def _visible(candidate: Candidate, start: Start, information: Array, cost: float) -> bool:
+    """Whether the smallest severity that would be accepted lies in the plausible range, in some direction."""
+    for k in range(len(information)):
+        for sign in (1.0, -1.0):
+            amplitude = np.zeros(len(information))
+            amplitude[k] = sign * least_amplitude(candidate, information, k, cost)
+            values = start.values(amplitude)
+            pairs = list(zip(candidate.unknowns, values, strict=True))
+            if all(u.low <= v <= u.high for u, v in pairs) and any(v != u.neutral for u, v in pairs if u.is_size):
+                return True
+    return False
+
+
+def _plausible(
+    candidate: Candidate, values_of: Callable[[Array], tuple[float, ...]], amplitude: Array
+) -> tuple[tuple[float, ...], float]:
+    """Shorten a first guess until it lies in the plausible range; return its values and the share that is left of it."""
+    for share in (1.0, 0.7, 0.5, 0.3, 0.1, 0.0):
+        values = values_of(share * amplitude)
+        if all(u.low - 1e-12 <= v <= u.high + 1e-12 for u, v in zip(candidate.unknowns, values, strict=True)):
+            return values, share
+    return candidate.kept(values_of(0.0 * amplitude)), 0.0

@@ -1,0 +1,251 @@
+"""Name what is missing: screen all candidates, refit the best of them, take the one that buys most, and look again.
+
+A candidate is accepted if it lowers minus two log posterior by more than chance and an imperfect simulator can
+(:data:`LEAST_GAIN`, more for every further unknown, and :data:`LEAST_SHARE` of what is left), if the runs agree on it, and if
+its value lies inside its plausible range. In the end every effect must still be worth its place beside the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.gap.estimation.fit import Fit, Model, cheapest, fit, linearise, total_cost, untouched, widened
+from wlr_gym.gap.estimation.likelihood import estimate_noise
+from wlr_gym.gap.estimation.refit import refit, refit_thoroughly
+from wlr_gym.gap.problem import Candidate, Problem
+from wlr_gym.gap.selection.cross_validation import Final, accept, beside, finalists
+from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, least_gain, responses, screen
+
+Tell = Callable[[str], None]
+
+#: Hypotheses that are refitted in one round, and at most so many per name.
+SHORTLIST, PER_NAME = 8, 3
+#: Effects in one analysis.
+MOST_EFFECTS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One look for an effect: what was screened, what was refitted (best first), and which was taken."""
+
+    scores: list[Score]
+    hypotheses: list[Hypothesis]
+    taken: Hypothesis | None
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class Naming:
+    """Outcome: the calibrated model without effects, the final fit, and every round.
+
+    ``swaps`` holds, per effect of a model of several, that effect and its rivals with the other effects kept (thorough
+    problems only).
+    """
+
+    calibrated: Fit
+    fit: Fit
+    rounds: list[Round]
+    swaps: dict[str, tuple[Hypothesis, list[Hypothesis]]]
+
+
+def shortlist(scores: Sequence[Score], cost: float = 0.0) -> list[Score]:
+    """Return the best scores, at most :data:`PER_NAME` of one effect, and only those that promise something.
+
+    To first order an effect promises as little as a quarter of what it buys; ``cost`` is that of the model without it.
+    """
+    least = 0.25 * least_gain(1, cost)
+    chosen: list[Score] = []
+    for score in scores:
+        if len(chosen) == SHORTLIST:
+            break
+        same = [other for other in chosen if other.candidate.name == score.candidate.name]
+        if len(same) < PER_NAME and score.gain > least:
+            chosen.append(score)
+    return chosen
+
+
+def name_effects(
+    problem: Problem,
+    runs: Sequence[int],
+    start: Fit,
+    tell: Tell = lambda text: None,
+    given: Sequence[NDArray[np.float32]] | None = None,
+) -> Naming:
+    """Look for missing effects.
+
+    Args:
+        problem: the system.
+        runs: those that are fitted; no other has a say.
+        start: the calibrated model.
+        tell: told of progress.
+        given: columns of ``start`` without its calibration, where they are known: one (numbers, rows x channels) array per run.
+    """
+    if given is None and not problem.thorough:
+        given = linearise(problem, untouched(problem, start.model), runs)[1]
+    current, calibrated, rounds, again = start, start, [], None
+    models = [start.model]
+    while True:
+        probes, candidates = problem.candidates(current.model.setting, current.residuals, runs)
+        candidates = [candidate for candidate in candidates if not _settled(current.model, candidate)]
+        tell(f"screening {len(candidates)} candidates")
+        found = responses(problem, current, runs, probes)
+        scores = screen(candidates, found, current.cost)
+        chosen = scores if problem.thorough else shortlist(scores, cost=current.cost)
+        tell(f"refitting {len(chosen)} hypotheses")
+        hypotheses = (
+            refit_thoroughly(problem, runs, current, chosen) if given is None else refit(problem, runs, current, chosen, given)
+        )
+        bare = _without_more(problem, current, hypotheses)
+        finals: list[Final] = []
+        accepted: Final | None = None
+        if current is again or not _deeper(problem, current, bare):
+            finals, bare = finalists(problem, runs, current, hypotheses, bare, tell)
+        if current is again or not _deeper(problem, current, bare):
+            accepted, finals, bare = accept(problem, runs, current, finals, bare, tell)
+        if current is not again and _deeper(problem, current, bare):
+            tell("the known numbers fit better elsewhere: calibrated anew from there")
+            anew = fit(problem, runs, bare.model, scatter=current.noise.scatter, steps=problem.steps)
+            current = again = widened(problem, runs, anew)
+            calibrated = calibrated if current.model.effects else current
+            given = _as_given(problem, runs, current, given)
+            continue
+        merged = _merged(problem, finals, hypotheses, bare, accepted or (finals[0] if finals else None))
+        taken = None if accepted is None else _labelled(merged, accepted.hypothesis)
+        rounds.append(Round(scores, merged, taken, current.cost))
+        if accepted is None:
+            break
+        tell(f"taken: {accepted.hypothesis.candidate.label}")
+        current = widened(problem, runs, drop_idle(problem, runs, accepted.fit, tell))
+        if len(current.model.effects) >= MOST_EFFECTS or any(_same(current.model, earlier) for earlier in models):
+            break
+        models.append(current.model)
+        given = _as_given(problem, runs, current, given)
+    return Naming(calibrated, current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
+
+
+def _as_given(
+    problem: Problem, runs: Sequence[int], current: Fit, given: Sequence[NDArray[np.float32]] | None
+) -> Sequence[NDArray[np.float32]] | None:
+    """Columns of the model without its calibration: beside a strong effect known numbers do other things than without it."""
+    if given is None or not current.model.effects:
+        return given
+    return linearise(problem, untouched(problem, current.model), runs, current.columns, current.noise)[1]
+
+
+def _settled(model: Model, candidate: Candidate) -> bool:
+    """Whether the model has the candidate, or an unknown law on every joint where it acts.
+
+    What a name buys beside a formula at one joint is what the formula has got wrong of the law.
+    """
+    unknown = {place for other, _ in model.effects if other.formula for place in other.where}
+    had = {other.label for other, _ in model.effects}
+    return candidate.label in had or (not candidate.formula and unknown.issuperset(candidate.where))
+
+
+def _without_more(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> Fit:
+    """The model without a further effect: the present one, or the one that refits have found if that is better."""
+    if not hypotheses:
+        return current
+    model, residuals = hypotheses[0].base, hypotheses[0].base_residuals
+    noise = estimate_noise(residuals, scatter=current.noise.scatter)
+    found = replace(
+        current,
+        model=model,
+        residuals=residuals,
+        noise=noise,
+        cost=total_cost(problem, model, residuals, noise.memory),
+        converged=False,
+    )
+    return cheapest(problem, (current, found), noise.memory)
+
+
+def _deeper(problem: Problem, current: Fit, bare: Fit) -> bool:
+    """Whether a model without a further effect, in another minimum than the present one, is clearly lower."""
+    if problem.thorough:
+        return False
+    memory = bare.noise.memory
+    lower = total_cost(problem, current.model, current.residuals, memory) - total_cost(
+        problem, bare.model, bare.residuals, memory
+    )
+    return lower > LEAST_GAIN
+
+
+def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tuple[Hypothesis, list[Hypothesis]]]:
+    """Put every candidate in the place of each effect of a model of several, and fit it there."""
+    swaps: dict[str, tuple[Hypothesis, list[Hypothesis]]] = {}
+    if len(final.model.effects) < 2:
+        return swaps
+    for index, (candidate, _) in enumerate(final.model.effects):
+        without = fit(
+            problem,
+            runs,
+            final.model.without_effect(index),
+            memory=final.noise.memory,
+            scatter=final.noise.scatter,
+            steps=problem.steps,
+        )
+        probes, candidates = problem.candidates(without.model.setting, without.residuals, runs)
+        scores = screen(candidates, responses(problem, without, runs, probes))
+        rivals = refit_thoroughly(problem, runs, without, scores)
+        own = [rival for rival in rivals if rival.candidate.label == candidate.label]
+        if own:
+            swaps[candidate.label] = (own[0], rivals)
+    return swaps
+
+
+def _same(one: Model, other: Model) -> bool:
+    return [candidate.label for candidate, _ in one.effects] == [candidate.label for candidate, _ in other.effects]
+
+
+def drop_idle(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = lambda text: None) -> Fit:
+    """Take out effects that the others have made needless, one after the other, the least useful first."""
+    while len(current.model.effects) > 1:
+        noise = current.noise
+        kept = len(problem.quantities)
+        trials = []
+        for index in range(len(current.model.effects)):
+            sizes = [len(values) for _, values in current.model.effects]
+            own = slice(kept + sum(sizes[:index]), kept + sum(sizes[: index + 1]))
+            silent = current.model.effects[index][0].replaced  # a number that an effect replaces has no columns beside it
+            columns = None if silent else [np.delete(column, own, axis=0) for column in current.columns]
+            model = current.model.without_effect(index)
+            trials.append(
+                fit(
+                    problem,
+                    runs,
+                    model,
+                    memory=noise.memory,
+                    scatter=noise.scatter,
+                    columns=columns,
+                    steps=problem.steps,
+                    renew=False,
+                )
+            )
+        losses = [trial.cost - current.cost for trial in trials]
+        least = int(np.argmin(losses))
+        unknowns = len(current.model.effects[least][1])
+        if losses[least] > least_gain(unknowns):
+            return current
+        tell(f"dropped: {current.model.effects[least][0].label}")
+        current = fit(problem, runs, trials[least].model, scatter=noise.scatter, steps=1, tell=tell)
+    return current
+
+
+def _merged(
+    problem: Problem, finals: Sequence[Final], hypotheses: Sequence[Hypothesis], bare: Fit, best: Final | None
+) -> list[Hypothesis]:
+    """All hypotheses, those fitted in full in their final form; where one was, all as they compare under its memory."""
+    final = {f.hypothesis.candidate.label: f.hypothesis for f in finals}
+    merged = [final.get(h.candidate.label, h) for h in hypotheses]
+    if best is not None:
+        merged = [beside(problem, hypothesis, bare, best.fit.noise.memory) for hypothesis in merged]
+    return sorted(merged, key=lambda hypothesis: -hypothesis.gain)
+
+
+def _labelled(hypotheses: Sequence[Hypothesis], wanted: Hypothesis) -> Hypothesis:
+    return next(hypothesis for hypothesis in hypotheses if hypothesis.candidate.label == wanted.candidate.label)

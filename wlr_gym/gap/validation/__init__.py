@@ -1,0 +1,1 @@
+"""Validation: held-out runs, and tests of what the final model leaves."""

@@ -1,0 +1,126 @@
+"""Proof on sealed runs, which no fit and no decision has seen: how far are replays from measurements, before and after?
+
+All numbers are root mean square residuals in units of sensor noise, over the channels of a run. A perfect model does not reach
+1.0: every window of a replay starts from measured, hence noisy, values. What it does reach is found by replaying data that the
+fitted model itself made, with the same sensors (:func:`noise_floor`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
+from wlr_gym.gap.estimation.fit import Model
+from wlr_gym.gap.estimation.uncertainty import two_sided_95
+from wlr_gym.gap.problem import Problem, Setting
+
+Array = NDArray[np.float64]
+
+#: Sealed runs from which on they tell how sure their mean is.
+LEAST_FOR_INTERVAL = 3
+#: Distance from the noise floor below which nothing is left to be removed.
+LEAST_ROOM = 1e-9
+
+
+def mean_squares(residuals: Sequence[Array], cap: float) -> Array:
+    """Return the mean square (runs, channels) of residuals, one (rows, channels) array per run; NaN where not measured.
+
+    Residuals beyond ``cap`` count as that: one lost wheel must not hide all else.
+    """
+    with np.errstate(invalid="ignore"):
+        squares = [np.nansum(np.minimum(r * r, cap**2), axis=0) / np.isfinite(r).sum(axis=0) for r in residuals]
+    return np.stack(squares)
+
+
+def mean_of_runs(squares: Array) -> Array:
+    """Return the mean over runs (channels) of mean squares; NaN where no run measured a channel."""
+    measured = np.isfinite(squares).sum(axis=0)
+    return np.where(measured > 0, np.nansum(squares, axis=0) / np.maximum(measured, 1), np.nan)
+
+
+def level(squares: Array) -> float:
+    """Return the root mean over channels (and runs) of mean squares."""
+    return float(np.sqrt(np.nanmean(squares)))
+
+
+def noise_floor(problem: Problem, setting: Setting, runs: Sequence[int]) -> float:
+    """Return the level that a model reaches on runs that it made itself, with the same sensors; NaN where it breaks down."""
+    made = next(problem.remade(setting, runs, 1), None)
+    return math.nan if made is None else level(mean_squares(made, problem.cap))
+
+
+def prove(
+    problem: Problem, fitted: Sequence[int], heldout: Sequence[int], models: Sequence[Model], floor: float
+) -> tuple[GapFigures, tuple[RunGap, ...], tuple[ChannelGap, ...]]:
+    """Compare three models on fitted and held-out runs.
+
+    Args:
+        problem: the system.
+        fitted, heldout: runs.
+        models: as its file says; calibrated; with the effects.
+        floor: level that a perfect model reaches.
+    """
+    settings = [model.setting for model in models]
+    found = problem.residuals(settings, [*fitted, *heldout])
+    squares = [mean_squares([r[k] for r in found], problem.cap) for k in range(3)]
+    inside, outside = slice(0, len(fitted)), slice(len(fitted), None)
+    before, calibrated, after = (level(s[outside]) for s in squares)
+    singly = [min(reduction(was, now, floor), 1.0) for was, now in zip(squares[1], squares[2], strict=True)]
+    figures = GapFigures(
+        problem.metric,
+        level(squares[0][inside]),
+        level(squares[2][inside]),
+        before,
+        calibrated,
+        after,
+        floor,
+        min(reduction(squares[1][outside], squares[2][outside], floor), 1.0),
+        _interval(squares[1][outside], squares[2][outside], floor),
+    )
+    gaps = tuple(
+        RunGap(problem.runs[run], k >= len(fitted), *(level(s[k]) for s in squares), reduction=closed)
+        for k, (run, closed) in enumerate(zip((*fitted, *heldout), singly, strict=True))
+    )
+    channels = tuple(
+        ChannelGap(
+            signal.name,
+            signal.unit,
+            signal.noise,
+            *(float(np.sqrt(mean_of_runs(s[outside])[c])) for s in squares),
+            group=signal.group,
+        )
+        for c, signal in enumerate(problem.signals)
+        if np.isfinite(squares[0][outside][:, c]).any()
+    )
+    return figures, gaps, channels
+
+
+def reduction(calibrated: Array, after: Array, floor: float) -> float:
+    """Return the share of the gap above the floor that the effects close: negative where they make it larger.
+
+    ``(L_c - L_a) / (L_c - floor)`` of the levels of all runs given; NaN where calibration leaves nothing to be closed.
+    """
+    room = level(calibrated) - floor
+    return (level(calibrated) - level(after)) / room if room > LEAST_ROOM else math.nan
+
+
+def _interval(calibrated: Array, after: Array, floor: float) -> tuple[float, float]:
+    """95 % interval of the reduction; NaN where the runs are too few to tell.
+
+    Student's t interval with the jackknife's standard error: ``R +- t(n-1) sqrt((n-1)/n sum (R_k - mean R_k)^2)``, with R_k the
+    reduction without run k. R counts 1 at most, as it is told; only the upper end is cut off at 1: an interval that lies above
+    it would have no width otherwise.
+    """
+    count = len(calibrated)
+    if count < LEAST_FOR_INTERVAL:
+        return math.nan, math.nan
+    left_out = np.array([reduction(np.delete(calibrated, k, axis=0), np.delete(after, k, axis=0), floor) for k in range(count)])
+    error = math.sqrt((count - 1) / count * float(((left_out - left_out.mean()) ** 2).sum()))
+    whole, half = reduction(calibrated, after, floor), two_sided_95(count - 1) * error
+    if not math.isfinite(whole + half):
+        return math.nan, math.nan
+    return min(whole, 1.0) - half, min(whole + half, 1.0)

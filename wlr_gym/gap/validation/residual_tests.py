@@ -1,0 +1,159 @@
+"""Is the final model adequate? What it leaves in the fitted runs, beside what it would leave in runs that it made itself.
+
+Three statistics: *level*, the root mean square of the residuals; *whiteness*, how many rows say the same (their integrated
+autocorrelation, see :mod:`wlr_gym.gap.estimation.likelihood`); *constancy*, how many times more than their rows promise the
+runs differ in where they pull the model's numbers. A parametric bootstrap tells what chance alone leaves: the same runs are
+made anew by the final model with the same sensors, the model's numbers are fitted to each such set by one linear step with the
+columns of the fit, drawn towards the numbers that made it, and the same statistics are taken.
+
+It informs and decides nothing. No simulator is right to the last digit, and such a test notices the last digit: with real runs
+it always rejects. What counts is how many times larger a statistic is than in the sets that were made.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.gap.analysis import Adequacy, Pulled, Statistic
+from wlr_gym.gap.estimation.fit import Fit, on_bounds, prior_tightness
+from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, run_scatter
+from wlr_gym.gap.problem import Problem
+
+Array = NDArray[np.float64]
+
+#: Sets of runs that the model makes: the least of which the largest is a limit of 5 %.
+REPLICATES = 19
+#: Curvature of the likelihood, scaled numbers, above which the data tell something of a number.
+TOLD = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Left:
+    """What a model leaves in one set of runs.
+
+    Attributes:
+        noise: of the residuals, without scatter.
+        scatter: how many times more than their rows promise the runs differ in where they pull the numbers; NaN = no number
+            is told.
+        pulls: (runs, numbers) by how many standard errors each run pulls each number away from the others.
+    """
+
+    noise: Noise
+    scatter: float
+    pulls: Array
+
+    @property
+    def level(self) -> Array:
+        """Root mean square (channels); NaN where not measured."""
+        return np.where(self.noise.rows > 0, np.sqrt(self.noise.square), np.nan)
+
+    @property
+    def memory(self) -> Array:
+        """Rows that say the same (channels); NaN where not measured."""
+        return np.where(self.noise.rows > 0, self.noise.memory, np.nan)
+
+
+class _Columns:
+    """The columns of a fit and their products, channel by channel: what a set of runs pulls costs next to nothing with them."""
+
+    def __init__(self, problem: Problem, found: Fit) -> None:
+        channels = len(problem.signals)
+        self._by_channel = [
+            np.ascontiguousarray(column.reshape(len(column), -1, channels).transpose(2, 0, 1)) for column in found.columns
+        ]
+        self._products = np.stack([c @ c.transpose(0, 2, 1) for c in self._by_channel])  # (runs, channels, numbers, numbers)
+        self._free = ~on_bounds(problem, found.model)
+        self._tight = prior_tightness(problem, found.model)
+        self._found = found
+
+    def refitted(self, residuals: Sequence[Array]) -> list[Array]:
+        """Return the residuals (rows, channels) per run after one linear step of the fit."""
+        pull = np.einsum("c,rcn->n", self._found.noise.weight, self._vectors(residuals))
+        step = -np.linalg.solve(self._found.hessian, pull)
+        return [
+            residual + (step.astype(np.float32) @ column).T
+            for residual, column in zip(residuals, self._by_channel, strict=True)
+        ]
+
+    def left(self, residuals: Sequence[Array]) -> _Left:
+        """Take the statistics of residuals (rows, channels), one array per run."""
+        noise = estimate_noise(residuals)
+        matrices = np.einsum("c,rcmn->rmn", noise.weight, self._products)[:, self._free][:, :, self._free]
+        vectors = np.einsum("c,rcn->rn", noise.weight, self._vectors(residuals))[:, self._free]
+        scatter = run_scatter(matrices, vectors)
+        pulls = np.zeros((len(residuals), len(self._free)))
+        pulls[:, self._free] = _pulls(matrices, vectors, self._tight[self._free])
+        return _Left(noise, np.nan if scatter is None else scatter, pulls)
+
+    def _vectors(self, residuals: Sequence[Array]) -> Array:
+        """Products (runs, channels, numbers) of columns and residuals."""
+        pairs = zip(self._by_channel, residuals, strict=True)
+        return np.stack([(c @ np.nan_to_num(r).T.astype(np.float32)[:, :, None])[:, :, 0] for c, r in pairs]).astype(np.float64)
+
+
+def _pulls(matrices: Array, vectors: Array, tight: Array) -> Array:
+    """By how many standard errors (runs, numbers) each run alone moves each number; 0 where the data tell nothing of it."""
+    total = matrices.sum(axis=0)
+    inverse = np.linalg.inv(total + np.diag(tight))
+    shifts = (vectors - vectors.mean(axis=0)) @ inverse
+    errors = np.sqrt(np.einsum("ij,rjk,ki->ri", inverse, matrices, inverse).clip(min=0.0))
+    return np.where((np.diag(total) > TOLD) & (errors > 0.0), np.abs(shifts) / np.where(errors > 0.0, errors, 1.0), 0.0)
+
+
+def adequacy_of(problem: Problem, runs: Sequence[int], found: Fit) -> Adequacy | None:
+    """Compare what a fitted model leaves in the runs it was fitted to with what it leaves in runs that it made itself.
+
+    None where it cannot make them.
+
+    Args:
+        problem: the system.
+        runs: the fitted runs.
+        found: the final model; its columns are of these runs.
+    """
+    columns = _Columns(problem, found)
+    made = problem.remade(found.model.setting, runs, REPLICATES)
+    seen = columns.left(found.residuals)
+    all_left = [seen, *(columns.left(columns.refitted(residuals)) for residuals in made)]
+    if len(all_left) == 1:
+        return None
+    levels, memories = np.stack([one.level for one in all_left]), np.stack([one.memory for one in all_left])
+    run, which = np.unravel_index(int(np.argmax(seen.pulls)), seen.pulls.shape)
+    return Adequacy(
+        REPLICATES,
+        compared(np.sqrt(np.nanmean(levels**2, axis=1))),
+        compared(np.exp(np.nanmean(np.log(memories), axis=1))),
+        compared(np.array([one.scatter for one in all_left])),
+        Pulled(
+            _number_names(problem, found)[which],
+            problem.runs[runs[int(run)]],
+            compared(np.array([one.pulls.max() for one in all_left])),
+        ),
+        {
+            signal.name: (compared(levels[:, c]), compared(memories[:, c]))
+            for c, signal in enumerate(problem.signals)
+            if seen.noise.rows[c] > 0
+        },
+    )
+
+
+def compared(values: Array) -> Statistic:
+    """Compare the first of the values, which was observed, with the others, which a true model would have left.
+
+    What cannot be compared has a p of NaN.
+    """
+    observed, others = float(values[0]), values[1:]
+    if not np.isfinite(values).all():
+        return Statistic(observed, math.nan, math.nan, math.nan)
+    larger = int((others >= observed).sum())
+    limit = float(np.quantile(others, 0.95, method="weibull"))  # what a value of p = 0.05 must exceed
+    return Statistic(observed, float(np.median(others)), limit, (1 + larger) / (1 + len(others)))
+
+
+def _number_names(problem: Problem, found: Fit) -> list[str]:
+    effects = [f"{candidate.label} {unknown.name}" for candidate, _ in found.model.effects for unknown in candidate.unknowns]
+    return [*(quantity.name for quantity in problem.quantities), *effects]

@@ -1,0 +1,197 @@
+"""Drive the real robot with a policy, and check afterwards, from the log alone, that the policy did what the log says."""
+
+from __future__ import annotations
+
+import csv
+import gc
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.read import Run, read_run
+from wlr_gym.hardware.loop import ControlLoop, StoppedError
+from wlr_gym.hardware.plant import RobotPlant
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
+from wlr_gym.robot import JOINTS
+
+if TYPE_CHECKING:
+    from wlr_gym.envs.core import Core
+    from wlr_gym.policy import Policy
+
+#: Times a policy is asked before the robot moves, so that whatever it compiles or allocates is there.
+REHEARSALS = 20
+
+
+@dataclass(frozen=True)
+class Deployment:
+    """How a run ended.
+
+    Attributes:
+        reason: why it ended; ``time is over`` when nothing happened.
+        well: it ended as it was asked to: time over, key or signal; and torque is confirmed off.
+        ticks: control ticks that the policy drove.
+        run: its log; None = none was written.
+        statistics: of the control loop.
+        inference: s that the policy took per tick, (ticks,).
+    """
+
+    reason: str
+    well: bool
+    ticks: int
+    run: Path | None
+    statistics: dict[str, Any]
+    inference: NDArray[np.float64]
+
+
+def loop_of(core: Core) -> ControlLoop:
+    """Return the control loop of a core that drives the real robot.
+
+    Raises:
+        InputError: it drives a simulator.
+    """
+    if not isinstance(core.plant, RobotPlant):
+        raise InputError(f"backend '{core.settings.backend}' is no robot: expected 'dynamixel'")
+    return core.plant.loop
+
+
+def deploy(core: Core, policy: Policy, seed: int = 0, command: Mapping[str, float] | None = None) -> Deployment:
+    """Bring the robot to its start pose and drive it until the episode is over or something stops it; torque is off then.
+
+    Args:
+        core: of one real robot; its episode length is how long it drives.
+        policy: what drives it.
+        seed: of the commands that are drawn.
+        command: held instead of drawn ones.
+    """
+    loop = loop_of(core)
+    core.seed(0, seed)
+    policy.reset(core.everyone)
+    for _ in range(REHEARSALS):
+        policy.act(core.observation)
+    policy.reset(core.everyone)
+    inference: list[float] = []
+    with _no_garbage_collection():
+        try:
+            core.begin_episodes(core.everyone, {"command": dict(command)} if command else None)
+            while not (core.terminated[0] or core.truncated[0]):
+                start = time.perf_counter()
+                action = policy.act(core.observation)
+                inference.append(time.perf_counter() - start)
+                _log(core, loop, action)
+                core.step(action, core.everyone)
+            loop.stop("time is over")
+        except StoppedError:
+            pass  # it is in the loop's reason
+        finally:
+            loop.stop("exception")
+    run = loop.log.run if loop.log is not None and loop.log.run.is_file() else None
+    return Deployment(loop.reason, loop.ended_well, len(inference), run, loop.statistics(), np.array(inference))
+
+
+def _log(core: Core, loop: ControlLoop, action: NDArray[np.float32]) -> None:
+    loop.log_policy(policy_columns(core), np.concatenate([core.command[0], np.asarray(action, np.float64)[0]]))
+
+
+def policy_columns(core: Core) -> list[str]:
+    """Return the columns of ``run_<n>.policy.csv``."""
+    return [*(f"command_{name}" for name in core.task.commands), *(f"action_{joint}" for joint in JOINTS)]
+
+
+@contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """Collect now, and not again before it is over: a collection takes longer than a tick's slack."""
+    was_on = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+# ---- again, from the log ----
+
+
+class LoggedPlant:
+    """Returns what a log says the robot read; for a :class:`Core` that is to see again what it saw."""
+
+    def __init__(self, core: Core, run: Run) -> None:
+        self.capabilities = core.plant.capabilities
+        self._rows = _sensor_rows(run)
+        self._at = 0
+
+    def reset(self, **_: object) -> Sensors:
+        """Return the first row."""
+        self._at = 0
+        return self._rows[0]
+
+    def step(self, *_: object) -> Sensors:
+        """Return the next row."""
+        self._at += 1
+        return self._rows[self._at]
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+def _sensor_rows(run: Run) -> list[Sensors]:
+    values = np.zeros((len(run.table), SENSOR_LAYOUT.width))
+    places = {"joint_position": "pos", "joint_velocity": "vel", "joint_effort": "eff", "gyro": "gyro", "accelerometer": "acc"}
+    for channel, prefix in places.items():
+        names = [f"{prefix}_{label}" for label in SENSOR_LAYOUT.channels[channel].labels]
+        values[:, SENSOR_LAYOUT.slices[channel]] = np.stack([run[name] for name in names], axis=1)
+    values[:, SENSOR_LAYOUT.slices["supply_voltage"]] = run["volt"][:, None]
+    return [Sensors(row[None]) for row in values]
+
+
+def read_policy_log(run: Path) -> dict[str, NDArray[np.float64]]:
+    """Return the columns of the ``policy.csv`` beside a run.
+
+    Raises:
+        InputError: there is none, or it is broken.
+    """
+    path = run.with_name(run.stem + ".policy.csv")
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            header, *rows = list(csv.reader(file))
+        values = np.array(rows, np.float64).reshape(len(rows), len(header))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: no log of a policy: {error}") from None
+    return dict(zip(header, values.T, strict=True))
+
+
+def act_again(core: Core, policy: Policy, run: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Show a policy what a log says the robot read; return the actions (T, 8) of the log and those it answers now.
+
+    They are the same, bit for bit, where policy, task and observation code are the ones that drove the robot.
+
+    Args:
+        core: as the one that drove it; its plant is not touched.
+        policy: as the one that drove it.
+        run: its log, with the ``policy.csv`` beside it.
+    """
+    log = read_policy_log(run)
+    commands = np.stack([log[f"command_{name}"] for name in core.task.commands], axis=1)
+    given = np.stack([log[f"action_{joint}"] for joint in JOINTS], axis=1).astype(np.float32)
+    plant, core.plant = core.plant, LoggedPlant(core, read_run(run))  # type: ignore[assignment]
+    answered = np.zeros_like(given)
+    try:
+        core.seed(0, 0)
+        core.begin_episodes(core.everyone, {"command": dict(zip(core.task.commands, commands[0].tolist(), strict=True))})
+        policy.reset(core.everyone)
+        for k in range(len(given)):
+            answered[k] = policy.act(core.observation)[0]
+            if k + 1 < len(given):
+                core.set_command(dict(zip(core.task.commands, commands[k + 1].tolist(), strict=True)))
+                core.step(given[k][None], core.everyone)
+    finally:
+        core.plant = plant
+    return given, answered

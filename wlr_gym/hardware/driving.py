@@ -1,0 +1,63 @@
+"""Drive the real robot through a motion, behind the safety gate, with a log in the measured-run format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlr_gym.data.excitations import Motion
+from wlr_gym.data.record import start_goals
+from wlr_gym.hardware.loop import StoppedError, stop_on_signals
+from wlr_gym.hardware.plant import RobotPlant
+from wlr_gym.physics.plants.base import standing_state
+from wlr_gym.robot.parameters import Parameters
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How a drive ended.
+
+    Attributes:
+        run: its log, whole or up to where it stopped; None where nothing was logged.
+        reason: why it stopped early, or not in good order; empty = neither. Drive no other motion then.
+        well: it ended at the motion's end, or because somebody asked for it; and torque is confirmed off.
+        ticks: control ticks driven.
+        statistics: of the control loop, with what the safety gate changed.
+    """
+
+    run: Path | None
+    reason: str
+    well: bool
+    ticks: int
+    statistics: dict[str, Any]
+
+
+def drive_robot(plant: RobotPlant, motion: Motion) -> Drive:
+    """Go to the motion's first pose, drive it, stop; torque is off afterwards.
+
+    Args:
+        plant: the robot, limp.
+        motion: goals; NaN = that motor off. Its servo profile must be the plant's.
+    """
+    loop, robot = plant.loop, plant.robot
+    state = standing_state(robot, Parameters.nominal(robot))
+    state.joint_position[0, :4] = start_goals(motion, robot)[:4]
+    reason, ticks = "", 0
+    torque_on = np.isfinite(motion.goals)
+    goals = np.nan_to_num(motion.goals)
+    with stop_on_signals(loop):
+        try:
+            plant.reset(state=state)
+            for tick in range(len(goals)):
+                plant.step(goals[tick : tick + 1], torque_on[tick : tick + 1])
+                ticks += 1
+            loop.finish("the motion is over")
+        except StoppedError as error:
+            reason = str(error)
+        finally:
+            loop.stop("exception")
+    run = loop.log.run if loop.log is not None and loop.log.run.is_file() else None
+    return Drive(run, reason, loop.ended_well, ticks, loop.statistics())

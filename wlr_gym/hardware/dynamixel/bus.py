@@ -1,0 +1,421 @@
+"""Servos on serial ports: reading and writing control table items by name, one bus group per port.
+
+One thread owns a group. Nothing here decides what is safe to send, and nothing retries but :meth:`BusGroup.torque_off`: that is
+the business of whoever uses it.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.hardware.dynamixel import protocol
+from wlr_gym.hardware.dynamixel.protocol import Error, Instruction, Packet, Status
+from wlr_gym.hardware.dynamixel.tables import ControlTable
+
+if TYPE_CHECKING:
+    from wlr_gym.hardware.dynamixel.sdk import GuardedHandler, GuardedPort
+
+#: s an answer may take beyond its bytes' time on the wire: adapter's latency timer (1 ms) twice, and the scheduler.
+PATIENCE = 0.005
+#: s a rebooting servo may be silent.
+REBOOT_TIME = 1.0
+#: Servo's clock against ours: part by which it may run slow, age (s) at which a reading is stale, and age (s) beyond which
+#: it is no lateness but a clock that restarted.
+CLOCK_TOLERANCE, STALE, LATEST = 0.02, 0.012, 1.0
+_TICKS = 32768
+_ERROR_NAMES = {error.value: error.name.lower().replace("_", " ") + " error" for error in Error}
+
+
+class NoAnswerError(TimeoutError):
+    """A servo did not answer."""
+
+
+class RestlessLineError(NoAnswerError):
+    """A servo did not answer, or was not heard: the line never falls quiet."""
+
+
+class RefusedError(RuntimeError):
+    """A servo refused an instruction.
+
+    Attributes:
+        status: its answer.
+    """
+
+    def __init__(self, message: str, status: Status) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+class Block:
+    """Neighbouring items of a control table that are read together.
+
+    Args:
+        table: of the servos.
+        first, last: names of the first and the last item.
+    """
+
+    def __init__(self, table: ControlTable, first: str, last: str) -> None:
+        self.address, self.length = table.block(first, last)
+        inside = [item for item in table.items.values() if self.address <= item.address < self.address + self.length]
+        self.names = tuple(item.name for item in inside)
+        pattern, place = "<", self.address
+        for item in inside:
+            letter = {1: "b", 2: "h", 4: "i"}[item.size]
+            pattern += f"{item.address - place}x" + (letter if item.signed else letter.upper())
+            place = item.address + item.size
+        self._struct = struct.Struct(pattern)
+
+    def decode(self, data: bytes) -> dict[str, int]:
+        """Return item -> count."""
+        return dict(zip(self.names, self._struct.unpack(data), strict=True))
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What one servo answered to a block read.
+
+    Attributes:
+        counts: item -> count.
+        alert: it has a hardware error (the counts are valid all the same).
+        age: s since the servo took the reading, from its own clock; 0 where the block holds no clock.
+        restarted: its clock jumped: it was rebooted, or had no power.
+    """
+
+    counts: Mapping[str, int]
+    alert: bool
+    age: float = 0.0
+    restarted: bool = False
+
+
+@dataclass
+class Statistics:
+    """What went over the bus since it was opened.
+
+    Attributes:
+        exchanges: instructions that wanted answers.
+        missing, alerts, stale: id -> answers that did not come, that carried the alert bit, that were too old.
+        crc_errors: packets with a wrong CRC.
+        discarded: bytes thrown away because they belonged to an exchange that was given up.
+        fallbacks: fast reads that were repeated as ordinary ones.
+    """
+
+    exchanges: int = 0
+    missing: dict[int, int] = field(default_factory=dict)
+    alerts: dict[int, int] = field(default_factory=dict)
+    stale: dict[int, int] = field(default_factory=dict)
+    crc_errors: int = 0
+    discarded: int = 0
+    fallbacks: int = 0
+
+
+class TickClock:
+    """Tells how old a reading is from the servo's Realtime Tick (ms, modulo 32768) and our clock.
+
+    The freshest reading seen so far sets the offset between the two clocks; the offset is allowed to drift by
+    ``CLOCK_TOLERANCE``. A late answer to an earlier request shows as age; Protocol 2.0 has nothing else to tell it by. Any
+    other jump is a servo that restarted.
+    """
+
+    def __init__(self) -> None:
+        self._offset: float | None = None
+        self._time = 0.0
+
+    def age(self, tick: int, now: float) -> tuple[float, bool]:
+        """Return the age (s) of a reading received at ``now`` (s), and whether the servo's clock was found restarted."""
+        sample = tick - now * 1e3
+        if self._offset is None:
+            self._offset, self._time = sample, now
+        ahead = (sample - self._offset + _TICKS / 2) % _TICKS - _TICKS / 2
+        drift = CLOCK_TOLERANCE * (now - self._time) * 1e3
+        age = max(0.0, -ahead - drift) * 1e-3
+        if STALE < age < LATEST:
+            return age, False
+        restarted = age >= LATEST or ahead > STALE * 1e3 + drift
+        self._offset, self._time = self._offset + (ahead if restarted else max(ahead, -drift)), now
+        return (0.0 if restarted else age), restarted
+
+
+class BusGroup:
+    """Servos on one port.
+
+    Args:
+        name: for messages.
+        port: device path.
+        baud_rate: bit/s.
+        servos: id -> control table.
+        patience: s an answer may take beyond its bytes' time on the wire.
+        clock: s; what the servos' own clocks are compared with.
+        make_port: (path, bit/s, patience) -> port; None = a serial port.
+
+    Attributes:
+        fast: sync reads use the fast instruction; cleared for good when servos turn out not to know it.
+        statistics: counts since the port was opened.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        port: str,
+        baud_rate: int,
+        servos: Mapping[int, ControlTable],
+        patience: float = PATIENCE,
+        clock: Callable[[], float] = time.monotonic,
+        make_port: Callable[[str, int, float], GuardedPort] | None = None,
+    ) -> None:
+        require_package("dynamixel_sdk", "robot")
+        require_package("serial", "robot")
+        from wlr_gym.hardware.dynamixel.sdk import GuardedHandler, GuardedPort
+
+        self.name = name
+        self.servos = dict(servos)
+        self.fast = True
+        self.statistics = Statistics()
+        self._port: GuardedPort = (make_port or GuardedPort)(port, baud_rate, patience)
+        self._handler: GuardedHandler = GuardedHandler()
+        self._clock = clock
+        self._clocks = {id: TickClock() for id in servos}
+        self._fast_failures = 0
+        self._asked: Block | None = None
+        self._asked_at = 0.0
+
+    def open(self) -> None:
+        """Open the port.
+
+        Raises:
+            InputError: it is not there, or cannot be opened.
+        """
+        self._port.openPort()
+
+    def close(self) -> None:
+        """Close the port; servos stay as they are."""
+        self._port.closePort()
+
+    @property
+    def patience(self) -> float:
+        """Time (s) an answer may take beyond its bytes' time on the wire."""
+        return self._port.patience
+
+    @patience.setter
+    def patience(self, seconds: float) -> None:
+        self._port.patience = seconds
+
+    @property
+    def gone(self) -> bool:
+        """Whether the port has failed since it was opened."""
+        return self._port.gone
+
+    def __enter__(self) -> BusGroup:
+        self.open()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    # ---- one servo ----
+
+    def ping(self, id: int) -> tuple[int, int]:
+        """Return model number and firmware version.
+
+        Raises:
+            NoAnswerError: the servo is silent.
+        """
+        status = self._ask(Packet(id, Instruction.PING, b""), 3, "ping")
+        return int.from_bytes(status.data[:2], "little"), status.data[2]
+
+    def scan(self) -> dict[int, tuple[int, int]]:
+        """Return id -> (model number, firmware) of every servo that answers; takes about 0.8 s."""
+        found, _ = self._handler.broadcastPing(self._port)
+        return {id: (model, firmware) for id, (model, firmware) in sorted(found.items())}
+
+    def read(self, id: int, item: str) -> int:
+        """Return the count an item holds.
+
+        Raises:
+            NoAnswerError, RefusedError: see there.
+            InputError: unknown id or item.
+        """
+        row = self._table(id)[item]
+        parameters = protocol.word(row.address) + protocol.word(row.size)
+        return row.decode(self._ask(Packet(id, Instruction.READ, parameters), row.size, f"read {item}").data)
+
+    def write(self, id: int, item: str, count: int) -> None:
+        """Write a count and have it acknowledged.
+
+        Raises:
+            NoAnswerError, RefusedError: see there; refused are values out of range and the EEPROM while torque is on.
+            InputError: unknown id or item, or a count that does not fit.
+        """
+        row = self._table(id)[item]
+        parameters = protocol.word(row.address) + row.encode(count)
+        self._ask(Packet(id, Instruction.WRITE, parameters), 0, f"write {item} = {count}")
+
+    def reboot(self, id: int) -> None:
+        """Reboot a servo and wait until it is back: RAM at its defaults, latched errors cleared, torque off.
+
+        Raises:
+            NoAnswerError: it did not come back.
+        """
+        self._ask(Packet(id, Instruction.REBOOT, b""), 0, "reboot")
+        end = time.monotonic() + REBOOT_TIME
+        while True:
+            try:
+                self.ping(id)
+                return
+            except NoAnswerError:
+                if time.monotonic() > end:
+                    raise
+
+    def _table(self, id: int) -> ControlTable:
+        if id not in self.servos:
+            raise InputError(f"bus {self.name}: no servo with id {id}; there are {', '.join(map(str, sorted(self.servos)))}")
+        return self.servos[id]
+
+    def _ask(self, packet: Packet, length: int, what: str) -> Status:
+        self.statistics.exchanges += 1
+        status = self._handler.exchange(self._port, packet, length)
+        self._note_port()
+        where = f"bus {self.name}, id {packet.id}: {what}"
+        if status is None:
+            self._count(self.statistics.missing, packet.id)
+            if not self._port.quiet:
+                raise RestlessLineError(f"{where}: no answer, the line is never quiet: check wiring, are two ports swapped?")
+            raise NoAnswerError(f"{where}: no answer")
+        if status.alert:
+            self._count(self.statistics.alerts, packet.id)
+        if status.fault:
+            raise RefusedError(f"{where}: refused ({_ERROR_NAMES.get(status.fault, status.fault)})", status)
+        return status
+
+    # ---- all servos ----
+
+    def ask_all(self, block: Block) -> None:
+        """Send the read of a block from every servo; :meth:`answers` collects. Several groups can be asked at once.
+
+        Raises:
+            BusGoneError: the port is gone.
+        """
+        self._asked, self._asked_at = block, self._clock()
+        self.statistics.exchanges += 1
+        count = len(self.servos)
+        self._handler.syncReadTx(self._port, block.address, block.length, list(self.servos), count, self.fast)
+        self._port.setPacketTimeout((block.length + 11) * count + 14 + count)
+
+    def answers(self) -> dict[int, Reading]:
+        """Return id -> reading of the servos that answered :meth:`ask_all`; who is missing, is missing.
+
+        A fast read that brings nothing is repeated as an ordinary one; after three in a row only ordinary ones are tried.
+
+        Raises:
+            BusGoneError: the port is gone.
+        """
+        block = self._asked
+        assert block is not None, "ask_all comes first"
+        wanted = dict.fromkeys(self.servos, block.length)
+        found = self._handler.collect(self._port, wanted)
+        if self.fast and not found:
+            self.statistics.fallbacks += 1
+            self.fast = False
+            self.ask_all(block)
+            found = self._handler.collect(self._port, wanted)
+            self._fast_failures = self._fast_failures + 1 if found else 0
+            self.fast = self._fast_failures < 3
+        elif self.fast:
+            self._fast_failures = 0
+        self._note_port()
+        now = self._clock()
+        for id in self.servos.keys() - found.keys():
+            self._count(self.statistics.missing, id)
+        readings = {id: self._reading(block, status, now) for id, status in found.items()}
+        oldest = now - self._asked_at + STALE  # an answer may have waited for us, but was not given before we asked
+        return {id: reading for id, reading in readings.items() if self._is_good(id, reading, oldest)}
+
+    def read_all(self, block: Block) -> dict[int, Reading]:
+        """Return id -> reading of every servo that answers; :meth:`ask_all` and :meth:`answers` in one.
+
+        Raises:
+            BusGoneError: the port is gone.
+        """
+        self.ask_all(block)
+        return self.answers()
+
+    def _reading(self, block: Block, status: Status, now: float) -> Reading:
+        counts = block.decode(status.data)
+        age, restarted = 0.0, False
+        if "realtime_tick" in counts:
+            age, restarted = self._clocks[status.id].age(counts["realtime_tick"], now)
+        if status.alert:
+            self._count(self.statistics.alerts, status.id)
+        return Reading(counts, status.alert, age, restarted)
+
+    def _is_good(self, id: int, reading: Reading, oldest: float) -> bool:
+        if reading.age > oldest:
+            self._count(self.statistics.stale, id)
+            self._port.suspect = True
+            return False
+        return True
+
+    def write_all(self, item: str, counts: Mapping[int, int]) -> None:
+        """Write id -> count in one packet. Nobody acknowledges it, and a servo ignores a count out of range: clamp before.
+
+        Raises:
+            BusGoneError: the port is gone.
+            InputError: unknown id or item, or a count that does not fit.
+        """
+        data = {id: self._table(id)[item].encode(count) for id, count in counts.items()}
+        row = self._table(next(iter(counts)))[item]
+        parameters = [value for id, raw in data.items() for value in (id, *raw)]
+        self._handler.syncWriteTxOnly(self._port, row.address, row.size, parameters, len(parameters))
+
+    def torque_off(self, retries: int = 5) -> set[int]:
+        """Switch every motor off, whatever happened before; return the ids that did not confirm it.
+
+        First all at once without acknowledgement, then one by one until each has confirmed or ``retries`` are over.
+
+        Raises:
+            BusGoneError: the port is gone.
+        """
+        left = set(self.servos)
+        for _ in range(retries):
+            self.write_all("torque_enable", dict.fromkeys(left, 0))
+            left = {id for id in left if not self._confirm_off(id)}
+            if not left:
+                break
+        return left
+
+    def _confirm_off(self, id: int) -> bool:
+        try:
+            self.write(id, "torque_enable", 0)
+            return self.read(id, "torque_enable") == 0
+        except (NoAnswerError, RefusedError):
+            return False
+
+    # ---- book-keeping ----
+
+    def _count(self, counts: dict[int, int], id: int) -> None:
+        counts[id] = counts.get(id, 0) + 1
+
+    def _note_port(self) -> None:
+        self.statistics.crc_errors = self._port.parser.crc_errors
+        self.statistics.discarded = self._port.discarded
+
+
+def open_all(groups: Iterable[BusGroup]) -> None:
+    """Open several groups; none stays open when one of them cannot be.
+
+    Raises:
+        InputError: a port is not there, or cannot be opened.
+    """
+    opened: list[BusGroup] = []
+    try:
+        for group in groups:
+            group.open()
+            opened.append(group)
+    except BaseException:
+        for group in opened:
+            group.close()
+        raise

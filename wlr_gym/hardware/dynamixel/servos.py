@@ -1,0 +1,319 @@
+"""The eight servos in SI units and joint order, over however many buses: counts, mounting signs and zeros end here."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.hardware.config import Hardware
+from wlr_gym.hardware.dynamixel.bus import PATIENCE, Block, BusGroup, NoAnswerError, Reading, open_all
+from wlr_gym.hardware.dynamixel.tables import HARDWARE_ERRORS, ControlTable, load_table
+from wlr_gym.physics.servo import effort_counts
+from wlr_gym.robot import JOINTS, LEGS, Robot
+
+if TYPE_CHECKING:
+    from wlr_gym.hardware.dynamixel.sdk import GuardedPort
+
+Array = NDArray[np.float64]
+
+#: Read every tick, and read now and then.
+_MOTION = ("realtime_tick", "present_position")
+_HEALTH = ("present_input_voltage", "present_temperature")
+#: Times that a single item is asked for again.
+RETRIES = 2
+
+
+class JointMap:
+    """Counts of the eight servos to SI values of the eight joints, and back.
+
+    Args:
+        robot: encoder and effort counts.
+        hardware: models, and how the servos are mounted.
+    """
+
+    def __init__(self, robot: Robot, hardware: Hardware) -> None:
+        models = {joint: bus.model for bus in hardware.buses.values() for joint in bus.joints}
+        tables = [load_table(models[joint]) for joint in JOINTS]
+        self._sign = np.array([hardware.joints[joint].sign for joint in JOINTS], np.float64)
+        self._zero = np.array([hardware.joints[joint].zero for joint in JOINTS], np.float64)
+        self._position = np.array([table.per_count("present_position") for table in tables])
+        self._velocity = np.array([table.per_count("present_velocity") for table in tables])
+        self._effort = effort_counts(robot)
+
+    def position(self, counts: ArrayLike) -> Array:
+        """Return joint angles (8,) in rad; wheels as many turns as the servos counted."""
+        return self._sign * (np.asarray(counts, np.float64) - self._zero) * self._position
+
+    def velocity(self, counts: ArrayLike) -> Array:
+        """Return joint rates (8,) in rad/s."""
+        return self._sign * np.asarray(counts, np.float64) * self._velocity
+
+    def effort(self, counts: ArrayLike) -> Array:
+        """Return motor torques (8,) in N m by the nominal torque constants, before gear friction."""
+        return self._sign * np.asarray(counts, np.float64) * self._effort
+
+    def goals(self, goals: ArrayLike) -> NDArray[np.int64]:
+        """Return goal counts (8,) of leg angles (rad) and wheel speeds (rad/s): Goal Position and Goal Velocity.
+
+        Raises:
+            InputError: wrong shape, or a goal that is not finite; names the joint.
+        """
+        values = np.asarray(goals, np.float64)
+        if values.shape != (len(JOINTS),):
+            raise InputError(f"goals have shape {values.shape}, expected ({len(JOINTS)},)")
+        if not np.isfinite(values).all():
+            bad = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise InputError(f"goal of {JOINTS[bad]} is {values[bad]}, expected a finite number")
+        legs = np.arange(len(JOINTS)) < len(LEGS)
+        counts = self._sign * values / np.where(legs, self._position, self._velocity) + np.where(legs, self._zero, 0.0)
+        return np.rint(counts).astype(np.int64)
+
+    def written(self, goals: ArrayLike) -> Array:
+        """Return goals (8,) as the registers hold them: rounded to whole counts, in rad and rad/s; see :meth:`goals`."""
+        counts = self.goals(goals)
+        return np.where(np.arange(len(JOINTS)) < len(LEGS), self.position(counts), self.velocity(counts))
+
+
+@dataclass(frozen=True)
+class JointReadings:
+    """What the eight servos said, in joint order; NaN where one did not.
+
+    Attributes:
+        position, velocity, effort: (8,) rad, rad/s, N m (see :class:`JointMap`).
+        age: (8,) s since the servo took the reading.
+        answered: (8,) it answered, and not too late.
+        alert: (8,) it has a hardware error.
+        restarted: (8,) it was rebooted, or had no power, since the last reading.
+    """
+
+    position: Array
+    velocity: Array
+    effort: Array
+    age: Array
+    answered: NDArray[np.bool_]
+    alert: NDArray[np.bool_]
+    restarted: NDArray[np.bool_]
+
+
+class Servos:
+    """All servos of a robot.
+
+    Use as a context manager, or :meth:`open` and :meth:`close`. Nothing here decides what is safe: callers other than the
+    safety gate read only.
+
+    Args:
+        robot: its ``dynamixel_ids``.
+        hardware: ports, models, mounting.
+        patience, clock, make_port: see :class:`wlr_gym.hardware.dynamixel.bus.BusGroup`.
+
+    Attributes:
+        groups: bus name -> bus group.
+        joint_map: counts to SI units.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        hardware: Hardware,
+        patience: float = PATIENCE,
+        clock: Callable[[], float] = time.monotonic,
+        make_port: Callable[[str, int, float], GuardedPort] | None = None,
+    ) -> None:
+        self.joint_map = JointMap(robot, hardware)
+        self._ids = [robot.dynamixel_ids[joint] for joint in JOINTS]
+        self._bus_of = {joint: name for name, bus in hardware.buses.items() for joint in bus.joints}
+        self.groups: dict[str, BusGroup] = {}
+        self._motion: dict[str, Block] = {}
+        self._health: dict[str, Block] = {}
+        for name, bus in hardware.buses.items():
+            table = load_table(bus.model)
+            servos = {robot.dynamixel_ids[joint]: table for joint in bus.joints}
+            self.groups[name] = BusGroup(name, bus.port, bus.baud_rate, servos, patience, clock, make_port)
+            self._motion[name] = Block(table, *_MOTION)
+            self._health[name] = Block(table, *_HEALTH)
+
+    def open(self) -> None:
+        """Open all ports, or none.
+
+        Raises:
+            InputError: a port is not there, or cannot be opened.
+        """
+        open_all(self.groups.values())
+
+    def set_patience(self, seconds: float) -> None:
+        """Set how long (s) an answer may take beyond its bytes' time on the wire, on all buses."""
+        for group in self.groups.values():
+            group.patience = seconds
+
+    def close(self) -> None:
+        """Close all ports; servos stay as they are."""
+        for group in self.groups.values():
+            group.close()
+
+    def __enter__(self) -> Servos:
+        self.open()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    # ---- reading ----
+
+    def read(self) -> JointReadings:
+        """Read all joints; the buses work at the same time.
+
+        Raises:
+            BusGoneError: a port is gone.
+        """
+        readings = self._read(self._motion)
+        counts = np.full((3, len(JOINTS)), np.nan)
+        flags = np.zeros((3, len(JOINTS)), bool)
+        age = np.full(len(JOINTS), np.nan)
+        for k, id in enumerate(self._ids):
+            reading = readings.get(id)
+            if reading is not None:
+                values = reading.counts
+                effort = values["present_current"] if "present_current" in values else values["present_load"]
+                counts[:, k] = values["present_position"], values["present_velocity"], effort
+                flags[:, k] = True, reading.alert, reading.restarted
+                age[k] = reading.age
+        position, velocity, effort = counts
+        convert = self.joint_map
+        return JointReadings(convert.position(position), convert.velocity(velocity), convert.effort(effort), age, *flags)
+
+    def read_health(self) -> tuple[Array, Array]:
+        """Return supply voltages (8,) in V and temperatures (8,) in degC; NaN where a servo did not answer.
+
+        Raises:
+            BusGoneError: a port is gone.
+        """
+        readings = self._read(self._health)
+        values = np.full((2, len(JOINTS)), np.nan)
+        for k, id in enumerate(self._ids):
+            if id in readings:
+                counts = readings[id].counts
+                values[:, k] = counts["present_input_voltage"] * 0.1, counts["present_temperature"]
+        return values[0], values[1]
+
+    def _read(self, blocks: Mapping[str, Block]) -> dict[int, Reading]:
+        for name, group in self.groups.items():
+            group.ask_all(blocks[name])
+        found: dict[int, Reading] = {}
+        for group in self.groups.values():
+            found |= group.answers()
+        return found
+
+    def hardware_errors(self, joint: str) -> list[str]:
+        """Return the names of a joint's hardware errors.
+
+        Raises:
+            NoAnswerError, RefusedError: see :class:`wlr_gym.hardware.dynamixel.bus.BusGroup`.
+        """
+        bits = self.get(joint, "hardware_error_status")
+        return [name for bit, name in HARDWARE_ERRORS.items() if bits & bit]
+
+    # ---- single items, by joint ----
+
+    def ping(self, joint: str) -> tuple[int, int]:
+        """Return a joint's model number and firmware version; see :meth:`BusGroup.ping`."""
+        return _persist(self._group(joint).ping, self._id(joint))
+
+    def get(self, joint: str, item: str) -> int:
+        """Return the count of a joint's control table item; see :meth:`BusGroup.read`. A lost answer is asked for again."""
+        return _persist(self._group(joint).read, self._id(joint), item)
+
+    def set(self, joint: str, item: str, count: int) -> None:
+        """Write a count into a joint's control table item; see :meth:`BusGroup.write`. A lost answer is asked for again."""
+        _persist(self._group(joint).write, self._id(joint), item, count)
+
+    def get_all(self, item: str) -> dict[str, int]:
+        """Return joint -> count of an item, of the joints that answered; the buses work at the same time.
+
+        Raises:
+            BusGoneError: a port is gone.
+        """
+        tables = {name: next(iter(group.servos.values())) for name, group in self.groups.items()}
+        readings = self._read({name: Block(table, item, item) for name, table in tables.items()})
+        return {joint: readings[id].counts[item] for joint, id in zip(JOINTS, self._ids, strict=True) if id in readings}
+
+    def _id(self, joint: str) -> int:
+        return self._ids[JOINTS.index(joint)]
+
+    def table(self, joint: str) -> ControlTable:
+        """Return a joint's control table."""
+        return self._group(joint).servos[self._id(joint)]
+
+    def _group(self, joint: str) -> BusGroup:
+        if joint not in self._bus_of:
+            raise InputError(f"no joint '{joint}'; there are {', '.join(JOINTS)}")
+        return self.groups[self._bus_of[joint]]
+
+    # ---- writing ----
+
+    def write_goals(self, goals: ArrayLike) -> None:
+        """Write goals (8,): leg angles in rad, wheel speeds in rad/s. Not acknowledged; out of range is ignored by the servo.
+
+        Raises:
+            InputError: wrong shape, or a goal that is not finite.
+            BusGoneError: a port is gone.
+        """
+        counts = dict(zip(JOINTS, self.joint_map.goals(goals).tolist(), strict=True))
+        for item, joints in (("goal_position", LEGS), ("goal_velocity", JOINTS[len(LEGS) :])):
+            self.write_item(item, {joint: counts[joint] for joint in joints})
+
+    def write_item(self, item: str, counts: Mapping[str, int]) -> None:
+        """Write joint -> count of one item, all joints of a bus in one packet. Not acknowledged.
+
+        Raises:
+            BusGoneError: a port is gone.
+        """
+        for name, group in self.groups.items():
+            here = {self._ids[JOINTS.index(joint)]: count for joint, count in counts.items() if self._bus_of[joint] == name}
+            if here:
+                group.write_all(item, here)
+
+    def shout_off(self) -> None:
+        """Tell every motor to switch off, without waiting for anybody; a bus that is gone does not keep the others."""
+        from wlr_gym.hardware.dynamixel.sdk import BusGoneError
+
+        for group in self.groups.values():
+            with contextlib.suppress(BusGoneError):
+                group.write_all("torque_enable", dict.fromkeys(group.servos, 0))
+
+    def reopen_gone(self) -> None:
+        """Open the ports again that are gone, where they are back."""
+        for group in self.groups.values():
+            if group.gone:
+                with contextlib.suppress(InputError):
+                    group.close()
+                    group.open()
+
+    def torque_off(self, retries: int = 5) -> list[str]:
+        """Switch every motor off, whatever happened before; return the joints that did not confirm it.
+
+        A bus whose port is gone does not keep the others from being tried.
+        """
+        from wlr_gym.hardware.dynamixel.sdk import BusGoneError
+
+        left: set[int] = set()
+        for group in self.groups.values():
+            try:
+                left |= group.torque_off(retries)
+            except BusGoneError:
+                left |= set(group.servos)
+        return [joint for joint, id in zip(JOINTS, self._ids, strict=True) if id in left]
+
+
+def _persist(ask: Callable[..., Any], *arguments: Any) -> Any:
+    """Ask up to three times: reading and writing an item twice does no harm."""
+    for _ in range(RETRIES):
+        with contextlib.suppress(NoAnswerError):
+            return ask(*arguments)
+    return ask(*arguments)

@@ -1,0 +1,1 @@
+"""The IMU: its frames, its drivers, and one interface over both."""

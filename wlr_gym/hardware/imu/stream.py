@@ -1,0 +1,152 @@
+"""The IMU behind a microcontroller that streams frames over a serial port (``wlr_gym.hardware.imu.frames`` has the format)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from wlr_gym.base.errors import require_package
+from wlr_gym.hardware.config import ImuPort
+from wlr_gym.hardware.imu.driver import Conversion, ImuGoneError, ImuReading, ImuStatistics
+from wlr_gym.hardware.imu.frames import Frame, FrameParser
+from wlr_gym.hardware.ports import open_serial
+
+#: Bytes taken at once; more than the system keeps for a port nobody reads.
+_CHUNK = 65536
+
+
+class Device(Protocol):
+    """What is used of ``serial.Serial`` with a time-out of 0. Failures are ``OSError``."""
+
+    def read(self, size: int) -> bytes: ...
+    def reset_input_buffer(self) -> None: ...
+    def close(self) -> None: ...
+
+
+def open_device(port: ImuPort) -> Device:
+    """Open the serial port.
+
+    Raises:
+        InputError: it is not there, cannot be opened, or another program has it.
+    """
+    require_package("serial", "robot")
+    return open_serial(port.port, port.baud_rate, "IMU port")
+
+
+class StreamClock:
+    """Tells how old a frame is from the microcontroller's microseconds (modulo 2^32) and our clock.
+
+    The frame that came soonest after its stamp sets the offset between the clocks, so ages are short by at most what that one
+    took: at a poll, up to one frame period. The microcontroller's clock may be wrong by ``drift`` (a ceramic resonator is by
+    0.5 %, an RC oscillator by 2 %). A clock that jumps further than ``latest`` restarted.
+    """
+
+    drift, latest = 0.02, 2.0
+    _turn = 2**32 * 1e-6
+
+    def __init__(self) -> None:
+        self._offset: float | None = None
+        self._time = 0.0
+
+    def age(self, microseconds: int, now: float) -> tuple[float, bool]:
+        """Return the age (s) of a frame that is here at ``now`` (s), and whether the microcontroller restarted."""
+        sample = microseconds * 1e-6 - now
+        if self._offset is None:
+            self._offset, self._time = sample, now
+        ahead = (sample - self._offset + self._turn / 2) % self._turn - self._turn / 2
+        drift = self.drift * (now - self._time)
+        if ahead > 0.1 + drift or ahead < -self.latest - drift:
+            self._offset, self._time = sample, now
+            return 0.0, True
+        if ahead > -drift:
+            self._offset, self._time = self._offset + ahead, now
+        return max(0.0, -ahead - drift), False
+
+
+class ImuStream:
+    """Serial stream of frames.
+
+    Args:
+        port: device, baud rate, ranges, calibration.
+        clock: s; what ages are told by.
+        make_device: opens the port; the emulator in memory puts its own here.
+
+    Attributes:
+        statistics: what came since the port was opened.
+    """
+
+    def __init__(
+        self,
+        port: ImuPort,
+        clock: Callable[[], float] = time.monotonic,
+        make_device: Callable[[ImuPort], Device] = open_device,
+    ) -> None:
+        self._port = port
+        self._clock = clock
+        self._make_device = make_device
+        self._convert = Conversion(port)
+        self._device: Device | None = None
+        self._reset()
+
+    def _reset(self) -> None:
+        self.statistics = ImuStatistics()
+        self._parser = FrameParser()
+        self._frame_clock = StreamClock()
+        self._newest: tuple[Frame, float] | None = None
+
+    def open(self) -> None:
+        """Open the port and throw away what piled up in it.
+
+        Raises:
+            InputError: it is not there, or cannot be opened.
+        """
+        self._reset()
+        self._device = self._make_device(self._port)
+        self._device.reset_input_buffer()
+
+    def close(self) -> None:
+        """Close the port."""
+        if self._device is not None:
+            self._device.close()
+            self._device = None
+
+    def __enter__(self) -> ImuStream:
+        if self._device is None:
+            self.open()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def frames(self) -> list[Frame]:
+        """Return all frames that came since the last call; does not wait.
+
+        Raises:
+            ImuGoneError: the port is gone.
+        """
+        frames = self._parser.feed(self._received())
+        self.statistics.readings += len(frames)
+        self.statistics.lost, self.statistics.errors = self._parser.lost, self._parser.crc_errors
+        return frames
+
+    def read(self) -> ImuReading | None:
+        """Return the newest frame; see :class:`wlr_gym.hardware.imu.driver.Imu`."""
+        frames = self.frames()
+        now = self._clock()
+        if frames:
+            age, restarted = self._frame_clock.age(frames[-1].microseconds, now)
+            self.statistics.restarts += restarted
+            self._newest = frames[-1], now - age
+        if self._newest is None:
+            return None
+        frame, taken = self._newest
+        return self._convert.reading(frame.accelerometer, frame.temperature, frame.gyroscope, now - taken)
+
+    def _received(self) -> bytes:
+        if self._device is None:
+            raise ImuGoneError(f"IMU port {self._port.port}: not open")
+        try:
+            return self._device.read(_CHUNK)
+        except (OSError, TypeError) as error:  # pyserial's exceptions are OSErrors; TypeError: its port was closed
+            raise ImuGoneError(f"IMU port {self._port.port} is gone: {error}") from None

@@ -1,0 +1,378 @@
+"""What is safe to ask of the robot: pure functions of what was wanted and what was last seen. No I/O, no clock.
+
+:func:`decide` puts them together once a control tick. :mod:`wlr_gym.hardware.safety.limiter` carries its decisions out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.hardware.safety.limits import Safety
+from wlr_gym.physics.servo import motor_constants
+from wlr_gym.robot import JOINTS, LEGS, Robot
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+STANDARD_GRAVITY = 9.80665
+#: s over which the accelerometer pulls the gyroscope's vertical to its own, and m/s2 it may differ from gravity to be asked.
+VERTICAL_TIME, VERTICAL_BAND = 0.5, 2.0
+#: A joint cannot turn faster than this many times its motor's no-load speed; a reading that says so is none. Counts of noise.
+OUTLIER_SPEED, OUTLIER_NOISE = 2.0, 0.03
+_N = len(JOINTS)
+_IS_LEG = np.arange(_N) < len(LEGS)
+
+
+class Level(IntEnum):
+    """What the robot may do, from harmless to worst; the worst verdict counts."""
+
+    DRIVE = 0  #: as asked, within limits
+    COAST = 1  #: the last goals hold
+    HOLD = 2  #: wheels stop, legs stay; goes on when the reason is over
+    STOP = 3  #: as HOLD, then torque off for good
+    OFF = 4  #: torque off now
+
+
+class Verdict(NamedTuple):
+    """One finding: how bad it is, which rule, what was found."""
+
+    level: Level
+    rule: str
+    text: str
+
+
+#: What is found where nothing is; rules that somebody asks for, and that are no faults.
+FINE = Verdict(Level.DRIVE, "", "")
+REQUESTS = ("stop", "emergency stop")
+
+
+@dataclass(frozen=True)
+class View:
+    """What is known of the robot at a tick. Arrays are in joint order.
+
+    Attributes:
+        time: s.
+        position, velocity, effort: (8,) last good readings, rad, rad/s, N m.
+        silence: (8,) s since the joint's last good reading; 0 = it answered in this tick.
+        alert, restarted: (8,) hardware error; rebooted since the last reading.
+        voltage, temperature: (8,) V, degC, as last read.
+        gyro, accelerometer: (3,) rad/s, m/s2, body frame.
+        imu_silence: s since the IMU's last reading.
+        up: (3,) the vertical in the body frame.
+        late_ticks: ticks in a row that started a period late or more. late_share: of the last second's.
+        operator_silence: s since the operator's last sign. idle: s for which nothing was sent to the servos.
+        lost: ports that are gone, in words. latched: joints that their watchdog has stopped, in words.
+        trouble: why log or terminal failed.
+        asked_to_stop: why a stop was asked for. asked_off: why torque is to go off at once.
+    """
+
+    time: float
+    position: Array
+    velocity: Array
+    effort: Array
+    silence: Array
+    alert: Mask
+    restarted: Mask
+    voltage: Array
+    temperature: Array
+    gyro: Array
+    accelerometer: Array
+    imu_silence: float
+    up: Array
+    late_ticks: int = 0
+    late_share: float = 0.0
+    operator_silence: float = 0.0
+    idle: float = 0.0
+    lost: str = ""
+    latched: str = ""
+    trouble: str = ""
+    asked_to_stop: str = ""
+    asked_off: str = ""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What lasts from tick to tick: how long things have been beyond their limits, s."""
+
+    loaded: Array = field(default_factory=lambda: np.zeros(_N))
+    current: float = 0.0
+    sagged: float = 0.0
+    tilted: float = 0.0
+    tilting: float = 0.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What the limits are about: the robot's numbers and what its servos' registers allow.
+
+    Attributes:
+        low, high: (8,) goals the servos take, rad and rad/s.
+        leg_limits: rad, of the robot file.
+        stall_torque: (8,) N m. amperes: (8,) A per N m. no_load_speed: (8,) rad/s.
+        period: s of a control tick.
+    """
+
+    low: Array
+    high: Array
+    leg_limits: tuple[float, float]
+    stall_torque: Array
+    amperes: Array
+    no_load_speed: Array
+    period: float
+
+
+def make_frame(robot: Robot, period: float, low: Array | None = None, high: Array | None = None) -> Frame:
+    """Return the frame of a robot; without register limits (``low``, ``high``) all goals are possible."""
+    motors = (robot.servo.leg, robot.servo.wheel)
+    stall = np.repeat([motor.stall_torque for motor in motors], 4)
+    speed = np.repeat([motor.no_load_speed for motor in motors], 4)
+    constant, _ = motor_constants(stall, speed, robot.servo.supply_voltage)
+    return Frame(
+        np.full(_N, -np.inf) if low is None else low,
+        np.full(_N, np.inf) if high is None else high,
+        robot.leg_limits,
+        stall,
+        1.0 / constant,
+        speed,
+        period,
+    )
+
+
+class Decision(NamedTuple):
+    """What to send.
+
+    Attributes:
+        level: what the robot may do.
+        goals: (8,) rad and rad/s, finite.
+        torque_on: (8,) motors that are on.
+        verdicts: findings above DRIVE.
+        limited: rule -> joints whose goals it changed.
+        memory: for the next tick.
+    """
+
+    level: Level
+    goals: Array
+    torque_on: Mask
+    verdicts: tuple[Verdict, ...]
+    limited: dict[str, Mask]
+    memory: Memory
+
+
+def decide(
+    limits: Safety,
+    frame: Frame,
+    view: View,
+    memory: Memory,
+    previous: Array,
+    wanted: object,
+    torque_on: Mask | None = None,
+) -> Decision:
+    """Decide on one control tick.
+
+    Args:
+        limits: the robot's.
+        frame: see :func:`make_frame`.
+        view: what was last seen.
+        memory: of the tick before.
+        previous: (8,) goals of the tick before, finite.
+        wanted: goals asked for: anything; only eight finite numbers are taken.
+        torque_on: (8,) motors that are to be on; goals of the others are not looked at. None = all.
+    """
+    on = np.ones(_N, bool) if torque_on is None else np.asarray(torque_on, bool)
+    goals, refusal = take_request(wanted, on, view.position, previous)
+    memory = remember(limits, frame, view, memory)
+    found = list(judge(limits, view, memory))
+    verdicts = (*found, refusal) if refusal else tuple(found)
+    level = max((verdict.level for verdict in verdicts), default=Level.DRIVE)
+    if level == Level.COAST:
+        goals = previous
+    elif level >= Level.HOLD:
+        goals = np.where(_IS_LEG, previous, 0.0)
+    start = np.where(on, previous, resting(view.position))
+    goals, limited = limit_goals(limits, frame, goals, start, view.position, slow_down(limits, view))
+    return Decision(level, goals, on, verdicts, limited if level == Level.DRIVE else {}, memory)
+
+
+# ---- the request ----
+
+
+def resting(position: Array) -> Array:
+    """Return goals (8,) that ask for no motion: legs where they are, wheels still."""
+    return np.where(_IS_LEG, position, 0.0)
+
+
+def take_request(wanted: object, on: Mask, position: Array, previous: Array) -> tuple[Array, Verdict | None]:
+    """Return what was asked for as goals (8,), or the previous ones and why it was refused."""
+    try:
+        goals = np.asarray(wanted, np.float64)
+    except (TypeError, ValueError):
+        return previous, Verdict(Level.STOP, "finite", f"goals of type {type(wanted).__name__} are no numbers")
+    if goals.shape != (_N,):
+        return previous, Verdict(Level.STOP, "shape", f"goals have shape {goals.shape}, expected ({_N},)")
+    goals = np.where(on, goals, resting(position))
+    if not np.isfinite(goals).all():
+        bad = int(np.flatnonzero(~np.isfinite(goals))[0])
+        return previous, Verdict(Level.STOP, "finite", f"goal of {JOINTS[bad]} is {goals[bad]}")
+    return goals, None
+
+
+def limit_goals(
+    limits: Safety, frame: Frame, goals: Array, previous: Array, position: Array, wheel_share: float
+) -> tuple[Array, dict[str, Mask]]:
+    """Return goals within all limits, and rule -> joints that it changed.
+
+    The slew limit comes last, so no goal ever jumps: not even back into range from outside.
+
+    Args:
+        limits, frame: see there.
+        goals, previous: (8,) finite.
+        position: (8,) rad, as last read.
+        wheel_share: of the wheel speed limit that is left.
+    """
+    low = np.where(_IS_LEG, frame.leg_limits[0] + limits.leg_margin, -limits.wheel_speed * wheel_share)
+    high = np.where(_IS_LEG, frame.leg_limits[1] - limits.leg_margin, limits.wheel_speed * wheel_share)
+    low, high = np.maximum(low, frame.low), np.minimum(high, frame.high)
+    inside = np.clip(goals, low, high)
+    near = np.clip(inside, position - limits.leg_lead, position + limits.leg_lead)
+    near = np.where(_IS_LEG, np.clip(near, low, high), inside)
+    step = frame.period * np.where(_IS_LEG, limits.leg_speed, limits.wheel_acceleration)
+    to_low, to_high = np.where(_IS_LEG, (previous - low, high - previous), np.inf)
+    tapered = np.clip(
+        near,
+        previous - step * np.clip(to_low / limits.leg_taper, 0.0, 1.0),
+        previous + step * np.clip(to_high / limits.leg_taper, 0.0, 1.0),
+    )
+    slewed = np.clip(near, previous - step, previous + step)
+    # beyond a limit the way back is never barred
+    final = np.where(_IS_LEG & (previous >= low) & (previous <= high), tapered, slewed)
+    changes = {"limit": goals != inside, "lead": inside != near, "slew": near != slewed, "taper": final != slewed}
+    return final, {rule: mask for rule, mask in changes.items() if mask.any()}
+
+
+def slow_down(limits: Safety, view: View) -> float:
+    """Return the share of the wheel speed limit that the hottest servo leaves, 1 to 0."""
+    hottest = np.nanmax(view.temperature, initial=-np.inf)
+    return float(np.clip((limits.hot - hottest) / (limits.hot - limits.warm), 0.0, 1.0))
+
+
+# ---- supervision ----
+
+
+def remember(limits: Safety, frame: Frame, view: View, memory: Memory) -> Memory:
+    """Count on how long things have been beyond their limits; loads and currents cool down as fast as they heat up."""
+    period = frame.period
+    over = np.abs(view.effort) > limits.load * frame.stall_torque
+    loaded = np.maximum(memory.loaded + np.where(over, period, -period), 0.0)
+    amperes = float(np.abs(view.effort) @ frame.amperes)
+    current = max(memory.current + (period if amperes > limits.current else -period), 0.0)
+    sagging = bool(np.nanmin(view.voltage, initial=np.inf) < limits.low_voltage)
+    tilting = max(tilt_of(view.up), tilt_of(turned(view.up, view.gyro, limits.tilt_horizon))) > limits.tilt
+    return Memory(
+        loaded,
+        current,
+        memory.sagged + period if sagging else 0.0,
+        memory.tilted + period if tilt_of(view.up) > limits.tilt else 0.0,
+        memory.tilting + period if tilting else 0.0,
+    )
+
+
+def judge(limits: Safety, view: View, memory: Memory) -> Iterator[Verdict]:
+    """Yield every finding of a tick."""
+    if view.asked_off:
+        yield Verdict(Level.OFF, "emergency stop", view.asked_off)
+    if view.asked_to_stop:
+        yield Verdict(Level.STOP, "stop", view.asked_to_stop)
+    if view.lost:
+        yield Verdict(Level.OFF, "port", view.lost)
+    if view.idle > limits.watchdog:
+        text = f"nothing was sent for {view.idle:.2f} s: the servos' watchdog has stopped them, and they refuse goals"
+        yield Verdict(Level.OFF, "idle", text)
+    if view.latched:
+        text = f"{view.latched} heard nothing for too long: the servos' watchdog has stopped them, and they refuse goals"
+        yield Verdict(Level.STOP, "watchdog", text)
+    if view.trouble:
+        yield Verdict(Level.STOP, "computer", view.trouble)
+    yield from _judge_answers(limits, view)
+    yield from _judge_servos(limits, view, memory)
+    lean = f"{tilt_of(view.up):.2f} rad, turning at {np.linalg.norm(view.gyro[:2]):.1f} rad/s"
+    if memory.tilted > limits.tilt_time:
+        yield Verdict(Level.OFF, "tilt", f"{lean}, limit {limits.tilt:g}")
+    elif memory.tilting > limits.tilt_time:
+        yield Verdict(Level.STOP, "tilt ahead", f"{lean}, will pass {limits.tilt:g}")
+    if limits.deadman is not None and view.operator_silence > limits.deadman:
+        yield Verdict(Level.HOLD, "deadman", f"no sign of the operator for {view.operator_silence:.1f} s")
+    # lost answers make ticks late: the silence is judged then, not the lateness
+    if not view.silence.any() and (view.late_ticks >= limits.late or view.late_share > limits.late_share):
+        text = f"{view.late_ticks} ticks in a row late, {view.late_share:.0%} of the last second's"
+        yield Verdict(Level.STOP, "deadlines", text)
+
+
+def _judge_answers(limits: Safety, view: View) -> Iterator[Verdict]:
+    """Communication ladder: coast, hold, off."""
+    longest = float(view.silence.max())
+    if longest > 0.0:
+        joints = ", ".join(JOINTS[k] for k in np.flatnonzero(view.silence > 0.0))
+        text = f"no answer from {joints} for {longest:.2f} s"
+        level = Level.OFF if longest > limits.silence else Level.HOLD if longest > limits.coast else Level.COAST
+        yield Verdict(level, "silence", text)
+    if view.imu_silence > limits.imu_silence:
+        yield Verdict(Level.STOP, "imu", f"no reading for {view.imu_silence:.2f} s")
+
+
+def _judge_servos(limits: Safety, view: View, memory: Memory) -> Iterator[Verdict]:
+    for k in np.flatnonzero(view.restarted):
+        yield Verdict(Level.OFF, "restart", f"{JOINTS[k]} was rebooted or had no power")
+    for k in np.flatnonzero(view.alert):
+        yield Verdict(Level.STOP, "alert", f"{JOINTS[k]} has a hardware error")
+    for k in np.flatnonzero(view.temperature >= limits.hot):
+        yield Verdict(Level.STOP, "temperature", f"{JOINTS[k]} has {view.temperature[k]:.0f} degC, limit {limits.hot:g}")
+    for k in np.flatnonzero(memory.loaded > limits.load_time):
+        text = f"{JOINTS[k]} gives {abs(view.effort[k]):.2f} N m, above {limits.load:.0%} of stall for {limits.load_time:g} s"
+        yield Verdict(Level.STOP, "load", text)
+    if memory.current > limits.current_time:
+        yield Verdict(Level.STOP, "current", f"motors above {limits.current:g} A for {limits.current_time:g} s")
+    if memory.sagged > limits.low_voltage_time:
+        lowest = np.nanmin(view.voltage)
+        yield Verdict(Level.STOP, "voltage", f"supply at {lowest:.1f} V, limit {limits.low_voltage:g}")
+
+
+# ---- the vertical ----
+
+
+def turned(up: Array, gyro: Array, time: float) -> Array:
+    """Return the vertical in the body frame after turning at ``gyro`` for ``time`` (s)."""
+    moved = up - np.cross(gyro, up) * time
+    return moved / np.linalg.norm(moved)
+
+
+def next_up(up: Array, gyro: Array, accelerometer: Array, time: float) -> Array:
+    """Return the vertical in the body frame ``time`` (s) later: the gyroscope's, slowly pulled to the accelerometer's.
+
+    The accelerometer counts only while it reads about one g.
+    """
+    up = turned(up, gyro, time)
+    size = float(np.linalg.norm(accelerometer))
+    if abs(size - STANDARD_GRAVITY) < VERTICAL_BAND:
+        up = up + min(1.0, time / VERTICAL_TIME) * (accelerometer / size - up)
+    return up / np.linalg.norm(up)
+
+
+def tilt_of(up: Array) -> float:
+    """Return the angle (rad) between the body's z axis and the vertical."""
+    return float(np.arccos(np.clip(up[2], -1.0, 1.0)))
+
+
+# ---- readings ----
+
+
+def plausible(frame: Frame, before: View, position: Array, time: float) -> Mask:
+    """Return which positions (8,) a joint can have reached since the last look; NaN is none."""
+    elapsed = np.maximum(time - before.time, frame.period) + before.silence
+    reach = OUTLIER_SPEED * frame.no_load_speed * elapsed + OUTLIER_NOISE
+    return np.abs(position - before.position) <= reach

@@ -1,0 +1,1 @@
+"""Learning: training, and the evaluation that policies are judged by."""

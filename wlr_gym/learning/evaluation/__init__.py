@@ -1,0 +1,59 @@
+"""Evaluation: whole episodes as one batch, score cards with confidence intervals, and their plots."""
+
+from wlr_gym.learning.evaluation.campaign import FIRST_SEED, Condition, play, work
+from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card, score
+from wlr_gym.learning.evaluation.curve import read_curve
+from wlr_gym.learning.evaluation.metrics import Metric, Played, metrics_of, summarise
+from wlr_gym.learning.evaluation.record import Recorder, record_episodes, write_samples
+from wlr_gym.learning.evaluation.rollout import Measure, Rollout, make_core, roll_out, start_episodes
+from wlr_gym.learning.evaluation.statistics import Estimate
+from wlr_gym.learning.evaluation.subjects import Subject, identity, make_player, read_subjects
+from wlr_gym.learning.evaluation.sweeps import Sweep, read_sweep, sweeps_for
+from wlr_gym.learning.evaluation.write import (
+    comparison_rows,
+    rows,
+    sweep_comparison_rows,
+    sweep_rows,
+    transfer_rows,
+    write_card,
+    write_episodes,
+)
+
+__all__ = [
+    "FIRST_SEED",
+    "MAIN",
+    "OTHER_PLANT",
+    "Card",
+    "Condition",
+    "Estimate",
+    "Measure",
+    "Metric",
+    "Played",
+    "Recorder",
+    "Rollout",
+    "Subject",
+    "Sweep",
+    "comparison_rows",
+    "identity",
+    "make_core",
+    "make_player",
+    "metrics_of",
+    "play",
+    "read_curve",
+    "read_subjects",
+    "read_sweep",
+    "record_episodes",
+    "roll_out",
+    "rows",
+    "score",
+    "start_episodes",
+    "summarise",
+    "sweep_comparison_rows",
+    "sweep_rows",
+    "sweeps_for",
+    "transfer_rows",
+    "work",
+    "write_card",
+    "write_episodes",
+    "write_samples",
+]

@@ -1,0 +1,135 @@
+"""The score card: every subject's scores with confidence intervals, and how the first one compares with the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.learning.evaluation.campaign import Results
+from wlr_gym.learning.evaluation.metrics import Metric, Played, metrics_of, summarise
+from wlr_gym.learning.evaluation.rollout import Rollout
+from wlr_gym.learning.evaluation.statistics import Bootstrap, Estimate
+from wlr_gym.learning.evaluation.sweeps import Sweep
+
+Array = NDArray[np.float64]
+Scores = dict[str, Estimate]
+
+#: Label of the condition that the tables and comparisons are about, and of the same on the other plant.
+MAIN, OTHER_PLANT = "main", "other plant"
+#: The subject that scores are counted from, if it plays.
+IDLE = "do_nothing"
+#: Metrics that are compared by their difference: a share of 0 %, or of a reward with an arbitrary zero, says nothing.
+BY_DIFFERENCE = ("success", "falls", "reward")
+
+
+@cache
+def bootstrap(blocks: int, episodes: int) -> Bootstrap:
+    """Return the resamples for so many episodes: always the same ones."""
+    return Bootstrap(blocks, episodes)
+
+
+def _bootstrap(played: Played) -> Bootstrap:
+    return bootstrap(*played.pairs["success"].shape[:2])
+
+
+def scores_of(played: Played) -> Scores:
+    """Return metric -> estimate."""
+    resampling = _bootstrap(played)
+    return {key: resampling.mean(pairs) for key, pairs in played.pairs.items()}
+
+
+def score(rollout: Rollout) -> Scores:
+    """Return metric -> estimate of one block of episodes."""
+    return scores_of(summarise([rollout]))
+
+
+def compare(ours: Played, theirs: Played, metrics: Sequence[Metric]) -> Scores:
+    """Return metric -> how much better ours is, paired episode by episode: positive is better.
+
+    In % of theirs; metrics in ``BY_DIFFERENCE`` in their own unit.
+    """
+    resampling = _bootstrap(ours)
+    better: Scores = {}
+    for metric in metrics:
+        a, b = ours.pairs[metric.key], theirs.pairs[metric.key]
+        if metric.key in BY_DIFFERENCE:
+            better[metric.key] = resampling.difference(*((b, a) if metric.less_is_better else (a, b)))
+        else:
+            better[metric.key] = resampling.reduction(a, b)
+    return better
+
+
+@dataclass(frozen=True)
+class Card:
+    """Everything that was played and what it was played for.
+
+    Attributes:
+        results: condition -> subject -> what is kept. Conditions: ``MAIN``, perhaps ``OTHER_PLANT``, and those of the sweeps.
+        sweeps: which were played.
+        conditions: what to say about how it was played.
+        identities: subject -> what identifies it; see :func:`wlr_gym.learning.evaluation.subjects.identity`.
+    """
+
+    results: Results
+    sweeps: tuple[Sweep, ...] = ()
+    conditions: Mapping[str, Any] = field(default_factory=dict)
+    identities: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def main(self) -> dict[str, Played]:
+        """Subject -> what is kept of the main condition."""
+        return self.results[MAIN]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the subjects; the first is the one the card is about."""
+        return tuple(self.main)
+
+    @cached_property
+    def metrics(self) -> tuple[Metric, ...]:
+        """Rows of the card."""
+        return metrics_of(self.main[self.names[0]].measures)
+
+    @cached_property
+    def scores(self) -> dict[str, dict[str, Scores]]:
+        """Condition -> subject -> metric -> estimate."""
+        return {
+            label: {name: scores_of(played) for name, played in subjects.items()} for label, subjects in self.results.items()
+        }
+
+    @cached_property
+    def comparison(self) -> dict[str, dict[str, Scores]]:
+        """Condition -> baseline -> metric -> how much better the first subject is; see :func:`compare`."""
+        ours, *others = self.names
+        return {
+            label: {name: compare(subjects[ours], subjects[name], self.metrics) for name in others}
+            for label, subjects in self.results.items()
+        }
+
+    @cached_property
+    def share_of(self) -> dict[str, Estimate]:
+        """Baseline -> the first subject's score in % of the baseline's; a score is the reward above doing nothing's."""
+        ours, *others = self.names
+        if IDLE not in others:
+            return {}
+        idle = self.main[IDLE].pairs["reward"]
+        resampling = _bootstrap(self.main[ours])
+        reward = {name: played.pairs["reward"] for name, played in self.main.items()}
+        return {name: resampling.share(reward[ours], reward[name], idle, idle) for name in others if name != IDLE}
+
+    @cached_property
+    def kept(self) -> dict[str, Estimate]:
+        """Subject -> what it keeps of its score on the other plant, %."""
+        other = self.results.get(OTHER_PLANT, {})
+        if IDLE not in other:
+            return {}
+        shape = other[IDLE].pairs["reward"].shape
+        there = {name: played.pairs["reward"] for name, played in other.items()}
+        here = {name: played.pairs["reward"][: shape[0], : shape[1]] for name, played in self.main.items()}
+        resampling = bootstrap(*shape[:2])
+        return {name: resampling.share(there[name], here[name], there[IDLE], here[IDLE]) for name in self.names if name != IDLE}

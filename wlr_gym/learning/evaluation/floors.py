@@ -1,0 +1,97 @@
+"""Picture of what a randomisation draws: floors seen from above, coloured by friction, each with its robot's wheels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.files import replace_file
+from wlr_gym.envs.tasks.draws import episode_seeds
+from wlr_gym.robot import CORNER_SIGNS
+from wlr_gym.robot.parameters import PATCHES, Parameters
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
+
+    from wlr_gym.envs.tasks import Randomization
+
+Array = NDArray[np.float64]
+
+COUNT = 8
+#: m from the start that is shown; range of the colours.
+_REACH = 1.3
+_LOWEST, _HIGHEST = 0.05, 1.0
+_COLOURS = "viridis"
+
+
+def draw_floors(path: Path, randomizations: Sequence[Randomization], first_seed: int = 0, count: int = COUNT) -> None:
+    """Draw the floors of ``reset(seed=first_seed)`` and the next seeds, one row per randomisation, and write the picture."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    rows = len(randomizations)
+    figure = Figure(figsize=(1.45 * count + 0.9, 1.45 * rows + 0.55), layout="constrained")
+    FigureCanvasAgg(figure)
+    norm = LogNorm(_LOWEST, _HIGHEST, clip=True)
+    panels = figure.subplots(rows, count, squeeze=False, sharex=True, sharey=True)
+    robot_seeds = first_seed + np.arange(count, dtype=np.uint64)
+    seeds = episode_seeds(robot_seeds, np.zeros(count, np.int64))
+    for row, randomization in zip(panels, randomizations, strict=True):
+        parameters = randomization.parameters(robot_seeds, seeds)
+        state = randomization.state(parameters, seeds)
+        yaw = 2 * np.arctan2(state.quaternion[:, 3], state.quaternion[:, 0])
+        for k, axes in enumerate(row):
+            _draw(axes, Parameters(parameters.values[k : k + 1]), float(yaw[k]), norm)
+        row[0].set_ylabel(f"{randomization.config.name}\ny (m)", fontsize=9)
+    for axes in panels[-1]:
+        axes.set_xlabel("x (m)", fontsize=8)
+    bar = figure.colorbar(ScalarMappable(norm, _COLOURS), ax=panels, pad=0.01, ticks=[0.05, 0.1, 0.2, 0.5, 1.0], format="%g")
+    bar.set_label("friction coefficient\nalong the heading", fontsize=9)
+    bar.ax.minorticks_off()
+    bar.ax.tick_params(labelsize=8)
+    replace_file(path, lambda temporary: figure.savefig(temporary, dpi=100, format=path.suffix[1:] or "png"))
+
+
+def _draw(axes: Axes, parameters: Parameters, yaw: float, norm: Normalize) -> None:
+    from matplotlib import colormaps
+    from matplotlib.patches import Rectangle
+    from matplotlib.transforms import Affine2D
+
+    colours = colormaps[_COLOURS]
+    ground = float(parameters["ground.mu_x"].mean())
+    axes.set_facecolor(colours(norm(ground)))
+    areas = [_area(parameters, k) for k in range(len(PATCHES))]
+    for mu, x_min, x_max, y_min, y_max in areas:
+        if x_max > x_min and y_max > y_min:
+            axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, color=colours(norm(mu)), linewidth=0))
+    turn = Affine2D().rotate(yaw) + axes.transData
+    hip_x, hip_y, _ = parameters["hip.position"][0]
+    for (sign_x, sign_y), grip, mu_x in zip(
+        CORNER_SIGNS, parameters["wheel.grip"][0], parameters["ground.mu_x"][0], strict=True
+    ):
+        x, y = sign_x * hip_x, sign_y * hip_y
+        place = np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y
+        mu = grip * next((area[0] for area in reversed(areas) if _holds(area, *place)), mu_x)
+        wheel = Rectangle((x - 0.11, y - 0.06), 0.22, 0.12, facecolor=colours(norm(mu)), edgecolor="white", linewidth=0.8)
+        wheel.set_transform(turn)
+        axes.add_patch(wheel)
+    axes.plot([0.0, 0.4], [0.0, 0.0], color="white", linewidth=1.2, transform=turn)
+    axes.set(xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH), aspect="equal", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+    axes.tick_params(labelsize=7)
+
+
+def _area(parameters: Parameters, patch: int) -> tuple[float, ...]:
+    """Friction and edges of one patch: mu, x_min, x_max, y_min, y_max."""
+    return tuple(float(parameters[f"patch.{name}"][0, patch]) for name in ("mu", "x_min", "x_max", "y_min", "y_max"))
+
+
+def _holds(area: tuple[float, ...], x: float, y: float) -> bool:
+    _, x_min, x_max, y_min, y_max = area
+    return x_min < x < x_max and y_min < y < y_max

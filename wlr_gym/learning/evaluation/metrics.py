@@ -1,0 +1,216 @@
+"""What an episode is scored by: the task's own measures, and slip, energy, saturation and smoothness in every task."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.envs.tasks.success import episode_max, episode_rms
+from wlr_gym.learning.evaluation.rollout import Measure, Rollout
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Less than this travelled per episode (m, mean), and a figure per metre says nothing.
+SHORTEST_TRAVEL = 0.05
+#: An action this near to its limit counts as being there.
+ACTION_AT_LIMIT = 0.99
+#: Hz from which a movement of the action counts as jitter: no command of a task changes that fast.
+JITTER_FREQUENCY = 5.0
+#: What a fall adds to the tracking error of its episode, which otherwise knows the time before it only.
+FALL = 10.0
+#: Control ticks of one window of the spectrum; windows overlap by half.
+WINDOW = 128
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One row of the card: key, unit, printed digits, whether less is better, meaning."""
+
+    key: str
+    unit: str
+    digits: int
+    less_is_better: bool
+    doc: str
+
+
+GENERAL = (
+    Metric("falls", "%", 0, True, "episodes that a termination ended"),
+    Metric("slip_speed", "m/s", 4, True, "slip speed, mean over wheels and time"),
+    Metric("excess_slip", "m/s", 4, True, "slip speed beyond what turning on skids needs, mean over wheels and time"),
+    Metric("slip_per_metre", "m/m", 3, True, "slip distance of a wheel per metre the body travels"),
+    Metric("energy_per_metre", "J/m", 1, True, "energy drawn per metre the body travels"),
+    Metric("power", "W", 2, True, "mean power drawn from the supply"),
+    Metric("saturation", "%", 2, True, "share of time and motors at the voltage or torque limit"),
+    Metric("action_saturation", "%", 2, True, f"share of time and joints with an action beyond ±{ACTION_AT_LIMIT:g}"),
+    Metric("action_jitter", "-", 4, True, f"rms of what moves faster than {JITTER_FREQUENCY:g} Hz in the action (range ±1)"),
+    Metric("reward", "-", 2, False, "sum of rewards over the episode"),
+)
+
+
+def metrics_of(measures: Sequence[Measure]) -> tuple[Metric, ...]:
+    """Return the rows of a task's card, in order: all limits in one number, the measures, success, and the general ones."""
+    limits = [f"{kind} of {m.name} {limit:g} {m.unit}" for m in measures for kind, limit in _limits(m).items()]
+    general = [metric.key for metric in GENERAL]
+    own = []
+    for m in measures:
+        if m.name not in general:
+            own.append(Metric(m.name, m.unit, 4, True, f"rms over the episode: {m.doc}"))
+        if m.max is not None:
+            own.append(Metric(f"{m.name}_max", m.unit, 4, True, f"largest magnitude in the episode: {m.doc}"))
+    return (
+        Metric(
+            "tracking_error",
+            "-",
+            3,
+            True,
+            f"rms over the task's limits of what is reached of each ({', '.join(limits)}); a fall adds {FALL:g}",
+        ),
+        *own,
+        Metric("success", "%", 0, False, "episodes without a fall and within every limit"),
+        *GENERAL,
+    )
+
+
+def has_limits(measures: Sequence[Measure]) -> bool:
+    """Return whether there is a limit to track within."""
+    return any(_limits(measure) for measure in measures)
+
+
+def _limits(measure: Measure) -> dict[str, float]:
+    return {kind: limit for kind in ("rms", "max") if (limit := getattr(measure, kind)) is not None}
+
+
+@dataclass(frozen=True)
+class Played:
+    """What is kept of S blocks of N episodes.
+
+    Attributes:
+        measures: of the task.
+        pairs: metric -> (S, N, 2), numerator and denominator of each episode. Over many episodes a metric is the sum of its
+            numerators over the sum of its denominators, so that in figures per metre an episode of little travel weighs little.
+        frequency: (F,) Hz. power: (F,) density of the action, mean over joints and episodes, 1/Hz; NaN if none was long enough.
+    """
+
+    measures: tuple[Measure, ...]
+    pairs: dict[str, Array]
+    frequency: Array
+    power: Array
+
+
+def summarise(rollouts: Iterable[Rollout]) -> Played:
+    """Return what is kept of blocks of episodes of the same number each; takes one after the other."""
+    measures: tuple[Measure, ...] = ()
+    frequency, powers, pairs = np.zeros(0), [], []
+    for rollout in rollouts:
+        measures = rollout.measures
+        frequency, power = spectrum(rollout)
+        pairs.append(_per_episode(rollout, frequency, power))
+        powers.append(power)
+    power = np.concatenate(powers)
+    seen = power[np.isfinite(power[:, 0])]
+    mean = seen.mean(axis=0) if len(seen) else np.full(frequency.size, np.nan)
+    return Played(measures, {key: np.stack([block[key] for block in pairs]) for key in pairs[0]}, frequency, mean)
+
+
+def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, Array]:
+    """Return metric -> (N, 2): numerator and denominator of every episode."""
+    active, period = rollout.active, rollout.control_period
+    ticks = active.sum(axis=0).astype(np.float64)
+    errors = errors_of(rollout.measures, rollout.measured, active)
+    slip = np.linalg.norm(rollout.slip_velocity, axis=-1).mean(axis=-1)
+    energy = _sum(rollout.energy, active)
+    travel = travelled(rollout)
+    travel = np.where(travel.mean() < SHORTEST_TRAVEL, 0.0, travel)
+    at_limit = np.abs(rollout.action) >= ACTION_AT_LIMIT
+    seen = np.isfinite(power[:, 0])
+    width = frequency[1] if frequency.size > 1 else 0.0
+    jitter = np.sqrt(np.where(seen[:, None], power, 0.0)[:, frequency > JITTER_FREQUENCY].sum(axis=1) * width)
+    ones = np.ones(rollout.episodes)
+    values = {
+        **{name if kind == "rms" else f"{name}_{kind}": error for (name, kind), error in errors.items()},
+        "tracking_error": (
+            tracking_error(rollout.measures, errors, rollout.fell),
+            ones if has_limits(rollout.measures) else 0.0 * ones,
+        ),
+        "success": 100.0 * rollout.succeeded,
+        "falls": 100.0 * rollout.fell,
+        "slip_speed": _sum(slip, active) / ticks,
+        "excess_slip": _sum(rollout.excess_slip, active) / ticks,
+        "slip_per_metre": (_sum(slip, active) * period, travel),
+        "energy_per_metre": (energy, travel),
+        "power": (energy, ticks * period),
+        "saturation": 100.0 * _sum(rollout.saturated.mean(axis=-1), active) / ticks,
+        "action_saturation": 100.0 * _sum(at_limit.mean(axis=-1), active) / ticks,
+        "action_jitter": (jitter, seen.astype(np.float64)),
+        "reward": _sum(rollout.reward, active),
+    }
+    return {key: np.stack(value if isinstance(value, tuple) else (value, ones), axis=1) for key, value in values.items()}
+
+
+def errors_of(measures: Sequence[Measure], measured: Array, active: Mask) -> dict[tuple[str, str], Array]:
+    """Return (measure, ``rms`` or ``max``) -> (N,), in SI units; ``max`` where it is limited.
+
+    Args:
+        measures: of the task.
+        measured: (T, N, M).
+        active: (T, N) the robot's episode was still going on in this tick.
+    """
+    errors = {}
+    for k, measure in enumerate(measures):
+        errors[measure.name, "rms"] = episode_rms(measured[:, :, k], active)
+        if measure.max is not None:
+            errors[measure.name, "max"] = episode_max(measured[:, :, k], active)
+    return errors
+
+
+def tracking_error(measures: Sequence[Measure], errors: Mapping[tuple[str, str], Array], fell: Mask) -> Array:
+    """Return the tracking error of each episode (N,): rms of what is reached of every limit; a fall adds :data:`FALL`.
+
+    Args:
+        measures: of the task; without a limit among them the rms is 0.
+        errors: see :func:`errors_of`.
+        fell: (N,) a termination term ended the episode.
+    """
+    limits = {(m.name, kind): limit for m in measures for kind, limit in _limits(m).items()}
+    shares = np.array([errors[which] / limit for which, limit in limits.items()]).reshape(len(limits), len(fell))
+    return np.sqrt((shares**2).sum(axis=0) / max(1, len(limits))) + FALL * fell
+
+
+def travelled(rollout: Rollout) -> Array:
+    """Return the path length of each body origin (N,), m."""
+    steps = np.linalg.norm(np.diff(rollout.position, axis=0), axis=-1)
+    return _sum(steps, rollout.active[1:])
+
+
+def spectrum(rollout: Rollout) -> tuple[Array, Array]:
+    """Return frequencies (F,) in Hz and the power density (N, F) of each episode's action, mean over joints, in 1/Hz.
+
+    Welch's estimate: Hann windows of ``WINDOW`` ticks (the whole episode if it is shorter) that overlap by half, each without
+    its mean; one-sided. NaN for an episode that ended before the first window did.
+    """
+    size = min(WINDOW, len(rollout.active))
+    frequency: Array = np.arange(size // 2 + 1) / np.float64(size * rollout.control_period)
+    window = np.hanning(size + 1)[:size] if size > 1 else np.ones(1)
+    density = np.full(frequency.size, 2.0 * rollout.control_period / (window @ window))
+    density[0] /= 2.0  # one-sided: all but the ends of an even window stand for two frequencies
+    if size % 2 == 0:
+        density[-1] /= 2.0
+    total = np.zeros((rollout.episodes, frequency.size))
+    windows = np.zeros(rollout.episodes)
+    for first in range(0, len(rollout.active) - size + 1, max(1, size // 2)):
+        piece = rollout.action[first : first + size]
+        moving = (piece - piece.mean(axis=0)) * window[:, None, None]
+        power = (np.abs(np.fft.rfft(moving, axis=0)) ** 2).mean(axis=-1).T * density
+        whole: Mask = np.all(rollout.active[first : first + size], axis=0)
+        total += np.where(whole[:, None], power, 0.0)
+        windows += whole
+    return frequency, np.where(windows[:, None] > 0, total / np.maximum(windows, 1.0)[:, None], np.nan)
+
+
+def _sum(values: Array, active: Mask) -> Array:
+    """Sum (T, N, ...) over the ticks that count; what is not finite after the end does not matter."""
+    return np.where(active.reshape(active.shape + (1,) * (values.ndim - 2)), values, 0.0).sum(axis=0)

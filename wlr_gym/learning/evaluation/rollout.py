@@ -1,0 +1,245 @@
+"""Play whole episodes, all at once as one batch, and keep what the score card and the plots need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.envs.tasks.success import succeeded
+from wlr_gym.envs.tasks.terms.geometry import yaw_of
+from wlr_gym.robot import Robot
+
+if TYPE_CHECKING:
+    from wlr_gym.envs.core import Core
+    from wlr_gym.physics.plants.base import Truth
+    from wlr_gym.policy import Policy
+
+Array = NDArray[np.float64]
+#: Share of the supply voltage, or of the stall torque, from which a motor counts as saturated.
+SATURATED = 0.98
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One number per control tick that says how well the task is done.
+
+    Attributes:
+        name, unit, doc: what it is.
+        rms, max: largest root mean square and largest magnitude over an episode that still count as a success; None = any.
+    """
+
+    name: str
+    unit: str
+    doc: str
+    rms: float | None = None
+    max: float | None = None
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Episodes of N robots over at most T control ticks. Signals of a robot count where ``active`` says so.
+
+    Attributes:
+        control_period: s.
+        seeds: (N,) seed of each episode.
+        measures: what the task measures itself by; see :class:`Measure`.
+        command_names: names of the commands, such as ``linear_velocity_x``.
+        active: (T, N) the robot's episode was still going on in this tick.
+        fell: (N,) a termination term ended the episode. succeeded: (N,) as the task defines it.
+        reward: (T, N).
+        measured: (T, N, M) the task's measures.
+        action: (T, N, 8) in [-1, 1].
+        command: (T, N, C) what the robot was asked to follow in this tick; SI units.
+        position: (T, N, 2) body origin in the floor frame, m. yaw: (T, N) rad.
+        forward_velocity: (T, N) of the body origin along the body's x, m/s. yaw_rate: (T, N) rad/s.
+        slip_velocity: (T, N, 4, 2) mean over the tick, along each wheel's heading and axle, m/s.
+        excess_slip: (T, N) mean slip speed of the wheels beyond what turning on skids needs, as the reward ``slip``, m/s.
+        energy: (T, N) drawn from the supply, J; braking counts as negative.
+        saturated: (T, N, 8) the motor was at its voltage or torque limit.
+        friction: (N, 4, 2) coefficients at each wheel, along heading and axle, in the first tick.
+        sampled: (K,) parameter elements that randomisation draws. samples: (N, K) their values at the start.
+        parameters: (N, P) the whole parameter table at the start. start: (N, S) the state the episodes began from.
+    """
+
+    control_period: float
+    seeds: NDArray[np.int64]
+    measures: tuple[Measure, ...]
+    command_names: tuple[str, ...]
+    active: NDArray[np.bool_]
+    fell: NDArray[np.bool_]
+    succeeded: NDArray[np.bool_]
+    reward: Array
+    measured: Array
+    action: Array
+    command: Array
+    position: Array
+    yaw: Array
+    forward_velocity: Array
+    yaw_rate: Array
+    slip_velocity: Array
+    excess_slip: Array
+    energy: Array
+    saturated: NDArray[np.bool_]
+    friction: Array
+    sampled: tuple[str, ...]
+    samples: Array
+    parameters: Array
+    start: Array
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes N."""
+        return self.active.shape[1]
+
+    def commanded(self, name: str) -> Array:
+        """Return one command, (T, N)."""
+        return self.command[:, :, self.command_names.index(name)]
+
+
+def make_core(environment: str, episodes: int, keywords: Mapping[str, Any]) -> Core:
+    """Return the batched core of an environment with one robot per episode.
+
+    Raises:
+        InputError: unknown environment or keyword.
+    """
+    from wlr_gym.envs.core import Core
+    from wlr_gym.envs.registry import task_name_of
+    from wlr_gym.envs.settings import read_settings
+
+    if episodes < 1:
+        raise InputError(f"episodes = {episodes}: expected 1 or more")
+    return Core(task_name_of(environment), read_settings(keywords), episodes)
+
+
+def start_episodes(core: Core, policy: Policy, first_seed: int, options: Mapping[str, Any] | None = None) -> None:
+    """Begin an episode with every robot of ``core``, robot i with seed ``first_seed + i``; the policy has forgotten the past.
+
+    Raises:
+        InputError: see :meth:`wlr_gym.envs.core.Core.begin_episodes`.
+    """
+    for row in range(core.count):
+        core.seed(row, first_seed + row)
+    core.begin_episodes(core.everyone, options)
+    policy.reset(core.everyone)
+
+
+def roll_out(
+    core: Core,
+    policy: Policy,
+    first_seed: int = 0,
+    on_tick: Callable[[], object] | None = None,
+    on_start: Callable[[], object] | None = None,
+    parameters: Mapping[str, float] | None = None,
+    commands: Mapping[str, float] | None = None,
+) -> Rollout:
+    """Play one episode per robot of ``core``; robot i has seed ``first_seed + i``. Deterministic.
+
+    Args:
+        core: batch of robots; nothing of its past matters.
+        policy: what drives them.
+        first_seed: seed of the first episode.
+        on_tick: called after every control tick (progress bars, logs).
+        on_start: called once when the episodes have begun.
+        parameters: values set after randomisation and effects, the same for all episodes.
+        commands: commands held through all episodes; the others are drawn.
+
+    Raises:
+        InputError: a real robot.
+    """
+    if not core.plant.capabilities.has_truth:
+        raise InputError(f"backend '{core.settings.backend}' has no truth to score by; to drive the robot: wlr deploy")
+    start_episodes(core, policy, first_seed, {"parameters": dict(parameters or {}), "command": dict(commands or {})})
+    table = core.parameters.values.copy()
+    start = np.concatenate([v.reshape(core.count, -1) for v in vars(core.state).values() if v is not None], axis=1)
+    if on_start is not None:
+        on_start()
+    active = core.everyone.copy()
+    excess_slip = excess_slip_of(core)
+    ticks: list[dict[str, NDArray]] = []
+    while active.any():
+        command = core.command.copy()
+        core.step(policy.act(core.observation), active)
+        ticks.append(_signals(core) | {"command": command, "active": active.copy(), "excess_slip": excess_slip()})
+        active &= ~(core.terminated | core.truncated)
+        if on_tick is not None:
+            on_tick()
+    stacked = {name: np.stack([tick[name] for tick in ticks]) for name in ticks[0]}
+    friction = stacked.pop("friction")[0]
+    return Rollout(
+        control_period=core.task.config.control_period,
+        seeds=first_seed + np.arange(core.count),
+        measures=measures_of(core),
+        command_names=core.task.commands,
+        fell=core.terminated.copy(),
+        succeeded=succeeded(core.task.config, stacked["measured"], stacked["active"], core.terminated),
+        friction=friction,
+        sampled=core.randomization.elements,
+        samples=table[:, core.randomization.columns],
+        parameters=table,
+        start=start,
+        **stacked,
+    )
+
+
+def _signals(core: Core) -> dict[str, NDArray]:
+    truth = core.plant.truth()
+    shape = (core.count, 4, 2)
+    return {
+        "reward": core.reward.copy(),
+        "measured": core.measures.copy(),
+        "action": core.action.copy(),
+        "position": truth["position"][:, :2].copy(),
+        "yaw": yaw_of(*truth["quaternion"].T),
+        "forward_velocity": truth["linear_velocity_in_body"][:, 0].copy(),
+        "yaw_rate": truth["angular_velocity_in_body"][:, 2].copy(),
+        "slip_velocity": truth["slip_displacement"].reshape(shape) / core.task.config.control_period,
+        "energy": truth["electrical_energy"].copy(),
+        "saturated": saturated(truth, core.task.robot),
+        "friction": truth["effective_friction"].reshape(shape).copy(),
+    }
+
+
+def measures_of(core: Core) -> tuple[Measure, ...]:
+    """Return the measures of a core's task."""
+    from wlr_gym.envs.tasks.terms import MEASURES
+
+    success = core.task.config.success
+    limits = {name: {"rms": success[name].rms, "max": success[name].max} for name in success}
+    return tuple(Measure(name, MEASURES[name].unit, MEASURES[name].doc, **limits.get(name, {})) for name in core.task.measures)
+
+
+def excess_slip_of(core: Core) -> Callable[[], Array]:
+    """Return a function that returns the mean slip speed (N,) of the wheels beyond what turning on skids needs, m/s.
+
+    It is what the reward term ``slip`` counts in the last tick, whether the task has that term or not.
+    """
+    from wlr_gym.envs.tasks.compiled import reader
+    from wlr_gym.envs.tasks.signals import Signals
+    from wlr_gym.envs.tasks.terms import REWARDS
+
+    matrices: dict[str, Array] = {}
+    signals = Signals(reader(core.task, matrices))
+
+    def excess_slip() -> Array:
+        matrices["truth"] = core.plant.truth().values
+        return REWARDS["slip"].function(signals, speed=1.0)
+
+    return excess_slip
+
+
+def saturated(truth: Truth, robot: Robot) -> NDArray[np.bool_]:
+    """Return which motors (N, 8) are at their limit: supply voltage, or stall torque.
+
+    DC motor at its output shaft: voltage / supply = torque / stall torque + speed / no-load speed.
+    """
+    legs, wheels = robot.servo.leg, robot.servo.wheel
+    stall = np.repeat([legs.stall_torque, wheels.stall_torque], 4)
+    no_load = np.repeat([legs.no_load_speed, wheels.no_load_speed], 4)
+    torque = truth["motor_torque"] / stall
+    voltage = torque + truth["joint_velocity"] / no_load
+    return (np.abs(voltage) >= SATURATED) | (np.abs(torque) >= SATURATED)

@@ -1,0 +1,119 @@
+"""Gains of a hand-written controller by search: what ``wlr train ENV --agent pid`` does.
+
+Every setting in turn goes up and down by its step; what scores best stays, and a step that brought nothing is halved. All
+candidates drive the same robots on the same floors, so the result depends on the settings at the start and the seed only.
+The score is the card's tracking error (:func:`wlr_gym.learning.evaluation.metrics.tracking_error`), mean over episodes: how
+much of each limit of the task's success is reached; a fall counts like errors of ten times the limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.provenance import record_provenance
+from wlr_gym.learning.evaluation.metrics import errors_of, has_limits, tracking_error
+from wlr_gym.learning.evaluation.rollout import make_core, measures_of, start_episodes
+from wlr_gym.policy import Policy, Training, write_contract
+from wlr_gym.policy.control import PidConfig, task_settings
+
+if TYPE_CHECKING:
+    from wlr_gym.envs.core import Core
+
+MakePolicy = Callable[[Mapping[str, Any], Mapping[str, Any]], Policy]
+Say = Callable[[str], object]
+
+
+def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[PidConfig]) -> Path:
+    """Search from the settings of ``training``, and return the folder of the policy with the best ones.
+
+    Raises:
+        InputError: bad settings, a task without limits to score by, or ``resume``: a search takes minutes and is not continued.
+    """
+    if training.resume:
+        raise InputError(f"agent '{agent}' is tuned by a search of a few minutes, which cannot be resumed: start it anew")
+    config = dict(training.config)
+    general = task_settings(model, {"task": ""}, config, agent)
+    _check_steps(general, agent)
+    episodes = general.search.episodes
+    core = make_core(training.environment, episodes, config.get("environment", {}))
+    try:
+        contract = core.contract()
+        if not has_limits(measures_of(core)):
+            raise InputError(f"agent '{agent}' is tuned by the limits of a task's success, and '{contract['task']}' has none")
+        start = task_settings(model, contract, config, agent)
+        make_output_folder(training.folder)
+        record_provenance(
+            training.folder, {"environment": training.environment, "agent": agent, "settings": config}, start.seed
+        )
+        say: Say = print if training.progress else lambda _: None
+        best, score = search(core, make_policy, start, say)
+    finally:
+        core.close()
+    folder = training.folder / "policy"
+    folder.mkdir(exist_ok=True)
+    origin = {"environment": training.environment, "score": score, "episodes": episodes, "seed": start.seed}
+    write_contract(folder, agent, best, contract, origin)
+    return folder
+
+
+def _check_steps(settings: PidConfig, agent: str) -> None:
+    tunable = [name for name, value in settings if isinstance(value, float)]
+    for name in settings.search.steps:
+        if name not in tunable:
+            raise unknown_name("setting", name, tunable, f"agent '{agent}': search.steps")
+
+
+def search(core: Core, make_policy: MakePolicy, start: PidConfig, say: Say) -> tuple[dict[str, Any], float]:
+    """Return the best settings found from ``start`` on, without those of other tasks, and their score."""
+    contract = core.contract()
+    best = start.model_dump(mode="json") | {"tasks": {}}
+
+    def tried(settings: Mapping[str, Any]) -> float:
+        return tracking_score(core, make_policy(contract, settings), start.seed)
+
+    score = tried(best)
+    steps = dict(start.search.steps)
+    for _ in range(start.search.rounds):
+        for name, step in list(steps.items()):
+            candidates = [_changed(best, name, move, type(start)) for move in (step, -step)]
+            values = [np.inf if candidate is None else tried(candidate) for candidate in candidates]
+            better = int(np.argmin(values))
+            if values[better] < score:
+                best, score = candidates[better] or best, values[better]
+                say(f"{name} = {best[name]:.4g}: {score:.4f}")
+            elif values[0] == values[1]:
+                del steps[name]  # plays no part in this task
+            else:
+                steps[name] = step / 2
+    return best, score
+
+
+def _changed(settings: Mapping[str, Any], name: str, step: float, model: type[PidConfig]) -> dict[str, Any] | None:
+    """Return the settings with one of them moved by ``step``, None where it would leave its range."""
+    changed = {**settings, name: settings[name] + step}
+    try:
+        model(**changed)
+    except ValueError:
+        return None
+    return changed
+
+
+def tracking_score(core: Core, policy: Policy, first_seed: int) -> float:
+    """Return the score of whole episodes, one per robot of ``core`` (see the module); less is better."""
+    start_episodes(core, policy, first_seed)
+    going, measured = [], []
+    active = core.everyone.copy()
+    while active.any():
+        core.step(policy.act(core.observation), active)
+        going.append(active.copy())
+        measured.append(core.measures.copy())
+        active &= ~(core.terminated | core.truncated)
+    measures = measures_of(core)
+    errors = errors_of(measures, np.stack(measured), np.stack(going))
+    return float(tracking_error(measures, errors, core.terminated).mean())

@@ -1,0 +1,204 @@
+"""The score card as text, Markdown and JSON, and its episodes as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlr_gym.base.files import replace_file, write_json
+from wlr_gym.learning.evaluation.campaign import BLOCK
+from wlr_gym.learning.evaluation.card import BY_DIFFERENCE, MAIN, OTHER_PLANT, Card, Scores
+from wlr_gym.learning.evaluation.metrics import Metric
+from wlr_gym.learning.evaluation.statistics import CONFIDENCE, Estimate
+
+#: Version of ``card.json``.
+FORMAT = 2
+#: Beyond this a number is the quotient of something and next to nothing, such as the slip of a robot against one that rests.
+LARGEST = 1000.0
+Table = list[list[str]]
+
+
+def rows(scores: Mapping[str, Scores], metrics: Sequence[Metric], *, short: bool = False) -> Table:
+    """Return a table as text: a header, then one row per metric with a column per subject.
+
+    ``short`` gives half the width of the interval instead of its ends.
+    """
+    header = ["metric", "unit", *scores]
+    return [header, *([m.key, m.unit, *(cell(own[m.key], m.digits, short) for own in scores.values())] for m in metrics)]
+
+
+def cell(estimate: Estimate, digits: int, short: bool = False) -> str:
+    """Return ``mean [low, high]``, or ``mean ± half``; ``-`` where there is nothing or nothing to compare with."""
+    if not abs(estimate.mean) <= LARGEST:
+        return "-"
+    if short:
+        return f"{_text(estimate.mean, digits)} ± {_text((estimate.high - estimate.low) / 2, digits)}"
+    return f"{_text(estimate.mean, digits)} [{_text(estimate.low, digits)}, {_text(estimate.high, digits)}]"
+
+
+def _text(value: float, digits: int) -> str:
+    return f"{round(value, digits) + 0.0:.{digits}f}"  # no -0
+
+
+def comparison_rows(card: Card, label: str = MAIN, *, short: bool = False) -> Table:
+    """Return how much better the first subject is than each baseline: a header, then one row per metric, and the score."""
+    others = card.comparison[label]
+    table = [["better in", "unit", *others]]
+    for metric in card.metrics:
+        unit, digits = (metric.unit, metric.digits) if metric.key in BY_DIFFERENCE else ("%", 1)
+        unit = "points" if unit == "%" and metric.key in BY_DIFFERENCE else unit
+        table.append([metric.key, unit, *(_comparing(own[metric.key], digits, short) for own in others.values())])
+    if label == MAIN and card.share_of:
+        shares = [cell(card.share_of[name], 1, short) if name in card.share_of else "-" for name in others]
+        table.append(["score, in % of its", "%", *shares])
+    return table
+
+
+def _comparing(estimate: Estimate, digits: int, short: bool) -> str:
+    """A cell, in bold (of Markdown) where the interval excludes zero."""
+    text = cell(estimate, digits, short)
+    return f"**{text}**" if not short and text != "-" and estimate.excludes_zero else text
+
+
+def sweep_rows(card: Card, index: int, key: str = "tracking_error", *, short: bool = True) -> Table:
+    """Return one metric of a sweep: a header, then one row per point with a column per subject."""
+    sweep = card.sweeps[index]
+    digits = next(metric.digits for metric in card.metrics if metric.key == key)
+    body = [
+        [point.label, *(cell(own[key], digits, short) for own in card.scores[sweep.label(point)].values())]
+        for point in sweep.points
+    ]
+    return [[sweep.axis, *card.names], *body]
+
+
+def sweep_comparison_rows(card: Card, index: int, key: str = "tracking_error", *, short: bool = False) -> Table:
+    """Return how much better the first subject is over a sweep, in %: one row per point with a column per baseline."""
+    sweep = card.sweeps[index]
+    body = [
+        [point.label, *(_comparing(own[key], 1, short) for own in card.comparison[sweep.label(point)].values())]
+        for point in sweep.points
+    ]
+    return [[sweep.axis, *card.names[1:]], *body]
+
+
+def transfer_rows(card: Card, *, short: bool = False) -> Table:
+    """Return scores on both plants on the same floors: a header, then one row per subject."""
+    keys = ("tracking_error", "success", "excess_slip")
+    digits = {metric.key: metric.digits for metric in card.metrics}
+    table = [["policy", "score kept (%)", *(f"{key}{plant}" for key in keys for plant in ("", ", other"))]]
+    for name in card.names:
+        kept = cell(card.kept[name], 1, short) if name in card.kept else "-"
+        pairs = [(card.scores[label][name][key], digits[key]) for key in keys for label in (MAIN, OTHER_PLANT)]
+        table.append([name, kept, *(cell(estimate, places, short) for estimate, places in pairs)])
+    return table
+
+
+def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
+    """Return the card as Markdown. ``pictures``: name -> file, linked where they belong."""
+    shown = dict(pictures or {})
+    ours = card.names[0]
+
+    def picture(name: str, text: str) -> list[str]:
+        return [f"![{text}]({shown[name]})", ""] if name in shown else []
+
+    lines = [f"# Score card: {ours}", "", *(f"- {name}: {value}" for name, value in card.conditions.items()), ""]
+    lines += [*_table(rows(card.scores[MAIN], card.metrics)), ""]
+    lines += [f"Mean over episodes [{CONFIDENCE:.0%} bootstrap interval over seeds and episodes]; `-` where nothing moved.", ""]
+    if len(card.names) > 1:
+        lines += [f"## {ours} against the others, on the same episodes", ""]
+        lines += [
+            f"By how much {ours} is better (positive) or worse, paired episode by episode; bold: the interval excludes 0.",
+            "",
+        ]
+        lines += [*_table(comparison_rows(card)), "", *picture("improvement", "Paired improvements")]
+    for index, sweep in enumerate(card.sweeps):
+        lines += [f"## Sweep: {sweep.name}", "", f"{sweep.doc[0].upper()}{sweep.doc[1:]}. Tracking error:", ""]
+        lines += [*_table(sweep_rows(card, index, short=False)), ""]
+        if len(card.names) > 1:
+            lines += [f"By how much {ours} is better in it (%), paired:", ""]
+            lines += [*_table(sweep_comparison_rows(card, index)), ""]
+        lines += picture(f"sweep_{sweep.name}", f"Sweep: {sweep.name}")
+    if OTHER_PLANT in card.results:
+        lines += ["## On the other plant", "", "The same floors, robots and commands in the other simulator.", ""]
+        lines += [*_table(transfer_rows(card)), ""]
+    if "spectrum" in shown:
+        lines += ["## Spectrum of the action", "", *picture("spectrum", "Spectrum of the action")]
+    if card.identities:
+        lines += ["## Who played", "", "SHA-256 of the policy file or of an agent's settings:", ""]
+        lines += [*(f"- {name}: `{identity}`" for name, identity in card.identities.items()), ""]
+    lines += ["## Meaning of the rows", ""]
+    lines += [f"- `{m.key}` ({m.unit}, {'less' if m.less_is_better else 'more'} is better): {m.doc}" for m in card.metrics]
+    lines += ["- score: reward above that of doing nothing on the same episodes"]
+    return "\n".join(lines) + "\n"
+
+
+def _table(table: Table) -> list[str]:
+    header, *body = table
+    return [f"| {' | '.join(header)} |", f"|{'---|' * len(header)}", *(f"| {' | '.join(row)} |" for row in body)]
+
+
+def content(card: Card) -> dict[str, Any]:
+    """Return the card as plain types: what ``card.json`` holds."""
+    document: dict[str, Any] = {
+        "format": FORMAT,
+        "conditions": dict(card.conditions),
+        "identities": dict(card.identities),
+        "metrics": {m.key: {"unit": m.unit, "less_is_better": m.less_is_better, "doc": m.doc} for m in card.metrics},
+        "policies": _scores(card.scores[MAIN]),
+        "better_than": _scores(card.comparison[MAIN]),
+        "score_in_percent_of": {name: _numbers(estimate) for name, estimate in card.share_of.items()},
+        "sweeps": {sweep.name: [_point(card, sweep.label(p), p.label) for p in sweep.points] for sweep in card.sweeps},
+        "spectrum": _spectrum(card),
+    }
+    if OTHER_PLANT in card.results:
+        document["other_plant"] = {
+            "policies": _scores(card.scores[OTHER_PLANT]),
+            "better_than": _scores(card.comparison[OTHER_PLANT]),
+            "score_kept": {name: _numbers(estimate) for name, estimate in card.kept.items()},
+        }
+    return document
+
+
+def _scores(scores: Mapping[str, Scores]) -> dict[str, Any]:
+    return {name: {key: _numbers(estimate) for key, estimate in own.items()} for name, own in scores.items()}
+
+
+def _numbers(estimate: Estimate) -> dict[str, float | None]:
+    return {name: float(value) if np.isfinite(value) else None for name, value in vars(estimate).items()}
+
+
+def _point(card: Card, label: str, at: str) -> dict[str, Any]:
+    return {"at": at, "policies": _scores(card.scores[label]), "better_than": _scores(card.comparison[label])}
+
+
+def _spectrum(card: Card) -> dict[str, Any]:
+    first = card.main[card.names[0]]
+    power = {name: [None if np.isnan(p) else float(p) for p in played.power] for name, played in card.main.items()}
+    return {"frequency": first.frequency.tolist(), "power": power}
+
+
+def write_card(folder: Path, card: Card, pictures: Mapping[str, str] | None = None) -> None:
+    """Write ``card.md`` and ``card.json`` into ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = markdown(card, pictures)
+    replace_file(folder / "card.md", lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_json(folder / "card.json", content(card))
+
+
+def write_episodes(path: Path, card: Card, first_seed: int) -> None:
+    """Write one row per condition, subject and episode as Parquet: seed and the episode's own metrics."""
+    import pandas
+
+    frames = []
+    for label, subjects in card.results.items():
+        for name, played in subjects.items():
+            blocks, episodes = played.pairs["success"].shape[:2]
+            seeds = first_seed + BLOCK * np.arange(blocks)[:, None] + np.arange(episodes)
+            table = {"condition": label, "policy": name, "seed": seeds.ravel()}
+            with np.errstate(divide="ignore", invalid="ignore"):
+                table |= {key: (pairs[..., 0] / pairs[..., 1]).ravel() for key, pairs in played.pairs.items()}
+            frames.append(pandas.DataFrame(table))
+    replace_file(path, lambda temporary: pandas.concat(frames, ignore_index=True).to_parquet(temporary, index=False))

@@ -1,0 +1,125 @@
+"""Proximal policy optimisation (Schulman et al. 2017) with Stable-Baselines3 on the native batch of robots.
+
+Observations are normalised by the fixed scales of the task, which are part of the policy's contract: no statistics are
+gathered while training, none can go missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.settings import parse_config
+from wlr_gym.learning.ppo.config import PpoConfig
+from wlr_gym.policy import Training
+
+MODEL_FILE = "model.zip"
+#: Weights that act; the others belong to the critic or to exploration.
+ACTOR = ("mlp_extractor.policy_net.", "action_net.")
+
+
+class PpoPolicy:
+    """The mean action of a network, clipped to [-1, 1]."""
+
+    def __init__(self, network: Any) -> None:
+        import torch
+
+        self.network = network
+        self._actor, self._torch = actor(network), torch
+
+    def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return actions (N, 8) for observations (N, D)."""
+        with self._torch.no_grad():
+            return self._actor(self._torch.as_tensor(np.asarray(observations, dtype=np.float32))).numpy()
+
+    def reset(self, mask: NDArray[np.bool_]) -> None:
+        """Nothing to forget: the network has no memory."""
+
+
+def make_policy(contract: Mapping[str, Any], config: Mapping[str, Any]) -> PpoPolicy:
+    """Return the policy before training: the network as the seed of ``config`` initialises it."""
+    return PpoPolicy(_network(contract, _parse(config)))
+
+
+def load_policy(folder: Path, contract: Mapping[str, Any]) -> PpoPolicy:
+    """Return the trained policy of a folder; ``contract`` is the content of its ``contract.json``.
+
+    Raises:
+        InputError: the model file is absent, broken, or of another network.
+    """
+    network = _network(contract["environment"], _parse(contract["config"]))
+    path = folder / MODEL_FILE
+    from stable_baselines3.common.save_util import load_from_zip_file
+
+    try:
+        _, parameters, _ = load_from_zip_file(path, device="cpu", load_data=False)
+        saved = parameters["policy"]  # the critic may see what is not in the contract, and is not needed any more
+        network.load_state_dict({name: saved[name] for name in network.state_dict() if name.startswith(ACTOR)}, strict=False)
+    except Exception as error:  # zip, pickle and torch each raise their own kinds for a broken file
+        raise InputError(f"{path}: not a readable model: {error}") from None
+    return PpoPolicy(network)
+
+
+def export_network(folder: Path, contract: Mapping[str, Any]) -> bytes:
+    """Return the ONNX model of the trained policy of a folder: observations (N, D) to actions (N, 8).
+
+    Raises:
+        MissingPackageError: a package is not installed.
+    """
+    require_package("torch", "train")
+    require_package("onnxscript", "export")
+    from wlr_gym.learning.ppo.export import to_onnx
+
+    return to_onnx(actor(load_policy(folder, contract).network), len(contract["environment"]["observation"]))
+
+
+def actor(network: Any) -> Any:
+    """Return the part of a network that acts, as a torch module: observations (N, D) to actions (N, 8) clipped to [-1, 1]."""
+    from torch import nn
+
+    return nn.Sequential(network.mlp_extractor.policy_net, network.action_net, nn.Hardtanh(-1.0, 1.0))
+
+
+def train(training: Training) -> Path:
+    """Train, and return the folder of the final policy (see ``training.run_training``)."""
+    require_package("torch", "train")
+    require_package("stable_baselines3", "train")
+    require_package("tensorboard", "train")
+    from wlr_gym.learning.ppo.training import run_training
+
+    return run_training(training, _parse(training.config))
+
+
+def _parse(config: Mapping[str, Any]) -> PpoConfig:
+    return parse_config(PpoConfig, dict(config), "agent 'ppo'")
+
+
+def policy_keywords(config: PpoConfig) -> dict[str, Any]:
+    """Return the keywords that make Stable-Baselines3's network the configured one."""
+    from torch import nn
+
+    activation = {"tanh": nn.Tanh, "elu": nn.ELU, "relu": nn.ReLU}[config.activation]
+    return {"net_arch": list(config.hidden_layers), "activation_fn": activation, "log_std_init": config.initial_log_std}
+
+
+def _network(contract: Mapping[str, Any], config: PpoConfig) -> Any:
+    """Return the network PPO starts with for these settings, in evaluation mode; leaves the global random state alone."""
+    require_package("torch", "train")
+    require_package("stable_baselines3", "train")
+    import torch
+    from gymnasium import spaces
+    from stable_baselines3.common.policies import ActorCriticPolicy
+
+    high = np.array([column["scale"] * column["limit"] for column in contract["observation"]], dtype=np.float32)
+    observation_space = spaces.Box(-high, high, dtype=np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (len(contract["action"]),), dtype=np.float32)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        network = ActorCriticPolicy(observation_space, action_space, lambda _: config.learning_rate, **policy_keywords(config))
+    network.set_training_mode(False)
+    return network

@@ -1,0 +1,91 @@
+"""A start from a controller that works: actor and critic imitate it, then PPO goes on from there.
+
+The controller drives all robots for an episode, with noise on its actions so that it is seen to correct errors. The actor
+learns its actions (without the noise), the critic its discounted rewards. Own random numbers: nothing else is shifted.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from torch import nn
+
+from wlr_gym.envs import Sb3VecEnv
+from wlr_gym.learning.ppo.config import PpoConfig
+from wlr_gym.policy import Policy, load_agent, load_agent_config
+
+#: 1 sigma of the noise on the controller's actions. Ticks between the readings that are kept.
+NOISE, STRIDE = 0.03, 5
+EPOCHS, BATCH_SIZE, LEARNING_RATE = 80, 512, 2e-3  # the rate falls to zero: actions are met within 2 % of their range
+
+Observations = dict[str, NDArray[np.float32]]
+
+
+def imitate(model: PPO, env: Sb3VecEnv, config: PpoConfig) -> None:
+    """Fit the networks of ``model`` to the controller ``config.teacher``."""
+    assert config.teacher is not None
+    teacher = load_agent(config.teacher).make_policy(env.contract(), load_agent_config(config.teacher))
+    observations, actions, returns = _demonstrate(env, teacher, config)
+    _fit(model, observations, torch.as_tensor(actions), torch.as_tensor(returns), config.seed)
+
+
+def _demonstrate(
+    env: Sb3VecEnv, teacher: Policy, config: PpoConfig
+) -> tuple[Observations, NDArray[np.float32], NDArray[np.float32]]:
+    """Return observations {group: (M, ...)}, the teacher's actions (M, 8), and discounted rewards (M,) from there on."""
+    noise = np.random.default_rng(config.seed)
+    seen, actions, rewards, dones = [], [], [], []
+    observation = _groups(env.reset())
+    teacher.reset(np.ones(env.num_envs, bool))
+    for _ in range(env.core.limit):
+        action = teacher.act(observation["policy"])
+        seen.append(observation)
+        actions.append(action)
+        tried = np.clip(action + NOISE * noise.standard_normal(action.shape), -1.0, 1.0)
+        new, reward, done, _ = env.step(tried.astype(np.float32))
+        observation = _groups(new)
+        teacher.reset(done)
+        rewards.append(reward)
+        dones.append(done)
+    returns = _discounted(np.array(rewards), np.array(dones), config.gamma)
+    horizon = min(int(5.0 / (1.0 - config.gamma)), len(seen) // 2)  # later rewards are cut off
+    kept = range(0, len(seen) - horizon, STRIDE)
+    groups = {name: np.concatenate([seen[tick][name] for tick in kept]) for name in observation}
+    return groups, np.concatenate([actions[tick] for tick in kept]), np.concatenate([returns[tick] for tick in kept])
+
+
+def _groups(observation: Any) -> Observations:
+    return dict(observation) if isinstance(observation, dict) else {"policy": observation}
+
+
+def _discounted(rewards: NDArray[np.float32], dones: NDArray[np.bool_], gamma: float) -> NDArray[np.float32]:
+    """Return the sums (T, N) of discounted rewards until the episode's end."""
+    sums = np.zeros_like(rewards)
+    later = np.zeros_like(rewards[0])
+    for tick in reversed(range(len(rewards))):
+        later = rewards[tick] + gamma * np.where(dones[tick], 0.0, later).astype(np.float32)
+        sums[tick] = later
+    return sums
+
+
+def _fit(model: PPO, observations: Observations, actions: torch.Tensor, returns: torch.Tensor, seed: int) -> None:
+    policy = model.policy
+    optimiser = torch.optim.Adam(policy.parameters(), lr=LEARNING_RATE)
+    tensors = {name: torch.as_tensor(values) for name, values in observations.items()}
+    order = torch.Generator().manual_seed(seed)
+    policy.set_training_mode(True)
+    for epoch in range(EPOCHS):
+        optimiser.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - epoch / EPOCHS)
+        for rows in torch.randperm(len(actions), generator=order).split(BATCH_SIZE):
+            batch = {name: values[rows] for name, values in tensors.items()}
+            seen = batch if len(batch) > 1 else batch["policy"]
+            mean = policy.get_distribution(seen).distribution.mean  # pyright: ignore[reportAttributeAccessIssue, reportArgumentType]
+            value = policy.predict_values(seen).flatten()  # pyright: ignore[reportArgumentType]
+            loss = nn.functional.mse_loss(mean, actions[rows]) + nn.functional.mse_loss(value, returns[rows])
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()

@@ -1,0 +1,316 @@
+"""Pose of a target from the ring centres of its markers: assignment, least squares, covariance.
+
+The centre of a circle's image is not the image of its centre: the ellipse's centre lies off by an amount that grows with
+radius and tilt. The measurement model here is the ellipse's centre itself: the circle of radius r about C with normal n (camera
+frame) is seen as an ellipse with its centre, in undistorted coordinates, at
+
+    (C_x C_z + r2 n_x n_z, C_y C_z + r2 n_y n_z) / (C_z2 - r2 (1 - n_z2)),  r2 = r^2,
+
+which follows from its dual conic M diag(1, 1, -1) M^T, M = [r e1, r e2, C], so nothing is left to correct. Height is free.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from wlr_gym.perception.markers.camera import Camera, distort
+from wlr_gym.perception.markers.detect import Detection
+from wlr_gym.perception.markers.targets import Target, ring_radii
+
+Array = NDArray[np.float64]
+
+#: At least this many markers make a pose; a target found anew needs four.
+MINIMUM_MARKERS = 3
+#: px; a pose whose circle centres miss by more (rms) is none.
+LARGEST_RESIDUAL = 1.5
+_SHAPE_TOLERANCE = 0.25  # of a marker's seen size and shape against what the pose says
+_OUTLIER = 16.0  # chi square per degree of freedom that makes the worst marker suspicious
+_MOST_CANDIDATES = 8  # markers of one code tried for a target
+
+
+@dataclass(frozen=True, eq=False)
+class TargetPose:
+    """Where a target is in the camera frame.
+
+    Attributes:
+        rotation: (3, 3) target to camera. position: (3,) of the target's origin, m.
+        covariance: (6, 6) of a small turn about the camera's axes (rad), then of the position (m).
+        used: (M,) markers the pose rests on.
+        residual: px, rms of the circles' centres.
+        chi_square: per degree of freedom, before the covariance was widened by it.
+    """
+
+    rotation: Array
+    position: Array
+    covariance: Array
+    used: NDArray[np.bool_]
+    residual: float
+    chi_square: float
+
+
+def find_target(
+    detections: Sequence[Detection],
+    target: Target,
+    camera: Camera,
+    up: Array | None = None,
+    tolerance: float = LARGEST_RESIDUAL,
+) -> TargetPose | None:
+    """Find a target among detections: the assignment of markers that fits best, or None.
+
+    Args:
+        detections: of the whole image. target: what to look for. camera: its lens.
+        up: (3,) direction in the camera frame the target's z axis is near to; decides between the two poses a plane has.
+        tolerance: px, largest rms residual.
+    """
+    codes, key = target.codes, target.key
+    keys = [d for d in detections if d.code == codes[key]][:_MOST_CANDIDATES]
+    others = [d for d in detections if d.code == codes[key - 1]][:_MOST_CANDIDATES]
+    plain = [index for index in range(len(codes)) if index != key]
+    best: TargetPose | None = None
+    for first in keys:
+        for chosen in permutations(others, 3):
+            for places in combinations(plain, 3):
+                seen = dict(zip((key, *places), (first, *chosen), strict=True))
+                for rotation, position in _plane_poses(seen, target, tolerance / camera.focal[0]):
+                    found = solve_pose(_completed(seen, others, target, rotation, position), target, camera, rotation, position)
+                    if found is None or found.residual > tolerance or found.used.sum() < 4:
+                        continue
+                    if up is not None and found.rotation[:, 2] @ up < 0.5:
+                        continue
+                    if best is None or _better(found, best, up):
+                        best = found
+    return best
+
+
+def solve_pose(
+    seen: dict[int, Detection], target: Target, camera: Camera, rotation: Array, position: Array
+) -> TargetPose | None:
+    """Least-squares pose from markers with known identity, near a first guess; None when too few agree.
+
+    A marker that is off on its own is left out. Three markers are enough; fewer are not.
+    """
+    indices = sorted(seen)
+    while len(indices) >= MINIMUM_MARKERS:
+        data = _measurements([(index, seen[index]) for index in indices], target)
+        turn, place = rotation.copy(), position.copy()
+        covariance, squares = np.empty((6, 6)), np.empty(len(data[0]))
+        if not _least_squares(*data, turn, place, covariance, squares):
+            return None
+        owners = data[-1]
+        per_marker = np.array([squares[owners == index].sum() / (2 * (owners == index).sum()) for index in indices])
+        chi_square = float(squares.sum() / max(1, 2 * len(squares) - 6))
+        wrong = [i for i in indices if not _looks_right(seen[i], target, i, turn, place)]
+        suspicious = wrong or ([indices[int(np.argmax(per_marker))]] if chi_square > _OUTLIER and len(indices) > 3 else [])
+        residual = _pixels(data, turn, place, camera)
+        if not suspicious or (not wrong and residual < 0.15):  # tiny, but beyond its noise: a model error, not an outlier
+            used = np.zeros(len(target.markers), bool)
+            used[indices] = True
+            return TargetPose(turn, place, covariance * max(1.0, chi_square), used, residual, chi_square)
+        indices = [i for i in indices if i != suspicious[0]]
+    return None
+
+
+def expected_ellipse(target: Target, index: int, camera: Array, rotation: Array, position: Array) -> Array | None:
+    """Image (6,) of a marker's outer circle at a pose, px, to first order; None behind the camera."""
+    ellipse = np.empty(6)
+    marker = target.markers[index]
+    if not _expected(rotation @ np.asarray(marker.position) + position, rotation, marker.radius, camera, ellipse):
+        return None
+    return ellipse
+
+
+def _measurements(seen: Sequence[tuple[int, Detection]], target: Target) -> tuple[Array, ...]:
+    """Rows of all usable circles: measured centre, inverse root of its covariance, marker centre, radius, marker index."""
+    rows = []
+    for index, detection in seen:
+        marker = target.markers[index]
+        for ring, share in enumerate(ring_radii(detection.code)):
+            if math.isfinite(detection.centres[ring, 0]):
+                root = np.linalg.inv(np.linalg.cholesky(detection.covariances[ring]))
+                rows.append((detection.centres[ring], root, marker.position, share * marker.radius, index))
+    return tuple(np.array(column, float) for column in zip(*rows, strict=True))
+
+
+def _plane_poses(seen: dict[int, Detection], target: Target, tolerance: float) -> list[tuple[Array, Array]]:
+    """Both poses a plane can have, from the outer circles' centres."""
+    import cv2
+
+    height = target.positions[0, 2]
+    places = np.array([(*target.positions[index, :2], 0.0) for index in seen])
+    centres = np.array([detection.shape[:2] for detection in seen.values()])
+    if _cycle(places[:, :2]) != _cycle(centres * (1, -1)):  # image y is down: a target seen from its front goes round as it is
+        return []
+    count, turns, shifts, errors = cv2.solvePnPGeneric(places, centres, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE)
+    result = []
+    for k in range(count):
+        rotation, position = cv2.Rodrigues(turns[k])[0], np.asarray(shifts[k]).reshape(3)
+        if float(np.asarray(errors).reshape(-1)[k]) < 4 * tolerance + 0.01 and position[2] > 0:
+            result.append((rotation, position - rotation[:, 2] * height))
+    return result
+
+
+def _cycle(points: Array) -> tuple[int, ...]:
+    """Order of the points by their angle about the middle, from point 0 on."""
+    offset = points - points.mean(axis=0)
+    order = np.argsort(np.arctan2(offset[:, 1], offset[:, 0])).tolist()
+    start = order.index(0)
+    return tuple(order[start:] + order[:start])
+
+
+def _completed(
+    seen: dict[int, Detection], others: Sequence[Detection], target: Target, rotation: Array, position: Array
+) -> dict[int, Detection]:
+    """Add the target's further markers, where there is a detection at the place the pose expects."""
+    result = dict(seen)
+    for index in range(len(target.markers)):
+        if index in result:
+            continue
+        point = rotation @ target.positions[index] + position
+        expected, reach = point[:2] / point[2], target.markers[index].radius / point[2]
+        near = [d for d in others if np.hypot(*(d.shape[:2] - expected)) < reach]
+        if near:
+            result[index] = near[0]
+    return result
+
+
+def _better(found: TargetPose, best: TargetPose, up: Array | None) -> bool:
+    if found.used.sum() != best.used.sum():
+        return bool(found.used.sum() > best.used.sum())
+    if up is not None and max(found.chi_square, best.chi_square) < 2 * min(found.chi_square, best.chi_square):
+        return bool(found.rotation[:, 2] @ up > best.rotation[:, 2] @ up)
+    return found.chi_square < best.chi_square
+
+
+def _looks_right(detection: Detection, target: Target, index: int, rotation: Array, position: Array) -> bool:
+    """Whether a marker is seen as large and as tilted as the pose says."""
+    marker = target.markers[index]
+    expected = np.empty(6)
+    centre = rotation @ np.asarray(marker.position) + position
+    if not _expected(centre, rotation, marker.radius, _IDENTITY, expected):
+        return False
+    ratio = np.linalg.svd(np.linalg.solve(expected[2:].reshape(2, 2), detection.shape[2:].reshape(2, 2)), compute_uv=False)
+    return bool(np.all(np.abs(np.log(ratio)) < _SHAPE_TOLERANCE))
+
+
+_IDENTITY = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def _pixels(data: tuple[Array, ...], rotation: Array, position: Array, camera: Camera) -> float:
+    measured, _, places, radii, _ = data
+    expected = np.empty_like(measured)
+    circle_centres(places, radii, rotation, position, expected)
+    error = (measured - expected) * np.array(camera.focal)
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+
+# --- kernels ----------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def circle_centres(places: Any, radii: Any, rotation: Any, position: Any, centres: Any) -> None:
+    """Fill ``centres`` (K, 2) with the centres of the ellipses that circles at ``places`` (K, 3) with ``radii`` (K,) show."""
+    nx, ny, nz = rotation[0, 2], rotation[1, 2], rotation[2, 2]
+    for k in range(places.shape[0]):
+        a, b, c = places[k, 0], places[k, 1], places[k, 2]
+        x = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c + position[0]
+        y = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c + position[1]
+        z = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c + position[2]
+        square = radii[k] * radii[k]
+        below = z * z - square * (1.0 - nz * nz)
+        centres[k, 0], centres[k, 1] = (x * z + square * nx * nz) / below, (y * z + square * ny * nz) / below
+
+
+@njit(cache=True, nogil=True)
+def turned(rotation: Any, turn: Any) -> Any:
+    """exp(turn) rotation, with ``turn`` (3,) a rotation vector."""
+    angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+    if angle < 1e-12:
+        a, b = 1.0, 0.5
+    else:
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
+    x, y, z = turn[0], turn[1], turn[2]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return rotation + (a * cross + b * (cross @ cross)) @ rotation
+
+
+@njit(cache=True, nogil=True)
+def _residuals(measured: Any, roots: Any, places: Any, radii: Any, rotation: Any, position: Any, out: Any) -> float:
+    centres = np.empty_like(measured)
+    circle_centres(places, radii, rotation, position, centres)
+    total = 0.0
+    for k in range(measured.shape[0]):
+        dx, dy = measured[k, 0] - centres[k, 0], measured[k, 1] - centres[k, 1]
+        out[2 * k] = roots[k, 0, 0] * dx + roots[k, 0, 1] * dy
+        out[2 * k + 1] = roots[k, 1, 0] * dx + roots[k, 1, 1] * dy
+        total += out[2 * k] ** 2 + out[2 * k + 1] ** 2
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _least_squares(
+    measured: Any, roots: Any, places: Any, radii: Any, owners: Any, rotation: Any, position: Any, covariance: Any, squares: Any
+) -> bool:
+    """Levenberg-Marquardt over a turn and a shift in the camera frame; pose in place, covariance of it, squares per circle."""
+    rows = 2 * measured.shape[0]
+    residual, moved, jacobian = np.empty(rows), np.empty(rows), np.empty((rows, 6))
+    damping, normal = 1e-4, np.eye(6)
+    attempt, attempt_rotation, attempt_position = 0.0, rotation, position
+    cost = _residuals(measured, roots, places, radii, rotation, position, residual)
+    for _ in range(30):
+        for k in range(6):
+            step = np.zeros(6)
+            step[k] = 1e-6
+            _residuals(measured, roots, places, radii, turned(rotation, step[:3]), position + step[3:], moved)
+            jacobian[:, k] = (moved - residual) / 1e-6
+        normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+        change, improved = np.zeros(6), False
+        for _ in range(8):
+            damped = normal.copy()
+            for k in range(6):
+                damped[k, k] *= 1.0 + damping
+            change = -np.linalg.solve(damped, gradient)
+            attempt_rotation, attempt_position = turned(rotation, change[:3]), position + change[3:]
+            attempt = _residuals(measured, roots, places, radii, attempt_rotation, attempt_position, moved)
+            if attempt <= cost:
+                improved = True
+                break
+            damping *= 10.0
+        if not improved:
+            break
+        gain = cost - attempt
+        rotation[:], position[:], cost = attempt_rotation, attempt_position, attempt
+        residual[:] = moved
+        damping = max(1e-9, damping / 10.0)
+        if gain < 1e-6 * (1.0 + cost):
+            break
+    if not (math.isfinite(cost) and position[2] > 0.0):
+        return False
+    covariance[:] = np.linalg.inv(normal)
+    for k in range(squares.shape[0]):
+        squares[k] = residual[2 * k] ** 2 + residual[2 * k + 1] ** 2
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _expected(centre: Any, rotation: Any, radius: Any, camera: Any, ellipse: Any) -> bool:
+    x, y, z = centre[0], centre[1], centre[2]
+    if z < 2.0 * radius:
+        return False
+    u, v = distort(camera, x / z, y / z)
+    ru, rv = distort(camera, x / z + 1e-5, y / z)
+    du, dv = distort(camera, x / z, y / z + 1e-5)
+    ellipse[0], ellipse[1] = u, v
+    for axis in range(2):
+        a = radius * (rotation[0, axis] - x / z * rotation[2, axis]) / z
+        b = radius * (rotation[1, axis] - y / z * rotation[2, axis]) / z
+        ellipse[2 + axis] = ((ru - u) * a + (du - u) * b) / 1e-5
+        ellipse[4 + axis] = ((rv - v) * a + (dv - v) * b) / 1e-5
+    return True

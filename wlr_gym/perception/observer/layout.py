@@ -1,0 +1,28 @@
+"""What the observer says."""
+
+from __future__ import annotations
+
+from wlr_gym.physics.plants.base import Channel, Layout
+from wlr_gym.robot import WHEELS
+
+_WHEEL_XY = tuple(f"{wheel},{axis}" for wheel in WHEELS for axis in ("x", "y"))
+
+ESTIMATE_LAYOUT = Layout(
+    (
+        Channel("position", ("x", "y"), "m", "body origin in the start frame: the floor frame as the body stood at the reset"),
+        Channel("yaw", (), "rad", "heading in the start frame, unwrapped"),
+        Channel("yaw_sigma", (), "rad", "1 sigma of it"),
+        Channel("linear_velocity_in_body", ("x", "y"), "m/s", "of the body origin, body frame"),
+        Channel("linear_velocity_sigma", ("x", "y"), "m/s", "1 sigma of it"),
+        Channel("yaw_rate", (), "rad/s", "about the floor's normal"),
+        Channel("gravity_in_body", ("x", "y", "z"), "-", "direction of gravity in the body frame, unit length"),
+        Channel(
+            "slip_velocity", _WHEEL_XY, "m/s", "of the contact point over the floor: along the wheel's heading, along its axle"
+        ),
+        Channel("slip_sigma", _WHEEL_XY, "m/s", "1 sigma of it"),
+        Channel("traction_force", WHEELS, "N", "of the floor on the wheel along its heading, from the wheel's effort"),
+        Channel("normal_force", WHEELS, "N", "of the floor on the wheel, from leg angles and accelerometer"),
+        Channel("traction_use", WHEELS, "-", "size of the traction force over the normal force"),
+        Channel("friction_demand", (), "-", "force of the floor on the whole robot: along the floor over normal to it"),
+    )
+)

@@ -1,0 +1,338 @@
+"""From a video and the run it shows to run columns ``cam_*``, a slip table, a summary and plots."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.files import replace_file, write_json
+from wlr_gym.data.anchor import rest_pose, rotation
+from wlr_gym.data.read import Run
+from wlr_gym.data.replay import robot_of
+from wlr_gym.data.write import write_run
+from wlr_gym.perception.markers.camera import Camera
+from wlr_gym.perception.markers.targets import Target
+from wlr_gym.perception.vision.align import Alignment, align, joint_signals
+from wlr_gym.perception.vision.slip import SlipResult, measure_slip, smoothed_poses
+from wlr_gym.perception.vision.track import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, Frame, Sample, track
+from wlr_gym.perception.vision.video import Frames
+from wlr_gym.robot import WHEELS, Robot
+from wlr_gym.robot.parameters import Parameters
+
+if TYPE_CHECKING:
+    import pandas
+
+Array = NDArray[np.float64]
+
+ORIGINS = ("start", "floor")
+#: px; above this the calibration, the print or the target file do not fit what is seen.
+POOR_FIT = 0.3
+#: m; the body's height by the camera may differ by this from what its legs say.
+HEIGHT_TOLERANCE = 0.005
+#: s of the first poses that make the start pose.
+_START = 0.3
+#: m/s; a robot faster than this is not at rest.
+_AT_REST = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """What a video says about a run.
+
+    Attributes:
+        run: with the columns ``cam_*``. samples: one per frame. alignment: None when the offset was given.
+        offset: servo time = camera time + offset, s. slip: per row. robot: geometry used. origin: of the ``cam_*`` columns.
+        height_error: m, body height by the camera minus that by the legs, median: shows a wrong print scale.
+        missing_frames: that the video announces but that could not be decoded. findings: what is odd, in words.
+    """
+
+    run: Run
+    samples: tuple[Sample, ...]
+    alignment: Alignment | None
+    offset: float
+    slip: SlipResult
+    robot: Robot
+    origin: str
+    height_error: float
+    missing_frames: int
+    findings: tuple[str, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """Return the main numbers as plain JSON types."""
+        slip, counts = self.slip, Counter(sample.status for sample in self.samples)
+        residuals = [sample.residual for sample in self.samples if math.isfinite(sample.residual)]
+        wheels = {
+            wheel: {
+                "longitudinal_slip_m": float(slip.slip[-1, w, 0]), "longitudinal_std_m": float(slip.slip_std[-1, w, 0]),
+                "longitudinal_std_from_radius_m": float(slip.slip_radius_std[-1, w]),
+                "lateral_slip_m": float(slip.slip[-1, w, 1]), "lateral_std_m": float(slip.slip_std[-1, w, 1]),
+                "std_from_layout_m": float(slip.slip_layout_std[-1, w]),
+            }
+            for w, wheel in enumerate(WHEELS)
+        }  # fmt: skip
+        return {
+            "frames": len(self.samples),
+            "missing_frames": self.missing_frames,
+            "status": {name: counts.get(name, 0) for name in (OK, PARTIAL, LOST, MOVED, IMPOSSIBLE)},
+            "outliers": int(slip.outliers.sum()),
+            "median_residual_px": float(np.median(residuals)),
+            "offset_s": self.offset,
+            "offset_std_s": self.alignment.std if self.alignment else None,
+            "offset_by_signal_s": {name: part[0] for name, part in self.alignment.parts.items()} if self.alignment else {},
+            "origin": self.origin,
+            "height_error_m": self.height_error,
+            "seconds": float(slip.time[-1] - slip.time[0]),
+            "body_longitudinal_slip_m": float(slip.body_slip[-1, 0]),
+            "body_lateral_slip_m": float(slip.body_slip[-1, 1]),
+            "no_slip_error": slip.no_slip_error,
+            "wheels": wheels,
+            "findings": list(self.findings),
+        }
+
+
+def analyse(
+    frames: Iterable[Frame],
+    run: Run,
+    camera: Camera,
+    body: Target,
+    floor: Target,
+    robot: Robot | str | None = None,
+    offset: float | None = None,
+    origin: str = "start",
+    watch: Callable[[Frame, Sample], None] | None = None,
+    around: float = 0.0,
+) -> Analysis:
+    """Track the robot through a video and measure pose and slip.
+
+    Args:
+        frames: of the video. run: what the robot logged meanwhile. camera: calibration. body, floor: targets.
+        robot: None = the one the run's meta data name.
+        offset: s, servo time minus camera time; None = found from the motion.
+        origin: frame of the ``cam_*`` columns: ``start`` (pose at the start is 0, 0, 0, as in simulated runs) or ``floor``.
+        watch: called with every frame and its sample.
+        around: s, where ``offset`` is looked for, within 1 s.
+
+    Raises:
+        InputError: wrong image size, no floor frame, too few poses, no motion to align on, video and run apart.
+    """
+    if origin not in ORIGINS:
+        raise unknown_name("origin", origin, ORIGINS)
+    found = robot_of(run, robot)
+    parameters = Parameters.nominal(found)
+    samples = tuple(_observed(frames, camera, body, floor, watch or (lambda frame, sample: None)))
+    seen = sum(math.isfinite(sample.pose[0]) for sample in samples)
+    if seen < 10:
+        counts = ", ".join(f"{count} {name}" for name, count in Counter(sample.status for sample in samples).items())
+        raise InputError(f"only {seen} of {len(samples)} frames have a pose of the robot ({counts}); are its markers in view?")
+    alignment = None
+    if offset is None:
+        time, poses = np.array([s.time for s in samples]), np.stack([s.pose for s in samples])
+        alignment = align(time, poses, run, found, parameters, around)
+        offset = alignment.offset
+    known = alignment.std if alignment else 0.0
+    slip = measure_slip(samples, offset, run, found, parameters, known, body.layout_std)
+    table = camera_columns(samples, offset, run, origin, slip.outliers)
+    measured = Run(table, run.meta, run.path, run.findings)
+    legs = joint_signals(run, slip.time, found)[0][:, :4] - parameters["joint.zero_offset"]
+    height_error = float(np.median(slip.pose[:, 2] - rest_pose(parameters, legs)[:, 0]))
+    missing = frames.missing if isinstance(frames, Frames) else 0
+    findings = tuple(_findings(samples, slip, height_error, missing))
+    return Analysis(measured, samples, alignment, offset, slip, found, origin, height_error, missing, findings)
+
+
+def camera_columns(
+    samples: Sequence[Sample], offset: float, run: Run, origin: str, outliers: NDArray[np.bool_]
+) -> pandas.DataFrame:
+    """Return the run's table with the columns ``cam_*``: each frame's own measurement, in the row nearest to it.
+
+    It is moved to the row's time by the smoothed rate (at most half a tick), so the columns have no delay; rows without a
+    frame are NaN. Position is that of the run's ``marker_offset`` in the body (0 = body origin G).
+    """
+    t = run["t"]
+    good = np.array([math.isfinite(s.pose[0]) for s in samples]) & ~outliers
+    kept = [sample for sample, fine in zip(samples, good, strict=True) if fine]
+    time = np.array([s.time for s in kept]) + offset
+    poses = np.stack([s.pose for s in kept])
+    poses[:, 3] = np.unwrap(poses[:, 3])
+    rates = np.stack([signal.rate for signal in smoothed_poses(kept, time, time)[0]], axis=1)
+    marker = np.asarray(run.meta.marker_offset)
+    place = poses[:, :3] + np.einsum("nij,j->ni", rotation(*poses[:, 3:].T), marker)
+    columns = {name: np.full(len(t), np.nan) for name in ("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch")}
+    rows = np.abs(t[:, None] - time[None]).argmin(axis=0)
+    late = t[rows] - time
+    inside = (time > t[0] - 0.01) & (time < t[-1] + 0.01)
+    values = np.column_stack([place[:, :2], poses[:, 3], place[:, 2], poses[:, 4]]) + late[:, None] * rates[:, [0, 1, 3, 2, 4]]
+    if origin == "start":
+        values[:, :3] = _from_start(values[:, :3], time)
+    for index in np.argsort(-np.abs(late)):  # of two frames near one row the nearer is written last
+        if inside[index]:
+            for name, value in zip(columns, values[index], strict=True):
+                columns[name][rows[index]] = value
+    return run.table.assign(**columns)
+
+
+def save(analysis: Analysis, folder: Path) -> list[Path]:
+    """Write run, slip table, samples, summary and plots into ``folder``; return their paths."""
+    name = analysis.run.name
+    paths = [write_run(folder / f"{name}.parquet", analysis.run.table, analysis.run.meta)]
+    for file, table in (("slip.csv", analysis.slip.table()), ("frames.csv", frame_table(analysis.samples, analysis.offset))):
+        replace_file(folder / file, lambda temporary, table=table: table.to_csv(temporary, index=False, float_format="%.9g"))
+        paths.append(folder / file)
+    write_json(folder / "summary.json", analysis.summary())
+    paths.append(folder / "summary.json")
+    for file, draw in (("pose.png", _draw_pose), ("slip.png", _draw_slip)):
+        figure = draw(analysis)
+        replace_file(folder / file, lambda temporary, figure=figure: figure.savefig(temporary, dpi=110, format="png"))
+        paths.append(folder / file)
+    return paths
+
+
+def frame_table(samples: Sequence[Sample], offset: float) -> pandas.DataFrame:
+    """One row per frame: number, time on both clocks, status, pose, 1 sigma, markers used, residual."""
+    import pandas
+
+    names = ("x", "y", "z", "yaw", "pitch", "roll")
+    rows = []
+    for sample in samples:
+        std = np.sqrt(np.diag(sample.covariance))
+        row = {"frame": sample.index, "camera_time": sample.time, "t": sample.time + offset, "status": sample.status}
+        row |= dict(zip(names, sample.pose, strict=True)) | {f"{n}_std": s for n, s in zip(names, std, strict=True)}
+        rows.append(row | {"markers": sample.markers, "residual_px": sample.residual})
+    return pandas.DataFrame(rows)
+
+
+def _observed(
+    frames: Iterable[Frame], camera: Camera, body: Target, floor: Target, watch: Callable[[Frame, Sample], None]
+) -> Iterator[Sample]:
+    """Track, and hand each frame with its sample to ``watch``; frames wait no longer than until the floor is located."""
+    waiting: list[Frame] = []
+
+    def passing() -> Iterator[Frame]:
+        for frame in frames:
+            waiting.append(frame)
+            yield frame
+
+    for sample in track(passing(), camera, body, floor):
+        watch(waiting.pop(0), sample)
+        yield sample
+
+
+def missing_frames(missing: int, decoded: int) -> str:
+    """Say that a video is not whole."""
+    return (
+        f"the video is cut off or damaged: it announces {missing + decoded} frames, of which {decoded} could be decoded; what "
+        "the others show is not in the results"
+    )
+
+
+def _from_start(values: Array, time: Array) -> Array:
+    """x, y, yaw (F, 3) in the frame of the mean pose over the first moments."""
+    x, y, yaw = values[time <= time[0] + _START].mean(axis=0)
+    c, s = math.cos(yaw), math.sin(yaw)
+    dx, dy = values[:, 0] - x, values[:, 1] - y
+    return np.column_stack([c * dx + s * dy, c * dy - s * dx, values[:, 2] - yaw])
+
+
+def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, missing: int = 0) -> Iterator[str]:
+    counts = Counter(sample.status for sample in samples)
+    if missing:
+        yield missing_frames(missing, len(samples))
+    if counts[MOVED]:
+        first = next(sample for sample in samples if sample.status == MOVED)
+        yield f"the camera moved: {counts[MOVED]} frames from {first.index} on ({first.time:.2f} s) have no pose"
+    if counts[LOST]:
+        yield f"{counts[LOST]} frames without the robot's markers (hidden, blurred or out of view)"
+    if counts[IMPOSSIBLE]:
+        yield f"{counts[IMPOSSIBLE]} frames gave a pose that cannot be, and were left out"
+    if slip.outliers.any():
+        yield f"{int(slip.outliers.sum())} frames contradict their neighbours, and were left out"
+    if not slip.covered.all():
+        yield f"{int((~slip.covered).sum())} rows are further than 0.15 s from a pose: interpolated, see the column 'covered'"
+    residual = float(np.median([sample.residual for sample in samples if math.isfinite(sample.residual)]))
+    if residual > POOR_FIT:
+        yield f"markers miss their places by {residual:.2f} px: calibration, print scale or target file do not fit"
+    if abs(height_error) > HEIGHT_TOLERANCE:
+        yield (
+            f"the body stands {1e3 * height_error:+.0f} mm off what its legs say: print scale, marker height, calibration or "
+            "leg zeros are wrong; a wrong scale also falsifies slip"
+        )
+    first = slip.time <= slip.time[0] + _START
+    if np.hypot(*slip.rate[first, :2].T).min() > _AT_REST:
+        yield "the robot already moves when the video starts: with --origin start, cam_* are 0 there, not at the run's start"
+    steps = np.diff([sample.time for sample in samples])
+    dropped = int(np.sum(np.round(steps / np.median(steps)) - 1)) if len(steps) else 0
+    if dropped > 0:
+        yield f"about {dropped} frames were dropped by the camera"
+
+
+# --- plots ------------------------------------------------------------------------------------------------------------
+
+_WHEEL_COLOURS = ("#1f4e9c", "#e06c00", "#2a9d5c", "#b03060")
+
+
+def _new_figure(rows: int, height: float) -> tuple[Any, Any]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+
+
+def _draw_pose(analysis: Analysis) -> Any:
+    figure, panels = _new_figure(5, 9.5)
+    slip, time = analysis.slip, np.array([s.time for s in analysis.samples]) + analysis.offset
+    poses = np.stack([s.pose for s in analysis.samples])
+    poses[:, 3] = np.unwrap(np.nan_to_num(poses[:, 3])) + 0 * poses[:, 3]
+    units = (
+        ("x", "mm", 1e3),
+        ("y", "mm", 1e3),
+        ("z", "mm", 1e3),
+        ("yaw", "deg", 180 / math.pi),
+        ("pitch", "deg", 180 / math.pi),
+    )
+    for axes, k, (name, unit, factor) in zip(panels, range(5), units, strict=True):
+        axes.plot(time, factor * poses[:, k], ".", color="#9a9a9a", markersize=3, label="frames")
+        axes.plot(slip.time, factor * slip.pose[:, k], color="#1f4e9c", linewidth=1.1, label="smoothed")
+        std = f"1 sigma of a smoothed pose: {factor * np.median(slip.pose_std[:, k]):.2g} {unit}"
+        axes.set_title(f"{name} of the body in the floor frame; {std}", fontsize=9, loc="left")
+        axes.set_ylabel(unit)
+        axes.grid(alpha=0.25)
+    panels[0].legend(loc="upper left", frameon=False, fontsize=8, ncols=2)
+    panels[-1].set_xlabel("t (s)")
+    figure.suptitle(f"{analysis.run.name}: pose from the camera", fontsize=13)
+    return figure
+
+
+def _draw_slip(analysis: Analysis) -> Any:
+    figure, panels = _new_figure(3, 8.5)
+    slip = analysis.slip
+    for w, (wheel, colour) in enumerate(zip(WHEELS, _WHEEL_COLOURS, strict=True)):
+        for axes, a in ((panels[0], 0), (panels[1], 1)):
+            spread = np.hypot(slip.slip_std[:, w, a], slip.slip_layout_std[:, w])
+            spread = np.hypot(spread, slip.slip_radius_std[:, w]) if a == 0 else spread
+            axes.plot(slip.time, 1e3 * slip.slip[:, w, a], color=colour, linewidth=1.2, label=wheel)
+            axes.fill_between(slip.time, 1e3 * (slip.slip[:, w, a] - 2 * spread), 1e3 * (slip.slip[:, w, a] + 2 * spread),
+                              color=colour, alpha=0.12, linewidth=0)  # fmt: skip
+        panels[2].plot(slip.time, slip.ratio[:, w], color=colour, linewidth=0.9)
+    titles = (
+        ("accumulated longitudinal slip (+ skids forward, - spins); band: 2 sigma with wheel radius and marker layout", "mm"),
+        ("accumulated lateral slip (+ to the left); band: 2 sigma with marker layout", "mm"),
+        ("slip ratio (0 rolls freely, +1 spins on the spot, -1 locked)", "-"),
+    )
+    for axes, (title, unit) in zip(panels, titles, strict=True):
+        axes.set_title(title, fontsize=9, loc="left")
+        axes.set_ylabel(unit)
+        axes.grid(alpha=0.25)
+    panels[0].legend(frameon=False, fontsize=8, ncols=4)
+    panels[-1].set_xlabel("t (s)")
+    figure.suptitle(f"{analysis.run.name}: slip of the wheels", fontsize=13)
+    return figure

@@ -1,0 +1,237 @@
+"""Slip of every wheel and of the body from the camera's poses and the encoders, with uncertainty.
+
+Poses and joint angles are smoothed onto the run's rows; their rates give each wheel's slip velocity by
+:mod:`wlr_gym.robot.slip`.
+
+Three kinds of error are kept apart. Random ones: motions that the frames allow as well are drawn (their noise with its
+covariance, the smoother's lag behind the motion, the offset of the clocks), and the spread of their slip is taken; so heading
+errors that turn the way driven sideways, and tilts that move the contacts, are in it. That of the wheels' radius
+(``tolerances`` of the robot file), and that of the layout of the markers on the body (its scale and heading): both grow with
+the distance driven and dominate long drives.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.anchor import quaternion, rotation
+from wlr_gym.data.read import Run
+from wlr_gym.perception.vision.align import joint_signals, repeated
+from wlr_gym.perception.vision.smooth import Smoothed, draw_error, smooth
+from wlr_gym.perception.vision.track import Sample
+from wlr_gym.robot import WHEELS, Robot
+from wlr_gym.robot.parameters import Parameters
+from wlr_gym.robot.slip import accumulate, contact_slip_velocity, no_slip_error, rolling_speed, slip_angle, slip_ratio
+
+if TYPE_CHECKING:
+    import pandas
+
+Array = NDArray[np.float64]
+
+#: s; rows further than this from a frame with a pose are flagged.
+LONGEST_GAP = 0.15
+#: Deviations from its neighbours (m, rad) from which on a pose can be an outlier.
+_JUMP = (0.01, 0.01, 0.01, 0.03, 0.05, 0.05)
+_DRAWS = 64  # of the motion: 1 sigma is known to 9 %
+_ENCODER_PACE = 10.0  # 1/s; an encoder's error changes over about five ticks
+
+
+@dataclass(frozen=True, eq=False)
+class SlipResult:
+    """Motion and slip at the run's rows that the video covers, (K).
+
+    Attributes:
+        time: (K,) s, servo clock.
+        pose, pose_std: (K, 6) x, y, z, yaw, pitch, roll of the body in the floor frame, smoothed, 1 sigma. rate: (K, 6).
+        slip_velocity: (K, 4, 2) m/s of each wheel's contact along its heading and to its left; slip_velocity_std: 1 sigma.
+        slip: (K, 4, 2) m, slip velocity accumulated from the first row. slip_std: 1 sigma, random errors.
+        slip_radius_std: (K, 4) m, 1 sigma of the longitudinal slip from the wheel radius.
+        slip_layout_std: (K, 4) m, 1 sigma of either from the places of the markers on the body.
+        ratio, angle: (K, 4) slip ratio and angle (rad).
+        no_slip_error: share of the predicted path that ignoring slip gets wrong (the paper's measure).
+        covered: (K,) False where no frame with a pose is near.
+        outliers: (F,) samples left out.
+    """
+
+    time: Array
+    pose: Array
+    pose_std: Array
+    rate: Array
+    slip_velocity: Array
+    slip_velocity_std: Array
+    slip: Array
+    slip_std: Array
+    slip_radius_std: Array
+    slip_layout_std: Array
+    ratio: Array
+    angle: Array
+    no_slip_error: float
+    covered: NDArray[np.bool_]
+    outliers: NDArray[np.bool_]
+
+    @property
+    def body_slip(self) -> Array:
+        """(K, 2) m, accumulated slip of the body: mean over the wheels, along the heading and to the left."""
+        return self.slip.mean(axis=1)
+
+    def table(self) -> pandas.DataFrame:
+        """One row per run row: time, pose, slip of every wheel and of the body, with 1 sigma."""
+        import pandas
+
+        columns: dict[str, Array] = {"t": self.time}
+        for k, name in enumerate(("x", "y", "z", "yaw", "pitch", "roll")):
+            columns |= {name: self.pose[:, k], f"{name}_std": self.pose_std[:, k], f"{name}_rate": self.rate[:, k]}
+        for w, wheel in enumerate(WHEELS):
+            for a, axis in enumerate(("longitudinal", "lateral")):
+                columns[f"slip_velocity_{axis}_{wheel}"] = self.slip_velocity[:, w, a]
+                columns[f"slip_velocity_{axis}_std_{wheel}"] = self.slip_velocity_std[:, w, a]
+                columns[f"slip_{axis}_{wheel}"] = self.slip[:, w, a]
+                columns[f"slip_{axis}_std_{wheel}"] = self.slip_std[:, w, a]
+            columns[f"slip_longitudinal_radius_std_{wheel}"] = self.slip_radius_std[:, w]
+            columns[f"slip_layout_std_{wheel}"] = self.slip_layout_std[:, w]
+            columns |= {f"slip_ratio_{wheel}": self.ratio[:, w], f"slip_angle_{wheel}": self.angle[:, w]}
+        columns |= {"slip_longitudinal_body": self.body_slip[:, 0], "slip_lateral_body": self.body_slip[:, 1]}
+        columns["covered"] = self.covered.astype(float)
+        return pandas.DataFrame(columns)
+
+
+def measure_slip(
+    samples: Sequence[Sample],
+    offset: float,
+    run: Run,
+    robot: Robot,
+    parameters: Parameters,
+    offset_std: float = 0.0,
+    layout_std: float = 0.0,
+) -> SlipResult:
+    """Slip of a run from the samples of its video.
+
+    Args:
+        samples: of :func:`wlr_gym.perception.vision.track.track`. offset: servo time = camera time + offset, s; offset_std: 1
+            sigma.
+        run: encoders. robot: encoder counts, radius tolerance. parameters: (1) geometry.
+        layout_std: 1 sigma of the body target's scale and heading
+            (:attr:`wlr_gym.perception.markers.targets.Target.layout_std`).
+
+    Raises:
+        InputError: fewer than 10 rows of the run lie within the video.
+    """
+    seen = np.array([math.isfinite(sample.pose[0]) for sample in samples])
+    time = np.array([sample.time for sample in samples]) + offset
+    if seen.sum() < 10:
+        raise InputError(f"only {int(seen.sum())} frames have a pose; at least 10 are needed")
+    rows = run["t"][(run["t"] >= time[seen][0]) & (run["t"] <= time[seen][-1])]
+    if len(rows) < 10:
+        raise InputError(
+            f"{run.path}: {len(rows)} rows lie within the video, which covers {time[seen][0]:.2f} to {time[seen][-1]:.2f} s of "
+            "the run's clock; does it belong to this run?"
+        )
+    signals, outliers = smoothed_poses(samples, time, rows)
+    value, rate, value_std = (np.stack([getattr(f, name) for f in signals], 1) for name in ("value", "rate", "value_std"))
+    joints = joint_signals(run, rows, robot)
+    joints[0][:, :4] -= parameters["joint.zero_offset"]
+    batch = repeated(parameters, len(rows))
+    velocity, rolling, no_slip_speed = _contacts(value, rate, joints, batch)
+    travel = velocity[:, :, 0] + rolling
+    heading_speed = rate[:, 0] * np.cos(value[:, 3]) + rate[:, 1] * np.sin(value[:, 3])
+    slip = accumulate(velocity, rows)
+    encoder = _encoder_variance(joints[0], robot, parameters)
+    velocity_std, slip_std = np.zeros_like(velocity), np.zeros_like(slip)
+    for change, turn in _drawn_motions(samples, outliers, time, rows, signals, offset_std):
+        drawn = _contacts(value + change, rate + turn, joints, batch)[0]
+        velocity_std += (drawn - velocity) ** 2 / _DRAWS
+        slip_std += (accumulate(drawn, rows) - slip) ** 2 / _DRAWS
+    velocity_std[:, :, 0] += _ENCODER_PACE**2 * encoder
+    slip_std[:, :, 0] += encoder + encoder[0]
+    tolerance = robot.tolerances.get("wheel.radius", 0.0)
+    share = tolerance if isinstance(tolerance, float) else 0.0
+    side_speed = rate[:, 1] * np.cos(value[:, 3]) - rate[:, 0] * np.sin(value[:, 3])
+    way = np.hypot(accumulate(heading_speed, rows), accumulate(side_speed, rows))  # wrong scales err along it, headings across
+    return SlipResult(
+        time=rows,
+        pose=value,
+        pose_std=value_std,
+        rate=rate,
+        slip_velocity=velocity,
+        slip_velocity_std=np.sqrt(velocity_std),
+        slip=slip,
+        slip_std=np.sqrt(slip_std),
+        slip_radius_std=share * np.abs(accumulate(rolling, rows)),
+        slip_layout_std=np.repeat(layout_std * way[:, None], 4, axis=1),
+        ratio=slip_ratio(travel, rolling),
+        angle=slip_angle(travel, velocity[:, :, 1]),
+        no_slip_error=float(no_slip_error(accumulate(heading_speed, rows)[-1], accumulate(no_slip_speed, rows)[-1])),
+        covered=np.abs(rows[:, None] - time[seen][None]).min(axis=1) < LONGEST_GAP,
+        outliers=outliers,
+    )
+
+
+def _contacts(value: Array, rate: Array, joints: tuple[Array, Array], batch: Parameters) -> tuple[Array, Array, Array]:
+    """Slip velocity (K, 4, 2) and rolling speed (K, 4) of the wheels; and the body's speed (K,) if none of them slipped."""
+    yaw, pitch, roll = value[:, 3:].T
+    linear = np.einsum("nji,nj->ni", rotation(yaw, pitch, roll), rate[:, :3])
+    angular = _body_rates(pitch, roll, rate[:, 3:])
+    attitude = quaternion(yaw, pitch, roll)
+    velocity = contact_slip_velocity(batch, attitude, linear, angular, *joints)
+    predicted = contact_slip_velocity(batch, attitude, np.zeros_like(linear), angular, *joints)
+    return velocity, rolling_speed(batch, angular, joints[1]), -predicted[:, :, 0].mean(axis=1)
+
+
+def _encoder_variance(angle: Array, robot: Robot, parameters: Parameters) -> Array:
+    """Variance (K, 4) in m2 of a contact's place along its heading: a wheel's count at its rim, a leg's at hip height."""
+    radius = parameters["wheel.radius"]
+    height = parameters["leg.length"] * np.sin(angle[:, :4]) + radius
+    return (radius**2 + height**2) * robot.sensors.encoder.position**2 / 12
+
+
+def _drawn_motions(
+    samples: Sequence[Sample],
+    outliers: NDArray[np.bool_],
+    time: Array,
+    rows: Array,
+    signals: Sequence[Smoothed],
+    offset_std: float,
+) -> Iterator[tuple[Array, Array]]:
+    """Yield errors of pose and rates, both (K, 6), as likely as the frames' noise and the clocks' offset make them."""
+    covariances = np.stack([sample.covariance for sample in samples])
+    covariances[outliers] = np.nan
+    known = np.isfinite(covariances[:, 0, 0])
+    roots, noise = np.linalg.cholesky(covariances[known]), np.full((len(samples), 6), np.nan)
+    std = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    rate = np.stack([signal.rate for signal in signals], axis=1)
+    acceleration = np.gradient(rate, rows, axis=0)
+    rng = np.random.default_rng(0)
+    for _ in range(_DRAWS):
+        noise[known] = np.einsum("nij,nj->ni", roots, rng.standard_normal((len(roots), 6)))
+        drawn = [draw_error(time, noise[:, k], std[:, k], rows, signals[k].density, rng) for k in range(6)]
+        late = offset_std * rng.standard_normal()
+        yield np.stack([d[0] for d in drawn], 1) + late * rate, np.stack([d[1] for d in drawn], 1) + late * acceleration
+
+
+def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> tuple[list[Smoothed], NDArray[np.bool_]]:
+    """Each of the six coordinates at the times ``at`` (K,), and which samples are outliers (F,)."""
+    poses = np.stack([sample.pose for sample in samples])
+    std = np.sqrt(np.stack([np.diag(sample.covariance) for sample in samples]))
+    known = np.isfinite(poses[:, 3])
+    poses[known, 3] = np.unwrap(poses[known, 3])
+    outliers = np.zeros(len(samples), bool)
+    for k in range(6):
+        outliers |= smooth(time, poses[:, k], std[:, k], time[:1], _JUMP[k]).outliers
+    poses[outliers] = np.nan
+    return [smooth(time, poses[:, k], std[:, k], at) for k in range(6)], outliers
+
+
+def _body_rates(pitch: Array, roll: Array, rates: Array) -> Array:
+    """Angular velocity in the body frame (K, 3) from rates of yaw, pitch, roll (K, 3)."""
+    yaw_rate, pitch_rate, roll_rate = rates.T
+    x = roll_rate - yaw_rate * np.sin(pitch)
+    y = pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll)
+    z = yaw_rate * np.cos(pitch) * np.cos(roll) - pitch_rate * np.sin(roll)
+    return np.stack([x, y, z], axis=1)

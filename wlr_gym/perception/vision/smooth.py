@@ -1,0 +1,188 @@
+"""Smooth sampled signals with gaps and known noise, and get their rates: Kalman filter and Rauch-Tung-Striebel smoother.
+
+The model is a constant acceleration with white jerk; how much jerk is what makes the data most likely. A sample far off what
+the others say is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from wlr_gym.base.errors import InputError
+
+Array = NDArray[np.float64]
+
+#: log10 of the jerk's spectral density, in unit^2/s^5, that are tried.
+_DENSITIES = np.arange(-6.0, 8.1, 0.5)
+_GATE = 100.0  # squared deviations from the prediction, in its variance
+_MOST_REJECTED = 4  # in a row; then the signal has really jumped
+#: Root of the covariance of value, rate and acceleration after a unit step of unit white jerk.
+_JERK_ROOT = np.linalg.cholesky(np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]]))
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """A signal at the times asked for.
+
+    Attributes:
+        value, rate: (K,). value_std, rate_std: 1 sigma.
+        outliers: (T,) samples left out.
+        density: spectral density of the jerk that was found, unit^2/s^5.
+    """
+
+    value: Array
+    rate: Array
+    value_std: Array
+    rate_std: Array
+    outliers: NDArray[np.bool_]
+    density: float
+
+
+def smooth(time: ArrayLike, values: ArrayLike, std: ArrayLike | float, at: ArrayLike, jump: float = math.inf) -> Smoothed:
+    """Smooth one signal.
+
+    Args:
+        time: (T,) s, increasing. values: (T,), NaN = missing. std: (T,) or one number, 1 sigma of the noise.
+        at: (K,) s, increasing: where the result is wanted.
+        jump: a sample is an outlier only if it is also this far from its prediction.
+
+    Raises:
+        InputError: fewer than three samples.
+    """
+    time, values, at = (np.asarray(x, np.float64) for x in (time, values, at))
+    known = np.isfinite(values)
+    if known.sum() < 3:
+        raise InputError(f"{int(known.sum())} samples; at least 3 are needed to smooth")
+    t, z = time[known], values[known]
+    variance = np.broadcast_to(np.asarray(std, np.float64), values.shape)[known] ** 2
+    middle = z.mean()
+    rejected, none, spreads = np.zeros(len(t), np.bool_), np.empty((0, 3)), np.empty((0, 3, 3))
+    likelihood = [_filter(t, z - middle, variance, 10.0**q, jump, rejected, none, spreads) for q in _DENSITIES]
+    density = 10.0 ** _DENSITIES[int(np.argmax(likelihood))]
+    moments, order, places = _merged(t, at)
+    rejected = np.zeros(len(moments), np.bool_)
+    states, spreads = _smoothed(moments, order, z - middle, variance, density, jump, rejected)
+    rows, outliers = places[len(t) :], np.zeros(len(time), np.bool_)
+    outliers[np.flatnonzero(known)] = rejected[places[: len(t)]]
+    deviations = np.sqrt(np.maximum(spreads[rows][:, [0, 1], [0, 1]], 0.0))
+    return Smoothed(states[rows, 0] + middle, states[rows, 1], deviations[:, 0], deviations[:, 1], outliers, density)
+
+
+def draw_error(
+    time: Array, noise: Array, std: Array, at: Array, density: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Draw one error of value and rate, both (K,), as :func:`smooth` makes them: right from one moment to the next.
+
+    A motion of the model is drawn, seen through the noise, and smoothed; the error is what comes out minus what went in.
+
+    Args:
+        time: (T,) s. noise: (T,) one draw of the samples' noise, NaN = no sample. std: (T,) 1 sigma that the smoother assumes.
+        at: (K,) s. density: of the jerk, found by :func:`smooth`. rng: of the motion.
+    """
+    known = np.isfinite(noise)
+    count = int(known.sum())
+    moments, order, places = _merged(time[known], at)
+    motion = np.empty((len(moments), 3))
+    _move(moments, density, _JERK_ROOT, rng.standard_normal((len(moments), 3)), motion)
+    seen = motion[places[:count], 0] + noise[known]
+    states, _ = _smoothed(moments, order, seen, std[known] ** 2, density, math.inf, np.zeros(len(moments), np.bool_))
+    error = (states - motion)[places[count:]]
+    return error[:, 0], error[:, 1]
+
+
+def _merged(time: Array, at: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Times of samples and results in order; the order; and at which place in it each sample, then each result, is."""
+    merged = np.concatenate([time, at])
+    order = np.argsort(merged, kind="stable")
+    return merged[order], order, np.argsort(order, kind="stable")
+
+
+def _smoothed(
+    moments: Array, order: NDArray[np.int64], values: Array, variance: Array, density: float, jump: float, rejected: Any
+) -> tuple[Array, Array]:
+    """Smoothed states (., 3) and covariances at all moments; ``rejected`` is written."""
+    others = len(moments) - len(values)
+    inputs, noise = np.concatenate([values, np.full(others, np.nan)])[order], np.concatenate([variance, np.ones(others)])[order]
+    states, spreads = np.empty((len(moments), 3)), np.empty((len(moments), 3, 3))
+    _filter(moments, inputs, noise, density, jump, rejected, states, spreads)
+    _smooth_back(moments, density, states, spreads)
+    return states, spreads
+
+
+@njit(cache=True, nogil=True)
+def _move(time: Any, density: float, root: Any, normals: Any, states: Any) -> None:
+    """Draw a motion of the model from rest at 0: white jerk, integrated exactly from moment to moment."""
+    states[0] = 0.0
+    for i in range(1, time.shape[0]):
+        step = time[i] - time[i - 1]
+        kick = root @ normals[i] * math.sqrt(density * step)
+        states[i, 0] = states[i - 1, 0] + step * (states[i - 1, 1] + 0.5 * step * states[i - 1, 2]) + step * step * kick[0]
+        states[i, 1] = states[i - 1, 1] + step * states[i - 1, 2] + step * kick[1]
+        states[i, 2] = states[i - 1, 2] + kick[2]
+
+
+@njit(cache=True, nogil=True)
+def _transition(step: float, density: float, matrix: Any, noise: Any) -> None:
+    matrix[:] = np.eye(3)
+    matrix[0, 1] = matrix[1, 2] = step
+    matrix[0, 2] = 0.5 * step * step
+    powers = np.array([step**5 / 20, step**4 / 8, step**3 / 6, step**3 / 3, step**2 / 2, step])
+    noise[0, 0], noise[0, 1], noise[0, 2] = density * powers[0], density * powers[1], density * powers[2]
+    noise[1, 0], noise[1, 1], noise[1, 2] = density * powers[1], density * powers[3], density * powers[4]
+    noise[2, 0], noise[2, 1], noise[2, 2] = density * powers[2], density * powers[4], density * powers[5]
+
+
+@njit(cache=True, nogil=True)
+def _filter(
+    time: Any, values: Any, variances: Any, density: float, jump: float, rejected: Any, states: Any, spreads: Any
+) -> float:
+    """Kalman filter; returns the log likelihood. Filtered states and covariances go to ``states``, ``spreads`` unless empty."""
+    matrix, noise = np.zeros((3, 3)), np.zeros((3, 3))
+    state, spread = np.zeros(3), np.diag(np.array([1e4, 1e2, 1e2]))
+    likelihood, in_a_row = 0.0, 0
+    for i in range(time.shape[0]):
+        if i > 0 and time[i] > time[i - 1]:
+            _transition(time[i] - time[i - 1], density, matrix, noise)
+            state = matrix @ state
+            spread = matrix @ spread @ matrix.T + noise
+        rejected[i] = False
+        if not math.isnan(values[i]):
+            total = spread[0, 0] + variances[i]
+            error = values[i] - state[0]
+            if error * error > _GATE * total and abs(error) > jump and in_a_row < _MOST_REJECTED:
+                rejected[i] = True
+                in_a_row += 1
+                likelihood -= 0.5 * (_GATE + math.log(total))
+            else:
+                in_a_row = 0
+                gain = spread[:, 0] / total
+                state = state + gain * error
+                change = np.eye(3)
+                change[:, 0] -= gain
+                spread = change @ spread @ change.T + variances[i] * np.outer(gain, gain)
+                likelihood -= 0.5 * (error * error / total + math.log(total))
+        if states.shape[0] > 0:
+            states[i] = state
+            spreads[i] = spread
+    return likelihood
+
+
+@njit(cache=True, nogil=True)
+def _smooth_back(time: Any, density: float, states: Any, spreads: Any) -> None:
+    matrix, noise = np.zeros((3, 3)), np.zeros((3, 3))
+    for i in range(time.shape[0] - 2, -1, -1):
+        _transition(time[i + 1] - time[i], density, matrix, noise)
+        ahead = matrix @ spreads[i] @ matrix.T + noise
+        if time[i + 1] == time[i]:
+            states[i] = states[i + 1]
+            spreads[i] = spreads[i + 1]
+            continue
+        gain = np.linalg.solve(ahead, matrix @ spreads[i]).T
+        states[i] = states[i] + gain @ (states[i + 1] - matrix @ states[i])
+        spreads[i] = spreads[i] + gain @ (spreads[i + 1] - ahead) @ gain.T

@@ -1,0 +1,298 @@
+"""Follow the robot's markers through a video: one sample per frame, flagged, with its covariance.
+
+The floor's markers are located first, over some frames, and watched from then on: a camera that moves is noticed. The body's
+markers are searched in the whole image until they are found, then only where a constant velocity puts them; one of four may be
+hidden. A frame without a pose that passes every check gives a sample without a pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.perception.markers.camera import Camera
+from wlr_gym.perception.markers.detect import Detection, Image, detect, refine
+from wlr_gym.perception.markers.pose import LARGEST_RESIDUAL, TargetPose, expected_ellipse, find_target, solve_pose
+from wlr_gym.perception.markers.targets import Target
+
+Array = NDArray[np.float64]
+
+#: Status of a sample: pose from all markers; from fewer; none found; the camera moved; a pose that cannot be.
+OK, PARTIAL, LOST, MOVED, IMPOSSIBLE = "ok", "partial", "lost", "moved", "impossible"
+FLOOR_FRAMES = 20
+#: m; positions of floor markers may be off by this much (they were measured by hand).
+FLOOR_TOLERANCE = 0.01
+_MOVED_BY = 0.4  # px, median over the floor's markers: 1 mm at 2 m with a focal length of 800 px
+_LEAST_COSINE = 0.7  # of the tilt of the body against the floor
+_HEIGHTS = (0.0, 0.6)  # m, of the body's origin
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image (H, W) grey with its number and its time on the camera's clock, s."""
+
+    index: int
+    time: float
+    image: Image
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """The body in the floor frame at one frame.
+
+    Attributes:
+        index, time: of the frame. status: see :data:`OK`.
+        pose: (6,) x, y, z (m) of the body's origin, yaw, pitch, roll (rad): Rz Ry Rx; NaN without a pose.
+        covariance: (6, 6) of it.
+        markers: number used. residual: px rms.
+        centres: (M, 2) px of the body's markers; NaN where not seen.
+    """
+
+    index: int
+    time: float
+    status: str
+    pose: Array
+    covariance: Array
+    markers: int
+    residual: float
+    centres: Array
+
+
+class Tracker:
+    """Turn frames into samples.
+
+    Args:
+        camera: its lens. body, floor: targets.
+        floor_pose, homes: where the floor is, and its markers in px (:func:`locate_floor`).
+    """
+
+    def __init__(self, camera: Camera, body: Target, floor: Target, floor_pose: TargetPose, homes: Array) -> None:
+        self.camera, self.body, self.floor, self.floor_pose = camera, body, floor, floor_pose
+        self._homes = homes
+        self._values = camera.values
+        self._track: list[tuple[float, TargetPose]] = []  # the last two poses
+        self._watched = 0
+
+    def __call__(self, frame: Frame) -> Sample:
+        """Process one frame. Frames must come in order of time."""
+        check_size(frame.image, self.camera, f"frame {frame.index}")
+        shift = self._floor_shift(frame.image)
+        found, seen = self._follow(frame)
+        if found is None:
+            found, seen = self._search(frame)
+        centres = np.full((len(self.body.markers), 2), np.nan)
+        if found is None or shift > _MOVED_BY:
+            self._track = []
+            dark = found is None and math.isinf(shift)  # nothing at all is seen
+            return _no_pose(frame, MOVED if shift > _MOVED_BY and not dark else LOST, centres)
+        for index, detection in seen.items():
+            if found.used[index]:
+                centres[index] = detection.ellipse[:2]
+        pose, covariance = pose_in_floor(found, self.floor_pose)
+        if not (_HEIGHTS[0] < pose[2] < _HEIGHTS[1] and math.cos(pose[4]) * math.cos(pose[5]) > _LEAST_COSINE):
+            self._track = []
+            return _no_pose(frame, IMPOSSIBLE, centres)
+        self._track = [*self._track[-1:], (frame.time, found)]
+        count = int(found.used.sum())
+        status = OK if count == len(self.body.markers) else PARTIAL
+        return Sample(frame.index, frame.time, status, pose, covariance, count, found.residual, centres)
+
+    def _follow(self, frame: Frame) -> tuple[TargetPose | None, dict[int, Detection]]:
+        """Look where the markers should be."""
+        if not self._track:
+            return None, {}
+        rotation, position = self._predicted(frame.time)
+        seen = {}
+        for index in range(len(self.body.markers)):
+            ellipse = expected_ellipse(self.body, index, self._values, rotation, position)
+            if ellipse is not None:
+                detection = refine(frame.image, self._values, ellipse, int(self.body.codes[index]))
+                if detection is not None:
+                    seen[index] = detection
+        found = solve_pose(seen, self.body, self.camera, rotation, position)
+        return (found, seen) if found is not None and found.residual < LARGEST_RESIDUAL else (None, seen)
+
+    def _search(self, frame: Frame) -> tuple[TargetPose | None, dict[int, Detection]]:
+        """Look around where the body was, then everywhere."""
+        up = self.floor_pose.rotation[:, 2]
+        boxes = [self._neighbourhood()] if self._track else []
+        for box in [*boxes, None]:
+            detections = detect(frame.image, self.camera, box)
+            found = find_target(detections, self.body, self.camera, up)
+            if found is not None:
+                return found, _identified(detections, found, self.body, self._values)
+        return None, {}
+
+    def _predicted(self, time: float) -> tuple[Array, Array]:
+        import cv2
+
+        last_time, last = self._track[-1]
+        if len(self._track) < 2:
+            return last.rotation, last.position
+        before_time, before = self._track[0]
+        share = min(3.0, (time - last_time) / max(1e-6, last_time - before_time))
+        turn = cv2.Rodrigues(last.rotation @ before.rotation.T)[0]
+        return cv2.Rodrigues(share * turn)[0] @ last.rotation, last.position + share * (last.position - before.position)
+
+    def _neighbourhood(self) -> tuple[int, int, int, int]:
+        _, last = self._track[-1]
+        ellipses = [
+            expected_ellipse(self.body, index, self._values, last.rotation, last.position)
+            for index in range(len(self.body.markers))
+        ]
+        points = np.array([ellipse[:2] for ellipse in ellipses if ellipse is not None])
+        low, high = points.min(axis=0), points.max(axis=0)
+        margin = 0.5 * (high - low).max() + 20
+        (x0, y0), (x1, y1) = np.floor(low - margin).astype(int), np.ceil(high + margin).astype(int)
+        return max(0, x0), max(0, y0), min(self.camera.width, x1), min(self.camera.height, y1)
+
+    def _floor_shift(self, image: Image) -> float:
+        """How far (px) the floor's markers are from their places; inf when none of them is to be seen there.
+
+        One marker is looked at per frame, in turn; when it is not in its place, all of them: it may just be hidden.
+        """
+        self._watched = (self._watched + 1) % len(self._homes)
+        shift = self._marker_shift(image, self._watched)
+        if shift < _MOVED_BY:
+            return shift
+        shifts = np.array([self._marker_shift(image, index) for index in range(len(self._homes))])
+        known = shifts[np.isfinite(shifts)]
+        return float(np.median(known)) if len(known) else math.inf
+
+    def _marker_shift(self, image: Image, index: int) -> float:
+        """Distance (px) of a floor marker from its place; NaN when it is not seen there."""
+        pose = self.floor_pose
+        ellipse = expected_ellipse(self.floor, index, self._values, pose.rotation, pose.position)
+        seen = None if ellipse is None else refine(image, self._values, ellipse, int(self.floor.codes[index]))
+        return math.nan if seen is None else math.hypot(*(seen.ellipse[:2] - self._homes[index]))
+
+
+def track(frames: Iterable[Frame], camera: Camera, body: Target, floor: Target) -> Iterator[Sample]:
+    """Locate the floor in the first frames, then yield one sample per frame.
+
+    Raises:
+        InputError: frames of another size than the camera was calibrated for, or no floor to be found.
+    """
+    stream = iter(frames)
+    first = list(islice(stream, FLOOR_FRAMES))
+    tracker = Tracker(camera, body, floor, *locate_floor(first, camera, floor))
+    return (tracker(frame) for frame in chain(first, stream))
+
+
+def locate_floor(frames: Sequence[Frame], camera: Camera, floor: Target) -> tuple[TargetPose, Array]:
+    """Locate the floor over several frames of a camera that stands still; also the markers' places (M, 2) in px.
+
+    Raises:
+        InputError: wrong image size, or too few floor markers; the message says what was seen.
+    """
+    if not frames:
+        raise InputError("the video has no frames")
+    start: TargetPose | None = None
+    sums: dict[int, list[Detection]] = {index: [] for index in range(len(floor.markers))}
+    most: list[Detection] = []
+    for frame in frames:
+        check_size(frame.image, camera, f"frame {frame.index}")
+        if start is None:
+            detections = detect(frame.image, camera)
+            most = max(most, [d for d in detections if d.code in floor.codes], key=len)
+            start = find_target(detections, floor, camera, tolerance=_floor_pixels(camera, detections, floor))
+        if start is not None:
+            for index, detection in _seen_at(frame.image, floor, camera.values, start).items():
+                sums[index].append(detection)
+    if start is None:
+        raise InputError(
+            f"no floor frame: {len(most)} of the target's {len(floor.markers)} floor markers were found in the first "
+            f"{len(frames)} frames, and at least 4 must fit together (check their positions in the target file, and the light)"
+        )
+    means = {index: _mean(found) for index, found in sums.items() if len(found) >= max(1, len(frames) // 2)}
+    found = solve_pose(means, floor, camera, start.rotation, start.position) or start
+    centres = np.full((len(floor.markers), 2), np.nan)
+    for index, detection in means.items():
+        centres[index] = detection.ellipse[:2]
+    return found, centres
+
+
+def check_size(image: Image, camera: Camera, where: str) -> None:
+    """Refuse an image that the calibration is not for."""
+    height, width = image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise InputError(
+            f"{where}: {width} x {height} px, but the camera was calibrated for {camera.width} x {camera.height}; film and "
+            "calibrate in the same mode"
+        )
+
+
+def pose_in_floor(body: TargetPose, floor: TargetPose) -> tuple[Array, Array]:
+    """Pose (6,) of the body in the floor frame and its covariance (6, 6); that of the floor itself is not part of it."""
+    rotation = floor.rotation.T @ body.rotation
+    position = floor.rotation.T @ (body.position - floor.position)
+    pose = np.concatenate([position, angles(rotation)])
+    yaw, pitch = pose[3], pose[4]
+    # a small turn w about the floor's axes changes yaw, pitch and roll by this matrix times w
+    cosine = max(0.1, math.cos(pitch))
+    rates = np.array(
+        [
+            [math.cos(yaw) * math.tan(pitch), math.sin(yaw) * math.tan(pitch), 1.0],
+            [-math.sin(yaw), math.cos(yaw), 0.0],
+            [math.cos(yaw) / cosine, math.sin(yaw) / cosine, 0.0],
+        ]
+    )
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, 3:] = floor.rotation.T
+    jacobian[3:, :3] = rates @ floor.rotation.T
+    return pose, jacobian @ body.covariance @ jacobian.T
+
+
+def angles(rotation: Array) -> Array:
+    """Yaw, pitch, roll (rad) of Rz(yaw) Ry(pitch) Rx(roll)."""
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    pitch = math.asin(max(-1.0, min(1.0, -rotation[2, 0])))
+    return np.array([yaw, pitch, math.atan2(rotation[2, 1], rotation[2, 2])])
+
+
+def _no_pose(frame: Frame, status: str, centres: Array) -> Sample:
+    return Sample(frame.index, frame.time, status, np.full(6, np.nan), np.full((6, 6), np.nan), 0, math.nan, centres)
+
+
+def _seen_at(image: Image, target: Target, camera: Array, pose: TargetPose) -> dict[int, Detection]:
+    seen = {}
+    for index in range(len(target.markers)):
+        ellipse = expected_ellipse(target, index, camera, pose.rotation, pose.position)
+        detection = None if ellipse is None else refine(image, camera, ellipse, int(target.codes[index]))
+        if detection is not None:
+            seen[index] = detection
+    return seen
+
+
+def _identified(detections: Sequence[Detection], found: TargetPose, target: Target, camera: Array) -> dict[int, Detection]:
+    seen = {}
+    for index in range(len(target.markers)):
+        ellipse = expected_ellipse(target, index, camera, found.rotation, found.position)
+        if ellipse is not None and detections:
+            x, y = ellipse[:2]
+            seen[index] = min(detections, key=lambda d, x=x, y=y: math.hypot(d.ellipse[0] - x, d.ellipse[1] - y))
+    return seen
+
+
+def _floor_pixels(camera: Camera, detections: Sequence[Detection], floor: Target) -> float:
+    """Largest residual of the floor (px): what a marker off by :data:`FLOOR_TOLERANCE` looks like."""
+    sizes = [d.radius for d in detections if d.code in floor.codes]
+    scale = max(sizes) / floor.radii.min() if sizes else camera.focal[0]
+    return LARGEST_RESIDUAL + FLOOR_TOLERANCE * scale
+
+
+def _mean(found: Sequence[Detection]) -> Detection:
+    """The mean of several detections of one marker that stands still."""
+    centres = np.stack([d.centres for d in found])
+    covariances = np.stack([d.covariances for d in found])
+    known = np.asarray(np.isfinite(centres[:, :, 0]).all(axis=0))
+    mean = np.where(known[:, None], centres.mean(axis=0), np.nan)
+    spread = np.where(known[:, None, None], covariances.mean(axis=0) / len(found), np.nan)
+    shape, ellipse = np.mean([d.shape for d in found], axis=0), np.mean([d.ellipse for d in found], axis=0)
+    return replace(found[0], centres=mean, covariances=spread, shape=shape, ellipse=ellipse)

@@ -1,0 +1,267 @@
+"""Where frames come from (video file, folder of images) and where annotated ones go. Live: see ``live.py``."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.perception.markers.detect import Image
+from wlr_gym.perception.markers.targets import Target
+from wlr_gym.perception.vision.track import LOST, MOVED, OK, PARTIAL, Frame, Sample
+
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
+_INEXACT = 0.005  # of the number of frames; where it is not stored, it is computed from the duration
+_COLOURS = {OK: (60, 180, 60), PARTIAL: (0, 165, 255), LOST: (40, 40, 220), MOVED: (200, 60, 200)}  # blue, green, red
+_FRAMES_FOR_RATE = 10
+
+
+class Frames:
+    """The frames of a video file or of a folder of images (in order of name); an iterator.
+
+    Args:
+        source: path.
+        rate: Hz; frames are evenly spaced by it. Default: the times in the video; 30 for images.
+        times: CSV with one time (s) per frame in its last column, which goes before ``rate``.
+        seconds: stop this long after the first frame.
+
+    Attributes:
+        missing: how many frames a video announces that could not be decoded: it is cut off or damaged. Known at its end.
+
+    Raises:
+        InputError: no such file, not a video, no frames, or another number of frames than of times.
+    """
+
+    def __init__(self, source: str, rate: float | None = None, times: Path | None = None, seconds: float | None = None) -> None:
+        require_package("cv2", "vision")
+        self.missing = 0
+        self._frames = self._read(source, rate, times, seconds)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self
+
+    def __next__(self) -> Frame:
+        return next(self._frames)
+
+    def _read(self, source: str, rate: float | None, times: Path | None, seconds: float | None) -> Iterator[Frame]:
+        stamps = None if times is None else _read_times(times)
+        count, first, cut = 0, 0.0, False
+        for index, (stamp, image) in enumerate(self._images(source)):
+            if stamps is not None and index >= len(stamps):
+                raise InputError(f"{times}: {len(stamps)} times, but {source} has more frames")
+            moment = stamps[index] if stamps is not None else index / rate if rate else stamp
+            first = moment if index == 0 else first
+            cut = seconds is not None and moment - first > seconds
+            if cut:
+                break
+            count += 1
+            yield Frame(index, moment, image)
+        if not count:
+            raise InputError(f"{source}: no frames could be read")
+        if stamps is not None and not cut and count < len(stamps):
+            broken = f" and {self.missing} that cannot be decoded" if self.missing else ""
+            raise InputError(
+                f"{times}: {len(stamps)} times, but {source} has {count} frames{broken}; which time is whose cannot be told"
+            )
+
+    def _images(self, source: str) -> Iterator[tuple[float, Image]]:
+        path = Path(source)
+        if path.is_dir():
+            return _folder(path)
+        if not path.is_file():
+            raise InputError(f"{source}: no such video or folder of images")
+        return self._file(path)
+
+    def _file(self, path: Path) -> Iterator[tuple[float, Image]]:
+        import cv2
+
+        video = cv2.VideoCapture(str(path))
+        if not video.isOpened():
+            raise InputError(f"{path}: cannot be read as a video; expected a format that OpenCV reads (AVI, MP4, MKV)")
+        rate, announced = video.get(cv2.CAP_PROP_FPS), video.get(cv2.CAP_PROP_FRAME_COUNT)
+        rate = rate if 1 < rate < 2000 else 30.0
+        index, before = 0, -math.inf
+        while True:
+            ok, image = video.read()
+            if not ok:
+                break
+            stamp = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            if not stamp > before:  # a container without times
+                stamp = index / rate if index == 0 else before + 1 / rate
+            yield stamp, grey(image)
+            index, before = index + 1, stamp
+        video.release()
+        if index == 0:
+            raise InputError(f"{path}: opened, but no frame could be decoded; is the file whole?")
+        if math.isfinite(announced) and announced - index > max(1.0, _INEXACT * announced):
+            self.missing = round(announced) - index
+
+
+def _folder(folder: Path) -> Iterator[tuple[float, Image]]:
+    import cv2
+
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
+    if not files:
+        raise InputError(f"{folder}: no images ({', '.join(IMAGES)})")
+    for index, path in enumerate(files):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise InputError(f"{path}: cannot be read as an image")
+        yield index / 30.0, np.asarray(image, np.uint8)
+
+
+def grey(image: Any) -> Image:
+    """Return one channel (H, W)."""
+    import cv2
+
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def _read_times(path: Path) -> list[float]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file of frame times")
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        cells = [row[-1].strip() for row in csv.reader(file) if row]
+    try:
+        stamps = [float(cell) for cell in (cells[1:] if cells and not _is_number(cells[0]) else cells)]
+    except ValueError as error:
+        raise InputError(f"{path}: not a table of frame times: {error}") from None
+    back = np.flatnonzero(np.diff(stamps) <= 0)
+    if len(back) or not np.isfinite(stamps).all():
+        where = int(back[0]) + 1 if len(back) else 0
+        raise InputError(f"{path}: frame {where}: times must be finite and increase")
+    return stamps
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+class VideoFile:
+    """A video that gets its name when it is whole. A context manager: after an error, what was there before stays.
+
+    Args:
+        path: of the file. code: four letters of the codec. rate: Hz.
+    """
+
+    def __init__(self, path: Path, code: str, rate: float) -> None:
+        self.path, self._code = path, code
+        self._rate = round(rate, 2)  # finer ones are more than MPEG-4's clock can take
+        self._unfinished = path.with_name(f".{path.stem}.unfinished{path.suffix}")
+        self._writer = None
+
+    def __enter__(self) -> VideoFile:
+        return self
+
+    def __exit__(self, fault: type[BaseException] | None, *_: object) -> None:
+        if self._writer is None:
+            return
+        self._writer.release()
+        if fault is None:
+            self._unfinished.replace(self.path)
+        else:
+            self._unfinished.unlink(missing_ok=True)
+
+    def write(self, image: NDArray[np.uint8]) -> None:
+        """Append an image, grey (H, W) or colour (H, W, 3)."""
+        import cv2
+
+        if self._writer is None:
+            code, size = cv2.VideoWriter.fourcc(*self._code), (image.shape[1], image.shape[0])
+            self._writer = cv2.VideoWriter(str(self._unfinished), code, self._rate, size, image.ndim == 3)
+            if not self._writer.isOpened():
+                raise InputError(f"{self.path}: cannot be written as a video")
+        self._writer.write(image)
+
+
+class AnnotatedVideo:
+    """Writes frames with what was found in them, at the rate at which they were filmed. A context manager.
+
+    Args:
+        path: of an ``.mp4`` or ``.avi`` file. body: the markers on the robot.
+    """
+
+    def __init__(self, path: Path, body: Target) -> None:
+        self.path, self.body = path, body
+        self._file: VideoFile | None = None
+        self._trail: list[tuple[int, int]] = []
+        self._waiting: list[tuple[float, NDArray[np.uint8]]] = []  # until the rate is known
+
+    def __enter__(self) -> AnnotatedVideo:
+        return self
+
+    def __exit__(self, fault: type[BaseException] | None, *rest: object) -> None:
+        if fault is None:
+            self._start()
+        if self._file is not None:
+            self._file.__exit__(fault, *rest)
+
+    def add(self, frame: Frame, sample: Sample) -> None:
+        """Append one frame."""
+        image = annotate(frame.image, sample, self.body, self._trail)
+        if self._file is not None:
+            self._file.write(image)
+            return
+        self._waiting.append((frame.time, image))
+        if len(self._waiting) == _FRAMES_FOR_RATE:
+            self._start()
+
+    def _start(self) -> None:
+        """Open the file, with the rate of the frames so far, and write them."""
+        if self._file is not None or not self._waiting:
+            return
+        steps = np.diff([time for time, _ in self._waiting])
+        rate = 1 / float(np.median(steps)) if len(steps) else 30.0
+        self._file = VideoFile(self.path, "mp4v" if self.path.suffix == ".mp4" else "MJPG", rate)
+        for _, image in self._waiting:
+            self._file.write(image)
+        self._waiting = []
+
+
+def annotate(image: Image, sample: Sample, body: Target, trail: list[tuple[int, int]]) -> NDArray[np.uint8]:
+    """Return a colour copy with markers, heading, track and pose; ``trail`` is added to."""
+    import cv2
+
+    picture: Any = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    colour = _COLOURS.get(sample.status, (40, 40, 220))
+    for x, y in sample.centres[np.isfinite(sample.centres[:, 0])]:
+        cv2.drawMarker(picture, (round(x), round(y)), colour, cv2.MARKER_CROSS, 18, 2)
+    arrow = _heading(sample.centres, body)
+    if arrow is not None:
+        trail.append(_whole(arrow[0]))
+        cv2.arrowedLine(picture, _whole(arrow[0]), _whole(arrow[1]), colour, 2, cv2.LINE_AA, tipLength=0.15)
+    if len(trail) > 1:
+        cv2.polylines(picture, [np.array(trail, np.int32)], False, (200, 120, 0), 2, cv2.LINE_AA)
+    text = f"frame {sample.index}  {sample.time:.3f} s  {sample.status}"
+    if math.isfinite(sample.pose[0]):
+        x, y, z, yaw, pitch, _ = sample.pose
+        text += f"  x {x:+.4f}  y {y:+.4f}  z {z:.4f} m  yaw {math.degrees(yaw):+.2f}  pitch {math.degrees(pitch):+.2f} deg"
+    picture[:40] //= 3  # a dark strip to read the text on
+    cv2.putText(picture, text, (12, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
+    return picture
+
+
+def _heading(centres: NDArray[np.float64], body: Target) -> NDArray[np.float64] | None:
+    """Where (2, 2) px the body's origin, at the height of its markers, and a point in front of it are; None when too few
+    markers are seen. By the affine map from the markers' places to their centres, which is enough to look at."""
+    seen = np.isfinite(centres[:, 0])
+    if seen.sum() < 3:
+        return None
+    places = np.column_stack([body.positions[:, :2], np.ones(len(centres))])
+    plane = np.linalg.lstsq(places[seen], centres[seen], rcond=None)[0]
+    ahead = 1.5 * float(np.abs(body.positions[:, 0]).max())
+    return np.asarray(np.array([[0.0, 0.0, 1.0], [ahead, 0.0, 1.0]]) @ plane, np.float64)
+
+
+def _whole(point: Sequence[float] | NDArray[np.float64]) -> tuple[int, int]:
+    return round(float(point[0])), round(float(point[1]))

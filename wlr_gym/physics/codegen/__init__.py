@@ -1,0 +1,11 @@
+"""Write scalar maths once, trace it, compile it.
+
+A function written with ``ops`` and the arithmetic operators runs on floats, on numpy arrays, and on :class:`Graph` nodes.
+On nodes it builds an expression graph with shared sub-expressions, which :func:`emit` prints as straight-line source and
+:func:`load_module` compiles with numba and caches. One source thus serves the readable reference and the fast kernel.
+"""
+
+from wlr_gym.physics.codegen.graph import Graph, Node, emit, hoist, live_nodes
+from wlr_gym.physics.codegen.module import load_module
+
+__all__ = ["Graph", "Node", "emit", "hoist", "live_nodes", "load_module"]

@@ -1,0 +1,226 @@
+"""Patches: effects as YAML, loaded, checked, composed, applied and saved.
+
+```yaml
+effects:
+  - name: rolling_resistance
+    where: [wheel_lf, wheel_rf]
+    parameters: {coefficient: 0.04}
+provenance: {made_by: hand}     # optional
+```
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.files import replace_file
+from wlr_gym.base.paths import find_config
+from wlr_gym.base.settings import read_yaml
+from wlr_gym.physics.codegen.expression import finite_number
+from wlr_gym.physics.effects.effect import Effect, EffectParameter, PatchEffect
+from wlr_gym.physics.effects.formula import KEYS, PLACES, force_of, parse_formula
+from wlr_gym.physics.effects.registry import EFFECTS, UNKNOWN_EFFECT, stage
+from wlr_gym.physics.plants.forces import Force
+from wlr_gym.robot.parameters import Parameters, range_in_words, unit_in_words
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Effects to add to the nominal model, in order, and where they come from."""
+
+    effects: tuple[PatchEffect, ...] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    source: str = "patch"
+
+    def __bool__(self) -> bool:
+        return bool(self.effects)
+
+    @cached_property
+    def forces(self) -> tuple[Force, ...]:
+        """What the plant itself must be given: the formulas of unknown effects."""
+        return tuple(force_of(effect) for effect in self.effects if effect.name == UNKNOWN_EFFECT)
+
+    def summary(self) -> str:
+        """Return the effects' names in order, or ``none``."""
+        return ", ".join(effect.name for effect in self.effects) or "none"
+
+    def content(self) -> dict[str, Any]:
+        """Return the patch as plain YAML types: what :func:`save_patch` writes and :func:`load_patch` reads."""
+        content: dict[str, Any] = {"effects": [effect.content() for effect in self.effects]}
+        if self.provenance:
+            content["provenance"] = dict(self.provenance)
+        return content
+
+
+Source = Patch | str | Path | Mapping[str, Any] | Sequence[Any] | None
+
+
+def load_patch(source: Source) -> Patch:
+    """Load a patch from what users pass as ``effects=`` or after ``--effects``.
+
+    Args:
+        source: path of a YAML file or name of one in ``configs/effects/``, an effect or a whole patch as a mapping, a
+            :class:`Patch`, a list of any of these (composed in order), or None (no effects).
+
+    Raises:
+        InputError: naming file, effect, key and the nearest valid name.
+    """
+    match source:
+        case Patch():
+            return source
+        case None:
+            return Patch()
+        case str() | Path():
+            if source in (*EFFECTS, UNKNOWN_EFFECT):
+                raise InputError(
+                    f"'{source}' is an effect, not a patch: write a file with its numbers (wlr effects {source}), "
+                    f"or give it as a mapping in Python: {{'name': '{source}', 'parameters': {{...}}}}"
+                )
+            path = find_config("effects", source)
+            return _parse(read_yaml(path), str(path))
+        case Mapping():
+            return _parse({"effects": [source]} if "name" in source else source, "effects")
+        case Sequence():
+            return _compose_entries(source)
+    raise InputError(f"effects = {source!r}: expected a path, a mapping or a list of effects")
+
+
+def compose(*patches: Patch) -> Patch:
+    """Return one patch with the effects of all, in order."""
+    given = [patch for patch in patches if patch.effects or patch.provenance]
+    if len(given) == 1:
+        return given[0]
+    effects = tuple(effect for patch in given for effect in patch.effects)
+    origins = [{"source": patch.source, **patch.provenance} for patch in given if patch.provenance]
+    sources = dict.fromkeys(patch.source for patch in given)
+    return Patch(effects, {"composed_of": origins} if origins else {}, ", ".join(sources))
+
+
+def _compose_entries(entries: Sequence[Any]) -> Patch:
+    patches: list[Patch] = []
+    for index, entry in enumerate(entries):
+        if isinstance(entry, Patch | str | Path) or (isinstance(entry, Mapping) and "effects" in entry):
+            patches.append(load_patch(entry))
+        else:
+            patches.append(Patch((_parse_effect(entry, "effects", index),), source="effects"))
+    return compose(*patches)
+
+
+def save_patch(patch: Patch, path: str | Path) -> Path:
+    """Write a patch as YAML; :func:`load_patch` reads back the same effects."""
+    text = yaml.dump(patch.content(), Dumper=_Dumper, sort_keys=False)  # in ASCII: PyYAML loses U+0085 and its kin otherwise
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    return path
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes text that :func:`wlr_gym.base.settings.read_yaml` would take for a number, such as the commit 12345e6."""
+
+
+_Dumper.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
+
+
+def apply_patch(patch: Patch, parameters: Parameters) -> Parameters:
+    """Return ``parameters`` with every effect added; kinds act in the order of :data:`wlr_gym.physics.effects.effect.STAGES`.
+
+    Formulas are no parameters: the plant takes them as ``forces=patch.forces``.
+
+    Raises:
+        InputError: an effect that these parameters cannot take, or a result outside the bounds of the table.
+    """
+    patched = parameters.copy()
+    for effect in sorted(patch.effects, key=lambda effect: stage(effect.name)):
+        if effect.name == UNKNOWN_EFFECT:
+            continue
+        try:
+            EFFECTS[effect.name].apply(patched, effect.where, effect.parameters)
+            patched.validate()
+        except InputError as error:
+            raise InputError(f"{effect.place or effect.name}: {error}") from None
+    return patched
+
+
+# ---- reading ---------------------------------------------------------------------------------------------------------
+
+
+def _parse(data: Any, source: str) -> Patch:
+    if not isinstance(data, Mapping):
+        raise InputError(f"{source}: expected a mapping with 'effects', got {type(data).__name__}")
+    _require_keys(data, ("effects", "provenance"), source)
+    effects, provenance = data.get("effects"), data.get("provenance") or {}
+    if not isinstance(effects, list | tuple):
+        raise InputError(f"{source}: 'effects' must be a list of effects, got {type(effects).__name__}")
+    if not isinstance(provenance, Mapping):
+        raise InputError(f"{source}: 'provenance' must be a mapping, got {type(provenance).__name__}")
+    return Patch(tuple(_parse_effect(entry, source, index) for index, entry in enumerate(effects)), dict(provenance), source)
+
+
+def _parse_effect(entry: Any, source: str, index: int) -> PatchEffect:
+    if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
+        raise InputError(
+            f"{source}: effect {index + 1}: expected a mapping with 'name', 'where' and 'parameters', got {entry!r}"
+        )
+    name = entry["name"]
+    place = f"{source}: effect {index + 1} ({name})"
+    if name == UNKNOWN_EFFECT:
+        _require_keys(entry, KEYS, place)
+        return parse_formula(entry, _parse_where(entry.get("where"), PLACES, place), place)
+    if name not in EFFECTS:
+        raise unknown_name("effect", name, [*EFFECTS, UNKNOWN_EFFECT], f"{source}: effect {index + 1}")
+    effect = EFFECTS[name]
+    _require_keys(entry, ("name", "where", "parameters"), place)
+    where = _parse_where(entry.get("where"), effect.where, place)
+    return PatchEffect(name, where, _parse_parameters(entry, effect, place), place=place)
+
+
+def _parse_where(where: Any, valid: tuple[str, ...], place: str) -> tuple[str, ...]:
+    if where is None and len(valid) == 1:
+        return valid
+    where = [where] if isinstance(where, str) else where
+    if not isinstance(where, list | tuple) or not where:
+        raise InputError(f"{place}: where = {where!r}: expected a list of {', '.join(valid)}")
+    for name in where:
+        if name not in valid:
+            raise unknown_name("where", str(name), valid, place)
+    if len(set(where)) < len(where):
+        raise InputError(f"{place}: where = {list(where)}: a place occurs twice")
+    return tuple(where)
+
+
+def _parse_parameters(entry: Mapping[str, Any], effect: Effect, place: str) -> dict[str, float]:
+    given = entry.get("parameters") or {}
+    if not isinstance(given, Mapping):
+        raise InputError(f"{place}: 'parameters' must be a mapping of {', '.join(effect.parameters)}, got {given!r}")
+    _require_keys(given, effect.parameters, place)
+    return {name: _number(given.get(name), name, spec, place) for name, spec in effect.parameters.items()}
+
+
+def _number(value: Any, name: str, spec: EffectParameter, place: str) -> float:
+    if value is None and spec.optional:
+        return float(spec.neutral)
+    if value is None:
+        raise InputError(f"{place}: parameter '{name}' ({unit_in_words(spec.unit)}) is missing")
+    number = finite_number(value)
+    if number is None:
+        raise InputError(f"{place}: {name} = {value!r}: expected a finite number ({unit_in_words(spec.unit)})")
+    if not spec.low <= number <= spec.high:
+        raise InputError(f"{place}: {name} = {number:g} is outside {range_in_words(spec.low, spec.high, spec.unit)}")
+    return number
+
+
+def _require_keys(data: Mapping[str, Any], valid: Sequence[str] | Mapping[str, Any], place: str) -> None:
+    for key in data:
+        if key not in valid:
+            raise unknown_name("key", str(key), valid, place)

@@ -1,0 +1,63 @@
+"""Plants: what can be driven. Simulators here; the real robot joins through the same contract (``base.Plant``).
+
+Its room, ``hardware``, lies above this one: it is looked up by name when it is asked for, and never imported.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from typing import Any
+
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.physics.plants.base import Plant, PlantOptions, RobotOptions
+from wlr_gym.physics.plants.forces import Force
+from wlr_gym.robot import Robot
+
+#: Backend -> "module:class", imported when it is first made.
+BACKENDS = {
+    "gibbs_appell": "wlr_gym.physics.plants.gibbs_appell.plant:GibbsAppellPlant",
+    "mujoco": "wlr_gym.physics.plants.mujoco.plant:MujocoPlant",
+    "dynamixel": "wlr_gym.hardware.plant:RobotPlant",
+}
+#: Backends that are no simulators: the real robot.
+REAL = ("dynamixel",)
+SIMULATORS = tuple(name for name in BACKENDS if name not in REAL)
+
+
+def make_plant(
+    backend: str,
+    robot: Robot,
+    count: int,
+    options: PlantOptions | None = None,
+    forces: Sequence[Force] = (),
+    hardware: RobotOptions | None = None,
+) -> Plant:
+    """Make a plant by backend name.
+
+    Args:
+        backend: one of :data:`BACKENDS`.
+        robot: the robot.
+        count: number of robots.
+        options: step sizes, precision, threads.
+        forces: formula forces that act on every robot (simulators only).
+        hardware: which real robot, and how it is connected (``dynamixel`` only).
+
+    Raises:
+        InputError: unknown backend (the message lists the valid ones), impossible robot, bad options.
+    """
+    check_backend(backend)
+    module, _, name = BACKENDS[backend].partition(":")
+    given: dict[str, Any] = {"forces": tuple(forces)} if forces else {}
+    if hardware is not None:
+        given["hardware"] = hardware
+    for word, fits in (("forces", SIMULATORS), ("hardware", REAL)):
+        if word in given and backend not in fits:
+            raise InputError(f"backend '{backend}' takes no {word}; {', '.join(fits)} would")
+    return getattr(importlib.import_module(module), name)(robot, count, options, **given)
+
+
+def check_backend(backend: str) -> None:
+    """Raise :class:`InputError` for a backend that does not exist, before anything is made or written for it."""
+    if backend not in BACKENDS:
+        raise unknown_name("backend", backend, BACKENDS)

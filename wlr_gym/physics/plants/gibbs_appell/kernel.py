@@ -1,0 +1,249 @@
+"""Trace the step into numba kernels over tiles of robots: robots innermost, one flat scratch array, no branches.
+
+A tile holds ``width`` robots side by side (8 float64 or 16 float32 lanes fill a vector register; 1 for a single robot). The
+arithmetic is strict IEEE with explicit fused multiply-adds, so a robot's result does not depend on the tile width, on the
+robots beside it, or on the number of threads.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Iterator, Mapping
+from types import ModuleType
+from typing import Any
+
+from wlr_gym.physics import servo
+from wlr_gym.physics.codegen import Graph, Node, emit, graph, hoist, live_nodes, load_module, ops
+from wlr_gym.physics.model import equations
+from wlr_gym.physics.plants import drive, ground
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT
+from wlr_gym.physics.plants.gibbs_appell import packing
+from wlr_gym.physics.plants.gibbs_appell import step as source
+from wlr_gym.physics.plants.gibbs_appell.packing import PARAMETER_LANES
+from wlr_gym.physics.plants.gibbs_appell.step import FORMULA_INPUTS, FORMULA_OUTPUTS, INPUTS, STORED, TICK_SUMS
+from wlr_gym.physics.plants.sensors import RAW_LAYOUT
+
+WIDTH = {"float64": 8, "float32": 16}
+
+_FIXED = frozenset(INPUTS + PARAMETER_LANES + ("step",))
+
+
+class _Lanes(Mapping[str, Any]):
+    """Lanes as graph inputs, except those already known to be plain numbers or parameters."""
+
+    def __init__(self, owner: Graph, known: Mapping[str, Any] | None = None) -> None:
+        self._owner = owner
+        self._known = dict(known or {})
+
+    def __getitem__(self, name: str) -> Any:
+        return self._known[name] if name in self._known else self._owner.input(name)
+
+    def __iter__(self) -> Iterator[str]:
+        raise TypeError("lanes are read by name")
+
+    def __len__(self) -> int:
+        raise TypeError("lanes are read by name")
+
+
+def trace(features: frozenset[str]) -> dict[str, dict[str, Any]]:
+    """Trace all blocks: name -> outputs. ``prepare`` holds what depends on parameters and inputs alone."""
+    owner = Graph()
+    lanes = _Lanes(owner)
+    step, time = owner.input("step"), owner.input("time")
+    setup = source.kick_setup(lanes, time, step, features)
+    known = {name: value for name, value in setup.items() if _is_known(value) and name not in STORED}
+    inner = _Lanes(owner, known)
+    blocks = {
+        "setup": {name: value for name, value in setup.items() if name not in known},
+        "sweep": source.kick_sweep(inner, features),
+        "finish": source.kick_finish(inner, step, features),
+    }
+    prepare: dict[str, Any] = {}
+    for name in blocks:
+        blocks[name], hoisted = hoist(blocks[name], _FIXED.__contains__, f"{name}_constant")
+        prepare |= hoisted
+    blocks["setup"] = _without_unread(blocks["setup"], blocks["sweep"], blocks["finish"])
+    if "forces" in features:
+        blocks["sense"] = source.sense(lanes, step, features)
+    return {
+        "prepare": prepare,
+        "drift": source.drift(lanes, owner.input("duration"), features),
+        **blocks,
+        "observe": source.observe(lanes, step, features),
+    }
+
+
+def _is_known(value: Any) -> bool:
+    """Tell whether a value is a plain number or a parameter, which the other blocks can read where it is."""
+    return not isinstance(value, Node) or (value.op == "input" and value.operands[0] in _FIXED)
+
+
+def _without_unread(outputs: dict[str, Any], *readers: dict[str, Any]) -> dict[str, Any]:
+    read = {node.operands[0] for block in readers for node in live_nodes(block.values()) if node.op == "input"}
+    return {name: value for name, value in outputs.items() if name in read or name in STORED}
+
+
+OUTPUTS: tuple[str, ...] = tuple(source.observe(_Lanes(Graph()), 1.0, frozenset()))
+_SCALARS = ("step", "time", "duration")
+
+
+def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
+    """Return the module of the step's blocks for one set of effect families, precision and tile width, and its driver.
+
+    With formula forces the driver is a module of its own (:func:`driver_source`): a new formula leaves the blocks as they are.
+    """
+    blocks = trace(features)
+    start = _places(blocks, width)
+
+    def load(name: str) -> str:
+        return name if name in _SCALARS else f"w[{start[name]} + k]"
+
+    def constant(value: float) -> str:
+        return f"F({value!r})" if precision == "float32" else (repr(value) if value >= 0 else f"({value!r})")
+
+    lines = [f"F = np.{precision}", ""]
+    for block, outputs in blocks.items():
+        used = {node.operands[0] for node in live_nodes(outputs.values()) if node.op == "input"}
+        arguments = ", ".join(["W", *(name for name in _SCALARS if name in used)])
+        body = emit(outputs, load, lambda name, text: f"w[{start[name]} + k] = {text}", " " * 8, constant, fused=True)
+        lines += [
+            _DECORATOR,
+            f"def {block}({arguments}):",
+            "    whole_registers()",
+            "    w = numbers_of(W)",
+            f"    for k in range({width}):",
+            *body,
+            "",
+        ]
+    return "\n".join(lines) + ("" if "forces" in features else _driver(start, width))
+
+
+def driver_source(features: frozenset[str], precision: str, width: int, blocks: str, formulas: str) -> str:
+    """Return the driver module that steps the blocks of module ``blocks`` under the formula forces of module ``formulas``."""
+    traced = trace(features)
+    imports = f"from {blocks} import {', '.join(traced)}\nfrom {formulas} import evaluate\nF = np.{precision}\n"
+    return imports + _driver(_places(traced, width), width, _APPLY_FORMULAS)
+
+
+def _places(blocks: Mapping[str, Mapping[str, Any]], width: int) -> dict[str, int]:
+    """Where each lane starts in the flat scratch array."""
+    formula = (*FORMULA_INPUTS, *FORMULA_OUTPUTS) if "sense" in blocks else ()
+    names = dict.fromkeys([*STORED, *INPUTS, *PARAMETER_LANES, *blocks["prepare"], *blocks["setup"], *OUTPUTS, *formula])
+    return {name: index * width for index, name in enumerate(names)}
+
+
+def _driver(start: Mapping[str, int], width: int, apply_formulas: str = "") -> str:
+    values = {
+        "width": width,
+        "scratch": len(start) * width,
+        "stored": len(STORED) * width,
+        "inputs": start[INPUTS[0]],
+        "parameters": start[PARAMETER_LANES[0]],
+        "parameter_count": len(PARAMETER_LANES) * width,
+        "truth": start[OUTPUTS[0]],
+        "truth_count": TRUTH_LAYOUT.width,
+        "raw": start[OUTPUTS[TRUTH_LAYOUT.width]],
+        "raw_count": RAW_LAYOUT.width - 1,
+        "cosine": start["heading_cosine"],
+        "sine": start["heading_sine"],
+        "sums": start[TICK_SUMS[0]],
+        "sum_count": len(TICK_SUMS) * width,
+        "decorator": _DECORATOR,
+        "sensed": start.get(FORMULA_INPUTS[0]),
+        "sensed_count": len(FORMULA_INPUTS),
+        "formula": start.get(FORMULA_OUTPUTS[0]),
+        "formula_count": len(FORMULA_OUTPUTS),
+    }
+    return _DRIVER.format(**values, apply_formulas=apply_formulas.format(**values))
+
+
+_DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
+_APPLY_FORMULAS = """
+            sense(W)
+            seen = W[{sensed} : {sensed} + {sensed_count} * {width}].reshape({sensed_count}, {width})
+            pushes = W[{formula} : {formula} + {formula_count} * {width}].reshape({formula_count}, {width})
+            evaluate(seen, formula_values[tile], memory[tile], pushes, step)"""
+_DRIVER = """
+{decorator}
+def scatter(W, TRUTH, RAW, tile, count):
+    for k in range(min({width}, count - tile * {width})):
+        row = tile * {width} + k
+        for c in range({truth_count}):
+            TRUTH[row, c] = W[{truth} + c * {width} + k]
+        for c in range({raw_count}):
+            RAW[row, c] = W[{raw} + c * {width} + k]
+        RAW[row, {raw_count}] = math.atan2(W[{sine} + k], W[{cosine} + k])
+
+
+{decorator}
+def tick(
+    X, P, goals, old_goals, switch_time, on, formula_values, memory, TRUTH, RAW, first, last, count, step, substeps, sweeps
+):
+    whole_registers()
+    W = np.zeros({scratch}, F)
+    half = F(0.5) * step
+    for tile in range(first, last):
+        W[:{stored}] = X[tile]
+        W[{parameters}:{parameters} + {parameter_count}] = P[tile]
+        W[{sums}:{sums} + {sum_count}] = F(0.0)
+        for k in range({width}):
+            row = min(tile * {width} + k, count - 1)
+            for j in range(8):
+                W[{inputs} + j * {width} + k] = goals[row, j]
+                W[{inputs} + (8 + j) * {width} + k] = old_goals[row, j]
+                W[{inputs} + (16 + j) * {width} + k] = switch_time[row, j]
+                W[{inputs} + (24 + j) * {width} + k] = on[row, j]
+        prepare(W, step)
+        drift(W, half)
+        for s in range(substeps):{apply_formulas}
+            setup(W, step, (F(s) + F(0.5)) * step)
+            for _ in range(sweeps):
+                sweep(W)
+            finish(W, step)
+            drift(W, step if s + 1 < substeps else half)
+        observe(W, step)
+        scatter(W, TRUTH, RAW, tile, count)
+        X[tile] = W[:{stored}]
+
+
+{decorator}
+def look(X, P, TRUTH, RAW, tiles, count, step):
+    whole_registers()
+    W = np.zeros({scratch}, F)
+    for tile in tiles:
+        W[:{stored}] = X[tile]
+        W[{parameters}:{parameters} + {parameter_count}] = P[tile]
+        observe(W, step)
+        scatter(W, TRUTH, RAW, tile, count)
+"""
+
+
+def load_kernel(features: frozenset[str], precision: str, width: int, formulas: str | None = None) -> ModuleType:
+    """Load (first use: generate and compile) the kernel module for a set of effect families.
+
+    Args:
+        features: families; holds ``forces`` exactly when there are formulas.
+        precision: ``float64`` or ``float32``.
+        width: robots side by side.
+        formulas: name of the module of compiled formula forces (``wlr_gym.physics.plants.forces``).
+    """
+    tag = "_".join(["gibbs_appell", precision, str(width), *sorted(features)])
+    message = (
+        f"wlr_gym: compiling the Gibbs-Appell engine ({precision}, {width} robots side by side); "
+        "about 15 s, once on this machine"
+    )
+    blocks = load_module(tag, lambda: kernel_source(features, precision, width), message, _SOURCE_KEY)
+    if formulas is None:
+        return blocks
+    names = (blocks.__name__, formulas)
+    return load_module(
+        f"{tag}_driver", lambda: driver_source(features, precision, width, *names), key="\0".join([_SOURCE_KEY, *names])
+    )
+
+
+#: Read at import, so that the key always tells of the code that is loaded.
+_SOURCE_KEY = "\0".join(
+    inspect.getsource(module)
+    for module in (source, equations, servo, drive, ground, packing, sys.modules[__name__], ops, graph)
+)

@@ -1,0 +1,257 @@
+"""The Gibbs-Appell engine as a Plant: batches of robots stepped by compiled kernels."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
+from wlr_gym.physics.plants import drive, ground
+from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors
+from wlr_gym.physics.plants.forces import MEMORY, Force, compile_forces
+from wlr_gym.physics.plants.gibbs_appell import kernel, packing
+from wlr_gym.physics.plants.gibbs_appell.step import STORED
+from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
+from wlr_gym.robot import Robot
+from wlr_gym.robot.parameters import Parameters
+
+Array = NDArray[np.float64]
+
+#: Passes over the friction rows per substep; see docs/physics.md for the study behind it.
+SWEEPS = 4
+#: Below this many tiles per thread, waking a thread costs more than it saves.
+TILES_PER_THREAD = 8
+_LANE = {name: index for index, name in enumerate(STORED)}
+_ROTOR_LEAD = [_LANE[f"rotor_lead{j}"] for j in range(8)]
+_ROTOR_RATE = [_LANE[f"rotor_rate{j}"] for j in range(8)]
+
+
+class GibbsAppellPlant(Simulator):
+    """Batch of robots on the Gibbs-Appell engine; see :class:`wlr_gym.physics.plants.base.Plant` for the contract.
+
+    Args:
+        robot: the robot; its nominal parameters are used until ``reset`` gets others.
+        count: number of robots.
+        options: step size, precision, threads.
+        forces: formula forces that act beside what the parameters say.
+        sweeps: passes over the friction rows per substep.
+
+    Raises:
+        InputError: a physically impossible robot, bad options.
+    """
+
+    capabilities = Capabilities("gibbs_appell", has_truth=True, can_set_state=True, real_time=False)
+
+    def __init__(
+        self,
+        robot: Robot,
+        count: int = 1,
+        options: PlantOptions | None = None,
+        forces: Sequence[Force] = (),
+        *,
+        sweeps: int = SWEEPS,
+    ) -> None:
+        super().__init__(robot, count, options)
+        self.sweeps = sweeps
+        if self.options.precision not in kernel.WIDTH:
+            raise InputError(
+                f"precision '{self.options.precision}'{nearest(self.options.precision, kernel.WIDTH)}; "
+                f"valid: {', '.join(kernel.WIDTH)}"
+            )
+        self._float = np.dtype(self.options.precision).type
+        self._step = self._float(self.options.physics_step)
+        self._width = 1 if count == 1 else kernel.WIDTH[self.options.precision]
+        self._tiles = -(-count // self._width)
+        self._lanes = np.zeros((self._tiles, len(STORED) * self._width), self._float)
+        self._constants = np.zeros((self._tiles, len(packing.PARAMETER_LANES) * self._width), self._float)
+        self._torque_on = np.ones((count, 8))
+        self._pool = self._make_pool()
+        self._formulas = compile_forces(forces, self.options.precision) if forces else None
+        values = self._formulas.values if self._formulas else np.zeros(0)
+        self.set_force_values(np.tile(values, (count, 1)))
+        self._memory = np.zeros((self._tiles, len(MEMORY), self._width), self._float)
+        self._features: frozenset[str] | None = None
+        self._start()
+
+    def _make_pool(self) -> ThreadPoolExecutor | None:
+        self._chunks = self._shared_out(self._tiles)
+        if len(self._chunks) < 2:
+            return None
+        return ThreadPoolExecutor(len(self._chunks) - 1, thread_name_prefix="wlr-engine")
+
+    def _shared_out(self, tiles: int) -> list[tuple[int, int]]:
+        """First and last of the tiles of each thread."""
+        threads = max(1, min(self.options.threads, tiles // TILES_PER_THREAD))
+        return list(itertools.pairwise(np.linspace(0, tiles, threads + 1).astype(int).tolist()))
+
+    # ---- parameters and state ----
+
+    def _use_parameters(self, rows: NDArray[np.intp], chosen: Parameters) -> None:
+        _scatter(self._constants, self._width, rows, packing.pack(chosen, self.robot, self.options.physics_step))
+        self._pad(self._constants)
+        self._choose_kernel()
+
+    def _look(self, rows: NDArray[np.intp]) -> None:
+        tiles = np.unique(rows // self._width)
+        self._kernel.look(self._lanes, self._constants, self._truth.values, self._raw, tiles, self._count, self._step)
+
+    def _fit_rotors(self, rows: NDArray[np.intp], chosen: Parameters) -> None:
+        old, new = self.parameters["servo.backlash"][rows], chosen["servo.backlash"]
+        if (old == new).all():
+            return
+        lanes = _gather(self._lanes, self._width, rows).astype(np.float64)
+        lanes[:, _ROTOR_LEAD] = refitted_lead(lanes[:, _ROTOR_LEAD], old, new)
+        turning = self._truth.joint_velocity[rows]
+        lanes[:, _ROTOR_RATE] = np.where((old == 0.0) & (new > 0.0), turning, lanes[:, _ROTOR_RATE])
+        _scatter(self._lanes, self._width, rows, lanes)
+
+    def _choose_kernel(self) -> None:
+        features = drive.families(self.parameters) | ground.families(self.parameters)
+        if self._formulas:
+            features.add("forces")
+        if "creep" in features:  # its line search rounds otherwise beside rotors with play: the same bits with and without them
+            features.add("backlash")
+        if self._features is None or not features <= self._features:
+            self._features = frozenset(features | (self._features or frozenset()))
+            formulas = self._formulas.module if self._formulas else None
+            self._kernel = kernel.load_kernel(self._features, self.options.precision, self._width, formulas)
+
+    def _pad(self, lanes: Array) -> None:
+        """Fill the unused places of the last tile with copies of robot 0, so that they stay finite."""
+        spare = np.arange(self._count, self._tiles * self._width)
+        if spare.size:
+            _scatter(lanes, self._width, spare, np.repeat(_gather(lanes, self._width, np.array([0])), spare.size, axis=0))
+
+    def _write_state(self, state: PlantState, rows: NDArray[np.intp]) -> None:
+        values = np.zeros((rows.size, len(STORED)))
+        quaternion = state.quaternion[rows] / np.linalg.norm(state.quaternion[rows], axis=1, keepdims=True)
+        w = state.angular_velocity_in_body[rows]
+        leg_rate = state.joint_velocity[rows, :4] + w[:, 1:2]
+        wheel_rate = state.joint_velocity[rows, 4:] + leg_rate
+        zero_offset = np.zeros((rows.size, 8))
+        zero_offset[:, :4] = self.parameters["joint.zero_offset"][rows]
+        reference = state.reference_position[rows] + zero_offset
+        groups = {
+            "p{}": (state.position[rows], "xyz"),
+            "q{}": (quaternion, "wxyz"),
+            "v{}": (state.linear_velocity_in_body[rows], "xyz"),
+            "w{}": (w, "xyz"),
+            "last_w{}": (w, "xyz"),
+            "gyro_{}": (w, "xyz"),
+            "leg_angle{}": (state.joint_position[rows, :4], range(4)),
+            "wheel_angle{}": (state.joint_position[rows, 4:], range(4)),
+            "leg_rate{}": (leg_rate, range(4)),
+            "last_leg_rate{}": (leg_rate, range(4)),
+            "wheel_rate{}": (wheel_rate, range(4)),
+            "last_wheel_rate{}": (wheel_rate, range(4)),
+            "reference_position{}": (reference, range(8)),
+            "reference_velocity{}": (state.reference_velocity[rows], range(8)),
+            "rotor_rate{}": ((state.joint_velocity if state.rotor_rate is None else state.rotor_rate)[rows], range(8)),
+        }
+        if state.rotor_lead is not None:
+            groups["rotor_lead{}"] = (state.rotor_lead[rows], range(8))
+        if state.supply_drop is not None:
+            groups["supply_drop{}"] = (state.supply_drop[rows, None], ("",))
+        for pattern, (columns, labels) in groups.items():
+            for k, label in enumerate(labels):
+                values[:, _LANE[pattern.format(label)]] = columns[:, k]
+        if not np.isfinite(values).all():
+            raise InputError("state holds numbers that are not finite")
+        still = -np.einsum("nji,nj->ni", rotation_matrix(quaternion), gravity_in_floor(self.parameters)[rows])
+        for k, axis in enumerate("xyz"):
+            values[:, _LANE[f"acceleration_{axis}"]] = still[:, k]
+        _scatter(self._lanes, self._width, rows, values)
+        self._pad(self._lanes)
+        wound = np.zeros((rows.size, 8)) if state.wind_up is None else state.wind_up[rows]
+        _scatter(self._memory, self._width, rows, wound, slice(1, None))
+
+    def get_state(self) -> PlantState:
+        """Return a copy of the mechanical and servo state."""
+        values = _gather(self._lanes, self._width, np.arange(self._count)).astype(np.float64)
+
+        def columns(pattern: str, labels: object) -> Array:
+            return np.stack([values[:, _LANE[pattern.format(label)]] for label in labels], axis=1)  # type: ignore[union-attr]
+
+        reference = columns("reference_position{}", range(8))
+        reference[:, :4] -= self.parameters["joint.zero_offset"]
+        has_play = self.parameters["servo.backlash"] > 0.0
+        return PlantState(
+            position=columns("p{}", "xyz"),
+            quaternion=columns("q{}", "wxyz"),
+            linear_velocity_in_body=columns("v{}", "xyz"),
+            angular_velocity_in_body=columns("w{}", "xyz"),
+            joint_position=self._truth.joint_position.copy(),
+            joint_velocity=self._truth.joint_velocity.copy(),
+            reference_position=reference,
+            reference_velocity=columns("reference_velocity{}", range(8)),
+            rotor_lead=np.where(has_play, columns("rotor_lead{}", range(8)), 0.0),
+            rotor_rate=np.where(has_play, columns("rotor_rate{}", range(8)), self._truth.joint_velocity),
+            supply_drop=values[:, _LANE["supply_drop"]],
+            time=self._time.copy(),
+            wind_up=_gather(self._memory, self._width, self._all)[:, 1:].astype(np.float64),
+        )
+
+    def expect_all_effects(self) -> None:
+        """Compile for every family of effects; see :class:`wlr_gym.physics.plants.simulator.Simulator`."""
+        self._features = frozenset({"rolling_resistance", "drive", "backlash", "ground", "creep"}) | (self._features or set())
+        formulas = self._formulas.module if self._formulas else None
+        self._kernel = kernel.load_kernel(self._features, self.options.precision, self._width, formulas)
+
+    def set_force_values(self, values: Array) -> None:
+        """Take the constants of the formula forces per robot; see :class:`wlr_gym.physics.plants.simulator.Simulator`."""
+        padded = np.vstack([values, np.repeat(values[:1], self._tiles * self._width - self._count, axis=0)])
+        shape = (self._tiles, self._width, values.shape[1])
+        self._formula_values = np.ascontiguousarray(padded.reshape(shape).transpose(0, 2, 1), self._float)
+
+    # ---- stepping ----
+
+    def keep_going(self, count: int) -> None:
+        """Leave the tiles without any of the first ``count`` robots; see ``Simulator.keep_going``."""
+        going = -(-count // self._width)
+        self._chunks = [(0, going)] if self._pool is None else self._shared_out(going)
+
+    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+        """Advance one control tick; see :meth:`wlr_gym.physics.plants.base.Plant.step`.
+
+        Raises:
+            InputError: wrong shape or a non-finite goal of a motor that is on.
+        """
+        inputs = (*self._take_goals(goals, torque_on, self._torque_on), self._torque_on, self._formula_values, self._memory)
+        if self._formulas:  # in full precision: single precision would lose it step by step
+            _scatter(self._memory, self._width, self._all, self._time[:, None], slice(0, 1))
+        arguments = (self._lanes, self._constants, *inputs, self._truth.values, self._raw)
+        if self._pool is None:
+            self._run(arguments, *self._chunks[0])
+        else:
+            waiting = [self._pool.submit(self._run, arguments, *chunk) for chunk in self._chunks[1:]]
+            self._run(arguments, *self._chunks[0])
+            for future in waiting:
+                future.result()
+        self._time += self.options.control_period
+        return self._readings
+
+    def _run(self, arguments: tuple[Array, ...], first: int, last: int) -> None:
+        self._kernel.tick(*arguments, first, last, self._count, self._step, self.substeps, self.sweeps)
+        self._sensors.measure(self._raw, self._readings.values, first * self._width, min(last * self._width, self._count))
+
+    def close(self) -> None:
+        """Stop the worker threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+            self._chunks = [(0, self._tiles)]
+
+
+def _scatter(lanes: Array, width: int, rows: NDArray[np.intp], values: Array, which: slice = slice(None)) -> None:
+    tiles, places = np.divmod(rows, width)
+    lanes.reshape(lanes.shape[0], -1, width)[:, which][tiles, :, places] = values
+
+
+def _gather(lanes: Array, width: int, rows: NDArray[np.intp]) -> Array:
+    tiles, places = np.divmod(rows, width)
+    return lanes.reshape(lanes.shape[0], -1, width)[tiles, :, places]

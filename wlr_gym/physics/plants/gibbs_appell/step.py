@@ -1,0 +1,804 @@
+"""One time step of the engine, written once as generic scalar arithmetic; ``kernel.py`` traces it into compiled code.
+
+Quasi-velocities: body-frame velocity of the body origin v (3), body-frame angular velocity w (3), absolute leg pitch
+rates (4), absolute wheel spin rates (4). The world frame is the floor frame; on a slope gravity is inclined.
+
+The step (drift - kick - drift, Moreau's midpoint rule):
+
+1. positions drift half a step with the old velocities;
+2. the kick solves Gauss's principle at the middle position: the new velocities minimise the Gibbs function's quadratic
+   form 1/2 (u - u*)' M (u - u*) + h D(u), where u* is the free motion and D the Coulomb dissipation of the four contacts
+   (elliptic, in each wheel's heading frame), the eight gear frictions and rolling resistance. Minimised by exact block
+   coordinate descent: 2x2 per contact, 1x1 per joint, warm started;
+3. positions drift half a step with the new velocities.
+
+Velocity-dependent inertia terms use the velocities extrapolated to the middle of the step, which makes smooth motion
+second order. Normal forces come from the contact spring at the middle position and are therefore known before friction is
+solved, so that the friction problem is convex and has one solution. Back-EMF and viscous friction are implicit with an
+exponentially fitted weight: a free motor follows its closed form exactly at any step.
+
+Every function maps a dictionary of lanes (state, parameters, inputs; each a scalar) to new lanes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.model.equations import assembly_terms, platform_terms
+from wlr_gym.physics.plants import drive, ground
+from wlr_gym.physics.plants.forces import COORDINATES
+from wlr_gym.physics.plants.forces import INPUTS as INPUTS_OF_FORMULAS
+from wlr_gym.robot import JOINTS
+
+Value = Any
+Lanes = Mapping[str, Value]
+Out = dict[str, Value]
+Vector = list[Value]
+
+CORNERS = range(4)
+AXES = "xyz"
+
+STATE: tuple[str, ...] = (
+    *(f"p{a}" for a in AXES),
+    *(f"q{a}" for a in "wxyz"),
+    *(f"v{a}" for a in AXES),
+    *(f"w{a}" for a in AXES),
+    *(f"leg_angle{i}" for i in CORNERS),
+    *(f"wheel_angle{i}" for i in CORNERS),
+    *(f"leg_rate{i}" for i in CORNERS),
+    *(f"wheel_rate{i}" for i in CORNERS),
+    *drive.STATE,
+    # what the step remembers: velocities one step ago, impulses of the last step (warm start), sensor filters
+    *(f"last_w{a}" for a in AXES),
+    *(f"last_leg_rate{i}" for i in CORNERS),
+    *(f"last_wheel_rate{i}" for i in CORNERS),
+    *(f"last_gap_rate{i}" for i in CORNERS),
+    *(f"friction_{a}{i}" for i in CORNERS for a in "xy"),
+    *(f"multiplier{i}" for i in CORNERS),
+    *(f"gear_friction{j}" for j in range(8)),
+    *(f"rolling_friction{i}" for i in CORNERS),
+    *(f"gyro_{a}" for a in AXES),
+    *(f"acceleration_{a}" for a in AXES),
+)
+#: Results of the last substep or of the whole tick, kept with the state for the observation block.
+RESULTS: tuple[str, ...] = (
+    *(f"normal{i}" for i in CORNERS),
+    *(f"motor_torque{j}" for j in range(8)),
+    *(f"current_torque{j}" for j in range(8)),
+    *(f"slip_displacement_{a}{i}" for i in CORNERS for a in "xy"),
+    "mechanical_energy",
+    "electrical_energy",
+)
+TICK_SUMS: tuple[str, ...] = RESULTS[-10:]
+STORED: tuple[str, ...] = STATE + RESULTS
+#: Written each control tick.
+INPUTS: tuple[str, ...] = (
+    *(f"goal{j}" for j in range(8)),
+    *(f"old_goal{j}" for j in range(8)),
+    *(f"switch_time{j}" for j in range(8)),
+    *(f"on{j}" for j in range(8)),
+)
+
+
+def cross(a: Sequence[Value], b: Sequence[Value]) -> Vector:
+    """Vector product."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def dot(a: Sequence[Value], b: Sequence[Value]) -> Value:
+    """Scalar product."""
+    total: Value = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+def vector(lanes: Lanes, prefix: str) -> Vector:
+    """Read the three lanes ``prefix + x|y|z``."""
+    return [lanes[prefix + a] for a in AXES]
+
+
+def rotation_rows(lanes: Lanes) -> list[Vector]:
+    """Rotation matrix body -> floor as rows, from the unit quaternion."""
+    w, x, y, z = (lanes[f"q{a}"] for a in "wxyz")
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+
+
+def to_body(rows: Sequence[Sequence[Value]], a: Sequence[Value]) -> Vector:
+    """Turn a floor-frame vector into the body frame."""
+    return [rows[0][k] * a[0] + rows[1][k] * a[1] + rows[2][k] * a[2] for k in range(3)]
+
+
+# ---- drift: positions ------------------------------------------------------------------------------------------------
+
+
+def drift(lanes: Lanes, duration: Value, features: frozenset[str] = frozenset()) -> Out:
+    """Move positions for ``duration`` at constant rates; the body-frame velocity turns with the body (Cayley map)."""
+    v, w = vector(lanes, "v"), vector(lanes, "w")
+    rows = rotation_rows(lanes)
+    out: Out = {f"p{a}": lanes[f"p{a}"] + duration * dot(rows[k], v) for k, a in enumerate(AXES)}
+    half = [0.5 * duration * x for x in w]
+    scale = 1.0 / ops.sqrt(1.0 + dot(half, half))
+    e0, e = scale, [scale * x for x in half]
+    q0, q = lanes["qw"], vector(lanes, "q")
+    turned = cross(q, e)
+    new = [q0 * e0 - dot(q, e), *(q0 * e[k] + q[k] * e0 + turned[k] for k in range(3))]
+    norm = 1.5 - 0.5 * dot(new, new)  # one Newton step keeps the quaternion at unit length
+    for name, value in zip("wxyz", new, strict=True):
+        out[f"q{name}"] = value * norm
+    t = [2.0 * x for x in cross(v, e)]  # v in the turned frame: rotate by the inverse increment
+    t2 = cross(t, e)
+    for k, a in enumerate(AXES):
+        out[f"v{a}"] = v[k] + e0 * t[k] + t2[k]
+    for i in CORNERS:
+        out[f"leg_angle{i}"] = lanes[f"leg_angle{i}"] + duration * (lanes[f"leg_rate{i}"] - w[1])
+        out[f"wheel_angle{i}"] = lanes[f"wheel_angle{i}"] + duration * (lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"])
+    if "backlash" in features:
+        for j, joint in enumerate(joints_of(lanes)):
+            out[f"rotor_lead{j}"] = lanes[f"rotor_lead{j}"] + duration * (lanes[f"rotor_rate{j}"] - joint.rate)
+    return out
+
+
+# ---- geometry of the wheels ------------------------------------------------------------------------------------------
+
+
+def floor_axes(rows: Sequence[Sequence[Value]]) -> tuple[Vector, Vector, Vector, Value]:
+    """Floor normal n, wheel heading t_x and lateral axis t_y in the body frame, and 1/|axle x n|.
+
+    All axles are parallel to body y. t_x = (axle x n)/|.|, t_y = n x t_x.
+    """
+    n = rows[2]
+    scale = 1.0 / ops.sqrt(n[0] * n[0] + n[2] * n[2] + 1e-12)
+    heading = [n[2] * scale, 0.0, -(n[0] * scale)]
+    return list(n), heading, cross(n, heading), scale
+
+
+def wheel_points(
+    lanes: Lanes, i: int, sine: Value, cosine: Value, n: Sequence[Value], scale: Value
+) -> tuple[Vector, Vector, Vector]:
+    """Hip, leg vector (hip -> axle) and rim vector (axle -> contact point of the thin disc) of wheel ``i``, body frame."""
+    hip = [lanes[f"hip_{a}{i}"] for a in AXES]
+    leg = [lanes[f"length{i}"] * cosine, 0.0, -(lanes[f"length{i}"] * sine)]
+    reach = lanes[f"radius{i}"] * scale
+    return hip, leg, [-(reach * n[0]), 0.0, -(reach * n[2])]
+
+
+def contact_row(hip: Vector, leg: Vector, rim: Vector, e: Sequence[Value]) -> tuple[Vector, Value]:
+    """Jacobian of the contact point's velocity along ``e``: six base entries and the leg-rate entry.
+
+    The wheel-rate entry is -radius along the heading and zero along the lateral axis and the normal.
+    """
+    point = [hip[0] + leg[0] + rim[0], hip[1], hip[2] + leg[2] + rim[2]]
+    arm = cross(point, e)
+    return [*e, arm[0], hip[2] * e[0] - hip[0] * e[2], arm[2]], leg[2] * e[0] - leg[0] * e[2]
+
+
+# ---- servos ----------------------------------------------------------------------------------------------------------
+
+
+def joints_of(lanes: Lanes) -> list[drive.Joint]:
+    """Return the eight joints as the drive sees them."""
+    joints: list[drive.Joint] = []
+    for i in CORNERS:
+        angle = lanes[f"leg_angle{i}"]
+        joints.append(drive.Joint(angle, lanes[f"leg_rate{i}"] - lanes["wy"], angle + lanes[f"zero_offset{i}"]))
+    for i in CORNERS:
+        angle = lanes[f"wheel_angle{i}"]
+        joints.append(drive.Joint(angle, lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"], angle))
+    return joints
+
+
+# ---- kick: velocities ------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Corner:
+    """One leg with its wheel while the Gauss problem is being set up.
+
+    Attributes:
+        coupling: leg-rate column of the mass matrix against the six base rows.
+        leg_leg, leg_wheel, wheel_wheel: its own 2x2 block.
+        leg_bias, wheel_bias: velocity-dependent inertia terms.
+        hip, leg, rim: geometry in the body frame, see :func:`wheel_points`.
+        block, inverse: the 2x2 block with implicit damping as (11, 12, 22), and its inverse.
+        free: free motion of the pair for a resting base.
+    """
+
+    coupling: Vector
+    leg_leg: Value
+    leg_wheel: Value
+    wheel_wheel: Value
+    leg_bias: Value
+    wheel_bias: Value
+    trig: tuple[Value, Value]
+    hip: Vector = field(default_factory=list)
+    leg: Vector = field(default_factory=list)
+    rim: Vector = field(default_factory=list)
+    block: tuple[Value, Value, Value] = (0.0, 0.0, 0.0)
+    inverse: tuple[Value, Value, Value] = (0.0, 0.0, 0.0)
+    free: tuple[Value, Value] = (0.0, 0.0)
+
+
+def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str]) -> Out:
+    """Build the Gauss problem of one substep: reduced base matrix, free motion, friction rows, impulse bounds."""
+    rows = rotation_rows(lanes)
+    n, heading, lateral, scale = floor_axes(rows)
+    gravity = to_body(rows, vector(lanes, "gravity_"))
+    v, w = vector(lanes, "v"), vector(lanes, "w")
+    u_base = [*(v[k] + step * gravity[k] for k in range(3)), *w]  # uniform gravity accelerates every point alike
+    w_mid = [1.5 * w[k] - 0.5 * lanes[f"last_w{a}"] for k, a in enumerate(AXES)]
+    joints = joints_of(lanes)
+    out, voltages = drive.command(lanes, joints, time, step, features)
+    mass, bias, corners = _inertia(lanes, w_mid)
+
+    momentum: list[Value] = [dot(mass[r], u_base) - step * bias[r] for r in range(6)]
+    _push_of_surroundings(lanes, rows, step, features, momentum)
+    reduced = [row[:] for row in mass]
+    for i, corner in enumerate(corners):
+        leg_rate, wheel_rate = lanes[f"leg_rate{i}"], lanes[f"wheel_rate{i}"]
+        for r in range(6):
+            momentum[r] = momentum[r] + corner.coupling[r] * leg_rate
+        own = [
+            dot(corner.coupling, u_base) + corner.leg_leg * leg_rate + corner.leg_wheel * wheel_rate - step * corner.leg_bias,
+            corner.leg_wheel * leg_rate + corner.wheel_wheel * wheel_rate - step * corner.wheel_bias,
+        ]
+        corner.hip, corner.leg, corner.rim = wheel_points(lanes, i, *corner.trig, n, scale)
+        _push_of_floor(lanes, i, corner, n, [*v, *w], step, momentum, own, out)
+        damping = _push_of_motors(lanes, i, voltages, joints, step, features, momentum, own, out)
+        _friction_under_wheel(lanes, i, corner, (rows, heading, lateral), [*v, *w], features, out)
+        _eliminate(corner, damping, own, momentum, reduced)
+
+    lower, inverse_diagonal = _cholesky(reduced)
+
+    def whiten(b: Vector) -> Vector:
+        x: Vector = []
+        for r in range(6):
+            s = b[r]
+            for k in range(r):
+                s = s - lower[r][k] * x[k]
+            x.append(s * inverse_diagonal[r])
+        return x
+
+    base = whiten(momentum)
+    hinge = whiten([0.0, 0.0, 0.0, 0.0, -1.0, 0.0])
+    for i, corner in enumerate(corners):
+        white = whiten(corner.coupling)
+        for r in range(6):
+            out[f"coupling{i}_{r}"] = corner.coupling[r]
+        out[f"i11_{i}"], out[f"i12_{i}"] = corner.inverse[0], corner.inverse[1]
+        out[f"a11_{i}"], out[f"a12_{i}"], out[f"a22_{i}"] = corner.block
+        out[f"y_leg{i}"], out[f"y_wheel{i}"] = corner.free
+        _warm_start(lanes, i, step, features, out)
+        # friction rows: (base part, leg entry, wheel entry, impulse)
+        local = {
+            f"leg{i}": (hinge, 1.0, 0.0, out[f"share{i}"] * out[f"gear_friction{i}"]),
+            f"wheel{i}": ([0.0] * 6, -1.0, 1.0, out[f"share{4 + i}"] * out[f"gear_friction{4 + i}"]),
+        }
+        if "rolling_resistance" in features:
+            local[f"rolling{i}"] = ([0.0] * 6, 0.0, 1.0, out[f"rolling_friction{i}"])
+        for e, name, wheel_entry in ((heading, "x", -lanes[f"radius{i}"]), (lateral, "y", 0.0)):
+            base_row, leg_entry = contact_row(corner.hip, corner.leg, corner.rim, e)
+            local[f"{name}{i}"] = (whiten(base_row), leg_entry, wheel_entry, out[f"friction_{name}{i}"])
+            out[f"leg_entry_{name}{i}"] = leg_entry
+        _friction_rows(lanes, i, corner, white, local, base, out)
+    for r in range(6):
+        out[f"base{r}"] = base[r]
+        out[f"inverse_diagonal{r}"] = inverse_diagonal[r]
+        for c in range(r):
+            out[f"lower{r}{c}"] = lower[r][c]
+    return out
+
+
+PLATFORM = (
+    "platform_mass",
+    *(f"platform_moment_{a}" for a in AXES),
+    *(f"platform_inertia_{a}" for a in ("xx", "yy", "zz", "xy", "xz", "yz")),
+)
+ASSEMBLY = (
+    *(f"hip_{a}" for a in AXES),
+    "assembly_mass",
+    "first_moment",
+    "second_moment",
+    "leg_ixx",
+    "leg_iyy",
+    "leg_izz",
+    "wheel_transverse",
+    "wheel_spin",
+    "armature_leg",
+    "armature_wheel",
+)
+
+
+def _inertia(lanes: Lanes, w_mid: Vector) -> tuple[list[list[Value]], list[Value], list[_Corner]]:
+    """Mass matrix and bias of the base, and the four corners, from the generated Gibbs-Appell equations."""
+    mass: list[list[Value]] = [[0.0 for _ in range(6)] for _ in range(6)]
+    bias: list[Value] = [0.0] * 6
+    platform_mass, platform_bias = platform_terms(*(lanes[name] for name in PLATFORM), *w_mid)
+    _accumulate(mass, bias, platform_mass, platform_bias)
+    corners: list[_Corner] = []
+    for i in CORNERS:
+        sine, cosine = ops.sin_cos(lanes[f"leg_angle{i}"])
+        mid_rates = [1.5 * lanes[f"{name}{i}"] - 0.5 * lanes[f"last_{name}{i}"] for name in ("leg_rate", "wheel_rate")]
+        arguments = [*(lanes[f"{name}{i}"] for name in ASSEMBLY), sine, cosine, *w_mid, *mid_rates]
+        base_mass, base_bias, coupling, *own = assembly_terms(*arguments)
+        _accumulate(mass, bias, base_mass, base_bias)
+        corners.append(_Corner([coupling.get(r, 0.0) for r in range(6)], *own, trig=(sine, cosine)))
+    return mass, bias, corners
+
+
+def _push_of_floor(
+    lanes: Lanes, i: int, corner: _Corner, n: Vector, twist: Vector, step: Value, momentum: Vector, own: Vector, out: Out
+) -> None:
+    """Add the normal impulse of wheel ``i``."""
+    base_row, leg_entry = contact_row(corner.hip, corner.leg, corner.rim, n)
+    normal, gap_rate = _normal_force(lanes, i, corner, n, dot(base_row, twist) + leg_entry * lanes[f"leg_rate{i}"])
+    out[f"normal{i}"], out[f"last_gap_rate{i}"] = normal, gap_rate
+    for r in range(6):
+        momentum[r] = momentum[r] + (step * normal) * base_row[r]
+    own[0] = own[0] + (step * normal) * leg_entry
+
+
+def _push_of_surroundings(
+    lanes: Lanes, rows: Sequence[Sequence[Value]], step: Value, features: frozenset[str], momentum: Vector
+) -> None:
+    """Add the impulses of external force, tether and formula forces on the body."""
+    pull = [lanes[f"external_{a}"] - lanes["tether_stiffness"] * (lanes[f"p{a}"] - lanes[f"anchor_{a}"]) for a in "xy"]
+    force = to_body(rows, [*pull, 0.0])
+    for k in range(3):
+        momentum[k] = momentum[k] + step * force[k]
+    if "forces" not in features:
+        return
+    on_floor = to_body(rows, [lanes[f"formula_floor_force_{a}"] for a in AXES])
+    for k, (a, turn) in enumerate(zip(AXES, ("roll", "pitch", "yaw"), strict=True)):
+        momentum[k] = momentum[k] + step * (lanes[f"formula_body_force_{a}"] + on_floor[k])
+        momentum[3 + k] = momentum[3 + k] + step * lanes[f"formula_body_torque_{turn}"]
+
+
+def _push_of_motors(
+    lanes: Lanes,
+    i: int,
+    voltages: Vector,
+    joints: Sequence[drive.Joint],
+    step: Value,
+    features: frozenset[str],
+    momentum: Vector,
+    own: Vector,
+    out: Out,
+) -> tuple[Value, Value]:
+    """Add the explicit impulses on both joints of leg ``i``; return their implicit damping (times the step)."""
+    pushes: list[drive.Push] = []
+    for j in (i, 4 + i):
+        pushed = drive.push(lanes, j, voltages[j], joints[j], step, step, features)
+        pushes.append(pushed)
+        out[f"drive{j}"], out[f"friction_bound{j}"] = voltages[j], pushed.bound
+        out |= drive.kept_for_finish(pushed, j)
+    leg, wheel = pushes
+    momentum[4] = momentum[4] - leg.impulse
+    own[0] = own[0] + leg.impulse - wheel.impulse
+    own[1] = own[1] + wheel.impulse
+    if "forces" in features:
+        leg_torque, wheel_torque = (lanes[f"formula_{JOINTS[j]}"] for j in (i, 4 + i))
+        momentum[4] = momentum[4] - step * leg_torque
+        own[0] = own[0] + step * (leg_torque - wheel_torque)
+        own[1] = own[1] + step * wheel_torque
+    return leg.damping, wheel.damping
+
+
+def _friction_under_wheel(
+    lanes: Lanes,
+    i: int,
+    corner: _Corner,
+    axes: tuple[Sequence[Sequence[Value]], Vector, Vector],
+    twist: Vector,
+    features: frozenset[str],
+    out: Out,
+) -> None:
+    """Find the friction coefficients under wheel ``i``, at its place and slip at the start of the kick."""
+    place: list[Value] = [0.0, 0.0]
+    speed: Value = 0.0
+    if "ground" in features:
+        rows, heading, lateral = axes
+        points = (corner.hip, corner.leg, corner.rim)
+        place = contact_place(lanes, rows, points)
+        slip = slip_velocity(lanes, i, points, heading, lateral, twist)
+        speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
+    found = ground.friction(lanes, i, place[0], place[1], speed, features)
+    out[f"acting_mu_x{i}"], out[f"acting_mu_y{i}"] = found.mu_x, found.mu_y
+    out[f"acting_inverse_mu_x{i}"], out[f"acting_inverse_mu_y{i}"] = found.inverse_mu_x, found.inverse_mu_y
+
+
+def contact_place(lanes: Lanes, rows: Sequence[Sequence[Value]], points: tuple[Vector, Vector, Vector]) -> Vector:
+    """Place (x, y) of a contact point on the floor, m."""
+    hip, leg, rim = points
+    point = [hip[k] + leg[k] + rim[k] for k in range(3)]
+    return [lanes[f"p{a}"] + dot(rows[k], point) for k, a in enumerate("xy")]
+
+
+def slip_velocity(
+    lanes: Lanes, i: int, points: tuple[Vector, Vector, Vector], heading: Vector, lateral: Vector, twist: Vector
+) -> Vector:
+    """Velocity of wheel ``i``'s contact point over the floor along heading and axle, at the present rates, m/s."""
+    slip: Vector = []
+    for e, wheel_entry in ((heading, -lanes[f"radius{i}"]), (lateral, 0.0)):
+        base_row, leg_entry = contact_row(*points, e)
+        speed = dot(base_row, twist) + leg_entry * lanes[f"leg_rate{i}"] + wheel_entry * lanes[f"wheel_rate{i}"]
+        slip.append(speed)
+    return slip
+
+
+def _eliminate(
+    corner: _Corner, damping: tuple[Value, Value], own: Vector, momentum: Vector, reduced: list[list[Value]]
+) -> None:
+    """Take leg and wheel out of the system: Schur complement onto the base."""
+    leg_damping, wheel_damping = damping
+    on_base = ops.rounded(leg_damping)  # a constant where the gear is rigid; rounded like one where it has play
+    reduced[4][4] = reduced[4][4] + on_base
+    corner.coupling = [*corner.coupling[:4], corner.coupling[4] - on_base, corner.coupling[5]]
+    a11 = corner.leg_leg + leg_damping + wheel_damping
+    a12 = corner.leg_wheel - wheel_damping
+    a22 = corner.wheel_wheel + wheel_damping
+    determinant = 1.0 / (a11 * a22 - a12 * a12)
+    i11, i12, i22 = a22 * determinant, -(a12 * determinant), a11 * determinant
+    corner.block, corner.inverse = (a11, a12, a22), (i11, i12, i22)
+    corner.free = (i11 * own[0] + i12 * own[1], i12 * own[0] + i22 * own[1])
+    scaled = [i11 * x for x in corner.coupling]
+    for r in range(6):
+        momentum[r] = momentum[r] - corner.coupling[r] * corner.free[0]
+        for c in range(r + 1):
+            reduced[r][c] = reduced[r][c] - scaled[r] * corner.coupling[c]
+
+
+def _friction_rows(
+    lanes: Lanes,
+    i: int,
+    corner: _Corner,
+    white: Vector,
+    local: Mapping[str, tuple[Vector, Value, Value, Value]],
+    base: Vector,
+    out: Out,
+) -> None:
+    """Whitened rows of all friction at one leg, their gains, and the effect of the warm-started impulses."""
+    i11, i12, i22 = corner.inverse
+    for name, (white_base, leg_entry, wheel_entry, impulse) in local.items():
+        on_leg, on_wheel = i12 * wheel_entry, i22 * wheel_entry
+        if not isinstance(wheel_entry, float):  # a constant where both gears are rigid: not to be fused where one has play
+            on_leg, on_wheel = ops.rounded(on_leg), ops.rounded(on_wheel)
+        g_leg = i11 * leg_entry + on_leg
+        g_wheel = i12 * leg_entry + on_wheel
+        z = [white_base[r] - g_leg * white[r] for r in range(6)]
+        gain = dot(z, z) + leg_entry * ops.rounded(g_leg) + wheel_entry * ops.rounded(g_wheel)
+        out[f"g_leg_{name}"], out[f"g_wheel_{name}"] = g_leg, g_wheel
+        for r in range(6):
+            out[f"z_{name}_{r}"] = z[r]
+            base[r] = base[r] + z[r] * impulse
+        out[f"y_leg{i}"] = out[f"y_leg{i}"] + g_leg * impulse
+        out[f"y_wheel{i}"] = out[f"y_wheel{i}"] + g_wheel * impulse
+        out[f"gain_{name}"] = gain
+        if (joint := {"leg": i, "wheel": 4 + i}.get(name[:-1])) is not None:  # friction acts on the rotor, which may have play
+            share = out[f"share{joint}"]
+            gain = share * share * gain + out[f"rotor_gain{joint}"]
+        if name[0] not in "xy":
+            out[f"inverse_gain_{name}"] = 1.0 / gain
+    cross_gain = dot([out[f"z_x{i}_{r}"] for r in range(6)], [out[f"z_y{i}_{r}"] for r in range(6)])
+    own_gain = cross_gain + out[f"leg_entry_x{i}"] * out[f"g_leg_y{i}"]
+    out[f"gain_xy{i}"] = own_gain - lanes[f"radius{i}"] * out[f"g_wheel_y{i}"]
+
+
+def _accumulate(
+    mass: list[list[Value]], bias: list[Value], more_mass: Mapping[tuple[int, int], Value], more_bias: Mapping[int, Value]
+) -> None:
+    for (r, c), value in more_mass.items():
+        mass[r][c] = mass[r][c] + value
+        if r != c:
+            mass[c][r] = mass[c][r] + value
+    for r, value in more_bias.items():
+        bias[r] = bias[r] + value
+
+
+def _normal_force(lanes: Lanes, i: int, corner: _Corner, n: Vector, gap_rate: Value) -> tuple[Value, Value]:
+    """Spring and damper at the middle position, never pulling. Returns the force (N) and the present gap rate (m/s)."""
+    point = [corner.hip[k] + corner.leg[k] + corner.rim[k] for k in range(3)]
+    gap = lanes["pz"] + dot(n, point)
+    mid_rate = gap_rate + lanes[f"look_ahead{i}"] * (gap_rate - lanes[f"last_gap_rate{i}"])
+    push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * mid_rate, 0.0)
+    return ops.where_positive(-gap, push, 0.0), gap_rate
+
+
+def _warm_start(lanes: Lanes, i: int, step: Value, features: frozenset[str], out: Out) -> None:
+    """Start from the last step's impulses, shrunk into this step's bounds: descent must begin at an admissible point."""
+    for j in (i, 4 + i):
+        bound = out[f"friction_bound{j}"]
+        out[f"gear_friction{j}"] = ops.clip(lanes[f"gear_friction{j}"], -bound, bound)
+    if "rolling_resistance" in features:
+        bound = (step * lanes[f"rolling{i}"]) * (lanes[f"radius{i}"] * out[f"normal{i}"])
+        out[f"bound_rolling{i}"] = bound
+        out[f"rolling_friction{i}"] = ops.clip(lanes[f"rolling_friction{i}"], -bound, bound)
+    out[f"bound{i}"] = step * out[f"normal{i}"]
+    x, y = (lanes[f"friction_{a}{i}"] * out[f"acting_inverse_mu_{a}{i}"] for a in "xy")
+    shrink = ops.minimum(out[f"bound{i}"] / ops.sqrt(x * x + y * y + 1e-30), 1.0)
+    for a in "xy":
+        limit = out[f"acting_mu_{a}{i}"] * out[f"bound{i}"]
+        out[f"friction_{a}{i}"] = ops.clip(lanes[f"friction_{a}{i}"] * shrink, -limit, limit)
+
+
+def _cholesky(matrix: list[list[Value]]) -> tuple[list[list[Value]], list[Value]]:
+    """Lower Cholesky factor without its diagonal, and the inverse of the diagonal."""
+    size = len(matrix)
+    lower: list[list[Value]] = [[0.0] * size for _ in range(size)]
+    inverse_diagonal: list[Value] = [0.0] * size
+    for r in range(size):
+        for c in range(r + 1):
+            s = matrix[r][c]
+            for k in range(c):
+                s = s - lower[r][k] * lower[c][k]
+            if r == c:
+                inverse_diagonal[r] = 1.0 / ops.sqrt(s)
+            else:
+                lower[r][c] = s * inverse_diagonal[c]
+    return lower, inverse_diagonal
+
+
+def kick_sweep(lanes: Lanes, features: frozenset[str]) -> Out:
+    """One pass of block coordinate descent over all friction impulses, front axle then rear axle.
+
+    Left and right wheel of an axle are solved from the same starting point and the joint step is scaled to the minimum of
+    the objective along it. The objective is convex, so every pass descends; and a mirrored robot gets mirrored impulses,
+    which solving left before right would not give.
+    """
+    base: Vector = [lanes[f"base{r}"] for r in range(6)]
+    out: Out = {}
+    for left, right in ((0, 1), (2, 3)):
+        sides = [_leg_block(lanes, i, base, features) for i in (left, right)]
+        change = [(sides[0][0][r] - base[r]) + (sides[1][0][r] - base[r]) for r in range(6)]
+        slope, curvature = dot(base, change), dot(change, change)
+        moved = []
+        for i, (_, y, impulses) in zip((left, right), sides, strict=True):
+            start = [lanes[f"y_leg{i}"], lanes[f"y_wheel{i}"]]
+            dy = [y[0] - start[0], y[1] - start[1]]
+            pull = [
+                lanes[f"a11_{i}"] * dy[0] + lanes[f"a12_{i}"] * dy[1],
+                lanes[f"a12_{i}"] * dy[0] + lanes[f"a22_{i}"] * dy[1],
+            ]
+            slope = slope + dot(start, pull)
+            curvature = curvature + dot(dy, pull)
+            more_slope, more_curvature = _beside_the_bodies(lanes, i, impulses, features)
+            slope, curvature = slope + more_slope, curvature + more_curvature
+            moved.append((i, start, dy, impulses))
+        scale = ops.clip(-slope / (curvature + 1e-30), 0.0, 1.0)
+        base = [base[r] + scale * change[r] for r in range(6)]
+        for i, start, dy, impulses in moved:
+            out[f"y_leg{i}"], out[f"y_wheel{i}"] = start[0] + scale * dy[0], start[1] + scale * dy[1]
+            out[f"multiplier{i}"] = impulses.pop(f"multiplier{i}")
+            out |= {name: lanes[name] + scale * (new - lanes[name]) for name, new in impulses.items()}
+    for r in range(6):
+        out[f"base{r}"] = base[r]
+    return out
+
+
+def _leg_block(lanes: Lanes, i: int, base: Vector, features: frozenset[str]) -> tuple[Vector, Vector, Out]:
+    """Solve the friction rows of one leg in turn: gear of the leg, gear of the wheel, rolling resistance, contact."""
+    out: Out = {}
+    y = [lanes[f"y_leg{i}"], lanes[f"y_wheel{i}"]]
+    for name, leg_entry, wheel_entry, j in ((f"leg{i}", 1.0, 0.0, i), (f"wheel{i}", -1.0, 1.0, 4 + i)):
+        old, bound, share = lanes[f"gear_friction{j}"], lanes[f"friction_bound{j}"], lanes[f"share{j}"]
+        z = [lanes[f"z_{name}_{r}"] for r in range(6)]
+        rate = share * (dot(z, base) + leg_entry * y[0] + wheel_entry * y[1])
+        rate = rate + (lanes[f"rotor_free{j}"] + lanes[f"rotor_gain{j}"] * old)
+        new = ops.clip(old - rate * lanes[f"inverse_gain_{name}"], -bound, bound)
+        base, y = _apply(lanes, name, z, share * (new - old), base, y)
+        out[f"gear_friction{j}"] = new
+    if "rolling_resistance" in features:
+        old, bound = lanes[f"rolling_friction{i}"], lanes[f"bound_rolling{i}"]
+        z = [lanes[f"z_rolling{i}_{r}"] for r in range(6)]
+        rate = dot(z, base) + y[1]
+        new = ops.clip(old - rate * lanes[f"inverse_gain_rolling{i}"], -bound, bound)
+        base, y = _apply(lanes, f"rolling{i}", z, new - old, base, y)
+        out[f"rolling_friction{i}"] = new
+    base, y = _contact_block(lanes, i, base, y, features, out)
+    return base, y, out
+
+
+def _beside_the_bodies(lanes: Lanes, i: int, new: Out, features: frozenset[str]) -> tuple[Value, Value]:
+    """Slope and curvature of the objective along a joint step that the bodies' motion does not show.
+
+    Rotors with play turn on their own; a creeping tyre's dissipation, taken at its present multiplier, is |p|^2/2 times that.
+    """
+    slope: Value = 0.0
+    curvature: Value = 0.0
+    for j in (i, 4 + i):
+        old, gain = lanes[f"gear_friction{j}"], lanes[f"rotor_gain{j}"]
+        change = new[f"gear_friction{j}"] - old
+        slope = slope + (lanes[f"rotor_free{j}"] + gain * old) * change
+        curvature = curvature + gain * (change * change)
+    if "creep" in features:
+        multiplier = ops.where_positive(lanes[f"creep_speed{i}"], new[f"multiplier{i}"], 0.0)
+        for a in "xy":
+            inverse = lanes[f"acting_inverse_mu_{a}{i}"]
+            old = inverse * lanes[f"friction_{a}{i}"]
+            change = inverse * new[f"friction_{a}{i}"] - old
+            slope = slope + multiplier * (old * change)
+            curvature = curvature + multiplier * (change * change)
+    return slope, curvature
+
+
+def _apply(lanes: Lanes, name: str, z: Vector, change: Value, base: Vector, y: Vector) -> tuple[Vector, Vector]:
+    return (
+        [base[r] + z[r] * change for r in range(6)],
+        [y[0] + lanes[f"g_leg_{name}"] * change, y[1] + lanes[f"g_wheel_{name}"] * change],
+    )
+
+
+def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, features: frozenset[str], out: Out) -> tuple[Vector, Vector]:
+    """Exact 2x2 friction block of wheel ``i``: maximum dissipation on the ellipse (mu_x N, mu_y N).
+
+    In impulses scaled by mu, min 1/2 p'Ap + b'p over |p| <= step N. On the circle (A + multiplier) p = -b; the
+    multiplier is improved by one Newton step on 1/|p| per sweep and carried from step to step. With creep the multiplier is
+    that at which |p| = step N tanh(slip speed/creep_speed).
+    """
+    zx, zy = ([lanes[f"z_{a}{i}_{r}"] for r in range(6)] for a in "xy")
+    slip_x = dot(zx, base) + lanes[f"leg_entry_x{i}"] * y[0] - lanes[f"radius{i}"] * y[1]
+    slip_y = dot(zy, base) + lanes[f"leg_entry_y{i}"] * y[0]
+    mu_x, mu_y, bound = lanes[f"acting_mu_x{i}"], lanes[f"acting_mu_y{i}"], lanes[f"bound{i}"]
+    old_x, old_y = lanes[f"friction_x{i}"], lanes[f"friction_y{i}"]
+    gain_x, gain_y, gain_xy = lanes[f"gain_x{i}"], lanes[f"gain_y{i}"], lanes[f"gain_xy{i}"]
+    b_x = mu_x * (slip_x - gain_x * old_x - gain_xy * old_y)
+    b_y = mu_y * (slip_y - gain_xy * old_x - gain_y * old_y)
+    a11 = mu_x * mu_x * gain_x + 1e-9
+    a22 = mu_y * mu_y * gain_y + 1e-9
+    a12 = mu_x * mu_y * gain_xy
+
+    def impulse(multiplier: Value) -> tuple[Value, Value, Value, Value, Value]:
+        c11, c22 = a11 + multiplier, a22 + multiplier
+        inverse = 1.0 / (c11 * c22 - a12 * a12)
+        return (a12 * b_y - c22 * b_x) * inverse, (a12 * b_x - c11 * b_y) * inverse, c11, c22, inverse
+
+    multiplier = lanes[f"multiplier{i}"]
+    least: Value = 0.0
+    if "creep" in features:  # the slope of tanh at rest
+        least = ops.minimum(lanes[f"creep_speed{i}"] * ops.minimum(mu_x, mu_y) / (bound + 1e-9), 1e6)
+        multiplier = ops.maximum(multiplier, least)
+    p_x, p_y, c11, c22, inverse = impulse(multiplier)
+    square = p_x * p_x + p_y * p_y + 1e-30
+    curvature = (p_x * p_x * c22 - 2.0 * (a12 * p_x * p_y) + p_y * p_y * c11) * inverse + 1e-30
+    better = multiplier + square * (ops.sqrt(square) - bound) / (curvature * (bound + 1e-9))
+    if "creep" in features:
+        creeping = _creep_multiplier(lanes, i, multiplier, (p_x, p_y), square, curvature)
+        better = ops.where_positive(lanes[f"creep_speed{i}"], creeping, better)
+    multiplier = ops.clip(better, least, 1e6)
+    p_x, p_y, *_ = impulse(multiplier)
+    shrink = ops.minimum(bound / ops.sqrt(p_x * p_x + p_y * p_y + 1e-30), 1.0)
+    new_x, new_y = mu_x * p_x * shrink, mu_y * p_y * shrink
+    out[f"multiplier{i}"] = multiplier
+    out[f"friction_x{i}"], out[f"friction_y{i}"] = new_x, new_y
+    base, y = _apply(lanes, f"x{i}", zx, new_x - old_x, base, y)
+    return _apply(lanes, f"y{i}", zy, new_y - old_y, base, y)
+
+
+def _creep_multiplier(
+    lanes: Lanes, i: int, multiplier: Value, p: tuple[Value, Value], square: Value, curvature: Value
+) -> Value:
+    """One Newton step on 1/|p| = 1/(step N tanh(slip speed/creep_speed)), where the slip is -multiplier p/mu.
+
+    The slope of the slip speed is that of equal mu along both axes; unequal ones only make convergence linear.
+    """
+    size = ops.sqrt(square)
+    unscaled = [p[k] * lanes[f"acting_inverse_mu_{a}{i}"] for k, a in enumerate("xy")]
+    reach = ops.sqrt(unscaled[0] * unscaled[0] + unscaled[1] * unscaled[1])
+    share, slope = ground.creep_share(lanes, i, multiplier * reach)
+    target = lanes[f"bound{i}"] * share + 1e-30
+    rise = lanes[f"bound{i}"] * slope * reach * ops.maximum(1.0 - multiplier * curvature / square, 0.0)
+    return multiplier + (size - target) / (target * curvature / square + size * rise / target)
+
+
+def kick_finish(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
+    """Back-substitute the new velocities; motor torques, energies, slip and the inertial sensors' low-pass."""
+    u: list[Value] = [0.0] * 6
+    for r in reversed(range(6)):
+        s = lanes[f"base{r}"]
+        for k in range(r + 1, 6):
+            s = s - lanes[f"lower{k}{r}"] * u[k]
+        u[r] = s * lanes[f"inverse_diagonal{r}"]
+    out: Out = {}
+    new_rates: list[Value] = [0.0] * 8
+    old_rates: list[Value] = [0.0] * 8
+    for i in CORNERS:
+        pull = dot([lanes[f"coupling{i}_{r}"] for r in range(6)], u)
+        leg_rate = lanes[f"y_leg{i}"] - lanes[f"i11_{i}"] * pull
+        wheel_rate = lanes[f"y_wheel{i}"] - lanes[f"i12_{i}"] * pull
+        out[f"leg_rate{i}"], out[f"wheel_rate{i}"] = leg_rate, wheel_rate
+        out[f"last_leg_rate{i}"], out[f"last_wheel_rate{i}"] = lanes[f"leg_rate{i}"], lanes[f"wheel_rate{i}"]
+        new_rates[i], new_rates[4 + i] = leg_rate - u[4], wheel_rate - leg_rate
+        old_rates[i] = lanes[f"leg_rate{i}"] - lanes["wy"]
+        old_rates[4 + i] = lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"]
+        for a, wheel_entry in (("x", -lanes[f"radius{i}"]), ("y", 0.0)):
+            z = [lanes[f"z_{a}{i}_{r}"] for r in range(6)]
+            slip = dot(z, [lanes[f"base{r}"] for r in range(6)]) + lanes[f"leg_entry_{a}{i}"] * lanes[f"y_leg{i}"]
+            slip = slip + wheel_entry * lanes[f"y_wheel{i}"]
+            name = f"slip_displacement_{a}{i}"
+            out[name] = lanes[name] + step * slip
+    mechanical, electrical = lanes["mechanical_energy"], lanes["electrical_energy"]
+    for j in range(8):
+        friction = lanes[f"gear_friction{j}"]
+        done = drive.finish(lanes, j, lanes[f"drive{j}"], old_rates[j], new_rates[j], friction, step, features)
+        mechanical = mechanical + done.pop(f"work{j}")
+        electrical = electrical + done.pop(f"electrical_work{j}")
+        out |= done
+    out["mechanical_energy"], out["electrical_energy"] = mechanical, electrical
+    gravity = to_body(rotation_rows(lanes), vector(lanes, "gravity_"))
+    for k, a in enumerate(AXES):
+        out[f"v{a}"], out[f"w{a}"], out[f"last_w{a}"] = u[k], u[3 + k], lanes[f"w{a}"]
+        specific_force = (u[k] - lanes[f"v{a}"]) * (1.0 / step) - gravity[k]
+        out[f"acceleration_{a}"] = lanes[f"acceleration_{a}"] + lanes["low_pass"] * (
+            specific_force - lanes[f"acceleration_{a}"]
+        )
+        mean_rate = 0.5 * (lanes[f"w{a}"] + u[3 + k])  # over the step: the rate at its end would come half a step early
+        out[f"gyro_{a}"] = lanes[f"gyro_{a}"] + lanes["low_pass"] * (mean_rate - lanes[f"gyro_{a}"])
+    return out
+
+
+# ---- observation at the end of a control tick ------------------------------------------------------------------------
+
+
+def observe(lanes: Lanes, step: Value, features: frozenset[str] = frozenset()) -> Out:
+    """Columns of the truth matrix, in the order of TRUTH_LAYOUT, then the raw sensor channels."""
+    rows = rotation_rows(lanes)
+    n, heading, lateral, scale = floor_axes(rows)
+    v, w = vector(lanes, "v"), vector(lanes, "w")
+    out: Out = {f"position_{a}": lanes[f"p{a}"] for a in AXES}
+    out |= {f"quaternion_{a}": lanes[f"q{a}"] for a in "wxyz"}
+    out |= {f"linear_velocity_in_body_{a}": lanes[f"v{a}"] for a in AXES}
+    out |= {f"angular_velocity_in_body_{a}": lanes[f"w{a}"] for a in AXES}
+    out |= {f"joint_position_{j}": lanes[f"{'leg' if j < 4 else 'wheel'}_angle{j % 4}"] for j in range(8)}
+    out |= {f"joint_velocity_{i}": lanes[f"leg_rate{i}"] - w[1] for i in CORNERS}
+    out |= {f"joint_velocity_{4 + i}": lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"] for i in CORNERS}
+    out |= {f"motor_torque_{j}": lanes[f"motor_torque{j}"] for j in range(8)}
+    out |= {f"friction_torque_{j}": lanes[f"gear_friction{j}"] * (1.0 / step) for j in range(8)}
+    out |= {f"rolling_torque_{i}": lanes[f"rolling_friction{i}"] * (1.0 / step) for i in CORNERS}
+    for i in CORNERS:
+        for a in "xy":
+            out[f"contact_force_{i}_{a}"] = lanes[f"friction_{a}{i}"] * (1.0 / step)
+        out[f"contact_force_{i}_z"] = lanes[f"normal{i}"]
+    frictions: list[ground.Friction] = []
+    for i in CORNERS:
+        points = wheel_points(lanes, i, *ops.sin_cos(lanes[f"leg_angle{i}"]), n, scale)
+        slip = slip_velocity(lanes, i, points, heading, lateral, [*v, *w])
+        out[f"slip_velocity_{i}_x"], out[f"slip_velocity_{i}_y"] = slip
+        place = contact_place(lanes, rows, points)
+        speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
+        frictions.append(ground.friction(lanes, i, place[0], place[1], speed, features))
+    out |= {f"slip_displacement_{i}_{a}": lanes[f"slip_displacement_{a}{i}"] for i in CORNERS for a in "xy"}
+    for i, found in enumerate(frictions):
+        out[f"effective_friction_{i}_x"], out[f"effective_friction_{i}_y"] = found.mu_x, found.mu_y
+    # own names: outputs lie side by side, apart from the stored sums they show
+    out["shown_mechanical_energy"], out["shown_electrical_energy"] = lanes["mechanical_energy"], lanes["electrical_energy"]
+    reach = [ops.absolute(n[k]) * lanes[f"half_size_{a}"] for k, a in enumerate(AXES)]
+    out["body_clearance"] = lanes["pz"] - reach[0] - reach[1] - reach[2]
+    # from here on: RAW_LAYOUT of plants/sensors.py; the heading's cosine and sine stand for its yaw
+    out |= {f"raw_position_{j}": out[f"joint_position_{j}"] for j in range(8)}
+    out |= {f"raw_velocity_{j}": out[f"joint_velocity_{j}"] for j in range(8)}
+    effort = "current_torque" if "drive" in features else "motor_torque"
+    out |= {f"raw_effort_{j}": lanes[f"{effort}{j}"] * lanes[f"effort_scale{j}"] for j in range(8)}
+    out |= {f"raw_gyro_{a}": lanes[f"gyro_{a}"] for a in AXES}
+    out |= {f"raw_acceleration_{a}": lanes[f"acceleration_{a}"] for a in AXES}
+    out["raw_supply"] = drive.supply_voltage(lanes, features)
+    out |= {"raw_x": lanes["px"], "raw_y": lanes["py"], "heading_cosine": rows[0][0], "heading_sine": rows[1][0]}
+    return out
+
+
+#: Lanes that formula forces read and write; each group lies side by side in this order.
+FORMULA_INPUTS: tuple[str, ...] = tuple(f"formula_input_{name}" for name in INPUTS_OF_FORMULAS)
+FORMULA_OUTPUTS: tuple[str, ...] = tuple(f"formula_{name}" for name in COORDINATES)
+
+
+def sense(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
+    """What formula forces read at the start of a substep."""
+    seen = observe(lanes, step, features)
+    seen["supply_voltage"] = seen["raw_supply"]
+    return {f"formula_input_{name}": seen[name] for name in INPUTS_OF_FORMULAS}

@@ -1,0 +1,76 @@
+"""Delayed goals: a command acts some time after it was written, per joint and robot."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.physics.plants.base import PlantState
+from wlr_gym.robot.parameters import SPECS, Parameters
+
+Array = NDArray[np.float64]
+
+
+class Goals(Protocol):
+    """Where a simulator gets the goals of a tick from; see :class:`GoalHistory`.
+
+    Attributes:
+        given: they come from elsewhere; what is written to the simulator is ignored.
+    """
+
+    given: bool
+
+    def reset(self, rows: NDArray[np.intp], state: PlantState, parameters: Parameters) -> None: ...
+
+    def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None: ...
+
+    def push(self, goals: Array) -> tuple[Array, Array, Array]: ...
+
+
+class GoalHistory:
+    """Ring of the last goals, from which each joint reads at its own ``command.delay``.
+
+    Within one control tick a joint follows the older of two neighbouring goals until ``switch_time``, then the newer one.
+    """
+
+    given = False
+
+    def __init__(self, count: int, control_period: float) -> None:
+        self._period = control_period
+        depth = int(np.ceil(SPECS["command.delay"].high / control_period)) + 2
+        self._ring = np.zeros((depth, count, 8))
+        self._head = 0
+        self._ticks = np.zeros((count, 8), np.intp)
+        self._switch_time = np.zeros((count, 8))
+        self._delayed = False
+
+    def reset(self, rows: NDArray[np.intp], state: PlantState, parameters: Parameters) -> None:
+        """Forget old goals: legs are told to stay where their reference is, wheels to keep their reference speed.
+
+        Goals are in terms of the reading, references in terms of the true angle.
+        """
+        hold = state.reference_velocity[rows].copy()
+        hold[:, :4] = state.reference_position[rows, :4] + parameters["joint.zero_offset"][rows]
+        self._ring[:, rows] = hold
+        self.set_delays(rows, parameters)
+
+    def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
+        """Take new delays; goals already written act at their new time."""
+        delay = parameters["command.delay"][rows]
+        self._ticks[rows] = np.floor(delay / self._period + 1e-9)
+        self._switch_time[rows] = np.maximum(delay - self._ticks[rows] * self._period, 0.0)
+        self._delayed = bool(parameters["command.delay"].any())
+
+    def push(self, goals: Array) -> tuple[Array, Array, Array]:
+        """Take this tick's goals (N, 8); return the newer goals, the older goals and the switch time (s), each (N, 8)."""
+        self._head = (self._head + 1) % len(self._ring)
+        self._ring[self._head] = goals
+        if not self._delayed:
+            return goals, goals, self._switch_time
+        return self._at(self._ticks), self._at(self._ticks + 1), self._switch_time
+
+    def _at(self, ticks: NDArray[np.intp]) -> Array:
+        places = (self._head - ticks) % len(self._ring)
+        return np.take_along_axis(self._ring, places[None], axis=0)[0]

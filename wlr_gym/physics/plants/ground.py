@@ -1,0 +1,116 @@
+"""Friction under a wheel, defined once for every simulator: grip, patches of floor, slip weakening, tyre creep.
+
+Scalar source over lanes (see :mod:`wlr_gym.physics.plants.drive`), traced by each simulator into its own kernel. :func:`pack`
+fills the parameter lanes from the table. Families of effects that change what is traced: ``ground`` (patches, weakening),
+``creep`` and ``rolling_resistance``; without the first two friction is a constant of each wheel, ``mu_x{i}`` and ``mu_y{i}``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.physics.codegen import ops
+from wlr_gym.robot.parameters import PATCHES, Parameters
+
+Value = Any
+Lanes = Mapping[str, Value]
+Array = NDArray[np.float64]
+
+WHEEL_LANES = (
+    "mu_x", "mu_y", "inverse_mu_x", "inverse_mu_y", "grip", "anisotropy", "kinetic_drop", "inverse_weakening_speed",
+    "creep_speed", "inverse_creep_speed",
+)  # fmt: skip
+_PATCH_FIELDS = ("mu", "x_min", "x_max", "y_min", "y_max")
+_PATCH_NUMBERS = range(len(PATCHES))
+#: Parameter lanes of the ground: four per wheel quantity, and the patches.
+GROUND_LANES: tuple[str, ...] = (
+    *(f"{name}{i}" for name in WHEEL_LANES for i in range(4)),
+    *(f"patch_{name}{k}" for name in _PATCH_FIELDS for k in _PATCH_NUMBERS),
+)
+#: Smallest friction coefficient that is divided by.
+_LEAST_MU = 1e-9
+
+
+def pack(parameters: Parameters) -> dict[str, Array]:
+    """Return the lanes GROUND_LANES, each (N,); ``anisotropy`` is ground.mu_y over mu_x (1 where mu_x is 0)."""
+    grip, creep_speed = parameters["wheel.grip"], parameters["ground.creep_speed"]
+    mu_x, mu_y = parameters["ground.mu_x"], parameters["ground.mu_y"]
+    wheel = {
+        "mu_x": grip * mu_x,
+        "mu_y": grip * mu_y,
+        "inverse_mu_x": 1.0 / np.maximum(grip * mu_x, _LEAST_MU),
+        "inverse_mu_y": 1.0 / np.maximum(grip * mu_y, _LEAST_MU),
+        "grip": grip,
+        "anisotropy": np.where(mu_x > 0.0, mu_y / np.where(mu_x > 0.0, mu_x, 1.0), 1.0),
+        "kinetic_drop": 1.0 - parameters["ground.kinetic_ratio"],
+        "inverse_weakening_speed": 1.0 / parameters["ground.weakening_speed"],
+        "creep_speed": creep_speed,
+        "inverse_creep_speed": 1.0 / np.where(creep_speed > 0.0, creep_speed, 1.0),
+    }
+    lanes = {f"{name}{i}": wheel[name][:, i] for name in WHEEL_LANES for i in range(4)}
+    lanes |= {f"patch_{name}{k}": parameters[f"patch.{name}"][:, k] for name in _PATCH_FIELDS for k in _PATCH_NUMBERS}
+    return lanes
+
+
+def families(parameters: Parameters) -> set[str]:
+    """Return which families of ground effects some robot of the batch has."""
+    has_patch = (parameters["patch.x_max"] > parameters["patch.x_min"]) & (
+        parameters["patch.y_max"] > parameters["patch.y_min"]
+    )
+    present = {
+        "ground": has_patch.any() or (parameters["ground.kinetic_ratio"] != 1.0).any(),
+        "creep": parameters["ground.creep_speed"].any(),
+        "rolling_resistance": parameters["ground.rolling_resistance"].any(),
+    }
+    return {name for name, is_present in present.items() if is_present}
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Friction coefficients acting under one wheel, along its heading (x) and its axle (y), and their inverses."""
+
+    mu_x: Value
+    mu_y: Value
+    inverse_mu_x: Value
+    inverse_mu_y: Value
+
+
+def friction(lanes: Lanes, i: int, x: Value, y: Value, slip_speed: Value, features: frozenset[str]) -> Friction:
+    """Return the friction under wheel ``i`` whose contact point stands at (x, y) (m, floor frame) and slips at a speed (m/s).
+
+    mu_x = grip * (mu of the last patch that holds the point, else ground.mu_x), mu_y = mu_x * ground.mu_y/ground.mu_x, both
+    times kinetic_ratio + (1 - kinetic_ratio) exp(-slip speed/weakening_speed). Tyre creep is not in it.
+    """
+    mu_x, mu_y = lanes[f"mu_x{i}"], lanes[f"mu_y{i}"]
+    inverse_x, inverse_y = lanes[f"inverse_mu_x{i}"], lanes[f"inverse_mu_y{i}"]
+    if "ground" not in features:
+        return Friction(mu_x, mu_y, inverse_x, inverse_y)
+    is_inside: Value = -1.0
+    patch_mu: Value = mu_x
+    for k in _PATCH_NUMBERS:
+        margin_x = ops.minimum(x - lanes[f"patch_x_min{k}"], lanes[f"patch_x_max{k}"] - x)
+        margin_y = ops.minimum(y - lanes[f"patch_y_min{k}"], lanes[f"patch_y_max{k}"] - y)
+        inside = ops.minimum(margin_x, margin_y)
+        is_inside = ops.where_positive(inside, 1.0, is_inside)
+        patch_mu = ops.where_positive(inside, lanes[f"grip{i}"] * lanes[f"patch_mu{k}"], patch_mu)
+    patch_mu_y = patch_mu * lanes[f"anisotropy{i}"]
+    mu_y = ops.where_positive(is_inside, patch_mu_y, mu_y)
+    inverse_x = ops.where_positive(is_inside, 1.0 / ops.maximum(patch_mu, _LEAST_MU), inverse_x)
+    inverse_y = ops.where_positive(is_inside, 1.0 / ops.maximum(patch_mu_y, _LEAST_MU), inverse_y)
+    left = 1.0 - lanes[f"kinetic_drop{i}"] * (1.0 - ops.decay(slip_speed * lanes[f"inverse_weakening_speed{i}"]))
+    inverse_left = 1.0 / ops.maximum(left, _LEAST_MU)
+    return Friction(patch_mu * left, mu_y * left, inverse_x * inverse_left, inverse_y * inverse_left)
+
+
+def creep_share(lanes: Lanes, i: int, slip_speed: Value) -> tuple[Value, Value]:
+    """Share of its friction that wheel ``i`` with tyre creep builds up at a slip speed (m/s), and its slope (s/m).
+
+    tanh(speed/creep_speed), against the whole slip vector. Only of use where ``creep_speed{i}`` is positive.
+    """
+    share = ops.saturation(slip_speed * lanes[f"inverse_creep_speed{i}"])
+    return share, (1.0 - share * share) * lanes[f"inverse_creep_speed{i}"]

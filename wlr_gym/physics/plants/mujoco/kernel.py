@@ -1,0 +1,165 @@
+"""Trace the arithmetic around a MuJoCo step into numba kernels that work on the batch's live arrays.
+
+Strict IEEE arithmetic, one robot after the other, explicit fused multiply-adds: a robot's result depends on nothing but
+itself.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.physics import servo
+from wlr_gym.physics.codegen import Graph, emit, graph, live_nodes, load_module, ops
+from wlr_gym.physics.plants import drive, forces, ground
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT
+from wlr_gym.physics.plants.gibbs_appell import step as engine
+from wlr_gym.physics.plants.mujoco import step as source
+from wlr_gym.physics.plants.mujoco.packing import PARAMETER_LANES
+from wlr_gym.physics.plants.mujoco.step import CORNERS, STATE
+from wlr_gym.physics.plants.sensors import RAW_LAYOUT
+
+Array = NDArray[np.float64]
+
+#: Arrays the kernels work on, in this order, one row per robot (:func:`addresses`): MuJoCo's positions, velocities, constraint
+#: forces and contact sensors; own state; parameter lanes; the tick's inputs; formula forces; what a step reads.
+_FLAT = (
+    "qpos", "qvel", "constraint", "contact", "state", "parameters", "goals", "old_goals", "switch_time", "on", "generalised",
+    "applied", "armature", "gear_bound", "pair_margin",
+)  # fmt: skip
+#: These have four rows per robot, one per wheel.
+_PER_WHEEL = ("pair_friction", "geom_size", "geom_pos", "geom_quat")
+
+
+def addresses(flat: Sequence[Array], per_wheel: Sequence[Array]) -> NDArray[np.intp]:
+    """Return where every robot's rows lie in memory, (N, rows per robot).
+
+    Unpacking twenty array arguments takes numba longer than computing a robot's step, so the kernels get this one table. It
+    holds for as long as the arrays live.
+    """
+    return np.hstack([_row_addresses(array).reshape(len(array), -1) for array in (*flat, *per_wheel)])
+
+
+def _row_addresses(array: Array) -> NDArray[np.intp]:
+    offsets = np.tensordot(np.array(array.strides[:-1]), np.indices(array.shape[:-1]), 1)
+    return array.ctypes.data + offsets
+
+
+def _columns(array: str, names: Sequence[str]) -> dict[str, str]:
+    return {name: f"{array}[{k}]" for k, name in enumerate(names)}
+
+
+_PLACES: dict[str, str] = (
+    _columns("qpos", source.POSITION)
+    | _columns("qvel", source.VELOCITY)
+    | _columns("constraint", source.CONSTRAINT)
+    | _columns("contact", source.CONTACT)
+    | _columns("state", STATE)
+    | _columns("parameters", PARAMETER_LANES)
+    | _columns("goals", [f"goal{j}" for j in range(8)])
+    | _columns("old_goals", [f"old_goal{j}" for j in range(8)])
+    | _columns("switch_time", [f"switch_time{j}" for j in range(8)])
+    | _columns("on", [f"on{j}" for j in range(8)])
+    | {name: f"generalised[{k} * count]" for k, name in enumerate(source.FORMULA)}  # the formulas' kernel has robots in columns
+    | _columns("applied", [f"applied_{name}" for name in source.VELOCITY])
+    | _columns("armature", [f"armature_{name}" for name in source.VELOCITY])
+    | _columns("gear_bound", [f"gear_bound_{name}" for name in source.VELOCITY])
+    | _columns("pair_margin", [f"margin{i}" for i in CORNERS])
+    # a capsule's first tangent runs along its axis: the axle
+    | {f"friction_{a}{i}": f"pair_friction{i}[{k}]" for i in CORNERS for k, a in enumerate("yx")}
+    | {f"geom_radius{i}": f"geom_size{i}[0]" for i in CORNERS}
+    | {f"geom_{a}{i}": f"geom_pos{i}[{k}]" for i in CORNERS for k, a in enumerate("xyz")}
+    | {f"geom_q{a}{i}": f"geom_quat{i}[{k}]" for i in CORNERS for k, a in enumerate("wxy")}
+)
+_ROWS = (*_FLAT, *(f"{name}{i}" for name in _PER_WHEEL for i in CORNERS))
+_SCALARS = ("step", "time", "duration")
+
+
+class _Lanes(Mapping[str, Any]):
+    """All lanes as inputs of a graph."""
+
+    def __init__(self, owner: Graph) -> None:
+        self._owner = owner
+
+    def __getitem__(self, name: str) -> Any:
+        return self._owner.input(name)
+
+    def __iter__(self) -> Iterator[str]:
+        raise TypeError("lanes are read by name")
+
+    def __len__(self) -> int:
+        raise TypeError("lanes are read by name")
+
+
+def trace() -> dict[str, dict[str, Any]]:
+    """Trace all blocks: name -> outputs."""
+    owner = Graph()
+    lanes = _Lanes(owner)
+    step = owner.input("step")
+    return {
+        "drift": source.drift(lanes, owner.input("duration")),
+        "before": source.before(lanes, owner.input("time"), step),
+        "after": source.after(lanes, step),
+        "features": source.formula_inputs(lanes),
+        "observe": source.observe(lanes),
+    }
+
+
+def kernel_source() -> str:
+    """Return the kernel module's source."""
+    blocks = trace()
+    observed = {name: f"truth[i, {k}]" for k, name in enumerate(blocks["observe"])}
+    for k, name in enumerate(list(observed)[TRUTH_LAYOUT.width :]):
+        observed[name] = f"raw[i, {k}]" if k < RAW_LAYOUT.width - 1 else name
+    named = {name: f"inputs[{k}, i]" for k, name in enumerate(forces.INPUTS)}
+    lines = []
+    for block, outputs in blocks.items():
+        used = {node.operands[0] for node in live_nodes(outputs.values()) if node.op == "input"}
+        scalars = [name for name in _SCALARS if name in used]
+        own = {"observe": ["truth", "raw"], "features": ["inputs"]}.get(block, [])
+        places = _PLACES | {"observe": observed, "features": named}.get(block, {})
+
+        def load(name: str) -> str:
+            return name if name in _SCALARS else _PLACES[name]
+
+        body = emit(
+            outputs,
+            load,
+            lambda name, text, places=places: f"{places[name]} = {text}",
+            " " * 8,
+            lambda value: repr(value) if value >= 0 else f"({value!r})",
+            fused=True,
+        )
+        if block == "observe":
+            body.append(f"        raw[i, {RAW_LAYOUT.width - 1}] = math.atan2(heading_sine, heading_cosine)")
+        arguments = ", ".join(["table", "rows", *own, *scalars])
+        signature = "" if block == "features" else _signature(len(own), len(scalars))
+        lines += [f"@njit({signature}cache=True, nogil=True, error_model='numpy')"]
+        lines += [f"def {block}({arguments}):", "    count = len(table)", "    for i in rows:"]
+        lines += [f"        {name} = array_at(table[i, {k}])" for k, name in enumerate(_ROWS)]
+        lines += [*body, "", ""]
+    return "\n".join(["from numba import types", "", *lines])
+
+
+def _signature(own: int, scalars: int) -> str:
+    """Types of a block's arguments, so that one compilation at import serves every batch size."""
+    kinds = ["types.intp[:, ::1]", "types.intp[::1]"] + ["types.float64[:, ::1]"] * own + ["types.float64"] * scalars
+    return f"types.void({', '.join(kinds)}), "
+
+
+def load_kernel() -> ModuleType:
+    """Load (first use: generate and compile) the kernel module."""
+    message = "wlr_gym: compiling the MuJoCo plant's kernel; about 10 s, once on this machine"
+    return load_module("mujoco_plant", kernel_source, message, _SOURCE_KEY)
+
+
+#: Read at import, so that the key always tells of the code that is loaded.
+_SOURCE_KEY = "\0".join(
+    inspect.getsource(module) for module in (source, engine, drive, ground, forces, servo, sys.modules[__name__], ops, graph)
+) + "\0".join(PARAMETER_LANES)

@@ -1,0 +1,399 @@
+"""What surrounds one MuJoCo step, as generic scalar arithmetic; ``kernel.py`` traces it into compiled code.
+
+MuJoCo's part: rigid-body dynamics, normal contact, Coulomb friction of wheels and gears. Before each step :func:`before` writes
+the motors' torques and this step's model fields, after it :func:`after` reads what happened. Choices, and why:
+
+- Drift - kick - drift, as in the engine: within a control tick MuJoCo's positions stand half a step ahead
+  (:func:`drift`), so that its Euler step is Moreau's midpoint rule. Forces act at the middle of a step; no cost.
+- Damping is implicit without a second solve: MuJoCo's Euler step with C = step * damping added to the joint's armature, and
+  -damping * rate as an applied torque, gives M (v' - v) = step (f - damping v') + constraint impulses. The constraint solver
+  works with the same matrix, so wheels and gears that stick do stick while the motor brakes. (``dof_damping`` is unknown to the
+  solver under ``implicitfast``.)
+- The wheel is the engine's thin disc. The geom that touches is a hidden sphere, one end of a capsule whose axis leans
+  upwards, away from the floor; a capsule's tangent frame turns with its axis, a sphere's does not. Before each step the
+  sphere is placed so that MuJoCo's contact point, which lies halfway into the overlap, is exactly the disc's lowest point.
+- Rolling resistance is a torque of our own: MuJoCo's (``condim`` 6) shares one cone with sliding friction, so a wheel that
+  rolls would lose its grip. Tyre creep is a force of our own: MuJoCo's friction knows no such curve. Both depend on a rate,
+  steeply; see :func:`_relaxed`.
+- MuJoCo's velocities: of the body origin in the floor frame, angular in the body frame, joint rates relative to the parent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.plants import drive, ground
+from wlr_gym.physics.plants.forces import COORDINATES
+from wlr_gym.physics.plants.forces import INPUTS as INPUTS_OF_FORMULAS
+from wlr_gym.physics.plants.gibbs_appell import step as engine
+from wlr_gym.physics.plants.gibbs_appell.step import (
+    AXES,
+    CORNERS,
+    cross,
+    dot,
+    floor_axes,
+    rotation_rows,
+    to_body,
+    vector,
+    wheel_points,
+)
+
+Value = Any
+Lanes = Mapping[str, Value]
+Out = dict[str, Value]
+Vector = list[Value]
+
+#: Families of effects: always all, so that no robot's bits can depend on what its neighbours have.
+FEATURES = frozenset({"drive", "backlash", "ground", "creep"})
+
+#: MuJoCo's state by lane: ``qpos`` and ``qvel``. Joints along the tree: leg, wheel, leg, wheel, ...
+POSITION: tuple[str, ...] = (
+    *(f"p{a}" for a in AXES),
+    *(f"q{a}" for a in "wxyz"),
+    *(f"{kind}_angle{i}" for i in CORNERS for kind in ("leg", "wheel")),
+)
+VELOCITY: tuple[str, ...] = (
+    *(f"u{a}" for a in AXES),
+    *(f"w{a}" for a in AXES),
+    *(f"joint_rate{j}" for i in CORNERS for j in (i, 4 + i)),
+)
+#: MuJoCo's results by lane: ``qfrc_constraint`` and the contact sensors (force on the wheel, floor frame).
+CONSTRAINT: tuple[str, ...] = tuple(f"constraint_{name}" for name in VELOCITY)
+CONTACT: tuple[str, ...] = tuple(f"floor_{a}{i}" for i in CORNERS for a in AXES)
+#: Generalised forces of formulas.
+FORMULA: tuple[str, ...] = tuple(f"formula_{name}" for name in COORDINATES)
+
+#: Kept from step to step beside MuJoCo's own state; the second part describes the last step, the third sums over the tick.
+STATE: tuple[str, ...] = (
+    *drive.STATE,
+    *(f"gyro_{a}" for a in AXES),
+    *(f"acceleration_{a}" for a in AXES),
+    *(f"own_force_{a}{i}" for i in CORNERS for a in "xy"),
+    *(f"rolling_torque{i}" for i in CORNERS),
+    *(f"old_spin{i}" for i in CORNERS),
+    *(f"old_{v}{a}" for v in "uw" for a in AXES),
+    *(f"old_rate{j}" for j in range(8)),
+    *(f"{name}{j}" for j in range(8) for name in ("voltage", "share", "rotor_free", "rotor_gain", "ripple", "rotor_friction")),
+    *(f"heading_{a}{i}" for i in CORNERS for a in "xy"),
+    *(f"leg_arm_{a}{i}" for i in CORNERS for a in AXES),
+    *(f"force_{a}{i}" for i in CORNERS for a in AXES),
+    *(f"{name}{j}" for j in range(8) for name in ("motor_torque", "current_torque", "gear_torque")),
+    *(f"slip_displacement_{a}{i}" for i in CORNERS for a in "xy"),
+    "mechanical_energy",
+    "electrical_energy",
+)
+TICK_SUMS: tuple[str, ...] = STATE[-10:]
+
+#: Half the length (m) of the capsule that touches the floor with one end, and how far its axis leans up from the floor (rad).
+CAPSULE_HALF_LENGTH = 0.01
+CAPSULE_LEAN = math.pi / 6
+#: Gains of the integral hold of rolling resistance on the spin and on its change, in wheel inertia over the step.
+HOLD_SPIN, HOLD_CHANGE = 0.2, 0.8
+#: Above this many steps of braking by its bound, rolling resistance brakes fully.
+HOLD_REACH = 8.0
+#: MuJoCo's smallest friction coefficient.
+LEAST_MU = 1e-5
+#: Slip speed (m/s) below which a direction of slip means nothing.
+LEAST_SLIP = 1e-9
+
+
+class Overlay(Mapping[str, Any]):
+    """Lanes with some added or replaced."""
+
+    def __init__(self, lanes: Lanes, added: Out) -> None:
+        self._lanes = lanes
+        self._added = added
+
+    def __getitem__(self, name: str) -> Any:
+        return self._added[name] if name in self._added else self._lanes[name]
+
+    def __iter__(self) -> Iterator[str]:
+        raise TypeError("lanes are read by name")
+
+    def __len__(self) -> int:
+        raise TypeError("lanes are read by name")
+
+
+def with_engine_rates(lanes: Lanes) -> Lanes:
+    """Add the quasi-velocities of the engine: body-frame velocity of the body origin, absolute leg and wheel rates."""
+    body = to_body(rotation_rows(lanes), vector(lanes, "u"))
+    added: Out = {f"v{a}": value for a, value in zip(AXES, body, strict=True)}
+    for i in CORNERS:
+        added[f"leg_rate{i}"] = lanes["wy"] + lanes[f"joint_rate{i}"]
+        added[f"wheel_rate{i}"] = added[f"leg_rate{i}"] + lanes[f"joint_rate{4 + i}"]
+    return Overlay(lanes, added)
+
+
+def drift(lanes: Lanes, duration: Value) -> Out:
+    """Move positions for ``duration`` at constant rates, forwards or backwards."""
+    moved = engine.drift(with_engine_rates(lanes), duration)
+    out: Out = {name: moved[name] for name in POSITION}
+    out |= {f"p{a}": lanes[f"p{a}"] + duration * lanes[f"u{a}"] for a in AXES}
+    for j in range(8):
+        name = f"{'leg' if j < 4 else 'wheel'}_angle{j % 4}"
+        out[name] = lanes[name] + duration * lanes[f"joint_rate{j}"]
+    return out | _drift_of_rotors(lanes, duration)
+
+
+def _drift_of_rotors(lanes: Lanes, duration: Value) -> Out:
+    lead = {f"rotor_lead{j}": lanes[f"rotor_rate{j}"] - lanes[f"joint_rate{j}"] for j in range(8)}
+    return {name: lanes[name] + duration * rate for name, rate in lead.items()}
+
+
+# ---- before a step ---------------------------------------------------------------------------------------------------
+
+
+def before(lanes: Lanes, time: Value, step: Value) -> Out:
+    """Servos, loads, and this step's model fields."""
+    lanes = with_engine_rates(lanes)
+    rows = rotation_rows(lanes)
+    axes = floor_axes(rows)
+    out: Out = {f"old_{v}{a}": lanes[f"{v}{a}"] for v in "uw" for a in AXES}
+    applied = _loads(lanes, rows)
+    joints = [_joint(lanes, j) for j in range(8)]
+    commanded, voltages = drive.command(lanes, joints, time, step, FEATURES)
+    out |= commanded
+    for j, joint in enumerate(joints):
+        pushed = drive.push(lanes, j, voltages[j], joint, step, 0.5 * step, FEATURES)
+        _push_joint(lanes, j, voltages[j], joint, pushed, step, applied, out)
+    for i in CORNERS:
+        _push_wheel(lanes, i, rows, axes, step, applied, out)
+    out |= {f"applied_{name}": value for name, value in applied.items()}
+    return out
+
+
+def _joint(lanes: Lanes, j: int) -> drive.Joint:
+    if j >= 4:
+        return drive.Joint(lanes[f"wheel_angle{j - 4}"], lanes[f"joint_rate{j}"], lanes[f"wheel_angle{j - 4}"])
+    return drive.Joint(lanes[f"leg_angle{j}"], lanes[f"joint_rate{j}"], lanes[f"leg_angle{j}"] + lanes[f"zero_offset{j}"])
+
+
+def _loads(lanes: Lanes, rows: list[Vector]) -> Out:
+    """Applied generalised forces so far: external force, tether, formulas."""
+    pull = [lanes["external_x"], lanes["external_y"], 0.0]
+    for k, a in enumerate("xy"):
+        pull[k] = pull[k] - lanes["tether"] * (lanes[f"p{a}"] - lanes[f"anchor_{a}"])
+    in_body = vector(lanes, "formula_body_force_")
+    applied: Out = {}
+    for k, a in enumerate(AXES):
+        applied[f"u{a}"] = pull[k] + (lanes[f"formula_floor_force_{a}"] + dot(rows[k], in_body))
+    for a, name in zip(AXES, ("roll", "pitch", "yaw"), strict=True):
+        applied[f"w{a}"] = lanes[f"formula_body_torque_{name}"]
+    names = list(COORDINATES)
+    applied |= {f"joint_rate{j}": lanes[f"formula_{names[j]}"] for j in range(8)}
+    return applied
+
+
+def _push_joint(
+    lanes: Lanes, j: int, voltage: Value, joint: drive.Joint, pushed: drive.Push, step: Value, applied: Out, out: Out
+) -> None:
+    """Motor torque, damping (see the module) and dry friction of joint ``j``; a gear with play rubs on its rotor, here."""
+    name, play = f"joint_rate{j}", lanes[f"half_play{j}"]
+    impulse, friction = drive.friction_on_rotor(pushed, joint.rate)
+    impulse = ops.where_positive(play, impulse, pushed.impulse)
+    applied[name] = applied[name] + (impulse - pushed.damping * joint.rate) * (1.0 / step)
+    out[f"armature_{name}"] = lanes[f"joint_armature{j}"] + pushed.damping
+    out[f"gear_bound_{name}"] = ops.where_positive(play, 0.0, pushed.bound * (1.0 / step))
+    out[f"rotor_friction{j}"] = ops.where_positive(play, friction, 0.0)
+    out[f"voltage{j}"], out[f"old_rate{j}"] = voltage, joint.rate
+    out |= drive.kept_for_finish(pushed, j)
+
+
+def _push_wheel(
+    lanes: Lanes, i: int, rows: list[Vector], axes: tuple[Vector, Vector, Vector, Value], step: Value, applied: Out, out: Out
+) -> None:
+    """Everything between wheel ``i`` and the floor."""
+    n, heading, lateral, scale = axes
+    hip, leg, rim = wheel_points(lanes, i, *ops.sin_cos(lanes[f"leg_angle{i}"]), n, scale)
+    point = [hip[k] + leg[k] + rim[k] for k in range(3)]
+    arm = [leg[k] + rim[k] for k in range(3)]
+    velocity = _point_velocity(lanes, i, point, arm, rim)
+    gap = lanes["pz"] + dot(n, point)
+    _place_sphere(lanes, i, n, scale, gap, out)
+
+    out[f"heading_x{i}"], out[f"heading_y{i}"] = dot(rows[0], heading), dot(rows[1], heading)
+    for a, e in zip(AXES, (heading, lateral, n), strict=True):
+        out[f"leg_arm_{a}{i}"] = arm[2] * e[0] - arm[0] * e[2]
+
+    slip = [dot(heading, velocity), dot(lateral, velocity)]
+    speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
+    place = [lanes[f"p{a}"] + dot(rows[k], point) for k, a in enumerate("xy")]
+    mu = ground.friction(lanes, i, place[0], place[1], speed, FEATURES)
+    creeps = lanes[f"creep_speed{i}"]
+    for a, value in (("x", mu.mu_x), ("y", mu.mu_y)):
+        out[f"friction_{a}{i}"] = ops.where_positive(creeps, LEAST_MU, ops.maximum(value, LEAST_MU))
+
+    push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * dot(n, velocity), 0.0)
+    normal = ops.where_positive(-gap, push, 0.0)
+    spin_inertia = lanes[f"wheel_spin{i}"] + out[f"armature_joint_rate{4 + i}"]
+    rolling = _rolling_torque(lanes, i, normal, lanes[f"wheel_spin{i}"] + lanes[f"joint_armature{4 + i}"], step)
+    out[f"rolling_torque{i}"], out[f"old_spin{i}"] = rolling, lanes[f"wheel_rate{i}"]
+    creep = _creep_force(lanes, i, mu, normal, slip, speed, spin_inertia, step)
+    for k, a in enumerate("xy"):
+        out[f"own_force_{a}{i}"] = creep[k] = ops.where_positive(creeps, creep[k], 0.0)
+    force = [creep[0] * heading[k] + creep[1] * lateral[k] for k in range(3)]
+    for k, a in enumerate(AXES):
+        applied[f"u{a}"] = applied[f"u{a}"] + dot(rows[k], force)
+    for name, value in zip(("wx", "wy", "wz"), cross(point, force), strict=True):
+        applied[name] = applied[name] + value
+    applied["wy"] = applied["wy"] + rolling
+    swing = arm[2] * force[0] - arm[0] * force[2]
+    applied[f"joint_rate{i}"] = applied[f"joint_rate{i}"] + (swing + rolling)
+    spin = rim[2] * force[0] - rim[0] * force[2]
+    applied[f"joint_rate{4 + i}"] = applied[f"joint_rate{4 + i}"] + (spin + rolling)
+
+
+def _point_velocity(lanes: Lanes, i: int, point: Vector, arm: Vector, rim: Vector) -> Vector:
+    """Velocity of the contact point of wheel ``i``, body frame."""
+    turned = cross(vector(lanes, "w"), point)
+    leg_rate, wheel_rate = lanes[f"joint_rate{i}"], lanes[f"joint_rate{4 + i}"]
+    swing = [leg_rate * arm[2] + wheel_rate * rim[2], 0.0, -(leg_rate * arm[0] + wheel_rate * rim[0])]
+    return [lanes[f"v{a}"] + turned[k] + swing[k] for k, a in enumerate(AXES)]
+
+
+def _place_sphere(lanes: Lanes, i: int, n: Vector, scale: Value, gap: Value, out: Out) -> None:
+    """Place the capsule whose lower end stands for the disc of wheel ``i``, in the wheel's frame.
+
+    The disc's lowest point lies a/cos(tilt) straight below a point of the axle that is a tan(tilt) off the wheel's plane. A
+    sphere around it with radius a/cos(tilt) - gap overlaps the floor by twice -gap, halfway of which lies the disc's lowest
+    point; the margin takes one -gap off again. High above the floor the gap is cut short, which keeps the radius positive.
+    """
+    sine, cosine = ops.sin_cos(lanes[f"leg_angle{i}"] + lanes[f"wheel_angle{i}"])
+    reach = lanes[f"radius{i}"] * scale  # scale = 1/cos(tilt)
+    level = [scale * ((1.0 if k == 1 else 0.0) - n[1] * n[k]) for k in range(3)]  # the axle's direction, laid on the floor
+    axis = [math.cos(CAPSULE_LEAN) * level[k] + math.sin(CAPSULE_LEAN) * n[k] for k in range(3)]
+    centre = [CAPSULE_HALF_LENGTH * x for x in axis]
+    centre[1] = centre[1] + reach * n[1]
+    near = ops.minimum(gap, 0.5 * reach)
+    out[f"geom_radius{i}"], out[f"margin{i}"] = reach - near, near
+    for a, value in zip(AXES, _to_wheel(centre, sine, cosine), strict=True):
+        out[f"geom_{a}{i}"] = value
+    x, y, z = _to_wheel(axis, sine, cosine)
+    w = ops.sqrt(0.5 + 0.5 * z)  # the shortest turn from z to the axis, whose y component keeps it away from -z
+    half = 0.5 / w
+    out |= {f"geom_qw{i}": w, f"geom_qx{i}": -(y * half), f"geom_qy{i}": x * half}
+
+
+def _to_wheel(a: Vector, sine: Value, cosine: Value) -> Vector:
+    """Turn a body-frame vector into the frame of a wheel that stands at an angle about y."""
+    return [cosine * a[0] - sine * a[2], a[1], sine * a[0] + cosine * a[2]]
+
+
+def _relaxed(old: Value, target: Value, stiffness: Value) -> Value:
+    """A force that falls steeply with the rate it acts on, explicit but stable at any step.
+
+    ``target`` is the force at the present rate, ``stiffness`` = -d force/d rate * step / apparent mass. The rate after the step
+    follows from the force: force = target + stiffness (old - force). Exact where the force is steady; where it changes it lags
+    by ``stiffness`` steps. For an apparent mass that is off by a factor c the scheme is stable for all c > 1/4.
+    """
+    return (target + stiffness * old) * (1.0 / (1.0 + stiffness))
+
+
+def _rolling_torque(lanes: Lanes, i: int, normal: Value, inertia: Value, step: Value) -> Value:
+    """Rolling resistance: brakes the absolute spin with at most c N a; at rest it holds.
+
+    Below the spin that the bound takes away in HOLD_REACH steps, the torque follows the spin, and its change, until there is
+    none (an integral hold): a load below the bound does not turn the wheel. Stable for every apparent inertia from the wheel's
+    own, k = 1, up: z^2 - (2 - k) z + 1 - HOLD_CHANGE k = 0 with k = own/apparent inertia.
+    """
+    spin, old = lanes[f"wheel_rate{i}"], lanes[f"old_spin{i}"]
+    bound = lanes[f"rolling{i}"] * lanes[f"radius{i}"] * normal
+    change = HOLD_SPIN * spin + HOLD_CHANGE * (spin - old)
+    hold = ops.clip(lanes[f"rolling_torque{i}"] - (inertia * change) * (1.0 / step), -bound, bound)
+    turns = inertia * ops.absolute(spin) - HOLD_REACH * (step * bound)
+    return ops.where_positive(turns, -(bound * ops.sign(spin)), hold)
+
+
+def _creep_force(
+    lanes: Lanes, i: int, mu: ground.Friction, normal: Value, slip: Vector, speed: Value, spin_inertia: Value, step: Value
+) -> Vector:
+    """Tyre creep: N tanh(speed/creep_speed) along (mu_x^2 s_x, mu_y^2 s_y), against the slip."""
+    share, _ = ground.creep_share(lanes, i, speed)
+    ease = ops.sqrt(mu.mu_x * mu.mu_x * (slip[0] * slip[0]) + mu.mu_y * mu.mu_y * (slip[1] * slip[1])) + LEAST_SLIP * mu.mu_x
+    inverse_spin = lanes[f"radius{i}"] * lanes[f"radius{i}"] * (1.0 / spin_inertia)
+    lightness = [lanes[f"contact_lightness_x{i}"] + inverse_spin, lanes[f"contact_lightness_y{i}"]]
+    slope = normal * share * (1.0 / (ease + 1e-30))
+    force: Vector = []
+    for k, (a, m) in enumerate((("x", mu.mu_x), ("y", mu.mu_y))):
+        own = m * m * slope
+        force.append(_relaxed(lanes[f"own_force_{a}{i}"], -(own * slip[k]), step * (own * lightness[k])))
+    x, y = force[0] * mu.inverse_mu_x, force[1] * mu.inverse_mu_y
+    shrink = ops.minimum(normal / ops.sqrt(x * x + y * y + 1e-30), 1.0)
+    return [shrink * f for f in force]
+
+
+# ---- after a step ----------------------------------------------------------------------------------------------------
+
+
+def after(lanes: Lanes, step: Value) -> Out:
+    """Forces, torques, energies, slip and the inertial sensors' low-pass of the step that was just made."""
+    lanes = with_engine_rates(lanes)
+    out: Out = {}
+    for i in CORNERS:
+        _read_wheel(lanes, i, out)
+    _add_slip(lanes, step, out)
+    mechanical, electrical = lanes["mechanical_energy"], lanes["electrical_energy"]
+    for j in range(8):
+        rates = lanes[f"old_rate{j}"], lanes[f"joint_rate{j}"]
+        friction = lanes[f"rotor_friction{j}"]
+        done = drive.finish(lanes, j, lanes[f"voltage{j}"], *rates, friction, step, FEATURES)
+        mechanical, electrical = mechanical + done.pop(f"work{j}"), electrical + done.pop(f"electrical_work{j}")
+        out |= done
+        out[f"gear_torque{j}"] = ops.where_positive(lanes[f"half_play{j}"], friction * (1.0 / step), out[f"gear_torque{j}"])
+    out["mechanical_energy"], out["electrical_energy"] = mechanical, electrical
+    out |= _drift_of_rotors(Overlay(lanes, out), step)
+    push = [(lanes[f"u{a}"] - lanes[f"old_u{a}"]) * (1.0 / step) - lanes[f"gravity_{a}"] for a in AXES]
+    specific_force = to_body(rotation_rows(lanes), push)
+    for k, a in enumerate(AXES):
+        mean_rate = 0.5 * (lanes[f"old_w{a}"] + lanes[f"w{a}"])
+        for name, value in ((f"acceleration_{a}", specific_force[k]), (f"gyro_{a}", mean_rate)):
+            out[name] = lanes[name] + lanes["low_pass"] * (value - lanes[name])
+    return out
+
+
+def _read_wheel(lanes: Lanes, i: int, out: Out) -> None:
+    """Contact force on wheel ``i``; gear friction is what the constraints do to a joint beyond it."""
+    floor = [lanes[f"floor_{a}{i}"] for a in AXES]
+    c, s = lanes[f"heading_x{i}"], lanes[f"heading_y{i}"]
+    along, across, normal = c * floor[0] + s * floor[1], c * floor[1] - s * floor[0], floor[2]
+    moment = lanes[f"leg_arm_x{i}"] * along + lanes[f"leg_arm_y{i}"] * across + lanes[f"leg_arm_z{i}"] * normal
+    out[f"gear_torque{i}"] = lanes[f"constraint_joint_rate{i}"] - moment
+    out[f"gear_torque{4 + i}"] = lanes[f"constraint_joint_rate{4 + i}"] + lanes[f"radius{i}"] * along
+    out[f"force_x{i}"], out[f"force_y{i}"] = along + lanes[f"own_force_x{i}"], across + lanes[f"own_force_y{i}"]
+    out[f"force_z{i}"] = normal
+
+
+def _add_slip(lanes: Lanes, step: Value, out: Out) -> None:
+    n, heading, lateral, scale = floor_axes(rotation_rows(lanes))
+    twist = [*vector(lanes, "v"), *vector(lanes, "w")]
+    for i in CORNERS:
+        points = wheel_points(lanes, i, *ops.sin_cos(lanes[f"leg_angle{i}"]), n, scale)
+        slip = engine.slip_velocity(lanes, i, points, heading, lateral, twist)
+        for a, speed in zip("xy", slip, strict=True):
+            out[f"slip_displacement_{a}{i}"] = lanes[f"slip_displacement_{a}{i}"] + step * speed
+
+
+# ---- observation at the end of a control tick ------------------------------------------------------------------------
+
+
+def observe(lanes: Lanes) -> Out:
+    """Columns of the truth matrix, then the raw sensor channels: the engine's observation of the same state."""
+    lanes = with_engine_rates(lanes)
+    renamed: Out = {f"friction_{a}{i}": lanes[f"force_{a}{i}"] for i in CORNERS for a in "xy"}
+    renamed |= {f"normal{i}": lanes[f"force_z{i}"] for i in CORNERS}
+    renamed |= {f"gear_friction{j}": lanes[f"gear_torque{j}"] for j in range(8)}
+    renamed |= {f"rolling_friction{i}": lanes[f"rolling_torque{i}"] for i in CORNERS}
+    out = engine.observe(Overlay(lanes, renamed), 1.0, FEATURES)  # impulses over a step of 1 are forces
+    for j in range(8):
+        out[f"joint_velocity_{j}"] = out[f"raw_velocity_{j}"] = lanes[f"joint_rate{j}"]
+    return out
+
+
+def formula_inputs(lanes: Lanes) -> Out:
+    """What formula forces may depend on, at the start of a step (``plants.forces.INPUTS``)."""
+    seen = observe(lanes)
+    seen["supply_voltage"] = seen["raw_supply"]
+    return {name: seen[name] for name in INPUTS_OF_FORMULAS}

@@ -1,0 +1,310 @@
+"""What the robot's sensors make of the truth: one model for every simulator.
+
+A simulator hands over one :data:`RAW_LAYOUT` row per robot and control tick; :class:`SensorModel` turns it into
+``SENSOR_LAYOUT``. Noise is counter-based, so a robot reads the same bits alone or anywhere in a batch of any size.
+
+Order of errors: mounting (``imu.mount``: what the IMU reads is in its own frame), then zero errors, scale and biases, then
+noise, then register counts. The simulator itself low-passes
+gyroscope and accelerometer (``imu.bandwidth``) inside its substeps.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.random import normals4, stream_number, words4
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Channel, Layout, PlantOptions
+from wlr_gym.physics.servo import REGISTER_UNITS, effort_counts
+from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot.parameters import SPECS, XYZ, Parameters
+
+Array = NDArray[np.float64]
+
+RAW_LAYOUT = Layout(
+    (
+        Channel("joint_position", JOINTS, "rad", "true joint angles at the tick's end"),
+        Channel("joint_velocity", JOINTS, "rad/s", "true joint rates, relative to the parent link"),
+        Channel("joint_effort", JOINTS, "N m", "motor current times the nominal torque constant"),
+        Channel("gyro", XYZ, "rad/s", "low-passed angular velocity, body frame"),
+        Channel("accelerometer", XYZ, "m/s2", "low-passed specific force at the body origin, body frame"),
+        Channel("supply_voltage", (), "V", "at the servos"),
+        Channel("pose", ("x", "y", "yaw"), "m, m, rad", "body origin in the floor frame at the tick's end; yaw may wrap"),
+    )
+)
+
+# Columns of the state matrix: what a robot's sensors remember.
+_CALIBRATION = (
+    "joint.zero_offset",
+    "imu.gyro_bias",
+    "imu.accel_bias",
+    "camera.mount_yaw",
+    "camera.scale",
+    "camera.delay",
+)
+_ZERO_OFFSET, _GYRO_BIAS, _ACCEL_BIAS, _MOUNT_YAW, _SCALE, _DELAY, _IMU_TO_BODY = 0, 4, 7, 10, 11, 12, 13
+_WHEEL_ZERO, _START_POSE, _SHOWN_POSE, _PHASE, _POSES = 22, 26, 29, 32, 33
+
+# Entries of the settings vector.
+_PERIOD, _CAMERA_RATE, _NOISY = 0, 1, 2
+_POSITION_COUNT, _VELOCITY_COUNT, _VOLT_COUNT, _EFFORT_COUNTS = 3, 4, 5, 6
+_VOLT_NOISE, _GYRO_NOISE, _ACCEL_NOISE, _CAMERA_NOISE, _YAW_NOISE, _EFFORT_NOISE = 14, 15, 16, 17, 18, 19
+
+# First columns of the signals, as plain numbers for the kernel.
+_RAW_VELOCITY, _RAW_EFFORT, _RAW_GYRO, _RAW_ACCEL, _RAW_VOLT, _RAW_POSE = (
+    RAW_LAYOUT.slices[name].start
+    for name in ("joint_velocity", "joint_effort", "gyro", "accelerometer", "supply_voltage", "pose")
+)
+_OUT_VELOCITY, _OUT_EFFORT, _OUT_GYRO, _OUT_ACCEL, _OUT_VOLT, _OUT_CAMERA, _OUT_AGE = (
+    SENSOR_LAYOUT.slices[name].start
+    for name in (
+        "joint_velocity",
+        "joint_effort",
+        "gyro",
+        "accelerometer",
+        "supply_voltage",
+        "camera_pose",
+        "joint_age",
+    )
+)
+_TICK_STREAM = stream_number("sensors")
+_CAMERA_STREAM = stream_number("camera")
+_PHASE_STREAM = stream_number("camera phase")
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _rounded(value: float, count: float) -> float:
+    """``value`` in whole counts (no negative zero); a count of 0 leaves it as it is."""
+    return np.rint(value / count) * count + 0.0 if count > 0.0 else value
+
+
+@njit(cache=True, nogil=True)
+def _camera(seed: Any, tick: int, pose: Any, settings: Any, state: Any, out: Any) -> None:
+    """Store this tick's pose; show the newest frame that has arrived: exposed at (j + phase) / rate, ``delay`` earlier."""
+    period, rate = settings[_PERIOD], settings[_CAMERA_RATE]
+    length = (state.shape[0] - _POSES) // 3
+    slot = _POSES + 3 * (tick % length)
+    last = state[_POSES + 3 * ((tick - 1) % length) + 2] if tick > 0 else pose[2]
+    turn = pose[2] - last
+    state[slot] = pose[0]
+    state[slot + 1] = pose[1]
+    state[slot + 2] = last + turn - 2.0 * np.pi * np.rint(turn / (2.0 * np.pi))
+    now = tick * period
+    frame = math.floor((now - state[_DELAY]) * rate - state[_PHASE])
+    before = math.floor(((tick - 1) * period - state[_DELAY]) * rate - state[_PHASE])
+    exposed = (frame + state[_PHASE]) / rate
+    is_new = tick == 0 or frame > before
+    if is_new:
+        _expose(seed, frame, exposed / period, length, settings, state)
+    out[_OUT_CAMERA] = state[_SHOWN_POSE]
+    out[_OUT_CAMERA + 1] = state[_SHOWN_POSE + 1]
+    out[_OUT_CAMERA + 2] = state[_SHOWN_POSE + 2]
+    out[_OUT_AGE] = 0.0
+    out[_OUT_AGE + 1] = 0.0
+    out[_OUT_AGE + 2] = now - exposed
+    out[_OUT_AGE + 3] = 1.0 if is_new else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _expose(seed: Any, frame: int, ticks: float, length: int, settings: Any, state: Any) -> None:
+    """Compute the pose a frame shows: at ``ticks`` (linear between tick poses), from the start pose, in the camera's frame."""
+    ticks = max(ticks, 0.0)
+    whole = math.floor(ticks)
+    part = ticks - whole
+    a = _POSES + 3 * (whole % length)
+    b = _POSES + 3 * ((whole + 1) % length) if part > 0.0 else a
+    dx = state[a] + part * (state[b] - state[a]) - state[_START_POSE]
+    dy = state[a + 1] + part * (state[b + 1] - state[a + 1]) - state[_START_POSE + 1]
+    yaw = state[a + 2] + part * (state[b + 2] - state[a + 2]) - state[_START_POSE + 2]
+    turn = state[_START_POSE + 2] + state[_MOUNT_YAW]
+    c, s = math.cos(turn), math.sin(turn)
+    state[_SHOWN_POSE] = state[_SCALE] * (c * dx + s * dy)
+    state[_SHOWN_POSE + 1] = state[_SCALE] * (c * dy - s * dx)
+    state[_SHOWN_POSE + 2] = yaw
+    if settings[_NOISY] > 0.0:
+        n0, n1, n2, _ = normals4(seed, _CAMERA_STREAM, frame, 0)
+        state[_SHOWN_POSE] += settings[_CAMERA_NOISE] * n0
+        state[_SHOWN_POSE + 1] += settings[_CAMERA_NOISE] * n1
+        state[_SHOWN_POSE + 2] += settings[_YAW_NOISE] * n2
+
+
+@njit(cache=True, nogil=True)
+def _add_noise(seed: Any, tick: int, settings: Any, out: Any) -> None:
+    """Add Gaussian noise to efforts, IMU and voltage."""
+    for block in range(2):
+        four = normals4(seed, _TICK_STREAM, tick, block)
+        for k in range(4):
+            out[_OUT_EFFORT + 4 * block + k] += settings[_EFFORT_NOISE + 4 * block + k] * four[k]
+    n0, n1, n2, n3 = normals4(seed, _TICK_STREAM, tick, 2)
+    out[_OUT_GYRO] += settings[_GYRO_NOISE] * n0
+    out[_OUT_GYRO + 1] += settings[_GYRO_NOISE] * n1
+    out[_OUT_GYRO + 2] += settings[_GYRO_NOISE] * n2
+    out[_OUT_VOLT] += settings[_VOLT_NOISE] * n3
+    n0, n1, n2, _ = normals4(seed, _TICK_STREAM, tick, 3)
+    out[_OUT_ACCEL] += settings[_ACCEL_NOISE] * n0
+    out[_OUT_ACCEL + 1] += settings[_ACCEL_NOISE] * n1
+    out[_OUT_ACCEL + 2] += settings[_ACCEL_NOISE] * n2
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _in_imu_frame(state: Any, row: Any, first: int, axis: int) -> float:
+    """Component ``axis`` in the IMU's frame of the body-frame vector in ``row[first:first + 3]`` (transposed rotation)."""
+    r = _IMU_TO_BODY + axis
+    return state[r] * row[first] + state[r + 3] * row[first + 1] + state[r + 6] * row[first + 2]
+
+
+@njit(cache=True, nogil=True)
+def _measure(raw: Any, seeds: Any, ticks: Any, settings: Any, states: Any, outs: Any, start: Any, stop: Any) -> None:
+    for i in range(start, stop):
+        row, state, out = raw[i], states[i], outs[i]
+        for k in range(4):
+            out[k] = row[k] + state[_ZERO_OFFSET + k]
+            out[4 + k] = row[4 + k] - state[_WHEEL_ZERO + k]
+        for k in range(3):
+            out[_OUT_GYRO + k] = _in_imu_frame(state, row, _RAW_GYRO, k) + state[_GYRO_BIAS + k]
+            out[_OUT_ACCEL + k] = _in_imu_frame(state, row, _RAW_ACCEL, k) + state[_ACCEL_BIAS + k]
+        for k in range(8):
+            out[_OUT_VELOCITY + k] = row[_RAW_VELOCITY + k]
+            out[_OUT_EFFORT + k] = row[_RAW_EFFORT + k]
+        out[_OUT_VOLT] = row[_RAW_VOLT]
+        if settings[_NOISY] > 0.0:
+            _add_noise(seeds[i], ticks[i], settings, out)
+        for k in range(8):
+            out[k] = _rounded(out[k], settings[_POSITION_COUNT])
+            out[_OUT_VELOCITY + k] = _rounded(out[_OUT_VELOCITY + k], settings[_VELOCITY_COUNT])
+            out[_OUT_EFFORT + k] = _rounded(out[_OUT_EFFORT + k], settings[_EFFORT_COUNTS + k])
+        out[_OUT_VOLT] = _rounded(out[_OUT_VOLT], settings[_VOLT_COUNT])
+        _camera(seeds[i], ticks[i], row[_RAW_POSE : _RAW_POSE + 3], settings, state, out)
+        ticks[i] += 1
+
+
+@njit(cache=True, nogil=True)
+def _camera_phase(seed: Any) -> float:
+    return float(np.int64(words4(seed, _PHASE_STREAM, 0, 0)[0])) * 2.0**-32
+
+
+class SensorModel:
+    """The sensors of ``count`` robots.
+
+    Encoders: true angle (legs plus ``joint.zero_offset``, wheels from where they stood at reset) and rate in register
+    counts. Efforts, gyroscope, accelerometer, voltage: bias, white noise, counts. Gyroscope and accelerometer read body-frame
+    vectors turned into the IMU's frame (``imu.mount``); their biases are along the IMU's own axes. Camera: frames at
+    ``camera.rate`` with a phase drawn per robot, shown at the first tick at least ``camera.delay`` after their exposure, and
+    until the next; pose from the start pose (x and y in the start heading turned by ``camera.mount_yaw``, then times
+    ``camera.scale``; yaw zeroed and unwrapped, not turned). Before the reset the robot is taken to have stood still.
+    ``camera_is_new`` is 1 at the reset.
+
+    With ``options.sensor_noise`` False there is neither noise nor rounding; biases, offsets, delays and frame times stay.
+    Sources: robot file's ``sensors``; counts of effort and voltage from :mod:`wlr_gym.physics.servo`.
+    """
+
+    def __init__(self, robot: Robot, options: PlantOptions, count: int) -> None:
+        history = math.ceil(SPECS["camera.delay"].high / options.control_period) + 3
+        self.count = count
+        self._settings = _settings(robot, options)
+        self._seeds = np.zeros(count, np.uint64)
+        self._ticks = np.zeros(count, np.int64)
+        self._states = np.zeros((count, _POSES + 3 * history))
+        self._states[:, _SCALE] = 1.0
+        self._states[:, _IMU_TO_BODY:_WHEEL_ZERO] = np.eye(3).ravel()
+
+    def reset(
+        self,
+        raw: Array,
+        out: Array,
+        seeds: NDArray[np.uint64] | None = None,
+        parameters: Parameters | None = None,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Start the sensors of the masked robots anew and write their first readings into ``out``.
+
+        Args:
+            raw: (N, RAW_LAYOUT.width) truth at the start; rows outside ``mask`` are ignored.
+            out: (N, SENSOR_LAYOUT.width); rows outside ``mask`` stay as they are.
+            seeds: (N,) noise seeds; None keeps the present ones, which repeats their noise.
+            parameters: (N) batch the sensor errors are read from; None keeps them.
+            mask: (N,) which robots; None = all.
+        """
+        self._require(raw, out)
+        rows = np.arange(self.count) if mask is None else np.flatnonzero(mask)
+        if seeds is not None:
+            self._seeds[rows] = np.asarray(seeds, np.uint64)[rows]
+        if parameters is not None:
+            self.set_errors(rows, parameters)
+        self._ticks[rows] = 0
+        self._states[rows, _WHEEL_ZERO:_START_POSE] = raw[rows, 4:8]
+        self._states[rows, _START_POSE:_SHOWN_POSE] = raw[rows, _RAW_POSE:]
+        self._states[rows, _PHASE] = [_camera_phase(seed) for seed in self._seeds[rows]]
+        for i in rows:
+            _measure(raw, self._seeds, self._ticks, self._settings, self._states, out, i, i + 1)
+
+    def set_errors(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
+        """Take zero errors, biases, mounting errors, camera scale and delay of robots ``rows``; nothing is forgotten."""
+        errors = [parameters[name].reshape(self.count, -1)[rows] for name in _CALIBRATION]
+        errors.append(imu_to_body(parameters)[rows].reshape(-1, 9))
+        self._states[rows, :_WHEEL_ZERO] = np.concatenate(errors, axis=1)
+
+    def measure(self, raw: Array, out: Array, start: int = 0, stop: int | None = None) -> None:
+        """Read the sensors of robots ``start`` to ``stop`` one control tick on; the rest of ``out`` stays.
+
+        Args:
+            raw: (N, RAW_LAYOUT.width) truth at the tick's end, float64, C order.
+            out: (N, SENSOR_LAYOUT.width), float64, C order. Threads may work on disjoint ranges at the same time.
+
+        Raises:
+            InputError: wrong shapes.
+        """
+        self._require(raw, out)
+        end = self.count if stop is None else stop
+        _measure(raw, self._seeds, self._ticks, self._settings, self._states, out, start, end)
+
+    def _require(self, raw: Array, out: Array) -> None:
+        if raw.shape != (self.count, RAW_LAYOUT.width) or out.shape != (self.count, SENSOR_LAYOUT.width):
+            raise InputError(
+                f"sensors of {self.count} robots take raw ({self.count}, {RAW_LAYOUT.width}) and "
+                f"out ({self.count}, {SENSOR_LAYOUT.width}), got {raw.shape} and {out.shape}"
+            )
+
+
+def imu_to_body(parameters: Parameters) -> Array:
+    """Return the rotation of ``imu.mount`` from the IMU's to the body frame, (N, 3, 3); exactly the identity without one."""
+    roll, pitch, yaw = parameters["imu.mount"].T
+    return rotation(yaw, pitch, roll)
+
+
+def rotation(yaw: Array, pitch: Array, roll: Array) -> Array:
+    """Return the matrices (N, 3, 3) of Rz(yaw) Ry(pitch) Rx(roll)."""
+    (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def _settings(robot: Robot, options: PlantOptions) -> Array:
+    """Counts and noise levels as the vector the kernel reads; all zero without sensor noise."""
+    sensors = robot.sensors
+    settings = np.zeros(_EFFORT_NOISE + len(JOINTS))
+    settings[_PERIOD] = options.control_period
+    settings[_CAMERA_RATE] = sensors.camera.rate
+    if not options.sensor_noise:
+        return settings
+    settings[_NOISY] = 1.0
+    settings[_POSITION_COUNT] = sensors.encoder.position
+    settings[_VELOCITY_COUNT] = sensors.encoder.velocity
+    settings[_VOLT_COUNT] = REGISTER_UNITS["XM540-W150-R"]["voltage"].per_count
+    settings[_EFFORT_COUNTS : _EFFORT_COUNTS + len(JOINTS)] = effort_counts(robot)
+    settings[_VOLT_NOISE] = sensors.volt_noise
+    settings[_GYRO_NOISE] = sensors.imu.gyro_noise
+    settings[_ACCEL_NOISE] = sensors.imu.accel_noise
+    settings[_CAMERA_NOISE] = sensors.camera.position_noise
+    settings[_YAW_NOISE] = sensors.camera.yaw_noise
+    settings[_EFFORT_NOISE:] = np.repeat([sensors.effort.leg_noise, sensors.effort.wheel_noise], 4)
+    return settings

@@ -1,0 +1,199 @@
+"""What every simulator does alike: buffers, taking and checking parameters, resets, goals of motors that are off."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.physics.plants.base import (
+    SENSOR_LAYOUT,
+    TRUTH_LAYOUT,
+    PlantOptions,
+    PlantState,
+    Sensors,
+    Truth,
+    check_goals,
+    hold_where_off,
+    standing_state,
+)
+from wlr_gym.physics.plants.goals import GoalHistory, Goals
+from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
+from wlr_gym.robot import Robot
+from wlr_gym.robot.parameters import Parameters
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+
+#: Of the platform's mass: what moves at least against one wheel's spring.
+LIGHTEST_SHARE = 0.05
+
+
+class Simulator(ABC):
+    """Base of the simulators; see :class:`wlr_gym.physics.plants.base.Plant` for the contract.
+
+    A simulator ends its constructor with :meth:`_start`, and defines ``step`` and what is abstract here.
+    """
+
+    def __init__(self, robot: Robot, count: int, options: PlantOptions | None) -> None:
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+            raise InputError(f"number of robots is {count!r}, expected 1 or more")
+        self.robot = robot
+        self.options = options or PlantOptions()
+        self.substeps = self.options.substeps
+        self.parameters = Parameters.nominal(robot, count)
+        self._count = count
+        self._all = np.arange(count)
+        self._truth = Truth(np.zeros((count, TRUTH_LAYOUT.width)))
+        self._raw = np.zeros((count, RAW_LAYOUT.width))
+        self._readings = Sensors(np.zeros((count, SENSOR_LAYOUT.width)))
+        self._time: Array = np.zeros(count)
+        self._goals: Goals = GoalHistory(count, self.options.control_period)
+        self._sensors = SensorModel(robot, self.options, count)
+
+    def _start(self) -> None:
+        self.reset(seeds=np.zeros(self._count, np.uint64), parameters=self.parameters)
+
+    @abstractmethod
+    def _use_parameters(self, rows: Rows, chosen: Parameters) -> None:
+        """Hand checked parameters (len(rows)) of robots ``rows`` to the simulation."""
+
+    @abstractmethod
+    def _fit_rotors(self, rows: Rows, chosen: Parameters) -> None:
+        """Move the rotors of gears whose play changes (:func:`refitted_lead`); a new rotor turns with its joint."""
+
+    @abstractmethod
+    def _write_state(self, state: PlantState, rows: Rows) -> None:
+        """Put robots ``rows`` where ``state`` (N) says."""
+
+    @abstractmethod
+    def get_state(self) -> PlantState:
+        """Return a copy of the mechanical and servo state."""
+
+    @abstractmethod
+    def _look(self, rows: Rows) -> None:
+        """Fill truth and raw sensor signals of robots ``rows``."""
+
+    def expect_all_effects(self) -> None:  # noqa: B027 (a simulator may have nothing to do)
+        """Get ready for every effect at once, where each would otherwise need a kernel of its own; the bits do not change."""
+
+    @abstractmethod
+    def set_force_values(self, values: Array) -> None:
+        """Take the constants of the formula forces per robot: (N, constants of all forces one after the other)."""
+
+    @property
+    def count(self) -> int:
+        """Number of robots."""
+        return self._count
+
+    def reset(
+        self,
+        seeds: NDArray[np.uint64] | None = None,
+        parameters: Parameters | None = None,
+        mask: NDArray[np.bool_] | None = None,
+        state: PlantState | None = None,
+    ) -> Sensors:
+        """Start robots anew; see :meth:`wlr_gym.physics.plants.base.Plant.reset`."""
+        rows = self._rows(mask)
+        if parameters is not None:
+            self._take_parameters(parameters, rows)
+        start = standing_state(self.robot, self.parameters) if state is None else state
+        self._write_state(start, rows)
+        self._time[rows] = 0.0 if start.time is None else start.time[rows]
+        self._goals.reset(rows, start, self.parameters)
+        self._look(rows)
+        self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)
+        return self._readings
+
+    def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
+        """Change parameters in mid-run (interval randomisation, drifting friction); the state stays."""
+        rows = self._rows(mask)
+        self._take_parameters(parameters, rows)
+        self._goals.set_delays(rows, self.parameters)
+        self._sensors.set_errors(rows, self.parameters)
+
+    def use_goals(self, goals: Goals) -> None:
+        """Take the goals from a schedule of one's own instead of the history of those written."""
+        self._goals = goals
+
+    def keep_going(self, count: int) -> None:  # noqa: B027 (a simulator may have no use for it)
+        """From now on nobody looks at any but the first ``count`` robots: a simulator need not move the others."""
+
+    def _take_goals(self, goals: Array, torque_on: NDArray[np.bool_] | None, on: Array) -> tuple[Array, Array, Array]:
+        """Write into ``on`` (N, 8) which motors are on; return newer goals, older goals and switch time of this tick.
+
+        Raises:
+            InputError: wrong shape or a non-finite goal of a motor that is on.
+        """
+        if torque_on is None:
+            on.fill(1.0)
+        elif self._goals.given:
+            on[...] = torque_on
+        else:
+            goals = hold_where_off(goals, torque_on, self._present_goals())
+            on[...] = np.asarray(torque_on, dtype=bool)
+        return self._goals.push(goals if self._goals.given else check_goals(goals, self._count))
+
+    def _rows(self, mask: NDArray[np.bool_] | None) -> Rows:
+        if mask is None:
+            return self._all
+        if np.shape(mask) != (self._count,):
+            raise InputError(f"mask has shape {np.shape(mask)}, expected ({self._count},)")
+        return np.flatnonzero(mask)
+
+    def _take_parameters(self, parameters: Parameters, rows: Rows) -> None:
+        if len(parameters) != self._count:
+            raise InputError(f"parameters hold {len(parameters)} robots, the plant {self._count}")
+        chosen = Parameters(parameters.values[rows])
+        chosen.validate()
+        check_contact_resolution(chosen, self.options.physics_step)
+        self._fit_rotors(rows, chosen)
+        self.parameters.values[rows] = chosen.values
+        self._use_parameters(rows, chosen)
+
+    def _present_goals(self) -> Array:
+        """Goals that keep every joint as it is: leg angles as the servo reads them, wheels at rest."""
+        present = np.zeros((self._count, 8))
+        present[:, :4] = self._truth.joint_position[:, :4] + self.parameters["joint.zero_offset"]
+        return present
+
+    def truth(self) -> Truth:
+        """Return the true state after the last step or reset; overwritten by the next step."""
+        return self._truth
+
+
+def refitted_lead(lead: Array, old: Array, new: Array) -> Array:
+    """Return how far rotors lead their joints when the play of their gears changes from ``old`` to ``new`` (rad).
+
+    How far the teeth are pressed together is kept; without play there is no rotor of its own.
+    """
+    pressed = np.maximum(np.abs(lead) - 0.5 * old, 0.0)
+    kept = np.where(old > 0.0, np.minimum(np.abs(lead), 0.5 * new) + pressed, 0.0)
+    return np.where(old == new, lead, np.where(new > 0.0, np.copysign(kept, lead), 0.0))
+
+
+def most_damping(parameters: Parameters, step: float) -> float:
+    """Return the contact damping (N s/m) that the step just resolves, for the lightest robot of the batch."""
+    return float(2.0 * LIGHTEST_SHARE * parameters["body.mass"].min() / step)
+
+
+def check_contact_resolution(parameters: Parameters, step: float) -> None:
+    """Refuse a contact spring that the step cannot resolve (explicit spring: step^2 k / m well below 4).
+
+    The mass that moves against one wheel's spring is at least about a twentieth of the platform (a light leg swinging up
+    against its own rotor inertia).
+    """
+    stiffness = parameters["ground.normal_stiffness"].max(axis=1)
+    damping = parameters["ground.normal_damping"].max(axis=1)
+    mass = LIGHTEST_SHARE * parameters["body.mass"]
+    worst = np.maximum(step * step * stiffness / mass / 2.0, step * damping / mass / 2.0)
+    robot = int(np.argmax(worst))
+    if worst[robot] > 1.0:
+        raise InputError(
+            f"ground.normal_stiffness {stiffness[robot]:g} N/m and ground.normal_damping {damping[robot]:g} N s/m are too "
+            f"stiff for a physics step of {step:g} s and a body of {parameters['body.mass'][robot]:g} kg: shorten physics_step "
+            f"below {step / worst[robot] ** 0.5:.2g} s or soften the contact"
+        )

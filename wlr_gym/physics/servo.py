@@ -1,0 +1,310 @@
+"""The Dynamixel servo, defined once for every simulator: profile generator, control law in voltage space, DC motor, registers.
+
+Everything is at the output shaft, in SI units. The control law and the profile generator are written with
+:mod:`wlr_gym.physics.codegen.ops`, so the same source runs on floats, numpy arrays (any shape that broadcasts, float32 or
+float64) and traced nodes. Facts about the servos: ROBOTIS e-manual, XM540-W150 and XL430-W250.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.physics.codegen import ops
+from wlr_gym.robot import JOINTS, LEGS, Robot
+
+Value = Any  # float | numpy array | traced node
+Array = NDArray[np.float64]
+
+#: Stands for "no limit" on profile velocity (rad/s) and acceleration (rad/s2). Finite, so that no select meets inf - inf.
+NO_LIMIT = 1e6
+#: Distance (rad) at which a leg's profile counts as arrived: a few float32 roundings, 1/1500 of an encoder count.
+ARRIVAL = 1e-6
+#: Braking may be this much harder than nominal. In exact arithmetic it is only used when a new goal lies too close to stop at;
+#: in float32 it makes up for rounding along the braking curve, without which the profile overshoots by up to 2e-4 rad.
+BRAKING_RESERVE = 1.02
+
+
+# --- motor ------------------------------------------------------------------------------------------------------------
+
+
+def motor_constants(stall_torque: Value, no_load_speed: Value, nominal_voltage: Value) -> tuple[Value, Value]:
+    """Return torque constant (N m/A = V s/rad) and winding resistance (ohm) of a motor from its data sheet.
+
+    Args:
+        stall_torque: N m at ``nominal_voltage``.
+        no_load_speed: rad/s at ``nominal_voltage``.
+        nominal_voltage: V the data-sheet figures hold for.
+    """
+    torque_constant = nominal_voltage / no_load_speed
+    return torque_constant, torque_constant * nominal_voltage / stall_torque
+
+
+def motor_torque(torque_constant: Value, resistance: Value, voltage: Value, velocity: Value) -> Value:
+    """Return the motor torque at the output shaft (N m), before gear friction."""
+    return (torque_constant / resistance) * (voltage - torque_constant * velocity)
+
+
+def controller_voltage(
+    kp: Value,
+    kd: Value,
+    reference_position: Value,
+    reference_velocity: Value,
+    position: Value,
+    velocity: Value,
+    supply_voltage: Value,
+) -> Value:
+    """Return the voltage (V) the servo puts on its motor: kp (q_ref - q) + kd (w_ref - w), limited to the supply.
+
+    One law for both modes. Legs (position mode): ``kp`` is the Position P Gain, ``kd`` the D gain. Wheels (velocity mode):
+    ``kd`` is the Velocity P Gain and ``kp`` the Velocity I Gain, acting on q_ref - q = integral of the velocity error.
+    """
+    wish = kp * (reference_position - position) + kd * (reference_velocity - velocity)
+    return ops.clip(wish, -supply_voltage, supply_voltage)
+
+
+# --- profile generator ------------------------------------------------------------------------------------------------
+
+
+def profile_limits(profile_velocity: ArrayLike, profile_acceleration: ArrayLike) -> tuple[Array, Array]:
+    """Translate profile registers, where 0 means "off", into finite limits for the profile steps below.
+
+    Legs: velocity 0 turns the whole profile off (step), acceleration 0 makes it rectangular. Wheels use the acceleration
+    only; 0 = step (e-manual, Profile Velocity 112 and Profile Acceleration 108).
+
+    Args:
+        profile_velocity, profile_acceleration: (..., 8) in joint order, rad/s and rad/s2.
+
+    Returns:
+        Velocity and acceleration limits, (..., 8).
+
+    Raises:
+        InputError: the last axis is not the eight joints.
+    """
+    velocity, acceleration = np.broadcast_arrays(
+        np.asarray(profile_velocity, dtype=np.float64), np.asarray(profile_acceleration, dtype=np.float64)
+    )
+    if velocity.shape[-1:] != (len(JOINTS),):
+        raise InputError(f"servo profile has shape {velocity.shape}, expected (..., {len(JOINTS)}): one value per joint")
+    is_leg = np.arange(len(JOINTS)) < len(LEGS)
+    stepping = (acceleration == 0) | (is_leg & (velocity == 0))
+    return np.where(velocity == 0, NO_LIMIT, velocity), np.where(stepping, NO_LIMIT, acceleration)
+
+
+def wheel_profile_step(
+    reference_position: Value,
+    reference_velocity: Value,
+    goal: Value,
+    acceleration: Value,
+    step: Value,
+    position: Value,
+    kp: Value,
+    supply: Value,
+) -> tuple[Value, Value, Value, Value]:
+    """Advance a wheel's profile generator (velocity mode) by one substep.
+
+    The reference velocity ramps to the goal; the reference position is its exact integral over the substep, also where the
+    ramp ends within it. Before that the reference is pulled to within supply/kp of the shaft, which is the servo's
+    anti-windup: the integral term alone never asks for more than the supply.
+
+    Args:
+        reference_position, reference_velocity: where the generator stands, rad and rad/s.
+        goal: rad/s.
+        acceleration: rad/s2, ``NO_LIMIT`` = step.
+        step: s.
+        position: shaft angle at the start of the substep as the servo reads it, rad.
+        kp: V/rad on the integral of the velocity error.
+        supply: V.
+
+    Returns:
+        New reference position and velocity, and both as the controller uses them in the middle of the substep.
+    """
+    reach = supply * (1.0 / ops.maximum(kp, 1e-9))
+    start = position + ops.clip(reference_position - position, -reach, reach)
+    room = acceleration * step
+    velocity = ops.clip(goal, reference_velocity - room, reference_velocity + room)
+    change = velocity - reference_velocity
+    mean_velocity = velocity - change * ops.absolute(change) * (0.5 / room)
+    travel = step * mean_velocity
+    return start + travel, velocity, start + 0.5 * travel, mean_velocity
+
+
+def leg_profile_step(
+    reference_position: Value,
+    reference_velocity: Value,
+    goal: Value,
+    velocity_limit: Value,
+    acceleration: Value,
+    step: Value,
+) -> tuple[Value, Value, Value, Value]:
+    """Advance a leg's profile generator (position mode) by one substep: step, rectangle or trapezoid.
+
+    The goal may change at any time; the generator brakes, overshoots if it must, and comes back. It stops exactly at the
+    goal, without chatter, in float32 too.
+
+    Args:
+        reference_position, reference_velocity: where the generator stands, rad and rad/s.
+        goal: rad.
+        velocity_limit: rad/s; ``NO_LIMIT`` = none.
+        acceleration: rad/s2; ``NO_LIMIT`` = rectangular profile.
+        step: s.
+
+    Returns:
+        New reference position and velocity, and both as the controller uses them in the middle of the substep. A jump of
+        the position (no limit at all) has reference velocity 0, so it gives the same answer at every step size.
+    """
+    to_goal = goal - reference_position
+    smooth = _trapezoid(to_goal, reference_velocity, velocity_limit, acceleration, step)
+    sharp = _rectangle(to_goal, velocity_limit, step)
+    is_sharp = acceleration - 0.5 * NO_LIMIT
+    travel, velocity, mean_velocity, arrived = (ops.where_positive(is_sharp, a, b) for a, b in zip(sharp, smooth, strict=True))
+    position = ops.where_positive(arrived, goal, reference_position + travel)
+    return position, velocity, 0.5 * (reference_position + position), mean_velocity
+
+
+def _trapezoid(to_goal: Value, velocity: Value, limit: Value, acceleration: Value, step: Value) -> tuple[Value, ...]:
+    """Travel, new velocity, mean velocity and whether (> 0) the goal is reached, with the acceleration limited.
+
+    The fastest speed v from which braking still ends at the goal, after a trapezoid-rule step, solves
+    v^2/(2 a) + v step/2 = distance - velocity step/2. Braking along it changes v by exactly a step, so the limit holds
+    up to the last step, which lands on the goal.
+    """
+    direction = ops.where_positive(to_goal, 1.0, -1.0)
+    distance = ops.absolute(to_goal)
+    along = direction * velocity
+    room = acceleration * step
+    left = ops.maximum(distance - 0.5 * step * along, 0.0)
+    braking = 2.0 * left / (0.5 * step + ops.sqrt(0.25 * step * step + left * (2.0 / acceleration)))
+    new_along = ops.clip(ops.minimum(limit, braking), along - BRAKING_RESERVE * room, along + room)
+    near = ops.maximum(0.5 * step * room, ARRIVAL)
+    arrived = ops.minimum(near - distance, 8.0 * acceleration * near - along * along)
+    new_velocity = ops.where_positive(arrived, 0.0, direction * new_along)
+    mean_velocity = 0.5 * (velocity + new_velocity)
+    return step * mean_velocity, new_velocity, mean_velocity, arrived
+
+
+def _rectangle(to_goal: Value, limit: Value, step: Value) -> tuple[Value, ...]:
+    """The same four values with the acceleration unlimited: constant speed, then stop; a jump where there is no limit."""
+    room = limit * step
+    travel = ops.clip(to_goal, -room, room)
+    arrived = ops.where_positive(ops.absolute(to_goal) - room, 0.0, 1.0)
+    speed = ops.where_positive(limit - 0.5 * NO_LIMIT, 0.0, travel * (1.0 / step))
+    return travel, speed, speed, arrived
+
+
+# --- readings and registers -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Register:
+    """One register quantity: SI unit, SI value of one count, and the range of counts the servo accepts or reports."""
+
+    unit: str
+    per_count: float
+    low: int
+    high: int
+
+
+def _pwm(divisor: float) -> float:
+    """Volts per count of a gain register: PWM units over ``divisor``; 885 units are the supply, 12 V nominal."""
+    return 12.0 / 885 / divisor
+
+
+_TURN = 2 * math.pi
+_POSITION = _TURN / 4096
+_VELOCITY = 0.229 * _TURN / 60
+#: The servo's controller runs at 1 kHz; the integral gain counts velocity errors per cycle.
+_CYCLE = 1e-3
+_COMMON = {
+    "position": Register("rad", _POSITION, -1_048_575, 1_048_575),
+    "profile_velocity": Register("rad/s", _VELOCITY, 0, 32767),
+    "profile_acceleration": Register("rad/s2", 214.577 * _TURN / 3600, 0, 32767),
+    "pwm": Register("-", 1 / 885, -885, 885),
+    "position_p_gain": Register("V/rad", _pwm(128) / _POSITION, 0, 16383),
+    "velocity_p_gain": Register("V s/rad", _pwm(128) / _VELOCITY, 0, 16383),
+    "velocity_i_gain": Register("V/rad", _pwm(65536) / (_VELOCITY * _CYCLE), 0, 16383),
+}
+
+#: Register quantities per servo model: model -> quantity -> :class:`Register`. Gains hold for a 12 V supply: Position P
+#: Gain 800 is K_P = 800/128 PWM units per position count; Velocity P and I Gain are /128 and /65536 per velocity count.
+#: Position range: extended mode, 256 turns. XL430 load is inferred by the servo from its output, XM540 current is measured.
+REGISTER_UNITS: Mapping[str, Mapping[str, Register]] = {
+    "XM540-W150-R": {
+        **_COMMON,
+        "velocity": Register("rad/s", _VELOCITY, -1023, 1023),
+        "current": Register("A", 2.69e-3, -2047, 2047),
+        "voltage": Register("V", 0.1, 0, 160),
+    },
+    "XL430-W250-T": {
+        **_COMMON,
+        "velocity": Register("rad/s", _VELOCITY, -1023, 1023),
+        "load": Register("-", 1e-3, -1000, 1000),
+        "voltage": Register("V", 0.1, 0, 140),
+    },
+}
+
+
+def _register(model: str, quantity: str) -> Register:
+    if model not in REGISTER_UNITS:
+        raise unknown_name("servo model", model, REGISTER_UNITS)
+    if quantity not in REGISTER_UNITS[model]:
+        raise unknown_name("register quantity", quantity, REGISTER_UNITS[model], model)
+    return REGISTER_UNITS[model][quantity]
+
+
+def _require_range(counts: Array, register: Register, model: str, quantity: str) -> None:
+    bad = ~((counts >= register.low) & (counts <= register.high))
+    if bad.any():
+        worst = np.ravel(counts)[np.ravel(bad)][0]
+        raise InputError(
+            f"{model} {quantity}: {worst * register.per_count:g} {register.unit} ({worst:g} counts) is outside "
+            f"[{register.low}, {register.high}] counts = "
+            f"[{register.low * register.per_count:g}, {register.high * register.per_count:g}] {register.unit}"
+        )
+
+
+def to_register(model: str, quantity: str, si_value: ArrayLike) -> Any:
+    """Return the register count(s) nearest to an SI value: int, or an integer array of the same shape.
+
+    Raises:
+        InputError: unknown model or quantity, non-finite value, or one beyond the register's range.
+    """
+    register = _register(model, quantity)
+    counts = np.rint(np.asarray(si_value, dtype=np.float64) / register.per_count)
+    _require_range(counts, register, model, quantity)
+    whole = counts.astype(np.int64)
+    return int(whole) if whole.ndim == 0 else whole
+
+
+def from_register(model: str, quantity: str, counts: ArrayLike) -> Any:
+    """Return the SI value(s) of register counts: float, or an array of the same shape.
+
+    Raises:
+        InputError: unknown model or quantity, or counts beyond the register's range.
+    """
+    register = _register(model, quantity)
+    values = np.asarray(counts, dtype=np.float64)
+    _require_range(values, register, model, quantity)
+    return float(values * register.per_count) if values.ndim == 0 else values * register.per_count
+
+
+def effort_constants(robot: Robot) -> Array:
+    """Return the nominal torque constants (8,) in N m/A that turn motor current into the reported effort."""
+    motors = (robot.servo.leg, robot.servo.wheel)
+    return np.repeat([motor_constants(m.stall_torque, m.no_load_speed, robot.servo.supply_voltage)[0] for m in motors], 4)
+
+
+def effort_counts(robot: Robot) -> Array:
+    """Return one count of reported effort per joint (8,), N m.
+
+    Legs: XM540 Present Current, 2.69 mA times the nominal torque constant. Wheels: XL430 Present Load, 0.1 % of stall torque.
+    """
+    leg = REGISTER_UNITS["XM540-W150-R"]["current"].per_count * effort_constants(robot)[0]
+    wheel = REGISTER_UNITS["XL430-W250-T"]["load"].per_count * robot.servo.wheel.stall_torque
+    return np.repeat([leg, wheel], 4)

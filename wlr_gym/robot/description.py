@@ -1,0 +1,286 @@
+"""The robot's numbers, loaded from ``configs/robot/*.yaml``. SI units and radians; frames as in REP-103.
+
+Joint order everywhere (actions, observations, logs): the four legs, then the four wheels, each lf, rf, lr, rr
+(left/right, front/rear). Leg angle: right-handed about body +y of the vector hip -> wheel centre, 0 forward, pi/2
+straight down. Wheel angle: right-handed about body +y, relative to its leg; positive rolls forward.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, Field, field_validator
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import find_config, named_in
+from wlr_gym.base.settings import Model, overlay, parse_config, read_yaml
+
+CORNERS = ("lf", "rf", "lr", "rr")
+LEGS = tuple(f"leg_{corner}" for corner in CORNERS)
+WHEELS = tuple(f"wheel_{corner}" for corner in CORNERS)
+JOINTS = LEGS + WHEELS
+#: Signs of the hip positions (x, y) in the body frame, in corner order.
+CORNER_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+
+Vector3 = tuple[float, float, float]
+
+
+class Body(Model):
+    """The platform: mass (kg), size (m), principal inertia about its centre of mass (kg m2), centre of mass (m)."""
+
+    mass: float = Field(gt=0)
+    size: Vector3
+    inertia: tuple[float | None, float | None, float | None]
+    com_offset: Vector3 = (0.0, 0.0, 0.0)
+
+
+class HipPosition(Model):
+    """Distance of the hips from the body origin along x and y (m, both signs occur), and their common z."""
+
+    x: float = Field(gt=0)
+    y: float = Field(gt=0)
+    z: float = 0.0
+
+
+class Leg(Model):
+    """One leg: length hip to wheel centre (m), mass (kg), centre of mass from the hip (m), inertia (kg m2)
+    about its own centre of mass, straight down: about x, about y, about its own axis."""
+
+    length: float = Field(gt=0)
+    mass: float | None = Field(gt=0)
+    com_along_leg: float = Field(ge=0)
+    inertia: tuple[float | None, float | None, float | None]
+
+
+class Wheel(Model):
+    """One wheel: radius, width (m), mass (kg), inertia about the axle and across it (kg m2)."""
+
+    radius: float = Field(gt=0)
+    width: float = Field(gt=0)
+    mass: float | None = Field(gt=0)
+    spin_inertia: float = Field(gt=0)
+    transverse_inertia: float | None = Field(gt=0)
+
+
+class Motor(Model):
+    """One servo at its output shaft; torque and speed at the nominal supply voltage (source: ROBOTIS e-manual)."""
+
+    stall_torque: float = Field(gt=0)
+    no_load_speed: float = Field(gt=0)
+    kp: float = Field(ge=0)
+    kd: float = Field(ge=0)
+    armature: float = Field(gt=0)
+    coulomb_friction: float = Field(ge=0)
+    gear_stiffness: float = Field(gt=0)
+    viscous_friction: float = Field(ge=0)
+
+
+class Servo(Model):
+    """Supply voltage (V) and the two servo types."""
+
+    supply_voltage: float = Field(gt=0)
+    leg: Motor
+    wheel: Motor
+
+
+class Ground(Model):
+    """Floor: friction along heading and axle, slope along x (rad), contact stiffness (N/m) and damping (N s/m)."""
+
+    mu_x: float = Field(ge=0)
+    mu_y: float = Field(ge=0)
+    slope: float = 0.0
+    normal_stiffness: float = Field(gt=0)
+    normal_damping: float = Field(ge=0)
+
+
+class Encoder(Model):
+    """One register count of position (rad) and velocity (rad/s)."""
+
+    position: float = Field(ge=0)
+    velocity: float = Field(ge=0)
+
+
+class EffortSensor(Model):
+    """1 sigma noise of the torque estimate (N m)."""
+
+    leg_noise: float = Field(ge=0)
+    wheel_noise: float = Field(ge=0)
+
+
+class Imu(Model):
+    """Bandwidth (Hz), noise per 50 Hz sample and constant bias, 1 sigma (rad/s, m/s2)."""
+
+    bandwidth: float = Field(gt=0)
+    gyro_noise: float = Field(ge=0)
+    accel_noise: float = Field(ge=0)
+    gyro_bias: float = Field(ge=0)
+    accel_bias: float = Field(ge=0)
+
+
+class Camera(Model):
+    """Frame rate (Hz) and 1 sigma noise of the floor pose (m, rad)."""
+
+    rate: float = Field(gt=0)
+    position_noise: float = Field(ge=0)
+    yaw_noise: float = Field(ge=0)
+
+
+class SensorSet(Model):
+    """What the robot can measure, and how badly."""
+
+    control_rate: float = Field(gt=0)
+    encoder: Encoder
+    effort: EffortSensor
+    volt_noise: float = Field(ge=0)
+    imu: Imu
+    camera: Camera
+
+
+class Home(Model):
+    """The pose every episode starts from."""
+
+    leg_angle: float
+
+
+class Robot(Model):
+    """A whole robot, as one ``configs/robot/*.yaml`` describes it."""
+
+    name: str
+    gravity: float = Field(ge=0)
+    body: Body
+    hip_position: HipPosition
+    leg: Leg
+    wheel: Wheel
+    joints: tuple[str, ...]
+    dynamixel_ids: dict[str, int]
+    home: Home
+    leg_limits: tuple[float, float]
+    servo: Servo
+    ground: Ground
+    sensors: SensorSet
+    tolerances: dict[str, float | str] = {}
+
+    @field_validator("leg_limits")
+    @classmethod
+    def _limits_are_ordered(cls, limits: tuple[float, float]) -> tuple[float, float]:
+        if not limits[0] < limits[1]:
+            raise ValueError("the lower limit must be below the upper one")
+        return limits
+
+    @field_validator("dynamixel_ids")
+    @classmethod
+    def _every_joint_has_its_own_id(cls, ids: dict[str, int]) -> dict[str, int]:
+        if set(ids) != set(JOINTS) or len(set(ids.values())) != len(JOINTS):
+            raise ValueError(f"expected one id of its own for each of {', '.join(JOINTS)}")
+        if not all(0 <= number <= 252 for number in ids.values()):
+            raise ValueError("Dynamixel ids are 0 to 252")
+        return ids
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of body, legs and wheels (kg)."""
+        return self.body.mass + 4 * ((self.leg.mass or 0.0) + (self.wheel.mass or 0.0))
+
+
+def physical_faults(robot: Robot) -> list[str]:
+    """Return why ``robot`` cannot be simulated: missing numbers and inertias no rigid body of that size can have.
+
+    A body's inertia is bounded below by plausibility (5 % of a uniform box of the given size: all mass within a fifth
+    of the half-width) and by the triangle inequality. Paper audit, Table I: I_Gy and I_Gz are 1000 times too small.
+    """
+    faults = [f"{path} is missing" for path, value in _missing_candidates(robot) if value is None]
+    x, y, z = robot.body.size
+    box = [robot.body.mass / 12 * s for s in (y * y + z * z, x * x + z * z, x * x + y * y)]
+    for axis, value, uniform in zip("xyz", robot.body.inertia, box, strict=True):
+        if value is not None and value < 0.05 * uniform:
+            faults.append(
+                f"body.inertia {axis} = {value:g} kg m2 is impossible for {robot.body.mass:g} kg in a body of {x:g} x {y:g} x "
+                f"{z:g} m: a uniform box has {uniform:.4g}, {uniform / value:.0f} times more"
+            )
+    faults += _triangle_faults("body.inertia", robot.body.inertia)
+    faults += _triangle_faults("leg.inertia", robot.leg.inertia)
+    if not robot.leg_limits[0] <= robot.home.leg_angle <= robot.leg_limits[1]:
+        faults.append(f"home.leg_angle = {robot.home.leg_angle:g} rad is outside leg_limits {list(robot.leg_limits)}")
+    if robot.joints != JOINTS:
+        faults.append(f"joints must be {list(JOINTS)} in this order, not {list(robot.joints)}")
+    return faults
+
+
+def _missing_candidates(robot: Robot) -> list[tuple[str, float | None]]:
+    candidates: list[tuple[str, float | None]] = [
+        (f"body.inertia {axis}", value) for axis, value in zip("xyz", robot.body.inertia, strict=True)
+    ]
+    candidates += [("leg.mass", robot.leg.mass)]
+    candidates += [(f"leg.inertia {axis}", value) for axis, value in zip("xyz", robot.leg.inertia, strict=True)]
+    return [*candidates, ("wheel.mass", robot.wheel.mass), ("wheel.transverse_inertia", robot.wheel.transverse_inertia)]
+
+
+def _triangle_faults(name: str, inertia: tuple[float | None, ...]) -> list[str]:
+    if any(value is None for value in inertia):
+        return []
+    values = [float(value) for value in inertia if value is not None]
+    if min(values) > 0 and 2 * max(values) <= sum(values) * (1 + 1e-9):
+        return []
+    return [f"{name} = {values} breaks the triangle inequality every rigid body obeys"]
+
+
+def load_robot(source: str | Path | Robot = "nominal", *, check: bool = True) -> Robot:
+    """Load a robot by config name or path.
+
+    Args:
+        source: name in ``configs/robot/``, path of a YAML file, or a :class:`Robot` (returned as it is).
+        check: refuse a robot that no rigid body can be (see :func:`physical_faults`).
+
+    Raises:
+        InputError: unreadable file, unknown or missing key, value of the wrong kind, or a physically impossible robot.
+    """
+    robot = source if isinstance(source, Robot) else _read(find_config("robot", source))
+    faults = physical_faults(robot) if check else []
+    if faults:
+        raise InputError(f"robot '{robot.name}' cannot be simulated: " + "; ".join(faults))
+    return robot
+
+
+def _read(path: Path) -> Robot:
+    return parse_config(Robot, _resolved(path), str(path))
+
+
+def _resolved(path: Path, above: tuple[Path, ...] = ()) -> Any:
+    """Return what a robot file says, laid over its ``base`` where it names one: a config name, or a path from this file on.
+
+    The name is its own: another robot has another one.
+    """
+    data = read_yaml(path)
+    if not isinstance(data, dict) or "base" not in data:
+        return data
+    if path in above:
+        raise InputError(f"{path}: is its own base ({' -> '.join(map(str, [*above, path]))})")
+    base = data.pop("base")
+    if not isinstance(base, str):
+        raise InputError(f"{path}: base = {base!r}: expected the name or the path of a robot file")
+    place = find_config("robot", named_in(path, base))
+    lower = _resolved(place, (*above, path))
+    parse_config(Robot, lower, str(place))  # what is wrong in a base is said with its own name
+    return overlay({key: value for key, value in lower.items() if key != "name"}, data)
+
+
+def standing_height(robot: Robot, leg_angle: float) -> float:
+    """Height of the body origin above a level floor with all legs at ``leg_angle``, contacts unloaded (m)."""
+    return robot.leg.length * math.sin(leg_angle) + robot.wheel.radius - robot.hip_position.z
+
+
+def robot_hash(robot: Robot) -> str:
+    """Short fingerprint of a robot's numbers."""
+    return _fingerprint(robot)
+
+
+def servo_hash(robot: Robot) -> str:
+    """Short fingerprint of the numbers of a robot's servos."""
+    return _fingerprint(robot.servo)
+
+
+def _fingerprint(numbers: BaseModel) -> str:
+    return hashlib.sha256(numbers.model_dump_json().encode()).hexdigest()[:16]

@@ -1,0 +1,81 @@
+"""One data set: a robot copy with something hidden in it, eight runs, files in the measured-run format."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from wlr_gym.studies.bench.blind import commands, drive, sensors
+from wlr_gym.studies.bench.blind.copies import Copy, draw, nominal, with_body_of
+from wlr_gym.studies.bench.blind.truth import hide
+from wlr_gym.studies.bench.blind.world import build
+
+#: Profile registers a set may have; 0 = off.
+ACCELERATIONS, SPEEDS = (0.0, 7.490150, 11.235225, 14.980301, 22.470451), (0.959233, 1.438849, 1.918466)
+LEG_ACCELERATIONS = (0.0, 7.490150, 14.980301)
+
+
+def simulate_runs(
+    robot: Mapping[str, Any],
+    effects: Sequence[Mapping[str, Any]],
+    seed: int,
+    runs: Sequence[int] = range(8),
+    exact: bool = False,
+) -> tuple[list[pd.DataFrame], dict[str, Any], Copy]:
+    """Simulate runs of a data set.
+
+    Args:
+        robot: contents of a robot file.
+        effects: what is hidden, ``{name, where, parameters}``.
+        seed: of the copy, the commands and the noise. With other effects it is the same robot with the same commands.
+        runs: which of the eight kinds.
+        exact: the nominal robot, but for its clocks and its sensors' biases, instead of a copy within tolerances.
+
+    Returns:
+        Tables of the runs, contents of ``meta.yaml``, the robot copy.
+    """
+    copy = draw(dict(robot), np.random.default_rng([seed, 1]))
+    copy = with_body_of(copy, nominal(dict(robot))) if exact else copy
+    choose = np.random.default_rng([seed, 2])
+    geometry = commands.Geometry(float(robot["leg"]["length"]), float(robot["wheel"]["radius"]))
+    scripts = commands.scripts(choose, geometry)
+    profile = drive.Profile(
+        float(choose.choice(ACCELERATIONS)), float(choose.choice(SPEEDS)), float(choose.choice(LEG_ACCELERATIONS))
+    )
+    hidden = hide(effects, copy)
+    tables = []
+    for kind in runs:
+        noise = np.random.default_rng([seed, 3, kind])
+        script = scripts[kind]
+        times = sensors.ticks(script.duration, float(robot["sensors"]["control_rate"]), noise)
+        goals = script.goals(times)
+        start = goals[0, :4] + 0.02 * noise.standard_normal(4)
+        records = drive.simulate(build(copy, hidden), copy, hidden, profile, times, goals, start, times[-1] + 0.01)
+        tables.append(sensors.log(records, times, goals, copy, hidden, dict(robot), noise))
+    return tables, _meta(robot, profile, runs), copy
+
+
+def _meta(robot: Mapping[str, Any], profile: drive.Profile, runs: Sequence[int]) -> dict[str, Any]:
+    registers = {name: value for name, value in vars(profile).items() if value > 0}
+    notes = ", ".join(f"run_{n + 1:02d} {commands.NAMES[kind]}" for n, kind in enumerate(runs))
+    return {
+        "robot": robot["name"],
+        "profile": registers,
+        "ground": "indoor floor",
+        "marker_offset": [0.0, 0.0, 0.0],
+        "notes": f"runs in order: {notes}",
+    }
+
+
+def write(folder: Path, tables: Sequence[pd.DataFrame], meta: Mapping[str, Any]) -> None:
+    """Write a data set; the folder's name and contents say nothing about what is hidden."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, table in enumerate(tables, start=1):
+        table.to_parquet(folder / f"run_{number:02d}.parquet", index=False)
+    with open(folder / "meta.yaml", "w", encoding="utf-8") as file:
+        yaml.safe_dump(dict(meta), file, sort_keys=False, width=1000)

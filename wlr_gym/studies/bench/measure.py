@@ -1,0 +1,136 @@
+"""How a measurement is made and kept: rounds of A B A B ..., medians, and the spread of the ratio pair by pair."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.base.provenance import git_commit, versions
+
+#: Runs some work and returns its rate (1/s) or its time (s).
+Contender = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much work: ``rounds`` per contender; ``quick`` shrinks everything to see that it runs."""
+
+    rounds: int = 5
+    quick: bool = False
+
+    def __call__(self, full: int, quick: int) -> int:
+        """Return the amount of work to do."""
+        return quick if self.quick else full
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One line of the report: a value (ours), what it is held against, and the bar of the project.
+
+    Attributes:
+        name: of the measurement it belongs to. what: in words. unit: of ``ours`` and ``peer``.
+        ours: one value per round. peer: those of the fastest peer, None where there is none. peer_name: which one.
+        bar: least ratio to the peer, or, without a peer, the upper limit of ``ours``; None = for information.
+        others: median of every slower peer.
+        at_least: the peer did not get to the end in every round: its values are upper bounds and the ratios lower ones.
+    """
+
+    name: str
+    what: str
+    unit: str
+    ours: tuple[float, ...]
+    peer: tuple[float, ...] | None = None
+    peer_name: str = ""
+    bar: float | None = None
+    others: Mapping[str, float] | None = None
+    at_least: bool = False
+
+    @property
+    def ratios(self) -> tuple[float, ...]:
+        """Ours over the peer's, pair by pair; empty without a peer."""
+        return tuple(_ratio(a, b) for a, b in zip(self.ours, self.peer, strict=True)) if self.peer else ()
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the bar is met by the median; None without a bar."""
+        if self.bar is None:
+            return None
+        return statistics.median(self.ratios) >= self.bar if self.peer else statistics.median(self.ours) < self.bar
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain JSON types."""
+        return {
+            "name": self.name, "what": self.what, "unit": self.unit, "ours": summary(self.ours),
+            "peer_name": self.peer_name or None, "peer": summary(self.peer) if self.peer else None,
+            "ratio": summary(self.ratios) if self.peer else None, "bar": self.bar, "met": self.met,
+            "other_peers": dict(self.others or {}), "at_least": self.at_least,
+        }  # fmt: skip
+
+
+def _ratio(ours: float, peer: float) -> float:
+    """Ours over the peer's; infinite where only the peer got nothing done, 0 where neither did."""
+    if peer == 0.0:
+        return math.inf if ours > 0.0 else 0.0
+    return ours / peer
+
+
+def summary(values: Sequence[float]) -> dict[str, Any]:
+    """Return median, extremes and all values."""
+    return {"median": statistics.median(values), "min": min(values), "max": max(values), "values": list(values)}
+
+
+def interleave(contenders: Mapping[str, Contender], rounds: int) -> dict[str, tuple[float, ...]]:
+    """Run every contender once unmeasured (compilation, caches), then ``rounds`` times in turn; return their values."""
+    for contender in contenders.values():
+        contender()
+    values: dict[str, list[float]] = {name: [] for name in contenders}
+    for _ in range(rounds):
+        for name, contender in contenders.items():
+            values[name].append(contender())
+    return {name: tuple(series) for name, series in values.items()}
+
+
+def against_fastest(
+    name: str, what: str, unit: str, ours: tuple[float, ...], peers: Mapping[str, tuple[float, ...]], bar: float | None
+) -> Measurement:
+    """Return the measurement against the peer with the highest median rate."""
+    medians = {peer: statistics.median(values) for peer, values in peers.items()}
+    best = max(medians, key=lambda peer: medians[peer])
+    others = {peer: value for peer, value in medians.items() if peer != best}
+    return Measurement(name, what, unit, ours, peers[best], best, bar, others)
+
+
+def rate(work: Callable[[], object], amount: float) -> float:
+    """Return ``amount`` over the time ``work`` takes, 1/s."""
+    start = time.perf_counter()
+    work()
+    return amount / (time.perf_counter() - start)
+
+
+def machine() -> dict[str, Any]:
+    """Return what the numbers depend on: date, processor, cores, load at the start, versions, commit."""
+    return {
+        "date": datetime.now(UTC).date().isoformat(),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "load_average": list(os.getloadavg()) if hasattr(os, "getloadavg") else None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "versions": versions(),
+        "git_commit": git_commit(),
+    }
+
+
+def _processor() -> str:
+    information = Path("/proc/cpuinfo")
+    if not information.is_file():
+        return platform.processor() or platform.machine()
+    names = [line.partition(":")[2].strip() for line in information.read_text().splitlines() if line.startswith("model name")]
+    return names[0] if names else platform.machine()

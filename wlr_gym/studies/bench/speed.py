@@ -1,0 +1,169 @@
+"""Speed of engine, environment, import and start. The peer is MuJoCo with the same robot, servo law, friction and step."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo fills its namespace when it is imported.)
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+import gymnasium as gym
+import mujoco.batch
+import numpy as np
+from numpy.typing import NDArray
+
+import wlr_gym  # noqa: F401  (registers the environments)
+from wlr_gym.physics.plants.base import PlantOptions, standing_state
+from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
+from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import Parameters
+from wlr_gym.studies.bench.measure import Contender, Measurement, Size, against_fastest, interleave, rate
+from wlr_gym.studies.bench.mujoco_loop import BACKEND, build_servo_model, register_backend
+
+Array = NDArray[np.float64]
+
+ENVIRONMENT = "WLR-Velocity-v0"
+SUBSTEPS = PlantOptions().substeps
+ENGINE_BARS = {"float32": 60.0, "float64": 25.0}
+START = (
+    "import gymnasium, wlr_gym; env = gymnasium.make('{}'); env.reset(seed=0); env.step(env.action_space.sample()); env.close()"
+)
+
+
+def random_goals(ticks: int, count: int) -> Array:
+    """Return goals (ticks, count, 8) that keep legs and wheels busy: new ones every tenth tick."""
+    rng = np.random.default_rng(0)
+    draws = -(-ticks // 10)
+    legs, wheels = np.pi / 2 + rng.uniform(-0.3, 0.3, (draws, count, 4)), rng.uniform(-6.0, 6.0, (draws, count, 4))
+    return np.repeat(np.concatenate([legs, wheels], axis=2), 10, axis=0)[:ticks]
+
+
+def measure_engine(size: Size) -> list[Measurement]:
+    """Substeps per second on one thread against ``mujoco.batch``; our sensors and truth are part of our time."""
+    count = size(1024, 16)
+    contenders: dict[str, Contender] = {
+        precision: _engine(count, size(50, 2), precision, threads=1) for precision in ENGINE_BARS
+    }
+    contenders |= {
+        f"mujoco.batch, {label} contact": mujoco_batch(count, size(2, 1), soft=soft)
+        for label, soft in (("matched", False), ("default", True))
+    }
+    values = interleave(contenders, size.rounds)
+    peers = {name: series for name, series in values.items() if name not in ENGINE_BARS}
+    return [
+        against_fastest(
+            "engine", f"substeps of 1 ms, {count} robots, 1 thread, {precision}", "1/s", values[precision], peers, bar
+        )
+        for precision, bar in ENGINE_BARS.items()
+    ]
+
+
+def _engine(count: int, ticks: int, precision: str, threads: int) -> Contender:
+    plant = GibbsAppellPlant(load_robot(), count, PlantOptions(precision=precision, threads=threads))
+    goals = random_goals(ticks, count)
+
+    def drive() -> None:
+        for row in goals:
+            plant.step(row)
+
+    def run() -> float:
+        plant.reset()
+        return rate(drive, count * ticks * SUBSTEPS)
+
+    return run
+
+
+def mujoco_batch(count: int, ticks: int, *, soft: bool) -> Contender:
+    """Bare ``mujoco.batch`` with the servos as MuJoCo's actuators: a control tick is one call."""
+    robot = load_robot()
+    parameters = Parameters.nominal(robot)
+    batch = mujoco.batch.Batch(build_servo_model(robot, parameters, soft=soft), count, 1)
+    position, control, activation = batch.bind("qpos"), batch.bind("ctrl"), batch.bind("act")
+    goals = random_goals(ticks, count)
+    height = standing_state(robot, parameters).position[0, 2]
+
+    def drive() -> None:
+        for row in goals:
+            control[:, :8] = row
+            control[:, 8:] = row[:, 4:]
+            batch.step(nstep=SUBSTEPS)
+
+    def run() -> float:
+        batch.reset()
+        position[:, 2] = height
+        activation[:] = 0.0
+        return rate(drive, count * ticks * SUBSTEPS)
+
+    return run
+
+
+def measure_env_step(size: Size) -> list[Measurement]:
+    """``env.step`` of one robot; the peer is the same environment on a plain MuJoCo loop."""
+    register_backend()
+    ours = gym.make(ENVIRONMENT, randomization="none")
+    peer = gym.make(ENVIRONMENT, randomization="none", backend=BACKEND)
+    steps = size(400, 5)
+    values = interleave({"ours": _stepping(ours, steps), "MuJoCo loop": _stepping(peer, steps)}, size.rounds)
+    ours.close()
+    peer.close()
+    peers = {"same env on mj_step(nstep=20)": values["MuJoCo loop"]}
+    return [against_fastest("env_step", "env.step of one robot, float64", "1/s", values["ours"], peers, 5.0)]
+
+
+def _stepping(env: gym.Env, steps: int) -> Contender:
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (steps, 8)).astype(np.float32)
+    env.reset(seed=0)
+
+    def drive() -> float:
+        resetting = 0.0
+        for action in actions:
+            *_, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                start = time.perf_counter()
+                env.reset()
+                resetting += time.perf_counter() - start
+        return resetting
+
+    def run() -> float:
+        start = time.perf_counter()
+        resetting = drive()
+        return steps / (time.perf_counter() - start - resetting)
+
+    return run
+
+
+def measure_batch(size: Size) -> list[Measurement]:
+    """Substeps per second by batch size, precision and threads; for information."""
+    counts: Sequence[int] = (1, 4) if size.quick else (1, 8, 64, 512, 4096)
+    cases = [(count, precision, threads) for precision in ENGINE_BARS for threads in (1, 2) for count in counts]
+    ticks = {count: max(5, 5_000 // count) if not size.quick else 2 for count in counts}
+    contenders = {
+        f"{count} robots, {precision}, {threads} thread{'s' * (threads > 1)}": _engine(count, ticks[count], precision, threads)
+        for count, precision, threads in cases
+    }
+    values = interleave(contenders, min(size.rounds, 3))
+    return [Measurement("batch", name, "1/s", series) for name, series in values.items()]
+
+
+def measure_import(size: Size) -> list[Measurement]:
+    """Time of ``import wlr_gym`` beyond that of Python itself."""
+    values = interleave({"import": _process("import wlr_gym"), "bare": _process("pass")}, size.rounds)
+    extra = tuple(a - b for a, b in zip(values["import"], values["bare"], strict=True))
+    return [Measurement("import", "import wlr_gym, beyond bare Python", "s", extra, bar=0.3)]
+
+
+def measure_start(size: Size) -> list[Measurement]:
+    """Whole process: Python, imports, ``gym.make``, reset, first step, exit; compiled code is cached by the first run."""
+    values = interleave({"start": _process(START.format(ENVIRONMENT))}, size.rounds)
+    return [Measurement("start", "second start: process, imports, gym.make, reset, first step", "s", values["start"], bar=2.0)]
+
+
+def _process(code: str) -> Callable[[], float]:
+    def run() -> float:
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-c", code], check=True)
+        return time.perf_counter() - start
+
+    return run

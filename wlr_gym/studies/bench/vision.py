@@ -1,0 +1,427 @@
+"""How well the camera measures: accuracy, recall, false poses, speed, and slip over whole filmed drives, all rendered.
+
+Ours stands beside printed square tags (OpenCV's ArUco detector, sub-pixel corners) and the paper's own method, in the same
+scenes. Poses are drawn from a seed, so every number repeats.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.perception.markers.camera import Camera
+from wlr_gym.perception.markers.detect import detect, refine
+from wlr_gym.perception.markers.pose import circle_centres, find_target
+from wlr_gym.perception.markers.targets import CODES, Target, load_target, ring_radii
+from wlr_gym.perception.scene import (
+    Image,
+    Look,
+    Patch,
+    Pose,
+    Renderer,
+    develop,
+    floor_patches,
+    plate_patch,
+    project,
+    robot_patches,
+    rotation_of,
+    view,
+)
+from wlr_gym.perception.vision.align import align
+from wlr_gym.perception.vision.paper import paper_pose
+from wlr_gym.perception.vision.slip import measure_slip
+from wlr_gym.perception.vision.track import Frame, Tracker, angles, locate_floor, track
+from wlr_gym.robot import Robot, load_robot
+from wlr_gym.robot.parameters import Parameters
+from wlr_gym.studies.bench.measure import Size
+from wlr_gym.studies.bench.vision_drives import Drive, film, paper_test, skid_turn
+
+Array = NDArray[np.float64]
+
+CAMERA = Camera(width=1280, height=720, focal=(800.0, 800.0), centre=(639.5, 359.5))
+LENS = (-0.1, 0.02, 0.001, -0.001, 0.0)
+STRONG_LENSES = ((-0.3, 0.1, 0.0, 0.0, 0.0), (0.3, -0.05, 0.0, 0.0, 0.0))
+HOME_HEIGHT = 0.169
+TRUE_OFFSET = 0.137
+TAG_SIDE = 0.06
+
+
+@dataclass(frozen=True)
+class Result:
+    """One line of the report.
+
+    Attributes:
+        what: in words. method: whose. value: found, in ``unit``. bar: of the project, None = for information.
+        least: the bar is a lower one. count: of samples behind the value.
+    """
+
+    what: str
+    method: str
+    value: float
+    unit: str
+    bar: float | None = None
+    least: bool = False
+    count: int = 0
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the bar is met; None without one."""
+        if self.bar is None:
+            return None
+        return self.value >= self.bar if self.least else self.value <= self.bar
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain JSON types."""
+        return {**vars(self), "met": self.met}
+
+
+def measure_vision(size: Size) -> list[Result]:
+    """Measure everything."""
+    import cv2
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        parts: Sequence[Callable[[Size], list[Result]]] = (
+            measure_centres, measure_poses, measure_recall, measure_false_poses, measure_rate, measure_drives,
+        )  # fmt: skip
+        return [result for part in parts for result in part(size)]
+    finally:
+        cv2.setNumThreads(threads)
+
+
+# --- centres ----------------------------------------------------------------------------------------------------------
+
+
+def measure_centres(size: Size) -> list[Result]:
+    """Error of a single marker's centre, given its tilt: rms over both axes together, px."""
+    count = size(200, 6)
+    strong = [CAMERA.model_copy(update={"distortion": lens}) for lens in STRONG_LENSES]
+    calm, blurred = Look(blur=0.8, noise=4.0), Look(blur=3.0, noise=4.0)
+    cases = (
+        ("centre, r 16 px, tilt 0-45 deg, noise 4", [CAMERA], calm, 0.05),
+        ("centre, r 16 px, tilt 0-45 deg, blur sigma 3", [CAMERA], blurred, 0.20),
+        ("centre, r 16 px, lens k1 = -0.3 and 0.3, calibrated", strong, calm, 0.08),
+    )
+    results = []
+    for what, cameras, look, bar in cases:
+        errors = np.array([_centre_error(cameras[k % len(cameras)], look, k) for k in range(count)])
+        found = errors[np.isfinite(errors)]
+        results.append(Result(what, "ours", float(np.sqrt(np.mean(found**2))), "px", bar, count=len(found)))
+    return results
+
+
+def _centre_error(camera: Camera, look: Look, seed: int) -> float:
+    """Distance (px) of the rings' common centre from where the pose puts it; NaN when the marker is not found."""
+    rng = np.random.default_rng(seed)
+    code = seed % 2  # the two codes on the robot
+    tilt, radius = rng.uniform(0, math.pi / 4), 0.03
+    distance = camera.focal[0] * radius / rng.uniform(16, 18)
+    spread = 0.45 if any(camera.distortion) else 0.1
+    direction = rng.uniform(-spread, spread, 2)
+    centre = distance * np.array([*direction, 1.0])
+    turn = rotation_of(rng.uniform(-math.pi, math.pi)) @ rotation_of(0, tilt) @ rotation_of(rng.uniform(-math.pi, math.pi))
+    rotation = turn @ np.diag([1.0, -1.0, -1.0])
+    radii = np.array(ring_radii(code))
+    circles = np.array([[0.0, 0.0, *(radius * radii)]])
+    patch = Patch(np.zeros(3), np.eye(3)[:2], (0.05, 0.05), 225.0, circles=circles).moved(centre, rotation)
+    crop, corner = _crop(camera, project(camera, centre[None])[0])
+    image = Renderer(crop, Pose(np.zeros(3), np.eye(3)), []).frame([[patch]], look, seed)
+    middle = project(camera, centre[None])[0] - corner + rng.uniform(-1, 1, 2)
+    edge = project(camera, centre + radius * rotation[:, :2].T) - project(camera, centre[None])
+    found = refine(image, crop, np.array([*middle, edge[0, 0], edge[1, 0], edge[0, 1], edge[1, 1]]), code)
+    if found is None:
+        return math.nan
+    expected = np.empty((3, 2))
+    circle_centres(np.zeros((3, 3)), radius * radii, rotation, centre, expected)
+    used = np.isfinite(found.centres[:, 0])
+    weights = 1 / np.trace(found.covariances[used], axis1=1, axis2=2)
+    error = np.average((found.centres - expected)[used], axis=0, weights=weights)
+    return float(np.hypot(*error) * camera.focal[0])
+
+
+def _crop(camera: Camera, middle: Array, half: int = 60) -> tuple[Camera, Array]:
+    """A camera that sees only the pixels around ``middle``, and its upper left corner."""
+    corner = np.round(middle) - half
+    centre = (camera.centre[0] - corner[0], camera.centre[1] - corner[1])
+    return camera.model_copy(update={"width": 2 * half, "height": 2 * half, "centre": centre}), corner
+
+
+# --- poses ------------------------------------------------------------------------------------------------------------
+
+
+def measure_poses(size: Size) -> list[Result]:
+    """Error of the body's pose in the floor frame from 2 m: ours, square tags, the paper's method."""
+    results = []
+    for name, tilt, bars in (("overhead", 0.0, (0.1, 0.01)), ("45 deg", math.pi / 4, (0.3, 0.02))):
+        rings, paper = _ring_poses(tilt, size(60, 3))
+        label = f"{name} at 2 m"
+        results += _pose_lines(label, "ours", rings, bars)
+        for legs, errors in paper.items():
+            results += _pose_lines(f"{label}{legs}", "paper's method", errors, None)
+        for dictionary in ("APRILTAG_36H11", "5X5_100"):
+            errors, seen = _tag_poses(tilt, size(30, 2), dictionary)
+            results += _pose_lines(label, f"tags {dictionary} ({seen})", errors, None)
+    return results
+
+
+def _pose_lines(label: str, method: str, errors: Array, bars: tuple[float, float] | None) -> list[Result]:
+    """Lines for xy (mm, rms of the distance) and yaw (deg, rms); ``errors`` is (F, 3) in m and rad."""
+    if not len(errors):
+        return [Result(f"body xy, {label}", method, math.nan, "mm")]
+    xy = 1e3 * float(np.sqrt(np.mean(np.sum(errors[:, :2] ** 2, axis=1))))
+    yaw = math.degrees(float(np.sqrt(np.mean(errors[:, 2] ** 2))))
+    first, second = bars or (None, None)
+    count = len(errors)
+    return [Result(f"body xy, {label}", method, xy, "mm", first, count=count),
+            Result(f"body yaw, {label}", method, yaw, "deg", second, count=count)]  # fmt: skip
+
+
+def _random_pose(rng: np.random.Generator, height: float | None = None) -> Pose:
+    position = np.array([rng.uniform(-0.45, 0.45), rng.uniform(-0.2, 0.2), height or HOME_HEIGHT + rng.uniform(-0.06, 0.0)])
+    return Pose(position, rotation_of(rng.uniform(-math.pi, math.pi), rng.uniform(-0.1, 0.1) if height is None else 0.0))
+
+
+def _shown(robot: Robot, plate: Patch, pose: Pose) -> list[Patch]:
+    return [patch.moved(pose.position, pose.rotation) for patch in (*robot_patches(robot, pose.legs), plate)]
+
+
+def _ring_poses(tilt: float, count: int) -> tuple[Array, dict[str, Array]]:
+    """Errors (F, 3) of our poses, and of the paper's method with legs at home and with legs that moved."""
+    body, floor, robot = load_target("body"), load_target("floor"), load_robot()
+    camera = CAMERA.model_copy(update={"distortion": LENS})
+    straight = view(tilt, 2.0)
+    renderer = Renderer(camera, straight, floor_patches(floor))
+    empty = [Frame(k, k / 30, renderer.frame([], Look(), 900 + k)) for k in range(10)]
+    floor_pose, homes = locate_floor(empty, camera, floor)
+    plate, ours = plate_patch(body), []
+    paper: dict[str, list[Array]] = {", legs at home": [], ", legs moved": []}
+    rng = np.random.default_rng(11)
+    for k in range(count):
+        for home in (True, False):
+            pose = _random_pose(rng, HOME_HEIGHT if home else None)
+            image = renderer.frame([_shown(robot, plate, pose)], Look(), k)
+            sample = Tracker(camera, body, floor, floor_pose, homes)(Frame(k, 0.0, image))
+            ours.append(_error(sample.pose[[0, 1, 3]], pose))
+            near = project(camera, (body.positions @ pose.rotation.T + pose.position) @ straight.rotation.T + straight.position)
+            height = HOME_HEIGHT + float(body.positions[0, 2])
+            found = paper_pose(image, camera, body, straight.rotation, straight.position, height, near)
+            if found is not None:
+                # the method knows nothing of the height of the markers over the body's origin; held against the plate's middle
+                plate_middle = pose.position + pose.rotation[:, 2] * body.positions[0, 2]
+                paper[", legs at home" if home else ", legs moved"].append(_error(found, Pose(plate_middle, pose.rotation)))
+    lost = [error for error in ours if not np.isfinite(error).all()]
+    if lost:
+        raise RuntimeError(f"{len(lost)} of {len(ours)} poses were not found at tilt {tilt:g} rad")
+    return np.array(ours), {name: np.array(errors) for name, errors in paper.items()}
+
+
+def _error(found: Array, pose: Pose) -> Array:
+    """x, y (m) and yaw (rad) found, minus the truth."""
+    yaw = angles(pose.rotation)[0]
+    return np.array([*(found[:2] - pose.position[:2]), math.remainder(found[2] - yaw, 2 * math.pi)])
+
+
+def _tag_poses(tilt: float, count: int, name: str) -> tuple[Array, str]:
+    """Errors (F, 3) with four square tags in the markers' places; the floor is given. Best of the corner conventions."""
+    import cv2
+
+    body, robot = load_target("body"), load_robot()
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
+    cells = dictionary.markerSize + 2
+    bits = [np.asarray(cv2.aruco.generateImageMarker(dictionary, k, cells) > 127, np.uint8) for k in range(4)]
+    tags = [(x, y, TAG_SIDE, bit) for (x, y, _), bit in zip(body.positions, bits, strict=True)]
+    plate, straight = plate_patch(body, tags), view(tilt, 2.0)
+    camera = CAMERA.model_copy(update={"distortion": LENS})
+    renderer = Renderer(camera, straight, floor_patches(None))
+    settings = cv2.aruco.DetectorParameters()
+    settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.ArucoDetector(dictionary, settings)
+    rng, errors, whole = np.random.default_rng(11), {shift: [] for shift in (0.0, -0.5, 0.5)}, 0
+    for k in range(count):
+        pose = _random_pose(rng)
+        image = renderer.frame([_shown(robot, plate, pose)], Look(), k)
+        corners, ids, _ = detector.detectMarkers(image)
+        seen: dict[int, Any] = {}
+        if ids is not None:
+            seen = {int(k): corner for k, corner in zip(np.asarray(ids).reshape(-1), corners, strict=True)}
+        whole += len(seen) == 4
+        if len(seen) < 3:
+            continue
+        for shift, kept in errors.items():
+            kept.append(_tag_error(seen, shift, body, camera, straight, pose))
+    best = min(errors.values(), key=lambda kept: float(np.mean(np.square(kept))) if kept else math.inf)
+    return np.array(best).reshape(-1, 3), f"all four in {whole} of {count} frames"
+
+
+def _tag_error(seen: dict[int, Any], shift: float, body: Target, camera: Camera, floor: Pose, pose: Pose) -> Array:
+    import cv2
+
+    half = TAG_SIDE / 2
+    square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
+    places = np.concatenate([body.positions[k] + square for k in seen])
+    pixels = np.concatenate([np.asarray(c, float).reshape(4, 2) for c in seen.values()]) + shift
+    _, turn, place = cv2.solvePnP(places, pixels, camera.matrix, np.array(camera.distortion), flags=cv2.SOLVEPNP_SQPNP)
+    turn, place = cv2.solvePnPRefineLM(places, pixels, camera.matrix, np.array(camera.distortion), turn, place)
+    rotation = floor.rotation.T @ cv2.Rodrigues(turn)[0]
+    position = floor.rotation.T @ (np.asarray(place).reshape(3) - floor.position)
+    return _error(np.array([*position[:2], angles(rotation)[0]]), pose)
+
+
+# --- recall, false poses, rate ----------------------------------------------------------------------------------------
+
+
+def measure_recall(size: Size) -> list[Result]:
+    """Share of markers found in whole images, at 12 to 16 px (the long axis), tilt up to 45 degrees, noise up to 10."""
+    body, robot = load_target("body"), load_robot()
+    rng, found, shown = np.random.default_rng(5), 0, 0
+    for k in range(size(150, 3)):
+        distance = CAMERA.focal[0] * body.radii[0] / rng.uniform(12.3, 16)
+        renderer = Renderer(CAMERA, view(rng.uniform(0, math.pi / 4), distance, turn=rng.uniform(-3, 3)), floor_patches(None))
+        pose = Pose(np.array([*rng.uniform(-0.2, 0.2, 2), 0.06]), rotation_of(rng.uniform(-math.pi, math.pi)))
+        look = Look(blur=rng.uniform(0.5, 1.2), noise=rng.uniform(0, 10), gain=rng.uniform(0.5, 1.1),
+                    gradient=(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4)))  # fmt: skip
+        detections = detect(renderer.frame([_shown(robot, plate_patch(body), pose)], look, k), CAMERA)
+        eye = renderer.floor_in_camera
+        places = project(CAMERA, (body.positions @ pose.rotation.T + pose.position) @ eye.rotation.T + eye.position)
+        for place, code in zip(places, body.codes, strict=True):
+            if np.all((place > 25) & (place < [CAMERA.width - 25, CAMERA.height - 25])):
+                shown += 1
+                found += any(d.code == code and np.hypot(*(d.ellipse[:2] - place)) < 1.0 for d in detections)
+    what = "recall, r >= 12 px, tilt <= 45 deg, noise <= 10"
+    return [Result(what, "ours", 100 * found / shown, "%", 99.0, least=True, count=shown)]
+
+
+def measure_false_poses(size: Size) -> list[Result]:
+    """Poses found in cluttered frames without markers; should be none."""
+    body, floor = load_target("body"), load_target("floor")
+    poses = markers = 0
+    count = size(1000, 5)
+    for k in range(count):
+        detections = detect(clutter(k), CAMERA)
+        markers += len(detections)
+        poses += sum(find_target(detections, target, CAMERA) is not None for target in (body, floor))
+    return [
+        Result(f"false poses in {count} cluttered frames", "ours", poses, "", 0, count=count),
+        Result(f"single false markers in {count} cluttered frames", "ours", markers, "", count=count),
+    ]
+
+
+def clutter(seed: int) -> Image:
+    """A frame full of discs, rings, targets with other radii, boxes, lines and words, but without our markers."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    height, width = CAMERA.height, CAMERA.width
+    image: Any = cv2.resize(rng.uniform(60, 200, (9, 16)).astype(np.uint8), (width, height), interpolation=cv2.INTER_CUBIC)
+
+    def place() -> tuple[int, int]:
+        return int(rng.integers(0, width)), int(rng.integers(0, height))
+
+    for _ in range(60):
+        shade, (x, y) = float(rng.choice([20, 235, rng.uniform(0, 255)])), place()
+        kind = rng.integers(0, 6)
+        if kind == 0:
+            cv2.rectangle(image, (x, y), (x + int(rng.integers(5, 160)), y + int(rng.integers(5, 120))), shade, -1)
+        elif kind == 1:
+            axes = int(rng.integers(4, 50)), int(rng.integers(4, 50))
+            cv2.ellipse(image, (x, y), axes, rng.uniform(0, 180), 0, 360, shade, int(rng.choice([-1, 2, 5])), cv2.LINE_AA)
+        elif kind == 2:
+            cv2.line(image, (x, y), place(), shade, int(rng.integers(1, 6)), cv2.LINE_AA)
+        elif kind == 3:
+            cv2.putText(image, "R0BO0 8@Q", (x, y), cv2.FONT_HERSHEY_DUPLEX, rng.uniform(0.4, 2.5), shade, 2, cv2.LINE_AA)
+        else:
+            _other_rings(image, rng, (x, y))
+    return develop(image.astype(np.float32), Look(blur=rng.uniform(0.3, 2), noise=rng.uniform(0, 10)), seed)
+
+
+def _other_rings(image: Image, rng: np.random.Generator, place: tuple[int, int]) -> None:
+    """Draw concentric discs whose radii are no code's (or light on dark, or too many)."""
+    import cv2
+
+    radius, aspect, turn = rng.uniform(8, 60), rng.uniform(0.5, 1), rng.uniform(0, 180)
+    while True:
+        shares = np.sort(rng.uniform(0.1, 0.95, int(rng.integers(1, 5))))[::-1]
+        dark_outside = bool(rng.integers(0, 2))
+        alike = len(shares) == 2 and dark_outside and min(np.hypot(*(shares - code)) for code in CODES.values()) < 0.15
+        if not alike:
+            break
+    for k, share in enumerate((1.0, *shares)):
+        axes = max(1, int(radius * share)), max(1, int(radius * share * aspect))
+        shade = 20.0 if (k % 2 == 0) == dark_outside else 235.0
+        cv2.ellipse(image, place, axes, turn, 0, 360, shade, -1, cv2.LINE_AA)
+
+
+def measure_rate(size: Size) -> list[Result]:
+    """Frames per second of the tracker on one core, once it has found the robot, 1280 x 720, images in memory."""
+    body, floor, robot = load_target("body"), load_target("floor"), load_robot()
+    renderer = Renderer(CAMERA, view(0.2, 2.0), floor_patches(floor))
+    frames = []
+    for k in range(size(60, 8)):
+        moment = k / 30
+        pose = Pose(np.array([-0.3 + 0.15 * moment, 0.02 * math.sin(moment), HOME_HEIGHT]), rotation_of(0.4 * moment))
+        frames.append(Frame(k, moment, renderer.frame([_shown(robot, plate_patch(body), pose)], Look(), k)))
+    floor_pose = locate_floor(frames[:5], CAMERA, floor)
+    rates = []
+    for _ in range(size.rounds):
+        tracker = Tracker(CAMERA, body, floor, *floor_pose)
+        for frame in frames[:2]:
+            tracker(frame)
+        start = time.perf_counter()
+        for frame in frames[2:]:
+            tracker(frame)
+        rates.append((len(frames) - 2) / (time.perf_counter() - start))
+    what = "tracked frames per second, 1280 x 720, one core"
+    return [Result(what, "ours", float(np.median(rates)), "1/s", 60, least=True, count=len(rates) * (len(frames) - 2))]
+
+
+# --- whole drives -----------------------------------------------------------------------------------------------------
+
+
+def measure_drives(size: Size) -> list[Result]:
+    """Film drives with known slip (30 Hz, 5 ms exposure) and measure it, clocks apart by an unknown offset."""
+    robot = load_robot()
+    makers = (lambda: paper_test(1, robot), lambda: paper_test(2, robot), lambda: skid_turn(robot))
+    return [line for make in makers[size(0, 2) :] for line in measure_drive(make())]
+
+
+def measure_drive(drive: Drive, tilt: float = 0.0, look: Look | None = None) -> list[Result]:
+    """Lines for one filmed drive: worst error of the accumulated slip of any wheel at any time, and the clocks' offset."""
+    body, floor = load_target("body"), load_target("floor")
+    camera = CAMERA.model_copy(update={"distortion": LENS})
+    renderer = Renderer(camera, view(tilt, 2.0), floor_patches(floor))
+    samples = list(track(film(drive, renderer, body, look or Look(), TRUE_OFFSET), camera, body, floor))
+    parameters = Parameters.nominal(drive.robot)
+    poses = np.stack([sample.pose for sample in samples])
+    found = align(np.array([sample.time for sample in samples]), poses, drive.run, drive.robot, parameters)
+    slip = measure_slip(samples, found.offset, drive.run, drive.robot, parameters, found.std)
+    error = 1e3 * np.abs(slip.slip - true_slip(drive, slip.time))
+    final = 1e3 * (slip.slip[-1] - true_slip(drive, slip.time)[-1])
+    largest = 1e3 * np.abs(drive.slip[-1]).max(axis=0)
+    lines: list[Result] = []
+    for axis, name in enumerate(("longitudinal", "lateral")):
+        what = f"{drive.name}: accumulated {name} slip (up to {largest[axis]:.0f} mm)"
+        lines.append(
+            Result(f"{what}, worst wheel and time", "ours", float(error[:, :, axis].max()), "mm", 1.0, count=len(samples))
+        )
+        lines.append(
+            Result(f"{what}, worst wheel, end", "ours", float(np.abs(final[:, axis]).max()), "mm", 1.0, count=len(samples))
+        )
+    late = 1e3 * abs(found.offset - TRUE_OFFSET)
+    return [
+        *lines,
+        Result(f"{drive.name}: clock offset (± {1e3 * found.std:.1f})", "ours", late, "ms", 2.0, count=len(samples)),
+    ]
+
+
+def true_slip(drive: Drive, at: Array) -> Array:
+    """(K, 4, 2) m, true accumulated slip from the first of the times on."""
+    flat = drive.slip.reshape(len(drive.time), 8)
+    values = np.stack([np.interp(at, drive.time, column) for column in flat.T], axis=1).reshape(-1, 4, 2)
+    return values - values[0]

@@ -1,0 +1,201 @@
+"""Drives with known slip for the vision bench: the Gibbs-Appell engine drives, the renderer films, the run is written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.data.format import Profile, RunMeta
+from wlr_gym.data.read import Run
+from wlr_gym.data.replay import profile_parameters
+from wlr_gym.perception.markers.targets import Target
+from wlr_gym.perception.scene import Look, Patch, Pose, Renderer, plate_patch, robot_patches
+from wlr_gym.perception.vision.track import Frame
+from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import PlantOptions, PlantState, standing_state
+from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot.parameters import Parameters
+
+Array = NDArray[np.float64]
+
+#: s; the truth's clock, and the run's period in ticks of it.
+TICK, ROW = 0.002, 10
+#: rad/s, rad/s2, rad/s: registers 80, 1 and 15 of the paper's servos; four turns of the driven wheels.
+PAPER_SPEED, PAPER_ACCELERATION, PAPER_LEG_SPEED = 1.918474, 0.374508, 0.359712
+_REST = 1.0
+_SETTLING = 1.0  # s before the log starts: legs and tyres take the weight
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A drive and its truth.
+
+    Attributes:
+        name: of it. run: what the robot logged (50 Hz).
+        time: (T,) s, servo clock, every :data:`TICK`. position: (T, 3). rotation: (T, 3, 3). legs: (T, 4).
+        slip: (T, 4, 2) m, true slip displacement of every wheel, accumulated.
+    """
+
+    name: str
+    run: Run
+    robot: Robot
+    parameters: Parameters
+    time: Array
+    position: Array
+    rotation: Array
+    legs: Array
+    slip: Array
+
+
+def paper_test(number: int, robot: Robot) -> Drive:
+    """The paper's first or second test: front wheels drive four turns, rear wheels run free, legs sweep 120 degrees.
+
+    Rear gear friction and floor are chosen so that it slips; the left rear gear is stiffer, so that it drifts sideways.
+    """
+    low, high = math.radians(30), math.radians(150)
+    start = [low] * 4 if number == 1 else [low, low, high, high]
+    end = [low, low, high, high] if number == 1 else [high, high, low, low]
+    parameters = _paper_parameters(robot)
+    ramp = PAPER_SPEED / PAPER_ACCELERATION
+    stop = _REST + (8 * math.pi - PAPER_SPEED * ramp) / PAPER_SPEED + ramp
+
+    def goals(t: float) -> tuple[list[float], list[float]]:
+        moving = _REST <= t < stop
+        return (end if t >= _REST else start), [PAPER_SPEED * moving] * 2 + [0.0, 0.0]
+
+    free = np.array([True] * 6 + [False] * 2)
+    return _drive(f"paper test {number}", robot, parameters, start, goals, stop + ramp + 0.5, free, -0.55)
+
+
+def skid_turn(robot: Robot) -> Drive:
+    """Forward, a turn on the spot with the wheels against each other, forward again; the legs move all the time."""
+    parameters = Parameters.nominal(robot)
+    parameters["ground.mu_x"] = parameters["ground.mu_y"] = 0.4
+
+    def goals(t: float) -> tuple[list[float], list[float]]:
+        sweep = math.pi / 2 + 0.35 * math.sin(1.5 * max(0.0, t - _REST))
+        left, right = (4.0, 4.0) if _REST <= t < 3.2 or 5.6 <= t < 7.8 else (-3.5, 3.5) if 3.2 <= t < 5.6 else (0.0, 0.0)
+        return [sweep, sweep, sweep, sweep], [left, right, left, right]
+
+    return _drive("skid turn", robot, parameters, [math.pi / 2] * 4, goals, 8.5, np.ones(8, bool), -0.3)
+
+
+def _paper_parameters(robot: Robot) -> Parameters:
+    profile = Profile(wheel_acceleration=PAPER_ACCELERATION, leg_velocity=PAPER_LEG_SPEED)
+    parameters = profile_parameters(Parameters.nominal(robot), profile)
+    parameters["ground.mu_x"] = parameters["ground.mu_y"] = 0.3
+    parameters["servo.coulomb_friction"][:, 6:] = 0.07, 0.03
+    return parameters
+
+
+def _drive(
+    name: str,
+    robot: Robot,
+    parameters: Parameters,
+    legs: list[float],
+    goals: Callable[[float], tuple[list[float], list[float]]],
+    duration: float,
+    torque_on: NDArray[np.bool_],
+    x: float,
+) -> Drive:
+    import pandas
+
+    plant = make_plant("gibbs_appell", robot, 1, PlantOptions(control_period=TICK, physics_step=0.001))
+    sensors = plant.reset(np.array([7], np.uint64), parameters, state=_start(robot, parameters, legs, x))
+    for _ in range(int(_SETTLING / TICK)):
+        leg_goals, wheel_goals = goals(0.0)
+        sensors = plant.step(np.array([[*leg_goals, *wheel_goals]]), torque_on[None])
+    count = int(duration / TICK)
+    rows: list[dict[str, float]] = []
+    truths, slips = [], np.zeros((count + 1, 4, 2))
+    for tick in range(count + 1):
+        time = tick * TICK
+        leg_goals, wheel_goals = goals(time - time % (ROW * TICK) if tick % ROW else time)
+        goal = np.array([[*leg_goals, *wheel_goals]])
+        truth = plant.truth()
+        truths.append(np.concatenate([truth.position[0], truth.quaternion[0], truth.joint_position[0, :4]]))
+        if tick > 0:
+            slips[tick] = slips[tick - 1] + truth.slip_displacement[0].reshape(4, 2)
+        if tick % ROW == 0:
+            rows.append(_row(time, np.where(torque_on, goal[0], np.nan), sensors.values[0], sensors.layout.slices))
+        sensors = plant.step(goal, torque_on[None])
+    plant.close()
+    found = np.array(truths)
+    run = Run(pandas.DataFrame(rows), RunMeta(robot=robot.name), Path(f"{name.replace(' ', '_')}.parquet"))
+    time = np.asarray(TICK * np.arange(count + 1), np.float64)
+    return Drive(name, run, robot, parameters, time, found[:, :3], _matrices(found[:, 3:7]), found[:, 7:], slips)
+
+
+def _start(robot: Robot, parameters: Parameters, legs: list[float], x: float) -> PlantState:
+    state = standing_state(robot, parameters, legs[0])  # sin is the same for all legs, so the body is level
+    state.joint_position[:, :4] = legs
+    state.reference_position[:, :4] = legs
+    state.position[:, 0] = x
+    return state
+
+
+def _row(time: float, goal: Array, sensors: Array, slices: dict[str, slice]) -> dict[str, float]:
+    row = {"t": time}
+    for kind, values in (("cmd", goal), *((k, sensors[slices[f"joint_{n}"]]) for k, n in _KINDS)):
+        row |= {f"{kind}_{joint}": float(value) for joint, value in zip(JOINTS, values, strict=True)}
+    for kind, name in (("gyro", "gyro"), ("acc", "accelerometer")):
+        row |= {f"{kind}_{axis}": float(v) for axis, v in zip("xyz", sensors[slices[name]], strict=True)}
+    return row
+
+
+_KINDS = (("pos", "position"), ("vel", "velocity"), ("eff", "effort"))
+
+
+def _matrices(quaternion: Array) -> Array:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix()
+
+
+def film(
+    drive: Drive,
+    renderer: Renderer,
+    body: Target,
+    look: Look,
+    offset: float,
+    rate: float = 30.0,
+    exposure: float = 0.005,
+    phase: float = 0.011,
+    seed: int = 0,
+    occluder: Callable[[float], list[Patch]] | None = None,
+) -> Iterator[Frame]:
+    """Film a drive.
+
+    Args:
+        drive: what happens. renderer: camera and floor. body: markers on the robot. look: light, blur, noise.
+        offset: s; servo time = the frame's time + offset. rate: Hz. exposure: s, around a frame's time. phase: s.
+        occluder: patches (floor frame) that hide something at a servo time.
+    """
+    instants = 4
+    shifts = exposure * ((np.arange(instants) + 0.5) / instants - 0.5)
+    for index in range(int((drive.time[-1] - 2 * phase) * rate)):
+        time = phase + index / rate
+        moving = [[*_robot_at(drive, time + shift, body), *(occluder(time) if occluder else [])] for shift in shifts]
+        yield Frame(index, time - offset, renderer.frame(moving, look, seed + index))
+
+
+def pose_at(drive: Drive, time: float) -> Pose:
+    """True pose of the body at a servo time: linear between ticks."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    k = min(int(time / TICK), len(drive.time) - 2)
+    part = (time - drive.time[k]) / TICK
+    turn = Slerp([0, 1], Rotation.from_matrix(drive.rotation[k : k + 2]))(part).as_matrix()
+    position, legs = ((1 - part) * a[k] + part * a[k + 1] for a in (drive.position, drive.legs))
+    return Pose(position, turn, legs)
+
+
+def _robot_at(drive: Drive, time: float, body: Target) -> list[Patch]:
+    pose = pose_at(drive, time)
+    patches = [*robot_patches(drive.robot, pose.legs), plate_patch(body)]
+    return [patch.moved(pose.position, pose.rotation) for patch in patches]

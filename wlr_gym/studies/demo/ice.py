@@ -1,0 +1,138 @@
+"""Second stage: the shipped policies, a classical controller and the new policy on the same ice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.gap.report.html import heading, table
+from wlr_gym.learning.evaluation import FIRST_SEED, MAIN, Card, Condition, Estimate, Subject, play, work
+from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
+from wlr_gym.studies.demo.stage import Section, Tell, paragraph, picture
+
+TITLE = "2. On ice"
+OURS, BLIND, NEW = "velocity_slip_aware", "velocity_blind", "trained just now"
+SHIPPED = (OURS, BLIND, "pid")
+_WHO = {
+    OURS: "shipped; sees its slip (observer with a camera above the floor)",
+    BLIND: "shipped; the same training, without the slip observer",
+    "pid": "classical controller, tuned",
+    NEW: "the policy of section 1",
+}
+#: Columns of the table: metric -> heading.
+_COLUMNS = {
+    "tracking_error": "error (limit = 1)",
+    "velocity_error": "velocity (m/s)",
+    "yaw_rate_error": "yaw rate (rad/s)",
+    "excess_slip": "extra slip (m/s)",
+    "success": "success (%)",
+}
+#: Label of the second kind of floor; what the kinds are, for the page and in short.
+SPLIT = "split"
+FLOORS = {
+    MAIN: "Ice everywhere: friction coefficient 0.05 to 0.2",
+    SPLIT: "Split floor: left of a line another friction coefficient than right of it, each 0.05 to 0.9",
+}
+_WHERE = {MAIN: "on ice", SPLIT: "on split floors"}
+#: The film: with the left wheels onto ice, then a turn to the right.
+SHEET, SCHEDULE = "ice_sheet", "0:0.1,0; 4:0.1,-0.3"
+PICTURES_PER_SECOND, SIZE = 10.0, (400, 330)
+
+
+def compare(demo: Demo, tell: Tell) -> Section:
+    """Play the same episodes with every policy, and film two of them."""
+    tell("on ice", 0.0)
+    card = _play(demo, tell)
+    html = paragraph(
+        f"{demo.episodes} episodes of 20 s each on each kind of floor: the same floors, robots and commands for all. A success "
+        "keeps velocity and yaw rate within 10 % of the range of commands, rms over the episode. Error: rms of both, in units "
+        "of that limit; then each by itself; extra slip: mean slip speed of the wheels beyond what turning needs. Mean ± half "
+        "of the 95 % confidence interval."
+    )
+    html += "".join(heading(said) + _table(card, label) + paragraph(_against(card, label)) for label, said in FLOORS.items())
+    return Section(TITLE, _headline(card), html + _film(demo, tell))
+
+
+def _play(demo: Demo, tell: Tell) -> Card:
+    subjects = [Subject(name, (name,)) for name in SHIPPED]
+    if (demo.training / "policy").is_dir():
+        subjects.append(Subject(NEW, (str(demo.training / "policy"),)))
+    conditions = [  # precision as in training: the engine is compiled once
+        Condition(label, {"randomization": floor, "precision": "float32"}, episodes=demo.episodes)
+        for label, floor in ((MAIN, "ice"), (SPLIT, "split"))
+    ]
+    total, done = work(conditions, subjects, 1000), 0
+
+    def on_tick(text: str, cost: int) -> None:
+        nonlocal done
+        done += cost
+        tell(f"on ice: {text.partition(':')[0]}", 0.5 * min(1.0, done / total))
+
+    return Card(play(ENVIRONMENT, subjects, conditions, FIRST_SEED + demo.seed, on_tick))
+
+
+def _table(card: Card, label: str) -> str:
+    digits = {metric.key: metric.digits for metric in card.metrics}
+    rows = [
+        (name, _WHO[name], *(_cell(own[key], min(digits[key], 3)) for key in _COLUMNS))
+        for name, own in card.scores[label].items()
+    ]
+    return table(("policy", "", *_COLUMNS.values()), rows, range(2, 2 + len(_COLUMNS)))
+
+
+def _cell(estimate: Estimate, digits: int) -> str:
+    return f"{estimate.mean:.{digits}f} ± {0.5 * (estimate.high - estimate.low):.{digits}f}"
+
+
+def _against(card: Card, label: str) -> str:
+    others = [f"{name} by {_percent(own['tracking_error'])}" for name, own in card.comparison[label].items()]
+    return f"Paired episode by episode, the tracking error of {OURS} is lower (minus: higher) than that of {'; '.join(others)}."
+
+
+def _percent(better: Estimate) -> str:
+    return f"{better.mean:.0f} % (95 % interval {better.low:.0f} to {better.high:.0f})"
+
+
+def _headline(card: Card) -> str:
+    said = [f"{_lower(card.comparison[label][BLIND]['tracking_error'])} {where}" for label, where in _WHERE.items()]
+    return f"The tracking error of a policy that observes its slip, against the same training without: {'; '.join(said)}."
+
+
+def _lower(better: Estimate) -> str:
+    if not better.excludes_zero:
+        return "not told apart"
+    return f"{abs(better.mean):.0f} % {'lower' if better.mean > 0 else 'higher'}"
+
+
+def _film(demo: Demo, tell: Tell) -> str:
+    from wlr_gym.learning.evaluation.film import Picture, film_beside
+    from wlr_gym.render.view import View
+
+    def watch(pictures: Iterable[Picture], count: int) -> Iterator[Picture]:
+        for index, one in enumerate(pictures):
+            tell(f"on ice: film, picture {index + 1} of {count}", 0.5 + 0.5 * index / count)
+            yield one
+
+    try:
+        path = film_beside(
+            demo.out / "ice.webp",
+            ENVIRONMENT,
+            [Subject(name, (name,)) for name in (OURS, BLIND)],
+            demo.seed,
+            demo.film_seconds,
+            {"randomization": "none", "effects": SHEET},
+            view=View(size=SIZE, path=True),
+            schedule=SCHEDULE,
+            fps=PICTURES_PER_SECOND,
+            watch=watch,
+        )
+    except InputError as error:
+        return paragraph(f"No film: {error}.")
+    return picture(path, _CAPTION)
+
+
+_CAPTION = (
+    "The same ice (blue, under the left wheels) and the same commands for both: drive on, after 4 s turn right as well. "
+    "Arrows: where each wheel slips to, 0.1 m for 0.05 m/s; the redder, the faster. Pink: the path of the robot; dashed: the "
+    "path that was commanded. Turning on skids needs slip; what counts is who follows. One scene; averages: the table."
+)

@@ -1,0 +1,115 @@
+"""First stage: train a policy for about a minute, beside two references."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
+from wlr_gym.studies.demo.stage import Section, Tell, drawn, paragraph
+
+if TYPE_CHECKING:
+    from wlr_gym.learning.evaluation import Rollout
+
+TITLE = "1. A policy learns"
+REFERENCES = ("do_nothing", "pid")
+#: The highest reward per second: both tracking terms of the task have weight 1.
+BEST = 2.0
+#: s between two looks at the learning curve.
+_LOOK = 0.5
+
+
+def train(demo: Demo, tell: Tell) -> Section:
+    """Train PPO, draw its learning curve."""
+    from wlr_gym.learning.evaluation import plots, read_curve
+    from wlr_gym.policy import Training, load_agent, load_agent_config
+
+    config = load_agent_config("ppo") | {"seed": demo.seed, "total_steps": demo.steps}
+    tell("training: compiling the simulator", 0.0)
+    with _watched(demo, tell):
+        load_agent("ppo").train(Training(ENVIRONMENT, demo.training, config, progress=False))
+    tell("training: episodes of the new policy and of references", 0.93)
+    references = {name: _reward_per_second(_play(name, demo)) for name in REFERENCES}
+    episodes = _play(demo.training / "policy", demo)
+    curve = read_curve(demo.training / "learning_curve.csv")
+    first, last = (row["reward_per_second"] for row in (curve[0], curve[-1]))
+    robots, period = int(config["num_envs"]), 0.02
+    hours = curve[-1]["steps"] * period / 3600.0
+    headline = (
+        f"A new policy learnt from nothing in {curve[-1]['steps'] / 1e6:.1f} million control ticks: "
+        f"reward {first:.2f} to {last:.2f} per second of at most {BEST:g}."
+    )
+    html = paragraph(
+        f"PPO (Stable-Baselines3) drives {robots} simulated robots at once, on floors from slippery to grippy, and is asked to "
+        f"follow commands of forward velocity and yaw rate. It saw {hours:.1f} hours of driving, simulated on one core. It is "
+        "one of the policies on ice below."
+    )
+    html += drawn(
+        plots.learning_curve(curve, references),
+        demo.out / "learning_curve.png",
+        "Left: reward per second of simulated time, over control ticks of all robots together; the references play whole "
+        "episodes of the same task without exploring. Right: what the reward is made of.",
+    )
+    chosen = _liveliest(episodes)
+    html += drawn(
+        plots.episode(episodes, chosen, f"The new policy on a floor of friction {episodes.friction[chosen].mean():.2f}"),
+        demo.out / "episode.png",
+        "An episode of the new policy that it has not trained on, the one of the most driving and turning.",
+    )
+    return Section(TITLE, headline, html)
+
+
+@contextmanager
+def _watched(demo: Demo, tell: Tell) -> Iterator[None]:
+    """Tell of the training's progress, by its learning curve, until it is over."""
+    from wlr_gym.learning.evaluation import read_curve
+
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.wait(_LOOK):
+            try:
+                done = read_curve(demo.training / "learning_curve.csv")[-1]
+            except (InputError, IndexError):
+                continue
+            reward = f"reward {done['reward_per_second']:.2f} per second"
+            tell(
+                f"training: {done['steps'] / 1e6:.1f} of {demo.steps / 1e6:.1f} million ticks, {reward}",
+                0.93 * done["steps"] / demo.steps,
+            )
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join()
+
+
+def _play(source: str | Path, demo: Demo) -> Rollout:
+    """Let a policy play whole episodes of the task."""
+    from wlr_gym.learning.evaluation import FIRST_SEED, make_player, roll_out
+
+    core, policy = make_player(ENVIRONMENT, source, demo.episodes, {"precision": "float32"})
+    try:
+        return roll_out(core, policy, FIRST_SEED + demo.seed)
+    finally:
+        core.close()
+
+
+def _reward_per_second(rollout: Rollout) -> float:
+    return float(rollout.reward[rollout.active].mean() / rollout.control_period)
+
+
+def _liveliest(rollout: Rollout) -> int:
+    """Return the episode that was asked for the most driving and turning: the most to see."""
+    largest = np.maximum(np.abs(rollout.command).max(axis=(0, 1)), 1e-9)
+    effort = (np.abs(rollout.command) / largest).sum(axis=-1)
+    return int(np.argmax(np.where(rollout.active, effort, 0.0).sum(axis=0)))

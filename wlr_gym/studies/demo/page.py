@@ -1,0 +1,51 @@
+"""The page: one HTML file with everything inside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from wlr_gym import __version__
+from wlr_gym.base.files import replace_file
+from wlr_gym.gap.report.html import document, section
+from wlr_gym.studies.demo.settings import Demo
+from wlr_gym.studies.demo.stage import FAILED, NOT_SHOWN, SHOWN, SKIPPED, Section
+
+_MARKS = {SHOWN: "✓", NOT_SHOWN: "✗", SKIPPED: "-", FAILED: "✗"}
+_COLOURS = {SHOWN: "#2e7d32", NOT_SHOWN: "#8a6d00", SKIPPED: "#8a6d00", FAILED: "#b03030"}
+#: From best to worst: the page has the colour of its worst section.
+_ORDER = (SHOWN, SKIPPED, NOT_SHOWN, FAILED)
+
+
+def write_page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> Path:
+    """Write the page and return its path."""
+    text = page(demo, sections, interrupted)
+    replace_file(demo.page, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    return demo.page
+
+
+def page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> str:
+    """Return the page."""
+    worst = max((one.verdict for one in sections), key=_ORDER.index, default=SKIPPED)
+    title = "wlr_gym: from learning to a simulator that agrees with the robot"
+    lines = "".join(_line(one) for one in sections)
+    stopped = "<p><b>Stopped before it was over: the page has what was made until then.</b></p>" if interrupted else ""
+    header = (
+        f'<header>\n<p class="label">wlr demo</p>\n<h1>{escape(title)}</h1>\n</header>\n{stopped}'
+        f'<ul style="list-style: none; padding: 0">{lines}</ul>\n'
+        '<p class="small">Everything here is simulated or emulated; no hardware was driven.</p>'
+    )
+    footer = (
+        f"<footer><p>wlr_gym {escape(__version__)}, seed {demo.seed}: the same seed gives the same numbers on one machine. "
+        f"Another secret: <code>wlr demo --seed {demo.seed + 1}</code>.</p></footer>"
+    )
+    return document(title, _COLOURS[worst], [header, *(section(one.title, one.html) for one in sections), footer])
+
+
+def _line(one: Section) -> str:
+    text = escape(one.headline or _WITHOUT[one.verdict])
+    return f"<li>{_MARKS[one.verdict]} <b>{escape(one.title)}</b> {text}</li>"
+
+
+_WITHOUT = {SHOWN: "", NOT_SHOWN: "Not shown.", SKIPPED: "Left out.", FAILED: "Failed."}

@@ -1,0 +1,151 @@
+"""Third stage: an emulated robot that hides something, driven by a shipped policy and logged as a real one would be."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.robot import JOINTS, LEGS, WHEELS
+from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
+from wlr_gym.studies.demo.stage import Section, Tell, drawn, paragraph
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from wlr_gym.data import Run
+
+TITLE = "3. A robot with a secret"
+POLICY = "velocity_slip_aware_no_camera"
+#: What each run is driven by: the policy, or a motion that brings out what a robot is made of.
+DRIVERS = ("posture", POLICY, "turns", "stop_and_go")
+Draw = np.random.Generator
+_CORNER_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red")
+
+
+def hide(seed: int) -> dict[str, Any]:
+    """Return what the robot hides: an effect, its place and its size, all drawn from the seed."""
+    from wlr_gym.base.random import generator
+
+    draw = generator(seed, "demo", "secret")
+    return _HIDDEN[int(draw.integers(len(_HIDDEN)))](draw)
+
+
+def _friction(draw: Draw) -> dict[str, Any]:
+    leg = LEGS[int(draw.integers(len(LEGS)))]
+    return {"name": "coulomb_friction", "where": [leg], "parameters": {"torque": round(float(draw.uniform(0.3, 0.45)), 3)}}
+
+
+def _delay(draw: Draw) -> dict[str, Any]:
+    delay = round(float(draw.uniform(0.03, 0.05)), 3)
+    return {"name": "command_delay", "where": list(JOINTS), "parameters": {"delay": delay}}
+
+
+_HIDDEN: tuple[Callable[[Draw], dict[str, Any]], ...] = (_friction, _delay)
+
+
+def drive(demo: Demo, tell: Tell) -> Section:
+    """Drive the robot and log its runs; what it hides is written where nothing looks before the end."""
+    from wlr_gym.data import read_dataset
+    from wlr_gym.physics.effects import load_patch, save_patch
+
+    shutil.rmtree(demo.measured, ignore_errors=True)
+    patch = load_patch([hide(demo.seed)])
+    save_patch(patch, demo.secret)
+    drivers = DRIVERS[: demo.runs]
+    for index, driver in enumerate(drivers):
+        tell(f"emulated robot: run {index + 1} of {len(drivers)}", index / len(drivers))
+        if driver == POLICY:
+            _deploy(demo, patch, demo.seed + index)
+        else:
+            _excite(demo, patch, driver)
+    runs = read_dataset(demo.measured).runs
+    seconds = sum(float(run["t"][-1] - run["t"][0]) for run in runs)
+    html = paragraph(
+        "An emulated robot, servo by servo and register by register, is driven like a real one: start-up checks, safety gate, "
+        f"50 Hz, a log of what was sent and read. {_told(drivers)} Something about this robot is not in its file: drawn from "
+        "the seed of this demo, and told to nobody until the end of this page."
+    )
+    html += drawn(
+        _picture(runs[drivers.index(POLICY)]),
+        demo.out / "measured_run.png",
+        "A run of the policy as the robot logged it. The robot has no camera: joints, motor currents and IMU are all there is.",
+    )
+    headline = f"A robot with a hidden fault was driven and logged: {len(runs)} runs, {seconds:.0f} s in all."
+    return Section(TITLE, headline, html)
+
+
+def _told(drivers: tuple[str, ...]) -> str:
+    from wlr_gym.data.excitations import EXCITATIONS
+
+    motions = [f"'{name}' ({EXCITATIONS[name].doc})" for name in drivers if name in EXCITATIONS]
+    count = drivers.count(POLICY)
+    runs = f"{count} run{'s' if count > 1 else ''}"
+    return f"{runs} by the shipped policy {POLICY}, and {len(motions)} by motions: {', '.join(motions)}."
+
+
+def _deploy(demo: Demo, patch: Any, seed: int) -> None:
+    from wlr_gym.hardware.deployment import deploy
+    from wlr_gym.learning.evaluation import make_core
+    from wlr_gym.policy import make_policy, policy_environment
+
+    hardware = {"emulated": True, "log": demo.measured, "effects": patch}
+    keywords = {"backend": "dynamixel", "hardware": hardware, "episode_length": demo.run_seconds}
+    core = make_core(ENVIRONMENT, 1, keywords | policy_environment(POLICY))
+    try:
+        ended = deploy(core, make_policy(POLICY, core.contract()), seed)
+    finally:
+        core.close()
+    if not ended.well:
+        raise InputError(f"the robot was stopped: {ended.reason}")
+
+
+def _excite(demo: Demo, patch: Any, name: str) -> None:
+    """Drive a motion with the servos as policies drive them, without a profile: the runs of a folder share it."""
+    from dataclasses import replace
+
+    from wlr_gym.data.excitations import excite
+    from wlr_gym.data.format import Profile
+    from wlr_gym.hardware.driving import drive_robot
+    from wlr_gym.hardware.plant import RobotPlant
+    from wlr_gym.physics.plants.base import RobotOptions
+    from wlr_gym.robot import load_robot
+
+    robot = load_robot()
+    motion = replace(excite(name, demo.seed, robot, seconds=demo.run_seconds), profile=Profile())
+    plant = RobotPlant(robot, 1, hardware=RobotOptions(emulated=True, log=demo.measured, effects=patch))
+    try:
+        ended = drive_robot(plant, motion)
+    finally:
+        plant.close()
+    if not ended.well:
+        raise InputError(f"the robot was stopped: {ended.reason}")
+
+
+def _picture(run: Run) -> Figure:
+    """Return wheel speeds, leg angles and turning rate of a run over time."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.0, 6.0), layout="constrained")
+    rows = figure.subplots(3, 1, sharex=True)
+    t = run["t"] - run["t"][0]
+    for axes, kind, joints, label in (
+        (rows[0], "vel", WHEELS, "wheel speed (rad/s)"),
+        (rows[1], "pos", LEGS, "leg angle (rad)"),
+    ):
+        for joint, colour in zip(joints, _CORNER_COLOURS, strict=True):
+            axes.plot(t, run[f"{kind}_{joint}"], color=colour, linewidth=1.0, label=joint)
+            axes.plot(t, run[f"cmd_{joint}"], color=colour, linewidth=0.7, linestyle=":")
+        axes.set_ylabel(label)
+        axes.legend(
+            loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False, title="dotted: goal", title_fontsize=8
+        )
+    rows[2].plot(t, run["gyro_z"], color="black", linewidth=1.0)
+    rows[2].set(ylabel="yaw rate, gyro (rad/s)", xlabel="time (s)")
+    for axes in rows:
+        axes.grid(alpha=0.3)
+        axes.margins(x=0.01)
+    return figure

@@ -1,0 +1,74 @@
+"""Stages of the demo, and what each contributes to the page."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wlr_gym.studies.demo.settings import Demo
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Told of what is going on and of the share of the stage that is done.
+Tell = Callable[[str, float], None]
+#: Verdicts of a section: what it set out to show was shown, was not, was not tried, or went wrong.
+SHOWN, NOT_SHOWN, SKIPPED, FAILED = "shown", "not shown", "skipped", "failed"
+_MEDIA = {".png": "image/png", ".webp": "image/webp"}
+
+
+@dataclass(frozen=True)
+class Section:
+    """What a stage has found.
+
+    Attributes:
+        title: of the section.
+        headline: one sentence for the top of the page; empty = none.
+        html: what stands below the title.
+        verdict: one of the four above.
+    """
+
+    title: str
+    headline: str
+    html: str
+    verdict: str = SHOWN
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage.
+
+    Attributes:
+        title: of its section.
+        work: does it.
+        share: of the time of its lane.
+        needs: (package, extra) it cannot do without.
+    """
+
+    title: str
+    work: Callable[[Demo, Tell], Section]
+    share: float
+    needs: tuple[tuple[str, str], ...] = ()
+
+
+def paragraph(text: str) -> str:
+    """Return text as a paragraph."""
+    return f"<p>{escape(text)}</p>"
+
+
+def picture(path: Path, caption: str) -> str:
+    """Return a picture or film inside the page, with its caption."""
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    source = f"data:{_MEDIA[path.suffix]};base64,{data}"
+    return f'<figure><img alt="{escape(path.stem)}" src="{source}"><figcaption>{escape(caption)}</figcaption></figure>'
+
+
+def drawn(figure: Figure, path: Path, caption: str) -> str:
+    """Save a figure as PNG, and return it for the page."""
+    from wlr_gym.learning.evaluation import plots
+
+    return picture(plots.save(figure, path), caption)
