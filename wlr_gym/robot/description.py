@@ -22,6 +22,9 @@ CORNERS = ("lf", "rf", "lr", "rr")
 LEGS = tuple(f"leg_{corner}" for corner in CORNERS)
 WHEELS = tuple(f"wheel_{corner}" for corner in CORNERS)
 JOINTS = LEGS + WHEELS
+#: Where legs and wheels stand in the joint order: ``position[:, LEG_SLICE]``; wheel i is joint ``FIRST_WHEEL + i``.
+FIRST_WHEEL = len(LEGS)
+LEG_SLICE, WHEEL_SLICE = slice(0, FIRST_WHEEL), slice(FIRST_WHEEL, len(JOINTS))
 #: Signs of the hip positions (x, y) in the body frame, in corner order.
 CORNER_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
 
@@ -161,7 +164,7 @@ class Robot(Model):
     servo: Servo
     ground: Ground
     sensors: SensorSet
-    tolerances: dict[str, float | str] = {}
+    tolerances: dict[str, float | str] = Field(default_factory=dict)
 
     @field_validator("leg_limits")
     @classmethod

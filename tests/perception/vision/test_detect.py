@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from vision_studio import pose_of
 
-from wlr_gym.perception.markers.detect import detect
 from wlr_gym.perception.markers.camera import distort, undistort
+from wlr_gym.perception.markers.detect import detect
 from wlr_gym.perception.markers.pose import circle_centres
 from wlr_gym.perception.markers.targets import CODE_NAMES
 from wlr_gym.perception.scene import Look, Pose, project
