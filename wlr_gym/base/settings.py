@@ -107,6 +107,8 @@ def _explain(model: type[BaseModel], problem: Any, where: str) -> str:
         return f"{where}: unknown key '{field}'{nearest(location[-1], valid)}; valid: {', '.join(valid)}"
     if problem["type"] == "missing":
         return f"{where}: '{field}' is missing"
+    if isinstance(refused := problem.get("ctx", {}).get("error"), InputError):
+        return f"{where}: {refused}"
     value = f"{field} = {problem['input']!r}: " if field else ""  # what is about the whole file does not repeat it
     return f"{where}: {value}{problem['msg']}"
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pydantic import BaseModel, ConfigDict, Field
 
 from wlr_gym.robot import JOINTS, LEGS, Vector3
-from wlr_gym.robot.parameters import XYZ
+from wlr_gym.robot.parameter_table import XYZ
 
 #: File suffixes a run may have.
 SUFFIXES = (".csv", ".parquet")

@@ -23,7 +23,8 @@ from wlr_gym.physics.effects import load_patch
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, Sensors
 from wlr_gym.robot import JOINTS, Robot
-from wlr_gym.robot.parameters import ELEMENTS, Parameters
+from wlr_gym.robot.parameter_table import ELEMENTS
+from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
     from wlr_gym.data.read import Run

@@ -12,21 +12,13 @@ import math
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field, field_serializer, field_validator, model_validator
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import find_config, named_in
 from wlr_gym.base.settings import Model, overlay, parse_config, read_yaml
-
-CORNERS = ("lf", "rf", "lr", "rr")
-LEGS = tuple(f"leg_{corner}" for corner in CORNERS)
-WHEELS = tuple(f"wheel_{corner}" for corner in CORNERS)
-JOINTS = LEGS + WHEELS
-#: Where legs and wheels stand in the joint order: ``position[:, LEG_SLICE]``; wheel i is joint ``FIRST_WHEEL + i``.
-FIRST_WHEEL = len(LEGS)
-LEG_SLICE, WHEEL_SLICE = slice(0, FIRST_WHEEL), slice(FIRST_WHEEL, len(JOINTS))
-#: Signs of the hip positions (x, y) in the body frame, in corner order.
-CORNER_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+from wlr_gym.robot.joints import JOINTS
+from wlr_gym.robot.tolerance import KEYS, ParameterTolerance, read_tolerances
 
 Vector3 = tuple[float, float, float]
 
@@ -164,7 +156,24 @@ class Robot(Model):
     servo: Servo
     ground: Ground
     sensors: SensorSet
-    tolerances: dict[str, float | str] = Field(default_factory=dict)
+    tolerances: dict[str, ParameterTolerance] = Field(default_factory=dict)
+
+    @field_validator("tolerances", mode="before")
+    @classmethod
+    def _tolerances_are_read(cls, stated: Any) -> dict[str, ParameterTolerance]:
+        return read_tolerances(stated)
+
+    @model_validator(mode="after")
+    def _tolerances_are_relative_to_something(self) -> Robot:
+        for key, tolerance in self.tolerances.items():
+            values = [value for row in KEYS[key] for value in row.nominal(self)]
+            if tolerance.unit is None and max(tolerance.legs, tolerance.wheels) > 0.0 and all(value == 0.0 for value in values):
+                raise InputError(f"tolerances.{key} = '{tolerance}': is relative to 0: expected an amount with its unit")
+        return self
+
+    @field_serializer("tolerances")
+    def _tolerances_as_written(self, tolerances: dict[str, ParameterTolerance]) -> dict[str, str]:
+        return {key: str(tolerance) for key, tolerance in tolerances.items()}
 
     @field_validator("leg_limits")
     @classmethod

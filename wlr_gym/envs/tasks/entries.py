@@ -14,7 +14,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks.draws import stream_numbers, uniforms
 from wlr_gym.envs.tasks.terms.events import DISTRIBUTIONS, number_of, tolerance_of
 from wlr_gym.robot import Robot
-from wlr_gym.robot.parameters import ELEMENTS, SPECS, Parameters, range_in_words, spec_of
+from wlr_gym.robot.parameter_table import ELEMENTS, SPECS, range_in_words, spec_of
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 Number = float | str

@@ -23,7 +23,8 @@ from wlr_gym.envs.tasks.entries import DISTRIBUTION_KEYS, Data, Entry, EventConf
 from wlr_gym.envs.tasks.identified import identified_events
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.robot import LEGS, Robot
-from wlr_gym.robot.parameters import ELEMENTS, TABLE, XYZ, Parameters
+from wlr_gym.robot.parameter_table import ELEMENTS, TABLE, XYZ
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
