@@ -208,7 +208,7 @@ def _drawn(core):
 
 @pytest.mark.parametrize(
     ("base", "message"),
-    [("mine.yaml", "is its own base"), ("5", "base = 5: expected a name"), ("ppo_blnd", "did you mean 'ppo_blind'")],
+    [("mine.yaml", "is its own base"), ("5", "base = 5: expected the name"), ("ppo_blnd", "did you mean 'ppo_blind'")],
 )
 def test_a_base_that_is_none_is_refused(tmp_path, monkeypatch, base, message):
     monkeypatch.chdir(tmp_path)
