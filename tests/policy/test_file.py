@@ -6,8 +6,10 @@ import json
 import pytest
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.envs.tasks.task import ObserverConfig
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import check_contract, load_policy, make_policy, read_contract, write_contract
+from wlr_gym.policy.file import DEFAULTS, with_defaults
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +65,42 @@ def test_first_difference_is_named(contract, change, message):
 )
 def test_other_conditions_are_not_refused(contract, change):
     check_contract(contract, changed(contract, change), "policy")
+
+
+@pytest.mark.parametrize("absent", DEFAULTS)
+def test_an_absent_key_means_its_default(contract, absent):
+    contract = with_defaults(contract)
+    group, _, key = absent.partition(".")
+
+    def forget(c):
+        entries = c[group] if isinstance(c[group], list) else [c[group] or {}]
+        for entry in entries if key else ():
+            if entry.get(key) == DEFAULTS[absent]:
+                del entry[key]
+        if not key and c[group] is None:
+            del c[group]
+
+    def differ(c):
+        forget(c)
+        entries = c[group] if isinstance(c[group], list) else [c[group]]
+        entries[0][key] = "other"
+
+    older = changed(contract, forget)
+    check_contract(older, contract, "policy")
+    check_contract(contract, older, "policy")
+    assert with_defaults(older) == contract
+    if key and contract[group]:
+        with pytest.raises(InputError, match=rf"{key} is .* in the policy, 'other' in the environment"):
+            check_contract(older, changed(contract, differ), "policy")
+
+
+def test_the_observers_defaults_are_those_of_its_settings():
+    defaults = {key.partition(".")[2]: value for key, value in DEFAULTS.items() if key.startswith("observer.")}
+    assert defaults == ObserverConfig().model_dump()
+
+
+def test_the_name_of_the_robot_does_not_matter(contract):
+    check_contract(contract, changed(contract, lambda c: c["robot"].update(name="other")), "policy")
 
 
 def test_the_environment_itself_decides(folder):

@@ -2,11 +2,12 @@
 
 import shutil
 
+import numpy as np
 import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.evaluation import make_core, start_episodes
 from wlr_gym.policy import (
     check_model_card,
     contract_of,
@@ -128,9 +129,16 @@ def test_command_line(policy, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("name", shipped_names())
-def test_every_shipped_policy_fits_its_environment(name):
-    core = make_core(trained_environment(name) or "", 1, policy_environment(name))
-    assert make_policy(name, core.contract()).act(core.observation).shape == (1, 8)
+def test_every_shipped_policy_plays_in_its_environment(name):
+    core = make_core(trained_environment(name) or "", 2, policy_environment(name))
+    policy = make_policy(name, core.contract())
+    start_episodes(core, policy, 0)
+    for _ in range(10):
+        actions = policy.act(core.observation)
+        assert actions.shape == (2, 8)
+        assert np.isfinite(actions).all()
+        core.step(actions, core.everyone)
+    assert not core.terminated.any()
     core.close()
 
 

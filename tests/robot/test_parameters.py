@@ -5,7 +5,8 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, load_robot
-from wlr_gym.robot.parameters import ELEMENTS, SPECS, TABLE, Parameters, spec_of
+from wlr_gym.robot.parameter_table import ELEMENTS, SPECS, TABLE, spec_of
+from wlr_gym.robot.parameters import Parameters
 
 ROBOT = load_robot()
 

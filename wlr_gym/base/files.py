@@ -54,5 +54,9 @@ def _replace(path: Path, write: Callable[[Path], object]) -> None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write ``content`` as indented JSON."""
-    text = json.dumps(content, indent=2) + "\n"
+    write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file (UTF-8)."""
     replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -12,11 +12,14 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.paths import find_config, named_in
 
 ModelType = TypeVar("ModelType", bound=BaseModel)
+#: What a file says, and its path as messages name it.
+Layer = tuple[Any, str]
 
 
-class Model(BaseModel):
+class SettingsModel(BaseModel):
     """A record of settings: frozen, finite numbers only, unknown keys refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -54,6 +57,43 @@ def read_yaml(path: str | Path) -> Any:
         raise InputError(f"{path}{place}: broken YAML: {getattr(error, 'problem', error)}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def read_config(kind: str, source: str | Path) -> Layer:
+    """Read a config given by path or by the name of a file in ``configs/<kind>/``."""
+    path = find_config(kind, source)
+    return read_yaml(path), str(path)
+
+
+def read_layers(kind: str, source: str | Path) -> list[Layer]:
+    """Return what a config says and what its bases say, the lowest first; see :func:`layers_of`."""
+    return layers_of(kind, read_config(kind, source))
+
+
+def layers_of(kind: str, top: Layer, read: Callable[[str, str | Path], Layer] = read_config) -> list[Layer]:
+    """Return what ``top`` says and what its bases say, the lowest first, each without its key ``base``.
+
+    A base is a name in ``configs/<kind>/`` or a path, looked for beside the file first.
+
+    Raises:
+        InputError: a base that is neither, that does not exist, or that is above itself.
+    """
+    found: list[Layer] = []
+    data, where = top
+    while isinstance(data, Mapping) and (base := data.get("base")) is not None:
+        above = [place for _, place in found]
+        if where in above:
+            raise InputError(f"{where}: is its own base ({' -> '.join([*above, where])})")
+        if not isinstance(base, str | Path):
+            raise InputError(f"{where}: base = {base!r}: expected the name or the path of a {kind} config")
+        found.append((_without_base(data), where))
+        data, where = read(kind, named_in(where, base))
+    found.append((_without_base(data), where))
+    return found[::-1]
+
+
+def _without_base(data: Any) -> Any:
+    return {key: value for key, value in data.items() if key != "base"} if isinstance(data, Mapping) else data
 
 
 def parse_yaml(text: str) -> Any:
@@ -107,6 +147,8 @@ def _explain(model: type[BaseModel], problem: Any, where: str) -> str:
         return f"{where}: unknown key '{field}'{nearest(location[-1], valid)}; valid: {', '.join(valid)}"
     if problem["type"] == "missing":
         return f"{where}: '{field}' is missing"
+    if isinstance(refused := problem.get("ctx", {}).get("error"), InputError):
+        return f"{where}: {refused}"
     value = f"{field} = {problem['input']!r}: " if field else ""  # what is about the whole file does not repeat it
     return f"{where}: {value}{problem['msg']}"
 

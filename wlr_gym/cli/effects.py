@@ -20,7 +20,8 @@ from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Effect, Patch, Patc
 from wlr_gym.physics.effects.document import places
 from wlr_gym.physics.plants.forces import COORDINATES, FEATURES
 from wlr_gym.robot import load_robot
-from wlr_gym.robot.parameters import ELEMENTS, Parameters, spec_of
+from wlr_gym.robot.parameter_table import ELEMENTS, spec_of
+from wlr_gym.robot.parameters import Parameters
 
 
 @dataclass(frozen=True)

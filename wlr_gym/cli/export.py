@@ -26,23 +26,48 @@ ELSEWHERE = ("--out", "--resume", "--max-minutes")
 
 @dataclass(frozen=True)
 class Options:
-    policy: tyro.conf.Positional[str]
-    """Policy folder or run folder; with --card: policy file, or name of a shipped policy."""
+    policy: tyro.conf.Positional[tuple[str, ...]]
+    """Policy folder or run folder; with --card or --reseal: policy file, or name of a shipped policy."""
     out: Path | None = None
     """The file; default: policy.onnx."""
     card: Path | None = None
     """Folder that wlr evaluate --out has written: instead, write the model card beside the policy file."""
+    reseal: bool = False
+    """Instead, rewrite the contracts of policy files in the present form, where the robot is the same, and say what changed."""
+    robot: str | None = None
+    """With --reseal: name or path of the robot that they were trained with; default: as their contract says."""
 
 
 def run(options: Options) -> int:
-    """Export, compare, say what was written."""
+    """Export and compare, or write the card, or reseal; say what was written."""
+    if options.reseal:
+        _reseal(options)
+        return OK
+    if options.robot is not None:
+        raise InputError("--robot goes with --reseal: what is exported carries the robot of its training")
+    if len(options.policy) != 1:
+        raise InputError(f"expected one policy, got {len(options.policy)}; several go with --reseal")
     if options.card is None:
-        _export(options.policy, options.out or Path("policy.onnx"))
+        _export(options.policy[0], options.out or Path("policy.onnx"))
     elif options.out is None:
-        _write_card(options.policy, options.card)
+        _write_card(options.policy[0], options.card)
     else:
         raise InputError("--card and --out: one or the other; a card is written beside its policy file")
     return OK
+
+
+def _reseal(options: Options) -> None:
+    from wlr_gym.policy import find_policy, reseal
+
+    if options.out is not None or options.card is not None:
+        raise InputError("--reseal rewrites policy files where they are: neither --out nor --card goes with it")
+    if not options.policy:
+        raise InputError("--reseal: expected policy files, or names of shipped policies")
+    for source in options.policy:
+        place = find_policy(source)
+        if not place.is_file():
+            raise InputError(f"{place}: is a policy folder; what can be resealed is a policy file")
+        print("\n  ".join([f"{place}:", *(reseal(place, options.robot) or ["nothing changed"])]))
 
 
 def _export(source: str, out: Path) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from wlr_gym.base.settings import SettingsModel
 from wlr_gym.robot import JOINTS, LEGS, Vector3
-from wlr_gym.robot.parameters import XYZ
+from wlr_gym.robot.parameter_table import XYZ
 
 #: File suffixes a run may have.
 SUFFIXES = (".csv", ".parquet")
@@ -99,19 +100,15 @@ CAMERA = ("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch")
 ANGLES_OF_THE_BODY = ("cam_yaw", "cam_pitch")
 
 
-class _Meta(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Profile(_Meta):
+class Profile(SettingsModel):
     """Servo profile registers: 0 = no profile, step references."""
 
-    wheel_acceleration: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    leg_velocity: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    leg_acceleration: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    wheel_acceleration: float = Field(default=0.0, ge=0)
+    leg_velocity: float = Field(default=0.0, ge=0)
+    leg_acceleration: float = Field(default=0.0, ge=0)
 
 
-class RunMeta(_Meta):
+class RunMeta(SettingsModel):
     """What ``meta.yaml`` says about the runs beside it.
 
     Attributes:

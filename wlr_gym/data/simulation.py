@@ -13,17 +13,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file
-from wlr_gym.base.settings import parse_config, read_yaml
+from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.data.format import COMMANDS
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, Sensors
 from wlr_gym.robot import JOINTS, Robot
-from wlr_gym.robot.parameters import ELEMENTS, Parameters
+from wlr_gym.robot.parameter_table import ELEMENTS
+from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
     from wlr_gym.data.read import Run
@@ -39,18 +40,14 @@ SENSED = (
 )
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ParameterChange(_Record):
+class ParameterChange(SettingsModel):
     """Parameters that changed after the sensors of ``row`` were read: they act from that row's goals on."""
 
     row: int = Field(ge=0)
     parameters: dict[str, float]
 
 
-class Simulation(_Record):
+class Simulation(SettingsModel):
     """How a run was simulated.
 
     Attributes:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.paths import find_config
-from wlr_gym.base.settings import parse_config, read_yaml
+from wlr_gym.base.settings import SettingsModel, parse_config, read_config
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, load_table
 from wlr_gym.hardware.safety.limits import Safety
 from wlr_gym.robot import JOINTS, LEGS, Vector3
@@ -18,18 +17,14 @@ from wlr_gym.robot import JOINTS, LEGS, Vector3
 POSITION_MODE, VELOCITY_MODE = 3, 1
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Bus(_Model):
+class Bus(SettingsModel):
     """One electrical bus: serial port, servo model, joints on it, and what the servos' EEPROM must hold (counts)."""
 
     port: str
     model: str
     baud_rate: int
     joints: tuple[str, ...] = Field(min_length=1)
-    eeprom: dict[str, int] = {}
+    eeprom: dict[str, int] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _is_possible(self) -> Bus:
@@ -42,7 +37,7 @@ class Bus(_Model):
         return self
 
 
-class ImuCalibration(_Model):
+class ImuCalibration(SettingsModel):
     """Errors of an IMU and how it is mounted: mounting * scale * (measured - offset). ``wlr calibrate imu`` writes it.
 
     Attributes:
@@ -60,7 +55,7 @@ class ImuCalibration(_Model):
     date: str | None = None
 
 
-class ImuPort(_Model):
+class ImuPort(SettingsModel):
     """The IMU: frames from a microcontroller's serial port (``stream``), or the chip on this computer's I2C bus (``i2c``).
 
     Attributes:
@@ -89,14 +84,14 @@ class ImuPort(_Model):
         return self
 
 
-class Mounting(_Model):
+class Mounting(SettingsModel):
     """How a servo sits on its joint: count = zero + sign * angle / count size."""
 
     sign: Literal[-1, 1] = 1
     zero: int = Field(0, ge=0, le=4095)
 
 
-class Hardware(_Model):
+class Hardware(SettingsModel):
     """Wiring and mounting of a whole robot, as one ``configs/hardware/*.yaml`` describes it."""
 
     name: str
@@ -133,8 +128,7 @@ def load_hardware(source: str | Path | Hardware = "nominal") -> Hardware:
     """
     if isinstance(source, Hardware):
         return source
-    path = find_config("hardware", source)
-    return parse_config(Hardware, read_yaml(path), str(path))
+    return parse_config(Hardware, *read_config("hardware", source))
 
 
 def with_ports(hardware: Hardware, ports: dict[str, str]) -> Hardware:

@@ -140,7 +140,7 @@ class RobotPlant:
             raise InputError(f"parameters hold {len(parameters)} robots, the plant 1")
         different = np.flatnonzero(parameters.values[0] != self.parameters.values[0])
         if len(different):
-            from wlr_gym.robot.parameters import ELEMENTS
+            from wlr_gym.robot.parameter_table import ELEMENTS
 
             raise InputError(
                 f"{ELEMENTS[different[0]]}: parameters of a real robot cannot be set (no randomisation, no effects)"

@@ -4,6 +4,7 @@ from wlr_gym.policy.agents import Agent, Policy, Training, agent_names, load_age
 from wlr_gym.policy.export import Parity, export_policy
 from wlr_gym.policy.file import check_contract, needs_camera, read_contract, write_contract
 from wlr_gym.policy.model_card import check_model_card, write_model_card
+from wlr_gym.policy.reseal import reseal
 from wlr_gym.policy.sources import (
     contract_of,
     find_policy,
@@ -32,6 +33,7 @@ __all__ = [
     "needs_camera",
     "policy_environment",
     "read_contract",
+    "reseal",
     "shipped_names",
     "trained_environment",
     "write_contract",

@@ -15,8 +15,8 @@ import yaml
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.paths import config_names, data_directory, find_config, named_in
-from wlr_gym.base.settings import merge_changes, parse_yaml, read_yaml
+from wlr_gym.base.paths import config_names, data_directory, named_in
+from wlr_gym.base.settings import merge_changes, parse_yaml, read_layers
 
 Contract = Mapping[str, Any]
 Config = Mapping[str, Any]
@@ -130,28 +130,21 @@ def load_agent_config(name: str | Path, changes: tuple[str, ...] = (), task: str
     return config
 
 
-def _read_config(name: str | Path, task: str | None, above: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return a task's settings of a name or path, laid over those of its base; ``above``: the files that lie over it."""
+def _read_config(name: str | Path, task: str | None) -> dict[str, Any]:
+    """Return a task's settings of a name or path, laid over those of its bases."""
     shipped = data_directory("configs") / "agent" / f"{name}.yaml"
     if str(name) in agent_names() and not shipped.is_file():
         return {}
-    path = find_config("agent", name)
-    config = read_yaml(path) or {}
-    if not isinstance(config, dict):
-        raise InputError(f"{path}: expected a mapping, got {type(config).__name__}")
-    base = config.pop("base", None)
-    if task is not None:
-        config = merge_changes(config, _of_task(path, config.pop("tasks", None), task))
-    if base is None:
-        return config
-    if not isinstance(base, str):
-        raise InputError(f"{path}: base = {base!r}: expected a name in configs/agent/, or a path")
-    if path in above:
-        raise InputError(f"{path}: is its own base")
-    return merge_changes(_read_config(named_in(path, base), task, (*above, path)), config)
+    config: dict[str, Any] = {}
+    for data, where in read_layers("agent", name):
+        own = _settings(data, where)
+        if task is not None:
+            own = merge_changes(own, _of_task(where, own.pop("tasks", None), task))
+        config = merge_changes(config, own)
+    return config
 
 
-def _of_task(path: Path, tasks: Any, task: str) -> Mapping[str, Any]:
+def _of_task(path: str, tasks: Any, task: str) -> Mapping[str, Any]:
     """Return what a file's ``tasks`` says of one task; a task is a name in ``configs/task/`` or the path of a file."""
     found: Mapping[str, Any] = {}
     for name, given in _settings(tasks, f"{path}: tasks").items():
@@ -163,9 +156,9 @@ def _of_task(path: Path, tasks: Any, task: str) -> Mapping[str, Any]:
     return found
 
 
-def _settings(value: Any, where: str) -> Mapping[str, Any]:
+def _settings(value: Any, where: str) -> dict[str, Any]:
     if not isinstance(value, Mapping | None):
-        raise InputError(f"{where} = {value!r}: expected a mapping")
+        raise InputError(f"{where}: expected a mapping, got {type(value).__name__}")
     return {str(key): entry for key, entry in (value or {}).items()}
 
 

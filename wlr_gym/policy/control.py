@@ -18,10 +18,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.settings import parse_config
+from wlr_gym.base.settings import SettingsModel, parse_config
 from wlr_gym.robot import CORNER_SIGNS, LEGS, Robot, load_robot, robot_hash
 
 Array = NDArray[np.float64]
@@ -118,7 +118,7 @@ class Chassis:
         return np.clip((goals - self._centre) / self._scale, -1.0, 1.0).astype(np.float32)
 
 
-class SearchConfig(BaseModel):
+class SearchConfig(SettingsModel):
     """How gains are searched (``wlr_gym/learning/evaluation/tuning.py``).
 
     Attributes:
@@ -127,14 +127,12 @@ class SearchConfig(BaseModel):
         episodes: that every candidate is scored by.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     steps: dict[str, float] = Field(default_factory=dict)
     rounds: int = Field(default=5, gt=0)
     episodes: int = Field(default=256, gt=0)
 
 
-class PidConfig(BaseModel):
+class PidConfig(SettingsModel):
     """Settings. Gains without a unit unless named.
 
     Attributes:
@@ -150,8 +148,6 @@ class PidConfig(BaseModel):
         environment: keywords of the environment.
         seed: of the first episode of the search. search: how it is made.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     robot: str = "nominal"
     steering: float = Field(1.0, ge=0)

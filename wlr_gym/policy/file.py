@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,26 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import versions
 from wlr_gym.policy.agents import Config, Contract
+from wlr_gym.robot.fingerprint import HASH_FORM
 
 FORMAT = 1
 CONTRACT_FILE = "contract.json"
 #: Keys of an environment's contract that a policy depends on. The others (randomisation, commands, latency) are recorded only:
 #: a policy may be tried under conditions it was not trained in.
 BINDING = ("robot", "control_period", "observation", "observer", "action")
-#: Of an observation, what differs by conditions and not by meaning.
-CONDITIONS = ("noise", "bias", "sensor_noise")
+#: Of those, what differs by conditions or by name and not by meaning.
+CONDITIONS = ("observation.noise", "observation.bias", "observation.sensor_noise", "robot.name")
+#: What an absent key means. A key that contracts get later is listed here with what went without saying before, so that older
+#: policies stay valid.
+DEFAULTS = {
+    "observation.offset": 0.0,
+    "observation.scale": 1.0,
+    "observation.lag": 0,
+    "observation.device": "",
+    "observer": None,
+    "observer.camera": True,
+}
+_INDEX = re.compile(r"\[\d+\]")
 
 
 def write_contract(folder: Path, agent: str, config: Config, environment: Contract, training: Mapping[str, Any]) -> None:
@@ -79,23 +92,52 @@ def check_contract(policy: Contract, environment: Contract, where: str) -> None:
         InputError: naming the first difference, with both values.
     """
     for key in BINDING:
-        difference = next(_differences(key, policy.get(key), environment.get(key)), None)
+        difference = next(differences(key, _entry(policy, key, key), _entry(environment, key, key)), None)
         if difference is not None:
             name, mine, theirs = difference
             raise InputError(
                 f"{where}: made for another environment: {name} is {mine!r} in the policy, {theirs!r} in the environment"
+                f"{_advice(name, mine, policy, environment)}"
             )
 
 
-def _differences(name: str, mine: Any, theirs: Any) -> Iterator[tuple[str, Any, Any]]:
+def _advice(name: str, mine: Any, policy: Contract, environment: Contract) -> str:
+    if name not in ("robot.hash", "robot.servo"):
+        return ""
+    if not str(mine).startswith(f"{HASH_FORM}-"):
+        return " (an older form: if the robot is the same, 'wlr export --reseal FILE' rewrites it)"
+    return f" (robot '{policy['robot'].get('name')}' in the policy, '{environment['robot'].get('name')}' in the environment)"
+
+
+def with_defaults(environment: Contract) -> dict[str, Any]:
+    """Return an environment's contract with every binding key, absent ones with their default."""
+    whole = dict(environment)
+    for place, default in DEFAULTS.items():
+        group, _, key = place.partition(".")
+        if not key:
+            whole.setdefault(group, default)
+        elif isinstance(whole.get(group), list):
+            whole[group] = [{**entry, key: entry.get(key, default)} for entry in whole[group]]
+        elif isinstance(whole.get(group), Mapping):
+            whole[group] = {**whole[group], key: whole[group].get(key, default)}
+    return whole
+
+
+def _entry(mapping: Mapping[str, Any], key: str, place: str) -> Any:
+    """Return what a contract says at a place such as ``observation[3].scale``, or the default."""
+    return mapping.get(key, DEFAULTS.get(_INDEX.sub("", place)))
+
+
+def differences(name: str, mine: Any, theirs: Any) -> Iterator[tuple[str, Any, Any]]:
     """Yield (path, value here, value there) of everything that differs, in order."""
     if isinstance(mine, Mapping) and isinstance(theirs, Mapping):
         for key in dict.fromkeys([*mine, *theirs]):
-            if key not in CONDITIONS:
-                yield from _differences(f"{name}.{key}", mine.get(key), theirs.get(key))
+            place = f"{name}.{key}" if name else key
+            if _INDEX.sub("", place) not in CONDITIONS:
+                yield from differences(place, _entry(mine, key, place), _entry(theirs, key, place))
     elif isinstance(mine, list | tuple) and isinstance(theirs, list | tuple):
         for index, (left, right) in enumerate(zip(mine, theirs, strict=False)):
-            yield from _differences(f"{name}[{index}]", left, right)
+            yield from differences(f"{name}[{index}]", left, right)
         if len(mine) != len(theirs):
             yield f"length of {name}", len(mine), len(theirs)
     elif mine != theirs:

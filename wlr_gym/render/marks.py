@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render.colours import FORCE, Colour, friction_colour, slip_colour
 from wlr_gym.render.stage import Stage
-from wlr_gym.robot.parameters import PATCHES, Parameters
+from wlr_gym.robot.parameter_table import PATCHES
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

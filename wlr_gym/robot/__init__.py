@@ -1,22 +1,8 @@
 """The robot as data: its description, the table of its physical parameters, slip. No simulator, no equation of motion."""
 
-from wlr_gym.robot.description import (
-    CORNER_SIGNS,
-    CORNERS,
-    FIRST_WHEEL,
-    JOINTS,
-    LEG_SLICE,
-    LEGS,
-    WHEEL_SLICE,
-    WHEELS,
-    Robot,
-    Vector3,
-    load_robot,
-    physical_faults,
-    robot_hash,
-    servo_hash,
-    standing_height,
-)
+from wlr_gym.robot.description import Robot, Vector3, load_robot, physical_faults, standing_height
+from wlr_gym.robot.fingerprint import robot_hash, servo_hash
+from wlr_gym.robot.joints import CORNER_SIGNS, CORNERS, FIRST_WHEEL, JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS
 
 __all__ = [
     "CORNERS",

@@ -7,31 +7,21 @@ straight down. Wheel angle: right-handed about body +y, relative to its leg; pos
 
 from __future__ import annotations
 
-import hashlib
 import math
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, Field, field_validator
+from pydantic import Field, field_serializer, field_validator, model_validator
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.paths import find_config, named_in
-from wlr_gym.base.settings import Model, overlay, parse_config, read_yaml
-
-CORNERS = ("lf", "rf", "lr", "rr")
-LEGS = tuple(f"leg_{corner}" for corner in CORNERS)
-WHEELS = tuple(f"wheel_{corner}" for corner in CORNERS)
-JOINTS = LEGS + WHEELS
-#: Where legs and wheels stand in the joint order: ``position[:, LEG_SLICE]``; wheel i is joint ``FIRST_WHEEL + i``.
-FIRST_WHEEL = len(LEGS)
-LEG_SLICE, WHEEL_SLICE = slice(0, FIRST_WHEEL), slice(FIRST_WHEEL, len(JOINTS))
-#: Signs of the hip positions (x, y) in the body frame, in corner order.
-CORNER_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_layers
+from wlr_gym.robot.joints import JOINTS
+from wlr_gym.robot.tolerance import KEYS, ParameterTolerance, read_tolerances
 
 Vector3 = tuple[float, float, float]
 
 
-class Body(Model):
+class Body(SettingsModel):
     """The platform: mass (kg), size (m), principal inertia about its centre of mass (kg m2), centre of mass (m)."""
 
     mass: float = Field(gt=0)
@@ -40,7 +30,7 @@ class Body(Model):
     com_offset: Vector3 = (0.0, 0.0, 0.0)
 
 
-class HipPosition(Model):
+class HipPosition(SettingsModel):
     """Distance of the hips from the body origin along x and y (m, both signs occur), and their common z."""
 
     x: float = Field(gt=0)
@@ -48,7 +38,7 @@ class HipPosition(Model):
     z: float = 0.0
 
 
-class Leg(Model):
+class Leg(SettingsModel):
     """One leg: length hip to wheel centre (m), mass (kg), centre of mass from the hip (m), inertia (kg m2)
     about its own centre of mass, straight down: about x, about y, about its own axis."""
 
@@ -58,7 +48,7 @@ class Leg(Model):
     inertia: tuple[float | None, float | None, float | None]
 
 
-class Wheel(Model):
+class Wheel(SettingsModel):
     """One wheel: radius, width (m), mass (kg), inertia about the axle and across it (kg m2)."""
 
     radius: float = Field(gt=0)
@@ -68,7 +58,7 @@ class Wheel(Model):
     transverse_inertia: float | None = Field(gt=0)
 
 
-class Motor(Model):
+class Motor(SettingsModel):
     """One servo at its output shaft; torque and speed at the nominal supply voltage (source: ROBOTIS e-manual)."""
 
     stall_torque: float = Field(gt=0)
@@ -81,7 +71,7 @@ class Motor(Model):
     viscous_friction: float = Field(ge=0)
 
 
-class Servo(Model):
+class Servo(SettingsModel):
     """Supply voltage (V) and the two servo types."""
 
     supply_voltage: float = Field(gt=0)
@@ -89,7 +79,7 @@ class Servo(Model):
     wheel: Motor
 
 
-class Ground(Model):
+class Ground(SettingsModel):
     """Floor: friction along heading and axle, slope along x (rad), contact stiffness (N/m) and damping (N s/m)."""
 
     mu_x: float = Field(ge=0)
@@ -99,21 +89,21 @@ class Ground(Model):
     normal_damping: float = Field(ge=0)
 
 
-class Encoder(Model):
+class Encoder(SettingsModel):
     """One register count of position (rad) and velocity (rad/s)."""
 
     position: float = Field(ge=0)
     velocity: float = Field(ge=0)
 
 
-class EffortSensor(Model):
+class EffortSensor(SettingsModel):
     """1 sigma noise of the torque estimate (N m)."""
 
     leg_noise: float = Field(ge=0)
     wheel_noise: float = Field(ge=0)
 
 
-class Imu(Model):
+class ImuSensor(SettingsModel):
     """Bandwidth (Hz), noise per 50 Hz sample and constant bias, 1 sigma (rad/s, m/s2)."""
 
     bandwidth: float = Field(gt=0)
@@ -123,7 +113,7 @@ class Imu(Model):
     accel_bias: float = Field(ge=0)
 
 
-class Camera(Model):
+class CameraSensor(SettingsModel):
     """Frame rate (Hz) and 1 sigma noise of the floor pose (m, rad)."""
 
     rate: float = Field(gt=0)
@@ -131,24 +121,24 @@ class Camera(Model):
     yaw_noise: float = Field(ge=0)
 
 
-class SensorSet(Model):
+class SensorSet(SettingsModel):
     """What the robot can measure, and how badly."""
 
     control_rate: float = Field(gt=0)
     encoder: Encoder
     effort: EffortSensor
     volt_noise: float = Field(ge=0)
-    imu: Imu
-    camera: Camera
+    imu: ImuSensor
+    camera: CameraSensor
 
 
-class Home(Model):
+class Home(SettingsModel):
     """The pose every episode starts from."""
 
     leg_angle: float
 
 
-class Robot(Model):
+class Robot(SettingsModel):
     """A whole robot, as one ``configs/robot/*.yaml`` describes it."""
 
     name: str
@@ -164,7 +154,24 @@ class Robot(Model):
     servo: Servo
     ground: Ground
     sensors: SensorSet
-    tolerances: dict[str, float | str] = Field(default_factory=dict)
+    tolerances: dict[str, ParameterTolerance] = Field(default_factory=dict)
+
+    @field_validator("tolerances", mode="before")
+    @classmethod
+    def _tolerances_are_read(cls, stated: Any) -> dict[str, ParameterTolerance]:
+        return read_tolerances(stated)
+
+    @model_validator(mode="after")
+    def _tolerances_are_relative_to_something(self) -> Robot:
+        for key, tolerance in self.tolerances.items():
+            values = [value for row in KEYS[key] for value in row.nominal(self)]
+            if tolerance.unit is None and max(tolerance.legs, tolerance.wheels) > 0.0 and all(value == 0.0 for value in values):
+                raise InputError(f"tolerances.{key} = '{tolerance}': is relative to 0: expected an amount with its unit")
+        return self
+
+    @field_serializer("tolerances")
+    def _tolerances_as_written(self, tolerances: dict[str, ParameterTolerance]) -> dict[str, str]:
+        return {key: str(tolerance) for key, tolerance in tolerances.items()}
 
     @field_validator("leg_limits")
     @classmethod
@@ -240,50 +247,24 @@ def load_robot(source: str | Path | Robot = "nominal", *, check: bool = True) ->
     Raises:
         InputError: unreadable file, unknown or missing key, value of the wrong kind, or a physically impossible robot.
     """
-    robot = source if isinstance(source, Robot) else _read(find_config("robot", source))
+    robot = source if isinstance(source, Robot) else _read(source)
     faults = physical_faults(robot) if check else []
     if faults:
         raise InputError(f"robot '{robot.name}' cannot be simulated: " + "; ".join(faults))
     return robot
 
 
-def _read(path: Path) -> Robot:
-    return parse_config(Robot, _resolved(path), str(path))
-
-
-def _resolved(path: Path, above: tuple[Path, ...] = ()) -> Any:
-    """Return what a robot file says, laid over its ``base`` where it names one: a config name, or a path from this file on.
-
-    The name is its own: another robot has another one.
-    """
-    data = read_yaml(path)
-    if not isinstance(data, dict) or "base" not in data:
-        return data
-    if path in above:
-        raise InputError(f"{path}: is its own base ({' -> '.join(map(str, [*above, path]))})")
-    base = data.pop("base")
-    if not isinstance(base, str):
-        raise InputError(f"{path}: base = {base!r}: expected the name or the path of a robot file")
-    place = find_config("robot", named_in(path, base))
-    lower = _resolved(place, (*above, path))
-    parse_config(Robot, lower, str(place))  # what is wrong in a base is said with its own name
-    return overlay({key: value for key, value in lower.items() if key != "name"}, data)
+def _read(source: str | Path) -> Robot:
+    """Read a robot file, laid over its bases. The name is its own: another robot has another one."""
+    layers = read_layers("robot", source)
+    data, where = layers[0]
+    robot = parse_config(Robot, data, where)  # what is wrong in a base is said with its own name
+    for changes, where in layers[1:]:
+        data = overlay({key: value for key, value in data.items() if key != "name"}, changes)
+        robot = parse_config(Robot, data, where)
+    return robot
 
 
 def standing_height(robot: Robot, leg_angle: float) -> float:
     """Height of the body origin above a level floor with all legs at ``leg_angle``, contacts unloaded (m)."""
     return robot.leg.length * math.sin(leg_angle) + robot.wheel.radius - robot.hip_position.z
-
-
-def robot_hash(robot: Robot) -> str:
-    """Short fingerprint of a robot's numbers."""
-    return _fingerprint(robot)
-
-
-def servo_hash(robot: Robot) -> str:
-    """Short fingerprint of the numbers of a robot's servos."""
-    return _fingerprint(robot.servo)
-
-
-def _fingerprint(numbers: BaseModel) -> str:
-    return hashlib.sha256(numbers.model_dump_json().encode()).hexdigest()[:16]

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -47,7 +48,7 @@ def test_uniform_set_is_shared_or_per_label_as_asked(robot):
 
 def test_tolerance_is_one_sigma_of_the_robot_file_cut_at_two(robot):
     drawn = draw(robot, mass={"parameters": ["body.mass"], "distribution": "tolerance", "cut": 2.0})["body.mass"]
-    sigma = robot.tolerances["body.mass"] * robot.body.mass
+    sigma = robot.tolerances["body.mass"].sigma("body.mass", robot.body.mass)
     assert np.abs(drawn - robot.body.mass).max() <= 2.0 * sigma * (1 + 1e-9)
     assert drawn.std() == pytest.approx(0.8796 * sigma, rel=0.04)  # standard deviation of a normal cut at 2 sigma
 
@@ -57,6 +58,20 @@ def test_tolerance_units(robot):
     assert tolerance_of(robot, "servo.viscous_friction[leg_lf]") == ("add", 0.01)
     assert tolerance_of(robot, "servo.viscous_friction[wheel_lf]") == ("add", 0.002)
     assert tolerance_of(robot, "wheel.radius[wheel_lf]") == ("scale", 0.005)
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "largest"),
+    [("command.delay", "5 ms", 0.010), ("body.com_offset", "3 mm", 0.006), ("servo.kp", "5 %", 0.1 * 55.24)],
+)
+def test_a_robot_file_with_other_units_is_drawn_from_as_it_says(tmp_path, key, text, largest):
+    """The nominal randomisation cuts at two tolerances."""
+    (tmp_path / "robot.yaml").write_text(f"base: nominal\nname: other\ntolerances: {{{key}: {text}}}\n")
+    env = gym.make("WLR-Velocity-v0", robot=tmp_path / "robot.yaml", randomization="nominal")
+    env.reset(seed=1)
+    off = np.abs(env.unwrapped.core.plant.parameters[key] - Parameters.nominal(load_robot())[key])
+    env.close()
+    assert 0.0 < off.max() <= largest * (1 + 1e-9)
 
 
 def test_one_sided_quantities_stay_one_sided_without_piling_up_at_zero(robot):

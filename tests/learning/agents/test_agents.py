@@ -6,7 +6,7 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import agent_names, load_agent, load_agent_config, make_policy, policy_environment
-from wlr_gym.robot.parameters import ELEMENTS
+from wlr_gym.robot.parameter_table import ELEMENTS
 
 ENVIRONMENT = "WLR-Velocity-v0"
 DELAYS = [index for index, element in enumerate(ELEMENTS) if element.startswith("command.delay[")]
@@ -208,7 +208,7 @@ def _drawn(core):
 
 @pytest.mark.parametrize(
     ("base", "message"),
-    [("mine.yaml", "is its own base"), ("5", "base = 5: expected a name"), ("ppo_blnd", "did you mean 'ppo_blind'")],
+    [("mine.yaml", "is its own base"), ("5", "base = 5: expected the name"), ("ppo_blnd", "did you mean 'ppo_blind'")],
 )
 def test_a_base_that_is_none_is_refused(tmp_path, monkeypatch, base, message):
     monkeypatch.chdir(tmp_path)

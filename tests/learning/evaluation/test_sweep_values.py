@@ -5,7 +5,7 @@ import pytest
 
 from wlr_gym.learning.evaluation import Rollout, play, read_subjects
 from wlr_gym.learning.evaluation.sweeps import LEFT_FRICTION, SLOPE_FRICTION, SWEEPS
-from wlr_gym.robot.parameters import ELEMENTS
+from wlr_gym.robot.parameter_table import ELEMENTS
 
 IDLE = read_subjects(["do_nothing"])
 LEFT, RIGHT = [0, 2], [1, 3]

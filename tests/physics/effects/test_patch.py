@@ -27,7 +27,7 @@ def patched(*effects: dict, count: int = 2) -> Parameters:
 
 def changes(parameters: Parameters) -> dict[str, float]:
     """Elements that differ from nominal, with their values; every robot of the batch must agree."""
-    from wlr_gym.robot.parameters import ELEMENTS
+    from wlr_gym.robot.parameter_table import ELEMENTS
 
     nominal = Parameters.nominal(ROBOT, len(parameters)).values
     assert (parameters.values == parameters.values[0]).all()

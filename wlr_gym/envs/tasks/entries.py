@@ -8,13 +8,15 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.settings import SettingsModel
 from wlr_gym.envs.tasks.draws import stream_numbers, uniforms
 from wlr_gym.envs.tasks.terms.events import DISTRIBUTIONS, number_of, tolerance_of
 from wlr_gym.robot import Robot
-from wlr_gym.robot.parameters import ELEMENTS, SPECS, Parameters, range_in_words, spec_of
+from wlr_gym.robot.parameter_table import ELEMENTS, SPECS, range_in_words, spec_of
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 Number = float | str
@@ -31,11 +33,7 @@ DISTRIBUTION_KEYS = {
 }
 
 
-class Data(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class AreaConfig(Data):
+class AreaConfig(SettingsModel):
     """Where the patches of an event lie: each edge and size is drawn evenly, for every patch on its own. Floor frame, m.
 
     Attributes:
@@ -49,7 +47,7 @@ class AreaConfig(Data):
     width: Range | None = None
 
 
-class EventConfig(Data):
+class EventConfig(SettingsModel):
     """One randomisation event.
 
     Attributes:

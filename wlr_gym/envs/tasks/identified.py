@@ -20,7 +20,8 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.envs.tasks.entries import EventConfig
 from wlr_gym.physics.effects import EFFECTS, apply_patch, load_patch
 from wlr_gym.robot import Robot
-from wlr_gym.robot.parameters import ELEMENTS, SPECS, TABLE, Parameters
+from wlr_gym.robot.parameter_table import ELEMENTS, SPECS, TABLE
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

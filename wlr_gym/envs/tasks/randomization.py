@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from wlr_gym.base.errors import InputError, nearest
-from wlr_gym.base.paths import find_config, named_in
-from wlr_gym.base.settings import overlay, parse_config, read_yaml
+from wlr_gym.base.paths import named_in
+from wlr_gym.base.settings import Layer, SettingsModel, layers_of, overlay, parse_config, read_config
 from wlr_gym.envs.tasks.draws import stream_numbers, uniforms
-from wlr_gym.envs.tasks.entries import DISTRIBUTION_KEYS, Data, Entry, EventConfig, Sampler, elements_of, entries_of
+from wlr_gym.envs.tasks.entries import DISTRIBUTION_KEYS, Entry, EventConfig, Sampler, elements_of, entries_of
 from wlr_gym.envs.tasks.identified import identified_events
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.robot import LEGS, Robot
-from wlr_gym.robot.parameters import ELEMENTS, TABLE, XYZ, Parameters
+from wlr_gym.robot.parameter_table import ELEMENTS, TABLE, XYZ
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
@@ -35,7 +36,7 @@ BELOW_LIMIT = "below_friction_limit"
 DRIFT_PERIOD = 0.2
 
 
-class InitialStateConfig(Data):
+class InitialStateConfig(SettingsModel):
     """Half-widths of the even spread around standing still at home: rad, rad, m/s, rad/s (body frame)."""
 
     leg_angle: float = Field(default=0.0, ge=0, le=math.tau)
@@ -44,7 +45,7 @@ class InitialStateConfig(Data):
     angular_velocity: float = Field(default=0.0, ge=0, le=100.0)
 
 
-class RandomizationConfig(Data):
+class RandomizationConfig(SettingsModel):
     """Contents of ``configs/randomization/*.yaml``.
 
     Attributes:
@@ -77,43 +78,42 @@ def load_randomization(source: str | Path | Mapping[str, Any] | RandomizationCon
     """
     if isinstance(source, RandomizationConfig):
         source = source.model_dump(mode="json", exclude_unset=True)
-    data, where = _read(source)
-    resolved, places = _resolved(data, robot, where)
-    return Randomization(parse_config(RandomizationConfig, resolved, where), robot, places)
+    layers = layers_of("randomization", _read("randomization", source), _read)
+    data, places = _laid_over({}, layers[0], robot)
+    for above, below in zip(layers[1:], layers, strict=False):
+        parse_config(RandomizationConfig, data, below[1])  # what is wrong in a base is said with its own name
+        data, added = _laid_over(data, above, robot)
+        places |= added
+    return Randomization(parse_config(RandomizationConfig, data, layers[-1][1]), robot, places)
 
 
-def _read(source: str | Path | Mapping[str, Any] | None) -> tuple[Any, str]:
+def _read(kind: str, source: str | Path | Mapping[str, Any] | None) -> Layer:
+    """Return what ``source`` says, and where it stands; a gap result lies over ``nominal`` unless it has another base."""
     if isinstance(source, Mapping):
-        return dict(source), "randomization"
-    if source is not None and Path(source).suffix == ".json":
-        return {"name": Path(source).stem, "result": str(source)}, str(source)
-    path = find_config("randomization", "none" if source is None else source)
-    return read_yaml(path), str(path)
+        data, where = dict(source), kind
+    elif source is not None and Path(source).suffix == ".json":
+        data, where = {"name": Path(source).stem, "result": str(source)}, str(source)
+    else:
+        data, where = read_config(kind, "none" if source is None else source)
+    if isinstance(data, dict) and data.get("result") is not None:
+        data = {"base": "nominal", **data}
+    return data, where
 
 
-def _resolved(data: Any, robot: Robot, where: str, above: tuple[str, ...] = ()) -> tuple[Any, dict[str, str]]:
-    """Return ``data`` laid over its base and the events of its result, complete by itself, and where each event stands."""
+def _laid_over(lower: Any, layer: Layer, robot: Robot) -> tuple[Any, dict[str, str]]:
+    """Return a layer and the events of its result, laid over ``lower``, complete by itself, and where each event stands."""
+    data, where = layer
     if not isinstance(data, dict):
         return data, {}
-    result = data.get("result")
-    base = data.get("base", None if result is None else "nominal")
-    if base is not None and not isinstance(base, str | Path):
-        raise InputError(f"{where}: base = {base!r}: expected the name or the path of a randomization")
-    if where in above:
-        raise InputError(f"{where}: is its own base ({' -> '.join([*above, where])})")
-    lower: Any = {}
     places: dict[str, str] = {}
-    if base is not None:
-        below, place = _read(named_in(where, base))
-        lower, places = _resolved(below, robot, place, (*above, where))
-        parse_config(RandomizationConfig, lower, place)  # what is wrong in a base is said with its own name
+    result = data.get("result")
     if result is not None:
         events = parse_config(RandomizationConfig, lower, where).events
         place = named_in(where, result)
         found = identified_events(place, robot)
         lower = {**lower, "events": _with_result(events, found, robot)}
-        places |= dict.fromkeys(found, str(place))
-    own = {key: value for key, value in data.items() if key not in ("base", "result")}
+        places = dict.fromkeys(found, str(place))
+    own = {key: value for key, value in data.items() if key != "result"}
     merged = overlay(lower, own) if lower else own
     events = _mapping(merged.get("events"))
     _refuse_idle_keys(_mapping(own.get("events")), events, _mapping(_mapping(lower).get("events")), where)

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.paths import find_config
-from wlr_gym.base.settings import overlay, parse_config, read_yaml
+from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_config
 from wlr_gym.envs.tasks.signals import Signals
 from wlr_gym.envs.tasks.terms import (
     COMMANDS,
@@ -38,18 +37,14 @@ _TERMS: dict[str, tuple[str, Mapping[str, Any]]] = {
 }
 
 
-class _Data(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class ActionConfig(_Data):
+class ActionConfig(SettingsModel):
     """Goal = centre + scale * action: rad about the home angle (legs), rad/s about zero (wheels)."""
 
     leg_scale: float = Field(gt=0)
     wheel_scale: float = Field(gt=0)
 
 
-class CommandsConfig(_Data):
+class CommandsConfig(SettingsModel):
     """Commands drawn uniformly in [low, high], held for a time drawn in ``hold_time`` (s); all zero now and then.
 
     ``ramp``: largest rate of change (unit/s) of a command, from 0 at the start; those not named jump. A command that is given
@@ -58,11 +53,11 @@ class CommandsConfig(_Data):
 
     hold_time: tuple[float, float]
     zero_probability: float = Field(default=0.0, ge=0, le=1)
-    ramp: dict[str, Annotated[float, Field(gt=0)]] = {}
+    ramp: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
     terms: dict[str, tuple[float, float]]
 
 
-class LatencyConfig(_Data):
+class LatencyConfig(SettingsModel):
     """Age of a device's readings: drawn per episode and robot in ``delay`` (s).
 
     ``interpolate`` mixes the two readings around that age; ``hold`` gives the newest reading at least that old.
@@ -72,7 +67,7 @@ class LatencyConfig(_Data):
     mode: Literal["interpolate", "hold"] = "interpolate"
 
 
-class ObservationConfig(_Data):
+class ObservationConfig(SettingsModel):
     """How a term enters the observation: ``scale * clip(reading - offset + bias + noise, +-limit)``.
 
     ``noise`` (per reading) and ``bias`` (per episode) are 1 sigma in the term's unit; ``history`` readings, newest first.
@@ -85,14 +80,14 @@ class ObservationConfig(_Data):
     history: int = Field(default=1, ge=1, le=64)
 
 
-class PrivilegedConfig(_Data):
+class PrivilegedConfig(SettingsModel):
     """How a true quantity enters the privileged observation: ``scale * clip(value, +-limit)``."""
 
     scale: float = Field(default=1.0, gt=0)
     limit: float | None = Field(default=None, gt=0)
 
 
-class ObserverConfig(_Data):
+class ObserverConfig(SettingsModel):
     """The slip observer (:mod:`wlr_gym.perception.observer`); it runs where a term needs its estimate.
 
     ``camera``: it uses the camera's poses as they come; False = as if there were no camera.
@@ -101,14 +96,14 @@ class ObserverConfig(_Data):
     camera: bool = True
 
 
-class RampConfig(_Data):
+class RampConfig(SettingsModel):
     """Share of a spread: ``start`` in the beginning, rising evenly to 1 after ``steps`` environment steps of all robots."""
 
     start: float = Field(gt=0, le=1)
     steps: float = Field(gt=0)
 
 
-class CurriculumConfig(_Data):
+class CurriculumConfig(SettingsModel):
     """What a training begins with less of. Every draw is moved towards the middle of its distribution.
 
     It only acts on who says how far training is (``Core.set_progress``): all else meets the whole task.
@@ -118,14 +113,14 @@ class CurriculumConfig(_Data):
     randomization: RampConfig | None = None
 
 
-class SuccessConfig(_Data):
+class SuccessConfig(SettingsModel):
     """Largest root mean square and largest magnitude of a measure over an episode, in its unit."""
 
     rms: float | None = Field(default=None, gt=0)
     max: float | None = Field(default=None, gt=0)
 
 
-class TaskConfig(_Data):
+class TaskConfig(SettingsModel):
     """Contents of ``configs/task/*.yaml``.
 
     An episode is a success when no termination term ended it and every measure named in ``success`` stays within its limits.
@@ -142,14 +137,14 @@ class TaskConfig(_Data):
     episode_length: float = Field(gt=0)
     action: ActionConfig
     commands: CommandsConfig
-    latency: dict[Literal["joints", "imu", "camera"], LatencyConfig] = {}
+    latency: dict[Literal["joints", "imu", "camera"], LatencyConfig] = Field(default_factory=dict)
     observer: ObserverConfig = ObserverConfig()
     observations: dict[str, ObservationConfig]
-    privileged: dict[str, PrivilegedConfig] = {}
+    privileged: dict[str, PrivilegedConfig] = Field(default_factory=dict)
     rewards: dict[str, dict[str, float]]
-    terminations: dict[str, dict[str, float]] = {}
-    measures: dict[str, dict[str, float]] = {}
-    success: dict[str, SuccessConfig] = {}
+    terminations: dict[str, dict[str, float]] = Field(default_factory=dict)
+    measures: dict[str, dict[str, float]] = Field(default_factory=dict)
+    success: dict[str, SuccessConfig] = Field(default_factory=dict)
     curriculum: CurriculumConfig = CurriculumConfig()
 
 
@@ -299,8 +294,7 @@ def _task_data(source: Any) -> tuple[Any, str]:
         return dict(source), "task"
     if not isinstance(source, (str, Path)):
         raise InputError(f"task = {source!r}: expected a name, a path or a mapping")
-    path = find_config("task", source)
-    return read_yaml(path), str(path)
+    return read_config("task", source)
 
 
 def _check_names(data: Mapping[str, Any], where: str) -> None:

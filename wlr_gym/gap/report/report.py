@@ -60,7 +60,7 @@ from wlr_gym.gap.report.text import (
 )
 from wlr_gym.gap.validation.held_out import LEAST_FOR_INTERVAL
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, load_patch
-from wlr_gym.robot.parameters import TABLE
+from wlr_gym.robot.parameter_table import TABLE
 
 REPORT_FILE, PLOTS = "report.html", "plots"
 _OWN = {RESULT_FILE, PATCH_FILE, REPORT_FILE, PLOTS, CONFIG_FILE, PROVENANCE_FILE}

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
+from wlr_gym.base.settings import SettingsModel
 from wlr_gym.gap.analysis import Adequacy, Analysis, Calibrated, Estimate, Evidence, FoundEffect, GapFigures, Statistic
 from wlr_gym.gap.report.text import closure, sentence, unit_of
 from wlr_gym.physics.effects import Patch, PatchEffect, save_patch
@@ -39,8 +40,8 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Interval = tuple[Number, Number]
 
 
-class _Entry(BaseModel):
-    model_config = ConfigDict(extra="allow", frozen=True)
+class _Entry(SettingsModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=True)
 
 
 class ParameterEntry(_Entry):
@@ -73,7 +74,7 @@ class EffectEntry(_Entry):
     confidence: Share
     gain: MaybeNumber = None
     formula: str | None = None
-    validity: dict[str, RangeEntry] = {}
+    validity: dict[str, RangeEntry] = Field(default_factory=dict)
 
 
 class CalibrationEntry(_Entry):
@@ -197,14 +198,14 @@ class Result(_Entry):
     summary: str = ""
     effects: list[EffectEntry]
     equivalent: list[list[str]]
-    separating_runs: list[str] = []
+    separating_runs: list[str] = Field(default_factory=list)
     calibration: dict[str, CalibrationEntry]
     localisation: dict[str, LocalisationEntry]
-    relations: list[RelationEntry] = []
+    relations: list[RelationEntry] = Field(default_factory=list)
     gap: GapEntry | None
     runs: RunsEntry
     patch: str
-    detectable: dict[str, DetectableEntry] = {}
+    detectable: dict[str, DetectableEntry] = Field(default_factory=dict)
     closure: str = ""
     turning: TurningEntry | None = None
     adequacy: AdequacyEntry | dict[str, MaybeNumber] | None = None  # earlier versions: the level of each channel

@@ -17,7 +17,7 @@ from wlr_gym.gap.rig.problem import RigProblem
 from wlr_gym.gap.rig.recording import read_recordings
 from wlr_gym.physics.codegen.expression import finite_number
 from wlr_gym.physics.effects import UNKNOWN_EFFECT, EffectParameter, Patch, PatchEffect, Source, compose
-from wlr_gym.robot.parameters import range_in_words
+from wlr_gym.robot.parameter_table import range_in_words
 
 #: Recordings that an analysis needs: two to fit, one for the proof.
 LEAST_RUNS = 3

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.gap.problem import Quantity
 from wlr_gym.physics.plants.simulator import most_damping
-from wlr_gym.robot import LEGS, Robot
-from wlr_gym.robot.parameters import SPECS, TABLE, Parameters
+from wlr_gym.robot import Robot
+from wlr_gym.robot.parameter_table import SPECS, TABLE
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
@@ -29,19 +27,6 @@ REACH, REACH_OF_BIAS = 2.5, 4.0
 CREEP = 0.001
 #: A leg's own inertia is a hundredth of its rotor's: no run shows it.
 UNSEEN = ("leg.inertia",)
-_AMOUNT = re.compile(r"\s*(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|\.\d+)\s*([^(,\d]+?)\s*(?:\((legs|wheels)\))?\s*(?:,|$)")
-_UNITS = {
-    "m": 1.0,
-    "mm": 1e-3,
-    "s": 1.0,
-    "ms": 1e-3,
-    "rad": 1.0,
-    "deg": math.radians(1.0),
-    "kg": 1.0,
-    "N m": 1.0,
-    "N m s/rad": 1.0,
-    "V": 1.0,
-}
 
 
 @dataclass(frozen=True)
@@ -69,14 +54,7 @@ def knobs(robot: Robot, physics_step: float) -> tuple[Knob, ...]:
     Args:
         robot: the robot.
         physics_step: s, with which it will be simulated.
-
-    Raises:
-        InputError: a tolerance that cannot be read, or of no number.
     """
-    known = {spec.tolerance for spec in TABLE if spec.tolerance} | SHARED.keys()
-    for key in robot.tolerances:
-        if key not in known:
-            raise unknown_name("tolerance", key, known, f"robot '{robot.name}'")
     nominal = Parameters.nominal(robot)
     found: list[Knob] = []
     for key, elements in SHARED.items():
@@ -106,10 +84,7 @@ def _knob(key: str, elements: tuple[str, ...], nominal: Parameters, robot: Robot
     name = elements[0] if len(elements) == 1 else key
     spec = SPECS[elements[0].partition("[")[0]]
     value = float(nominal[elements[0]][0])
-    label = elements[0].partition("[")[2].rstrip("]")
-    sigma = tolerance(
-        robot.tolerances[key], value, "legs" if label in LEGS else "wheels", f"robot '{robot.name}': tolerances.{key}"
-    )
+    sigma = robot.tolerances[key].sigma(elements[0], value)
     shares = tuple(float(nominal[element][0]) / value if value else 1.0 for element in elements)
     return Knob(_quantity(name, spec.name, value, sigma), elements, shares)
 
@@ -119,20 +94,6 @@ def _quantity(name: str, parameter: str, nominal: float, sigma: float, reach: fl
     return Quantity(
         name, spec.unit, nominal, sigma, max(spec.low, nominal - reach * sigma), min(spec.high, nominal + reach * sigma)
     )
-
-
-def tolerance(entry: float | str, nominal: float, kind: str, place: str) -> float:
-    """Return one sigma: a number is relative; a text has a unit, and may differ between legs and wheels.
-
-    Raises:
-        InputError: neither, or less than 0.
-    """
-    if not isinstance(entry, str) and entry >= 0.0:
-        return float(entry) * abs(nominal)
-    for amount, unit, group in _AMOUNT.findall(str(entry)):
-        if group in ("", kind) and unit in _UNITS:
-            return float(amount) * _UNITS[unit]
-    raise InputError(f"{place} = {entry!r}: expected a number of 0 or more, or a number with its unit ({', '.join(_UNITS)})")
 
 
 def write(knobs: Sequence[Knob], values: Array, parameters: Parameters) -> None:

@@ -42,7 +42,8 @@ from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState
 from wlr_gym.physics.plants.forces import Force
 from wlr_gym.robot import JOINTS, LEGS, Robot
-from wlr_gym.robot.parameters import SPECS, Parameters
+from wlr_gym.robot.parameter_table import SPECS
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from wlr_gym.base.settings import SettingsModel
 
 
-class Safety(BaseModel):
+class Safety(SettingsModel):
     """Limits of the safety gate. SI units; the reasons stand in ``configs/hardware/nominal.yaml``.
 
     Attributes:
@@ -30,8 +32,6 @@ class Safety(BaseModel):
         stop_time: s from wheels ordered to stop until torque goes off.
         off_time: s to go on trying to switch torque off where servos do not confirm it.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     leg_margin: float = Field(default=0.05, ge=0.0)
     leg_taper: float = Field(default=0.1, gt=0.0)

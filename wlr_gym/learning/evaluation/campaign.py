@@ -14,7 +14,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.learning.evaluation.metrics import Played, summarise
 from wlr_gym.learning.evaluation.rollout import Rollout, roll_out
 from wlr_gym.learning.evaluation.subjects import Subject, make_player
-from wlr_gym.robot.parameters import ELEMENTS
+from wlr_gym.robot.parameter_table import ELEMENTS
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core

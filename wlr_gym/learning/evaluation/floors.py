@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from wlr_gym.base.files import replace_file
 from wlr_gym.envs.tasks.draws import episode_seeds
 from wlr_gym.robot import CORNER_SIGNS
-from wlr_gym.robot.parameters import PATCHES, Parameters
+from wlr_gym.robot.parameter_table import PATCHES
+from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from wlr_gym.base.settings import SettingsModel
 
 
-class PpoConfig(BaseModel):
+class PpoConfig(SettingsModel):
     """Proximal policy optimisation on one native batch of robots.
 
     Attributes:
@@ -29,8 +31,6 @@ class PpoConfig(BaseModel):
         environment: keywords of the environment (precision, randomization, task, ...).
         tasks: task name -> settings that differ there (``load_agent_config`` lays them over the others).
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     seed: int = Field(0, ge=0)
     total_steps: int = Field(5_000_000, gt=0)

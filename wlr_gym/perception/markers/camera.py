@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import write_yaml
-from wlr_gym.base.settings import parse_config, read_yaml
+from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 
 if TYPE_CHECKING:
     from wlr_gym.perception.vision.sheets import Board
@@ -35,7 +35,7 @@ _SHORTEST_FOCAL = 0.2
 _LEAST_TILT = math.radians(8)
 
 
-class Quality(BaseModel):
+class Quality(SettingsModel):
     """What a calibration says about itself.
 
     Attributes:
@@ -45,7 +45,8 @@ class Quality(BaseModel):
         focal_std: px, 1 sigma of fx and fy; centre_std: px, of cx and cy.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(allow_inf_nan=True)
+
     views: int
     rejected: int
     rms: float
@@ -54,7 +55,7 @@ class Quality(BaseModel):
     centre_std: tuple[float, float]
 
 
-class Camera(BaseModel):
+class Camera(SettingsModel):
     """Intrinsic parameters.
 
     Attributes:
@@ -64,7 +65,6 @@ class Camera(BaseModel):
         quality: of the calibration; None for parameters from elsewhere.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     camera_format: int = Field(default=SCHEMA, ge=1, le=SCHEMA)
     width: int = Field(gt=0)
     height: int = Field(gt=0)

@@ -12,11 +12,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.paths import find_config
-from wlr_gym.base.settings import parse_config, read_yaml
+from wlr_gym.base.settings import SettingsModel, parse_config, read_config
 from wlr_gym.robot import Vector3
 
 Array = NDArray[np.float64]
@@ -33,17 +32,16 @@ CODE_NAMES = tuple(CODES)
 QUIET_ZONE = 1.3
 
 
-class Marker(BaseModel):
+class Marker(SettingsModel):
     """One marker: name, centre (m, target frame), outer radius (m), code (a name in :data:`CODES`)."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     name: str
     position: Vector3
     radius: float = Field(gt=0)
     code: str
 
 
-class Target(BaseModel):
+class Target(SettingsModel):
     """Markers in one plane z = constant of a frame, seen from +z.
 
     Attributes:
@@ -53,11 +51,10 @@ class Target(BaseModel):
         tolerance: m, 1 sigma of a marker's place, along each axis: print, glue, measurement.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     name: str
     frame: str = ""
     markers: tuple[Marker, ...]
-    tolerance: float = Field(default=0.0005, ge=0, lt=0.1, allow_inf_nan=False)
+    tolerance: float = Field(default=0.0005, ge=0, lt=0.1)
 
     @property
     def positions(self) -> Array:
@@ -96,9 +93,9 @@ def load_target(source: str | Path | Target) -> Target:
     """
     if isinstance(source, Target):
         return source
-    path = find_config("vision", source)
-    target = parse_config(Target, read_yaml(path), str(path))
-    for fault in _faults(target, str(path)):
+    data, where = read_config("vision", source)
+    target = parse_config(Target, data, where)
+    for fault in _faults(target, where):
         raise fault
     return target
 

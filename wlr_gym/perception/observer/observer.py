@@ -13,7 +13,7 @@ from wlr_gym.perception.observer.layout import ESTIMATE_LAYOUT
 from wlr_gym.perception.observer.record import constants, record
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import Robot
-from wlr_gym.robot.parameters import SPECS
+from wlr_gym.robot.parameter_table import SPECS
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

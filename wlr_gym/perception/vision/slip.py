@@ -150,8 +150,8 @@ def measure_slip(
         slip_std += (accumulate(drawn, rows) - slip) ** 2 / _DRAWS
     velocity_std[:, :, 0] += _ENCODER_PACE**2 * encoder
     slip_std[:, :, 0] += encoder + encoder[0]
-    tolerance = robot.tolerances.get("wheel.radius", 0.0)
-    share = tolerance if isinstance(tolerance, float) else 0.0
+    known = robot.tolerances.get("wheel.radius")
+    share = 0.0 if known is None else known.share("wheel.radius", robot.wheel.radius)
     side_speed = rate[:, 1] * np.cos(value[:, 3]) - rate[:, 0] * np.sin(value[:, 3])
     way = np.hypot(accumulate(heading_speed, rows), accumulate(side_speed, rows))  # wrong scales err along it, headings across
     return SlipResult(

@@ -9,7 +9,8 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.effects.effect import Effect, EffectParameter, Values, add, add_vector, multiply, put
 from wlr_gym.robot import WHEELS
-from wlr_gym.robot.parameters import PATCHES, SPECS, Parameters
+from wlr_gym.robot.parameter_table import PATCHES, SPECS
+from wlr_gym.robot.parameters import Parameters
 
 #: m; farther than any robot drives: an area whose y bounds are left out has none.
 UNBOUNDED = SPECS["patch.y_max"].high

@@ -29,7 +29,8 @@ from wlr_gym.physics.effects.effect import Effect, EffectParameter, PatchEffect
 from wlr_gym.physics.effects.formula import KEYS, PLACES, force_of, parse_formula
 from wlr_gym.physics.effects.registry import EFFECTS, UNKNOWN_EFFECT, stage
 from wlr_gym.physics.plants.forces import Force
-from wlr_gym.robot.parameters import Parameters, range_in_words, unit_in_words
+from wlr_gym.robot.parameter_table import range_in_words, unit_in_words
+from wlr_gym.robot.parameters import Parameters
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.robot import JOINTS, WHEELS, Robot
-from wlr_gym.robot.parameters import XYZ, Parameters
+from wlr_gym.robot.parameter_table import XYZ
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from wlr_gym.physics.codegen.expression import (
     unit_of,
 )
 from wlr_gym.robot import CORNERS, JOINTS
-from wlr_gym.robot.parameters import XYZ
+from wlr_gym.robot.parameter_table import XYZ
 
 Array = NDArray[np.float64]
 Value = Any  # float | numpy array | Node

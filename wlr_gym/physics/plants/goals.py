@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.plants.base import PlantState
-from wlr_gym.robot.parameters import SPECS, Parameters
+from wlr_gym.robot.parameter_table import SPECS
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

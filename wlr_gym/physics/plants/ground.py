@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.codegen import ops
-from wlr_gym.robot.parameters import PATCHES, Parameters
+from wlr_gym.robot.parameter_table import PATCHES
+from wlr_gym.robot.parameters import Parameters
 
 Value = Any
 Lanes = Mapping[str, Value]

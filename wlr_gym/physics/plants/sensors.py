@@ -22,7 +22,8 @@ from wlr_gym.base.random import normals4, stream_number, words4
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Channel, Layout, PlantOptions
 from wlr_gym.physics.servo import REGISTER_UNITS, effort_counts
 from wlr_gym.robot import JOINTS, Robot
-from wlr_gym.robot.parameters import SPECS, XYZ, Parameters
+from wlr_gym.robot.parameter_table import SPECS, XYZ
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

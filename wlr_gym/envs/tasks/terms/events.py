@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from typing import Any
 
@@ -10,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.robot import LEGS, Robot
-from wlr_gym.robot.parameters import spec_of
+from wlr_gym.robot import Robot
+from wlr_gym.robot.parameter_table import spec_of
 
 Array = NDArray[np.float64]
 
@@ -47,28 +46,16 @@ DISTRIBUTIONS: dict[str, Callable[[Array, Array, Array, Array], Array]] = {
     "half_normal": half_normal,
 }
 
-_TOLERANCE = re.compile(r"\s*([-+0-9.eE]+)\s*([^,(]*?)\s*(?:\((legs|wheels)\))?\s*(?:,|$)")
-_DEGREE = np.pi / 180.0
-
 
 def tolerance_of(robot: Robot, element: str) -> tuple[str, float]:
-    """Return how well an element of the parameter table is known: operation (``scale`` or ``add``) and 1 sigma.
-
-    The robot file gives a relative number, a number with a unit (``0.5 deg``, ``0.003 m``), or one each for legs and wheels.
-    """
+    """Return how well the robot file says an element is known: operation (``scale`` or ``add``) and 1 sigma."""
     spec = spec_of(element)
-    if not spec.tolerance or spec.tolerance not in robot.tolerances:
+    stated = robot.tolerances.get(spec.tolerance)
+    if stated is None:
         raise InputError(
             f"robot '{robot.name}' states no tolerance for parameter '{spec.name}'; known: {', '.join(robot.tolerances)}"
         )
-    stated = robot.tolerances[spec.tolerance]
-    if not isinstance(stated, str):
-        return "scale", float(stated)
-    group = "legs" if element.partition("[")[2].rstrip("]") in LEGS else "wheels"
-    for number, unit, where in _TOLERANCE.findall(stated):
-        if where in ("", group):
-            return "add", float(number) * (_DEGREE if unit == "deg" else 1.0)
-    raise InputError(f"robot '{robot.name}': tolerance {spec.tolerance} = {stated!r} says nothing about {group}")
+    return "scale" if stated.unit is None else "add", stated.of(element)
 
 
 def number_of(value: float | str, robot: Robot, where: str) -> float:

@@ -13,7 +13,8 @@ from wlr_gym.physics.model.dynamics import gravity_in_floor
 from wlr_gym.physics.plants.mujoco.mjcf import build_model, principal_inertia
 from wlr_gym.physics.plants.mujoco.step import CAPSULE_HALF_LENGTH
 from wlr_gym.robot import CORNER_SIGNS, LEGS, WHEELS, Robot
-from wlr_gym.robot.parameters import SPECS, Parameters
+from wlr_gym.robot.parameter_table import SPECS
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,101 @@
+"""``wlr export --reseal``: contracts in an older form are rewritten where the robot is the same; what is computed stays."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+import onnx
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.cli import main
+from wlr_gym.learning.evaluation import make_core
+from wlr_gym.policy import check_model_card, contract_of, find_policy, make_policy, policy_environment, reseal
+from wlr_gym.policy.model_card import file_hash
+from wlr_gym.policy.onnx_file import seal
+
+#: Fingerprints of the nominal robot as contracts had them at first.
+FIRST_ROBOT = "8601eeed2036c97c"
+FIRST_SERVO = "c8636cc4d3b45309"
+
+
+@pytest.fixture
+def old(tmp_path):
+    """A shipped policy and its card as they were: first form of the hash, and without keys that have a default."""
+    path = shutil.copy(find_policy("velocity_blind"), tmp_path / "velocity_blind.onnx")
+    card = shutil.copy(find_policy("velocity_blind").with_suffix(".md"), tmp_path / "velocity_blind.md")
+    before, content = file_hash(path), contract_of(path)
+    content["environment"]["robot"] = {"name": "wlr-nominal", "hash": FIRST_ROBOT, "servo": FIRST_SERVO}
+    for column in content["environment"]["observation"]:
+        column.pop("lag")
+    path.write_bytes(seal(path.read_bytes(), content))
+    card.write_text(card.read_text().replace(before, file_hash(path)))
+    return path
+
+
+def test_the_older_form_is_refused_with_advice(old):
+    core = make_core("WLR-Velocity-v0", 1, policy_environment(old))
+    with pytest.raises(InputError, match=r"robot\.hash is '8601.*wlr export --reseal"):
+        make_policy(old, core.contract())
+    core.close()
+
+
+def test_it_says_what_changed_and_changes_nothing_else(old, capsys):
+    before, graph = contract_of(old), onnx.load(old).graph.SerializeToString(deterministic=True)
+    sha = file_hash(old)
+    assert main(["export", "--reseal", str(old)]) == 0
+    said = capsys.readouterr().out
+    assert f"environment.robot.hash: '{FIRST_ROBOT}' -> '2-" in said
+    assert f"environment.robot.servo: '{FIRST_SERVO}' -> '2-" in said
+    assert f"velocity_blind.md: SHA-256 {sha} -> {file_hash(old)}" in said
+    assert onnx.load(old).graph.SerializeToString(deterministic=True) == graph
+    after = contract_of(old)
+    assert {column.pop("lag") for column in after["environment"]["observation"]} == {0}
+    assert [key for key in before if after[key] != before[key]] == ["environment"]
+    assert [key for key in before["environment"] if after["environment"][key] != before["environment"][key]] == ["robot"]
+    check_model_card(old)
+    core = make_core("WLR-Velocity-v0", 1, policy_environment(old))
+    assert np.isfinite(make_policy(old, core.contract()).act(core.observation)).all()
+    core.close()
+
+
+def test_twice_is_once(old, capsys):
+    reseal(old)
+    data = old.read_bytes()
+    assert main(["export", "--reseal", str(old), str(old)]) == 0
+    assert capsys.readouterr().out.count("nothing changed") == 2
+    assert old.read_bytes() == data
+
+
+def test_another_robot_is_refused(old, tmp_path):
+    data = old.read_bytes()
+    heavy = tmp_path / "heavy.yaml"
+    heavy.write_text("base: nominal\nname: heavy\nbody: {mass: 3.0}\n")
+    with pytest.raises(InputError, match=r"velocity_blind\.onnx: robot\.hash is '8601.*not the robot of its training"):
+        reseal(old, str(heavy))
+    assert old.read_bytes() == data
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--reseal"], "expected policy files"),
+        (["--reseal", "pid"], "'pid' is an agent"),
+        (["--reseal", "velocity_blind", "--out", "x.onnx"], "neither --out nor --card"),
+        (["velocity_blind", "--robot", "nominal"], "--robot goes with --reseal"),
+        (["velocity_blind", "velocity_oracle"], "expected one policy, got 2"),
+    ],
+)
+def test_options_that_do_not_go_together(words, message, capsys):
+    assert main(["export", *words]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_policy_folder_is_not_resealed(tmp_path, capsys):
+    (tmp_path / "contract.json").write_text(json.dumps({"format": 1, "agent": "ppo", "environment": {}, "config": {}}))
+    assert main(["export", "--reseal", str(tmp_path)]) == 2
+    assert "is a policy folder" in capsys.readouterr().err

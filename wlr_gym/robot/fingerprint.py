@@ -1,0 +1,48 @@
+"""Fingerprints of a robot: equal where a simulator reads equal numbers. Policy files carry them, and are refused elsewhere.
+
+The canonical form is one line ``key = value`` per number, sorted, under a title with the version of the form. A number that has
+its declared default is left out, so that a new field with a default changes the fingerprint of no robot that does not use it.
+Not in it: name, bus addresses, order of joints (there is one only) and tolerances.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from typing import Any
+
+from pydantic import BaseModel
+
+from wlr_gym.robot.description import Robot
+
+#: Of the canonical form; a fingerprint begins with it.
+HASH_FORM = "2"
+#: Keys of a robot file that no simulator reads.
+NOT_SIMULATED = ("name", "joints", "dynamixel_ids", "tolerances")
+
+
+def robot_hash(robot: Robot) -> str:
+    """Return the fingerprint of the numbers of a robot that a simulator reads."""
+    return _fingerprint("robot", robot)
+
+
+def servo_hash(robot: Robot) -> str:
+    """Return the fingerprint of the numbers of a robot's servos."""
+    return _fingerprint("servo", robot.servo)
+
+
+def _fingerprint(title: str, model: BaseModel) -> str:
+    lines = [f"{title} {HASH_FORM}", *sorted(_lines(model, ""))]
+    return f"{HASH_FORM}-{hashlib.sha256(chr(10).join(lines).encode()).hexdigest()[:16]}"
+
+
+def _lines(model: BaseModel, above: str) -> Iterator[str]:
+    """Yield ``key = value`` of what differs from its default; the keys of ``above`` come before."""
+    for name, field in type(model).model_fields.items():
+        value: Any = getattr(model, name)
+        if above + name in NOT_SIMULATED or value == field.get_default(call_default_factory=True):
+            continue
+        if isinstance(value, BaseModel):
+            yield from _lines(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name} = {value!r}"

@@ -1,0 +1,204 @@
+"""THE parameter table: every physical number a simulator reads, once, one line each.
+
+Names are dotted, with the joint, wheel or axis in brackets: ``wheel.radius[wheel_lf]``, ``ground.mu_x[wheel_rr]``,
+``body.com_offset[x]``. Values for a batch of robots: :class:`wlr_gym.robot.parameters.Parameters`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
+
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.robot.joints import JOINTS, LEGS, WHEELS
+
+Labels = tuple[str, ...]
+Sources = tuple[str | float, ...]
+
+XYZ = ("x", "y", "z")
+XY = ("x", "y")
+#: Areas of the floor that may have a friction of their own.
+PATCHES = ("patch_1", "patch_2", "patch_3", "patch_4")
+SLOPE = ("pitch", "roll")
+ANGLES = ("roll", "pitch", "yaw")
+INERTIA_LABELS = ("xx", "yy", "zz", "xy", "xz", "yz")
+#: Nominal values of rows that need more than one path.
+LEVEL_ACROSS = ("ground.slope", 0.0)
+HIP = ("hip_position.x", "hip_position.y", "hip_position.z")
+LEG_INERTIA_LABELS = tuple(f"{leg},{axis}" for leg in LEGS for axis in XYZ)
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """One row of the table.
+
+    Attributes:
+        name: dotted name without index.
+        unit: SI unit, "-" for a pure number.
+        labels: names of the elements; empty for a scalar.
+        sources: nominal values: numbers, or dotted paths in the robot's file; repeated until every element has one.
+        low, high: bounds outside which the engine refuses a value.
+        tolerance: key of the robot file's tolerances, or empty.
+        doc: meaning.
+    """
+
+    name: str
+    unit: str
+    labels: Labels
+    sources: Sources
+    low: float
+    high: float
+    tolerance: str
+    doc: str
+
+    @property
+    def size(self) -> int:
+        """Number of values per robot."""
+        return max(1, len(self.labels))
+
+    @property
+    def elements(self) -> list[str]:
+        """Full names, one per value: ``wheel.radius[wheel_lf]`` or just ``gravity``."""
+        return [f"{self.name}[{label}]" for label in self.labels] or [self.name]
+
+    def nominal(self, robot: Any) -> list[float | None]:
+        """Return the values (size) for a :class:`wlr_gym.robot.Robot`; None where its file has none."""
+        values = [value for source in self.sources for value in _values(robot, source)]
+        return values * (self.size // len(values))
+
+
+def _values(robot: Any, source: str | float) -> list[float | None]:
+    found = attrgetter(source)(robot) if isinstance(source, str) else source
+    return list(found) if isinstance(found, tuple) else [found]
+
+
+def stated(
+    name: str, unit: str, labels: Labels = (), *, of: Sources = (), low: float, high: float, tolerance: str = "", doc: str
+) -> ParameterSpec:
+    """Return a row whose nominal value the robot's file states at the path of the same name, or at those ``of``."""
+    return ParameterSpec(name, unit, labels, of or (name,), low, high, tolerance, doc)
+
+
+def motor(name: str, unit: str, *, low: float, high: float, tolerance: str = "", doc: str) -> ParameterSpec:
+    """Return a row of all joints whose nominal values are those of the robot's leg servos and of its wheel servos."""
+    group, _, field = name.partition(".")
+    sources = (f"{group}.leg.{field}",) * len(LEGS) + (f"{group}.wheel.{field}",) * len(WHEELS)
+    return ParameterSpec(name, unit, JOINTS, sources, low, high, tolerance, doc)
+
+
+def fixed(
+    name: str, unit: str, labels: Labels = (), *, at: float = 0.0, low: float, high: float, tolerance: str = "", doc: str
+) -> ParameterSpec:
+    """Return a row whose nominal value is the same for every robot."""
+    return ParameterSpec(name, unit, labels, (at,), low, high, tolerance, doc)
+
+
+# fmt: off
+TABLE: tuple[ParameterSpec, ...] = (
+    stated("gravity", "m/s2", low=0, high=30, doc="gravitational acceleration"),
+    # The body is the platform. Its inertia is principal, axes of the body frame. IMU and marker stay at its geometric origin.
+    stated("body.mass", "kg", low=0.05, high=100, tolerance="body.mass", doc="platform without legs, wheels and payload"),
+    stated("body.inertia", "kg m2", XYZ, low=1e-5, high=10, tolerance="body.inertia", doc="about its centre of mass"),
+    stated("body.com_offset", "m", XYZ, low=-0.2, high=0.2, tolerance="body.com_offset", doc="centre of mass from the origin"),
+    # A payload may be several masses; xy = -integral of x y dm.
+    fixed("payload.mass", "kg", low=0, high=20, doc="mass fixed to the body"),
+    fixed("payload.position", "m", XYZ, low=-0.5, high=0.5, doc="its centre of mass in the body frame"),
+    fixed("payload.inertia", "kg m2", INERTIA_LABELS, low=-10, high=10, doc="about its own centre, axes of the body frame"),
+    stated("hip.position", "m", XYZ, of=HIP, low=-1, high=1, doc="from the body origin; x and y with the signs of the corner"),
+    stated("leg.length", "m", LEGS, low=0.01, high=1, doc="hip axis to wheel axle"),
+    stated("leg.mass", "kg", LEGS, low=0, high=10, tolerance="leg.mass", doc="leg without wheel"),
+    stated("leg.com_along_leg", "m", LEGS, low=-0.5, high=1, doc="hip to the leg's centre of mass"),
+    # About the leg's own centre of mass, leg straight down: about x, about y, about its own axis.
+    stated("leg.inertia", "kg m2", LEG_INERTIA_LABELS, low=1e-8, high=1, tolerance="leg.inertia", doc="own, leg straight down"),
+    stated("wheel.radius", "m", WHEELS, low=0.005, high=0.5, tolerance="wheel.radius", doc="rolling radius"),
+    fixed("wheel.grip", "-", WHEELS, at=1.0, low=0, high=5, doc="factor on every floor's friction under this wheel (wear)"),
+    stated("wheel.mass", "kg", WHEELS, low=0, high=10, doc="wheel, at the end of its leg"),
+    stated("wheel.spin_inertia", "kg m2", WHEELS, low=1e-8, high=1, doc="about the axle, without rotor"),
+    stated("wheel.transverse_inertia", "kg m2", WHEELS, low=0, high=1, doc="about an axis across the axle"),
+    # Torque and speed are those at the robot file's nominal supply voltage; together they give torque constant and resistance.
+    stated("servo.supply_voltage", "V", low=0, high=30, tolerance="servo.supply_voltage", doc="voltage at the servos"),
+    motor("servo.stall_torque", "N m", low=1e-3, high=100, tolerance="servo.stall_torque", doc="at the nominal voltage"),
+    motor("servo.no_load_speed", "rad/s", low=0.1, high=200, tolerance="servo.no_load_speed", doc="at the nominal voltage"),
+    motor("servo.kp", "V/rad", low=0, high=2000, tolerance="servo.kp", doc="on angle error; wheels: integral of speed error"),
+    motor("servo.kd", "V s/rad", low=0, high=50, doc="gain on the velocity error"),
+    motor("servo.armature", "kg m2", low=1e-6, high=1, tolerance="servo.armature", doc="rotor inertia at the output shaft"),
+    motor("servo.coulomb_friction", "N m", low=0, high=50, tolerance="servo.coulomb_friction", doc="dry gear friction"),
+    motor("servo.viscous_friction", "N m s/rad", low=0, high=10, tolerance="servo.viscous_friction", doc="beyond back-EMF"),
+    # Below 1: a weak magnet, not seen in the reported effort.
+    fixed("servo.torque_scale", "-", JOINTS, at=1.0, low=0, high=2, doc="torque of the motor over what its current says"),
+    # Fades with exp(-(rate/stribeck_speed)^2).
+    fixed("servo.stribeck_torque", "N m", JOINTS, low=0, high=50, doc="dry gear friction at rest beyond that in motion"),
+    fixed("servo.stribeck_speed", "rad/s", JOINTS, at=0.1, low=1e-4, high=20, doc="rate over which stribeck_torque fades"),
+    fixed("servo.load_friction", "-", JOINTS, low=0, high=1, doc="dry gear friction per torque that the gear transmits"),
+    fixed("servo.ripple_amplitude", "N m", JOINTS, low=0, high=10, doc="of motor torque: amplitude sin(order angle + phase)"),
+    fixed("servo.ripple_order", "-", JOINTS, at=1.0, low=0, high=1000, doc="periods of the ripple per turn"),
+    fixed("servo.ripple_phase", "rad", JOINTS, low=-10, high=10, doc="phase of the ripple at angle 0"),
+    # Encoder and link are on the output side of the play, rotor and gear friction on the motor's. Without play: a rigid gear.
+    fixed("servo.backlash", "rad", JOINTS, low=0, high=0.5, doc="full width of the gear's play"),
+    motor("servo.gear_stiffness", "N m/rad", low=1, high=1e5, doc="of the teeth that meet at the end of the play"),
+    fixed("servo.supply_resistance", "ohm", low=0, high=5, doc="supply drop per sum of absolute motor currents"),
+    fixed("servo.profile_velocity", "rad/s", JOINTS, low=0, high=200, doc="of the legs; 0 = no limit; not used by the wheels"),
+    fixed("servo.profile_acceleration", "rad/s2", JOINTS, low=0, high=1e5, doc="of the profile; 0 = step references"),
+    fixed("command.delay", "s", JOINTS, low=0, high=0.2, tolerance="command.delay", doc="setpoints act this much later"),
+    stated("ground.mu_x", "-", WHEELS, low=0, high=5, tolerance="ground.mu", doc="friction along the wheel's heading"),
+    stated("ground.mu_y", "-", WHEELS, low=0, high=5, tolerance="ground.mu", doc="friction along the wheel's axle"),
+    fixed("ground.rolling_resistance", "-", WHEELS, low=0, high=1, doc="torque over normal force and radius, against the spin"),
+    # ratio + (1 - ratio) exp(-slip speed/weakening_speed)
+    fixed("ground.kinetic_ratio", "-", WHEELS, at=1.0, low=0, high=1, doc="friction at fast slip over friction at rest"),
+    fixed("ground.weakening_speed", "m/s", WHEELS, at=0.1, low=1e-3, high=10, doc="slip speed over which friction falls"),
+    fixed("ground.creep_speed", "m/s", WHEELS, low=0, high=1, doc="friction grows as tanh(slip/creep_speed); 0 = dry, sticks"),
+    # A patch has a friction of its own along the heading (along the axle: times ground.mu_y/mu_x). Later patches win.
+    fixed("patch.mu", "-", PATCHES, low=0, high=5, doc="friction along the heading inside an area of the floor"),
+    fixed("patch.x_min", "m", PATCHES, low=-1e3, high=1e3, doc="area of the patch, floor frame"),
+    fixed("patch.x_max", "m", PATCHES, low=-1e3, high=1e3, doc="no patch where x_max <= x_min"),
+    fixed("patch.y_min", "m", PATCHES, low=-1e3, high=1e3, doc="area of the patch, floor frame"),
+    fixed("patch.y_max", "m", PATCHES, low=-1e3, high=1e3, doc="no patch where y_max <= y_min"),
+    stated("ground.normal_stiffness", "N/m", WHEELS, low=100, high=2e5, doc="tyre and chassis together"),
+    stated("ground.normal_damping", "N s/m", WHEELS, low=0, high=500, doc="normal contact damping"),
+    # Inclination of the floor's x and y axes, positive = uphill. The world frame is the floor frame.
+    stated("ground.slope", "rad", SLOPE, of=LEVEL_ACROSS, low=-1.2, high=1.2, tolerance="ground.slope", doc="of floor axes"),
+    fixed("external_force", "N", XY, low=-1e3, high=1e3, doc="constant force on the body origin, floor frame"),
+    fixed("tether.stiffness", "N/m", low=0, high=1e4, doc="horizontal pull of the body origin to the anchor, no rest length"),
+    fixed("tether.anchor", "m", XY, low=-1e3, high=1e3, doc="point on the floor, floor frame"),
+    # The servo regulates the reading.
+    fixed("joint.zero_offset", "rad", LEGS, low=-0.5, high=0.5, tolerance="joint_zero", doc="encoder reading minus true angle"),
+    fixed("imu.gyro_bias", "rad/s", XYZ, low=-1, high=1, doc="constant gyroscope offset"),
+    fixed("imu.accel_bias", "m/s2", XYZ, low=-5, high=5, doc="constant accelerometer offset"),
+    fixed("imu.mount", "rad", ANGLES, low=-0.5, high=0.5, doc="rotation from sensor to body, Rz(yaw) Ry(pitch) Rx(roll)"),
+    stated("imu.bandwidth", "Hz", of=("sensors.imu.bandwidth",), low=1, high=1e4, doc="low-pass of gyro, accelerometer"),
+    fixed("camera.mount_yaw", "rad", low=-0.5, high=0.5, tolerance="camera.mount_yaw", doc="floor frame to start heading"),
+    fixed("camera.scale", "-", at=1.0, low=0.5, high=2, doc="measured over true lengths of the camera's floor frame"),
+    fixed("camera.delay", "s", low=0, high=0.5, tolerance="camera.delay", doc="age of a vision pose when it is delivered"),
+)
+# fmt: on
+
+SPECS: dict[str, ParameterSpec] = {spec.name: spec for spec in TABLE}
+ELEMENTS: tuple[str, ...] = tuple(element for spec in TABLE for element in spec.elements)
+
+
+def unit_in_words(unit: str) -> str:
+    """Return a unit as messages name it: "-" is a pure number."""
+    return "a pure number" if unit == "-" else unit
+
+
+def range_in_words(low: float, high: float, unit: str) -> str:
+    """Return a range with its unit as messages name it."""
+    return f"[{low:g}, {high:g}] {'(a pure number)' if unit == '-' else unit}"
+
+
+def spec_of(name: str) -> ParameterSpec:
+    """Return the table row of a parameter or of one of its elements."""
+    spec = SPECS.get(name.partition("[")[0])
+    if spec is None or (name != spec.name and name not in spec.elements):
+        raise unknown_parameter(name)
+    return spec
+
+
+def unknown_parameter(name: str) -> InputError:
+    """Build the error for a name that is not in the table, with the nearest valid one."""
+    base = name.partition("[")[0]
+    if base in SPECS and SPECS[base].labels:
+        label = name.partition("[")[2].rstrip("]")
+        return unknown_name(f"element of parameter '{base}'", label, SPECS[base].labels)
+    return unknown_name("parameter", name, [*SPECS])
