@@ -17,7 +17,8 @@ from wlr_gym.data.excitations import Motion
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
 from wlr_gym.data.read import read_meta
 from wlr_gym.data.replay import profile_parameters
-from wlr_gym.data.simulation import SENSED, Simulation, channels, departures, start_of
+from wlr_gym.data.sensor_columns import SENSED, channels
+from wlr_gym.data.simulation_record import Simulation, departures, start_of
 from wlr_gym.data.write import write_meta, write_run
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
 from wlr_gym.physics.plants import SIMULATORS, make_plant

@@ -10,7 +10,8 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
-from wlr_gym.data.simulation import SENSED, ParameterChange, Simulation, channels, departures, start_of
+from wlr_gym.data.sensor_columns import SENSED, channels
+from wlr_gym.data.simulation_record import ParameterChange, Simulation, departures, start_of
 from wlr_gym.data.write import write_run
 from wlr_gym.learning.evaluation.rollout import roll_out
 from wlr_gym.physics.effects import EFFECTS

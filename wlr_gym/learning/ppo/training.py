@@ -29,21 +29,23 @@ from wlr_gym.learning.ppo import checkpoint
 from wlr_gym.learning.ppo.asymmetric import AsymmetricPolicy
 from wlr_gym.learning.ppo.config import PpoConfig
 from wlr_gym.learning.ppo.curve import LearningCurve, Meter, losses
-from wlr_gym.learning.ppo.policy import policy_keywords
+from wlr_gym.learning.ppo.policy import parse_settings, policy_keywords
 from wlr_gym.learning.ppo.warm_start import imitate
 from wlr_gym.policy import Training
 
 
-def run_training(training: Training, config: PpoConfig) -> Path:
+def run_training(training: Training) -> Path:
     """Train and return the folder of the final policy.
 
     The run folder then holds ``config.yaml``, ``provenance.yaml``, ``learning_curve.csv``, ``tensorboard/``,
     ``checkpoints/step_.../`` (each a policy folder) and ``policy/``.
 
     Raises:
+        InputError: bad settings.
         KeyboardInterrupt: after a checkpoint was saved; the message says how to resume.
         TrainingError: a loss, weight or observation is not finite; the message names the file with the state.
     """
+    config = parse_settings(training.config)
     torch.set_num_threads(config.torch_threads)
     env = Sb3VecEnv(training.environment, config.num_envs, **config.environment)
     try:

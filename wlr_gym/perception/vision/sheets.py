@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from wlr_gym.base.files import replace_file
+from wlr_gym.perception.markers.calibration import Board
 from wlr_gym.perception.markers.targets import QUIET_ZONE, Marker, Target, ring_radii
 
 A4, A3 = (297.0, 210.0), (420.0, 297.0)
@@ -63,22 +63,6 @@ class Page:
     name: str
     size: tuple[float, float]
     shapes: tuple[Shape, ...]
-
-
-@dataclass(frozen=True)
-class Board:
-    """A ChArUco board: squares along and across, their side (m). A marker's side is 0.7 of it."""
-
-    columns: int = 9
-    rows: int = 6
-    square: float = 0.028
-
-    def aruco(self) -> Any:
-        """Return OpenCV's board."""
-        import cv2
-
-        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, 0.7 * self.square, dictionary)
 
 
 def target_pages(target: Target) -> list[Page]:

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.anchor import quaternion, rotation
 from wlr_gym.data.read import Run
-from wlr_gym.perception.vision.align import joint_signals, repeated
-from wlr_gym.perception.vision.smooth import Smoothed, draw_error, smooth
-from wlr_gym.perception.vision.track import Sample
+from wlr_gym.perception.vision.alignment import joint_signals, repeated
+from wlr_gym.perception.vision.smoothing import Smoothed, draw_error, smooth
+from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.robot import WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import accumulate, contact_slip_velocity, no_slip_error, rolling_speed, slip_angle, slip_ratio
@@ -114,7 +114,7 @@ def measure_slip(
     """Slip of a run from the samples of its video.
 
     Args:
-        samples: of :func:`wlr_gym.perception.vision.track.track`. offset: servo time = camera time + offset, s; offset_std: 1
+        samples: of :func:`wlr_gym.perception.vision.tracking.track`. offset: servo time = camera time + offset, s; offset_std: 1
             sigma.
         run: encoders. robot: encoder counts, radius tolerance. parameters: (1) geometry.
         layout_std: 1 sigma of the body target's scale and heading

@@ -17,7 +17,7 @@ from typing import Any
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import replace_file
 from wlr_gym.perception.markers.camera import Camera
-from wlr_gym.perception.vision.track import check_size
+from wlr_gym.perception.vision.tracking import check_size
 from wlr_gym.perception.vision.video import Image, VideoFile, grey
 
 _BACKLOG = 300  # frames that may wait to be written

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.anchor import quaternion, rest_pose
 from wlr_gym.data.read import Run
-from wlr_gym.perception.vision.smooth import smooth
+from wlr_gym.perception.vision.smoothing import smooth
 from wlr_gym.robot import JOINTS, Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import accumulate, contact_slip_velocity
