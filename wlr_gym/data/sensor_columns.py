@@ -19,7 +19,7 @@ SENSED = (
 
 
 def channels(sensors: Sensors, robot: int) -> Array:
-    """Return what a log shows of one robot's readings: :data:`SENSED`; NaN for the camera pose on control steps without a new frame."""
+    """Return one robot's readings as :data:`SENSED`; NaN for the camera pose on control steps without a new frame."""
     camera = sensors.camera_pose[robot] if sensors.camera_is_new[robot] else np.full(3, np.nan)
     joints = (sensors.joint_position[robot], sensors.joint_velocity[robot], sensors.joint_effort[robot])
     return np.concatenate([*joints, sensors.gyro[robot], sensors.accelerometer[robot], camera, [sensors.supply_voltage[robot]]])

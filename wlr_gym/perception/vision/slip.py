@@ -114,8 +114,8 @@ def measure_slip(
     """Slip of a run from the samples of its video.
 
     Args:
-        samples: of :func:`wlr_gym.perception.vision.tracking.track`. offset: servo time = camera time + offset, s; offset_std: 1
-            sigma.
+        samples: of :func:`wlr_gym.perception.vision.tracking.track`.
+        offset: servo time = camera time + offset, s; offset_std: 1 sigma.
         run: encoders. robot: encoder counts, radius tolerance. parameters: (1) geometry.
         layout_std: 1 sigma of the body target's scale and heading
             (:attr:`wlr_gym.perception.markers.targets.Target.layout_std`).
