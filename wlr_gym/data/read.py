@@ -29,7 +29,7 @@ class Run:
     """One measured run.
 
     Attributes:
-        table: one row per control tick, columns of :data:`wlr_gym.data.format.COLUMNS`, float64.
+        table: one row per control step, columns of :data:`wlr_gym.data.format.COLUMNS`, float64.
         meta: what ``meta.yaml`` beside the file says; defaults where there is none.
         path: the file it came from.
         findings: what is odd about it (gaps, dead channels, ...).

@@ -1,7 +1,7 @@
-"""What a simulated run knows of itself, so that it can be simulated again, bit for bit.
+"""The record of how a run was simulated: what is needed to simulate it again, bit for bit.
 
 It stands beside the run, ``run_01.simulation.yaml`` beside ``run_01.parquet``, and not in the run: what a robot could not
-measure is no part of the measured-run format, and whoever is to find it out must not be handed it.
+measure is no part of the measured-run format: a workflow that has to identify it must not read it there.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One control tick of the observer: a small Kalman filter per robot, compiled; every robot on its own.
+"""One control step of the observer: a small Kalman filter per robot, compiled; every robot on its own.
 
 Frames: *start* (the floor frame as the body stood at the reset: x along its heading), *heading* (turns with the body about the
 floor's normal; x along the wheels, y to the left in the floor), *body*. Velocities are estimated in the heading frame, each
@@ -78,7 +78,7 @@ def reset(robot: Any, records: Any, mask: Any, sensors: Any, values: Any) -> Non
 
 @njit(cache=True, nogil=True)
 def update(robot: Any, records: Any, mask: Any, sensors: Any, values: Any) -> None:
-    """Advance masked robots by one control tick."""
+    """Advance masked robots by one control step."""
     for i in range(mask.shape[0]):
         if mask[i]:
             _advance(robot, sensors[i], records[i])

@@ -45,7 +45,7 @@ class SlipObserver:
         estimate.reset(self._constants, self._records, mask, sensors, self.values)
 
     def update(self, mask: Mask, sensors: Array) -> None:
-        """Take in the readings of one control tick later of the masked robots. A reading that is no number is the last one."""
+        """Take in the readings of one control step later of the masked robots. A reading that is no number is the last one."""
         self._require(mask, sensors)
         estimate.update(self._constants, self._records, mask, sensors, self.values)
 

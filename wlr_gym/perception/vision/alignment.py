@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.anchor import quaternion, rest_pose
+from wlr_gym.data.body_pose import quaternion, rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.perception.vision.smoothing import smooth
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import accumulate, contact_slip_velocity
 
@@ -213,7 +213,7 @@ def _without_slow(time: Array, slowest: float) -> Callable[[Array], Array]:
 def _pairs(time: Array, poses: Array, run: Run, robot: Robot, parameters: Parameters, around: float) -> list[_Pair]:
     t = run["t"]
     joints = joint_signals(run, t, robot)
-    legs = joints[0][:, :4] - parameters["joint.zero_offset"]
+    legs = joints[0][:, LEG_SLICE] - parameters["joint.zero_offset"]
     rest = rest_pose(parameters, legs)
     sag = _sag(legs, parameters)
     pairs = [

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import replace_file, write_json
-from wlr_gym.data.anchor import rest_pose, rotation
+from wlr_gym.data.body_pose import rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import robot_of
 from wlr_gym.data.write import write_run
@@ -24,7 +24,8 @@ from wlr_gym.perception.vision.alignment import Alignment, align, joint_signals
 from wlr_gym.perception.vision.slip import SlipResult, measure_slip, smoothed_poses
 from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, Sample, VideoFrame, track
 from wlr_gym.perception.vision.video import Frames
-from wlr_gym.robot import WHEELS, Robot
+from wlr_gym.physics.plants.sensors import rotation
+from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -141,7 +142,7 @@ def analyse(
     slip = measure_slip(samples, offset, run, found, parameters, known, body.layout_std)
     table = camera_columns(samples, offset, run, origin, slip.outliers)
     measured = Run(table, run.meta, run.path, run.findings)
-    legs = joint_signals(run, slip.time, found)[0][:, :4] - parameters["joint.zero_offset"]
+    legs = joint_signals(run, slip.time, found)[0][:, LEG_SLICE] - parameters["joint.zero_offset"]
     height_error = float(np.median(slip.pose[:, 2] - rest_pose(parameters, legs)[:, 0]))
     missing = frames.missing if isinstance(frames, Frames) else 0
     findings = tuple(_findings(samples, slip, height_error, missing))

@@ -21,12 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.anchor import quaternion, rotation
+from wlr_gym.data.body_pose import quaternion
 from wlr_gym.data.read import Run
 from wlr_gym.perception.vision.alignment import joint_signals, repeated
 from wlr_gym.perception.vision.smoothing import Smoothed, draw_error, smooth
 from wlr_gym.perception.vision.tracking import Sample
-from wlr_gym.robot import WHEELS, Robot
+from wlr_gym.physics.plants.sensors import rotation
+from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import accumulate, contact_slip_velocity, no_slip_error, rolling_speed, slip_angle, slip_ratio
 
@@ -136,7 +137,7 @@ def measure_slip(
     signals, outliers = smoothed_poses(samples, time, rows)
     value, rate, value_std = (np.stack([getattr(f, name) for f in signals], 1) for name in ("value", "rate", "value_std"))
     joints = joint_signals(run, rows, robot)
-    joints[0][:, :4] -= parameters["joint.zero_offset"]
+    joints[0][:, LEG_SLICE] -= parameters["joint.zero_offset"]
     batch = repeated(parameters, len(rows))
     velocity, rolling, no_slip_speed = _contacts(value, rate, joints, batch)
     travel = velocity[:, :, 0] + rolling
@@ -187,7 +188,7 @@ def _contacts(value: Array, rate: Array, joints: tuple[Array, Array], batch: Par
 def _encoder_variance(angle: Array, robot: Robot, parameters: Parameters) -> Array:
     """Variance (K, 4) in m2 of a contact's place along its heading: a wheel's count at its rim, a leg's at hip height."""
     radius = parameters["wheel.radius"]
-    height = parameters["leg.length"] * np.sin(angle[:, :4]) + radius
+    height = parameters["leg.length"] * np.sin(angle[:, LEG_SLICE]) + radius
     return (radius**2 + height**2) * robot.sensors.encoder.position**2 / 12
 
 
