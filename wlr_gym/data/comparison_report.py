@@ -22,7 +22,10 @@ _PANELS = (
     ("normal_force",), ("total_along", "total_across"), ("total_turn",), ("slip_along", "slip_across"), ("gyro",),
     ("friction_across",),
 )  # fmt: skip
-_FIRST, _SECOND, _LIMIT = "#1f4e9c", "#e06c00", "#b03030"
+# Colours of the first and the second plant, and of the threshold.
+_FIRST = "#1f4e9c"
+_SECOND = "#e06c00"
+_LIMIT = "#b03030"
 
 
 @dataclass(frozen=True)

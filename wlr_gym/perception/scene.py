@@ -23,12 +23,23 @@ from wlr_gym.robot import CORNER_SIGNS, Robot
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-WHITE, BLACK, FLOOR, DARK, GREY = 225.0, 25.0, 130.0, 45.0, 80.0
-#: Size (m) of the sheet with the robot's markers, and of a sheet with a floor marker in outer radii of the marker.
+# Brightness, grey levels.
+WHITE = 225.0
+BLACK = 25.0
+FLOOR = 130.0
+DARK = 45.0
+GREY = 80.0
+#: m; size of the sheet with the robot's markers.
 PLATE = (0.40, 0.29)
+#: Half the side of a sheet with a floor marker, in outer radii of the marker.
 _SHEET = 1.6
-_RECTANGLE, _DISC = 0.0, 1.0
-_FEW, _FLAT = 3, 8.0  # rays a side in every pixel; brightness they may differ by in a pixel without an edge
+# Outline of a facet.
+_RECTANGLE = 0.0
+_DISC = 1.0
+#: Rays a side in every pixel.
+_FEW = 3
+#: Grey levels by which they may differ in a pixel without an edge.
+_FLAT = 8.0
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,9 @@ from wlr_gym.robot import WHEELS
 
 Array = NDArray[np.float64]
 
-ACTUAL, COMMANDED = "tab:blue", "black"
+# Colours of curves.
+ACTUAL = "tab:blue"
+COMMANDED = "black"
 WHEEL_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red")
 #: Seconds between the heading arrows along a path.
 ARROW_PERIOD = 2.0

@@ -16,8 +16,13 @@ from wlr_gym.base.files import replace_file
 from wlr_gym.perception.markers.calibration import Board
 from wlr_gym.perception.markers.targets import QUIET_ZONE, Marker, Target, ring_radii
 
-A4, A3 = (297.0, 210.0), (420.0, 297.0)
-_BLACK, _WHITE, _GREY = 0.0, 1.0, 0.6
+# Landscape, mm.
+A4 = (297.0, 210.0)
+A3 = (420.0, 297.0)
+# Shade: 0 black to 1 white.
+_BLACK = 0.0
+_WHITE = 1.0
+_GREY = 0.6
 _MARGIN = 8.0  # mm that printers leave white
 _ARC = 0.5522847498  # control points of a quarter circle
 

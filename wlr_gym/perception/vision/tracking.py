@@ -23,8 +23,17 @@ from wlr_gym.perception.markers.targets import Target
 
 Array = NDArray[np.float64]
 
-#: Status of a sample: pose from all markers; from fewer; none found; the camera moved; a pose that cannot be.
-OK, PARTIAL, LOST, MOVED, IMPOSSIBLE = "ok", "partial", "lost", "moved", "impossible"
+# Status of a sample.
+#: Pose from all markers.
+OK = "ok"
+#: Pose from fewer than all markers.
+PARTIAL = "partial"
+#: No markers found.
+LOST = "lost"
+#: The camera moved.
+MOVED = "moved"
+#: A pose that cannot be: in the floor, or upside down.
+IMPOSSIBLE = "impossible"
 FLOOR_FRAMES = 20
 #: m; positions of floor markers may be off by this much (they were measured by hand).
 FLOOR_TOLERANCE = 0.01

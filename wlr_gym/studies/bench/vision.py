@@ -34,7 +34,7 @@ from wlr_gym.perception.scene import (
     view,
 )
 from wlr_gym.perception.vision.alignment import align
-from wlr_gym.perception.vision.paper import paper_pose
+from wlr_gym.perception.vision.paper_method import paper_pose
 from wlr_gym.perception.vision.slip import measure_slip
 from wlr_gym.perception.vision.tracking import Tracker, VideoFrame, angles, locate_floor, track
 from wlr_gym.robot import Robot, load_robot

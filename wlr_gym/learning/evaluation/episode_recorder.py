@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from wlr_gym.policy import Policy
 
 
-class Recorder:
+class EpisodeRecorder:
     """Logs one robot of a batch, from the episode it has just begun to that episode's end.
 
     ```python
     env.reset(seed=3)
-    recorder = Recorder(env.unwrapped.core)
+    recorder = EpisodeRecorder(env.unwrapped.core)
     ...
     env.step(action); recorder.note()
     ...
@@ -109,13 +109,13 @@ class Recorder:
 
 def record_episodes(core: Core, policy: Policy, folder: Path, first_seed: int = 0) -> list[Path]:
     """Play one episode per robot of ``core``, seeds as in ``roll_out``, and write each as ``folder/run_<n>.parquet``."""
-    recorders: list[Recorder] = []
+    recorders: list[EpisodeRecorder] = []
     roll_out(
         core,
         policy,
         first_seed,
         on_tick=lambda: [recorder.note() for recorder in recorders],
-        on_start=lambda: recorders.extend(Recorder(core, robot) for robot in range(core.count)),
+        on_start=lambda: recorders.extend(EpisodeRecorder(core, robot) for robot in range(core.count)),
     )
     digits = max(2, len(str(core.count)))
     return [recorder.save(folder / f"run_{k:0{digits}d}.parquet") for k, recorder in enumerate(recorders, 1)]
