@@ -1,7 +1,7 @@
 """The training loop: updates, learning curve, checkpoints, stopping in good order, resuming.
 
 Every checkpoint starts new episodes with seeds made from the run's seed and the steps done. So a run that was killed and
-resumed from a checkpoint goes on exactly, bit for bit, as it would have without the interruption.
+resumed from a checkpoint continues exactly, bit for bit, as it would have without the interruption.
 """
 
 from __future__ import annotations
@@ -127,10 +127,10 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv) -> Path:
             if model.num_timesteps // config.checkpoint_every > before // config.checkpoint_every:
                 _save_checkpoint(training, config, env, model)
                 begin_episodes(model, env, config.seed)
-    if model.num_timesteps < config.total_steps:  # nothing is lost: --resume goes on from here
+    if model.num_timesteps < config.total_steps:  # nothing is lost: --resume continues from here
         place = _save_checkpoint(training, config, env, model)
         if stop.requested:
-            raise KeyboardInterrupt(f"interrupted; saved {place}; go on with: wlr train --resume {folder}")
+            raise KeyboardInterrupt(f"interrupted; saved {place}; resume with: wlr train --resume {folder}")
     return checkpoint.save(folder / "policy", model, config, env.contract(), training.environment)
 
 

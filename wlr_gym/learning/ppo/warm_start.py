@@ -1,4 +1,4 @@
-"""A start from a controller that works: actor and critic imitate it, then PPO goes on from there.
+"""A start from a controller that works: actor and critic imitate it, and PPO continues from there.
 
 The controller drives all robots for an episode, with noise on its actions so that it is seen to correct errors. The actor
 learns its actions (without the noise), the critic its discounted rewards. Own random numbers: nothing else is shifted.

@@ -84,7 +84,7 @@ def measure_force(r: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def sense_force(robot: Any, r: Any) -> float:
-    """Mean specific force over the tick; friction demand, and how far all wheels may slip alike, ``r.limit`` 0 to 1.
+    """Mean specific force over the step; friction demand, and how far all wheels may slip alike, ``r.limit`` 0 to 1.
 
     Returns:
         How much the specific force changed along the floor, m/s2.
@@ -105,7 +105,7 @@ def sense_force(robot: Any, r: Any) -> float:
 
 @njit(cache=True, nogil=True)
 def move(robot: Any, turned: float, r: Any) -> None:
-    """Carry pose and velocity over the tick."""
+    """Carry pose and velocity over the step."""
     dt = robot.period
     c, s = math.cos(turned), math.sin(turned)
     gx, gy = r.slope[0], r.slope[1]
@@ -115,7 +115,7 @@ def move(robot: Any, turned: float, r: Any) -> None:
     middle = r.yaw - 0.5 * turned
     cm, sm = math.cos(middle), math.sin(middle)
     vx, vy = r.velocity[0], r.velocity[1]
-    # in the frame of the tick's middle: turned by half, kicked, turned by half
+    # in the frame of the step's middle: turned by half, kicked, turned by half
     ch, sh = math.cos(0.5 * turned), math.sin(0.5 * turned)
     bx, by = ch * vx + sh * vy, ch * vy - sh * vx
     ex, ey = bx + dt * ax, by + dt * ay
@@ -135,7 +135,7 @@ def move(robot: Any, turned: float, r: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def spread(robot: Any, turned: float, change: float, r: Any) -> None:
-    """Carry the uncertainty over the tick, and let slip fade."""
+    """Carry the uncertainty over the step, and let slip fade."""
     dt = robot.period
     split = min(1.0, (r.slope[0] ** 2 + r.slope[1] ** 2) / robot.accel_bias**2)
     common = LIMIT_SLIP * r.limit

@@ -91,16 +91,16 @@ def state_type(history: int) -> np.dtype[Any]:
         "normal": (3,),  # of the floor, body frame
         "rate": (3,),  # body frame
         "yaw_rate": (),
-        "force": (3,),  # specific, mean over the tick
+        "force": (3,),  # specific, mean over the step
         "last_force": (3,),
         "demand": (),  # friction demand, smoothed
         "limit": (),  # 0 to 1: slip that all wheels share is possible
         "surprise": (2,),  # mean normalised innovation of the camera's last frames
         "doubt": (),  # 0 to 1: the camera contradicts the wheels
         "strange": (),  # camera frames far off, in a row
-        # without corrections, for what the camera saw some ticks ago
+        # without corrections, for what the camera saw some steps ago
         "raw_velocity": (2,),  # start frame
-        "raw": (history, 3),  # x, y, yaw at each tick
+        "raw": (history, 3),  # x, y, yaw at each step
         # wheels, see contacts.py
         "heading": (3,),  # body frame
         "left": (3,),  # body frame

@@ -154,8 +154,8 @@ def camera_columns(
 ) -> pandas.DataFrame:
     """Return the run's table with the columns ``cam_*``: each frame's own measurement, in the row nearest to it.
 
-    It is moved to the row's time by the smoothed rate (at most half a tick), so the columns have no delay; rows without a
-    frame are NaN. Position is that of the run's ``marker_offset`` in the body (0 = body origin G).
+    It is moved to the row's time by the smoothed rate (at most half a control step), so the columns have no delay; rows
+    without a frame are NaN. Position is that of the run's ``marker_offset`` in the body (0 = body origin G).
     """
     t = run["t"]
     good = np.array([math.isfinite(s.pose[0]) for s in samples]) & ~outliers

@@ -28,7 +28,7 @@ def film(number: int, folder: Path, camera: Camera, seconds: float | None = None
 
     Args:
         number: of the camera. folder: for ``film.avi`` and ``film.csv`` (number and time, s, of every frame).
-        camera: its calibration; the size of its images is asked for. seconds: None = until Ctrl-C.
+        camera: its calibration; the size of its images is requested from the driver. seconds: None = until Ctrl-C.
 
     Returns:
         The two paths.

@@ -41,7 +41,7 @@ LONGEST_GAP = 0.15
 #: Deviations from its neighbours (m, rad) from which on a pose can be an outlier.
 _JUMP = (0.01, 0.01, 0.01, 0.03, 0.05, 0.05)
 _DRAWS = 64  # of the motion: 1 sigma is known to 9 %
-_ENCODER_PACE = 10.0  # 1/s; an encoder's error changes over about five ticks
+_ENCODER_PACE = 10.0  # 1/s; an encoder's error changes over about five control steps
 
 
 @dataclass(frozen=True, eq=False)
