@@ -9,22 +9,14 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Profile, Run, RunMeta
-from wlr_gym.data import compare as module
-from wlr_gym.data.compare import (
-    BOUNDS,
-    Contender,
-    Motion,
-    Traces,
-    compare,
-    drive,
-    motion_of,
-    parse_contender,
-    resolutions,
-    severe_patch,
-    standing_at,
-)
-from wlr_gym.data.compare_report import markdown, summary_table
-from wlr_gym.data.excitations import excite
+from wlr_gym.data import comparison as module
+from wlr_gym.data.compared_plants import ComparedPlant, Traces, drive, parse_plant
+from wlr_gym.data.compared_signals import resolutions
+from wlr_gym.data.comparison import BOUNDS, compare, severe_patch
+from wlr_gym.data.comparison_report import markdown, summary_table
+from wlr_gym.data.excitations import Motion, excite
+from wlr_gym.data.record import motion_of
+from wlr_gym.data.run_states import standing_at
 from wlr_gym.physics.effects import EFFECTS, apply_patch
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions
@@ -32,7 +24,7 @@ from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.robot.parameters import Parameters
 
 ROBOT = load_robot()
-ENGINE = Contender("gibbs_appell")
+ENGINE = ComparedPlant("gibbs_appell")
 MOTION = excite("steps", 1, ROBOT, seconds=3.0)
 SIGNALS = resolutions(ROBOT)
 
@@ -165,8 +157,8 @@ def test_whose_zeros_are_off_begins_at_its_goals():
     state = standing_at(goals, ROBOT, parameters)
     np.testing.assert_allclose(state.reference_position[:, :4], 1.4)
     np.testing.assert_array_equal(state.reference_position, state.joint_position)
-    for contender in (ENGINE, Contender("mujoco")):
-        plant = make_plant(contender.backend, ROBOT, 1, PlantOptions(sensor_noise=False))
+    for compared in (ENGINE, ComparedPlant("mujoco")):
+        plant = make_plant(compared.backend, ROBOT, 1, PlantOptions(sensor_noise=False))
         plant.reset(np.zeros(1, np.uint64), parameters, state=state)
         plant.step(goals)
         moved = plant.get_state().reference_position[:, :4]
@@ -204,10 +196,10 @@ def test_every_effect_has_a_severe_case(name):
 
 
 def test_plants_by_name():
-    assert parse_contender("gibbs_appell", 0.002) == Contender("gibbs_appell", 0.002)
+    assert parse_plant("gibbs_appell", 0.002) == ComparedPlant("gibbs_appell", 0.002)
     text = "gibbs_appell:physics_step=0.0005,precision=float32"
-    assert parse_contender(text) == Contender("gibbs_appell", 0.0005, "float32")
-    assert parse_contender(text).label == "gibbs_appell, 0.5 ms, float32"
+    assert parse_plant(text) == ComparedPlant("gibbs_appell", 0.0005, "float32")
+    assert parse_plant(text).label == "gibbs_appell, 0.5 ms, float32"
 
 
 @pytest.mark.parametrize(
@@ -222,7 +214,7 @@ def test_plants_by_name():
 )
 def test_a_plant_that_is_none_is_named(text, words):
     with pytest.raises(InputError, match=words):
-        parse_contender(text)
+        parse_plant(text)
 
 
 def test_bad_arguments_are_named():
@@ -238,7 +230,7 @@ def test_bad_arguments_are_named():
 
 def test_two_simulators_agree():
     """The engine and MuJoCo, on the hardest motion: well within the bounds of the project."""
-    found = compare([MOTION], (ENGINE, Contender("mujoco")), ROBOT)
+    found = compare([MOTION], (ENGINE, ComparedPlant("mujoco")), ROBOT)
     agreement = found.cases[0].agreement
     assert all(getattr(agreement, name) < 0.5 * bound for name, bound in BOUNDS.items())
     assert 0.0 < agreement.apart < 1e-3

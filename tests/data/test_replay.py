@@ -14,13 +14,15 @@ import yaml
 from wlr_gym import cli
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Profile, Run, RunMeta, read_dataset, read_run
-from wlr_gym.data.anchor import euler_angles, local_fit, quaternion, rest_pose, rotation
+from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.noise import channel_noise
 from wlr_gym.data.replay import ReplayResult, held_goals, profile_parameters, replay, robot_entry, robot_of
+from wlr_gym.data.run_states import local_fit
 from wlr_gym.physics.effects import apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, standing_state
+from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -116,7 +118,7 @@ def worst(result: ReplayResult, kind: str, *, segments: bool = True) -> float:
     ("effects", "steps"),
     [
         ([], [10]),
-        ([], [9, 10, 11, 10, 20]),  # jitter and lost ticks
+        ([], [9, 10, 11, 10, 20]),  # jitter and lost control steps
         ([DELAY], [10]),
         ([ZERO, RESISTANCE, PAYLOAD], [10]),
         ([CAMERA, MOUNT], [10]),

@@ -6,7 +6,7 @@ import numpy as np
 import pandas
 
 from wlr_gym.data import Profile, Run, RunMeta
-from wlr_gym.data.anchor import euler_angles
+from wlr_gym.data.body_pose import euler_angles
 from wlr_gym.data.format import CHANNELS, COMMANDS
 from wlr_gym.data.noise import noise_parts
 from wlr_gym.data.replay import profile_parameters

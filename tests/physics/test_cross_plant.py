@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from two_plants import BACKENDS, ROBOT
 
-from wlr_gym.data.compare import severe_patch
+from wlr_gym.data.comparison import severe_patch
 from wlr_gym.data.excitations import EXCITATIONS, Motion, excite
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.physics.effects import EFFECTS, apply_patch

@@ -249,7 +249,7 @@ def test_slip_arrow_points_where_the_contact_skids(robot, parameters, yaw):
     ahead, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
     assert np.allclose(arrow.end - arrow.start, marks.SLIP_SCALE * (0.03 * ahead + 0.04 * left))
     contact = 0.175 * ahead - 0.16 * left
-    assert np.allclose(arrow.start[:2], (contact - marks.BESIDE * left)[:2])
+    assert np.allclose(arrow.start[:2], (contact - marks.SLIP_BESIDE * left)[:2])
     assert 0 < arrow.start[2] < 0.02
 
 
@@ -258,10 +258,10 @@ def test_slip_arrow_is_seen_at_its_place(new_scene, parameters):
     calm = scene.draw(truth_of(parameters), parameters)
     truth = truth_of(parameters, slip_velocity=[[0, 0, 0, -0.1, 0, 0, 0, 0]])  # right front wheel, to the right
     picture = scene.draw(truth, parameters)
-    shaft = at(picture, scene, [0.175, -0.16 - marks.BESIDE - 0.07, 0.007])
+    shaft = at(picture, scene, [0.175, -0.16 - marks.SLIP_BESIDE - 0.07, 0.007])
     assert shaft[0] > 180
     assert shaft[2] < 90
-    opposite = [0.175, 0.16 + marks.BESIDE + 0.07, 0.007]
+    opposite = [0.175, 0.16 + marks.SLIP_BESIDE + 0.07, 0.007]
     assert np.allclose(at(picture, scene, opposite), at(calm, scene, opposite), atol=3)
 
 

@@ -71,8 +71,8 @@ def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions |
 
 
 def _camera(options: CameraOptions) -> int:
-    from wlr_gym.perception.markers.camera import calibrate, save_camera
-    from wlr_gym.perception.vision.sheets import Board
+    from wlr_gym.perception.markers.calibration import Board, calibrate
+    from wlr_gym.perception.markers.camera import save_camera
     from wlr_gym.perception.vision.video import Frames
 
     if not 0.001 < options.square < 0.5:
@@ -104,8 +104,9 @@ def _camera(options: CameraOptions) -> int:
 
 def _targets(options: TargetsOptions) -> int:
     from wlr_gym.base.files import make_output_folder
+    from wlr_gym.perception.markers.calibration import Board
     from wlr_gym.perception.markers.targets import load_target
-    from wlr_gym.perception.vision.sheets import Board, board_page, target_pages, write_pages
+    from wlr_gym.perception.vision.sheets import board_page, target_pages, write_pages
 
     body, floor = load_target(options.markers), load_target(options.floor)
     make_output_folder(options.out)

@@ -1,4 +1,4 @@
-"""Drive two plants with the same goals and parameters, and report where they part, in units of sensor noise.
+"""Drive two plants with the same goals and parameters, and report where they diverge, in units of sensor noise.
 
 Writes compare.json, report.md, a map of all differences, a figure per motion, config.yaml and provenance.yaml. docs/compare.md
 says how to read them.
@@ -18,8 +18,9 @@ from wlr_gym.cli.options import EffectsOption
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from wlr_gym.data.compare import Comparison, Contender
-    from wlr_gym.data.compare_report import Table
+    from wlr_gym.data.compared_plants import ComparedPlant
+    from wlr_gym.data.comparison import Comparison
+    from wlr_gym.data.comparison_report import ReportTable
     from wlr_gym.data.excitations import Motion
     from wlr_gym.physics.effects import Patch
     from wlr_gym.robot import Robot
@@ -50,7 +51,7 @@ class Options(EffectsOption):
     every_effect: bool = False
     """Also compare with each effect of the library at its default severity, one at a time, on top of --effects."""
     threshold: float = 5.0
-    """Two signals have parted when they differ by more than this many units of sensor noise."""
+    """Two signals have diverged when they differ by more than this many units of sensor noise."""
     threads: int = 1
     """Worker threads of each plant."""
     plots: bool = True
@@ -71,10 +72,10 @@ def run(options: Options) -> int:
     from wlr_gym.base.files import make_output_folder, replace_file, write_json
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.cli import FAILED, OK
-    from wlr_gym.data.compare import parse_contender
-    from wlr_gym.data.compare_report import markdown, summary_table
+    from wlr_gym.data.compared_plants import parse_plant
+    from wlr_gym.data.comparison_report import markdown, summary_table
 
-    first, second = (parse_contender(text, options.physics_step) for text in options.plants)
+    first, second = (parse_plant(text, options.physics_step) for text in options.plants)
     if not options.threshold > 0.0:
         raise InputError(f"--threshold {options.threshold:g}: expected more than 0 units of sensor noise")
     motions, robot = _motions(options)
@@ -97,8 +98,8 @@ def run(options: Options) -> int:
 
 def _motions(options: Options) -> tuple[list[Motion], Robot]:
     from wlr_gym.data import read_dataset, read_run
-    from wlr_gym.data.compare import motion_of
     from wlr_gym.data.excitations import EXCITATIONS, excite
+    from wlr_gym.data.record import motion_of
     from wlr_gym.data.replay import robot_of
     from wlr_gym.robot import load_robot
 
@@ -118,7 +119,7 @@ def _motions(options: Options) -> tuple[list[Motion], Robot]:
 
 def _patches(options: Options, motions: Sequence[Motion], robot: Robot) -> list[Patch]:
     """Return what to compare with, each tried on the parameters first so that a refusal leaves no folder behind."""
-    from wlr_gym.data.compare import severe_patch
+    from wlr_gym.data.comparison import severe_patch
     from wlr_gym.physics.effects import EFFECTS, apply_patch, compose
     from wlr_gym.robot.parameters import Parameters
 
@@ -134,15 +135,15 @@ def _patches(options: Options, motions: Sequence[Motion], robot: Robot) -> list[
 def _compare_all(
     options: Options,
     motions: Sequence[Motion],
-    plants: tuple[Contender, Contender],
+    plants: tuple[ComparedPlant, ComparedPlant],
     robot: Robot,
     patches: Sequence[Patch],
     console: Console,
 ) -> Iterator[Comparison]:
     from rich.progress import track
 
-    from wlr_gym.data.compare import compare
-    from wlr_gym.data.compare_report import save_map, save_motion_plot
+    from wlr_gym.data.comparison import compare
+    from wlr_gym.data.comparison_report import save_map, save_motion_plot
 
     for patch in track(patches, description="comparing", console=console, disable=len(patches) == 1):
         found = compare(
@@ -169,17 +170,17 @@ def _resolved(options: Options, motions: Sequence[Motion], robot: Robot, patch: 
 
 
 def _print_all(console: Console, comparison: Comparison) -> None:
-    from wlr_gym.data.compare_report import tables
+    from wlr_gym.data.comparison_report import tables
 
     for table in tables(comparison):
         _print(console, table)
 
 
-def _print(console: Console, table: Table) -> None:
+def _print(console: Console, table: ReportTable) -> None:
     from rich import box
-    from rich.table import Table as RichTable
+    from rich.table import Table
 
-    shown = RichTable(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE, padding=(0, 1, 0, 0))
+    shown = Table(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE, padding=(0, 1, 0, 0))
     for number, heading in enumerate(table.headings):
         shown.add_column(heading, justify="left" if number == 0 else "right", overflow="fold")
     for row in table.rows:

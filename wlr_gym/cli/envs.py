@@ -54,7 +54,7 @@ def run(options: Options) -> int:
 
 
 def _draw(path: Path, randomization: Randomization) -> None:
-    from wlr_gym.learning.evaluation.floors import draw_floors
+    from wlr_gym.learning.evaluation.floor_plots import draw_floors
 
     if path.suffix not in PICTURES:
         raise InputError(f"--picture {path}: expected a file that ends in {', '.join(PICTURES)}")

@@ -67,8 +67,8 @@ def run(options: Options) -> int:
 
     from wlr_gym.base.files import make_output_folder, write_json
     from wlr_gym.base.provenance import record_provenance
-    from wlr_gym.data.plot import save_plots
     from wlr_gym.data.replay import prepare
+    from wlr_gym.data.replay_plots import save_plots
     from wlr_gym.physics.plants import REAL, check_backend
     from wlr_gym.render.video import check_video
 
@@ -140,10 +140,9 @@ def _replay_all(options: Options, runs: Sequence[Run], patch: Patch, console: Co
 def _repeat_all(options: Options, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
     """Drive the robot with each run's commands, log to ``out/robot``, compare; ends with the first run that is stopped."""
     from wlr_gym.data import read_run
-    from wlr_gym.data.compare import motion_of
     from wlr_gym.data.format import RunMeta
-    from wlr_gym.data.record import meta_of
-    from wlr_gym.data.repeat import compare_repeat
+    from wlr_gym.data.record import meta_of, motion_of
+    from wlr_gym.data.repetition import compare_repeat
     from wlr_gym.data.replay import robot_entry, robot_of
     from wlr_gym.hardware.driving import drive_robot
 

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from wlr_gym.data import Run
-    from wlr_gym.perception.vision import Analysis, Camera, Frame, Sample, Target
+    from wlr_gym.perception.markers.camera import Camera
+    from wlr_gym.perception.markers.targets import Target
+    from wlr_gym.perception.vision import VideoAnalysis
+    from wlr_gym.perception.vision.tracking import Sample, VideoFrame
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ def run(options: Options) -> int:
     from wlr_gym.base.files import make_output_folder
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.data import read_run
-    from wlr_gym.perception.vision import load_camera, load_target, save
+    from wlr_gym.perception.vision import load_camera, load_target, save_video_analysis
 
     if options.rate is not None and not options.rate > 0:
         raise InputError(f"--rate {options.rate:g}: expected more than 0")
@@ -93,7 +96,7 @@ def run(options: Options) -> int:
         if fresh and not (options.out / "film.avi").exists():  # a refusal leaves no folder behind
             shutil.rmtree(options.out, ignore_errors=True)
         raise
-    paths = save(analysis, options.out)
+    paths = save_video_analysis(analysis, options.out)
     settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
     record_provenance(options.out, settings | {"robot": analysis.robot.name})
     _print(analysis, console)
@@ -103,7 +106,7 @@ def run(options: Options) -> int:
 
 def _filmed(options: Options, camera: Camera, console: Console) -> Options:
     """Film, and say how to analyse the film (again); returns the options for that."""
-    from wlr_gym.perception.vision import film
+    from wlr_gym.perception.vision.live_camera import film
 
     if options.times is not None or options.rate is not None:
         raise InputError("--times, --rate: a live camera's frames have the times at which they come")
@@ -114,7 +117,7 @@ def _filmed(options: Options, camera: Camera, console: Console) -> Options:
     return replace(options, video=str(video), times=times)
 
 
-def _analyse(options: Options, measured: Run, camera: Camera, body: Target, floor: Target, console: Console) -> Analysis:
+def _analyse(options: Options, measured: Run, camera: Camera, body: Target, floor: Target, console: Console) -> VideoAnalysis:
     from contextlib import nullcontext
 
     from wlr_gym.perception.vision import Frames, analyse
@@ -124,7 +127,7 @@ def _analyse(options: Options, measured: Run, camera: Camera, body: Target, floo
     writer = AnnotatedVideo(options.out / "annotated.mp4", body) if options.annotate else nullcontext()
     with writer as video, console.status("tracking") as status:
 
-        def watch(frame: Frame, sample: Sample) -> None:
+        def watch(frame: VideoFrame, sample: Sample) -> None:
             if video is not None:
                 video.add(frame, sample)
             if frame.index % 30 == 0:
@@ -135,7 +138,7 @@ def _analyse(options: Options, measured: Run, camera: Camera, body: Target, floo
         )
 
 
-def _print(analysis: Analysis, console: Console) -> None:
+def _print(analysis: VideoAnalysis, console: Console) -> None:
     from rich import box
     from rich.table import Table
 

@@ -1,4 +1,4 @@
-"""What a run must be (else it is refused) and what is odd about one (reported, and work goes on).
+"""What a run must be (else it is refused) and what is odd about one (reported, not refused).
 
 Rows count from 0, as in the table. Limits on magnitudes sit far outside what the robot can do and far inside what the wrong
 unit gives, and look at medians or quantiles, so that a single bad sample is no "unit mistake".

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.random import generator
 from wlr_gym.data.format import Profile
-from wlr_gym.robot import Robot, load_robot
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot, load_robot
 
 Array = NDArray[np.float64]
 
+#: s between the goals of a motion.
+CONTROL_PERIOD = 0.02
 #: s of rest before and after every motion.
 REST = 1.0
 #: What a careful operator writes into the servos' profile registers.
@@ -28,7 +30,6 @@ GENTLE = Profile(wheel_acceleration=11.2, leg_velocity=1.44, leg_acceleration=15
 TOP_SPEED = 5.5
 #: rad; leg goals stay this far off the leg limits.
 LEG_MARGIN = 0.1
-_WHEELS = slice(4, 8)
 _DOWN = np.pi / 2
 
 
@@ -55,7 +56,7 @@ class Motion:
 
     def travel(self, wheel_radius: float) -> Array:
         """Return the way rolled after each tick (ticks,), m, forward positive: without slip, motors that are off left out."""
-        wheels = self.goals[:, _WHEELS]
+        wheels = self.goals[:, WHEEL_SLICE]
         driven = np.isfinite(wheels).sum(axis=1)
         return wheel_radius * self.period * np.cumsum(np.nansum(wheels, axis=1) / np.maximum(driven, 1))
 
@@ -84,14 +85,16 @@ class Excitation:
     profile: Profile = GENTLE
 
 
-def excite(name: str, seed: int = 0, robot: Robot | None = None, period: float = 0.02, seconds: float | None = None) -> Motion:
+def excite(
+    name: str, seed: int = 0, robot: Robot | None = None, period: float = CONTROL_PERIOD, seconds: float | None = None
+) -> Motion:
     """Return one motion of :data:`EXCITATIONS`.
 
     Args:
         name: of the excitation; every one has its own random stream.
         seed: another seed is another motion of the same kind.
         robot: whose leg limits and lengths; None = nominal.
-        period: s per control tick.
+        period: s per control step.
         seconds: cut it off after this long; None = all of it.
 
     Raises:
@@ -109,10 +112,10 @@ def excite(name: str, seed: int = 0, robot: Robot | None = None, period: float =
     t: Array = period * np.arange(round((length + 2 * REST) / period), dtype=np.float64)
     own: Array = np.clip(t - REST, 0.0, length)
     goals = np.asarray(course(own), dtype=np.float64)
-    goals[(t < REST) | (t > REST + length), _WHEELS] *= 0.0  # NaN stays NaN
+    goals[(t < REST) | (t > REST + length), WHEEL_SLICE] *= 0.0  # NaN stays NaN
     low, high = robot.leg_limits
-    goals[:, :4] = np.clip(goals[:, :4], low + LEG_MARGIN, high - LEG_MARGIN)
-    goals[:, _WHEELS] = np.clip(goals[:, _WHEELS], -TOP_SPEED, TOP_SPEED)
+    goals[:, LEG_SLICE] = np.clip(goals[:, LEG_SLICE], low + LEG_MARGIN, high - LEG_MARGIN)
+    goals[:, WHEEL_SLICE] = np.clip(goals[:, WHEEL_SLICE], -TOP_SPEED, TOP_SPEED)
     return Motion(name, goals, period, excitation.profile).cut(seconds)
 
 
@@ -292,7 +295,7 @@ def _chirp(rng: np.random.Generator, robot: Robot) -> Course:
             own = np.clip(t - part * length, 0.0, length)
             phase = 2 * np.pi * low * length / np.log(high / low) * ((high / low) ** (own / length) - 1.0)
             wave = amplitude * np.sin(phase) * _fade(own, length, 0.3)
-            columns = slice(0, 4) if part == 2 else _WHEELS
+            columns = LEG_SLICE if part == 2 else WHEEL_SLICE
             goals[:, columns] += np.multiply.outer(wave, sign)
         return goals
 

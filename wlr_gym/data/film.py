@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.anchor import measured_state
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import ReplayResult
+from wlr_gym.data.run_states import measured_state
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantState, Truth, standing_state
 from wlr_gym.render.view import View
 from wlr_gym.robot.parameters import Parameters

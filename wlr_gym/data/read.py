@@ -16,7 +16,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.data.check import Finding, check_names, check_table
 from wlr_gym.data.format import META_FILE, SUFFIXES, RunMeta
-from wlr_gym.data.simulation import Simulation, read_simulation
+from wlr_gym.data.simulation_record import Simulation, read_simulation
 
 if TYPE_CHECKING:
     import pandas
@@ -29,7 +29,7 @@ class Run:
     """One measured run.
 
     Attributes:
-        table: one row per control tick, columns of :data:`wlr_gym.data.format.COLUMNS`, float64.
+        table: one row per control step, columns of :data:`wlr_gym.data.format.COLUMNS`, float64.
         meta: what ``meta.yaml`` beside the file says; defaults where there is none.
         path: the file it came from.
         findings: what is odd about it (gaps, dead channels, ...).

@@ -1,4 +1,4 @@
-"""Motions as files, and runs of a simulator that was driven through one: what the robot's own log would hold."""
+"""Motions from and to files; simulated runs: what the robot's own log would hold after it was driven through a motion."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, replace_file
-from wlr_gym.data.compare import SETTLE, standing_at
-from wlr_gym.data.excitations import Motion
+from wlr_gym.data.compared_plants import SETTLE
+from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
-from wlr_gym.data.read import read_meta
-from wlr_gym.data.replay import profile_parameters
-from wlr_gym.data.simulation import SENSED, Simulation, channels, departures, start_of
+from wlr_gym.data.read import Run, read_meta
+from wlr_gym.data.replay import held_goals, profile_parameters
+from wlr_gym.data.run_states import standing_at
+from wlr_gym.data.sensor_columns import SENSED, channels
+from wlr_gym.data.simulation_record import Simulation, departures, start_of
 from wlr_gym.data.write import write_meta, write_run
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
 from wlr_gym.physics.plants import SIMULATORS, make_plant
 from wlr_gym.physics.plants.base import PlantOptions
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import JOINTS, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -50,12 +52,12 @@ def write_commands(folder: Path, motion: Motion) -> Path:
     return path
 
 
-def read_commands(path: Path, period: float = 0.02) -> Motion:
+def read_commands(path: Path, period: float = CONTROL_PERIOD) -> Motion:
     """Read a motion from the goals in a command file or a whole run; its profile from the ``meta.yaml`` beside it.
 
     Args:
         path: file with the columns ``t`` and ``cmd_*``; others are not looked at. Each row's goals hold until the next row.
-        period: s per control tick.
+        period: s per control step.
 
     Raises:
         InputError: no such file, a column that is missing, times that do not increase, goals that are not rad and rad/s.
@@ -84,6 +86,16 @@ def read_commands(path: Path, period: float = 0.02) -> Motion:
     ticks = round((t[-1] - t[0]) / period) + 1
     rows = np.searchsorted(t - t[0], period * (np.arange(ticks) + 0.5), side="right") - 1
     return Motion(path.stem, goals[rows], period, read_meta(path.parent).profile)
+
+
+def motion_of(run: Run) -> Motion:
+    """Return the commands of a measured run at the control rate, each row's from its time on; NaN = torque off."""
+    t = run["t"] - run["t"][0]
+    ticks = round(t[-1] / CONTROL_PERIOD) + 1
+    rows = np.searchsorted(t, CONTROL_PERIOD * (np.arange(ticks) + 0.5), side="right") - 1
+    commanded = np.stack([np.isfinite(run[f"cmd_{joint}"]) for joint in JOINTS], axis=1)
+    goals = np.where(commanded, held_goals(run), np.nan)[rows]
+    return Motion(run.name, goals, CONTROL_PERIOD, run.meta.profile)
 
 
 # ---- runs ------------------------------------------------------------------------------------------------------------
@@ -159,7 +171,7 @@ def record_simulation(
 def start_goals(motion: Motion, robot: Robot) -> Array:
     """Return the goals (8,) a motion starts from: a leg without one at home, wheels at rest."""
     goals = motion.goals[0].copy()
-    goals[4:] = 0.0
+    goals[WHEEL_SLICE] = 0.0
     return np.where(np.isnan(goals), robot.home.leg_angle, goals)
 
 

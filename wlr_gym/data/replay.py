@@ -5,7 +5,7 @@ reckoning. *Segments*: the run is cut into pieces of about a second, each starte
 drift does not swamp what is missing in the model. All segments of a run are one batch.
 
 The plant ticks on its own clock (2 ms by default). A goal acts from the row it was written in until the next row's, at the
-measured times, so jitter and lost ticks are replayed as they happened; simulated channels are interpolated to the rows'
+measured times, so jitter and lost control steps are replayed as they happened; simulated channels are interpolated to the rows'
 times. Command delays shift the measured times of the goals, so that a segment starts with the goals that were under way.
 """
 
@@ -22,14 +22,16 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.settings import read_yaml
-from wlr_gym.data.anchor import euler_angles, measured_state, rotation, start_state, starts_at_rest
+from wlr_gym.data.body_pose import euler_angles
 from wlr_gym.data.format import ANGLES_OF_THE_BODY, CHANNELS, COLUMNS, COMMANDS, META_FILE, Profile
 from wlr_gym.data.noise import channel_noise
 from wlr_gym.data.read import Run
+from wlr_gym.data.run_states import measured_state, start_state, starts_at_rest
 from wlr_gym.physics.effects import Source, apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors, Truth
-from wlr_gym.robot import JOINTS, Robot, load_robot
+from wlr_gym.physics.plants.sensors import rotation
+from wlr_gym.robot import JOINTS, LEG_SLICE, WHEEL_SLICE, Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -89,7 +91,7 @@ class ReplayResult:
 
 
 def robot_of(run: Run, robot: Robot | str | Path | None = None) -> Robot:
-    """Return the robot a run is of: the one asked for, else the one its meta data name, else the nominal one.
+    """Return the robot a run is of: ``robot`` if given, else the one its meta data name, else the nominal one.
 
     ``meta.yaml`` may name a robot file (relative to itself), a config, or the ``name`` inside a config; see
     :func:`robot_entry`.
@@ -120,9 +122,9 @@ def robot_entry(robot: str, folder: Path) -> str | None:
 def profile_parameters(parameters: Parameters, profile: Profile) -> Parameters:
     """Return ``parameters`` with the servo profile of a run."""
     result = parameters.copy()
-    result["servo.profile_velocity"][:, :4] = profile.leg_velocity
-    result["servo.profile_acceleration"][:, :4] = profile.leg_acceleration
-    result["servo.profile_acceleration"][:, 4:] = profile.wheel_acceleration
+    result["servo.profile_velocity"][:, LEG_SLICE] = profile.leg_velocity
+    result["servo.profile_acceleration"][:, LEG_SLICE] = profile.leg_acceleration
+    result["servo.profile_acceleration"][:, WHEEL_SLICE] = profile.wheel_acceleration
     return result
 
 
@@ -242,12 +244,12 @@ def _simulate(
     parameters["command.delay"] = 0.0  # the goals come delayed
     snapshots = np.array([] if passing is None else np.rint((passing - begin[0]) / clock), dtype=int).tolist()
     states: list[PlantState] = []
-    wheels = state.joint_position[:, 4:]
+    wheels = state.joint_position[:, WHEEL_SLICE]
     offset = np.asarray(run.meta.marker_offset)
     values = np.empty((ticks + 1, plant.count, len(CHANNELS)))
     try:
         sensors = plant.reset(parameters=parameters, state=replace(state, time=begin - run["t"][0]))
-        first_reading = sensors.joint_position[:, 4:].copy()
+        first_reading = sensors.joint_position[:, WHEEL_SLICE].copy()
         for tick in range(ticks + 1):
             states += [plant.get_state() for _ in range(snapshots.count(tick))]
             values[tick] = _readings(sensors, plant.truth(), wheels - first_reading, offset)
@@ -287,7 +289,7 @@ def held_goals(run: Run) -> Array:
     commands = pandas.DataFrame({name: run[name] for name in COMMANDS}).ffill().bfill().to_numpy()
     measured = np.stack([run[f"pos_{joint}"] for joint in JOINTS], axis=1)
     stay = np.zeros(8)
-    for joint in np.flatnonzero(np.isnan(commands[:, :4]).all(axis=0)):
+    for joint in np.flatnonzero(np.isnan(commands[:, LEG_SLICE]).all(axis=0)):
         angles = measured[np.isfinite(measured[:, joint]), joint]
         stay[joint] = angles[0] if angles.size else 0.0
     return np.where(np.isnan(commands), stay, commands)

@@ -16,7 +16,7 @@ from wlr_gym.base.files import replace_file
 from wlr_gym.data.check import check_table
 from wlr_gym.data.format import COLUMNS, META_FILE, SUFFIXES, RunMeta
 from wlr_gym.data.read import read_meta
-from wlr_gym.data.simulation import Simulation, write_simulation
+from wlr_gym.data.simulation_record import Simulation, write_simulation
 
 if TYPE_CHECKING:
     import pandas

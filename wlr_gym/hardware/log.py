@@ -18,7 +18,7 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, RunMeta
-from wlr_gym.data.simulation import SENSED, channels
+from wlr_gym.data.sensor_columns import SENSED, channels
 from wlr_gym.data.write import write_meta
 from wlr_gym.hardware.safety.rules import View
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors

@@ -1,8 +1,8 @@
 """Frames of the moving robot and its markers, to scale, for tests, tutorials and the vision bench.
 
-A ray caster: every sub-sample of a pixel is followed through the lens to flat patches (floor, marker plate, body, legs,
+A ray caster: every sub-sample of a pixel is followed through the lens to flat facets (floor, marker plate, body, legs,
 wheels), each sub-sample at its own instant of the exposure. Then lens blur, uneven light, a shadow's edge, noise. It shares no
-code with the detector: of :mod:`wlr_gym.perception.vision` it takes only the data of cameras and targets.
+code with the detector: of :mod:`wlr_gym.perception.markers` it takes only the data of cameras and targets.
 """
 
 from __future__ import annotations
@@ -23,16 +23,27 @@ from wlr_gym.robot import CORNER_SIGNS, Robot
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-WHITE, BLACK, FLOOR, DARK, GREY = 225.0, 25.0, 130.0, 45.0, 80.0
-#: Size (m) of the sheet with the robot's markers, and of a sheet with a floor marker in outer radii of the marker.
+# Brightness, grey levels.
+WHITE = 225.0
+BLACK = 25.0
+FLOOR = 130.0
+DARK = 45.0
+GREY = 80.0
+#: m; size of the sheet with the robot's markers.
 PLATE = (0.40, 0.29)
+#: Half the side of a sheet with a floor marker, in outer radii of the marker.
 _SHEET = 1.6
-_RECTANGLE, _DISC = 0.0, 1.0
-_FEW, _FLAT = 3, 8.0  # rays a side in every pixel; brightness they may differ by in a pixel without an edge
+# Outline of a facet.
+_RECTANGLE = 0.0
+_DISC = 1.0
+#: Rays a side in every pixel.
+_FEW = 3
+#: Grey levels by which they may differ in a pixel without an edge.
+_FLAT = 8.0
 
 
 @dataclass(frozen=True)
-class Pose:
+class ScenePose:
     """A pose in a frame: position (3,) m and rotation (3, 3) to that frame; leg angles (4,) rad."""
 
     position: Array
@@ -62,7 +73,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Patch:
+class Facet:
     """A flat piece: centre (3,), axes (2, 3) along its sides, half sizes (m), brightness; its markers in its own plane.
 
     ``circles`` is (M, 5): x, y, outer radius and the radii of white disc and dot, m. ``tags`` is a list of (x, y, side m,
@@ -78,22 +89,22 @@ class Patch:
     tags: tuple[tuple[float, float, float, NDArray[np.uint8]], ...] = ()
     texture: float = 0.0
 
-    def moved(self, position: Array, rotation: Array) -> Patch:
-        """Return the patch in another frame."""
+    def moved(self, position: Array, rotation: Array) -> Facet:
+        """Return the facet in another frame."""
         return replace(self, centre=rotation @ self.centre + position, axes=self.axes @ rotation.T)
 
 
-def look_at(eye: ArrayLike, target: ArrayLike, up: Sequence[float] = (1.0, 0.0, 0.0)) -> Pose:
+def look_at(eye: ArrayLike, target: ArrayLike, up: Sequence[float] = (1.0, 0.0, 0.0)) -> ScenePose:
     """Pose of the floor frame in the frame of a camera at ``eye`` that looks at ``target``, image up along ``up``."""
     forward = np.subtract(target, eye).astype(float)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    return Pose(-rotation @ np.asarray(eye, float), rotation)
+    return ScenePose(-rotation @ np.asarray(eye, float), rotation)
 
 
-def view(tilt: float, distance: float, target: Sequence[float] = (0.0, 0.0, 0.1), turn: float = 0.0) -> Pose:
+def view(tilt: float, distance: float, target: Sequence[float] = (0.0, 0.0, 0.1), turn: float = 0.0) -> ScenePose:
     """Floor in the camera frame: ``distance`` m from ``target``, ``tilt`` rad from straight above, ``turn`` rad around."""
     away = np.array([-math.cos(turn) * math.sin(tilt), -math.sin(turn) * math.sin(tilt), math.cos(tilt)])
     return look_at(np.asarray(target) + distance * away, target, (math.cos(turn), math.sin(turn), 0.0))
@@ -106,7 +117,7 @@ def rotation_of(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> Array:
     return turn @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]) @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
 
 
-# --- patches ----------------------------------------------------------------------------------------------------------
+# --- facets ----------------------------------------------------------------------------------------------------------
 
 
 def circles_of(target: Target) -> Array:
@@ -115,41 +126,41 @@ def circles_of(target: Target) -> Array:
     return np.array(rows, float)
 
 
-def floor_patches(target: Target | None) -> list[Patch]:
+def floor_facets(target: Target | None) -> list[Facet]:
     """The floor, and one sheet of paper per floor marker."""
     flat = np.eye(3)[:2]
-    patches = [Patch(np.zeros(3), flat, (50.0, 50.0), FLOOR, texture=0.12)]
+    facets = [Facet(np.zeros(3), flat, (50.0, 50.0), FLOOR, texture=0.12)]
     for x, y, *radii in circles_of(target) if target else ():
         half = _SHEET * radii[0]
-        patches.append(Patch(np.array([x, y, 1e-4]), flat, (half, half), WHITE, circles=np.array([[0.0, 0.0, *radii]])))
-    return patches
+        facets.append(Facet(np.array([x, y, 1e-4]), flat, (half, half), WHITE, circles=np.array([[0.0, 0.0, *radii]])))
+    return facets
 
 
-def plate_patch(target: Target, tags: Sequence[tuple[float, float, float, NDArray[np.uint8]]] = ()) -> Patch:
+def plate_facet(target: Target, tags: Sequence[tuple[float, float, float, NDArray[np.uint8]]] = ()) -> Facet:
     """The plate on top of the body, with ring markers, or with ``tags`` in their place."""
     circles = circles_of(target) if not tags else np.zeros((0, 5))
     half = (PLATE[0] / 2, PLATE[1] / 2)
-    return Patch(np.array([0, 0, target.positions[0, 2]]), np.eye(3)[:2], half, WHITE, circles=circles, tags=tuple(tags))
+    return Facet(np.array([0, 0, target.positions[0, 2]]), np.eye(3)[:2], half, WHITE, circles=circles, tags=tuple(tags))
 
 
-def robot_patches(robot: Robot, legs: Array) -> list[Patch]:
+def robot_facets(robot: Robot, legs: Array) -> list[Facet]:
     """Body, legs and wheels in the body frame."""
     x, y, z = np.eye(3)
     length, width, height = (half / 2 for half in robot.body.size)
-    patches = [Patch(height * z, np.stack([x, y]), (length, width), DARK)]
-    patches += [Patch(s * width * y, np.stack([x, z]), (length, height), DARK) for s in (-1, 1)]
-    patches += [Patch(s * length * x, np.stack([y, z]), (width, height), DARK) for s in (-1, 1)]
+    facets = [Facet(height * z, np.stack([x, y]), (length, width), DARK)]
+    facets += [Facet(s * width * y, np.stack([x, z]), (length, height), DARK) for s in (-1, 1)]
+    facets += [Facet(s * length * x, np.stack([y, z]), (width, height), DARK) for s in (-1, 1)]
     for (sx, sy), angle in zip(CORNER_SIGNS, legs, strict=True):
         along = np.array([math.cos(angle), 0, -math.sin(angle)])
         hip = np.array([sx * robot.hip_position.x, sy * (robot.hip_position.y + 0.02), robot.hip_position.z])
         axle = hip + robot.leg.length * along
-        patches.append(Patch(hip + robot.leg.length / 2 * along, np.stack([along, y]), (robot.leg.length / 2, 0.012), GREY))
-        patches.append(Patch(hip + robot.leg.length / 2 * along + 0.012 * sy * y, np.stack([along, np.cross(y, along)]),
+        facets.append(Facet(hip + robot.leg.length / 2 * along, np.stack([along, y]), (robot.leg.length / 2, 0.012), GREY))
+        facets.append(Facet(hip + robot.leg.length / 2 * along + 0.012 * sy * y, np.stack([along, np.cross(y, along)]),
                              (robot.leg.length / 2, 0.012), GREY))  # fmt: skip
         radius, half = robot.wheel.radius, robot.wheel.width / 2
-        patches.append(Patch(axle, np.stack([x, y]), (radius, half), BLACK))
-        patches += [Patch(axle + s * half * y, np.stack([x, z]), (radius, radius), BLACK, disc=True) for s in (-1, 1)]
-    return patches
+        facets.append(Facet(axle, np.stack([x, y]), (radius, half), BLACK))
+        facets += [Facet(axle + s * half * y, np.stack([x, z]), (radius, radius), BLACK, disc=True) for s in (-1, 1)]
+    return facets
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------
@@ -159,11 +170,11 @@ class Renderer:
     """Frames of one camera that stands still over a still floor.
 
     Args:
-        camera: intrinsics. floor_in_camera: where the floor frame is. still: patches in the floor frame that never move.
+        camera: intrinsics. floor_in_camera: where the floor frame is. still: facets in the floor frame that never move.
         samples: rays a side, per pixel with an edge.
     """
 
-    def __init__(self, camera: Camera, floor_in_camera: Pose, still: Sequence[Patch], samples: int = 12) -> None:
+    def __init__(self, camera: Camera, floor_in_camera: ScenePose, still: Sequence[Facet], samples: int = 12) -> None:
         self.camera, self.floor_in_camera, self.still, self.samples = camera, floor_in_camera, tuple(still), samples
         self._rays = _rays(camera)
         whole = np.array([0, 0, camera.width, camera.height])
@@ -173,11 +184,11 @@ class Renderer:
         packed = self._pack([self.still])
         _cast(self._rays, *packed, whole, samples, self._background)
 
-    def frame(self, moving: Sequence[Sequence[Patch]], look: Look, seed: int) -> Image:
+    def frame(self, moving: Sequence[Sequence[Facet]], look: Look, seed: int) -> Image:
         """Render one frame.
 
         Args:
-            moving: patches in the floor frame at instants spread evenly over the exposure (one list each, same patches).
+            moving: facets in the floor frame at instants spread evenly over the exposure (one list each, same facets).
             look: light, blur, noise. seed: of the noise.
         """
         image = self._background.copy()
@@ -187,31 +198,31 @@ class Renderer:
         return develop(image, look, seed)
 
     def _pack(
-        self, instants: Sequence[Sequence[Patch]]
+        self, instants: Sequence[Sequence[Facet]]
     ) -> tuple[Array, Array, NDArray[np.int64], Array, Array, NDArray[np.uint8]]:
         turn, shift = self.floor_in_camera.rotation, self.floor_in_camera.position
-        seen = [[patch.moved(shift, turn) for patch in instant] for instant in instants]
+        seen = [[facet.moved(shift, turn) for facet in instant] for instant in instants]
         geometry = np.array([[np.concatenate([p.centre, p.axes.ravel(), np.cross(*p.axes)]) for p in i] for i in seen])
         circles, tags, cells, kinds, offset = [], [], [], [], 0
-        for patch in seen[0]:
+        for facet in seen[0]:
             first = len(circles), len(tags)
-            circles += list(patch.circles)
-            for x, y, side, bits in patch.tags:
+            circles += list(facet.circles)
+            for x, y, side, bits in facet.tags:
                 tags.append((x, y, side, len(bits), offset))
                 cells.append(np.asarray(bits, np.uint8).ravel())
                 offset += bits.size
-            disc = _DISC if patch.disc else _RECTANGLE
-            kinds.append((*patch.half, patch.shade, disc, first[0], len(circles), first[1], len(tags), patch.texture))
+            disc = _DISC if facet.disc else _RECTANGLE
+            kinds.append((*facet.half, facet.shade, disc, first[0], len(circles), first[1], len(tags), facet.texture))
         bits = np.concatenate(cells) if cells else np.zeros(0, np.uint8)
         boxes = np.array([self._box(same) for same in zip(*instants, strict=True)])
         return geometry, np.array(kinds, float), boxes, _rows(circles, 5), _rows(tags, 5), bits
 
-    def _box(self, patches: Sequence[Patch]) -> NDArray[np.int64]:
-        """Pixels (x0, y0, x1, y1) that show the patches, with a margin."""
+    def _box(self, facets: Sequence[Facet]) -> NDArray[np.int64]:
+        """Pixels (x0, y0, x1, y1) that show the facets, with a margin."""
         corners = []
-        for patch in patches:
+        for facet in facets:
             for s, t in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-                corners.append(patch.centre + s * patch.half[0] * patch.axes[0] + t * patch.half[1] * patch.axes[1])
+                corners.append(facet.centre + s * facet.half[0] * facet.axes[0] + t * facet.half[1] * facet.axes[1])
         points = np.array(corners) @ self.floor_in_camera.rotation.T + self.floor_in_camera.position
         limit = [self.camera.width, self.camera.height]
         if (points[:, 2] < 0.05).any() or np.abs(points).max() > 20:
@@ -317,16 +328,16 @@ def _shade(kind: Any, circles: Any, tags: Any, cells: Any, x: float, y: float) -
 def _cast(
     rays: Any, geometry: Any, kinds: Any, boxes: Any, circles: Any, tags: Any, cells: Any, box: Any, samples: Any, image: Any
 ) -> None:
-    """Render the pixels of ``box``; ``geometry`` is (instants, patches, 12).
+    """Render the pixels of ``box``; ``geometry`` is (instants, facets, 12).
 
     A few rays per pixel first; where they differ there is an edge, and samples x samples rays say where.
     """
-    patches = geometry.shape[1]
-    near, corners = np.empty(patches, np.int64), np.empty((4, 2))
+    facets = geometry.shape[1]
+    near, corners = np.empty(facets, np.int64), np.empty((4, 2))
     for v in range(box[1], box[3]):
         for u in range(box[0], box[2]):
             count = 0
-            for p in range(patches):
+            for p in range(facets):
                 if boxes[p, 0] <= u < boxes[p, 2] and boxes[p, 1] <= v < boxes[p, 3]:
                     near[count] = p
                     count += 1

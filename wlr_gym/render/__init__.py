@@ -6,13 +6,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from wlr_gym.render.compare import side_by_side
+    from wlr_gym.render.film_pair import side_by_side
     from wlr_gym.render.scene import Scene
     from wlr_gym.render.video import write_video
     from wlr_gym.render.view import View
     from wlr_gym.render.viewer import Viewer
 
-_PARTS = {"Scene": "scene", "View": "view", "Viewer": "viewer", "side_by_side": "compare", "write_video": "video"}
+_PARTS = {"Scene": "scene", "View": "view", "Viewer": "viewer", "side_by_side": "film_pair", "write_video": "video"}
 
 __all__ = ["Scene", "View", "Viewer", "side_by_side", "write_video"]
 

@@ -21,7 +21,7 @@ LOOK_HEIGHT = 0.09
 
 
 @dataclass(frozen=True)
-class Camera:
+class FollowCamera:
     """A camera that goes along with the robot.
 
     Attributes:
@@ -38,10 +38,10 @@ class Camera:
 
 
 CAMERAS = {
-    "follow": Camera(math.radians(62), math.radians(-30), 1.25),
-    "chase": Camera(math.radians(0), math.radians(-28), 1.25, turns=True),
-    "side": Camera(math.radians(90), math.radians(-12), 1.1),
-    "top": Camera(math.radians(90), math.radians(-89.9), 1.5),
+    "follow": FollowCamera(math.radians(62), math.radians(-30), 1.25),
+    "chase": FollowCamera(math.radians(0), math.radians(-28), 1.25, turns=True),
+    "side": FollowCamera(math.radians(90), math.radians(-12), 1.1),
+    "top": FollowCamera(math.radians(90), math.radians(-89.9), 1.5),
 }
 
 
@@ -51,7 +51,7 @@ def up_direction(slope: Array) -> Array:
     return np.array([pitch, roll, math.sqrt(max(0.0, 1.0 - pitch**2 - roll**2))])
 
 
-def aim(scene: mujoco.MjvScene, camera: Camera, place: Array, yaw: float, up: Array) -> None:
+def aim(scene: mujoco.MjvScene, camera: FollowCamera, place: Array, yaw: float, up: Array) -> None:
     """Point the scene's camera at a robot, with gravity pulling down in the picture: a slope is seen as a slope.
 
     Args:

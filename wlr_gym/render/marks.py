@@ -20,18 +20,29 @@ from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-#: Arrows: m of length per m/s of slip and per N of friction, and what is too little to draw.
-SLIP_SCALE, SLIP_FLOOR = 2.0, 0.003
-FORCE_SCALE, FORCE_FLOOR = 0.025, 0.2
+#: m of arrow per m/s of slip.
+SLIP_SCALE = 2.0
+#: m/s; less slip is not drawn.
+SLIP_FLOOR = 0.003
+#: m of arrow per N of friction.
+FORCE_SCALE = 0.025
+#: N; less friction is not drawn.
+FORCE_FLOOR = 0.2
+#: m.
 LONGEST_ARROW = 0.4
+#: m; half the width of an arrow.
 SHAFT = 0.006
-#: m; slip and force arrows start this far outside the wheel's middle plane, beside the tyre, where they can be seen.
-BESIDE, BESIDE_SLIP_ARROWS = 0.022, 0.040
+#: m; slip arrows start this far outside the wheel's middle plane, beside the tyre, where they can be seen.
+SLIP_BESIDE = 0.022
+#: m; force arrows start outside of them.
+FORCE_BESIDE = 0.040
 #: m; areas are drawn on the floor this far around the robot.
 REACH = 15.0
 LAYER = 4e-4
-#: m: half the width of a trail, and the length of its pieces.
-LINE, PIECE = 0.004, 0.03
+#: m; half the width of a trail.
+LINE = 0.004
+#: m; length of its pieces.
+PIECE = 0.03
 
 
 @dataclass(frozen=True)
@@ -141,13 +152,13 @@ def slip_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) ->
     slip = truth.slip_velocity[row].reshape(4, 2)
     speed = np.hypot(slip[:, 0], slip[:, 1])
     colours = [slip_colour(float(value)) for value in speed]
-    return _arrows(stage, parameters, row, SLIP_SCALE * slip, SLIP_SCALE * SLIP_FLOOR, BESIDE, colours)
+    return _arrows(stage, parameters, row, SLIP_SCALE * slip, SLIP_SCALE * SLIP_FLOOR, SLIP_BESIDE, colours)
 
 
 def force_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) -> list[Arrow]:
     """Return one arrow per wheel: the floor's friction force on it."""
     force = truth.contact_force[row].reshape(4, 3)[:, :2]
-    return _arrows(stage, parameters, row, FORCE_SCALE * force, FORCE_SCALE * FORCE_FLOOR, BESIDE_SLIP_ARROWS, [FORCE] * 4)
+    return _arrows(stage, parameters, row, FORCE_SCALE * force, FORCE_SCALE * FORCE_FLOOR, FORCE_BESIDE, [FORCE] * 4)
 
 
 def _arrows(

@@ -14,9 +14,14 @@ from wlr_gym.render.colours import friction_colour
 
 Picture = NDArray[np.uint8]
 
-PAPER, INK = (255, 255, 255, 205), (25, 28, 32, 255)
-#: Width of the friction bar and the coefficients at its ends.
-BAR, BAR_RANGE = 120, (0.0, 1.0)
+# Colours (red, green, blue, opacity), 0 to 255.
+PAPER = (255, 255, 255, 205)
+INK = (25, 28, 32, 255)
+#: Pixels; width of the friction bar.
+BAR = 120
+#: Friction coefficients at its ends.
+BAR_RANGE = (0.0, 1.0)
+#: Pixels.
 MARGIN = 8
 
 

@@ -28,8 +28,13 @@ SHAPING = ("hip.position", "leg.length", "wheel.radius", "payload.mass", "payloa
 _SHAPES = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "geom_rbound", "geom_aabb", "geom_rgba", "qpos0")
 PAYLOAD_DENSITY = 2500.0  # kg/m3, for its size only
 SPOKES = 3
-METAL, DARK, ACCENT = (0.72, 0.74, 0.78, 1.0), (0.16, 0.17, 0.19, 1.0), (1.0, 0.45, 0.05, 1.0)
-BODY, TYRE, WHITE = (0.16, 0.32, 0.55, 1.0), (0.11, 0.11, 0.12, 1.0), (0.95, 0.95, 0.95, 1.0)
+# Colours (red, green, blue, opacity), 0 to 1.
+METAL = (0.72, 0.74, 0.78, 1.0)
+DARK = (0.16, 0.17, 0.19, 1.0)
+ACCENT = (1.0, 0.45, 0.05, 1.0)
+BODY = (0.16, 0.32, 0.55, 1.0)
+TYRE = (0.11, 0.11, 0.12, 1.0)
+WHITE = (0.95, 0.95, 0.95, 1.0)
 
 
 class Stage:

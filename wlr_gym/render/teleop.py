@@ -10,8 +10,14 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
 
-#: Key codes of GLFW, which the viewer reports.
-UP, DOWN, LEFT, RIGHT, SPACE, RESET = 265, 264, 263, 262, 32, 82
+# Key codes of GLFW, which the viewer reports.
+UP = 265
+DOWN = 264
+LEFT = 263
+RIGHT = 262
+SPACE = 32
+#: R.
+RESET = 82
 #: A tap changes a command by this share of its range on the named side, of the other where it has none there.
 TAP = 0.1
 #: What the arrow keys and sticks steer: command -> (more, less).

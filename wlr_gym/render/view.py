@@ -9,8 +9,10 @@ from typing import Any
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.render.camera import CAMERAS
 
-#: Pixels: smallest and largest width and height.
-SMALLEST, LARGEST = 64, 4096
+#: Pixels; smallest width and height.
+SMALLEST = 64
+#: Pixels; largest width and height.
+LARGEST = 4096
 
 
 @dataclass(frozen=True)

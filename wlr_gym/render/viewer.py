@@ -156,7 +156,7 @@ class Viewer:
         eye.azimuth = np.degrees(start.azimuth + (stage.yaw() if start.turns else 0.0))
 
     def _pace(self, period: float) -> None:
-        """Wait for the next tick; after a hold-up of more than a few ticks go on from now instead of catching up."""
+        """Wait for the next tick; after a hold-up of more than a few, continue from now instead of catching up."""
         now = self._clock()
         if now > self._next + 5 * period:
             self._next = now

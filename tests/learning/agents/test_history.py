@@ -6,7 +6,7 @@ from ppo_runs import ENVIRONMENT, train
 
 from wlr_gym.hardware.deployment import act_again, deploy
 from wlr_gym.learning.evaluation import make_core, play, read_subjects
-from wlr_gym.learning.evaluation.campaign import Condition
+from wlr_gym.learning.evaluation.conditions import Condition
 from wlr_gym.policy import contract_of, export_policy, make_policy, policy_environment
 
 pytest.importorskip("stable_baselines3")

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from observed_runs import PERIOD, estimated, observe, plain_odometry, simulate, slip_in_truth_order
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver, axis
+from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver, kalman
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, PlantOptions, standing_state
 from wlr_gym.robot import CORNER_SIGNS, load_robot
@@ -245,21 +245,21 @@ def test_the_filter_is_the_textbooks():
     transition = np.diag([1.0, 1.0, 1.0, *decay])
     transition[0, 1:3], transition[1, 2] = (step, -0.5 * step**2), -step
     p = start.copy()
-    axis.predict(p, step, decay, noise)
+    kalman.predict(p, step, decay, noise)
     np.testing.assert_allclose(p, transition @ start @ transition.T + np.diag(noise), rtol=1e-12, atol=1e-12)
 
     age, weights, column = 0.1, np.array([0.1, 0.4, 0.3, 0.2]), np.empty(7)
     measurements = [
-        (axis.see_wheel(p, 2, column), column.copy(), np.array([0, 1, 0, 0, 0, 1, 0])),
-        (axis.see_balance(p, weights, column), column.copy(), np.array([0, 0, 0, *weights])),
-        (axis.see_position(p, age, column), column.copy(), h := np.array([1, -age, -0.5 * age**2, 0, 0, 0, 0])),
+        (kalman.see_wheel(p, 2, column), column.copy(), np.array([0, 1, 0, 0, 0, 1, 0])),
+        (kalman.see_balance(p, weights, column), column.copy(), np.array([0, 0, 0, *weights])),
+        (kalman.see_position(p, age, column), column.copy(), h := np.array([1, -age, -0.5 * age**2, 0, 0, 0, 0])),
     ]
     for spread, seen, row in measurements:
         np.testing.assert_allclose(seen, p @ row, rtol=1e-12)
         assert spread == pytest.approx(row @ p @ row)
     change, total = np.zeros(7), float(h @ p @ h) + 0.5
     corrected = p.copy()
-    axis.correct(corrected, column.copy(), 2.0, total, change)
+    kalman.correct(corrected, column.copy(), 2.0, total, change)
     np.testing.assert_allclose(change, 2.0 * (p @ h) / total, rtol=1e-12)
     np.testing.assert_allclose(corrected, p - np.outer(p @ h, p @ h) / total, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(corrected, corrected.T)
@@ -296,9 +296,9 @@ def test_covariances_stay_positive_and_readings_that_are_no_numbers_do_no_harm()
     observer.reset(everyone, sensors[0])
     for row in sensors[1:]:
         observer.update(everyone, row)
-        spread = np.linalg.eigvalsh(observer._records["covariance"])
+        spread = np.linalg.eigvalsh(observer._states["covariance"])
         assert (spread[..., 0] > -1e-12 * spread[..., -1]).all()
-        yaw, both, bias = observer._records["yaw_covariance"].T
+        yaw, both, bias = observer._states["yaw_covariance"].T
         assert ((yaw >= 0) & (bias > 0) & (both**2 <= yaw * bias * (1 + 1e-9) + 1e-18)).all()
     assert np.isfinite(observer.values).all()
     error = ESTIMATE_LAYOUT.view(observer.values, "linear_velocity_in_body") - runs.true("linear_velocity_in_body")[-1, :, :2]

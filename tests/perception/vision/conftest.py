@@ -6,7 +6,7 @@ pytest.importorskip("cv2")
 
 from vision_studio import Studio
 
-from wlr_gym.perception.vision import Camera
+from wlr_gym.perception.markers.camera import Camera
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from vision_studio import pose_of
 
-from wlr_gym.perception.markers.camera import distort, undistort
-from wlr_gym.perception.markers.detect import detect
-from wlr_gym.perception.markers.pose import circle_centres
-from wlr_gym.perception.markers.targets import CODE_NAMES
-from wlr_gym.perception.scene import Look, Pose, project
-from wlr_gym.perception.vision import Camera, find_target, load_target
+from wlr_gym.perception.markers.camera import Camera, distort, undistort
+from wlr_gym.perception.markers.detection import detect
+from wlr_gym.perception.markers.pose import circle_centres, find_target
+from wlr_gym.perception.markers.targets import CODE_NAMES, load_target
+from wlr_gym.perception.scene import Look, ScenePose, project
 from wlr_gym.studies.bench.vision import _centre_error, clutter
 
 CAMERA = Camera(width=1280, height=720, focal=(800.0, 800.0), centre=(639.5, 359.5))
@@ -37,7 +36,7 @@ def test_all_markers_of_a_frame_are_found_with_their_codes(studio):
     pose = pose_of(yaw=2.0, pitch=0.08)
     detections = detect(studio.frame(pose).image, studio.camera)
     eye = studio.renderer.floor_in_camera
-    for target, shift in ((studio.body, pose), (studio.floor, Pose(np.zeros(3), np.eye(3)))):
+    for target, shift in ((studio.body, pose), (studio.floor, ScenePose(np.zeros(3), np.eye(3)))):
         points = (target.positions @ shift.rotation.T + shift.position) @ eye.rotation.T + eye.position
         for place, code in zip(project(studio.camera, points), target.codes, strict=True):
             near = [d for d in detections if math.hypot(*(d.ellipse[:2] - place)) < 1]

@@ -8,10 +8,11 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Run, read_run
-from wlr_gym.perception.vision import Sample, align, measure_slip
-from wlr_gym.perception.vision.analyse import Analysis, _findings, camera_columns, save
-from wlr_gym.perception.vision.smooth import smooth
-from wlr_gym.perception.vision.track import LOST, OK, angles
+from wlr_gym.perception.vision.alignment import align
+from wlr_gym.perception.vision.analysis import VideoAnalysis, _findings, camera_columns, save_video_analysis
+from wlr_gym.perception.vision.slip import measure_slip
+from wlr_gym.perception.vision.smoothing import smooth
+from wlr_gym.perception.vision.tracking import LOST, OK, Sample, angles
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.vision import true_slip
@@ -182,8 +183,8 @@ def test_results_are_written_and_the_run_reads_back(turn, tmp_path):
     slip = measure_slip(samples, OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
     table = camera_columns(samples, OFFSET, turn.run, "start", slip.outliers)
     run = Run(table, turn.run.meta, tmp_path / "run_01.parquet")
-    analysis = Analysis(run, tuple(samples), None, OFFSET, slip, turn.robot, "start", 0.0, 3, ())
-    names = {path.name for path in save(analysis, tmp_path)}
+    analysis = VideoAnalysis(run, tuple(samples), None, OFFSET, slip, turn.robot, "start", 0.0, 3, ())
+    names = {path.name for path in save_video_analysis(analysis, tmp_path)}
     assert names == {"run_01.parquet", "slip.csv", "frames.csv", "summary.json", "pose.png", "slip.png"}
     again = read_run(tmp_path / "run_01.parquet")
     assert np.isfinite(again["cam_x"]).sum() == len(samples)

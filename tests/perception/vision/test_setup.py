@@ -13,11 +13,15 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.perception.markers.detect import detect
-from wlr_gym.perception.scene import Look, Patch, Pose, Renderer, rotation_of
-from wlr_gym.perception.vision import Camera, Frame, Frames, Sample, calibrate, film, load_camera, load_target, save_camera
+from wlr_gym.perception.markers.calibration import calibrate
+from wlr_gym.perception.markers.camera import Camera, load_camera, save_camera
+from wlr_gym.perception.markers.detection import detect
+from wlr_gym.perception.markers.targets import load_target
+from wlr_gym.perception.scene import Facet, Look, Renderer, ScenePose, rotation_of
+from wlr_gym.perception.vision.live_camera import film
 from wlr_gym.perception.vision.sheets import Board, Box, Disc, board_page, pdf, svg, target_pages
-from wlr_gym.perception.vision.video import AnnotatedVideo, annotate
+from wlr_gym.perception.vision.tracking import Sample, VideoFrame
+from wlr_gym.perception.vision.video import AnnotatedVideo, Frames, annotate
 
 TRUE = Camera(width=640, height=480, focal=(620.0, 615.0), centre=(325.0, 236.0), distortion=(-0.2, 0.05, 0.001, -0.002, 0.0))
 
@@ -71,15 +75,15 @@ def test_calibration_recovers_the_lens_from_the_printed_board():
     bits = np.ones((180, 180), np.uint8)
     bits[30:150] = cells > 127
     side = board.columns * board.square
-    patch = Patch(np.zeros(3), np.eye(3)[:2], (side / 2 + 0.02, side / 3 + 0.02), 225.0, tags=((0.0, 0.0, side, bits),))
-    renderer = Renderer(TRUE, Pose(np.zeros(3), np.eye(3)), [], samples=5)
+    facet = Facet(np.zeros(3), np.eye(3)[:2], (side / 2 + 0.02, side / 3 + 0.02), 225.0, tags=((0.0, 0.0, side, bits),))
+    renderer = Renderer(TRUE, ScenePose(np.zeros(3), np.eye(3)), [], samples=5)
     rng, views = np.random.default_rng(0), []
     for k in range(14):
         distance = rng.uniform(0.35, 0.55)
         place = np.array([rng.uniform(-0.35, 0.35), rng.uniform(-0.25, 0.25), 1.0]) * distance
         turn = rotation_of(rng.uniform(-0.4, 0.4), rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5))
-        patches = [patch.moved(place, turn @ np.diag([1.0, -1.0, -1.0]))]
-        views.append((f"view {k}", renderer.frame([patches], Look(noise=3.0), k)))
+        facets = [facet.moved(place, turn @ np.diag([1.0, -1.0, -1.0]))]
+        views.append((f"view {k}", renderer.frame([facets], Look(noise=3.0), k)))
     found = calibrate(views, board)
     assert found.quality is not None
     assert found.quality.rms < 0.3
@@ -196,7 +200,7 @@ def test_an_annotated_video_is_whole_or_what_it_was(fails, count, tmp_path):
     path.write_bytes(b"earlier")
     with pytest.raises(ZeroDivisionError) if fails else nullcontext(), AnnotatedVideo(path, load_target("body")) as video:
         for k in range(count):
-            video.add(Frame(k, k / 30, np.zeros((48, 64), np.uint8)), NOWHERE)
+            video.add(VideoFrame(k, k / 30, np.zeros((48, 64), np.uint8)), NOWHERE)
         assert path.read_bytes() == b"earlier"
         assert 1 / (not fails)
     assert (path.read_bytes() == b"earlier") == fails
@@ -210,7 +214,7 @@ def test_an_annotated_video_plays_at_the_cameras_rate(rate, name, tmp_path):
 
     with AnnotatedVideo(tmp_path / name, load_target("body")) as video:
         for k in range(25):
-            video.add(Frame(k, 7.0 + (k + (k > 4)) / rate, np.zeros((48, 64), np.uint8)), NOWHERE)  # the fifth was dropped
+            video.add(VideoFrame(k, 7.0 + (k + (k > 4)) / rate, np.zeros((48, 64), np.uint8)), NOWHERE)  # the fifth was dropped
     written = cv2.VideoCapture(str(tmp_path / name))
     assert written.get(cv2.CAP_PROP_FPS) == pytest.approx(rate, abs=0.01)
     assert len(list(Frames(str(tmp_path / name)))) == 25

@@ -8,9 +8,9 @@ import pytest
 from vision_studio import Studio, hand, pose_of, wrapped
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.perception.scene import Pose
-from wlr_gym.perception.vision import Camera, Frame, Tracker, locate_floor, track
-from wlr_gym.perception.vision.track import LOST, MOVED, OK, PARTIAL
+from wlr_gym.perception.markers.camera import Camera
+from wlr_gym.perception.scene import ScenePose
+from wlr_gym.perception.vision.tracking import LOST, MOVED, OK, PARTIAL, Tracker, VideoFrame, locate_floor, track
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def tracker(studio, located):
     return Tracker(studio.camera, studio.body, studio.floor, *located)
 
 
-def moving(index: int) -> Pose:
+def moving(index: int) -> ScenePose:
     t = index / 30
     return pose_of(-0.1 + 0.2 * t, 0.05 * math.sin(t), 0.3 + 0.8 * t, 0.05 * math.sin(2 * t), 0.169 - 0.03 * t)
 
@@ -118,12 +118,12 @@ def test_a_hidden_floor_marker_is_not_a_moved_camera(studio, tracker):
 
 
 def test_a_dark_image_is_lost(studio, tracker):
-    assert tracker(Frame(0, 0.0, np.zeros((720, 1280), np.uint8))).status == LOST
+    assert tracker(VideoFrame(0, 0.0, np.zeros((720, 1280), np.uint8))).status == LOST
 
 
 def test_wrong_image_size_is_refused(studio):
     with pytest.raises(InputError, match=r"frame 0: 640 x 480 px, but the camera was calibrated for 1280 x 720"):
-        track([Frame(0, 0.0, np.zeros((480, 640), np.uint8))], studio.camera, studio.body, studio.floor)
+        track([VideoFrame(0, 0.0, np.zeros((480, 640), np.uint8))], studio.camera, studio.body, studio.floor)
 
 
 def test_too_few_floor_markers_are_refused(studio):

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.anchor import CAMERA_WINDOW, JOINT_WINDOW, frame_near, has_camera, local_fit, starts_at_rest, unwrapped
 from wlr_gym.data.format import COMMANDS
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import held_goals
+from wlr_gym.data.run_states import CAMERA_WINDOW, JOINT_WINDOW, frame_near, has_camera, local_fit, starts_at_rest, unwrapped
 from wlr_gym.gap.robot.windows import WINDOW, window_rows
 from wlr_gym.robot import LEGS, WHEELS
 

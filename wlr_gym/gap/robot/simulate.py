@@ -16,9 +16,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from wlr_gym.data.anchor import euler_angles, quaternion, rest_pose, start_state
+from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters
+from wlr_gym.data.run_states import start_state
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
 from wlr_gym.gap.robot.recorder import POSE_TICKS, Recorder, Replays
 from wlr_gym.physics.plants import drive, ground, make_plant

@@ -1,15 +1,7 @@
 """Evaluation: whole episodes as one batch, score cards with confidence intervals, and their plots."""
 
-from wlr_gym.learning.evaluation.campaign import FIRST_SEED, Condition, play, work
 from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card, score
-from wlr_gym.learning.evaluation.curve import read_curve
-from wlr_gym.learning.evaluation.metrics import Metric, Played, metrics_of, summarise
-from wlr_gym.learning.evaluation.record import Recorder, record_episodes, write_samples
-from wlr_gym.learning.evaluation.rollout import Measure, Rollout, make_core, roll_out, start_episodes
-from wlr_gym.learning.evaluation.statistics import Estimate
-from wlr_gym.learning.evaluation.subjects import Subject, identity, make_player, read_subjects
-from wlr_gym.learning.evaluation.sweeps import Sweep, read_sweep, sweeps_for
-from wlr_gym.learning.evaluation.write import (
+from wlr_gym.learning.evaluation.card_report import (
     comparison_rows,
     rows,
     sweep_comparison_rows,
@@ -18,6 +10,14 @@ from wlr_gym.learning.evaluation.write import (
     write_card,
     write_episodes,
 )
+from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, play, work
+from wlr_gym.learning.evaluation.episode_recorder import EpisodeRecorder, record_episodes, write_samples
+from wlr_gym.learning.evaluation.learning_curve import read_curve
+from wlr_gym.learning.evaluation.metrics import Metric, Played, metrics_of, summarise
+from wlr_gym.learning.evaluation.rollout import Measure, Rollout, make_core, roll_out, start_episodes
+from wlr_gym.learning.evaluation.statistics import Estimate
+from wlr_gym.learning.evaluation.subjects import Subject, identity, make_player, read_subjects
+from wlr_gym.learning.evaluation.sweeps import Sweep, read_sweep, sweeps_for
 
 __all__ = [
     "FIRST_SEED",
@@ -25,11 +25,11 @@ __all__ = [
     "OTHER_PLANT",
     "Card",
     "Condition",
+    "EpisodeRecorder",
     "Estimate",
     "Measure",
     "Metric",
     "Played",
-    "Recorder",
     "Rollout",
     "Subject",
     "Sweep",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.learning.evaluation.campaign import Results
+from wlr_gym.learning.evaluation.conditions import Results
 from wlr_gym.learning.evaluation.metrics import Metric, Played, metrics_of, summarise
 from wlr_gym.learning.evaluation.rollout import Rollout
 from wlr_gym.learning.evaluation.statistics import Bootstrap, Estimate
@@ -19,8 +19,10 @@ from wlr_gym.learning.evaluation.sweeps import Sweep
 Array = NDArray[np.float64]
 Scores = dict[str, Estimate]
 
-#: Label of the condition that the tables and comparisons are about, and of the same on the other plant.
-MAIN, OTHER_PLANT = "main", "other plant"
+#: Label of the condition that the tables and comparisons are about.
+MAIN = "main"
+#: Label of the same condition on the other plant.
+OTHER_PLANT = "other plant"
 #: The subject that scores are counted from, if it plays.
 IDLE = "do_nothing"
 #: Metrics that are compared by their difference: a share of 0 %, or of a reward with an arbitrary zero, says nothing.

@@ -36,7 +36,7 @@ class Driver(Protocol):
         ...
 
     def wants_reset(self) -> bool:
-        """Return whether a new episode was asked for since the last call."""
+        """Return whether a new episode is requested since the last call."""
         ...
 
 
@@ -53,12 +53,12 @@ class OwnCommands:
 
 
 def drive(core: Core, policy: Policy, seed: int, driver: Driver | None = None) -> Iterator[None]:
-    """Let a policy drive the one robot of ``core`` for ever, episode after episode, yielding before every control tick.
+    """Let a policy drive the one robot of ``core`` for ever, episode after episode, yielding before every environment step.
 
     Args:
         core: a batch of one.
         policy: what drives it.
-        seed: of the first episode; the following go on from it.
+        seed: of the first episode; the following ones follow from it.
         driver: where the commands come from; None = the task's own.
     """
     driver, period = driver or OwnCommands(), core.task.config.control_period
@@ -76,7 +76,7 @@ def drive(core: Core, policy: Policy, seed: int, driver: Driver | None = None) -
 
 
 def film_length(core: Core, seconds: float, fps: float = FPS) -> tuple[int, int, float]:
-    """Return how many pictures a film of ``seconds`` has, how many control ticks each stands for, and pictures per second."""
+    """Return the number of pictures of a film of ``seconds``, environment steps per picture, and pictures per second."""
     period = core.task.config.control_period
     every = max(1, round(1.0 / (fps * period)))
     return max(1, round(seconds / (every * period))), every, 1.0 / (every * period)
@@ -177,7 +177,7 @@ class Journey:
         self._yaw = 0.0
 
     def note(self, core: Core) -> None:
-        """Take the present tick down."""
+        """Note the present step."""
         truth, asked = core.plant.truth(), commands(core)
         place = truth.position[0, :2].copy()
         if core.ticks[0] == 0 or not self._driven:

@@ -22,7 +22,7 @@ ACTION_AT_LIMIT = 0.99
 JITTER_FREQUENCY = 5.0
 #: What a fall adds to the tracking error of its episode, which otherwise knows the time before it only.
 FALL = 10.0
-#: Control ticks of one window of the spectrum; windows overlap by half.
+#: Environment steps of one window of the spectrum; windows overlap by half.
 WINDOW = 128
 
 
@@ -40,7 +40,7 @@ class Metric:
 GENERAL = (
     Metric("falls", "%", 0, True, "episodes that a termination ended"),
     Metric("slip_speed", "m/s", 4, True, "slip speed, mean over wheels and time"),
-    Metric("excess_slip", "m/s", 4, True, "slip speed beyond what turning on skids needs, mean over wheels and time"),
+    Metric("excess_slip", "m/s", 4, True, "slip speed beyond what a steady skid turn needs, mean over wheels and time"),
     Metric("slip_per_metre", "m/m", 3, True, "slip distance of a wheel per metre the body travels"),
     Metric("energy_per_metre", "J/m", 1, True, "energy drawn per metre the body travels"),
     Metric("power", "W", 2, True, "mean power drawn from the supply"),
@@ -157,7 +157,7 @@ def errors_of(measures: Sequence[Measure], measured: Array, active: Mask) -> dic
     Args:
         measures: of the task.
         measured: (T, N, M).
-        active: (T, N) the robot's episode was still going on in this tick.
+        active: (T, N) the robot's episode had not ended before this step.
     """
     errors = {}
     for k, measure in enumerate(measures):
@@ -189,7 +189,7 @@ def travelled(rollout: Rollout) -> Array:
 def spectrum(rollout: Rollout) -> tuple[Array, Array]:
     """Return frequencies (F,) in Hz and the power density (N, F) of each episode's action, mean over joints, in 1/Hz.
 
-    Welch's estimate: Hann windows of ``WINDOW`` ticks (the whole episode if it is shorter) that overlap by half, each without
+    Welch's estimate: Hann windows of ``WINDOW`` steps (the whole episode if it is shorter) that overlap by half, each without
     its mean; one-sided. NaN for an episode that ended before the first window did.
     """
     size = min(WINDOW, len(rollout.active))
@@ -212,5 +212,5 @@ def spectrum(rollout: Rollout) -> tuple[Array, Array]:
 
 
 def _sum(values: Array, active: Mask) -> Array:
-    """Sum (T, N, ...) over the ticks that count; what is not finite after the end does not matter."""
+    """Sum (T, N, ...) over the steps that count; what is not finite after the end does not matter."""
     return np.where(active.reshape(active.shape + (1,) * (values.ndim - 2)), values, 0.0).sum(axis=0)

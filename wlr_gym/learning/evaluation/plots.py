@@ -18,7 +18,9 @@ from wlr_gym.robot import WHEELS
 
 Array = NDArray[np.float64]
 
-ACTUAL, COMMANDED = "tab:blue", "black"
+# Colours of curves.
+ACTUAL = "tab:blue"
+COMMANDED = "black"
 WHEEL_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red")
 #: Seconds between the heading arrows along a path.
 ARROW_PERIOD = 2.0
@@ -45,7 +47,7 @@ def learning_curve(curve: Sequence[Mapping[str, float]], references: Mapping[str
     for (name, value), style in zip(references.items(), ("--", ":", "-.", (0, (1, 4))), strict=False):
         left.axhline(value, color="0.3", linestyle=style, linewidth=1.2, label=name)
     left.set(
-        xlabel="control ticks (millions)",
+        xlabel="environment steps (millions)",
         ylabel="reward per second",
         title="Learning curve (dips: all robots start new episodes)",
     )
@@ -54,7 +56,7 @@ def learning_curve(curve: Sequence[Mapping[str, float]], references: Mapping[str
         values = [row[name] for row in curve]
         if any(values):
             right.plot(steps, values, label=name.removeprefix("term."))
-    right.set(xlabel="control ticks (millions)", ylabel="reward per second", title="Terms of the reward")
+    right.set(xlabel="environment steps (millions)", ylabel="reward per second", title="Terms of the reward")
     right.legend(fontsize=7, ncols=2)
     return figure
 
@@ -67,24 +69,24 @@ def episode(rollout: Rollout, index: int, title: str) -> Figure:
     figure.suptitle(title)
     grid = figure.add_gridspec(4, 2, width_ratios=(1.1, 1.0))
     _draw_path(figure.add_subplot(grid[:, 0]), rollout, index, ticks)
-    velocity, yaw_rate, along, across = (figure.add_subplot(grid[k, 1]) for k in range(4))
+    velocity, yaw_rate, longitudinal, lateral = (figure.add_subplot(grid[k, 1]) for k in range(4))
     _draw_tracking(velocity, time, rollout.commanded("linear_velocity_x")[:, index], rollout.forward_velocity[:, index])
     _draw_tracking(yaw_rate, time, rollout.commanded("yaw_rate")[:, index], rollout.yaw_rate[:, index])
     velocity.set_ylabel("forward velocity\n(m/s)")
     yaw_rate.set_ylabel("yaw rate\n(rad/s)")
     velocity.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=8, ncols=2, frameon=False)
-    for axes, component, name in ((along, 0, "slip along\nheading (m/s)"), (across, 1, "slip along\naxle (m/s)")):
+    for axes, component, name in ((longitudinal, 0, "longitudinal\nslip (m/s)"), (lateral, 1, "lateral\nslip (m/s)")):
         for wheel, label in enumerate(WHEELS):
             slip = rollout.slip_velocity[:ticks, index, wheel, component]
             axes.plot(time, slip, color=WHEEL_COLOURS[wheel], label=label, linewidth=1)
         axes.set_ylabel(name)
-    along.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), fontsize=8, ncols=4, frameon=False)
-    for axes in (velocity, yaw_rate, along):
+    longitudinal.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), fontsize=8, ncols=4, frameon=False)
+    for axes in (velocity, yaw_rate, longitudinal):
         axes.tick_params(labelbottom=False)
-    for axes in (velocity, yaw_rate, along, across):
+    for axes in (velocity, yaw_rate, longitudinal, lateral):
         axes.grid(alpha=0.3)
         axes.set_xlim(0, time[-1])
-    across.set_xlabel("time (s)")
+    lateral.set_xlabel("time (s)")
     return figure
 
 

@@ -26,7 +26,7 @@ SATURATED = 0.98
 
 @dataclass(frozen=True)
 class Measure:
-    """One number per control tick that says how well the task is done.
+    """One number per environment step that says how well the task is done.
 
     Attributes:
         name, unit, doc: what it is.
@@ -42,26 +42,26 @@ class Measure:
 
 @dataclass(frozen=True)
 class Rollout:
-    """Episodes of N robots over at most T control ticks. Signals of a robot count where ``active`` says so.
+    """Episodes of N robots over at most T environment steps. Signals of a robot count where ``active`` says so.
 
     Attributes:
         control_period: s.
         seeds: (N,) seed of each episode.
         measures: what the task measures itself by; see :class:`Measure`.
         command_names: names of the commands, such as ``linear_velocity_x``.
-        active: (T, N) the robot's episode was still going on in this tick.
+        active: (T, N) the robot's episode had not ended before this step.
         fell: (N,) a termination term ended the episode. succeeded: (N,) as the task defines it.
         reward: (T, N).
         measured: (T, N, M) the task's measures.
         action: (T, N, 8) in [-1, 1].
-        command: (T, N, C) what the robot was asked to follow in this tick; SI units.
+        command: (T, N, C) what the robot had to follow in this step; SI units.
         position: (T, N, 2) body origin in the floor frame, m. yaw: (T, N) rad.
         forward_velocity: (T, N) of the body origin along the body's x, m/s. yaw_rate: (T, N) rad/s.
-        slip_velocity: (T, N, 4, 2) mean over the tick, along each wheel's heading and axle, m/s.
-        excess_slip: (T, N) mean slip speed of the wheels beyond what turning on skids needs, as the reward ``slip``, m/s.
+        slip_velocity: (T, N, 4, 2) mean over the step, along each wheel's heading and axle, m/s.
+        excess_slip: (T, N) mean slip speed of the wheels beyond what a steady skid turn needs, as the reward ``slip``, m/s.
         energy: (T, N) drawn from the supply, J; braking counts as negative.
         saturated: (T, N, 8) the motor was at its voltage or torque limit.
-        friction: (N, 4, 2) coefficients at each wheel, along heading and axle, in the first tick.
+        friction: (N, 4, 2) coefficients at each wheel, along heading and axle, in the first step.
         sampled: (K,) parameter elements that randomisation draws. samples: (N, K) their values at the start.
         parameters: (N, P) the whole parameter table at the start. start: (N, S) the state the episodes began from.
     """
@@ -143,7 +143,7 @@ def roll_out(
         core: batch of robots; nothing of its past matters.
         policy: what drives them.
         first_seed: seed of the first episode.
-        on_tick: called after every control tick (progress bars, logs).
+        on_tick: called after every environment step (progress bars, logs).
         on_start: called once when the episodes have begun.
         parameters: values set after randomisation and effects, the same for all episodes.
         commands: commands held through all episodes; the others are drawn.
@@ -214,9 +214,9 @@ def measures_of(core: Core) -> tuple[Measure, ...]:
 
 
 def excess_slip_of(core: Core) -> Callable[[], Array]:
-    """Return a function that returns the mean slip speed (N,) of the wheels beyond what turning on skids needs, m/s.
+    """Return a function that returns the mean slip speed (N,) of the wheels beyond what a steady skid turn needs, m/s.
 
-    It is what the reward term ``slip`` counts in the last tick, whether the task has that term or not.
+    It is what the reward term ``slip`` counts in the last step, whether the task has that term or not.
     """
     from wlr_gym.envs.tasks.compiled import reader
     from wlr_gym.envs.tasks.signals import Signals

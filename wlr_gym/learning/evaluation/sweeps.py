@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.learning.evaluation.campaign import Condition
+from wlr_gym.learning.evaluation.conditions import Condition
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,23 @@ def _paper_sweep(front: tuple[float, float], rear: tuple[float, float]) -> dict[
 PAPER_LEGS = {"test 1": ((30.0, 30.0), (30.0, 150.0)), "test 2": ((30.0, 150.0), (150.0, 30.0))}
 #: In the order of the command ``path_shape``: below 1, below 2, above.
 SHAPES = ("line", "S-curve", "circle")
+#: Friction coefficients of an even floor.
 FRICTION = (0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)
-#: Beyond a ratio of about 2 a robot standing square cannot turn: see docs/evaluation.md.
-LEFT_FRICTION, SPLIT_RATIO = 0.25, (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0)
-SLOPE_FRICTION, DEGREES_BELOW_LIMIT = 0.4, (10.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.0, 0.5)
-GRIP_FRICTION, GRIP_DEGREES = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7), 2.0
+#: Friction coefficient under the left wheels of split floors.
+LEFT_FRICTION = 0.25
+#: Friction under the right wheels over it. Beyond about 2 a robot standing square cannot turn: see docs/evaluation.md.
+SPLIT_RATIO = (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0)
+#: Friction coefficient of the slopes.
+SLOPE_FRICTION = 0.4
+#: Degrees by which the slopes stay below its limit.
+DEGREES_BELOW_LIMIT = (10.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.0, 0.5)
+#: Friction coefficients of slopes near their limit.
+GRIP_FRICTION = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7)
+#: Degrees by which these stay below their limits.
+GRIP_DEGREES = 2.0
+#: s.
 DELAY = (0.0, 0.01, 0.02, 0.04, 0.06)
+#: kg.
 PAYLOAD = (0.0, 0.25, 0.5, 1.0, 2.0)
 #: m, body frame: ahead, to the left and above the middle, so that the wheels carry unequal loads.
 PAYLOAD_PLACE = {"payload.position[x]": 0.05, "payload.position[y]": 0.03, "payload.position[z]": 0.05}

@@ -14,8 +14,8 @@ class PpoConfig(SettingsModel):
 
     Attributes:
         seed: of weights, exploration, minibatches and episodes; the same seed gives the same run bit for bit.
-        total_steps: control ticks of all robots together.
-        num_envs, steps_per_env: robots, and control ticks of each, per update.
+        total_steps: environment steps of all robots together.
+        num_envs, steps_per_env: robots, and environment steps of each, per update.
         batch_size: samples per gradient step. Small ones cap the speed: the optimiser, not the physics, takes the time.
         epochs: passes over the samples of an update.
         learning_rate, final_learning_rate, learning_rate_falls: Adam's, over the training. Once little exploration noise is
@@ -24,8 +24,8 @@ class PpoConfig(SettingsModel):
         target_kl: end the passes of an update early beyond 1.5 times this divergence; None = never.
         hidden_layers, activation: of the networks of policy and value, which share nothing.
         initial_log_std: logarithm of the exploration noise at the start, in actions.
-        teacher: agent whose actions the actor learns before PPO goes on (``warm_start.py``); None = from nothing.
-        checkpoint_every: control ticks between checkpoints.
+        teacher: agent whose actions the actor learns before PPO starts (``warm_start.py``); None = from nothing.
+        checkpoint_every: environment steps between checkpoints.
         keep_checkpoints: how many of the newest stay.
         torch_threads: more than 1 was slower on busy machines, and changes the last bits.
         environment: keywords of the environment (precision, randomization, task, ...).

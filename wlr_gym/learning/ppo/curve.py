@@ -24,7 +24,7 @@ class TrainingError(RuntimeError):
 
 
 class Meter(BaseCallback):
-    """Watches every control tick of an update: sums up what the learning curve shows and stops at non-finite numbers.
+    """Watches every environment step of an update: sums up what the learning curve shows and stops at non-finite numbers.
 
     Args:
         core: the batch of robots.
@@ -69,7 +69,7 @@ class Meter(BaseCallback):
         raise TrainingError(f"{reason} after {self.num_timesteps} steps; state written to {self.dump}")
 
     def take(self) -> dict[str, float]:
-        """Return the means since the last call, rewards per second; terms and slip over robots whose episode went on."""
+        """Return the means since the last call, rewards per second; terms and slip over robots whose episode continued."""
         period = self.core.task.config.control_period
         terms = self._terms / max(self._robots, 1) / period
         means = {"reward_per_second": self._reward / max(self._ticks, 1) / period}
@@ -91,7 +91,7 @@ class LearningCurve:
 
     Args:
         path: of the file; rows beyond ``steps`` (of updates that a resumed run repeats) are dropped.
-        steps: control ticks done so far.
+        steps: environment steps done so far.
     """
 
     def __init__(self, path: Path, steps: int) -> None:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.settings import parse_config
 from wlr_gym.learning.ppo.config import PpoConfig
-from wlr_gym.policy import Training
 
 MODEL_FILE = "model.zip"
 #: Weights that act; the others belong to the critic or to exploration.
@@ -43,7 +42,7 @@ class PpoPolicy:
 
 def make_policy(contract: Mapping[str, Any], config: Mapping[str, Any]) -> PpoPolicy:
     """Return the policy before training: the network as the seed of ``config`` initialises it."""
-    return PpoPolicy(_network(contract, _parse(config)))
+    return PpoPolicy(_network(contract, parse_settings(config)))
 
 
 def load_policy(folder: Path, contract: Mapping[str, Any]) -> PpoPolicy:
@@ -52,7 +51,7 @@ def load_policy(folder: Path, contract: Mapping[str, Any]) -> PpoPolicy:
     Raises:
         InputError: the model file is absent, broken, or of another network.
     """
-    network = _network(contract["environment"], _parse(contract["config"]))
+    network = _network(contract["environment"], parse_settings(contract["config"]))
     path = folder / MODEL_FILE
     from stable_baselines3.common.save_util import load_from_zip_file
 
@@ -85,17 +84,8 @@ def actor(network: Any) -> Any:
     return nn.Sequential(network.mlp_extractor.policy_net, network.action_net, nn.Hardtanh(-1.0, 1.0))
 
 
-def train(training: Training) -> Path:
-    """Train, and return the folder of the final policy (see ``training.run_training``)."""
-    require_package("torch", "train")
-    require_package("stable_baselines3", "train")
-    require_package("tensorboard", "train")
-    from wlr_gym.learning.ppo.training import run_training
-
-    return run_training(training, _parse(training.config))
-
-
-def _parse(config: Mapping[str, Any]) -> PpoConfig:
+def parse_settings(config: Mapping[str, Any]) -> PpoConfig:
+    """Return the checked settings of an agent."""
     return parse_config(PpoConfig, dict(config), "agent 'ppo'")
 
 

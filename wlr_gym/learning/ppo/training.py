@@ -1,7 +1,7 @@
 """The training loop: updates, learning curve, checkpoints, stopping in good order, resuming.
 
 Every checkpoint starts new episodes with seeds made from the run's seed and the steps done. So a run that was killed and
-resumed from a checkpoint goes on exactly, bit for bit, as it would have without the interruption.
+resumed from a checkpoint continues exactly, bit for bit, as it would have without the interruption.
 """
 
 from __future__ import annotations
@@ -29,21 +29,23 @@ from wlr_gym.learning.ppo import checkpoint
 from wlr_gym.learning.ppo.asymmetric import AsymmetricPolicy
 from wlr_gym.learning.ppo.config import PpoConfig
 from wlr_gym.learning.ppo.curve import LearningCurve, Meter, losses
-from wlr_gym.learning.ppo.policy import policy_keywords
+from wlr_gym.learning.ppo.policy import parse_settings, policy_keywords
 from wlr_gym.learning.ppo.warm_start import imitate
 from wlr_gym.policy import Training
 
 
-def run_training(training: Training, config: PpoConfig) -> Path:
+def run_training(training: Training) -> Path:
     """Train and return the folder of the final policy.
 
     The run folder then holds ``config.yaml``, ``provenance.yaml``, ``learning_curve.csv``, ``tensorboard/``,
     ``checkpoints/step_.../`` (each a policy folder) and ``policy/``.
 
     Raises:
+        InputError: bad settings.
         KeyboardInterrupt: after a checkpoint was saved; the message says how to resume.
         TrainingError: a loss, weight or observation is not finite; the message names the file with the state.
     """
+    config = parse_settings(training.config)
     torch.set_num_threads(config.torch_threads)
     env = Sb3VecEnv(training.environment, config.num_envs, **config.environment)
     try:
@@ -125,10 +127,10 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv) -> Path:
             if model.num_timesteps // config.checkpoint_every > before // config.checkpoint_every:
                 _save_checkpoint(training, config, env, model)
                 begin_episodes(model, env, config.seed)
-    if model.num_timesteps < config.total_steps:  # nothing is lost: --resume goes on from here
+    if model.num_timesteps < config.total_steps:  # nothing is lost: --resume continues from here
         place = _save_checkpoint(training, config, env, model)
         if stop.requested:
-            raise KeyboardInterrupt(f"interrupted; saved {place}; go on with: wlr train --resume {folder}")
+            raise KeyboardInterrupt(f"interrupted; saved {place}; resume with: wlr train --resume {folder}")
     return checkpoint.save(folder / "policy", model, config, env.contract(), training.environment)
 
 

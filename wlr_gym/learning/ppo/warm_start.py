@@ -1,4 +1,4 @@
-"""A start from a controller that works: actor and critic imitate it, then PPO goes on from there.
+"""A start from a controller that works: actor and critic imitate it, and PPO continues from there.
 
 The controller drives all robots for an episode, with noise on its actions so that it is seen to correct errors. The actor
 learns its actions (without the noise), the critic its discounted rewards. Own random numbers: nothing else is shifted.
@@ -18,9 +18,16 @@ from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.ppo.config import PpoConfig
 from wlr_gym.policy import Policy, load_agent, load_agent_config
 
-#: 1 sigma of the noise on the controller's actions. Ticks between the readings that are kept.
-NOISE, STRIDE = 0.03, 5
-EPOCHS, BATCH_SIZE, LEARNING_RATE = 80, 512, 2e-3  # the rate falls to zero: actions are met within 2 % of their range
+#: 1 sigma of the noise on the controller's actions.
+NOISE = 0.03
+#: Environment steps between the readings that are kept.
+STRIDE = 5
+#: Passes over the readings.
+EPOCHS = 80
+#: Readings per gradient step.
+BATCH_SIZE = 512
+#: At the start; it falls to zero: actions are met within 2 % of their range.
+LEARNING_RATE = 2e-3
 
 Observations = dict[str, NDArray[np.float32]]
 

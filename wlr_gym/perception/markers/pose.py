@@ -22,7 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from wlr_gym.perception.markers.camera import Camera, distort
-from wlr_gym.perception.markers.detect import Detection
+from wlr_gym.perception.markers.detection import Detection
 from wlr_gym.perception.markers.targets import Target, ring_radii
 
 Array = NDArray[np.float64]

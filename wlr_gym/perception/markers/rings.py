@@ -21,12 +21,19 @@ from wlr_gym.perception.markers.camera import undistort
 
 RAYS = 64
 RINGS = 3
-#: Columns of the quality row: least contrast of the used edges (grey levels), rms of the edges about the ellipses (px),
-#: share of edge points used, worst error of a circle's radius over the outer radius (blur moves edges of narrow rings).
-CONTRAST, RESIDUAL, SHARE, RADIUS_ERROR = range(4)
+# Columns of the quality row.
+#: Least contrast of the used edges, grey levels.
+CONTRAST = 0
+#: Rms of the edges about the ellipses, px.
+RESIDUAL = 1
+#: Share of the edge points that are used.
+SHARE = 2
+#: Worst error of a circle's radius over the outer radius (blur moves edges of narrow rings).
+RADIUS_ERROR = 3
 
 _ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS
-_COS, _SIN = np.cos(_ANGLES), np.sin(_ANGLES)
+_COS = np.cos(_ANGLES)
+_SIN = np.sin(_ANGLES)
 _MINIMUM_CONTRAST = 12.0
 _MINIMUM_RADIUS = 3.0  # px; smaller circles are too blurred to help
 _MINIMUM_SHARE = 0.4  # of the rays, per ring

@@ -8,10 +8,11 @@ from typing import Any
 from numba import njit
 
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
+from wlr_gym.robot import FIRST_WHEEL
 
 _LEG_RATE = SENSOR_LAYOUT.slices["joint_velocity"].start
-_WHEEL_RATE = _LEG_RATE + 4
-_WHEEL_EFFORT = SENSOR_LAYOUT.slices["joint_effort"].start + 4
+_WHEEL_RATE = _LEG_RATE + FIRST_WHEEL
+_WHEEL_EFFORT = SENSOR_LAYOUT.slices["joint_effort"].start + FIRST_WHEEL
 #: N. Less than this counts as a wheel in the air when something is divided by its load.
 LEAST_LOAD = 0.5
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.perception.observer import estimate
+from wlr_gym.perception.observer import slip_filter
 from wlr_gym.perception.observer.layout import ESTIMATE_LAYOUT
-from wlr_gym.perception.observer.record import constants, record
+from wlr_gym.perception.observer.state import constants, state_type
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import SPECS
@@ -37,17 +37,17 @@ class SlipObserver:
         self.count = count
         self.values: Array = np.zeros((count, ESTIMATE_LAYOUT.width))
         self._constants = constants(robot, control_period, camera)
-        self._records = np.zeros(count, record(history))
+        self._states = np.zeros(count, state_type(history))
 
     def reset(self, mask: Mask, sensors: Array) -> None:
         """Start the masked robots anew from their first readings (N, SENSOR_LAYOUT.width): at rest, or nearly."""
         self._require(mask, sensors)
-        estimate.reset(self._constants, self._records, mask, sensors, self.values)
+        slip_filter.reset(self._constants, self._states, mask, sensors, self.values)
 
     def update(self, mask: Mask, sensors: Array) -> None:
-        """Take in the readings of one control tick later of the masked robots. A reading that is no number is the last one."""
+        """Take in the readings of one control step later of the masked robots. A reading that is no number is the last one."""
         self._require(mask, sensors)
-        estimate.update(self._constants, self._records, mask, sensors, self.values)
+        slip_filter.update(self._constants, self._states, mask, sensors, self.values)
 
     def _require(self, mask: Mask, sensors: Array) -> None:
         if mask.shape != (self.count,) or sensors.shape != (self.count, SENSOR_LAYOUT.width):

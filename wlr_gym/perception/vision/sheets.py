@@ -9,15 +9,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from wlr_gym.base.files import replace_file
+from wlr_gym.perception.markers.calibration import Board
 from wlr_gym.perception.markers.targets import QUIET_ZONE, Marker, Target, ring_radii
 
-A4, A3 = (297.0, 210.0), (420.0, 297.0)
-_BLACK, _WHITE, _GREY = 0.0, 1.0, 0.6
+# Landscape, mm.
+A4 = (297.0, 210.0)
+A3 = (420.0, 297.0)
+# Shade: 0 black to 1 white.
+_BLACK = 0.0
+_WHITE = 1.0
+_GREY = 0.6
 _MARGIN = 8.0  # mm that printers leave white
 _ARC = 0.5522847498  # control points of a quarter circle
 
@@ -63,22 +68,6 @@ class Page:
     name: str
     size: tuple[float, float]
     shapes: tuple[Shape, ...]
-
-
-@dataclass(frozen=True)
-class Board:
-    """A ChArUco board: squares along and across, their side (m). A marker's side is 0.7 of it."""
-
-    columns: int = 9
-    rows: int = 6
-    square: float = 0.028
-
-    def aruco(self) -> Any:
-        """Return OpenCV's board."""
-        import cv2
-
-        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, 0.7 * self.square, dictionary)
 
 
 def target_pages(target: Target) -> list[Page]:

@@ -21,12 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.anchor import quaternion, rotation
+from wlr_gym.data.body_pose import quaternion
 from wlr_gym.data.read import Run
-from wlr_gym.perception.vision.align import joint_signals, repeated
-from wlr_gym.perception.vision.smooth import Smoothed, draw_error, smooth
-from wlr_gym.perception.vision.track import Sample
-from wlr_gym.robot import WHEELS, Robot
+from wlr_gym.perception.vision.alignment import joint_signals, repeated
+from wlr_gym.perception.vision.smoothing import Smoothed, draw_error, smooth
+from wlr_gym.perception.vision.tracking import Sample
+from wlr_gym.physics.plants.sensors import rotation
+from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import accumulate, contact_slip_velocity, no_slip_error, rolling_speed, slip_angle, slip_ratio
 
@@ -40,7 +41,7 @@ LONGEST_GAP = 0.15
 #: Deviations from its neighbours (m, rad) from which on a pose can be an outlier.
 _JUMP = (0.01, 0.01, 0.01, 0.03, 0.05, 0.05)
 _DRAWS = 64  # of the motion: 1 sigma is known to 9 %
-_ENCODER_PACE = 10.0  # 1/s; an encoder's error changes over about five ticks
+_ENCODER_PACE = 10.0  # 1/s; an encoder's error changes over about five control steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +115,8 @@ def measure_slip(
     """Slip of a run from the samples of its video.
 
     Args:
-        samples: of :func:`wlr_gym.perception.vision.track.track`. offset: servo time = camera time + offset, s; offset_std: 1
-            sigma.
+        samples: of :func:`wlr_gym.perception.vision.tracking.track`.
+        offset: servo time = camera time + offset, s; offset_std: 1 sigma.
         run: encoders. robot: encoder counts, radius tolerance. parameters: (1) geometry.
         layout_std: 1 sigma of the body target's scale and heading
             (:attr:`wlr_gym.perception.markers.targets.Target.layout_std`).
@@ -136,7 +137,7 @@ def measure_slip(
     signals, outliers = smoothed_poses(samples, time, rows)
     value, rate, value_std = (np.stack([getattr(f, name) for f in signals], 1) for name in ("value", "rate", "value_std"))
     joints = joint_signals(run, rows, robot)
-    joints[0][:, :4] -= parameters["joint.zero_offset"]
+    joints[0][:, LEG_SLICE] -= parameters["joint.zero_offset"]
     batch = repeated(parameters, len(rows))
     velocity, rolling, no_slip_speed = _contacts(value, rate, joints, batch)
     travel = velocity[:, :, 0] + rolling
@@ -187,7 +188,7 @@ def _contacts(value: Array, rate: Array, joints: tuple[Array, Array], batch: Par
 def _encoder_variance(angle: Array, robot: Robot, parameters: Parameters) -> Array:
     """Variance (K, 4) in m2 of a contact's place along its heading: a wheel's count at its rim, a leg's at hip height."""
     radius = parameters["wheel.radius"]
-    height = parameters["leg.length"] * np.sin(angle[:, :4]) + radius
+    height = parameters["leg.length"] * np.sin(angle[:, LEG_SLICE]) + radius
     return (radius**2 + height**2) * robot.sensors.encoder.position**2 / 12
 
 

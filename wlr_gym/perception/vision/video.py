@@ -1,4 +1,4 @@
-"""Where frames come from (video file, folder of images) and where annotated ones go. Live: see ``live.py``."""
+"""Where frames come from (video file, folder of images) and where annotated ones go. Live: ``live_camera.py``."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.perception.markers.detect import Image
+from wlr_gym.perception.markers.detection import Image
 from wlr_gym.perception.markers.targets import Target
-from wlr_gym.perception.vision.track import LOST, MOVED, OK, PARTIAL, Frame, Sample
+from wlr_gym.perception.vision.tracking import LOST, MOVED, OK, PARTIAL, Sample, VideoFrame
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 _INEXACT = 0.005  # of the number of frames; where it is not stored, it is computed from the duration
@@ -43,13 +43,13 @@ class Frames:
         self.missing = 0
         self._frames = self._read(source, rate, times, seconds)
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[VideoFrame]:
         return self
 
-    def __next__(self) -> Frame:
+    def __next__(self) -> VideoFrame:
         return next(self._frames)
 
-    def _read(self, source: str, rate: float | None, times: Path | None, seconds: float | None) -> Iterator[Frame]:
+    def _read(self, source: str, rate: float | None, times: Path | None, seconds: float | None) -> Iterator[VideoFrame]:
         stamps = None if times is None else _read_times(times)
         count, first, cut = 0, 0.0, False
         for index, (stamp, image) in enumerate(self._images(source)):
@@ -61,7 +61,7 @@ class Frames:
             if cut:
                 break
             count += 1
-            yield Frame(index, moment, image)
+            yield VideoFrame(index, moment, image)
         if not count:
             raise InputError(f"{source}: no frames could be read")
         if stamps is not None and not cut and count < len(stamps):
@@ -206,7 +206,7 @@ class AnnotatedVideo:
         if self._file is not None:
             self._file.__exit__(fault, *rest)
 
-    def add(self, frame: Frame, sample: Sample) -> None:
+    def add(self, frame: VideoFrame, sample: Sample) -> None:
         """Append one frame."""
         image = annotate(frame.image, sample, self.body, self._trail)
         if self._file is not None:

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from wlr_gym.base.random import generator
-from wlr_gym.data.anchor import start_state
 from wlr_gym.data.format import CHANNELS, COMMANDS, RunMeta
 from wlr_gym.data.read import Run
-from wlr_gym.data.simulation import SENSED, channels
+from wlr_gym.data.run_states import start_state
+from wlr_gym.data.sensor_columns import SENSED, channels
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.robot.clock import LEAD
 from wlr_gym.gap.robot.problem import RobotProblem

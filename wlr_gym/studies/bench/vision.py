@@ -16,27 +16,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.perception.markers.camera import Camera
-from wlr_gym.perception.markers.detect import detect, refine
+from wlr_gym.perception.markers.detection import detect, refine
 from wlr_gym.perception.markers.pose import circle_centres, find_target
 from wlr_gym.perception.markers.targets import CODES, Target, load_target, ring_radii
 from wlr_gym.perception.scene import (
+    Facet,
     Image,
     Look,
-    Patch,
-    Pose,
     Renderer,
+    ScenePose,
     develop,
-    floor_patches,
-    plate_patch,
+    floor_facets,
+    plate_facet,
     project,
-    robot_patches,
+    robot_facets,
     rotation_of,
     view,
 )
-from wlr_gym.perception.vision.align import align
-from wlr_gym.perception.vision.paper import paper_pose
+from wlr_gym.perception.vision.alignment import align
+from wlr_gym.perception.vision.paper_method import paper_pose
 from wlr_gym.perception.vision.slip import measure_slip
-from wlr_gym.perception.vision.track import Frame, Tracker, angles, locate_floor, track
+from wlr_gym.perception.vision.tracking import Tracker, VideoFrame, angles, locate_floor, track
 from wlr_gym.robot import Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.measure import Size
@@ -130,9 +130,9 @@ def _centre_error(camera: Camera, look: Look, seed: int) -> float:
     rotation = turn @ np.diag([1.0, -1.0, -1.0])
     radii = np.array(ring_radii(code))
     circles = np.array([[0.0, 0.0, *(radius * radii)]])
-    patch = Patch(np.zeros(3), np.eye(3)[:2], (0.05, 0.05), 225.0, circles=circles).moved(centre, rotation)
+    facet = Facet(np.zeros(3), np.eye(3)[:2], (0.05, 0.05), 225.0, circles=circles).moved(centre, rotation)
     crop, corner = _crop(camera, project(camera, centre[None])[0])
-    image = Renderer(crop, Pose(np.zeros(3), np.eye(3)), []).frame([[patch]], look, seed)
+    image = Renderer(crop, ScenePose(np.zeros(3), np.eye(3)), []).frame([[facet]], look, seed)
     middle = project(camera, centre[None])[0] - corner + rng.uniform(-1, 1, 2)
     edge = project(camera, centre + radius * rotation[:, :2].T) - project(camera, centre[None])
     found = refine(image, crop, np.array([*middle, edge[0, 0], edge[1, 0], edge[0, 1], edge[1, 1]]), code)
@@ -183,13 +183,13 @@ def _pose_lines(label: str, method: str, errors: Array, bars: tuple[float, float
             Result(f"body yaw, {label}", method, yaw, "deg", second, count=count)]  # fmt: skip
 
 
-def _random_pose(rng: np.random.Generator, height: float | None = None) -> Pose:
+def _random_pose(rng: np.random.Generator, height: float | None = None) -> ScenePose:
     position = np.array([rng.uniform(-0.45, 0.45), rng.uniform(-0.2, 0.2), height or HOME_HEIGHT + rng.uniform(-0.06, 0.0)])
-    return Pose(position, rotation_of(rng.uniform(-math.pi, math.pi), rng.uniform(-0.1, 0.1) if height is None else 0.0))
+    return ScenePose(position, rotation_of(rng.uniform(-math.pi, math.pi), rng.uniform(-0.1, 0.1) if height is None else 0.0))
 
 
-def _shown(robot: Robot, plate: Patch, pose: Pose) -> list[Patch]:
-    return [patch.moved(pose.position, pose.rotation) for patch in (*robot_patches(robot, pose.legs), plate)]
+def _shown(robot: Robot, plate: Facet, pose: ScenePose) -> list[Facet]:
+    return [facet.moved(pose.position, pose.rotation) for facet in (*robot_facets(robot, pose.legs), plate)]
 
 
 def _ring_poses(tilt: float, count: int) -> tuple[Array, dict[str, Array]]:
@@ -197,17 +197,17 @@ def _ring_poses(tilt: float, count: int) -> tuple[Array, dict[str, Array]]:
     body, floor, robot = load_target("body"), load_target("floor"), load_robot()
     camera = CAMERA.model_copy(update={"distortion": LENS})
     straight = view(tilt, 2.0)
-    renderer = Renderer(camera, straight, floor_patches(floor))
-    empty = [Frame(k, k / 30, renderer.frame([], Look(), 900 + k)) for k in range(10)]
+    renderer = Renderer(camera, straight, floor_facets(floor))
+    empty = [VideoFrame(k, k / 30, renderer.frame([], Look(), 900 + k)) for k in range(10)]
     floor_pose, homes = locate_floor(empty, camera, floor)
-    plate, ours = plate_patch(body), []
+    plate, ours = plate_facet(body), []
     paper: dict[str, list[Array]] = {", legs at home": [], ", legs moved": []}
     rng = np.random.default_rng(11)
     for k in range(count):
         for home in (True, False):
             pose = _random_pose(rng, HOME_HEIGHT if home else None)
             image = renderer.frame([_shown(robot, plate, pose)], Look(), k)
-            sample = Tracker(camera, body, floor, floor_pose, homes)(Frame(k, 0.0, image))
+            sample = Tracker(camera, body, floor, floor_pose, homes)(VideoFrame(k, 0.0, image))
             ours.append(_error(sample.pose[[0, 1, 3]], pose))
             near = project(camera, (body.positions @ pose.rotation.T + pose.position) @ straight.rotation.T + straight.position)
             height = HOME_HEIGHT + float(body.positions[0, 2])
@@ -215,14 +215,16 @@ def _ring_poses(tilt: float, count: int) -> tuple[Array, dict[str, Array]]:
             if found is not None:
                 # the method knows nothing of the height of the markers over the body's origin; held against the plate's middle
                 plate_middle = pose.position + pose.rotation[:, 2] * body.positions[0, 2]
-                paper[", legs at home" if home else ", legs moved"].append(_error(found, Pose(plate_middle, pose.rotation)))
+                paper[", legs at home" if home else ", legs moved"].append(
+                    _error(found, ScenePose(plate_middle, pose.rotation))
+                )
     lost = [error for error in ours if not np.isfinite(error).all()]
     if lost:
         raise RuntimeError(f"{len(lost)} of {len(ours)} poses were not found at tilt {tilt:g} rad")
     return np.array(ours), {name: np.array(errors) for name, errors in paper.items()}
 
 
-def _error(found: Array, pose: Pose) -> Array:
+def _error(found: Array, pose: ScenePose) -> Array:
     """x, y (m) and yaw (rad) found, minus the truth."""
     yaw = angles(pose.rotation)[0]
     return np.array([*(found[:2] - pose.position[:2]), math.remainder(found[2] - yaw, 2 * math.pi)])
@@ -237,9 +239,9 @@ def _tag_poses(tilt: float, count: int, name: str) -> tuple[Array, str]:
     cells = dictionary.markerSize + 2
     bits = [np.asarray(cv2.aruco.generateImageMarker(dictionary, k, cells) > 127, np.uint8) for k in range(4)]
     tags = [(x, y, TAG_SIDE, bit) for (x, y, _), bit in zip(body.positions, bits, strict=True)]
-    plate, straight = plate_patch(body, tags), view(tilt, 2.0)
+    plate, straight = plate_facet(body, tags), view(tilt, 2.0)
     camera = CAMERA.model_copy(update={"distortion": LENS})
-    renderer = Renderer(camera, straight, floor_patches(None))
+    renderer = Renderer(camera, straight, floor_facets(None))
     settings = cv2.aruco.DetectorParameters()
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(dictionary, settings)
@@ -260,7 +262,7 @@ def _tag_poses(tilt: float, count: int, name: str) -> tuple[Array, str]:
     return np.array(best).reshape(-1, 3), f"all four in {whole} of {count} frames"
 
 
-def _tag_error(seen: dict[int, Any], shift: float, body: Target, camera: Camera, floor: Pose, pose: Pose) -> Array:
+def _tag_error(seen: dict[int, Any], shift: float, body: Target, camera: Camera, floor: ScenePose, pose: ScenePose) -> Array:
     import cv2
 
     half = TAG_SIDE / 2
@@ -283,11 +285,11 @@ def measure_recall(size: Size) -> list[Result]:
     rng, found, shown = np.random.default_rng(5), 0, 0
     for k in range(size(150, 3)):
         distance = CAMERA.focal[0] * body.radii[0] / rng.uniform(12.3, 16)
-        renderer = Renderer(CAMERA, view(rng.uniform(0, math.pi / 4), distance, turn=rng.uniform(-3, 3)), floor_patches(None))
-        pose = Pose(np.array([*rng.uniform(-0.2, 0.2, 2), 0.06]), rotation_of(rng.uniform(-math.pi, math.pi)))
+        renderer = Renderer(CAMERA, view(rng.uniform(0, math.pi / 4), distance, turn=rng.uniform(-3, 3)), floor_facets(None))
+        pose = ScenePose(np.array([*rng.uniform(-0.2, 0.2, 2), 0.06]), rotation_of(rng.uniform(-math.pi, math.pi)))
         look = Look(blur=rng.uniform(0.5, 1.2), noise=rng.uniform(0, 10), gain=rng.uniform(0.5, 1.1),
                     gradient=(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4)))  # fmt: skip
-        detections = detect(renderer.frame([_shown(robot, plate_patch(body), pose)], look, k), CAMERA)
+        detections = detect(renderer.frame([_shown(robot, plate_facet(body), pose)], look, k), CAMERA)
         eye = renderer.floor_in_camera
         places = project(CAMERA, (body.positions @ pose.rotation.T + pose.position) @ eye.rotation.T + eye.position)
         for place, code in zip(places, body.codes, strict=True):
@@ -361,12 +363,12 @@ def _other_rings(image: Image, rng: np.random.Generator, place: tuple[int, int])
 def measure_rate(size: Size) -> list[Result]:
     """Frames per second of the tracker on one core, once it has found the robot, 1280 x 720, images in memory."""
     body, floor, robot = load_target("body"), load_target("floor"), load_robot()
-    renderer = Renderer(CAMERA, view(0.2, 2.0), floor_patches(floor))
+    renderer = Renderer(CAMERA, view(0.2, 2.0), floor_facets(floor))
     frames = []
     for k in range(size(60, 8)):
         moment = k / 30
-        pose = Pose(np.array([-0.3 + 0.15 * moment, 0.02 * math.sin(moment), HOME_HEIGHT]), rotation_of(0.4 * moment))
-        frames.append(Frame(k, moment, renderer.frame([_shown(robot, plate_patch(body), pose)], Look(), k)))
+        pose = ScenePose(np.array([-0.3 + 0.15 * moment, 0.02 * math.sin(moment), HOME_HEIGHT]), rotation_of(0.4 * moment))
+        frames.append(VideoFrame(k, moment, renderer.frame([_shown(robot, plate_facet(body), pose)], Look(), k)))
     floor_pose = locate_floor(frames[:5], CAMERA, floor)
     rates = []
     for _ in range(size.rounds):
@@ -395,7 +397,7 @@ def measure_drive(drive: Drive, tilt: float = 0.0, look: Look | None = None) -> 
     """Lines for one filmed drive: worst error of the accumulated slip of any wheel at any time, and the clocks' offset."""
     body, floor = load_target("body"), load_target("floor")
     camera = CAMERA.model_copy(update={"distortion": LENS})
-    renderer = Renderer(camera, view(tilt, 2.0), floor_patches(floor))
+    renderer = Renderer(camera, view(tilt, 2.0), floor_facets(floor))
     samples = list(track(film(drive, renderer, body, look or Look(), TRUE_OFFSET), camera, body, floor))
     parameters = Parameters.nominal(drive.robot)
     poses = np.stack([sample.pose for sample in samples])

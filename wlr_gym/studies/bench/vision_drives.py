@@ -14,8 +14,8 @@ from wlr_gym.data.format import Profile, RunMeta
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.perception.markers.targets import Target
-from wlr_gym.perception.scene import Look, Patch, Pose, Renderer, plate_patch, robot_patches
-from wlr_gym.perception.vision.track import Frame
+from wlr_gym.perception.scene import Facet, Look, Renderer, ScenePose, plate_facet, robot_facets
+from wlr_gym.perception.vision.tracking import VideoFrame
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, standing_state
 from wlr_gym.robot import JOINTS, Robot
@@ -167,24 +167,24 @@ def film(
     exposure: float = 0.005,
     phase: float = 0.011,
     seed: int = 0,
-    occluder: Callable[[float], list[Patch]] | None = None,
-) -> Iterator[Frame]:
+    occluder: Callable[[float], list[Facet]] | None = None,
+) -> Iterator[VideoFrame]:
     """Film a drive.
 
     Args:
         drive: what happens. renderer: camera and floor. body: markers on the robot. look: light, blur, noise.
         offset: s; servo time = the frame's time + offset. rate: Hz. exposure: s, around a frame's time. phase: s.
-        occluder: patches (floor frame) that hide something at a servo time.
+        occluder: facets (floor frame) that hide something at a servo time.
     """
     instants = 4
     shifts = exposure * ((np.arange(instants) + 0.5) / instants - 0.5)
     for index in range(int((drive.time[-1] - 2 * phase) * rate)):
         time = phase + index / rate
         moving = [[*_robot_at(drive, time + shift, body), *(occluder(time) if occluder else [])] for shift in shifts]
-        yield Frame(index, time - offset, renderer.frame(moving, look, seed + index))
+        yield VideoFrame(index, time - offset, renderer.frame(moving, look, seed + index))
 
 
-def pose_at(drive: Drive, time: float) -> Pose:
+def pose_at(drive: Drive, time: float) -> ScenePose:
     """True pose of the body at a servo time: linear between ticks."""
     from scipy.spatial.transform import Rotation, Slerp
 
@@ -192,10 +192,10 @@ def pose_at(drive: Drive, time: float) -> Pose:
     part = (time - drive.time[k]) / TICK
     turn = Slerp([0, 1], Rotation.from_matrix(drive.rotation[k : k + 2]))(part).as_matrix()
     position, legs = ((1 - part) * a[k] + part * a[k + 1] for a in (drive.position, drive.legs))
-    return Pose(position, turn, legs)
+    return ScenePose(position, turn, legs)
 
 
-def _robot_at(drive: Drive, time: float, body: Target) -> list[Patch]:
+def _robot_at(drive: Drive, time: float, body: Target) -> list[Facet]:
     pose = pose_at(drive, time)
-    patches = [*robot_patches(drive.robot, pose.legs), plate_patch(body)]
-    return [patch.moved(pose.position, pose.rotation) for patch in patches]
+    facets = [*robot_facets(drive.robot, pose.legs), plate_facet(body)]
+    return [facet.moved(pose.position, pose.rotation) for facet in facets]

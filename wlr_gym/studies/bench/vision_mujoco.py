@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.targets import Target
-from wlr_gym.perception.scene import PLATE, Look, Pose, circles_of, develop
+from wlr_gym.perception.scene import PLATE, Look, ScenePose, circles_of, develop
 from wlr_gym.render.gl import Canvas
 from wlr_gym.render.stage import Stage
 from wlr_gym.robot import JOINTS, Robot
@@ -37,7 +37,7 @@ class MujocoStudio:
         floor_in_camera: where the floor is. body, floor: targets; the body's is lifted to :data:`DECK` (``studio.body``).
     """
 
-    def __init__(self, robot: Robot, camera: Camera, floor_in_camera: Pose, body: Target, floor: Target) -> None:
+    def __init__(self, robot: Robot, camera: Camera, floor_in_camera: ScenePose, body: Target, floor: Target) -> None:
         self.camera, self.body, self.floor = camera, _lifted(body), floor
         self._floor_in_camera = floor_in_camera
         size = (camera.width, camera.height)
@@ -50,7 +50,7 @@ class MujocoStudio:
             self._scene.flags[flag] = 0
         self._joints = [int(model.joint(joint).qposadr[0]) for joint in JOINTS[:4]]
 
-    def frame(self, pose: Pose, look: Look, seed: int) -> NDArray[np.uint8]:
+    def frame(self, pose: ScenePose, look: Look, seed: int) -> NDArray[np.uint8]:
         """Draw the robot at ``pose`` (H, W), then let ``look`` blur it and add noise."""
         data, model = self._stage.data, self._stage.model
         data.qpos[:3] = pose.position
@@ -61,7 +61,7 @@ class MujocoStudio:
         options, free = mujoco.MjvOption(), mujoco.MjvCamera()
         mujoco.mjv_updateScene(model, data, options, None, free, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)
         self._aim()
-        self._add_target(self.floor, Pose(np.zeros(3), np.eye(3)), None)
+        self._add_target(self.floor, ScenePose(np.zeros(3), np.eye(3)), None)
         self._add_target(self.body, pose, PLATE)
         picture = self._canvas.draw(self._scene).astype(np.float32)
         return develop(picture @ np.array([0.299, 0.587, 0.114], np.float32), look, seed)
@@ -83,7 +83,7 @@ class MujocoStudio:
             eye.frustum_center = -_NEAR * middle[0] / camera.focal[0]
             eye.frustum_width = _NEAR * camera.width / 2 / camera.focal[0]
 
-    def _add_target(self, target: Target, pose: Pose, plate: tuple[float, float] | None) -> None:
+    def _add_target(self, target: Target, pose: ScenePose, plate: tuple[float, float] | None) -> None:
         z = float(target.positions[0, 2])
         if plate is not None:
             half = np.array([plate[0] / 2, plate[1] / 2, _STEP / 2])
@@ -97,7 +97,7 @@ class MujocoStudio:
                 self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([radius, _STEP / 2, 0]), pose, place, colour)
 
     def _add(
-        self, kind: mujoco.mjtGeom, size: Array, pose: Pose, place: Array, colour: tuple[float, float, float, float]
+        self, kind: mujoco.mjtGeom, size: Array, pose: ScenePose, place: Array, colour: tuple[float, float, float, float]
     ) -> None:
         geom = self._scene.geoms[self._scene.ngeom]
         where = pose.rotation @ place + pose.position

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.data.anchor import euler_angles
-from wlr_gym.data.compare import standing_at
+from wlr_gym.data.body_pose import euler_angles
 from wlr_gym.data.excitations import Motion
 from wlr_gym.data.format import Profile, RunMeta
 from wlr_gym.data.replay import profile_parameters
+from wlr_gym.data.run_states import standing_at
 from wlr_gym.physics.plants import REAL, SIMULATORS, check_backend, make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, RobotOptions, Sensors
 from wlr_gym.physics.plants.forces import Force

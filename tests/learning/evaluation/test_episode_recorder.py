@@ -11,8 +11,8 @@ import wlr_gym  # noqa: F401
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.data import convert, read_dataset, read_run, simulate_again, simulated_parameters, write_run
-from wlr_gym.data.simulation import SENSED
-from wlr_gym.learning.evaluation import Recorder
+from wlr_gym.data.sensor_columns import SENSED
+from wlr_gym.learning.evaluation import EpisodeRecorder
 from wlr_gym.robot.parameters import Parameters
 
 EVENTS = {
@@ -35,7 +35,7 @@ KEYWORDS = {"randomization": RANDOM, "episode_length": 2.0, "effects": [{"name":
 def record(path, count=3, robot=1, steps=60, **keywords) -> Any:
     env: Any = gym.make_vec("WLR-Velocity-v0", num_envs=count, **{**KEYWORDS, **keywords})
     env.reset(seed=5)
-    recorder = Recorder(env.core, robot)
+    recorder = EpisodeRecorder(env.core, robot)
     for action in np.random.default_rng(0).uniform(-1, 1, (steps, count, 8)).astype(np.float32):
         env.step(action)
         recorder.note()
@@ -93,11 +93,11 @@ def test_the_record_follows_the_run(tmp_path):
 def test_a_recorder_starts_at_a_reset():
     env: Any = gym.make("WLR-Velocity-v0").unwrapped
     with pytest.raises(InputError, match="right after a reset"):
-        Recorder(env.core)
+        EpisodeRecorder(env.core)
     env.reset(seed=0)
     env.step(np.zeros(8, np.float32))
     with pytest.raises(InputError, match="right after a reset"):
-        Recorder(env.core)
+        EpisodeRecorder(env.core)
 
 
 def test_evaluate_logs_what_was_drawn(tmp_path, capsys):

@@ -17,7 +17,7 @@ from typing import Any
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import replace_file
 from wlr_gym.perception.markers.camera import Camera
-from wlr_gym.perception.vision.track import check_size
+from wlr_gym.perception.vision.tracking import check_size
 from wlr_gym.perception.vision.video import Image, VideoFile, grey
 
 _BACKLOG = 300  # frames that may wait to be written
@@ -28,7 +28,7 @@ def film(number: int, folder: Path, camera: Camera, seconds: float | None = None
 
     Args:
         number: of the camera. folder: for ``film.avi`` and ``film.csv`` (number and time, s, of every frame).
-        camera: its calibration; the size of its images is asked for. seconds: None = until Ctrl-C.
+        camera: its calibration; the size of its images is requested from the driver. seconds: None = until Ctrl-C.
 
     Returns:
         The two paths.

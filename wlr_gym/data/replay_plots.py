@@ -23,7 +23,10 @@ _BODY = [
     ["cam_x", "cam_y", "cam_yaw"],
     ["cam_z", "cam_pitch", "volt"],
 ]
-_MEASURED, _FULL, _SEGMENTS = "#8c8c8c", "#e06c00", "#1f4e9c"
+# Colours of the curves.
+_MEASURED = "#8c8c8c"
+_FULL = "#e06c00"
+_SEGMENTS = "#1f4e9c"
 _CALM = 6.0  # noise units; flat channels are not blown up beyond this
 
 

@@ -6,7 +6,7 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.learning.evaluation import Condition, Subject, identity, play, read_subjects, work
 from wlr_gym.learning.evaluation import subjects as subjects_module
-from wlr_gym.learning.evaluation.campaign import BLOCK
+from wlr_gym.learning.evaluation.conditions import BLOCK
 from wlr_gym.learning.evaluation.subjects import make_player
 from wlr_gym.learning.evaluation.sweeps import SWEEPS, read_sweep, sweeps_for
 

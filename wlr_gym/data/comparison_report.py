@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wlr_gym.base.files import replace_file
-from wlr_gym.data.compare import BOUNDS, HORIZON, Agreement, Case, Comparison, difference
+from wlr_gym.data.comparison import BOUNDS, HORIZON, Agreement, Comparison, MotionComparison, difference
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,11 +22,14 @@ _PANELS = (
     ("normal_force",), ("total_along", "total_across"), ("total_turn",), ("slip_along", "slip_across"), ("gyro",),
     ("friction_across",),
 )  # fmt: skip
-_FIRST, _SECOND, _LIMIT = "#1f4e9c", "#e06c00", "#b03030"
+# Colours of the first and the second plant, and of the threshold.
+_FIRST = "#1f4e9c"
+_SECOND = "#e06c00"
+_LIMIT = "#b03030"
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """A table of strings: title, headings, rows; the first column holds names."""
 
     title: str
@@ -39,9 +42,9 @@ class Table:
         return "\n".join([f"**{self.title}**", "", *(f"| {' | '.join(line)} |" for line in lines)])
 
 
-def tables(comparison: Comparison) -> list[Table]:
+def tables(comparison: Comparison) -> list[ReportTable]:
     """Return the tables of one comparison: agreement, differences by signal, and what becomes of them at half the steps."""
-    plants = " against ".join(traces.contender.label for traces in (comparison.second, comparison.first))
+    plants = " against ".join(traces.plant.label for traces in (comparison.second, comparison.first))
     note = f"{plants}; effects: {comparison.effects}"
     found = [agreement_table(f"Agreement, {note}", [(case.motion, case) for case in comparison.cases])]
     if comparison.half:
@@ -57,7 +60,7 @@ def tables(comparison: Comparison) -> list[Table]:
     ]
     motions = tuple(case.motion for case in comparison.cases)
     found.append(
-        Table(
+        ReportTable(
             "Rms difference in units of sensor noise; *: how wheels that stick share a load is open",
             ("signal", "unit", "noise", *motions),
             tuple(rows),
@@ -68,16 +71,16 @@ def tables(comparison: Comparison) -> list[Table]:
     return found
 
 
-def agreement_table(title: str, cases: Sequence[tuple[str, Case]]) -> Table:
-    """Return the figures that :data:`wlr_gym.data.compare.BOUNDS` bounds, one row per named case; ``!`` marks a broken one."""
+def agreement_table(title: str, cases: Sequence[tuple[str, MotionComparison]]) -> ReportTable:
+    """Return the figures that :data:`~wlr_gym.data.comparison.BOUNDS` bounds, one row per case; ``!`` marks a broken bound."""
     headings = (
         "motion", "travel m", f"apart after {HORIZON:g} s mm", "% of travel", "yaw deg", "leg torque %", "wheel torque %",
-        "parts first in", "at s",
+        "diverges first in", "at s",
     )  # fmt: skip
-    return Table(title, headings, tuple((name, *_agreement(case)) for name, case in cases))
+    return ReportTable(title, headings, tuple((name, *_agreement(case)) for name, case in cases))
 
 
-def summary_table(comparisons: Sequence[Comparison]) -> Table:
+def summary_table(comparisons: Sequence[Comparison]) -> ReportTable:
     """Return one row per comparison: its worst figures over all motions, and the motions that break a bound."""
     headings = (
         "effects", "apart mm", "% of travel", "yaw deg", "leg torque %", "wheel torque %", "largest signal", "broken by"
@@ -92,10 +95,10 @@ def summary_table(comparisons: Sequence[Comparison]) -> Table:
         figures = _figures(worst)
         rows.append((comparison.effects, f"{1e3 * worst['apart']:.2f}", *figures, f"{signal} {_noise(size)}", broken))
     step = " at half of both steps" if comparisons[0].half else ""
-    return Table(f"Worst of all motions{step}", headings, tuple(rows))
+    return ReportTable(f"Worst of all motions{step}", headings, tuple(rows))
 
 
-def _agreement(case: Case) -> tuple[str, ...]:
+def _agreement(case: MotionComparison) -> tuple[str, ...]:
     found: Agreement = case.agreement
     name, time = case.first or ("never", None)
     values = {bound: getattr(found, bound) for bound in BOUNDS}
@@ -107,15 +110,20 @@ def _figures(values: dict[str, float]) -> tuple[str, ...]:
     return tuple(f"{scale[name] * values[name]:.2f}{'' if values[name] <= bound else ' !'}" for name, bound in BOUNDS.items())
 
 
-def _convergence_table(comparison: Comparison, half: Sequence[Case], first: Sequence[Case], second: Sequence[Case]) -> Table:
-    def pooled(cases: Sequence[Case], name: str) -> str:
+def _convergence_table(
+    comparison: Comparison,
+    half: Sequence[MotionComparison],
+    first: Sequence[MotionComparison],
+    second: Sequence[MotionComparison],
+) -> ReportTable:
+    def pooled(cases: Sequence[MotionComparison], name: str) -> str:
         return _noise(float(np.sqrt(np.mean([case.differences[name].rms_in_noise ** 2 for case in cases]))))
 
     sets = (comparison.cases, half, first, second)
-    labels = [traces.contender.backend for traces in (comparison.first, comparison.second)]
+    labels = [traces.plant.backend for traces in (comparison.first, comparison.second)]
     headings = ("signal", "apart", "at half the steps", *(f"{label}'s own step" for label in labels))
     rows = tuple((name, *(pooled(cases, name) for cases in sets)) for name in comparison.signals)
-    return Table("Does it shrink with the step? All motions, rms in units of sensor noise", headings, rows)
+    return ReportTable("Does it shrink with the step? All motions, rms in units of sensor noise", headings, rows)
 
 
 def _noise(value: float) -> str:
@@ -167,7 +175,7 @@ def _motion_figure(comparison: Comparison, index: int, title: str) -> Figure:
         above = figure.add_subplot(inner[0])
         below = figure.add_subplot(inner[1], sharex=above)
         _draw_panel(comparison, index, names, above, below)
-    labels = [traces.contender.label for traces in (comparison.first, comparison.second)]
+    labels = [traces.plant.label for traces in (comparison.first, comparison.second)]
     handles = [figure.axes[0].plot([], [], color=colour)[0] for colour in (_FIRST, _SECOND)]
     figure.legend(handles, labels, loc="outside upper right", ncols=2, frameon=False)
     figure.suptitle(title, fontsize=13)
@@ -216,7 +224,7 @@ def _map_figure(comparison: Comparison) -> Figure:
         colour = "black" if 0.1 < size < 30.0 else "white"
         axes.text(column, row, _noise(size), ha="center", va="center", fontsize=7, color=colour)
     axes.set_title(
-        f"{comparison.second.contender.label} minus {comparison.first.contender.label}\n"
+        f"{comparison.second.plant.label} minus {comparison.first.plant.label}\n"
         f"rms in units of sensor noise; effects: {comparison.effects}",
         fontsize=10,
     )

@@ -1,4 +1,4 @@
-"""Robot states from measurements: where a replay starts, and where each of its segments starts again.
+"""Robot states of a run, from what it measures: where a replay starts, and where each of its segments starts again.
 
 What the run measures is taken from it, smoothed; the rest (height, attitude, servo references) comes from a background state.
 """
@@ -8,17 +8,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.physics.plants.sensors import imu_to_body, rotation
 from wlr_gym.physics.servo import motor_constants
-from wlr_gym.robot import CORNER_SIGNS, JOINTS, Robot
+from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-#: Half width (s) of the window a joint or gyro reading is smoothed over; the camera is slower and noisier.
+#: s; half width of the window over which a joint or gyro reading is smoothed.
 JOINT_WINDOW = 0.07
+#: s; the same for the camera, which is slower and noisier.
 CAMERA_WINDOW = 0.2
 #: rad; a joint that stays within this stands still.
 REST = 0.004
@@ -57,14 +59,14 @@ def start_state(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
     """
     background = standing_state(robot, parameters)
     first = run["t"][:1]
-    legs = np.array([[run[f"cmd_{joint}"][0] for joint in JOINTS[:4]]])
+    legs = np.array([[run[f"cmd_{joint}"][0] for joint in LEGS]])
     degree = 0 if starts_at_rest(run) else 2
     measured = _joints(run, first, parameters, degree)[0]
     goal = legs - parameters["joint.zero_offset"]
-    background.reference_position[:, :4] = np.where(np.isnan(goal), measured[:, :4], goal)
-    background.reference_position[:, 4:] += _wheel_tension(run, robot, parameters)
+    background.reference_position[:, LEG_SLICE] = np.where(np.isnan(goal), measured[:, LEG_SLICE], goal)
+    background.reference_position[:, WHEEL_SLICE] += _wheel_tension(run, robot, parameters)
     state = measured_state(run, first, background, parameters, degree)
-    state.reference_velocity[:, 4:] = state.joint_velocity[:, 4:]
+    state.reference_velocity[:, WHEEL_SLICE] = state.joint_velocity[:, WHEEL_SLICE]
     return state
 
 
@@ -85,12 +87,13 @@ def measured_state(run: Run, times: Array, background: PlantState, parameters: P
     """
     state = background.copy()
     state.joint_position, state.joint_velocity = _joints(run, times, parameters, degree)
-    state.reference_position[:, 4:] += state.joint_position[:, 4:] - background.joint_position[:, 4:]
+    state.reference_position[:, WHEEL_SLICE] += state.joint_position[:, WHEEL_SLICE] - background.joint_position[:, WHEEL_SLICE]
     if state.rotor_rate is not None:
         state.rotor_rate += state.joint_velocity - background.joint_velocity
 
     yaw, pitch, roll = euler_angles(background.quaternion)
-    moved = rest_pose(parameters, state.joint_position[:, :4]) - rest_pose(parameters, background.joint_position[:, :4])
+    measured_rest, background_rest = (rest_pose(parameters, s.joint_position[:, LEG_SLICE]) for s in (state, background))
+    moved = measured_rest - background_rest
     state.position[:, 2] += moved[:, 0]
     pitch, roll = pitch + moved[:, 1], roll + moved[:, 2]
     velocity = np.einsum("nij,nj->ni", rotation(yaw, pitch, roll), background.linear_velocity_in_body)
@@ -110,6 +113,18 @@ def measured_state(run: Run, times: Array, background: PlantState, parameters: P
     offset = np.asarray(run.meta.marker_offset)
     state.position[seen, :2] -= (turn @ offset)[seen, :2]
     state.linear_velocity_in_body[seen] -= np.cross(state.angular_velocity_in_body, offset)[seen]
+    return state
+
+
+def standing_at(goals: Array, robot: Robot, parameters: Parameters) -> PlantState:
+    """Return every robot standing on the floor at its first leg goals, level where its parameters let it."""
+    state = standing_state(robot, parameters)
+    level = rest_pose(parameters, state.joint_position[:, LEG_SLICE])
+    state.joint_position[:, LEG_SLICE] = goals[:, LEG_SLICE] - parameters["joint.zero_offset"]  # goals are readings
+    state.reference_position[:, LEG_SLICE] = state.joint_position[:, LEG_SLICE]  # true angles, both
+    pose = rest_pose(parameters, state.joint_position[:, LEG_SLICE])
+    state.position[:, 2] += pose[:, 0] - level[:, 0]
+    state.quaternion = quaternion(np.zeros(len(pose)), pose[:, 1], pose[:, 2])
     return state
 
 
@@ -134,7 +149,7 @@ def _joints(run: Run, times: Array, parameters: Parameters, degree: int) -> tupl
         positions[:, j], velocities[:, j] = local_fit(run["t"], run[f"pos_{joint}"], times, JOINT_WINDOW, degree)
         if f"vel_{joint}" in run and np.isfinite(run[f"vel_{joint}"]).sum() > 2:
             velocities[:, j], _ = local_fit(run["t"], run[f"vel_{joint}"], times, JOINT_WINDOW, degree)
-    positions[:, :4] -= parameters["joint.zero_offset"]
+    positions[:, LEG_SLICE] -= parameters["joint.zero_offset"]
     return positions, velocities
 
 
@@ -161,55 +176,12 @@ def _wheel_tension(run: Run, robot: Robot, parameters: Parameters) -> Array:
     nominal_voltage = robot.servo.supply_voltage
     constant, resistance = motor_constants(robot.servo.wheel.stall_torque, robot.servo.wheel.no_load_speed, nominal_voltage)
     still = _rows_before_motion(run)
-    effort = [np.mean(run[f"eff_{joint}"][still]) if f"eff_{joint}" in run else 0.0 for joint in JOINTS[4:]]
-    return np.nan_to_num(effort) * resistance / constant / np.maximum(parameters["servo.kp"][:, 4:], 1e-9)
+    effort = [np.mean(run[f"eff_{joint}"][still]) if f"eff_{joint}" in run else 0.0 for joint in WHEELS]
+    return np.nan_to_num(effort) * resistance / constant / np.maximum(parameters["servo.kp"][:, WHEEL_SLICE], 1e-9)
 
 
 def _rows_before_motion(run: Run) -> NDArray[np.bool_]:
     """Rows of the first tenths of a second that were read before any goal asked a wheel to turn; the first one at least."""
-    asked = np.any([np.nan_to_num(run[f"cmd_{joint}"]) != 0.0 for joint in JOINTS[4:]], axis=0)
+    asked = np.any([np.nan_to_num(run[f"cmd_{joint}"]) != 0.0 for joint in WHEELS], axis=0)
     before = np.concatenate([[False], np.logical_or.accumulate(asked)[:-1]])
     return (run["t"] <= run["t"][0] + CAMERA_WINDOW) & ~before
-
-
-# --- geometry ---------------------------------------------------------------------------------------------------------
-
-
-def rest_pose(parameters: Parameters, legs: Array) -> Array:
-    """Return height of the body origin, pitch and roll (N, 3) that put four wheels on a flat floor, least squares.
-
-    Args:
-        parameters: (N).
-        legs: (N, 4) true leg angles, rad.
-    """
-    signs = np.array(CORNER_SIGNS)
-    hip, length, radius = parameters["hip.position"], parameters["leg.length"], parameters["wheel.radius"]
-    x = signs[:, 0] * hip[:, :1] + length * np.cos(legs)
-    y = signs[:, 1] * hip[:, 1:2] + np.zeros_like(legs)
-    z = hip[:, 2:] - length * np.sin(legs)
-    pose = np.zeros((len(legs), 3))
-    for _ in range(5):  # Gauss-Newton; the problem is almost linear
-        height, pitch, roll = pose[:, :1], pose[:, 1:2], pose[:, 2:]
-        up = np.sin(roll) * y + np.cos(roll) * z
-        gap = height - np.sin(pitch) * x + np.cos(pitch) * up - radius
-        along = np.cos(pitch) * (np.cos(roll) * y - np.sin(roll) * z)
-        slope = np.stack([np.ones_like(x), -np.cos(pitch) * x - np.sin(pitch) * up, along], axis=2)
-        pose = pose - np.einsum("nij,nj->ni", np.linalg.pinv(slope), gap)
-    return pose
-
-
-def euler_angles(q: Array) -> tuple[Array, Array, Array]:
-    """Yaw, pitch and roll (N,) of quaternions (N, 4), (w, x, y, z): Rz(yaw) Ry(pitch) Rx(roll), body to floor frame."""
-    w, x, y, z = q.T
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1, 1))
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    return yaw, pitch, roll
-
-
-def quaternion(yaw: Array, pitch: Array, roll: Array) -> Array:
-    """Quaternions (N, 4) of Rz(yaw) Ry(pitch) Rx(roll)."""
-    (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a / 2), np.sin(a / 2)) for a in (yaw, pitch, roll))
-    w, x = cy * cp * cr + sy * sp * sr, cy * cp * sr - sy * sp * cr
-    y, z = cy * sp * cr + sy * cp * sr, sy * cp * cr - cy * sp * sr
-    return np.stack([w, x, y, z], axis=1)

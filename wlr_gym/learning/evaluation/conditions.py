@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 FIRST_SEED = 100_000
 #: Distance between the first seeds of two blocks of episodes.
 BLOCK = 10_000
-#: One control tick on MuJoCo takes as long as so many on the engine: for the progress bar only.
+#: One environment step on MuJoCo takes as long as so many on the engine: for the progress bar only.
 TICK_COST = {"mujoco": 40}
 
 
@@ -54,7 +54,7 @@ class Condition:
 
     @property
     def cost(self) -> int:
-        """Relative cost of a control tick of all episodes of a block."""
+        """Relative cost of a environment step of all episodes of a block."""
         return self.episodes * TICK_COST.get(str(self.keywords.get("backend")), 1)
 
 
@@ -64,7 +64,7 @@ Watch = Callable[[Condition, Subject, int, Rollout], object]
 
 
 def work(conditions: Sequence[Condition], subjects: Sequence[Subject], ticks: int) -> int:
-    """Return how often ``tell`` of :func:`play` counts in all, for episodes of ``ticks`` control ticks."""
+    """Return how often ``tell`` of :func:`play` counts in all, for episodes of ``ticks`` environment steps."""
     return sum(condition.cost * condition.blocks for condition in conditions) * len(subjects) * ticks
 
 
@@ -83,7 +83,7 @@ def play(
         subjects: who plays.
         conditions: under which; neighbours with the same keywords and number of episodes share their environment.
         first_seed: of the first block.
-        tell: called after every control tick with what is going on and its cost; see :func:`work`.
+        tell: called after every environment step with a description and its cost; see :func:`work`.
         watch: called with every block that was played.
 
     Raises:
@@ -161,4 +161,4 @@ class _Given:
         differs = (self.command[:ticks] != other.command[:ticks]).any(axis=2) & both
         if differs.any():
             tick, episode = np.argwhere(differs)[0]
-            raise InputError(f"{names}: seed {self.seeds[episode]} gets another command from control tick {tick} on{hint}")
+            raise InputError(f"{names}: seed {self.seeds[episode]} gets another command from environment step {tick} on{hint}")

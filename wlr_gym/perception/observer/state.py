@@ -1,4 +1,4 @@
-"""What the observer knows about the robot, and what it remembers of one."""
+"""The robot as the observer's filter takes it, and the state that the filter keeps of each robot."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.perception.observer import axis
+from wlr_gym.perception.observer import kalman
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import CORNER_SIGNS, Robot
 
 Array = NDArray[np.float64]
 
 
-class Constants(NamedTuple):
+class ObserverConstants(NamedTuple):
     """The robot as its file describes it, and its sensors' errors."""
 
     period: float
@@ -43,10 +43,10 @@ class Constants(NamedTuple):
     camera_yaw_noise: float
 
 
-def constants(robot: Robot, period: float, camera: bool) -> Constants:
+def constants(robot: Robot, period: float, camera: bool) -> ObserverConstants:
     """Return the constants of a robot read every ``period`` s; ``camera``: whether its poses are used."""
     hip, sensors = robot.hip_position, robot.sensors
-    return Constants(
+    return ObserverConstants(
         period=period,
         gravity=robot.gravity,
         mass=robot.total_mass,
@@ -73,8 +73,8 @@ def constants(robot: Robot, period: float, camera: bool) -> Constants:
     )
 
 
-def record(history: int) -> np.dtype[Any]:
-    """What the observer remembers of one robot; vectors along heading, left and normal unless named otherwise."""
+def state_type(history: int) -> np.dtype[Any]:
+    """Return the type of the state of one robot; vectors along heading, left and normal unless named otherwise."""
     numbers = {
         "tick": (),
         "seen": (SENSOR_LAYOUT.width,),  # last finite readings
@@ -85,22 +85,22 @@ def record(history: int) -> np.dtype[Any]:
         "leak": (2,),  # of the accelerometer, m/s2
         "slip": (2, 4),  # by how much each wheel rolls faster than the body moves, m/s
         "slope": (2,),  # gravity along the floor, m/s2
-        "covariance": (2, axis.SIZE, axis.SIZE),
+        "covariance": (2, kalman.SIZE, kalman.SIZE),
         "yaw_covariance": (3,),  # yaw, yaw with bias, bias
         "gyro_bias": (),  # about the normal
         "normal": (3,),  # of the floor, body frame
         "rate": (3,),  # body frame
         "yaw_rate": (),
-        "force": (3,),  # specific, mean over the tick
+        "force": (3,),  # specific, mean over the step
         "last_force": (3,),
         "demand": (),  # friction demand, smoothed
         "limit": (),  # 0 to 1: slip that all wheels share is possible
         "surprise": (2,),  # mean normalised innovation of the camera's last frames
         "doubt": (),  # 0 to 1: the camera contradicts the wheels
         "strange": (),  # camera frames far off, in a row
-        # without corrections, for what the camera saw some ticks ago
+        # without corrections, for what the camera saw some steps ago
         "raw_velocity": (2,),  # start frame
-        "raw": (history, 3),  # x, y, yaw at each tick
+        "raw": (history, 3),  # x, y, yaw at each step
         # wheels, see contacts.py
         "heading": (3,),  # body frame
         "left": (3,),  # body frame
@@ -112,10 +112,10 @@ def record(history: int) -> np.dtype[Any]:
         "traction": (4,),
         "spin": (4,),
         # scratch
-        "noise": (axis.SIZE,),
+        "noise": (kalman.SIZE,),
         "decay": (4,),
-        "column": (axis.SIZE,),
-        "change": (axis.SIZE,),
+        "column": (kalman.SIZE,),
+        "change": (kalman.SIZE,),
         "grips": (4,),
         "loose": (),
         "mean_square": (),

@@ -28,7 +28,7 @@ _JERK_ROOT = np.linalg.cholesky(np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3,
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """A signal at the times asked for.
+    """A signal at the requested times.
 
     Attributes:
         value, rate: (K,). value_std, rate_std: 1 sigma.

@@ -2,7 +2,7 @@
 
 x = (p, v, l, c_1 .. c_4): p' = v; v' = a - l with the measured acceleration a; l, what leaks into the accelerometer (bias, and
 gravity on a slope that is not known), a random walk; c_i, by how much wheel i rolls faster than the body moves, first-order
-Gauss-Markov. Covariances only: the means live in frames that turn, see ``observer.py``.
+Gauss-Markov. Covariances only: the means live in frames that turn, see ``prediction.py``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,12 @@ from typing import Any
 
 from numba import njit
 
-VELOCITY, LEAK, SLIP, SIZE = 1, 2, 3, 7
+# Where the state's elements stand; the position is first.
+VELOCITY = 1
+LEAK = 2
+SLIP = 3
+#: Number of elements.
+SIZE = 7
 
 
 @njit(cache=True, nogil=True)

@@ -17,14 +17,23 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.perception.markers.camera import Camera
-from wlr_gym.perception.markers.detect import Detection, Image, detect, refine
+from wlr_gym.perception.markers.detection import Detection, Image, detect, refine
 from wlr_gym.perception.markers.pose import LARGEST_RESIDUAL, TargetPose, expected_ellipse, find_target, solve_pose
 from wlr_gym.perception.markers.targets import Target
 
 Array = NDArray[np.float64]
 
-#: Status of a sample: pose from all markers; from fewer; none found; the camera moved; a pose that cannot be.
-OK, PARTIAL, LOST, MOVED, IMPOSSIBLE = "ok", "partial", "lost", "moved", "impossible"
+# Status of a sample.
+#: Pose from all markers.
+OK = "ok"
+#: Pose from fewer than all markers.
+PARTIAL = "partial"
+#: No markers found.
+LOST = "lost"
+#: The camera moved.
+MOVED = "moved"
+#: A pose that cannot be: in the floor, or upside down.
+IMPOSSIBLE = "impossible"
 FLOOR_FRAMES = 20
 #: m; positions of floor markers may be off by this much (they were measured by hand).
 FLOOR_TOLERANCE = 0.01
@@ -34,7 +43,7 @@ _HEIGHTS = (0.0, 0.6)  # m, of the body's origin
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class VideoFrame:
     """One image (H, W) grey with its number and its time on the camera's clock, s."""
 
     index: int
@@ -79,7 +88,7 @@ class Tracker:
         self._track: list[tuple[float, TargetPose]] = []  # the last two poses
         self._watched = 0
 
-    def __call__(self, frame: Frame) -> Sample:
+    def __call__(self, frame: VideoFrame) -> Sample:
         """Process one frame. Frames must come in order of time."""
         check_size(frame.image, self.camera, f"frame {frame.index}")
         shift = self._floor_shift(frame.image)
@@ -103,7 +112,7 @@ class Tracker:
         status = OK if count == len(self.body.markers) else PARTIAL
         return Sample(frame.index, frame.time, status, pose, covariance, count, found.residual, centres)
 
-    def _follow(self, frame: Frame) -> tuple[TargetPose | None, dict[int, Detection]]:
+    def _follow(self, frame: VideoFrame) -> tuple[TargetPose | None, dict[int, Detection]]:
         """Look where the markers should be."""
         if not self._track:
             return None, {}
@@ -118,7 +127,7 @@ class Tracker:
         found = solve_pose(seen, self.body, self.camera, rotation, position)
         return (found, seen) if found is not None and found.residual < LARGEST_RESIDUAL else (None, seen)
 
-    def _search(self, frame: Frame) -> tuple[TargetPose | None, dict[int, Detection]]:
+    def _search(self, frame: VideoFrame) -> tuple[TargetPose | None, dict[int, Detection]]:
         """Look around where the body was, then everywhere."""
         up = self.floor_pose.rotation[:, 2]
         boxes = [self._neighbourhood()] if self._track else []
@@ -173,7 +182,7 @@ class Tracker:
         return math.nan if seen is None else math.hypot(*(seen.ellipse[:2] - self._homes[index]))
 
 
-def track(frames: Iterable[Frame], camera: Camera, body: Target, floor: Target) -> Iterator[Sample]:
+def track(frames: Iterable[VideoFrame], camera: Camera, body: Target, floor: Target) -> Iterator[Sample]:
     """Locate the floor in the first frames, then yield one sample per frame.
 
     Raises:
@@ -185,7 +194,7 @@ def track(frames: Iterable[Frame], camera: Camera, body: Target, floor: Target) 
     return (tracker(frame) for frame in chain(first, stream))
 
 
-def locate_floor(frames: Sequence[Frame], camera: Camera, floor: Target) -> tuple[TargetPose, Array]:
+def locate_floor(frames: Sequence[VideoFrame], camera: Camera, floor: Target) -> tuple[TargetPose, Array]:
     """Locate the floor over several frames of a camera that stands still; also the markers' places (M, 2) in px.
 
     Raises:
@@ -256,7 +265,7 @@ def angles(rotation: Array) -> Array:
     return np.array([yaw, pitch, math.atan2(rotation[2, 1], rotation[2, 2])])
 
 
-def _no_pose(frame: Frame, status: str, centres: Array) -> Sample:
+def _no_pose(frame: VideoFrame, status: str, centres: Array) -> Sample:
     return Sample(frame.index, frame.time, status, np.full(6, np.nan), np.full((6, 6), np.nan), 0, math.nan, centres)
 
 

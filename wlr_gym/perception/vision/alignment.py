@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.anchor import quaternion, rest_pose
+from wlr_gym.data.body_pose import quaternion, rest_pose
 from wlr_gym.data.read import Run
-from wlr_gym.perception.vision.smooth import smooth
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.perception.vision.smoothing import smooth
+from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import accumulate, contact_slip_velocity
 
@@ -29,14 +29,20 @@ Array = NDArray[np.float64]
 SEARCH = 1.0
 #: s; an offset less certain than this is refused.
 LARGEST_STD = 0.004
-_DRIFT, _SLIP = 40.0, 5.0  # s; differences with a longer period say nothing about the clocks
+#: s; of turns and heights, differences with a longer period are drift of the gyroscope and not of the clocks.
+_DRIFT = 40.0
+#: s; of the distance driven, differences with a longer period are slip.
+_SLIP = 5.0
 _GRID = 0.005  # s
 _LATENCY = 1e-3  # s; the delays inside IMU and camera are known no better
 _DISTANCE = "distance"
 _START_SLIP = 1e-4  # m; a wheel that starts later than the body looks like a clock that is late
 _ROLLS = 20.0  # a wheel that rolls explains the distance this many times better than nothing
 _DISTINCT = 0.1  # s; a second minimum this far off
-_TURN, _SAME_TURN = 0.02, 10.0  # rad rms; a turn seen by the camera that the gyroscope must explain to a tenth of it
+#: rad rms; a turn seen by the camera that the gyroscope must explain.
+_TURN = 0.02
+#: The part of it that stays unexplained is at most one over this.
+_SAME_TURN = 10.0
 
 
 @dataclass(frozen=True)
@@ -213,7 +219,7 @@ def _without_slow(time: Array, slowest: float) -> Callable[[Array], Array]:
 def _pairs(time: Array, poses: Array, run: Run, robot: Robot, parameters: Parameters, around: float) -> list[_Pair]:
     t = run["t"]
     joints = joint_signals(run, t, robot)
-    legs = joints[0][:, :4] - parameters["joint.zero_offset"]
+    legs = joints[0][:, LEG_SLICE] - parameters["joint.zero_offset"]
     rest = rest_pose(parameters, legs)
     sag = _sag(legs, parameters)
     pairs = [

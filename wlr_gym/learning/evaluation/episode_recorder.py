@@ -10,7 +10,8 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
-from wlr_gym.data.simulation import SENSED, ParameterChange, Simulation, channels, departures, start_of
+from wlr_gym.data.sensor_columns import SENSED, channels
+from wlr_gym.data.simulation_record import ParameterChange, Simulation, departures, start_of
 from wlr_gym.data.write import write_run
 from wlr_gym.learning.evaluation.rollout import roll_out
 from wlr_gym.physics.effects import EFFECTS
@@ -22,12 +23,12 @@ if TYPE_CHECKING:
     from wlr_gym.policy import Policy
 
 
-class Recorder:
+class EpisodeRecorder:
     """Logs one robot of a batch, from the episode it has just begun to that episode's end.
 
     ```python
     env.reset(seed=3)
-    recorder = Recorder(env.unwrapped.core)
+    recorder = EpisodeRecorder(env.unwrapped.core)
     ...
     env.step(action); recorder.note()
     ...
@@ -108,13 +109,13 @@ class Recorder:
 
 def record_episodes(core: Core, policy: Policy, folder: Path, first_seed: int = 0) -> list[Path]:
     """Play one episode per robot of ``core``, seeds as in ``roll_out``, and write each as ``folder/run_<n>.parquet``."""
-    recorders: list[Recorder] = []
+    recorders: list[EpisodeRecorder] = []
     roll_out(
         core,
         policy,
         first_seed,
         on_tick=lambda: [recorder.note() for recorder in recorders],
-        on_start=lambda: recorders.extend(Recorder(core, robot) for robot in range(core.count)),
+        on_start=lambda: recorders.extend(EpisodeRecorder(core, robot) for robot in range(core.count)),
     )
     digits = max(2, len(str(core.count)))
     return [recorder.save(folder / f"run_{k:0{digits}d}.parquet") for k, recorder in enumerate(recorders, 1)]

@@ -24,7 +24,9 @@ Image = NDArray[np.uint8]
 
 SMALLEST_RADIUS = 5.0  # px, of a marker's outer circle
 #: Shrinking of the image and block (px) of the adaptive threshold: large markers, usual ones, ones beside a shadow's edge.
-_PASSES, _OFFSET = ((1, 51), (2, 51), (1, 21)), 6
+_PASSES = ((1, 51), (2, 51), (1, 21))
+#: Grey levels below the mean of the block from which on a pixel is dark.
+_OFFSET = 6
 _LARGEST_AXIS_RATIO = 4.0
 _ELLIPSE_TOLERANCE = 0.15  # of the area
 _LEAST_MATCH = 0.78  # correlation of a brightness profile with a code

@@ -11,7 +11,7 @@ from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.noise import channel_noise
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import ReplayResult, channel_errors, prepare, segment_starts
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import WHEELS, Robot
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ def compare_repeat(measured: Run, repeated: Run, robot: Robot | str | Path | Non
             continue
         full[name] = np.interp(t - t[0], own[known], repeated[name][known], right=np.nan)
         full[name][t - t[0] > own[-1]] = np.nan
-        turns = name in {f"pos_{joint}" for joint in JOINTS[4:]}
+        turns = name in {f"pos_{joint}" for joint in WHEELS}
         pieces[name] = _from_each_start(measured[name], full[name], starts) if turns else full[name]
     errors = channel_errors(measured, full, pieces, channel_noise(robot))
     return ReplayResult(measured, full, pieces, tuple(map(int, starts)), errors, robot, float(np.median(np.diff(own))), 0.0)

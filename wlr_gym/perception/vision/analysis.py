@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import replace_file, write_json
-from wlr_gym.data.anchor import rest_pose, rotation
+from wlr_gym.data.body_pose import rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import robot_of
 from wlr_gym.data.write import write_run
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.targets import Target
-from wlr_gym.perception.vision.align import Alignment, align, joint_signals
+from wlr_gym.perception.vision.alignment import Alignment, align, joint_signals
 from wlr_gym.perception.vision.slip import SlipResult, measure_slip, smoothed_poses
-from wlr_gym.perception.vision.track import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, Frame, Sample, track
+from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, Sample, VideoFrame, track
 from wlr_gym.perception.vision.video import Frames
-from wlr_gym.robot import WHEELS, Robot
+from wlr_gym.physics.plants.sensors import rotation
+from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ _AT_REST = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Analysis:
+class VideoAnalysis:
     """What a video says about a run.
 
     Attributes:
@@ -99,7 +100,7 @@ class Analysis:
 
 
 def analyse(
-    frames: Iterable[Frame],
+    frames: Iterable[VideoFrame],
     run: Run,
     camera: Camera,
     body: Target,
@@ -107,9 +108,9 @@ def analyse(
     robot: Robot | str | None = None,
     offset: float | None = None,
     origin: str = "start",
-    watch: Callable[[Frame, Sample], None] | None = None,
+    watch: Callable[[VideoFrame, Sample], None] | None = None,
     around: float = 0.0,
-) -> Analysis:
+) -> VideoAnalysis:
     """Track the robot through a video and measure pose and slip.
 
     Args:
@@ -141,11 +142,11 @@ def analyse(
     slip = measure_slip(samples, offset, run, found, parameters, known, body.layout_std)
     table = camera_columns(samples, offset, run, origin, slip.outliers)
     measured = Run(table, run.meta, run.path, run.findings)
-    legs = joint_signals(run, slip.time, found)[0][:, :4] - parameters["joint.zero_offset"]
+    legs = joint_signals(run, slip.time, found)[0][:, LEG_SLICE] - parameters["joint.zero_offset"]
     height_error = float(np.median(slip.pose[:, 2] - rest_pose(parameters, legs)[:, 0]))
     missing = frames.missing if isinstance(frames, Frames) else 0
     findings = tuple(_findings(samples, slip, height_error, missing))
-    return Analysis(measured, samples, alignment, offset, slip, found, origin, height_error, missing, findings)
+    return VideoAnalysis(measured, samples, alignment, offset, slip, found, origin, height_error, missing, findings)
 
 
 def camera_columns(
@@ -153,8 +154,8 @@ def camera_columns(
 ) -> pandas.DataFrame:
     """Return the run's table with the columns ``cam_*``: each frame's own measurement, in the row nearest to it.
 
-    It is moved to the row's time by the smoothed rate (at most half a tick), so the columns have no delay; rows without a
-    frame are NaN. Position is that of the run's ``marker_offset`` in the body (0 = body origin G).
+    It is moved to the row's time by the smoothed rate (at most half a control step), so the columns have no delay; rows
+    without a frame are NaN. Position is that of the run's ``marker_offset`` in the body (0 = body origin G).
     """
     t = run["t"]
     good = np.array([math.isfinite(s.pose[0]) for s in samples]) & ~outliers
@@ -179,7 +180,7 @@ def camera_columns(
     return run.table.assign(**columns)
 
 
-def save(analysis: Analysis, folder: Path) -> list[Path]:
+def save_video_analysis(analysis: VideoAnalysis, folder: Path) -> list[Path]:
     """Write run, slip table, samples, summary and plots into ``folder``; return their paths."""
     name = analysis.run.name
     paths = [write_run(folder / f"{name}.parquet", analysis.run.table, analysis.run.meta)]
@@ -210,12 +211,12 @@ def frame_table(samples: Sequence[Sample], offset: float) -> pandas.DataFrame:
 
 
 def _observed(
-    frames: Iterable[Frame], camera: Camera, body: Target, floor: Target, watch: Callable[[Frame, Sample], None]
+    frames: Iterable[VideoFrame], camera: Camera, body: Target, floor: Target, watch: Callable[[VideoFrame, Sample], None]
 ) -> Iterator[Sample]:
     """Track, and hand each frame with its sample to ``watch``; frames wait no longer than until the floor is located."""
-    waiting: list[Frame] = []
+    waiting: list[VideoFrame] = []
 
-    def passing() -> Iterator[Frame]:
+    def passing() -> Iterator[VideoFrame]:
         for frame in frames:
             waiting.append(frame)
             yield frame
@@ -287,7 +288,7 @@ def _new_figure(rows: int, height: float) -> tuple[Any, Any]:
     return figure, figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
 
 
-def _draw_pose(analysis: Analysis) -> Any:
+def _draw_pose(analysis: VideoAnalysis) -> Any:
     figure, panels = _new_figure(5, 9.5)
     slip, time = analysis.slip, np.array([s.time for s in analysis.samples]) + analysis.offset
     poses = np.stack([s.pose for s in analysis.samples])
@@ -312,7 +313,7 @@ def _draw_pose(analysis: Analysis) -> Any:
     return figure
 
 
-def _draw_slip(analysis: Analysis) -> Any:
+def _draw_slip(analysis: VideoAnalysis) -> Any:
     figure, panels = _new_figure(3, 8.5)
     slip = analysis.slip
     for w, (wheel, colour) in enumerate(zip(WHEELS, _WHEEL_COLOURS, strict=True)):

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from wlr_gym.base.files import replace_file, write_json
-from wlr_gym.learning.evaluation.campaign import BLOCK
 from wlr_gym.learning.evaluation.card import BY_DIFFERENCE, MAIN, OTHER_PLANT, Card, Scores
+from wlr_gym.learning.evaluation.conditions import BLOCK
 from wlr_gym.learning.evaluation.metrics import Metric
 from wlr_gym.learning.evaluation.statistics import CONFIDENCE, Estimate
 

@@ -23,10 +23,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+#: Floors per row.
 COUNT = 8
-#: m from the start that is shown; range of the colours.
+#: m from the start that is shown.
 _REACH = 1.3
-_LOWEST, _HIGHEST = 0.05, 1.0
+#: Friction coefficients at the ends of the colours.
+_LOWEST = 0.05
+_HIGHEST = 1.0
 _COLOURS = "viridis"
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.perception.markers.camera import Camera
-from wlr_gym.perception.markers.detect import Image
+from wlr_gym.perception.markers.detection import Image
 from wlr_gym.perception.markers.targets import Target
 
 Array = NDArray[np.float64]

@@ -1,0 +1,168 @@
+"""One control step of the observer: a small Kalman filter per robot, compiled; every robot on its own.
+
+Frames: *start* (the floor frame as the body stood at the reset: x along its heading), *heading* (turns with the body about the
+floor's normal; x along the wheels, y to the left in the floor), *body*. Velocities are estimated in the heading frame, each
+direction by a filter of its own (:mod:`wlr_gym.perception.observer.kalman`), heading and gyroscope bias by a third.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from numba import njit
+
+from wlr_gym.perception.observer import kalman
+from wlr_gym.perception.observer.contacts import LEAST_LOAD, carry, look, pull
+from wlr_gym.perception.observer.correction import (
+    RADIUS,
+    guess_velocity,
+    see_camera,
+    see_friction_balance,
+    see_rest,
+    see_rolling,
+)
+from wlr_gym.perception.observer.layout import ESTIMATE_LAYOUT
+from wlr_gym.perception.observer.prediction import measure_force, move, sense_force, settle, spread, turn
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT
+
+# Uncertainty (1 sigma) at the start.
+#: m/s of a robot that has just been put down.
+_START_SPEED = 0.05
+#: m/s2 beyond the accelerometer's noise.
+_START_LEAK = 0.02
+#: m/s.
+_START_SLIP = 0.1
+
+# Where the readings and the estimates stand in their rows.
+_GYRO = SENSOR_LAYOUT.slices["gyro"].start
+_ACCEL = SENSOR_LAYOUT.slices["accelerometer"].start
+_CAMERA = SENSOR_LAYOUT.slices["camera_pose"].start
+_CAMERA_IS_NEW = SENSOR_LAYOUT.slices["camera_is_new"].start
+_O_POSITION = ESTIMATE_LAYOUT.slices["position"].start
+_O_YAW = ESTIMATE_LAYOUT.slices["yaw"].start
+_O_YAW_SIGMA = ESTIMATE_LAYOUT.slices["yaw_sigma"].start
+_O_VELOCITY = ESTIMATE_LAYOUT.slices["linear_velocity_in_body"].start
+_O_SIGMA = ESTIMATE_LAYOUT.slices["linear_velocity_sigma"].start
+_O_RATE = ESTIMATE_LAYOUT.slices["yaw_rate"].start
+_O_GRAVITY = ESTIMATE_LAYOUT.slices["gravity_in_body"].start
+_O_SLIP = ESTIMATE_LAYOUT.slices["slip_velocity"].start
+_O_SLIP_SIGMA = ESTIMATE_LAYOUT.slices["slip_sigma"].start
+_O_TRACTION = ESTIMATE_LAYOUT.slices["traction_force"].start
+_O_LOAD = ESTIMATE_LAYOUT.slices["normal_force"].start
+_O_USE = ESTIMATE_LAYOUT.slices["traction_use"].start
+_O_DEMAND = ESTIMATE_LAYOUT.slices["friction_demand"].start
+
+
+@njit(cache=True, nogil=True)
+def reset(robot: Any, states: Any, mask: Any, sensors: Any, values: Any) -> None:
+    """Start masked robots anew; see :class:`wlr_gym.perception.observer.observer.SlipObserver`."""
+    for i in range(mask.shape[0]):
+        if mask[i]:
+            _start(robot, sensors[i], states[i])
+            _report(robot, states[i], values[i])
+
+
+@njit(cache=True, nogil=True)
+def update(robot: Any, states: Any, mask: Any, sensors: Any, values: Any) -> None:
+    """Advance masked robots by one control step."""
+    for i in range(mask.shape[0]):
+        if mask[i]:
+            _advance(robot, sensors[i], states[i])
+            _report(robot, states[i], values[i])
+
+
+@njit(cache=True, nogil=True)
+def _start(robot: Any, sensors: Any, r: Any) -> None:
+    """Begin level and at rest; what the accelerometer reads along the floor is bias or, where it is much, a slope."""
+    r.seen[:] = 0.0
+    r.seen[_ACCEL + 2] = robot.gravity
+    _take(sensors, r)
+    r.tick = r.yaw = r.gyro_bias = r.demand = r.doubt = r.strange = 0.0
+    r.normal[0], r.normal[1], r.normal[2] = 0.0, 0.0, 1.0
+    r.raw[:] = 0.0
+    r.yaw_covariance[0], r.yaw_covariance[1], r.yaw_covariance[2] = 0.0, 0.0, robot.gyro_bias**2
+    for k in range(3):
+        r.rate[k] = r.seen[_GYRO + k]
+    r.yaw_rate = r.rate[2]
+    look(robot, r.seen, r)
+    measure_force(r)
+    for k in range(3):
+        r.force[k] = r.last_force[k]
+    pull(robot, r.seen, r)
+    r.traction[:] = 0.0
+    carry(robot, r.seen, r)
+    r.covariance[:] = 0.0
+    for k in range(2):
+        total = r.force[k]
+        bias = total / (1.0 + (total / (3.0 * robot.accel_bias)) ** 4)  # more than that is a slope
+        r.leak[k], r.slope[k] = bias, total - bias
+        r.position[k] = r.velocity[k] = r.raw_velocity[k] = r.surprise[k] = 0.0
+        r.covariance[k, kalman.VELOCITY, kalman.VELOCITY] = _START_SPEED**2
+        r.covariance[k, kalman.LEAK, kalman.LEAK] = robot.accel_noise**2 + _START_LEAK**2
+        for i in range(4):
+            r.slip[k, i] = 0.0
+            r.covariance[k, kalman.SLIP + i, kalman.SLIP + i] = _START_SLIP**2
+
+
+@njit(cache=True, nogil=True)
+def _take(sensors: Any, r: Any) -> None:
+    """Keep what is a number: ``r.seen``."""
+    for k in range(sensors.shape[0]):
+        if math.isfinite(sensors[k]):
+            r.seen[k] = sensors[k]
+
+
+@njit(cache=True, nogil=True)
+def _advance(robot: Any, sensors: Any, r: Any) -> None:
+    """Predict with the IMU, then take in wheels and camera."""
+    _take(sensors, r)
+    r.tick += 1.0
+    turned = turn(robot, r)
+    look(robot, r.seen, r)
+    change = sense_force(robot, r)
+    move(robot, turned, r)
+    spread(robot, turned, change, r)
+    pull(robot, r.seen, r)
+    settle(robot, r)
+    if r.tick == 1.0:
+        guess_velocity(r)
+    see_rolling(robot, r)
+    see_friction_balance(robot, r)
+    pose_sum = sensors[_CAMERA] + sensors[_CAMERA + 1] + sensors[_CAMERA + 2]
+    if robot.camera > 0.0 and r.seen[_CAMERA_IS_NEW] > 0.5 and math.isfinite(pose_sum):
+        see_camera(robot, r)
+    see_rest(robot, r)
+
+
+@njit(cache=True, nogil=True)
+def _report(robot: Any, r: Any, out: Any) -> None:
+    """Write the estimates."""
+    h, n, left = r.heading, r.normal, r.left
+    rise, carried = 0.0, 1e-12
+    for i in range(4):
+        rise += r.load[i] * r.lift[i]
+        carried += r.load[i]
+    rise /= carried
+    vx, vy = r.velocity[0], r.velocity[1]
+    out[_O_POSITION], out[_O_POSITION + 1] = r.position[0], r.position[1]
+    out[_O_YAW], out[_O_YAW_SIGMA] = r.yaw, math.sqrt(max(r.yaw_covariance[0], 0.0))
+    out[_O_VELOCITY] = vx * h[0] + vy * left[0] + rise * n[0]
+    out[_O_VELOCITY + 1] = vy * left[1] + rise * n[1]
+    out[_O_RATE] = r.yaw_rate
+    gx, gy = r.slope[0] / robot.gravity, r.slope[1] / robot.gravity
+    gz = math.sqrt(max(0.0, 1.0 - gx * gx - gy * gy))
+    for k in range(3):
+        out[_O_GRAVITY + k] = -(gx * h[k] + gy * left[k] + gz * n[k])
+    vote = (robot.velocity_count * robot.wheel_radius) ** 2 / 6.0
+    for k in range(2):
+        variance = max(r.covariance[k, kalman.VELOCITY, kalman.VELOCITY], 0.0)
+        out[_O_SIGMA + k] = math.sqrt(variance)
+        for i in range(4):
+            own = vote + (RADIUS * r.rolling[i, 0]) ** 2 if k == 0 else (robot.gyro_noise * r.point[i, 0]) ** 2
+            out[_O_SLIP + 2 * i + k] = r.velocity[k] - r.rolling[i, k]
+            out[_O_SLIP_SIGMA + 2 * i + k] = math.sqrt(variance + own)
+    for i in range(4):
+        out[_O_TRACTION + i], out[_O_LOAD + i] = r.traction[i], r.load[i]
+        out[_O_USE + i] = abs(r.traction[i]) / max(r.load[i], LEAST_LOAD)
+    out[_O_DEMAND] = r.demand
