@@ -15,15 +15,15 @@ from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions,
 from wlr_gym.cli.robot_options import RobotOption
 from wlr_gym.hardware import calibration as find
 from wlr_gym.hardware.config import ImuCalibration, Mounting, load_hardware
-from wlr_gym.hardware.dynamixel.setup import FoundServo, check_new_servo
 from wlr_gym.hardware.imu.driver import to_body
+from wlr_gym.hardware.servo_setup import FoundServo, check_new_servo
 from wlr_gym.robot import JOINTS, LEGS, load_robot
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
 from wlr_gym.hardware.dynamixel.bus import BusGroup
-from wlr_gym.hardware.dynamixel.sdk import BusGoneError
+from wlr_gym.hardware.dynamixel.errors import BusGoneError
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.link import emulated_link

@@ -12,13 +12,13 @@ from pydantic import ValidationError
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware import calibration as calibrate
 from wlr_gym.hardware.config import ImuCalibration, ImuPort, load_hardware, with_ports
-from wlr_gym.hardware.dynamixel.servos import Servos
 from wlr_gym.hardware.imu.driver import Conversion, ImuGoneError, open_imu
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY, Frame, accel_per_count, encode_frame, gyro_per_count, to_counts
 from wlr_gym.hardware.imu.mpu6050 import Mpu6050, open_bus
 from wlr_gym.hardware.imu.stream import ImuStream, StreamClock
 from wlr_gym.hardware.ports import PortInUseError
 from wlr_gym.hardware.safety.preflight import open_ports
+from wlr_gym.hardware.servos import Servos
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import load_robot
 

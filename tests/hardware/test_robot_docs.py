@@ -40,7 +40,7 @@ def test_every_option_named_exists():
 
 
 def test_every_defect_is_guarded_where_the_page_says():
-    guarded = (ROOT / "wlr_gym/hardware/dynamixel/sdk.py").read_text(encoding="utf-8")
+    guarded = (ROOT / "wlr_gym/hardware/dynamixel/port.py").read_text(encoding="utf-8")
     tested = (ROOT / "tests/hardware/test_bus.py").read_text(encoding="utf-8")
     for number, *_ in table_under("## Bus driver"):
         assert re.search(rf"Defects? [\d, ]*\b{number}\b", guarded), number

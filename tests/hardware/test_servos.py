@@ -14,7 +14,7 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware.dynamixel.servos import JointMap, Servos
+from wlr_gym.hardware.servos import JointMap, Servos
 
 ROBOT = load_robot()
 HARDWARE = load_hardware()

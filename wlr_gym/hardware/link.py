@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.servos import Servos
 from wlr_gym.hardware.imu.driver import Imu
+from wlr_gym.hardware.servos import Servos
 from wlr_gym.robot import Robot
 
 if TYPE_CHECKING:

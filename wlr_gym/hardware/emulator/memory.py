@@ -11,7 +11,7 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import ImuPort
-from wlr_gym.hardware.dynamixel.sdk import GuardedPort
+from wlr_gym.hardware.dynamixel.port import DynamixelPort
 from wlr_gym.hardware.emulator.line import Emission
 from wlr_gym.hardware.emulator.machine import Machine
 from wlr_gym.hardware.imu.driver import ImuGoneError
@@ -83,7 +83,7 @@ class World:
 
 
 class _Device:
-    """What :class:`GuardedPort` uses of ``serial.Serial``."""
+    """What :class:`DynamixelPort` uses of ``serial.Serial``."""
 
     def __init__(self, world: World, name: str, baud_rate: int) -> None:
         self._world, self._name, self._baud_rate = world, name, baud_rate
@@ -117,14 +117,14 @@ class _Device:
         pass
 
 
-class MemoryPort(GuardedPort):
+class MemoryPort(DynamixelPort):
     """The port of one emulated bus.
 
     Args:
         world: the robot.
         name: of its bus.
         baud_rate: bit/s.
-        patience: s of emulated time; see :class:`GuardedPort`.
+        patience: s of emulated time; see :class:`DynamixelPort`.
     """
 
     def __init__(self, world: World, name: str, baud_rate: int, patience: float) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.hardware.dynamixel.protocol import ALERT, Error
+from wlr_gym.hardware.dynamixel.protocol import ALERT, CLEAR_TURNS, Error
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, TABLE_SIZE, ControlTable, Item
 
 VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_POSITION_MODE, CURRENT_MODE, PWM_MODE = 1, 3, 4, 5, 0, 16
@@ -45,7 +45,6 @@ _WATCHDOG_UNIT = 0.02
 #: Items that decide what Present Position counts from, and which way.
 _FRAME = ("drive_mode", "operating_mode", "homing_offset")
 _KEPT = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}
-_CLEAR_KEY = bytes([0x01, 0x44, 0x58, 0x4C, 0x22])
 
 
 @dataclass
@@ -279,7 +278,7 @@ class EmulatedServo:
 
     def clear(self, parameters: bytes) -> Error:
         """Bring Present Position back into one turn; refused while moving."""
-        if parameters != _CLEAR_KEY:
+        if parameters != CLEAR_TURNS:
             return Error.DATA_RANGE
         if self["moving"]:
             return Error.RESULT_FAIL
