@@ -15,7 +15,7 @@ from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions,
 from wlr_gym.cli.robot_options import RobotOption
 from wlr_gym.hardware import calibration as find
 from wlr_gym.hardware.config import ImuCalibration, Mounting, load_hardware
-from wlr_gym.hardware.imu.driver import to_body
+from wlr_gym.hardware.imu.reading import to_body
 from wlr_gym.hardware.servo_setup import FoundServo, check_new_servo
 from wlr_gym.robot import JOINTS, LEGS, load_robot
 
@@ -235,9 +235,9 @@ def sensor(monkeypatch):
 
     def link(self, changed=None):
         made = emulated_link(machine)
-        from wlr_gym.hardware.emulator.memory import MemoryImu, World
+        from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu
 
-        assert isinstance(made.clock, World)
+        assert isinstance(made.clock, EmulatedWorld)
         assert changed is not None
         made.imu = MemoryImu(made.clock, changed.imu)
         return made

@@ -242,7 +242,7 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
 
 def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, ask: Ask) -> ImuCalibration:
     from wlr_gym.hardware import calibration as find
-    from wlr_gym.hardware.imu.driver import to_body
+    from wlr_gym.hardware.imu.reading import to_body
 
     level = "Stand the robot level on its wheels and let go of it, then Enter."
     if options.poses == 6:

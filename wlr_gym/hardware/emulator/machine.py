@@ -35,8 +35,8 @@ from wlr_gym.hardware.emulator.servo import (
     Drive,
     EmulatedServo,
 )
-from wlr_gym.hardware.imu import frames as imu
-from wlr_gym.hardware.imu.driver import Conversion
+from wlr_gym.hardware.imu.frames import ImuFrame, encode_frame
+from wlr_gym.hardware.imu.reading import Conversion
 from wlr_gym.physics import servo as law
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState
@@ -346,8 +346,8 @@ class Machine:
         self._frames += 1
         stamp = self._frames / self.hardware.imu.rate
         force, rate = self._imu.counts(sensors.accelerometer[0], sensors.gyro[0])
-        frame = imu.Frame(self._frames % 65536, round(stamp * 1e6) % 2**32, force, _IMU_TEMPERATURE, rate)
-        raw, delay = self.faults.mangle(self.time, imu.encode_frame(frame), ["imu"])
+        frame = ImuFrame(self._frames % 65536, round(stamp * 1e6) % 2**32, force, _IMU_TEMPERATURE, rate)
+        raw, delay = self.faults.mangle(self.time, encode_frame(frame), ["imu"])
         if raw and not self.faults.happens(self.time, "dead", ["imu"]):
             self._imu_output.append(Emission(self.time + delay, raw))
 
