@@ -211,7 +211,7 @@ class Turner:
         machine.plant.step = self._read
 
     def _read(self, goals, torque):
-        sensors = self.machine._sensors
+        sensors = self.machine.coupling.sensors
         sensors.accelerometer[0] = 9.80665 * self.up + 0.03 * self.rng.standard_normal(3)
         sensors.gyro[0] = 0.001 * self.rng.standard_normal(3)
         return sensors

@@ -12,6 +12,7 @@ from wlr_gym.hardware.config import load_hardware
 from wlr_gym.hardware.dynamixel import protocol
 from wlr_gym.hardware.dynamixel.protocol import BROADCAST, Error, Instruction, Packet, Parser, Status, word
 from wlr_gym.hardware.emulator import Machine, MachineOptions
+from wlr_gym.hardware.emulator.commands import run_command
 from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
 from wlr_gym.hardware.imu.frames import FrameParser, accel_per_count, from_counts
 from wlr_gym.physics.plants import make_plant
@@ -585,17 +586,17 @@ def test_same_seed_same_bytes():
 def test_commands_that_cannot_be_understood(text, words):
     machine = make()
     with pytest.raises(InputError, match=words):
-        machine.command(text)
+        run_command(machine, text)
 
 
 def test_commands():
     machine = make()
-    assert machine.command("drop wheels probability=0.5 duration=2").endswith("drop wheels probability=0.5 duration=2")
-    assert machine.command("faults") == "drop wheels probability=0.5 duration=2"
-    assert machine.command("clear drop") == "cleared"
-    assert machine.command("faults") == "no faults"
-    assert machine.command("status").count("torque off") == 8
-    assert "overheat" in machine.command("help")
+    assert run_command(machine, "drop wheels probability=0.5 duration=2").endswith("drop wheels probability=0.5 duration=2")
+    assert run_command(machine, "faults") == "drop wheels probability=0.5 duration=2"
+    assert run_command(machine, "clear drop") == "cleared"
+    assert run_command(machine, "faults") == "no faults"
+    assert run_command(machine, "status").count("torque off") == 8
+    assert "overheat" in run_command(machine, "help")
 
 
 def test_a_plant_of_another_size_or_period_is_refused():
