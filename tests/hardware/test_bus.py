@@ -1,4 +1,4 @@
-"""Bus groups on the emulator: each defect of dynamixel-sdk shown in the SDK and guarded here, faults, clocks, blocks."""
+"""Bus groups on the emulator: each defect of the SDK's port driver shown there and absent here, faults, clocks, blocks."""
 
 import os
 import select
@@ -21,19 +21,13 @@ pytest.importorskip("termios")
 
 from robot_rig import jabbering_port  # noqa: E402
 
-from wlr_gym.hardware.dynamixel.bus import (  # noqa: E402
-    Block,
-    BusGroup,
-    NoAnswerError,
-    RefusedError,
-    RestlessLineError,
-    TickClock,
-    open_all,
-)
-from wlr_gym.hardware.dynamixel.sdk import BusGoneError, GuardedHandler, GuardedPort  # noqa: E402
-from wlr_gym.hardware.dynamixel.servos import Servos  # noqa: E402
+from wlr_gym.hardware.dynamixel.bus import Block, BusGroup, open_all  # noqa: E402
+from wlr_gym.hardware.dynamixel.errors import BusGoneError, NoAnswerError, RefusedError, RestlessLineError  # noqa: E402
+from wlr_gym.hardware.dynamixel.port import DynamixelPort  # noqa: E402
+from wlr_gym.hardware.dynamixel.tick_clock import TickClock  # noqa: E402
 from wlr_gym.hardware.ports import PortInUseError  # noqa: E402
 from wlr_gym.hardware.safety import preflight as checks  # noqa: E402
+from wlr_gym.hardware.servos import Servos  # noqa: E402
 
 TABLE = load_table("XM540-W150-R")
 FAST_BLOCK = Block(TABLE, "realtime_tick", "present_position")
@@ -124,6 +118,45 @@ def test_fast_reads_fall_back_for_good_on_old_firmware():
         assert group.statistics.fallbacks == 3
 
 
+def test_stuffed_counts_come_through_both_ways(server, group):
+    """FF FF FD in a count: the SDK sends it unstuffed, and removes stuffing wrongly."""
+    server.machine.servos["leg_lf"].set("operating_mode", 4)
+    group.write(2, "goal_position", -131073)  # FF FF FD FF
+    assert server.machine.servos["leg_lf"]["goal_position"] == -131073
+    assert group.read(2, "goal_position") == -131073
+    data = b"\xff\xff\xfd\xff\xfd\xfd"
+    for k, byte in enumerate(data):
+        server.machine.servos["leg_lf"].set(f"indirect_data_{k + 1}", byte)
+    group.fast = False
+    assert bytes(group.read_all(Block(TABLE, "indirect_data_1", "indirect_data_6"))[2].counts.values()) == data
+
+
+def test_an_alert_shows_in_group_reads(server, group):
+    server.machine.inject("overload leg_rf duration=0.005")
+    server.advance(0.01)
+    readings = group.read_all(FAST_BLOCK)
+    assert {id for id, reading in readings.items() if reading.alert} == {3}
+    assert group.statistics.alerts == {3: 1}
+
+
+def test_one_missing_servo_costs_only_itself(server, group):
+    server.machine.inject("drop leg_rf")  # its answer is lost; the others were heard on the line
+    group.fast = False
+    assert set(group.read_all(FAST_BLOCK)) == {1, 2, 4}
+    assert group.statistics.missing == {3: 1}
+
+
+def test_an_exception_in_the_middle_does_not_block_torque_off(server, group, monkeypatch):
+    for id in LEGS:
+        group.write(id, "torque_enable", 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(DynamixelPort, "readPort", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            group.read_all(FAST_BLOCK)
+    assert group.torque_off() == set()
+    assert not any(server.machine.servos[joint]["torque_enable"] for joint in ("leg_lf", "leg_rf", "leg_lr", "leg_rr"))
+
+
 # --- the SDK's defects, by number (docs/robot.md)
 
 
@@ -133,65 +166,7 @@ def sdk_port(server):
     return port, sdk.Protocol2PacketHandler()
 
 
-def test_defect_1_stuffing_is_lost_on_sending(server):
-    port, handler = sdk_port(server)
-    data = (-3).to_bytes(4, "little", signed=True)  # FD FF FF FF behind FF FF of the current
-    both = TABLE["goal_current"].encode(-1) + data
-    server.machine.servos["leg_lf"].set("operating_mode", 1)
-    result, _ = handler.writeTxRx(port, 2, 102, len(both), list(both))
-    assert result != sdk.COMM_SUCCESS
-    assert server.machine.servos["leg_lf"]["goal_velocity"] == 0
-    port.closePort()
-    guarded = GuardedPort(server.ports["legs"], 1_000_000, PATIENCE)
-    guarded.openPort()
-    assert GuardedHandler().writeTxRx(guarded, 2, 102, len(both), list(both)) == (sdk.COMM_SUCCESS, 0)
-    assert server.machine.servos["leg_lf"]["goal_velocity"] == -3
-    guarded.closePort()
-
-
-def test_defect_2_stuffing_is_removed_wrongly_on_receiving(server, group):
-    data = b"\xff\xff\xfd\xff\xfd\xfd"
-    raw = protocol.encode_status(2, 0, data)
-    kept = sdk.Protocol2PacketHandler().removeStuffing(list(raw))
-    assert bytes(kept[9 : 9 + (kept[5] | kept[6] << 8) - 4]) != data
-    servo = server.machine.servos["leg_lf"]
-    for k, byte in enumerate(data):
-        servo.set(f"indirect_data_{k + 1}", byte)
-    block = Block(TABLE, "indirect_data_1", "indirect_data_6")
-    group.fast = False
-    assert bytes(group.read_all(block)[2].counts.values()) == data
-
-
-def test_defects_3_and_4_alert_and_missing_data_in_group_reads(server, group):
-    server.machine.inject("overload leg_rf duration=0.005")
-    server.advance(0.01)
-    port, handler = sdk_port(server)
-    reader = sdk.GroupSyncRead(port, handler, 132, 4)
-    reader.addParam(3)
-    assert reader.txRxPacket() == sdk.COMM_SUCCESS  # not a word about the alert
-    assert reader.getData(99, 132, 4) == 0  # nor about a servo that does not exist
-    port.closePort()
-    readings = group.read_all(FAST_BLOCK)
-    assert {id for id, reading in readings.items() if reading.alert} == {3}
-    assert group.statistics.alerts == {3: 1}
-    assert 99 not in readings
-
-
-def test_defect_5_one_missing_servo_costs_only_itself_and_those_behind(server, group):
-    server.machine.inject("drop leg_rf")  # its answer is lost; the others were heard on the line
-    port, handler = sdk_port(server)
-    reader = sdk.GroupSyncRead(port, handler, 132, 4)
-    for id in LEGS:
-        reader.addParam(id)
-    assert reader.txRxPacket() != sdk.COMM_SUCCESS
-    assert not any(reader.isAvailable(id, 132, 4) for id in LEGS)
-    port.closePort()
-    group.fast = False
-    assert set(group.read_all(FAST_BLOCK)) == {1, 2, 4}
-    assert group.statistics.missing == {3: 1}
-
-
-def test_defect_6_time_out_is_what_was_asked_for(server):
+def test_defect_1_time_out_is_what_was_asked_for(server):
     server.machine.inject("dead")
     server.advance(0.002)
     port, handler = sdk_port(server)
@@ -209,7 +184,7 @@ def test_defect_6_time_out_is_what_was_asked_for(server):
         assert min(spent) < 0.025
 
 
-def test_defect_7_waiting_takes_no_processor_time(server):
+def test_defect_2_waiting_takes_no_processor_time(server):
     server.machine.inject("dead")
     server.advance(0.002)
     with connect(server, 0.5) as group:
@@ -220,29 +195,7 @@ def test_defect_7_waiting_takes_no_processor_time(server):
         assert time.thread_time() - busy < 0.1
 
 
-def test_defect_8_an_exception_in_the_middle_does_not_block_torque_off(server, group, monkeypatch):
-    class Interrupted(sdk.PortHandler):
-        def readPort(self, length):  # noqa: N802
-            raise KeyboardInterrupt
-
-    port, handler = Interrupted(server.ports["legs"]), sdk.Protocol2PacketHandler()
-    port.openPort()
-    with pytest.raises(KeyboardInterrupt):
-        handler.read1ByteTxRx(port, 2, 64)
-    assert handler.write1ByteTxRx(port, 2, 64, 0)[0] == sdk.COMM_PORT_BUSY  # the SDK: motor stays on
-    port.closePort()
-
-    for id in LEGS:
-        group.write(id, "torque_enable", 1)
-    with monkeypatch.context() as patch:
-        patch.setattr(GuardedPort, "readPort", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            group.read_all(FAST_BLOCK)
-    assert group.torque_off() == set()
-    assert not any(server.machine.servos[joint]["torque_enable"] for joint in ("leg_lf", "leg_rf", "leg_lr", "leg_rr"))
-
-
-def test_defect_9_late_answer_is_not_taken_for_the_next(server, group):
+def test_defect_3_late_answer_is_not_taken_for_the_next(server, group):
     """Answers to a read that was given up come while the next read of the same servo waits: another length, then the same."""
     group.write(2, "profile_velocity", 5)
     group.write(2, "profile_acceleration", 9)
@@ -258,7 +211,7 @@ def test_defect_9_late_answer_is_not_taken_for_the_next(server, group):
     assert group.statistics.discarded > 0
 
 
-def test_defect_9_in_group_reads(server, group):
+def test_defect_3_in_group_reads(server, group):
     """A leftover of another length from one of the servos asked comes first."""
     line = server.machine.lines["legs"]
     answer = line.receive
@@ -269,23 +222,7 @@ def test_defect_9_in_group_reads(server, group):
         assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
 
 
-def test_the_sdks_own_calls_work_on_the_guarded_classes(server):
-    server.machine.inject("echo legs")  # without the guard the echo would be the answer
-    port, handler = GuardedPort(server.ports["legs"], 1_000_000, PATIENCE), GuardedHandler()
-    port.openPort()
-    assert handler.ping(port, 2) == (1130, sdk.COMM_SUCCESS, 0)
-    assert handler.write4ByteTxRx(port, 2, 112, 33) == (sdk.COMM_SUCCESS, 0)
-    assert handler.read4ByteTxRx(port, 2, 112) == (33, sdk.COMM_SUCCESS, 0)
-    assert handler.read1ByteTxRx(port, 77, 65)[1] == sdk.COMM_RX_TIMEOUT
-    reader = sdk.GroupSyncRead(port, handler, 112, 4)
-    for id in LEGS:
-        reader.addParam(id)
-    assert reader.txRxPacket() == sdk.COMM_SUCCESS
-    assert reader.getData(2, 112, 4) == 33
-    port.closePort()
-
-
-def test_defect_10_unplugging_is_one_kind_of_error(server, group):
+def test_defect_4_unplugging_is_one_kind_of_error(server, group):
     group.ping(2)
     server.command("unplug legs")
     server.advance(0.002)
@@ -294,14 +231,14 @@ def test_defect_10_unplugging_is_one_kind_of_error(server, group):
             act()
 
 
-def test_defect_13_a_port_in_use_is_refused_untouched_until_it_is_closed():
+def test_defect_7_a_port_in_use_is_refused_untouched_until_it_is_closed():
     import termios
     import tty
 
     ours, theirs = os.openpty()
     tty.setraw(theirs)
     try:
-        first, second = (GuardedPort(os.ttyname(theirs), 1000000, 0.005) for _ in range(2))
+        first, second = (DynamixelPort(os.ttyname(theirs), 1000000, 0.005) for _ in range(2))
         first.openPort()
         os.write(ours, b"answer")
         second.baudrate = 57600
@@ -322,7 +259,7 @@ def test_defect_13_a_port_in_use_is_refused_untouched_until_it_is_closed():
         os.close(theirs)
 
 
-def test_defect_11_missing_port_is_named(tmp_path):
+def test_defect_5_missing_port_is_named(tmp_path):
     path = str(tmp_path / "ttyUSB7")
     with pytest.raises(OSError, match="ttyUSB7"):
         sdk.PortHandler(path).openPort()
@@ -383,8 +320,8 @@ def test_torque_off_gets_through_heavy_loss(server):
 
 def test_a_packet_that_was_sent_in_part_does_not_count_as_sent(group, monkeypatch):
     """The adapter is stuck: nobody heard the goal, or the torque-off, that it cut short."""
-    write = GuardedPort._write
-    monkeypatch.setattr(GuardedPort, "_write", lambda self, data: write(self, data[:-1]))
+    write = DynamixelPort._write
+    monkeypatch.setattr(DynamixelPort, "_write", lambda self, data: write(self, data[:-1]))
     for act in (
         lambda: group.write_all("torque_enable", {2: 0}),
         lambda: group.ask_all(FAST_BLOCK),
@@ -492,7 +429,7 @@ def test_stale_readings_are_dropped_and_counted(server, group):
     assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
 
 
-def test_defect_12_waits_without_end_for_a_device_that_takes_no_bytes():
+def test_defect_6_waits_without_end_for_a_device_that_takes_no_bytes():
     import tty
 
     def fill(port):
@@ -507,7 +444,7 @@ def test_defect_12_waits_without_end_for_a_device_that_takes_no_bytes():
     filling.start()
     filling.join(0.3)
     assert filling.is_alive()
-    ours = GuardedPort(os.ttyname(slave), 1_000_000, 0.01)
+    ours = DynamixelPort(os.ttyname(slave), 1_000_000, 0.01)
     ours.openPort()
     with pytest.raises(BusGoneError):
         fill(ours)

@@ -10,7 +10,7 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware.dynamixel.servos import Servos
+from wlr_gym.hardware.servos import Servos
 from wlr_gym.studies.bench import bus
 
 

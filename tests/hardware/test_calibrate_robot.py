@@ -15,15 +15,15 @@ from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions,
 from wlr_gym.cli.robot_options import RobotOption
 from wlr_gym.hardware import calibration as find
 from wlr_gym.hardware.config import ImuCalibration, Mounting, load_hardware
-from wlr_gym.hardware.dynamixel.setup import FoundServo, check_new_servo
-from wlr_gym.hardware.imu.driver import to_body
+from wlr_gym.hardware.imu.reading import to_body
+from wlr_gym.hardware.servo_setup import FoundServo, check_new_servo
 from wlr_gym.robot import JOINTS, LEGS, load_robot
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
 from wlr_gym.hardware.dynamixel.bus import BusGroup
-from wlr_gym.hardware.dynamixel.sdk import BusGoneError
+from wlr_gym.hardware.dynamixel.errors import BusGoneError
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.link import emulated_link
@@ -211,7 +211,7 @@ class Turner:
         machine.plant.step = self._read
 
     def _read(self, goals, torque):
-        sensors = self.machine._sensors
+        sensors = self.machine.coupling.sensors
         sensors.accelerometer[0] = 9.80665 * self.up + 0.03 * self.rng.standard_normal(3)
         sensors.gyro[0] = 0.001 * self.rng.standard_normal(3)
         return sensors
@@ -235,9 +235,9 @@ def sensor(monkeypatch):
 
     def link(self, changed=None):
         made = emulated_link(machine)
-        from wlr_gym.hardware.emulator.memory import MemoryImu, World
+        from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu
 
-        assert isinstance(made.clock, World)
+        assert isinstance(made.clock, EmulatedWorld)
         assert changed is not None
         made.imu = MemoryImu(made.clock, changed.imu)
         return made

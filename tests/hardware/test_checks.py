@@ -11,8 +11,8 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware.dynamixel.servos import Servos
 from wlr_gym.hardware.safety import preflight as checks
+from wlr_gym.hardware.servos import Servos
 
 ROBOT = load_robot()
 HARDWARE = load_hardware()

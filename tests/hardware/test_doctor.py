@@ -15,7 +15,7 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware.dynamixel import setup
+from wlr_gym.hardware import servo_setup
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.link import emulated_link
@@ -89,8 +89,8 @@ def test_a_tilted_robot_and_a_lossy_imu(machine, capsys):
     assert (code, "imu, losses" in text) == (0, True)
     assert "0 faults, 1 warning in" in text
     machine.clear()
-    machine._sensors.accelerometer[0] = [3.0, 0.0, 9.3]
-    machine.plant.step = lambda goals, torque: machine._sensors
+    machine.coupling.sensors.accelerometer[0] = [3.0, 0.0, 9.3]
+    machine.plant.step = lambda goals, torque: machine.coupling.sensors
     code, text = look(capsys)
     assert (code, "First: imu, level: 17" in text) == (1, True)
     assert "wlr calibrate imu --mounting" in text
@@ -115,7 +115,7 @@ def test_on_ports_with_a_scan(capsys, monkeypatch):
     machine = Machine(ROBOT, HARDWARE, MachineOptions(timing=NO_TIME, sensor_noise=False))
     machine.servos["wheel_lf"].set("id", 42)
     rates = (1_000_000, 4_500_000)  # each takes a second; the SDK does not know the last
-    monkeypatch.setattr(setup, "find_servos", partial(setup.find_servos, baud_rates=rates))
+    monkeypatch.setattr(servo_setup, "find_servos", partial(servo_setup.find_servos, baud_rates=rates))
     with Server(machine, real_time=False) as server:
         ports = tuple(f"{name}={path}" for name, path in server.ports.items())
         code = doctor.run(doctor.Options(port=ports, scan=True))

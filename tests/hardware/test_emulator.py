@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import load_hardware
 from wlr_gym.hardware.dynamixel import protocol
-from wlr_gym.hardware.dynamixel.protocol import BROADCAST, Error, Instruction, Packet, Parser, Status
+from wlr_gym.hardware.dynamixel.protocol import BROADCAST, Error, Instruction, Packet, Parser, Status, word
 from wlr_gym.hardware.emulator import Machine, MachineOptions
+from wlr_gym.hardware.emulator.commands import run_command
 from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
-from wlr_gym.hardware.imu import frames as imu
+from wlr_gym.hardware.imu.frames import FrameParser, accel_per_count, from_counts
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.physics.servo import motor_constants
@@ -66,7 +67,7 @@ def test_read_write_and_errors_on_the_line():
     assert statuses(machine, protocol.read(2, 65, 1)) == [Status(2, 0, b"\1")]
     assert statuses(machine, protocol.write(2, 65, b"\2"))[0].fault == Error.DATA_RANGE
     assert statuses(machine, protocol.encode(2, 0x77))[0].fault == Error.INSTRUCTION
-    assert statuses(machine, protocol.action(2))[0].fault == Error.INSTRUCTION
+    assert statuses(machine, protocol.encode(2, Instruction.ACTION))[0].fault == Error.INSTRUCTION
     assert statuses(machine, protocol.encode(2, Instruction.READ, b"\1"))[0].fault == Error.DATA_LENGTH
 
 
@@ -88,9 +89,9 @@ def test_broadcasts_act_without_answer():
 def test_reg_write_and_action_by_broadcast_move_all_at_once():
     machine = make()
     for id in LEG_IDS:
-        statuses(machine, protocol.write(id, 65, b"\1", Instruction.REG_WRITE))
+        statuses(machine, protocol.encode(id, Instruction.REG_WRITE, b"\x41\0\1"))
     assert not any(machine.servos[joint]["led"] for joint in JOINTS[:4])
-    assert ask(machine, protocol.action()) == []
+    assert ask(machine, protocol.encode(BROADCAST, Instruction.ACTION)) == []
     assert all(machine.servos[joint]["led"] for joint in JOINTS[:4])
 
 
@@ -100,7 +101,8 @@ def test_sync_and_bulk_writes_are_silent_even_when_refused():
     assert ask(machine, protocol.sync_write(116, goals)) == []
     assert machine.servos["leg_lf"]["goal_position"] == 2100
     assert machine.servos["leg_rf"]["goal_position"] != 9999
-    assert ask(machine, protocol.bulk_write({1: (65, b"\1"), 4: (112, (9).to_bytes(4, "little"))})) == []
+    bulk = b"\1" + word(65) + word(1) + b"\1" + b"\4" + word(112) + word(4) + (9).to_bytes(4, "little")
+    assert ask(machine, protocol.encode(BROADCAST, Instruction.BULK_WRITE, bulk)) == []
     assert machine.servos["leg_lr"]["led"] == 1
     assert machine.servos["leg_rr"]["profile_velocity"] == 9
 
@@ -110,9 +112,10 @@ def test_sync_bulk_and_fast_reads_agree():
     address, length = machine.servos["leg_lf"].table.block("present_pwm", "present_position")
     wanted = [machine.servos[joint].read(address, length)[1] for joint in JOINTS[:4]]
     assert [s.data for s in statuses(machine, protocol.sync_read(address, length, LEG_IDS))] == wanted
-    blocks = dict.fromkeys(LEG_IDS, (address, length))
-    assert [s.data for s in statuses(machine, protocol.bulk_read(blocks))] == wanted
-    for raw in (protocol.sync_read(address, length, LEG_IDS, fast=True), protocol.bulk_read(blocks, fast=True)):
+    blocks = b"".join(bytes([id]) + word(address) + word(length) for id in LEG_IDS)
+    assert [s.data for s in statuses(machine, protocol.encode(BROADCAST, Instruction.BULK_READ, blocks))] == wanted
+    fast_bulk = protocol.encode(BROADCAST, Instruction.FAST_BULK_READ, blocks)
+    for raw in (protocol.sync_read(address, length, LEG_IDS, fast=True), fast_bulk):
         (packet,) = ask(machine, raw)
         answers = protocol.split_fast_status(packet, [length] * 4)
         assert answers is not None
@@ -147,7 +150,7 @@ def test_factory_reset_of_all_is_refused_for_everything():
     machine = make()
     assert statuses(machine, protocol.encode(BROADCAST, Instruction.FACTORY_RESET, b"\xff")) == []
     assert machine.servos["leg_lf"]["id"] == 2
-    assert statuses(machine, protocol.factory_reset(2, 0xFF))[0].fault == Error.NONE
+    assert statuses(machine, protocol.encode(2, Instruction.FACTORY_RESET, b"\xff"))[0].fault == Error.NONE
     assert machine.servos["leg_lf"]["id"] == 1
 
 
@@ -459,11 +462,11 @@ def test_torque_off_lets_a_wheel_run_down():
 def test_imu_streams_gravity_at_its_rate():
     machine = make()
     machine.advance(0.1)
-    parser = imu.FrameParser()
+    parser = FrameParser()
     frames = [frame for emission in machine.take_imu_output() for frame in parser.feed(emission.data)]
     assert [frame.sequence for frame in frames] == list(range(1, 21))
     assert [b.microseconds - a.microseconds for a, b in pairwise(frames)] == [5000] * 19
-    gravity = imu.from_counts(frames[-1].accelerometer, imu.accel_per_count(4))
+    gravity = from_counts(frames[-1].accelerometer, accel_per_count(4))
     assert np.linalg.norm(gravity) == pytest.approx(9.81, abs=0.35)  # the robot's constant bias stays
 
 
@@ -476,10 +479,7 @@ def test_a_hit_answer_is_lost_and_the_others_are_not(kind):
     machine.inject(f"{kind} leg_rf")
     raw = protocol.sync_read(132, 4, LEG_IDS)
     emissions = machine.lines["legs"].receive(raw, 0.0)
-    parser = Parser()
-    packets = parser.feed(b"".join(emission.data for emission in emissions))
-    while parser.pending:
-        packets += parser.give_up()
+    packets = Parser().feed(b"".join(emission.data for emission in emissions))
     assert [packet.id for packet in packets] == [id for id in LEG_IDS if id != 3]
 
 
@@ -586,17 +586,17 @@ def test_same_seed_same_bytes():
 def test_commands_that_cannot_be_understood(text, words):
     machine = make()
     with pytest.raises(InputError, match=words):
-        machine.command(text)
+        run_command(machine, text)
 
 
 def test_commands():
     machine = make()
-    assert machine.command("drop wheels probability=0.5 duration=2").endswith("drop wheels probability=0.5 duration=2")
-    assert machine.command("faults") == "drop wheels probability=0.5 duration=2"
-    assert machine.command("clear drop") == "cleared"
-    assert machine.command("faults") == "no faults"
-    assert machine.command("status").count("torque off") == 8
-    assert "overheat" in machine.command("help")
+    assert run_command(machine, "drop wheels probability=0.5 duration=2").endswith("drop wheels probability=0.5 duration=2")
+    assert run_command(machine, "faults") == "drop wheels probability=0.5 duration=2"
+    assert run_command(machine, "clear drop") == "cleared"
+    assert run_command(machine, "faults") == "no faults"
+    assert run_command(machine, "status").count("torque off") == 8
+    assert "overheat" in run_command(machine, "help")
 
 
 def test_a_plant_of_another_size_or_period_is_refused():

@@ -3,15 +3,24 @@
 import numpy as np
 import pytest
 
-from wlr_gym.hardware.imu import frames as imu
-from wlr_gym.hardware.imu.frames import Frame, FrameParser, encode_frame
+from wlr_gym.hardware.imu.frames import (
+    SIZE,
+    STANDARD_GRAVITY,
+    FrameParser,
+    ImuFrame,
+    accel_per_count,
+    encode_frame,
+    from_counts,
+    gyro_per_count,
+    to_counts,
+)
 
 
 def random_frames(count, seed=1):
     rng = np.random.default_rng(seed)
     for k in range(count):
         numbers = rng.integers(-32768, 32768, 7).tolist()
-        yield Frame((65500 + k) % 65536, int(rng.integers(2**32)), tuple(numbers[:3]), numbers[3], tuple(numbers[4:]))
+        yield ImuFrame((65500 + k) % 65536, int(rng.integers(2**32)), tuple(numbers[:3]), numbers[3], tuple(numbers[4:]))
 
 
 def test_round_trip_whole_and_in_pieces():
@@ -22,7 +31,7 @@ def test_round_trip_whole_and_in_pieces():
         pieces = [stream[start : start + size] for start in range(0, len(stream), size)]
         assert [frame for piece in pieces for frame in parser.feed(piece)] == frames
         assert (parser.crc_errors, parser.lost) == (0, 0)
-    assert len(encode_frame(frames[0])) == imu.SIZE
+    assert len(encode_frame(frames[0])) == SIZE
 
 
 def test_noise_and_losses_cost_only_the_frames_they_hit():
@@ -50,14 +59,12 @@ def test_endless_noise_does_not_pile_up():
     parser = FrameParser()
     for _ in range(50):
         assert parser.feed(b"\x11" * 1000) == []
-    assert len(parser._buffer) <= 2 * imu.SIZE
+    assert len(parser._buffer) <= 2 * SIZE
 
 
 def test_units_of_the_data_sheet():
-    assert imu.to_counts([0.0, 0.0, imu.STANDARD_GRAVITY], imu.accel_per_count(4)) == (0, 0, 8192)
-    assert imu.to_counts(np.deg2rad([65.5, 0, -65.5]), imu.gyro_per_count(500)) == (4293, 0, -4293)
-    assert imu.to_counts([1e9, -1e9, 0], imu.gyro_per_count(250)) == (32767, -32768, 0)
-    np.testing.assert_allclose(
-        imu.from_counts((4293, 0, -4293), imu.gyro_per_count(500)), np.deg2rad([65.5, 0, -65.5]), rtol=1e-4
-    )
-    assert imu.gyro_per_count(500) == pytest.approx(np.deg2rad(1 / 65.5), rel=1e-3)
+    assert to_counts([0.0, 0.0, STANDARD_GRAVITY], accel_per_count(4)) == (0, 0, 8192)
+    assert to_counts(np.deg2rad([65.5, 0, -65.5]), gyro_per_count(500)) == (4293, 0, -4293)
+    assert to_counts([1e9, -1e9, 0], gyro_per_count(250)) == (32767, -32768, 0)
+    np.testing.assert_allclose(from_counts((4293, 0, -4293), gyro_per_count(500)), np.deg2rad([65.5, 0, -65.5]), rtol=1e-4)
+    assert gyro_per_count(500) == pytest.approx(np.deg2rad(1 / 65.5), rel=1e-3)

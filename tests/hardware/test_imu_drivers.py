@@ -12,13 +12,14 @@ from pydantic import ValidationError
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware import calibration as calibrate
 from wlr_gym.hardware.config import ImuCalibration, ImuPort, load_hardware, with_ports
-from wlr_gym.hardware.dynamixel.servos import Servos
-from wlr_gym.hardware.imu.driver import Conversion, ImuGoneError, open_imu
-from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY, Frame, accel_per_count, encode_frame, gyro_per_count, to_counts
+from wlr_gym.hardware.imu.driver import make_imu
+from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY, ImuFrame, accel_per_count, encode_frame, gyro_per_count, to_counts
 from wlr_gym.hardware.imu.mpu6050 import Mpu6050, open_bus
+from wlr_gym.hardware.imu.reading import Conversion, ImuGoneError
 from wlr_gym.hardware.imu.stream import ImuStream, StreamClock
 from wlr_gym.hardware.ports import PortInUseError
 from wlr_gym.hardware.safety.preflight import open_ports
+from wlr_gym.hardware.servos import Servos
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import load_robot
 
@@ -212,7 +213,7 @@ def test_nobody_at_the_address_and_a_stuck_register(clock, chip, monkeypatch):
 def test_a_bus_that_is_not_there():
     pytest.importorskip("smbus2")
     with pytest.raises(InputError, match="join the group 'i2c'"):
-        open_imu(PORT)
+        make_imu(PORT).open()
 
 
 @pytest.mark.parametrize("rate", [300.0, 3.0, 999.0])
@@ -246,7 +247,7 @@ class Memory:
 
 
 def frame(stamp, sequence=0, gyro=(0, 0, 0)):
-    return encode_frame(Frame(sequence, round(stamp * 1e6) % 2**32, (0, 0, 8192), -2220, gyro))
+    return encode_frame(ImuFrame(sequence, round(stamp * 1e6) % 2**32, (0, 0, 8192), -2220, gyro))
 
 
 @pytest.fixture
@@ -319,7 +320,7 @@ def test_a_port_that_goes_away(memory, stream):
 def test_a_port_that_is_not_there():
     pytest.importorskip("serial")
     with pytest.raises(InputError, match=r"no_such_port: cannot be opened"):
-        open_imu(ImuPort(port="/dev/no_such_port", rate=200.0))
+        make_imu(ImuPort(port="/dev/no_such_port", rate=200.0)).open()
 
 
 def test_a_stream_in_use_is_refused_and_the_doctor_says_what_to_do(tmp_path):
@@ -373,7 +374,7 @@ def test_on_the_emulated_robots_port():
     machine = Machine(load_robot(), load_hardware(), MachineOptions(timing=NO_TIME, sensor_noise=False))
     with Server(machine, real_time=False) as server:
         port = with_ports(machine.hardware, server.ports).imu
-        with open_imu(port, lambda: machine.time) as imu:
+        with make_imu(port, lambda: machine.time) as imu:
             server.advance(0.5)
             reading, end = imu.read(), time.monotonic() + 5.0
             while imu.statistics.readings < 100 and time.monotonic() < end:  # the system passes bytes on when it likes

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from wlr_gym.cli import emulate
 from wlr_gym.hardware.config import load_hardware
-from wlr_gym.hardware.emulator import FAULTS
-from wlr_gym.hardware.emulator import servo as firmware
+from wlr_gym.hardware.emulator import FAULTS, health
+from wlr_gym.hardware.emulator.servo import BOOT_TIME, FIRMWARE
 from wlr_gym.robot import JOINTS, load_robot
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -40,7 +40,7 @@ def test_every_option_named_exists():
 
 
 def test_every_defect_is_guarded_where_the_page_says():
-    guarded = (ROOT / "wlr_gym/hardware/dynamixel/sdk.py").read_text(encoding="utf-8")
+    guarded = (ROOT / "wlr_gym/hardware/dynamixel/port.py").read_text(encoding="utf-8")
     tested = (ROOT / "tests/hardware/test_bus.py").read_text(encoding="utf-8")
     for number, *_ in table_under("## Bus driver"):
         assert re.search(rf"Defects? [\d, ]*\b{number}\b", guarded), number
@@ -57,8 +57,8 @@ def test_ports_and_ids_are_those_of_the_files():
 
 
 def test_chosen_numbers():
-    assert f"firmware {firmware.FIRMWARE} on" in PAGE
-    assert f"{firmware.BOOT_TIME:g} s of silence" in PAGE
-    assert f"above {firmware.OVERLOAD:.0%} of stall for {firmware.OVERLOAD_TIME:g} s".replace("80%", "80 %") in PAGE
-    heating = f"{firmware.AMBIENT:g} degC, {firmware.HEATING:g} degC above that in a lasting stall"
-    assert f"{heating}, time constant {firmware.THERMAL_TIME:g} s" in PAGE
+    assert f"firmware {FIRMWARE} on" in PAGE
+    assert f"{BOOT_TIME:g} s of silence" in PAGE
+    assert f"above {health.LARGEST_LOAD:.0%} of stall for {health.OVERLOAD_TIME:g} s".replace("80%", "80 %") in PAGE
+    heating = f"{health.AMBIENT:g} degC, {health.HEATING:g} degC above that in a lasting stall"
+    assert f"{heating}, time constant {health.THERMAL_TIME:g} s" in PAGE

@@ -9,7 +9,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import load_hardware
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.imu import frames as imu
+from wlr_gym.hardware.imu.frames import SIZE, FrameParser
 from wlr_gym.robot import load_robot
 
 sdk = pytest.importorskip("dynamixel_sdk")
@@ -151,8 +151,8 @@ def test_imu_stream(server):
 
     with serial.Serial(server.ports["imu"], 115200, timeout=0.2) as port:
         port.reset_input_buffer()
-        parser = imu.FrameParser()
-        frames = [frame for _ in range(3) for frame in parser.feed(port.read(20 * imu.SIZE))]
+        parser = FrameParser()
+        frames = [frame for _ in range(3) for frame in parser.feed(port.read(20 * SIZE))]
     assert len(frames) > 40
     assert parser.lost == 0
 

@@ -14,7 +14,7 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware.dynamixel.servos import JointMap, Servos
+from wlr_gym.hardware.servos import JointMap, Servos
 
 ROBOT = load_robot()
 HARDWARE = load_hardware()
@@ -50,7 +50,7 @@ def test_readings_are_the_plants_own_sensors(server, servos):
     """Counts, signs and zeros cancel: SI values equal what the plant's sensor model read, to the last count."""
     drive(servos)
     server.advance(0.4)
-    readings, sensors = servos.read(), server.machine._sensors
+    readings, sensors = servos.read(), server.machine.coupling.sensors
     np.testing.assert_allclose(readings.position[:4], sensors.joint_position[0, :4], atol=1e-9)
     turned = readings.position[4:] - sensors.joint_position[0, 4:]
     np.testing.assert_allclose(turned, np.rint(turned / (2 * np.pi)) * 2 * np.pi, atol=1e-9)  # whole turns apart

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from wlr_gym.hardware.calibration import Pose
     from wlr_gym.hardware.config import Hardware, ImuCalibration, Mounting
-    from wlr_gym.hardware.dynamixel.servos import Servos
     from wlr_gym.hardware.link import Link
+    from wlr_gym.hardware.servos import Servos
     from wlr_gym.robot import Robot
 
 #: Shows a text, waits for Enter, returns what was typed.
@@ -104,8 +104,8 @@ def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
     Raises:
         InputError: unknown joint, none or several servos, another model, a servo that does not take it.
     """
-    from wlr_gym.hardware.dynamixel.setup import FACTORY_RATE, check_new_servo, find_servos, set_up
     from wlr_gym.hardware.dynamixel.tables import BAUD_RATES
+    from wlr_gym.hardware.servo_setup import FACTORY_RATE, check_new_servo, find_servos, set_up
 
     if options.joint not in JOINTS:
         raise unknown_name("joint", options.joint, JOINTS)
@@ -242,7 +242,7 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
 
 def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, ask: Ask) -> ImuCalibration:
     from wlr_gym.hardware import calibration as find
-    from wlr_gym.hardware.imu.driver import to_body
+    from wlr_gym.hardware.imu.reading import to_body
 
     level = "Stand the robot level on its wheels and let go of it, then Enter."
     if options.poses == 6:
@@ -291,7 +291,7 @@ def _dialogue() -> Iterator[None]:
     Raises:
         InputError: a servo or the IMU does not answer as it should.
     """
-    from wlr_gym.hardware.dynamixel.bus import NoAnswerError, RefusedError
+    from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 
     try:
         yield

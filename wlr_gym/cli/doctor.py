@@ -75,7 +75,7 @@ def run(options: Options) -> int:
 
 def examine(link: Link, robot: Robot, hardware: Hardware, options: Options, console: Console) -> list[Check]:
     """Return all checks of ports, adapters, servos, buses and IMU; mends and scans on the way, where that was asked for."""
-    from wlr_gym.hardware.dynamixel.sdk import BusGoneError
+    from wlr_gym.hardware.dynamixel.errors import BusGoneError
     from wlr_gym.hardware.loop import TIMED_READS
     from wlr_gym.hardware.safety import preflight as checks
 
@@ -128,7 +128,7 @@ def check_policy(source: str, robot: str) -> list[Check]:
 
 
 def _scan(link: Link, hardware: Hardware, buses: Sequence[str], console: Console) -> None:
-    from wlr_gym.hardware.dynamixel.setup import find_servos
+    from wlr_gym.hardware.servo_setup import find_servos
 
     for name in buses:
         link.servos.groups[name].close()

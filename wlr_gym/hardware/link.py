@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.servos import Servos
 from wlr_gym.hardware.imu.driver import Imu
+from wlr_gym.hardware.servos import Servos
 from wlr_gym.robot import Robot
 
 if TYPE_CHECKING:
@@ -98,9 +98,9 @@ def serial_link(robot: Robot, hardware: Hardware) -> Link:
 
 def emulated_link(machine: Machine) -> Link:
     """Return a link to an emulated robot in this process and in emulated time: the same bits each time."""
-    from wlr_gym.hardware.emulator.memory import MemoryImu, MemoryPort, World
+    from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu, MemoryPort
 
-    world, hardware = World(machine), machine.hardware
+    world, hardware = EmulatedWorld(machine), machine.hardware
     names = {bus.port: name for name, bus in hardware.buses.items()}
     servos = Servos(
         machine.robot,

@@ -30,8 +30,8 @@ from numpy.typing import ArrayLike, NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.bus import NoAnswerError, RefusedError
-from wlr_gym.hardware.imu.driver import ImuGoneError, ImuReading
+from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
+from wlr_gym.hardware.imu.reading import ImuGoneError, ImuReading
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.log import RunLog, sensors_of
 from wlr_gym.hardware.safety.limiter import Gate

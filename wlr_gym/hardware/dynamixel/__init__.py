@@ -1,1 +1,1 @@
-"""Dynamixel servos: protocol, control tables, buses, eight servos in SI units."""
+"""Dynamixel servos: protocol, control tables, ports, buses."""

@@ -14,41 +14,25 @@ from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.hardware.dynamixel import protocol
-from wlr_gym.hardware.dynamixel.protocol import Error, Instruction, Packet, Status
+from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError, RestlessLineError
+from wlr_gym.hardware.dynamixel.protocol import Error, Status
 from wlr_gym.hardware.dynamixel.tables import ControlTable
+from wlr_gym.hardware.dynamixel.tick_clock import STALE, TickClock
 
 if TYPE_CHECKING:
-    from wlr_gym.hardware.dynamixel.sdk import GuardedHandler, GuardedPort
+    from wlr_gym.hardware.dynamixel.port import DynamixelPort
 
 #: s an answer may take beyond its bytes' time on the wire: adapter's latency timer (1 ms) twice, and the scheduler.
 PATIENCE = 0.005
 #: s a rebooting servo may be silent.
 REBOOT_TIME = 1.0
-#: Servo's clock against ours: part by which it may run slow, age (s) at which a reading is stale, and age (s) beyond which
-#: it is no lateness but a clock that restarted.
-CLOCK_TOLERANCE, STALE, LATEST = 0.02, 0.012, 1.0
-_TICKS = 32768
+#: Data bytes of a ping's answer: model number and firmware version.
+_PING_DATA = 3
+#: Time a servo waits for each id below its own before it answers a ping of all, ms.
+_PING_SPACING = 3.0
+#: Time for the first answer to a ping of all, ms.
+_PING_START = 16.0
 _ERROR_NAMES = {error.value: error.name.lower().replace("_", " ") + " error" for error in Error}
-
-
-class NoAnswerError(TimeoutError):
-    """A servo did not answer."""
-
-
-class RestlessLineError(NoAnswerError):
-    """A servo did not answer, or was not heard: the line never falls quiet."""
-
-
-class RefusedError(RuntimeError):
-    """A servo refused an instruction.
-
-    Attributes:
-        status: its answer.
-    """
-
-    def __init__(self, message: str, status: Status) -> None:
-        super().__init__(message)
-        self.status = status
 
 
 class Block:
@@ -76,7 +60,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Reading:
+class BlockReading:
     """What one servo answered to a block read.
 
     Attributes:
@@ -113,33 +97,6 @@ class Statistics:
     fallbacks: int = 0
 
 
-class TickClock:
-    """Tells how old a reading is from the servo's Realtime Tick (ms, modulo 32768) and our clock.
-
-    The freshest reading seen so far sets the offset between the two clocks; the offset is allowed to drift by
-    ``CLOCK_TOLERANCE``. A late answer to an earlier request shows as age; Protocol 2.0 has nothing else to tell it by. Any
-    other jump is a servo that restarted.
-    """
-
-    def __init__(self) -> None:
-        self._offset: float | None = None
-        self._time = 0.0
-
-    def age(self, tick: int, now: float) -> tuple[float, bool]:
-        """Return the age (s) of a reading received at ``now`` (s), and whether the servo's clock was found restarted."""
-        sample = tick - now * 1e3
-        if self._offset is None:
-            self._offset, self._time = sample, now
-        ahead = (sample - self._offset + _TICKS / 2) % _TICKS - _TICKS / 2
-        drift = CLOCK_TOLERANCE * (now - self._time) * 1e3
-        age = max(0.0, -ahead - drift) * 1e-3
-        if STALE < age < LATEST:
-            return age, False
-        restarted = age >= LATEST or ahead > STALE * 1e3 + drift
-        self._offset, self._time = self._offset + (ahead if restarted else max(ahead, -drift)), now
-        return (0.0 if restarted else age), restarted
-
-
 class BusGroup:
     """Servos on one port.
 
@@ -165,18 +122,17 @@ class BusGroup:
         servos: Mapping[int, ControlTable],
         patience: float = PATIENCE,
         clock: Callable[[], float] = time.monotonic,
-        make_port: Callable[[str, int, float], GuardedPort] | None = None,
+        make_port: Callable[[str, int, float], DynamixelPort] | None = None,
     ) -> None:
         require_package("dynamixel_sdk", "robot")
         require_package("serial", "robot")
-        from wlr_gym.hardware.dynamixel.sdk import GuardedHandler, GuardedPort
+        from wlr_gym.hardware.dynamixel.port import DynamixelPort
 
         self.name = name
         self.servos = dict(servos)
         self.fast = True
         self.statistics = Statistics()
-        self._port: GuardedPort = (make_port or GuardedPort)(port, baud_rate, patience)
-        self._handler: GuardedHandler = GuardedHandler()
+        self._port: DynamixelPort = (make_port or DynamixelPort)(port, baud_rate, patience)
         self._clock = clock
         self._clocks = {id: TickClock() for id in servos}
         self._fast_failures = 0
@@ -224,13 +180,20 @@ class BusGroup:
         Raises:
             NoAnswerError: the servo is silent.
         """
-        status = self._ask(Packet(id, Instruction.PING, b""), 3, "ping")
-        return int.from_bytes(status.data[:2], "little"), status.data[2]
+        status = self._ask(id, protocol.ping(id), _PING_DATA, "ping")
+        return _identity(status)
 
     def scan(self) -> dict[int, tuple[int, int]]:
         """Return id -> (model number, firmware) of every servo that answers; takes about 0.8 s."""
-        found, _ = self._handler.broadcastPing(self._port)
-        return {id: (model, firmware) for id, (model, firmware) in sorted(found.items())}
+        port = self._port
+        port.send(protocol.ping(), is_answered=True)
+        port.setPacketTimeoutMillis(protocol.MAX_ID * ((_PING_DATA + 11) * port.tx_time_per_byte + _PING_SPACING) + _PING_START)
+        found: dict[int, tuple[int, int]] = {}
+        while (packet := port.next_answer()) is not None:
+            status = protocol.as_status(packet)
+            if status is not None and len(status.data) == _PING_DATA:
+                found[status.id] = _identity(status)
+        return dict(sorted(found.items()))
 
     def read(self, id: int, item: str) -> int:
         """Return the count an item holds.
@@ -240,8 +203,7 @@ class BusGroup:
             InputError: unknown id or item.
         """
         row = self._table(id)[item]
-        parameters = protocol.word(row.address) + protocol.word(row.size)
-        return row.decode(self._ask(Packet(id, Instruction.READ, parameters), row.size, f"read {item}").data)
+        return row.decode(self._ask(id, protocol.read(id, row.address, row.size), row.size, f"read {item}").data)
 
     def write(self, id: int, item: str, count: int) -> None:
         """Write a count and have it acknowledged.
@@ -251,8 +213,7 @@ class BusGroup:
             InputError: unknown id or item, or a count that does not fit.
         """
         row = self._table(id)[item]
-        parameters = protocol.word(row.address) + row.encode(count)
-        self._ask(Packet(id, Instruction.WRITE, parameters), 0, f"write {item} = {count}")
+        self._ask(id, protocol.write(id, row.address, row.encode(count)), 0, f"write {item} = {count}")
 
     def reboot(self, id: int) -> None:
         """Reboot a servo and wait until it is back: RAM at its defaults, latched errors cleared, torque off.
@@ -260,7 +221,7 @@ class BusGroup:
         Raises:
             NoAnswerError: it did not come back.
         """
-        self._ask(Packet(id, Instruction.REBOOT, b""), 0, "reboot")
+        self._ask(id, protocol.reboot(id), 0, "reboot")
         end = time.monotonic() + REBOOT_TIME
         while True:
             try:
@@ -275,18 +236,18 @@ class BusGroup:
             raise InputError(f"bus {self.name}: no servo with id {id}; there are {', '.join(map(str, sorted(self.servos)))}")
         return self.servos[id]
 
-    def _ask(self, packet: Packet, length: int, what: str) -> Status:
+    def _ask(self, id: int, raw: bytes, length: int, what: str) -> Status:
         self.statistics.exchanges += 1
-        status = self._handler.exchange(self._port, packet, length)
+        status = self._port.exchange(raw, length)
         self._note_port()
-        where = f"bus {self.name}, id {packet.id}: {what}"
+        where = f"bus {self.name}, id {id}: {what}"
         if status is None:
-            self._count(self.statistics.missing, packet.id)
+            self._count(self.statistics.missing, id)
             if not self._port.quiet:
                 raise RestlessLineError(f"{where}: no answer, the line is never quiet: check wiring, are two ports swapped?")
             raise NoAnswerError(f"{where}: no answer")
         if status.alert:
-            self._count(self.statistics.alerts, packet.id)
+            self._count(self.statistics.alerts, id)
         if status.fault:
             raise RefusedError(f"{where}: refused ({_ERROR_NAMES.get(status.fault, status.fault)})", status)
         return status
@@ -302,10 +263,10 @@ class BusGroup:
         self._asked, self._asked_at = block, self._clock()
         self.statistics.exchanges += 1
         count = len(self.servos)
-        self._handler.syncReadTx(self._port, block.address, block.length, list(self.servos), count, self.fast)
+        self._port.send(protocol.sync_read(block.address, block.length, self.servos, self.fast), is_answered=True)
         self._port.setPacketTimeout((block.length + 11) * count + 14 + count)
 
-    def answers(self) -> dict[int, Reading]:
+    def answers(self) -> dict[int, BlockReading]:
         """Return id -> reading of the servos that answered :meth:`ask_all`; who is missing, is missing.
 
         A fast read that brings nothing is repeated as an ordinary one; after three in a row only ordinary ones are tried.
@@ -316,12 +277,12 @@ class BusGroup:
         block = self._asked
         assert block is not None, "ask_all comes first"
         wanted = dict.fromkeys(self.servos, block.length)
-        found = self._handler.collect(self._port, wanted)
+        found = self._port.collect(wanted)
         if self.fast and not found:
             self.statistics.fallbacks += 1
             self.fast = False
             self.ask_all(block)
-            found = self._handler.collect(self._port, wanted)
+            found = self._port.collect(wanted)
             self._fast_failures = self._fast_failures + 1 if found else 0
             self.fast = self._fast_failures < 3
         elif self.fast:
@@ -334,7 +295,7 @@ class BusGroup:
         oldest = now - self._asked_at + STALE  # an answer may have waited for us, but was not given before we asked
         return {id: reading for id, reading in readings.items() if self._is_good(id, reading, oldest)}
 
-    def read_all(self, block: Block) -> dict[int, Reading]:
+    def read_all(self, block: Block) -> dict[int, BlockReading]:
         """Return id -> reading of every servo that answers; :meth:`ask_all` and :meth:`answers` in one.
 
         Raises:
@@ -343,16 +304,16 @@ class BusGroup:
         self.ask_all(block)
         return self.answers()
 
-    def _reading(self, block: Block, status: Status, now: float) -> Reading:
+    def _reading(self, block: Block, status: Status, now: float) -> BlockReading:
         counts = block.decode(status.data)
         age, restarted = 0.0, False
         if "realtime_tick" in counts:
             age, restarted = self._clocks[status.id].age(counts["realtime_tick"], now)
         if status.alert:
             self._count(self.statistics.alerts, status.id)
-        return Reading(counts, status.alert, age, restarted)
+        return BlockReading(counts, status.alert, age, restarted)
 
-    def _is_good(self, id: int, reading: Reading, oldest: float) -> bool:
+    def _is_good(self, id: int, reading: BlockReading, oldest: float) -> bool:
         if reading.age > oldest:
             self._count(self.statistics.stale, id)
             self._port.suspect = True
@@ -368,8 +329,7 @@ class BusGroup:
         """
         data = {id: self._table(id)[item].encode(count) for id, count in counts.items()}
         row = self._table(next(iter(counts)))[item]
-        parameters = [value for id, raw in data.items() for value in (id, *raw)]
-        self._handler.syncWriteTxOnly(self._port, row.address, row.size, parameters, len(parameters))
+        self._port.send(protocol.sync_write(row.address, data), is_answered=False)
 
     def torque_off(self, retries: int = 5) -> set[int]:
         """Switch every motor off, whatever happened before; return the ids that did not confirm it.
@@ -402,6 +362,11 @@ class BusGroup:
     def _note_port(self) -> None:
         self.statistics.crc_errors = self._port.parser.crc_errors
         self.statistics.discarded = self._port.discarded
+
+
+def _identity(ping: Status) -> tuple[int, int]:
+    """Model number and firmware version in the answer to a ping."""
+    return int.from_bytes(ping.data[:2], "little"), ping.data[2]
 
 
 def open_all(groups: Iterable[BusGroup]) -> None:

@@ -19,10 +19,11 @@ PREFIX = 7
 MAX_LENGTH = 1024
 #: Bit of a status packet's error byte: the servo has a hardware error, see its Hardware Error Status.
 ALERT = 0x80
+#: Parameters of CLEAR that bring Present Position back into one turn.
+CLEAR_TURNS = bytes([0x01, 0x44, 0x58, 0x4C, 0x22])
 
 _PATTERN = b"\xff\xff\xfd"
 _STUFFED = b"\xff\xff\xfd\xfd"
-_CLEAR_TURNS = bytes([0x01, 0x44, 0x58, 0x4C, 0x22])
 
 
 class Instruction(IntEnum):
@@ -147,29 +148,14 @@ def read(id: int, address: int, length: int) -> bytes:
     return encode(id, Instruction.READ, word(address) + word(length))
 
 
-def write(id: int, address: int, data: bytes, instruction: int = Instruction.WRITE) -> bytes:
-    """Return a write; ``instruction`` REG_WRITE keeps it back until :func:`action`."""
-    return encode(id, instruction, word(address) + data)
-
-
-def action(id: int = BROADCAST) -> bytes:
-    """Return the instruction that carries out what REG_WRITE registered."""
-    return encode(id, Instruction.ACTION)
+def write(id: int, address: int, data: bytes) -> bytes:
+    """Return a write."""
+    return encode(id, Instruction.WRITE, word(address) + data)
 
 
 def reboot(id: int) -> bytes:
     """Return a reboot: RAM to its defaults, latched errors cleared, torque off."""
     return encode(id, Instruction.REBOOT)
-
-
-def factory_reset(id: int, keep: int = 0x02) -> bytes:
-    """Return a factory reset. ``keep``: FF nothing, 01 the id, 02 id and baud rate."""
-    return encode(id, Instruction.FACTORY_RESET, bytes([keep]))
-
-
-def clear_turns(id: int) -> bytes:
-    """Return the instruction that brings Present Position back into one turn."""
-    return encode(id, Instruction.CLEAR, _CLEAR_TURNS)
 
 
 def sync_read(address: int, length: int, ids: Iterable[int], fast: bool = False) -> bytes:
@@ -183,19 +169,6 @@ def sync_write(address: int, data: Mapping[int, bytes]) -> bytes:
     (length,) = {len(block) for block in data.values()}
     blocks = b"".join(bytes([id]) + block for id, block in data.items())
     return encode(BROADCAST, Instruction.SYNC_WRITE, word(address) + word(length) + blocks)
-
-
-def bulk_read(blocks: Mapping[int, tuple[int, int]], fast: bool = False) -> bytes:
-    """Return a read of id -> (address, length)."""
-    instruction = Instruction.FAST_BULK_READ if fast else Instruction.BULK_READ
-    parts = (bytes([id]) + word(address) + word(length) for id, (address, length) in blocks.items())
-    return encode(BROADCAST, instruction, b"".join(parts))
-
-
-def bulk_write(blocks: Mapping[int, tuple[int, bytes]]) -> bytes:
-    """Return a write of id -> (address, bytes)."""
-    parts = (bytes([id]) + word(address) + word(len(data)) + data for id, (address, data) in blocks.items())
-    return encode(BROADCAST, Instruction.BULK_WRITE, b"".join(parts))
 
 
 def encode_fast_status(answers: Sequence[Status]) -> list[bytes]:
@@ -253,13 +226,11 @@ class Parser:
 
     Attributes:
         crc_errors: packets dropped because their CRC was wrong.
-        skipped: bytes dropped because they belonged to no packet.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self.crc_errors = 0
-        self.skipped = 0
 
     def feed(self, data: bytes) -> list[Packet]:
         """Take bytes from the line; return the packets they complete."""
@@ -274,49 +245,33 @@ class Parser:
             packet = _decode(raw) if whole else None
             self.crc_errors += not whole
             if packet is None:
-                self._skip(1)
+                del self._buffer[:1]
             else:
                 packets.append(packet)
                 del self._buffer[:size]
         return packets
 
-    def give_up(self) -> list[Packet]:
-        """Drop the unfinished packet at the front, after a time-out, and return what was hidden behind its header."""
-        if not self._buffer:
-            return []
-        self._skip(1)
-        return self.feed(b"")
-
     def clear(self) -> None:
         """Forget everything received so far."""
         self._buffer.clear()
-
-    @property
-    def pending(self) -> int:
-        """Bytes that are not yet a packet."""
-        return len(self._buffer)
 
     def _align(self) -> bool:
         """Bring a plausible packet start to the front; False where more bytes are needed to tell."""
         while True:
             place = self._buffer.find(HEADER)
             if place < 0:
-                self._skip(max(0, len(self._buffer) - _header_tail(self._buffer)))
+                del self._buffer[: len(self._buffer) - _header_tail(self._buffer)]
                 return False
-            self._skip(place)
+            del self._buffer[:place]
             if len(self._buffer) < PREFIX:
                 return False
             if self._is_plausible():
                 return True
-            self._skip(1)
+            del self._buffer[:1]
 
     def _is_plausible(self) -> bool:
         id, length = self._buffer[4], int.from_bytes(self._buffer[5:7], "little")
         return (id <= MAX_ID or id == BROADCAST) and 3 <= length <= MAX_LENGTH
-
-    def _skip(self, count: int) -> None:
-        self.skipped += count
-        del self._buffer[:count]
 
 
 def _header_tail(data: bytearray) -> int:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from wlr_gym.hardware.dynamixel import protocol
 from wlr_gym.hardware.dynamixel.protocol import BROADCAST, Error, Instruction, Packet, Parser, Status
+from wlr_gym.hardware.dynamixel.tables import OVERLOAD
 from wlr_gym.hardware.emulator.faults import FaultBoard
 from wlr_gym.hardware.emulator.servo import EmulatedServo
 
@@ -47,7 +48,7 @@ class LineTiming:
 NO_TIME = LineTiming(wire=False, turnaround=0.0, usb_latency=0.0)
 
 
-class Line:
+class BusLine:
     """Servos on one bus.
 
     Args:
@@ -126,6 +127,20 @@ class Line:
                 held = []
         yield from (Emission(start + self.timing.usb_latency + delay, data) for delay, data in held if data)
         self._busy_until = start
+
+    def apply_faults(self, now: float) -> None:
+        """Let the faults that hold now act on the servos."""
+        active = self._faults.active
+        for servo in self.servos:
+            places = (servo.name, self.name)
+            unpowered = bool(active(now, "dead", places) or active(now, "brownout", places))
+            if servo.dead and not unpowered:
+                servo.boot()
+            servo.set_power(not unpowered)
+            heat = active(now, "overheat", places)
+            servo.health.heating_rate = heat.value if heat else 0.0
+            if active(now, "overload", places) and not unpowered:
+                servo.raise_error(OVERLOAD)
 
     # ---- who answers ----
 

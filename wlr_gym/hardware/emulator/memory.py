@@ -11,14 +11,14 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import ImuPort
-from wlr_gym.hardware.dynamixel.sdk import GuardedPort
+from wlr_gym.hardware.dynamixel.port import DynamixelPort
 from wlr_gym.hardware.emulator.line import Emission
 from wlr_gym.hardware.emulator.machine import Machine
-from wlr_gym.hardware.imu.driver import ImuGoneError
+from wlr_gym.hardware.imu.reading import ImuGoneError
 from wlr_gym.hardware.imu.stream import ImuStream
 
 
-class World:
+class EmulatedWorld:
     """A machine, the bytes on their way, and the clock that passes when somebody waits.
 
     Args:
@@ -83,9 +83,9 @@ class World:
 
 
 class _Device:
-    """What :class:`GuardedPort` uses of ``serial.Serial``."""
+    """What :class:`DynamixelPort` uses of ``serial.Serial``."""
 
-    def __init__(self, world: World, name: str, baud_rate: int) -> None:
+    def __init__(self, world: EmulatedWorld, name: str, baud_rate: int) -> None:
         self._world, self._name, self._baud_rate = world, name, baud_rate
         self._connection = world.connect(name)
 
@@ -117,17 +117,17 @@ class _Device:
         pass
 
 
-class MemoryPort(GuardedPort):
+class MemoryPort(DynamixelPort):
     """The port of one emulated bus.
 
     Args:
         world: the robot.
         name: of its bus.
         baud_rate: bit/s.
-        patience: s of emulated time; see :class:`GuardedPort`.
+        patience: s of emulated time; see :class:`DynamixelPort`.
     """
 
-    def __init__(self, world: World, name: str, baud_rate: int, patience: float) -> None:
+    def __init__(self, world: EmulatedWorld, name: str, baud_rate: int, patience: float) -> None:
         super().__init__(name, baud_rate, patience)
         self._world = world
 
@@ -160,7 +160,7 @@ class MemoryImu(ImuStream):
         port: ranges and calibration.
     """
 
-    def __init__(self, world: World, port: ImuPort) -> None:
+    def __init__(self, world: EmulatedWorld, port: ImuPort) -> None:
         super().__init__(port, world.now)
         self._world = world
         self._connection = 0

@@ -20,6 +20,7 @@ from concurrent.futures import Future
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.hardware.emulator.commands import run_command
 from wlr_gym.hardware.emulator.machine import Machine
 
 #: Emulated time may fall behind by this much (s); beyond, it slips, as on a computer that was suspended.
@@ -100,7 +101,7 @@ class Server:
         machine: the robot.
         real_time: emulated time follows the clock; False = it passes only in :meth:`advance`.
         links: folder for links of fixed names (bus names and ``imu``) to the terminals; None = none.
-        control: path of a Unix socket that takes command lines (see :meth:`Machine.command`); None = none.
+        control: path of a Unix socket that takes command lines (see :func:`run_command`); None = none.
 
     Attributes:
         slipped: s of emulated time given up because the computer was too busy.
@@ -188,7 +189,7 @@ class Server:
         return future.result()
 
     def command(self, text: str) -> str:
-        """Carry out one command line (see :meth:`Machine.command`; ``step S`` here too); any thread may ask.
+        """Carry out one command line (see :func:`run_command`; ``step S`` here too); any thread may ask.
 
         Raises:
             InputError: it cannot be understood.
@@ -310,7 +311,7 @@ class Server:
     def _carry_out(self, text: str) -> str:
         word, *rest = text.split() or ["help"]
         if word != "step":
-            return self.machine.command(text)
+            return run_command(self.machine, text)
         if self._real_time:
             raise InputError("step: this emulator runs in real time")
         try:

@@ -23,7 +23,7 @@ STANDARD_GRAVITY = 9.80665
 
 
 @dataclass(frozen=True)
-class Frame:
+class ImuFrame:
     """One reading, in counts.
 
     Attributes:
@@ -61,7 +61,7 @@ def from_counts(counts: ArrayLike, per_count: float) -> NDArray[np.float64]:
     return np.asarray(counts, np.float64) * per_count
 
 
-def encode_frame(frame: Frame) -> bytes:
+def encode_frame(frame: ImuFrame) -> bytes:
     """Return a frame as bytes."""
     numbers = (*frame.accelerometer, frame.temperature, *frame.gyroscope)
     body = _LAYOUT.pack(SYNC, frame.sequence & 0xFFFF, frame.microseconds & 0xFFFFFFFF, *numbers)
@@ -82,7 +82,7 @@ class FrameParser:
         self.crc_errors = 0
         self.lost = 0
 
-    def feed(self, data: bytes) -> list[Frame]:
+    def feed(self, data: bytes) -> list[ImuFrame]:
         """Take bytes; return the frames they complete."""
         self._buffer += data
         frames = []
@@ -97,9 +97,9 @@ class FrameParser:
         del self._buffer[: max(0, len(self._buffer) - 2 * SIZE)]  # noise without a start never piles up
         return frames
 
-    def _take(self, raw: bytes) -> Frame:
+    def _take(self, raw: bytes) -> ImuFrame:
         _, sequence, microseconds, ax, ay, az, temperature, gx, gy, gz = _LAYOUT.unpack(raw[:-2])
         if self._last is not None:
             self.lost += (sequence - self._last - 1) % 65536
         self._last = sequence
-        return Frame(sequence, microseconds, (ax, ay, az), temperature, (gx, gy, gz))
+        return ImuFrame(sequence, microseconds, (ax, ay, az), temperature, (gx, gy, gz))

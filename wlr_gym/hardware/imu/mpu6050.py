@@ -9,18 +9,32 @@ from typing import Any, Protocol
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.hardware.config import ImuPort
-from wlr_gym.hardware.imu.driver import Conversion, Counts, ImuGoneError, ImuReading, ImuStatistics
+from wlr_gym.hardware.imu.reading import Conversion, Counts, ImuGoneError, ImuReading, ImuStatistics
 from wlr_gym.hardware.ports import lock
 
-SAMPLE_RATE_DIVIDER, CONFIG, GYRO_CONFIG, ACCEL_CONFIG = 0x19, 0x1A, 0x1B, 0x1C
-INTERRUPT_ENABLE, INTERRUPT_STATUS, POWER_1, WHO_AM_I = 0x38, 0x3A, 0x6B, 0x75
+# Registers.
+SAMPLE_RATE_DIVIDER = 0x19
+CONFIG = 0x1A
+GYRO_CONFIG = 0x1B
+ACCEL_CONFIG = 0x1C
+INTERRUPT_ENABLE = 0x38
+INTERRUPT_STATUS = 0x3A
+POWER_1 = 0x6B
+WHO_AM_I = 0x75
+#: What an MPU-6050 answers to WHO_AM_I.
 IDENTITY = 0x68
 #: What pin-compatible chips answer to WHO_AM_I: their accelerometer's filter is set in another register.
 RELATIVES = {0x70: "MPU-6500", 0x71: "MPU-9250", 0x73: "MPU-9255", 0x98: "ICM-20689", 0x12: "ICM-20602"}
 #: Accelerometer bandwidth (Hz) -> DLPF_CFG. With any of them the chip samples at 1 kHz before the divider.
 FILTERS = {184: 1, 94: 2, 44: 3, 21: 4, 10: 5, 5: 6}
+#: Hz before the divider.
 _SAMPLING = 1000.0
-_RESET, _GYRO_CLOCK, _DATA_READY = 0x80, 0x01, 0x01
+#: POWER_1: reset.
+_RESET = 0x80
+#: POWER_1: clocked by the gyroscope.
+_GYRO_CLOCK = 0x01
+#: INTERRUPT_STATUS: new values.
+_DATA_READY = 0x01
 #: s the chip needs after a reset.
 RESET_TIME = 0.1
 #: INT_STATUS and the seven values behind it, big-endian, in one burst: only then do the axes belong together.
@@ -147,8 +161,7 @@ class Mpu6050:
             self._bus = None
 
     def __enter__(self) -> Mpu6050:
-        if self._bus is None:
-            self.open()
+        self.open()
         return self
 
     def __exit__(self, *error: object) -> None:

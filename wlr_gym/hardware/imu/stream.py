@@ -8,8 +8,8 @@ from typing import Protocol
 
 from wlr_gym.base.errors import require_package
 from wlr_gym.hardware.config import ImuPort
-from wlr_gym.hardware.imu.driver import Conversion, ImuGoneError, ImuReading, ImuStatistics
-from wlr_gym.hardware.imu.frames import Frame, FrameParser
+from wlr_gym.hardware.imu.frames import FrameParser, ImuFrame
+from wlr_gym.hardware.imu.reading import Conversion, ImuGoneError, ImuReading, ImuStatistics
 from wlr_gym.hardware.ports import open_serial
 
 #: Bytes taken at once; more than the system keeps for a port nobody reads.
@@ -42,8 +42,9 @@ class StreamClock:
     0.5 %, an RC oscillator by 2 %). A clock that jumps further than ``latest`` restarted.
     """
 
-    drift, latest = 0.02, 2.0
-    _turn = 2**32 * 1e-6
+    drift = 0.02  #: part by which the microcontroller's clock may be wrong
+    latest = 2.0  #: s
+    _turn = 2**32 * 1e-6  #: s after which the clock wraps
 
     def __init__(self) -> None:
         self._offset: float | None = None
@@ -93,7 +94,7 @@ class ImuStream:
         self.statistics = ImuStatistics()
         self._parser = FrameParser()
         self._frame_clock = StreamClock()
-        self._newest: tuple[Frame, float] | None = None
+        self._newest: tuple[ImuFrame, float] | None = None
 
     def open(self) -> None:
         """Open the port and throw away what piled up in it.
@@ -112,14 +113,13 @@ class ImuStream:
             self._device = None
 
     def __enter__(self) -> ImuStream:
-        if self._device is None:
-            self.open()
+        self.open()
         return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def frames(self) -> list[Frame]:
+    def frames(self) -> list[ImuFrame]:
         """Return all frames that came since the last call; does not wait.
 
         Raises:

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import Profile
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.bus import NoAnswerError, RefusedError
-from wlr_gym.hardware.dynamixel.servos import JointReadings, Servos
+from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 from wlr_gym.hardware.link import Clock
 from wlr_gym.hardware.safety import preflight as checks
 from wlr_gym.hardware.safety import rules as safety
 from wlr_gym.hardware.safety.rules import Decision, Memory, View
+from wlr_gym.hardware.servos import JointReadings, Servos
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 
 Array = NDArray[np.float64]

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.calibration import ACCEL_REST, GYRO_REST, motion
 from wlr_gym.hardware.config import Hardware, ImuPort
-from wlr_gym.hardware.dynamixel.bus import NoAnswerError, RefusedError, RestlessLineError
-from wlr_gym.hardware.dynamixel.servos import Servos
+from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError, RestlessLineError
 from wlr_gym.hardware.dynamixel.tables import ControlTable, load_table
-from wlr_gym.hardware.imu.driver import Imu, ImuGoneError
+from wlr_gym.hardware.imu.driver import Imu
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
+from wlr_gym.hardware.imu.reading import ImuGoneError
 from wlr_gym.hardware.ports import PortInUseError
+from wlr_gym.hardware.servos import Servos
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
 if TYPE_CHECKING:

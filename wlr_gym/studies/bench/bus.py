@@ -139,7 +139,7 @@ def _latency(delay: Callable[[], float], count: int) -> list[float]:
 @contextlib.contextmanager
 def _our_cycle(robot: Robot, hardware: Hardware) -> Iterator[tuple[Cycle, Callable[[], float]]]:
     """A cycle of :class:`Servos`, and one that returns the s from its readings to its goals on their way."""
-    from wlr_gym.hardware.dynamixel.servos import Servos
+    from wlr_gym.hardware.servos import Servos
 
     goals = np.array([np.pi / 2] * 4 + [1.0] * 4)
     with Servos(robot, hardware, 1.0, lambda: 0.0) as servos:  # recorded answers: the servos' clocks stand still

@@ -18,8 +18,27 @@ FIRST_RAM_ADDRESS = 64
 TABLE_SIZE = 662
 #: Baud Rate register -> bits per second.
 BAUD_RATES = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
+# Values of Operating Mode.
+CURRENT_MODE = 0
+VELOCITY_MODE = 1
+POSITION_MODE = 3
+EXTENDED_POSITION_MODE = 4
+CURRENT_POSITION_MODE = 5
+PWM_MODE = 16
+POSITION_MODES = (POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_POSITION_MODE)
+
+# Bits of Hardware Error Status and Shutdown that the emulator sets.
+INPUT_VOLTAGE = 0x01
+OVERHEATING = 0x04
+OVERLOAD = 0x20
 #: Hardware Error Status and Shutdown bits.
-HARDWARE_ERRORS = {0x01: "input voltage", 0x04: "overheating", 0x08: "encoder", 0x10: "electrical shock", 0x20: "overload"}
+HARDWARE_ERRORS = {
+    INPUT_VOLTAGE: "input voltage",
+    OVERHEATING: "overheating",
+    0x08: "encoder",
+    0x10: "electrical shock",
+    OVERLOAD: "overload",
+}
 
 Bound = int | str | None
 

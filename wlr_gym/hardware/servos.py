@@ -13,13 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.bus import PATIENCE, Block, BusGroup, NoAnswerError, Reading, open_all
+from wlr_gym.hardware.dynamixel.bus import PATIENCE, Block, BlockReading, BusGroup, open_all
+from wlr_gym.hardware.dynamixel.errors import BusGoneError, NoAnswerError
 from wlr_gym.hardware.dynamixel.tables import HARDWARE_ERRORS, ControlTable, load_table
 from wlr_gym.physics.servo import effort_counts
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
 if TYPE_CHECKING:
-    from wlr_gym.hardware.dynamixel.sdk import GuardedPort
+    from wlr_gym.hardware.dynamixel.port import DynamixelPort
 
 Array = NDArray[np.float64]
 
@@ -124,7 +125,7 @@ class Servos:
         hardware: Hardware,
         patience: float = PATIENCE,
         clock: Callable[[], float] = time.monotonic,
-        make_port: Callable[[str, int, float], GuardedPort] | None = None,
+        make_port: Callable[[str, int, float], DynamixelPort] | None = None,
     ) -> None:
         self.joint_map = JointMap(robot, hardware)
         self._ids = [robot.dynamixel_ids[joint] for joint in JOINTS]
@@ -202,10 +203,10 @@ class Servos:
                 values[:, k] = counts["present_input_voltage"] * 0.1, counts["present_temperature"]
         return values[0], values[1]
 
-    def _read(self, blocks: Mapping[str, Block]) -> dict[int, Reading]:
+    def _read(self, blocks: Mapping[str, Block]) -> dict[int, BlockReading]:
         for name, group in self.groups.items():
             group.ask_all(blocks[name])
-        found: dict[int, Reading] = {}
+        found: dict[int, BlockReading] = {}
         for group in self.groups.values():
             found |= group.answers()
         return found
@@ -281,8 +282,6 @@ class Servos:
 
     def shout_off(self) -> None:
         """Tell every motor to switch off, without waiting for anybody; a bus that is gone does not keep the others."""
-        from wlr_gym.hardware.dynamixel.sdk import BusGoneError
-
         for group in self.groups.values():
             with contextlib.suppress(BusGoneError):
                 group.write_all("torque_enable", dict.fromkeys(group.servos, 0))
@@ -300,8 +299,6 @@ class Servos:
 
         A bus whose port is gone does not keep the others from being tried.
         """
-        from wlr_gym.hardware.dynamixel.sdk import BusGoneError
-
         left: set[int] = set()
         for group in self.groups.values():
             try:

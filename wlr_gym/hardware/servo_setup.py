@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import Bus
-from wlr_gym.hardware.dynamixel.bus import BusGroup, NoAnswerError, RefusedError
+from wlr_gym.hardware.dynamixel.bus import BusGroup
+from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, load_table
 
 #: bit/s of a servo out of the box.

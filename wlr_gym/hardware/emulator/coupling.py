@@ -1,0 +1,244 @@
+"""Servos on a plant: what their firmware asks of the motors becomes setpoints, what the physics did becomes their shafts.
+
+How the plant's own servo model is the physics. A plant takes leg angles and wheel speeds and runs the servo's law itself, every
+substep. So a leg in (extended) position mode and a wheel in velocity mode are *native*: goal, torque, gains and profile
+registers go straight to the plant, and the motion is bit for bit the simulator's. In any other mode, or with a PWM limit, the
+emulator runs that mode's law once per tick and hands the plant the voltage: a leg gets gain 1 V/rad and the setpoint
+``angle + voltage``, a wheel gain 1 V s/rad and the setpoint ``speed + voltage``, which the plant's law turns back into that
+voltage. It acts half a tick late and is held over the tick; at 1 ms, the servo's own control period, that is what the servo
+does too. Position I and D gains and the feed-forward gains are registers without effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.hardware.config import Hardware
+from wlr_gym.hardware.dynamixel.tables import (
+    CURRENT_MODE,
+    CURRENT_POSITION_MODE,
+    EXTENDED_POSITION_MODE,
+    POSITION_MODE,
+    POSITION_MODES,
+    PWM_MODE,
+    VELOCITY_MODE,
+)
+from wlr_gym.hardware.emulator.motion import MotorDrive
+from wlr_gym.hardware.emulator.servo import EmulatedServo
+from wlr_gym.physics import servo as law
+from wlr_gym.physics.plants.base import Plant, PlantState
+from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, Robot
+from wlr_gym.robot.parameters import SPECS, Parameters
+
+Array = NDArray[np.float64]
+
+_IS_LEG = np.arange(len(JOINTS)) < len(LEGS)
+_NATIVE_MODES = {True: (POSITION_MODE, EXTENDED_POSITION_MODE), False: (VELOCITY_MODE,)}
+#: Gains that make the plant's law pass a voltage on: (kp, kd, profile velocity, profile acceleration).
+_LEG_CARRIER = (1.0, 0.0, 0.0, 0.0)
+_WHEEL_CARRIER = (0.0, 1.0, 0.0, 0.0)
+_TUNED = ("servo.kp", "servo.kd", "servo.profile_velocity", "servo.profile_acceleration")
+
+
+class PlantCoupling:
+    """Eight servos on a plant of one robot.
+
+    Args:
+        robot: the robot.
+        hardware: how the servos are mounted.
+        plant: steps by one tick.
+        servos: in joint order.
+        parameters: of the plant. Gains differ from what the registers say by the same factor as they do from nominal.
+        seed: of sensor noise.
+        state: where the robot starts; None = standing.
+
+    Attributes:
+        plant: see above.
+        sensors: its last readings.
+        supply: V at the servos.
+        nominal_supply: V without a fault.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        hardware: Hardware,
+        plant: Plant,
+        servos: Sequence[EmulatedServo],
+        parameters: Parameters | None,
+        seed: int,
+        state: PlantState | None,
+    ) -> None:
+        self.plant = plant
+        self._servos = servos
+        self._sign = np.array([hardware.joints[joint].sign for joint in JOINTS], np.float64)
+        units = [servo.table.per_count("present_position") for servo in servos]
+        self._zero = np.array([hardware.joints[joint].zero * unit for joint, unit in zip(JOINTS, units, strict=True)])
+        self._effort_count = law.effort_counts(robot)
+        nominal = Parameters.nominal(robot, 1)
+        self._parameters = nominal.copy() if parameters is None else parameters.copy()
+        self._gain_factor = self._parameters["servo.kp"][0] / nominal["servo.kp"][0]
+        self._damping = self._parameters["servo.kd"][0].copy()
+        known = nominal["servo.kd"][0]
+        self._damping_factor = np.divide(self._damping, known, where=known > 0, out=np.ones(len(JOINTS)))
+        leg, wheel = robot.servo.leg, robot.servo.wheel
+        self._nominal_stall = np.where(_IS_LEG, leg.stall_torque, wheel.stall_torque)
+        speed = np.where(_IS_LEG, leg.no_load_speed, wheel.no_load_speed)
+        self._nominal_motor = law.motor_constants(self._nominal_stall, speed, robot.servo.supply_voltage)
+        self.nominal_supply = float(self._parameters["servo.supply_voltage"][0])
+        self.supply = self.nominal_supply
+        seeds = np.array([seed], np.uint64)
+        plant.reset(seeds, self._parameters, state=state)
+        plant.step(np.zeros((1, len(JOINTS))), np.zeros((1, len(JOINTS)), bool))  # compiles now, not under a client's eyes
+        self.sensors = plant.reset(seeds, self._parameters, state=state)
+        self._setpoints = np.zeros((1, len(JOINTS)))
+        self._torque = np.zeros((1, len(JOINTS)), bool)
+        self._own_law = np.zeros(len(JOINTS), bool)
+        self._reference = np.zeros((2, len(JOINTS)))  # of the emulator's own laws
+        self._plant_reference: Array | None = None  # of the plant's, at this tick
+        self._turned = np.zeros(len(JOINTS))  # rad by which wheels were turned beyond what the plant's encoders count
+        self._tuning: list[tuple[float, ...]] = [(-1.0,)] * len(JOINTS)
+        for k, servo in enumerate(servos):
+            servo.shaft.reference = partial(self._reference_of, k)
+        self._show_sensors()
+
+    def step(self) -> None:
+        """Let the motors do for one tick what the firmware asks."""
+        self._command_plant()
+        self.sensors = self.plant.step(self._setpoints, self._torque)
+        self._plant_reference = None
+        self._show_sensors()
+
+    # ---- firmware to plant ----
+
+    def _command_plant(self) -> None:
+        tuning = list(self._tuning)
+        for k, servo in enumerate(self._servos):
+            drive = servo.drive()
+            self._torque[0, k] = drive.on
+            native = drive.mode in _NATIVE_MODES[bool(_IS_LEG[k])] and drive.goal_pwm >= 1.0
+            if drive.on and self._own_law[k] and native:
+                self._torque[0, k] = False  # one tick, in which the plant's profile generator comes back to the joint
+            if not self._torque[0, k]:
+                self._own_law[k] = False
+                continue
+            setpoint = self._native_setpoint if native else self._voltage_setpoint
+            self._setpoints[0, k], tuning[k] = setpoint(k, drive, servo)
+        if tuning != self._tuning or self.supply != self._parameters["servo.supply_voltage"][0]:
+            self._tune(tuning)
+
+    def _native_setpoint(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> tuple[float, tuple[float, ...]]:
+        """Return the plant's setpoint for a mode that the plant has itself, and its gains and profile."""
+        if _IS_LEG[k]:
+            gain = drive.position_gain * self._gain_factor[k]
+            gains = (gain, self._damping[k], drive.profile_velocity, drive.profile_acceleration)
+            return self._sign[k] * (drive.goal_position - self._zero[k]), gains
+        integral, gain = drive.velocity_integral_gain * self._gain_factor[k], drive.velocity_gain * self._damping_factor[k]
+        gains = (integral, gain, 0.0, drive.profile_acceleration)
+        return self._sign[k] * drive.goal_velocity, gains
+
+    def _voltage_setpoint(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> tuple[float, tuple[float, ...]]:
+        """Return the setpoint that makes the plant put a mode's voltage on the motor, and the gains that do it."""
+        voltage = self._sign[k] * self._voltage(k, drive, servo)
+        if _IS_LEG[k]:
+            return self._sign[k] * (servo.shaft.position - self._zero[k]) + voltage, _LEG_CARRIER
+        return self._sign[k] * servo.shaft.velocity + voltage, _WHEEL_CARRIER
+
+    def _voltage(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> float:
+        """Return the voltage (V, encoder frame) of a law the plant has not got, and move its profile on by a tick."""
+        shaft, supply, step = servo.shaft, self.supply, self.plant.options.control_period
+        if not self._own_law[k]:
+            self._reference[:, k] = shaft.reference()
+            self._own_law[k] = True
+        constant, resistance = (values[k] for values in self._nominal_motor)
+        back_emf = constant * shaft.velocity
+        if drive.mode == PWM_MODE:
+            return drive.goal_pwm * supply
+        limit = drive.goal_pwm * supply
+        if drive.mode == CURRENT_MODE:
+            return float(np.clip(back_emf + resistance * drive.goal_current, -limit, limit))
+        acceleration = drive.profile_acceleration or law.NO_LIMIT
+        stood, moved = self._reference[:, k].tolist()
+        if drive.mode in POSITION_MODES:
+            speed = drive.profile_velocity or law.NO_LIMIT
+            acceleration = acceleration if drive.profile_velocity else law.NO_LIMIT
+            new = law.leg_profile_step(stood, moved, drive.goal_position, speed, acceleration, step)
+            kp, kd = drive.position_gain, 0.0
+        else:
+            kp, kd = drive.velocity_integral_gain, drive.velocity_gain
+            new = law.wheel_profile_step(stood, moved, drive.goal_velocity, acceleration, step, shaft.position, kp, supply)
+        self._reference[:, k] = new[:2]
+        voltage = law.controller_voltage(kp, kd, new[0], new[1], shaft.position, shaft.velocity, limit)
+        if drive.mode == CURRENT_POSITION_MODE:
+            room = resistance * abs(drive.goal_current)
+            voltage = np.clip(voltage, back_emf - room, back_emf + room)
+        return float(voltage)
+
+    def _tune(self, tuning: list[tuple[float, ...]]) -> None:
+        """Hand gains, profiles and supply to the plant."""
+        for k, values in enumerate(tuning):
+            if len(values) == len(_TUNED):
+                for name, value in zip(_TUNED, values, strict=True):  # registers go beyond what a plant takes
+                    self._parameters[name][0, k] = np.clip(value, SPECS[name].low, SPECS[name].high)
+        self._parameters["servo.supply_voltage"][0] = self.supply
+        self._tuning = tuning
+        self.plant.set_parameters(self._parameters)
+
+    # ---- plant to firmware ----
+
+    def _show_sensors(self) -> None:
+        sensors = self.sensors
+        effort = self._sign * sensors.joint_effort[0]
+        position = self._zero + self._sign * (sensors.joint_position[0] + self._turned)
+        velocity = self._sign * sensors.joint_velocity[0]
+        counts = np.rint(effort / self._effort_count)
+        volt = float(sensors.supply_voltage[0])
+        constant, resistance = self._nominal_motor
+        pwm = np.where(self._torque[0], (resistance / constant * effort + constant * velocity) / max(self.supply, 1e-3), 0.0)
+        load = effort / self._nominal_stall
+        columns = zip(position.tolist(), velocity.tolist(), counts.tolist(), pwm.tolist(), load.tolist(), strict=True)
+        for servo, (p, v, e, u, strain) in zip(self._servos, columns, strict=True):
+            shaft = servo.shaft
+            shaft.position, shaft.velocity, shaft.effort, shaft.pwm, shaft.load, shaft.voltage = p, v, int(e), u, strain, volt
+
+    def _reference_of(self, k: int) -> tuple[float, float]:
+        """Return where the profile generator of joint ``k`` stands: rad and rad/s, encoder frame."""
+        if self._own_law[k] or not self.plant.capabilities.can_set_state:
+            return self._reference[0, k], self._reference[1, k]
+        if self._plant_reference is None:
+            state = self.plant.get_state()
+            position = state.reference_position[0].copy()
+            position[LEG_SLICE] += self.plant.parameters["joint.zero_offset"][0]
+            position += self._turned
+            self._plant_reference = np.stack([self._zero + self._sign * position, self._sign * state.reference_velocity[0]])
+        return self._plant_reference[0, k], self._plant_reference[1, k]
+
+    # ---- a hand ----
+
+    def turn(self, joint: str, angle: float) -> None:
+        """Turn a joint by hand while torque is off.
+
+        Args:
+            joint: name.
+            angle: rad, in the joint's positive direction.
+
+        Raises:
+            InputError: torque is on, or the plant's state cannot be set.
+        """
+        if not self.plant.capabilities.can_set_state or any(servo["torque_enable"] for servo in self._servos):
+            raise InputError(f"turn {joint}: motors are on, or this plant's state cannot be set")
+        k = JOINTS.index(joint)
+        wheels = self.sensors.joint_position[0, WHEEL_SLICE].copy()
+        if _IS_LEG[k]:
+            state = self.plant.get_state()
+            state.joint_position[0, k] += angle
+            self.sensors = self.plant.reset(state=state)
+            self._turned[WHEEL_SLICE] += wheels  # a reset plant counts its wheels from zero
+        else:
+            self._turned[k] += angle
+        self._show_sensors()

@@ -1,0 +1,157 @@
+"""What an emulated servo's firmware asks of the motor, and what the physics hands back.
+
+Everything is in the encoder's own frame: radians from count 0, positive as the encoder counts, before Drive Mode, turn counting
+and Homing Offset; :class:`EncoderFrame` turns that into Present Position.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from wlr_gym.hardware.dynamixel.tables import POSITION_MODE, PWM_MODE
+from wlr_gym.hardware.emulator.registers import EXTENDED_RANGE, Registers
+
+#: Counts per turn.
+TURN = 4096
+#: Homing Offset that acts in position mode, counts.
+HOMING_IN_POSITION_MODE = 1024
+#: Goal PWM that is the whole supply, counts.
+FULL_PWM = 885
+
+
+@dataclass
+class Shaft:
+    """What the physics hands to a servo each tick.
+
+    Attributes:
+        position, velocity: rad from encoder count 0, rad/s.
+        effort: counts of Present Current or Present Load, positive as the encoder counts.
+        load: motor torque over stall torque, 0 to about 1.
+        voltage: V at the servo.
+        pwm: part of the supply on the motor, -1 to 1.
+        reference: asks where the profile generator stands: rad and rad/s.
+    """
+
+    position: float = 0.0
+    velocity: float = 0.0
+    effort: int = 0
+    load: float = 0.0
+    voltage: float = 12.0
+    pwm: float = 0.0
+    reference: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class MotorDrive:
+    """What the firmware asks of the motor: SI units, encoder frame.
+
+    Attributes:
+        on: torque.
+        mode: Operating Mode.
+        goal_position, goal_velocity: rad, rad/s.
+        goal_current: A; limit of the current in current-based position mode.
+        goal_pwm: part of the supply; limit of the output in every mode but PWM mode.
+        position_gain: V/rad on the position error.
+        velocity_gain, velocity_integral_gain: V s/rad on the velocity error, V/rad on its integral.
+        profile_velocity, profile_acceleration: rad/s, rad/s2; 0 = none.
+    """
+
+    on: bool
+    mode: int
+    goal_position: float
+    goal_velocity: float
+    goal_current: float
+    goal_pwm: float
+    position_gain: float
+    velocity_gain: float
+    velocity_integral_gain: float
+    profile_velocity: float
+    profile_acceleration: float
+
+
+class EncoderFrame:
+    """From the encoder's frame to Present Position: direction, turns counted, Homing Offset.
+
+    Args:
+        unit: rad per count.
+
+    Attributes:
+        direction: 1, or -1 where Drive Mode reverses it.
+    """
+
+    #: Items that decide what Present Position counts from, and which way.
+    ITEMS = ("drive_mode", "operating_mode", "homing_offset")
+
+    def __init__(self, unit: float) -> None:
+        self.direction = 1
+        self._unit = unit
+        self._homing = 0
+        self._turns = 0
+
+    def update(self, registers: Registers) -> None:
+        """Take direction and offset from :attr:`ITEMS`."""
+        in_position_mode = registers.get("operating_mode") == POSITION_MODE
+        limit = HOMING_IN_POSITION_MODE if in_position_mode else EXTENDED_RANGE
+        self.direction = -1 if registers.get("drive_mode") & 1 else 1
+        self._homing = max(-limit, min(limit, registers.get("homing_offset")))
+
+    def start_turn_count(self, position: float) -> None:
+        """Present Position becomes the absolute angle within one turn (plus Homing Offset)."""
+        self._turns = self._raw_count(position) // TURN
+
+    def count(self, position: float) -> int:
+        """Return Present Position at a position (rad)."""
+        return self._raw_count(position) - TURN * self._turns + self._homing
+
+    def position(self, count: int) -> float:
+        """Return the position (rad) of a Goal Position."""
+        return self.direction * (count - self._homing + TURN * self._turns) * self._unit
+
+    def _raw_count(self, position: float) -> int:
+        return self.direction * round(position / self._unit)
+
+
+def motor_drive(registers: Registers, frame: EncoderFrame, profile_start: float, is_powered: bool) -> MotorDrive:
+    """Return what the firmware asks of the motor.
+
+    Args:
+        registers: of the servo.
+        frame: of its encoder.
+        profile_start: rad, where the way to the goal began.
+        is_powered: the electronics work.
+    """
+    si, get = registers.table.per_count, registers.get
+    sign = frame.direction
+    goal = frame.position(get("goal_position"))
+    velocity, acceleration = _profile(registers, abs(goal - profile_start))
+    mode = get("operating_mode")
+    pwm = get("goal_pwm") / FULL_PWM
+    has_current = "goal_current" in registers.table.items
+    return MotorDrive(
+        on=bool(get("torque_enable")) and is_powered,
+        mode=mode,
+        goal_position=goal,
+        goal_velocity=sign * get("goal_velocity") * si("goal_velocity"),
+        goal_current=sign * get("goal_current") * si("goal_current") if has_current else math.inf,
+        goal_pwm=sign * pwm if mode == PWM_MODE else abs(pwm),
+        position_gain=get("position_p_gain") * si("position_p_gain"),
+        velocity_gain=get("velocity_p_gain") * si("velocity_p_gain"),
+        velocity_integral_gain=get("velocity_i_gain") * si("velocity_i_gain"),
+        profile_velocity=velocity,
+        profile_acceleration=acceleration,
+    )
+
+
+def _profile(registers: Registers, way: float) -> tuple[float, float]:
+    """Profile velocity and acceleration in SI units; time-based profiles for the ``way`` (rad) to the goal."""
+    velocity, acceleration = registers.get("profile_velocity"), registers.get("profile_acceleration")
+    if not registers.get("drive_mode") & 4:
+        si = registers.table.per_count
+        return velocity * si("profile_velocity"), acceleration * si("profile_acceleration")
+    duration, ramp = velocity * 1e-3, min(acceleration, velocity / 2) * 1e-3
+    if duration == 0.0 or way == 0.0:
+        return 0.0, 0.0
+    speed = way / (duration - ramp)
+    return speed, speed / ramp if ramp > 0.0 else 0.0
