@@ -5,7 +5,7 @@ import json
 import pytest
 
 from wlr_gym.cli import main
-from wlr_gym.data import compare as module
+from wlr_gym.data import comparison as module
 
 SELF = ["--plants", "gibbs_appell", "gibbs_appell:physics_step=0.002", "--seconds", "1.5"]
 
