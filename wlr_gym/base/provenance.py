@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import write_text
 from wlr_gym.base.paths import PACKAGE
 
 PACKAGES = (
@@ -71,5 +71,4 @@ def git_commit() -> str | None:
 
 def write_yaml(path: Path, content: Any) -> None:
     """Write ``content`` as YAML, keys in the order given."""
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
-    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))

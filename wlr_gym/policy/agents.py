@@ -137,7 +137,9 @@ def _read_config(name: str | Path, task: str | None) -> dict[str, Any]:
         return {}
     config: dict[str, Any] = {}
     for data, where in read_layers("agent", name):
-        own = _settings(data, where)
+        if not isinstance(data, Mapping | None):
+            raise InputError(f"{where}: expected a mapping, got {type(data).__name__}")
+        own = dict(data or {})
         if task is not None:
             own = merge_changes(own, _of_task(where, own.pop("tasks", None), task))
         config = merge_changes(config, own)
@@ -158,7 +160,7 @@ def _of_task(path: str, tasks: Any, task: str) -> Mapping[str, Any]:
 
 def _settings(value: Any, where: str) -> dict[str, Any]:
     if not isinstance(value, Mapping | None):
-        raise InputError(f"{where}: expected a mapping, got {type(value).__name__}")
+        raise InputError(f"{where} = {value!r}: expected a mapping")
     return {str(key): entry for key, entry in (value or {}).items()}
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import write_text
 from wlr_gym.policy.file import needs_camera
 from wlr_gym.policy.onnx_file import open_policy
 
@@ -36,7 +36,7 @@ def write_model_card(policy: Path, evaluation: str) -> Path:
         )
     card = policy.with_suffix(SUFFIX)
     text = "\n\n".join([f"# {policy.stem}", _summary(content), _table(_facts(policy, content)), _below(evaluation)]) + "\n"
-    replace_file(card, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(card, text)
     return card
 
 
