@@ -26,7 +26,7 @@ from wlr_gym.hardware.dynamixel.bus import BusGroup
 from wlr_gym.hardware.dynamixel.sdk import BusGoneError
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.link import emulated_link
+from wlr_gym.hardware.emulator.link import emulated_link
 
 ROBOT, NOMINAL = load_robot(), load_hardware()
 #: How the robot at hand is really mounted: not as the file says.

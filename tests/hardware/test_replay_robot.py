@@ -21,7 +21,7 @@ pytest.importorskip("serial")
 
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.link import emulated_link
+from wlr_gym.hardware.emulator.link import emulated_link
 
 ROBOT = load_robot()
 

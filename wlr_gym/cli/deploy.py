@@ -174,9 +174,9 @@ def _emulator(options: Options, console: Console) -> Iterator[dict[str, str]]:
 
 
 def _signals(loop: ControlLoop) -> contextlib.AbstractContextManager[None]:
-    from wlr_gym.hardware.loop import stop_on_signals
+    from wlr_gym.hardware.operator import stop_on_signals
 
-    return stop_on_signals(loop)
+    return stop_on_signals(loop.operator)
 
 
 def _say_what_is_not_known(core: Core, console: Console) -> None:
@@ -201,17 +201,17 @@ def _status(loop: ControlLoop, core: Core, keys: Any, show: bool, console: Conso
 
     def spare() -> None:
         nonlocal count
-        keys.serve(loop)
+        keys.serve(loop.operator)
         count += 1
         if live is not None and count % _STATUS_TICKS == 0:
             live.update(status_table(loop, core), refresh=True)
 
-    loop.spare = spare
+    loop.operator.spare = spare
     with live or contextlib.nullcontext():
         try:
             yield
         finally:
-            loop.spare = None
+            loop.operator.spare = None
 
 
 def status_table(loop: ControlLoop, core: Core) -> Any:
@@ -226,11 +226,11 @@ def status_table(loop: ControlLoop, core: Core) -> Any:
     )
     for name in ("joint", "angle rad", "goal", "speed rad/s", "effort N m", "degC", "V"):
         table.add_column(name, justify="left" if name == "joint" else "right")
-    view = loop.view
+    view = loop.status
     if view is None:
         return table
     for k, joint in enumerate(JOINTS):
-        numbers = (view.position[k], loop.goals[k], view.velocity[k], view.effort[k], view.temperature[k], view.voltage[k])
+        numbers = (view.position[k], loop.setpoints[k], view.velocity[k], view.effort[k], view.temperature[k], view.voltage[k])
         table.add_row(joint, *(f"{number:.2f}" for number in numbers), style="red" if view.silence[k] > 0 else "")
     command = "  ".join(f"{name} {value:+.2f}" for name, value in zip(core.task.commands, core.command[0], strict=True))
     limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from wlr_gym.data.excitations import Motion
     from wlr_gym.data.format import RunMeta
-    from wlr_gym.hardware.driving import Drive
+    from wlr_gym.hardware.driving import DriveResult
     from wlr_gym.robot import Robot
 
 
@@ -136,7 +136,7 @@ def _record_robot(options: Options, motions: Sequence[Motion], robot: Robot, met
     return OK if well else FAILED
 
 
-def _report(motion: Motion, drive: Drive, console: Console) -> None:
+def _report(motion: Motion, drive: DriveResult, console: Console) -> None:
     from wlr_gym.data import read_run
 
     ended = drive.reason or "to its end"

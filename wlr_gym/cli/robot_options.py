@@ -52,7 +52,8 @@ class HardwareOption:
         Raises:
             InputError: a patch for a real robot.
         """
-        from wlr_gym.hardware.link import emulated_link, emulated_robot, serial_link
+        from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot
+        from wlr_gym.hardware.link import serial_link
 
         if not self.emulated:
             if patch is not None and patch.effects:

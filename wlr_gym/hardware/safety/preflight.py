@@ -24,7 +24,7 @@ from wlr_gym.hardware.ports import PortInUseError
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
 if TYPE_CHECKING:
-    from wlr_gym.hardware.link import Clock
+    from wlr_gym.hardware.timing import Clock
 
 FIRST_FIRMWARE, FAST_READ_FIRMWARE = 42, 45
 #: degC at which a servo is too warm to start with: below the XL430's shutdown at 72 by enough for a run.

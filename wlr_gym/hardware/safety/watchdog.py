@@ -28,7 +28,7 @@ START_TIME, TRY_TIME, LOOK_TIME = 30.0, 60.0, 0.05
 _PAUSE = 0.05
 
 
-class Guard:
+class WatchdogProcess:
     """The driving process's end.
 
     Args:
