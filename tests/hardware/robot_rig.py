@@ -1,4 +1,4 @@
-"""An emulated robot behind the real control loop, in emulated time: what the tests of loop, gate and faults share."""
+"""An emulated robot behind the real control loop, in emulated time: shared by the tests of loop, limiter and faults."""
 
 from __future__ import annotations
 

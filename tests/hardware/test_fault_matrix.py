@@ -144,7 +144,7 @@ def test_matrix(tmp_path, name, phase):
         assert "CUT THE POWER" in rig.loop.reason
         stands_from_now(rig, struck[0])
         rig.machine.clear()
-        rig.loop._limiter.off()  # as the guard process does it, once the line is back
+        rig.loop._limiter.off()  # as the watchdog process does it, once the line is back
     assert not any(servo["torque_enable"] for servo in rig.machine.servos.values() if not servo.dead)
     rig.loop.close()
     check_log(tmp_path, rig, phase, ended)
@@ -160,7 +160,7 @@ def stands_from_now(rig, struck):
 
 
 def check_log(folder, rig, phase, ended):
-    """All rows up to the end are there, in the run format, evenly spaced; and what the gate did."""
+    """All rows up to the end are there, in the run format, evenly spaced; and the interventions."""
     if rig.loop.recorder.log is None:
         assert phase == "start-up"
         return

@@ -216,7 +216,7 @@ def test_the_watchdog_of_a_servo_that_does_not_confirm_torque_off_stays_armed(tm
 
 
 def test_servo_limits_are_kept(rig):
-    """Goals beyond a servo's registers would be ignored without a word; the gate reads the registers and stays inside."""
+    """A servo ignores setpoints beyond its registers; the command limiter reads the registers and stays inside."""
     for joint in JOINTS[4:]:
         rig.machine.servos[joint].set("velocity_limit", 100)  # 2.4 rad/s
     rig.loop.start()

@@ -19,9 +19,9 @@ from wlr_gym.data.excitations import excite
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.deployment import deploy, loop_of
 from wlr_gym.hardware.driving import drive_robot
+from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.operator import Keys, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
-from wlr_gym.hardware.safety.limits import Safety
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 from wlr_gym.policy import make_policy
@@ -303,7 +303,7 @@ def hold(rig, joint):
 
 def test_a_leg_that_is_not_at_the_start_pose_stops_the_robot(rig):
     hold(rig, "leg_rf")
-    words = r"^start pose: leg_rf is at 1\.\d\d rad, its goal is 1\.00 rad \(limit 0\.3 rad\)$"
+    words = r"^start pose: leg_rf is at 1\.\d\d rad, its setpoint is 1\.00 rad \(limit 0\.3 rad\)$"
     with pytest.raises(StoppedError, match=words):
         rig.loop.start([1.0] * 4)
     assert rig.loop.phase is Phase.FAULT
@@ -335,7 +335,7 @@ def test_the_way_to_the_start_pose_waits_for_slow_servos():
 
 def test_a_limit_of_nothing_is_refused():
     with pytest.raises(ValidationError, match="start_error"):
-        Safety(start_error=0.0)
+        SafetyLimits(start_error=0.0)
 
 
 def test_the_way_to_the_start_pose_waits_for_the_operator(tmp_path):

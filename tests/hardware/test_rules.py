@@ -13,14 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.safety import limiter, rules
-from wlr_gym.hardware.safety.limits import Safety
 from wlr_gym.hardware.safety.rules import Level, Memory, RobotStatus
 from wlr_gym.robot import JOINTS, load_robot
 
 ROOT = Path(__file__).resolve().parents[2]
 ROBOT = load_robot()
-LIMITS = Safety()
+LIMITS = SafetyLimits()
 RATINGS = rules.ratings_of(ROBOT, 0.02)
 HOME = np.r_[[np.pi / 2] * 4, [0.0] * 4]
 STEP = 0.02 * np.r_[[LIMITS.leg_speed] * 4, [LIMITS.wheel_acceleration] * 4]
@@ -329,16 +329,16 @@ def test_positions_no_joint_can_reach_are_none():
 def test_every_limit_stands_in_the_file_with_its_reason():
     text = (ROOT / "configs/hardware/nominal.yaml").read_text(encoding="utf-8")
     section = text.split("\nsafety:", 1)[1]
-    assert set(yaml.safe_load(text)["safety"]) == set(Safety.model_fields)
-    assert Safety(**yaml.safe_load(text)["safety"]) == Safety()
-    for name in Safety.model_fields:
+    assert set(yaml.safe_load(text)["safety"]) == set(SafetyLimits.model_fields)
+    assert SafetyLimits(**yaml.safe_load(text)["safety"]) == SafetyLimits()
+    for name in SafetyLimits.model_fields:
         assert re.search(rf"^  {name}: \S+ +# .{{15,}}$", section, re.MULTILINE), name
 
 
 def test_every_limit_is_in_the_documentation():
     page = (ROOT / "docs/robot.md").read_text(encoding="utf-8")
     section = page.split("### Limits", 1)[1].split("\n#", 1)[0]
-    for name in Safety.model_fields:
+    for name in SafetyLimits.model_fields:
         assert f"`{name}`" in section, name
 
 
@@ -347,13 +347,13 @@ def test_every_limit_is_in_the_documentation():
 )
 def test_limits_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
-        Safety(**wrong)
+        SafetyLimits(**wrong)
 
 
 def test_every_limit_does_something():
-    """Each attribute of Safety is read somewhere in the hardware package."""
+    """Each attribute of SafetyLimits is read somewhere in the hardware package."""
     sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "wlr_gym/hardware").rglob("*.py"))
-    for name in Safety.model_fields:
+    for name in SafetyLimits.model_fields:
         assert re.search(rf"(limits|safety)\.{name}\b", sources), name
 
 

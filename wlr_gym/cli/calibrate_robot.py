@@ -20,7 +20,7 @@ from wlr_gym.robot import JOINTS, LEGS
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from wlr_gym.hardware.calibration import Pose
+    from wlr_gym.hardware.calibration import RestPose
     from wlr_gym.hardware.config import Hardware, ImuCalibration, Mounting
     from wlr_gym.hardware.dynamixel.servos import Servos
     from wlr_gym.hardware.link import Link
@@ -39,7 +39,7 @@ _READS = 20
 
 @dataclass(frozen=True)
 class JointsOptions(RobotOption):
-    """Find sign and zero of each servo by moving the limp robot by hand. Put it on a stand, wheels off the ground.
+    """Find sign and zero of each servo by moving the robot by hand, torque off. Put it on a stand, wheels off the ground.
 
     Attributes:
         out: hardware file to write; may be the one of --hardware.
@@ -272,11 +272,11 @@ def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, as
     )
 
 
-def _pose(options: ImuOptions, link: Link, ask: Ask, text: str) -> Pose:
+def _pose(options: ImuOptions, link: Link, ask: Ask, text: str) -> RestPose:
     from wlr_gym.hardware.calibration import rest_pose
     from wlr_gym.hardware.safety.preflight import sample_imu
 
-    def look() -> Pose:
+    def look() -> RestPose:
         _answer(ask, text)
         samples = sample_imu(link.imu, link.clock, options.seconds)
         return rest_pose(samples.gyro, samples.accelerometer, samples.temperature)

@@ -1,6 +1,6 @@
-"""Logs of runs on the robot: measured runs, written row by row while it moves, with what the safety gate did beside them.
+"""Logs of runs on the robot: measured runs, written row by row while it moves, and the interventions of the command limiter.
 
-Each row and event goes to the file at once, so that a process that is killed leaves all it saw. While a run is going on its
+Each row and event goes to the file at once, so that a process that is killed leaves all it read. While a run is going on its
 files are called ``partial_run_01.csv`` and so on, which no data set takes for a run; they can be read all the same.
 """
 
@@ -123,7 +123,7 @@ class RunLog:
 
     def row(self, time: float, sensors: Sensors, setpoints: np.ndarray) -> None:
         """Write what was read at ``time`` (s) and what was then asked for; NaN = motor off."""
-        if self._current and time > self._last:  # a tick that was interrupted is looked at twice
+        if self._current and time > self._last:  # a control step that was interrupted is written twice
             self._last = time
             values = np.concatenate([[time], setpoints, channels(sensors, 0)])
             self._tables[self._current].add(values[_ORDER])

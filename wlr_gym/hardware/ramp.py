@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.hardware.safety.limits import Safety
+from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.robot import LEGS, WHEELS, Robot
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ def make_ramp(begin: Array, target: Array, speed: float, period: float) -> Ramp:
     return Ramp(begin, target, int(np.ceil(duration / period)))
 
 
-def ramp_speed(limits: Safety, profile_velocity: float) -> float:
+def ramp_speed(limits: SafetyLimits, profile_velocity: float) -> float:
     """Return a mean speed (rad/s) that legs with a velocity profile (rad/s; 0 = none) can follow."""
     return min(limits.start_speed, profile_velocity / PEAK_SPEED) if profile_velocity > 0.0 else limits.start_speed
 
@@ -67,5 +67,5 @@ def legs_away(position: Array, target: Array, limit: float) -> str:
     far = np.flatnonzero(np.abs(position - target) > limit)
     if not len(far):
         return ""
-    found = "; ".join(f"{LEGS[k]} is at {position[k]:.2f} rad, its goal is {target[k]:.2f} rad" for k in far)
+    found = "; ".join(f"{LEGS[k]} is at {position[k]:.2f} rad, its setpoint is {target[k]:.2f} rad" for k in far)
     return f"start pose: {found} (limit {limit:g} rad)"

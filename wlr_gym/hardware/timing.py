@@ -1,4 +1,4 @@
-"""Clocks; control ticks against absolute deadlines, and statistics of what they took."""
+"""Clocks; control steps against absolute deadlines, and statistics of what they took."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-#: Parts of a tick that are timed; latency is from the readings to the goals that answer them.
+#: Parts of a control step that are timed; latency is from the readings to the setpoints that answer them.
 PARTS = ("read", "think", "write", "slack", "latency")
 _PERCENTILES = (50, 95, 99, 100)
 
@@ -42,7 +42,7 @@ class MonotonicClock:
 
 
 class Pacer:
-    """Starts ticks at ``origin + k * period``: lateness never adds up, and ticks that were missed are left out, not caught up.
+    """Starts control steps at ``origin + k * period``: lateness never adds up, and steps that were missed are left out.
 
     Args:
         clock: of the run.

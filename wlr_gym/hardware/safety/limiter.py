@@ -1,4 +1,4 @@
-"""The safety gate: the only thing that writes setpoints and torque. Nothing can be driven but through it, and it cannot be off.
+"""The command limiter: the only one that writes setpoints and torque. Nothing drives but through it; nothing switches it off.
 
 What is safe is decided in :mod:`wlr_gym.hardware.safety.rules`, by pure functions; here decisions are carried out.
 """
@@ -39,7 +39,7 @@ _PREPARED = (
 )
 #: s of Bus Watchdog per count (e-manual).
 WATCHDOG_UNIT = 0.02
-#: s an answer may take while nothing moves: where no tick waits for it, a slow computer is no dead servo.
+#: s an answer may take while nothing moves: where no control step waits for it, a slow computer is no dead servo.
 CALM_PATIENCE = 0.05
 #: Fastest setpoints of legs on the way to the start pose, over ``start_speed``: a minimum-jerk path needs 1.9 of it.
 CALM_SPEED = 2.0
@@ -50,20 +50,20 @@ _OFF_PAUSE = 0.05
 
 
 class CommandLimiter:
-    """Guards the servos.
+    """Decides, limits and writes what the servos are sent.
 
     Args:
         servos: taken over; nobody else may keep them.
         robot, hardware: limits and registers.
         clock: of the run.
-        period: s of a control tick.
+        period: s of a control step.
         dry_run: decide, but write nothing.
         profile: of the servos; all 0 = step references.
 
     Attributes:
-        interventions: rule -> ticks in which it changed or stopped something.
+        interventions: rule -> control steps in which it changed or stopped something.
         setpoints: (8,) last setpoints. torque_on: (8,) motors that are on.
-        ratings: what the limits are about.
+        ratings: of the motors, with the limits of the servos' registers.
         is_calm: legs may move no faster than on the way to the start pose, whatever is asked for.
     """
 
@@ -248,10 +248,10 @@ class CommandLimiter:
 
         Raises:
             BusGoneError, NoAnswerError, RefusedError: a servo did not take it.
-            InputError: the gate is not armed.
+            InputError: it is not armed.
         """
         if not self._armed:
-            raise InputError("the safety gate is not armed: nothing is written")
+            raise InputError("the command limiter is not armed: nothing is written")
         limits = self._calm_limits if self.is_calm else self.limits
         decision = rules.decide(limits, self.ratings, status, self._memory, self.setpoints, wanted, torque_on)
         self._memory = decision.memory
@@ -288,6 +288,6 @@ class CommandLimiter:
             self._clock.wait_until(self._clock.now() + _OFF_PAUSE)
             servos.reopen_gone()
         with contextlib.suppress(ConnectionError):
-            # it goes on guarding a motor that may still be on
+            # it stays armed where a motor may still be on
             servos.write_item("bus_watchdog", {joint: 0 for joint in JOINTS if joint not in left})
         return left

@@ -1,6 +1,6 @@
 """What is safe to ask of the robot: pure functions of what was wanted and what was last seen. No I/O, no clock.
 
-:func:`decide` puts them together once a control tick. :mod:`wlr_gym.hardware.safety.limiter` carries its decisions out.
+:func:`decide` puts them together once per control step. :mod:`wlr_gym.hardware.safety.limiter` carries its decisions out.
 """
 
 from __future__ import annotations
@@ -13,18 +13,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.hardware.safety.limits import Safety
+from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
+from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.physics.servo import motor_constants
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-STANDARD_GRAVITY = 9.80665
-#: s over which the accelerometer pulls the gyroscope's vertical to its own, and m/s2 it may differ from gravity to be asked.
-VERTICAL_TIME, VERTICAL_BAND = 0.5, 2.0
-#: A joint cannot turn faster than this many times its motor's no-load speed; a reading that says so is none. Counts of noise.
-OUTLIER_SPEED, OUTLIER_NOISE = 2.0, 0.03
+#: s over which the accelerometer corrects the gyroscope's vertical.
+VERTICAL_TIME = 0.5
+#: m/s2 that the accelerometer may differ from gravity while it is used for that.
+VERTICAL_BAND = 2.0
+#: Fastest believable speed of a joint, over its motor's no-load speed; a faster reading is an outlier.
+OUTLIER_SPEED = 2.0
+#: rad a reading may jump by noise alone.
+OUTLIER_NOISE = 0.03
 _N = len(JOINTS)
 _IS_LEG = np.arange(_N) < len(LEGS)
 
@@ -47,25 +51,26 @@ class Verdict(NamedTuple):
     text: str
 
 
-#: What is found where nothing is; rules that somebody asks for, and that are no faults.
+#: The verdict where nothing is found.
 FINE = Verdict(Level.DRIVE, "", "")
+#: Rules that somebody asks for: they are no faults.
 REQUESTS = ("stop", "emergency stop")
 
 
 @dataclass(frozen=True)
 class RobotStatus:
-    """What is known of the robot at a tick. Arrays are in joint order.
+    """What is known of the robot at a control step. Arrays are in joint order.
 
     Attributes:
         time: s.
         position, velocity, effort: (8,) last good readings, rad, rad/s, N m.
-        silence: (8,) s since the joint's last good reading; 0 = it answered in this tick.
+        silence: (8,) s since the joint's last good reading; 0 = it answered in this step.
         alert, restarted: (8,) hardware error; rebooted since the last reading.
         voltage, temperature: (8,) V, degC, as last read.
         gyro, accelerometer: (3,) rad/s, m/s2, body frame.
         imu_silence: s since the IMU's last reading.
         up: (3,) the vertical in the body frame.
-        late_ticks: ticks in a row that started a period late or more. late_share: of the last second's.
+        late_ticks: control steps in a row that started a period late or more. late_share: of the last second's.
         operator_silence: s since the operator's last sign. idle: s for which nothing was sent to the servos.
         lost: ports that are gone, in words. latched: joints that their watchdog has stopped, in words.
         trouble: why log or terminal failed.
@@ -98,7 +103,7 @@ class RobotStatus:
 
 @dataclass(frozen=True)
 class Memory:
-    """What lasts from tick to tick: how long things have been beyond their limits, s."""
+    """What lasts from step to step: how long things have been beyond their limits, s."""
 
     loaded: Array = field(default_factory=lambda: np.zeros(_N))
     current: float = 0.0
@@ -109,13 +114,13 @@ class Memory:
 
 @dataclass(frozen=True)
 class Ratings:
-    """What the limits are about: the robot's numbers and what its servos' registers allow.
+    """Ratings of the robot's motors, and what its servos' registers allow.
 
     Attributes:
         low, high: (8,) setpoints the servos take, rad and rad/s.
         leg_limits: rad, of the robot file.
         stall_torque: (8,) N m. amperes: (8,) A per N m. no_load_speed: (8,) rad/s.
-        period: s of a control tick.
+        period: s of a control step.
     """
 
     low: Array
@@ -153,7 +158,7 @@ class Decision(NamedTuple):
         torque_on: (8,) motors that are on.
         verdicts: findings above DRIVE.
         limited: rule -> joints whose setpoints it changed.
-        memory: for the next tick.
+        memory: for the next step.
     """
 
     level: Level
@@ -170,7 +175,7 @@ class Decision(NamedTuple):
 
 
 def decide(
-    limits: Safety,
+    limits: SafetyLimits,
     ratings: Ratings,
     status: RobotStatus,
     memory: Memory,
@@ -178,14 +183,14 @@ def decide(
     wanted: object,
     torque_on: Mask | None = None,
 ) -> Decision:
-    """Decide on one control tick.
+    """Decide on one control step.
 
     Args:
         limits: the robot's.
-        ratings: see :func:`ratings_of`.
+        ratings: the robot's.
         status: what was last seen.
-        memory: of the tick before.
-        previous: (8,) setpoints of the tick before, finite.
+        memory: of the step before.
+        previous: (8,) setpoints of the step before, finite.
         wanted: setpoints asked for: anything; only eight finite numbers are taken.
         torque_on: (8,) motors that are to be on; setpoints of the others are not looked at. None = all.
     """
@@ -228,14 +233,14 @@ def take_request(wanted: object, on: Mask, position: Array, previous: Array) -> 
 
 
 def limit_setpoints(
-    limits: Safety, ratings: Ratings, setpoints: Array, previous: Array, position: Array, wheel_share: float
+    limits: SafetyLimits, ratings: Ratings, setpoints: Array, previous: Array, position: Array, wheel_share: float
 ) -> tuple[Array, dict[str, Mask]]:
     """Return setpoints within all limits, and rule -> joints that it changed.
 
     The slew limit comes last, so no setpoint ever jumps: not even back into range from outside.
 
     Args:
-        limits, ratings: see there.
+        limits, ratings: the robot's.
         setpoints, previous: (8,) finite.
         position: (8,) rad, as last read.
         wheel_share: of the wheel speed limit that is left.
@@ -260,7 +265,7 @@ def limit_setpoints(
     return final, {rule: mask for rule, mask in changes.items() if mask.any()}
 
 
-def slow_down(limits: Safety, status: RobotStatus) -> float:
+def slow_down(limits: SafetyLimits, status: RobotStatus) -> float:
     """Return the share of the wheel speed limit that the hottest servo leaves, 1 to 0."""
     hottest = np.nanmax(status.temperature, initial=-np.inf)
     return float(np.clip((limits.hot - hottest) / (limits.hot - limits.warm), 0.0, 1.0))
@@ -269,7 +274,7 @@ def slow_down(limits: Safety, status: RobotStatus) -> float:
 # ---- supervision ----
 
 
-def remember(limits: Safety, ratings: Ratings, status: RobotStatus, memory: Memory) -> Memory:
+def remember(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: Memory) -> Memory:
     """Count on how long things have been beyond their limits; loads and currents cool down as fast as they heat up."""
     period = ratings.period
     over = np.abs(status.effort) > limits.load * ratings.stall_torque
@@ -287,8 +292,8 @@ def remember(limits: Safety, ratings: Ratings, status: RobotStatus, memory: Memo
     )
 
 
-def judge(limits: Safety, status: RobotStatus, memory: Memory) -> Iterator[Verdict]:
-    """Yield every finding of a tick."""
+def judge(limits: SafetyLimits, status: RobotStatus, memory: Memory) -> Iterator[Verdict]:
+    """Yield every finding of a control step."""
     if status.asked_off:
         yield Verdict(Level.OFF, "emergency stop", status.asked_off)
     if status.asked_to_stop:
@@ -318,7 +323,7 @@ def judge(limits: Safety, status: RobotStatus, memory: Memory) -> Iterator[Verdi
         yield Verdict(Level.STOP, "deadlines", text)
 
 
-def _judge_answers(limits: Safety, status: RobotStatus) -> Iterator[Verdict]:
+def _judge_answers(limits: SafetyLimits, status: RobotStatus) -> Iterator[Verdict]:
     """Communication ladder: coast, hold, off."""
     longest = float(status.silence.max())
     if longest > 0.0:
@@ -330,7 +335,7 @@ def _judge_answers(limits: Safety, status: RobotStatus) -> Iterator[Verdict]:
         yield Verdict(Level.STOP, "imu", f"no reading for {status.imu_silence:.2f} s")
 
 
-def _judge_servos(limits: Safety, status: RobotStatus, memory: Memory) -> Iterator[Verdict]:
+def _judge_servos(limits: SafetyLimits, status: RobotStatus, memory: Memory) -> Iterator[Verdict]:
     for k in np.flatnonzero(status.restarted):
         yield Verdict(Level.OFF, "restart", f"{JOINTS[k]} was rebooted or had no power")
     for k in np.flatnonzero(status.alert):
