@@ -49,13 +49,6 @@ class Link:
         self.imu.close()
         self.finish()
 
-    def __enter__(self) -> Link:
-        self.open()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
 
 def serial_link(robot: Robot, hardware: Hardware) -> Link:
     """Return a link over the hardware file's ports."""

@@ -102,14 +102,6 @@ class CommandLimiter:
         """Return voltages and temperatures; see :meth:`Servos.read_health`."""
         return self.__servos.read_health()
 
-    def hardware_errors(self) -> dict[str, list[str]]:
-        """Return joint -> hardware errors, of the joints that answer and have some."""
-        found = {}
-        for joint in JOINTS:
-            with contextlib.suppress(NoAnswerError, RefusedError, ConnectionError):
-                found[joint] = self.__servos.hardware_errors(joint)
-        return {joint: errors for joint, errors in found.items() if errors}
-
     def latched(self, joints: Iterable[str]) -> list[str]:
         """Return those of the joints whose watchdog has stopped them, or that do not say."""
         return [joint for joint in joints if not self._listens(joint)]
