@@ -67,8 +67,8 @@ class Operator:
 
     def take(self) -> str:
         """Return what was asked for, and forget it: it has happened."""
-        asked = self.asked
-        self.asked_to_stop = self.asked_off = ""
+        if asked := self.asked:  # a signal that comes between these lines, where nothing was asked, must not get lost
+            self.asked_to_stop = self.asked_off = ""
         return asked
 
     def serve(self) -> None:
