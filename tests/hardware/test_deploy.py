@@ -272,7 +272,7 @@ def test_nobody_there_to_start_the_robot(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("stop", ["signal", "key"])
 def test_command_line_on_real_terminals(tmp_path, stop):
-    """The whole way in real time: emulator process, ports, guard, a stop from outside. No claim about time."""
+    """The whole way in real time: emulator process, ports, watchdog process, a stop from outside. No claim about time."""
     pytest.importorskip("termios")
     hardware = hardware_file(tmp_path, {})
     arguments = ["deploy", "pid", "--emulated", "--seconds", "120", "--out", str(tmp_path / "log")]

@@ -29,7 +29,7 @@ def rig(tmp_path):
     rig.loop.close()
 
 
-# ---- from limp to limp -------------------------------------------------------------------------------------------------
+# ---- from torque off to torque off ------------------------------------------------------------------------------------
 
 
 def test_making_a_loop_moves_and_opens_nothing(rig):

@@ -153,7 +153,7 @@ def test_every_way_to_end_or_stop_a_program_stops_the_robot(rig, name):
 
 
 def test_motors_that_are_off_stay_off_in_a_stop(rig):
-    """Somebody may hold a limp leg."""
+    """Somebody may hold the leg."""
     rig.loop.start()
     on = np.ones(8, bool)
     on[0] = False

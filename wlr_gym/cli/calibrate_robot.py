@@ -158,7 +158,7 @@ def calibrate_joints(options: JointsOptions, ask: Ask = ask_terminal) -> int:
 def _calibrate_joints(options: JointsOptions, robot: Robot, hardware: Hardware, source: Path, link: Link, ask: Ask) -> int:
     from wlr_gym.hardware.calibration import with_mountings
 
-    _require_limp(link.servos, ask)
+    _require_torque_off(link.servos, ask)
     print("Put the robot on a stand, wheels off the ground. Enter goes on, s skips a joint, q ends without a file.")
     wanted = options.only or JOINTS
     found = {joint: _calibrate(joint, robot, hardware, link.servos, ask) for joint in JOINTS if joint in wanted}
@@ -170,7 +170,7 @@ def _calibrate_joints(options: JointsOptions, robot: Robot, hardware: Hardware, 
     return _save(options.out, source, lambda file: with_mountings(file, mountings), "joints", note, ask)
 
 
-def _require_limp(servos: Servos, ask: Ask) -> None:
+def _require_torque_off(servos: Servos, ask: Ask) -> None:
     """Have all motors off; what is on is switched off only when the operator holds the robot and says so."""
     on = [joint for joint in JOINTS if servos.get(joint, "torque_enable")]
     if not on:
