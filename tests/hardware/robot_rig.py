@@ -1,4 +1,4 @@
-"""An emulated robot behind the real control loop, in emulated time: what the tests of loop, gate and faults share."""
+"""An emulated robot behind the real control loop, in emulated time: shared by the tests of loop, limiter and faults."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from wlr_gym.hardware import loop as loop_module
 from wlr_gym.hardware.config import load_hardware, with_ports
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.link import emulated_link
+from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.loop import ControlLoop, Phase, StoppedError
 from wlr_gym.robot import JOINTS, load_robot
 

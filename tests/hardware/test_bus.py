@@ -26,7 +26,7 @@ from wlr_gym.hardware.dynamixel.errors import BusGoneError, NoAnswerError, Refus
 from wlr_gym.hardware.dynamixel.port import DynamixelPort  # noqa: E402
 from wlr_gym.hardware.dynamixel.tick_clock import TickClock  # noqa: E402
 from wlr_gym.hardware.ports import PortInUseError  # noqa: E402
-from wlr_gym.hardware.safety import preflight as checks  # noqa: E402
+from wlr_gym.hardware.safety import preflight  # noqa: E402
 from wlr_gym.hardware.servos import Servos  # noqa: E402
 
 TABLE = load_table("XM540-W150-R")
@@ -363,7 +363,7 @@ def test_a_line_that_never_falls_quiet_does_not_keep_the_other_bus_from_torque_o
         assert time.monotonic() - start < 10.0
         for sent, ids in ((to_legs, LEGS), (to_wheels, (6, 7, 5, 8))):
             assert protocol.sync_write(64, dict.fromkeys(ids, b"\0")) in sent()
-        (check,) = checks.check_servos(servos, load_robot(), hardware, ["leg_lf"])
+        (check,) = preflight.check_servos(servos, load_robot(), hardware, ["leg_lf"])
         servos.close()
     assert check.found == "none, the line is never quiet"
     assert "Are two ports swapped" in check.remedy

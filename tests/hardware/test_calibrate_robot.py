@@ -26,7 +26,7 @@ from wlr_gym.hardware.dynamixel.bus import BusGroup
 from wlr_gym.hardware.dynamixel.errors import BusGoneError
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.link import emulated_link
+from wlr_gym.hardware.emulator.link import emulated_link
 
 ROBOT, NOMINAL = load_robot(), load_hardware()
 #: How the robot at hand is really mounted: not as the file says.
@@ -106,7 +106,7 @@ def test_ports_of_the_command_line_are_not_written_and_comments_stay(monkeypatch
     calibrate_imu(own, Turner(machine, [(0, 0, 1), (-0.3, 0, 0.95)]))
     found = load_hardware(out)
     assert (found.imu.port, found.buses) == (NOMINAL.imu.port, NOMINAL.buses)
-    assert "# Limits of the safety gate" in out.read_text()
+    assert "# Limits of the command limiter" in out.read_text()
 
 
 def test_notes_do_not_pile_up_and_odd_layouts_are_written_anew(monkeypatch, tmp_path):
@@ -122,7 +122,7 @@ def test_notes_do_not_pile_up_and_odd_layouts_are_written_anew(monkeypatch, tmp_
     assert load_hardware(odd) == load_hardware(out)
     calibrate_joints(JointsOptions(hardware=str(odd), out=odd, only=("wheel_lf",)), Operator(machine))
     assert load_hardware(odd) == load_hardware(out)
-    assert "# Limits of the safety gate" in odd.read_text()
+    assert "# Limits of the command limiter" in odd.read_text()
     odd.write_text(
         out.read_text()
         .replace("joints:\n", "joints: {\n")

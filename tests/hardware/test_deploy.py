@@ -23,9 +23,10 @@ from wlr_gym.data.read import read_run
 from wlr_gym.data.replay import replay
 from wlr_gym.hardware.deployment import REHEARSALS, act_again, loop_of, read_policy_log
 from wlr_gym.hardware.deployment import deploy as drive
-from wlr_gym.hardware.link import MonotonicClock, emulated_robot
+from wlr_gym.hardware.emulator.link import emulated_robot
 from wlr_gym.hardware.log import RunLog, read_events
 from wlr_gym.hardware.loop import StoppedError
+from wlr_gym.hardware.timing import MonotonicClock
 from wlr_gym.learning.evaluation import make_core, roll_out
 from wlr_gym.policy import make_policy
 
@@ -102,7 +103,7 @@ def test_a_policy_tracks_on_the_robot_as_in_simulation(tmp_path):
     """Errors on the emulated robot lie where those of randomised simulated robots lie, with the same command."""
     core = robot_core(tmp_path, 8.0)
     machine, seen = machine_of(core), []
-    loop_of(core).spare = lambda: seen.append(machine.plant.truth().values[0].copy())
+    loop_of(core).operator.spare = lambda: seen.append(machine.plant.truth().values[0].copy())
     result = drive(core, make_policy("pid", core.contract()), command=COMMAND)
     assert result.reason == "time is over"
     columns = machine.plant.truth().layout.slices
@@ -271,7 +272,7 @@ def test_nobody_there_to_start_the_robot(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("stop", ["signal", "key"])
 def test_command_line_on_real_terminals(tmp_path, stop):
-    """The whole way in real time: emulator process, ports, guard, a stop from outside. No claim about time."""
+    """The whole way in real time: emulator process, ports, watchdog process, a stop from outside. No claim about time."""
     pytest.importorskip("termios")
     hardware = hardware_file(tmp_path, {})
     arguments = ["deploy", "pid", "--emulated", "--seconds", "120", "--out", str(tmp_path / "log")]
@@ -342,7 +343,7 @@ def sleepy_drive(folder, monkeypatch, late, sleeps):
         clocks.append(WallClock(link.clock))
         return replace(link, clock=clocks[0])
 
-    monkeypatch.setattr("wlr_gym.hardware.plant.emulated_robot", in_real_time)
+    monkeypatch.setattr("wlr_gym.hardware.emulator.link.emulated_robot", in_real_time)
     hardware = {"hardware": hardware_file(folder, {}, late=late), "emulated": True, "log": folder / "log"}
     core = make_core(ID, 1, {"backend": "dynamixel", "hardware": hardware, "episode_length": 2.0})
     result = drive(core, Sleepy(core, sleeps), command=COMMAND)

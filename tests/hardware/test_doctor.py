@@ -18,8 +18,8 @@ pytest.importorskip("termios")
 from wlr_gym.hardware import servo_setup
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.link import emulated_link
-from wlr_gym.hardware.safety import preflight as checks
+from wlr_gym.hardware.emulator.link import emulated_link
+from wlr_gym.hardware.safety import preflight
 
 ROBOT, HARDWARE = load_robot(), load_hardware()
 
@@ -139,12 +139,12 @@ def test_what_cannot_be_asked_for(tmp_path):
 
 
 def test_ports_that_are_there_are_named(tmp_path):
-    assert "no USB serial port" in checks._ports_here(tmp_path)
+    assert "no USB serial port" in preflight._ports_here(tmp_path)
     (tmp_path / "ttyUSB3").touch()
-    assert checks._ports_here(tmp_path).endswith("ttyUSB3")
+    assert preflight._ports_here(tmp_path).endswith("ttyUSB3")
     (tmp_path / "serial/by-id").mkdir(parents=True)
     (tmp_path / "serial/by-id/usb-U2D2").touch()
-    assert checks._ports_here(tmp_path).endswith("by-id/usb-U2D2")
+    assert preflight._ports_here(tmp_path).endswith("by-id/usb-U2D2")
 
 
 def write_policy(folder, **changes):

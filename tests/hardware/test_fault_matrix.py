@@ -100,9 +100,9 @@ def play(rig, phase, fault, seconds, struck):
         strike()
     elif phase == "ramp":
         ticks = iter(range(1000))
-        loop.spare = lambda: strike() if next(ticks) == 5 else None
+        loop.operator.spare = lambda: strike() if next(ticks) == 5 else None
     loop.start([1.4] * 4)
-    loop.spare = None
+    loop.operator.spare = None
     rig.drive(0.3)
     if phase == "running":
         strike()
@@ -127,10 +127,10 @@ def test_matrix(tmp_path, name, phase):
     watch.look()
     time_to_off = np.inf if watch.off_at is None else watch.off_at - struck[0]
     assert watch.jump <= 1.0
-    assert rig.loop.phase in (Phase.LIMP, Phase.FAULT)
+    assert rig.loop.phase in (Phase.TORQUE_OFF, Phase.FAULT)
     if outcome == "runs":
         assert reason == ""
-        assert rig.loop.phase is Phase.LIMP
+        assert rig.loop.phase is Phase.TORQUE_OFF
     elif phase == "start-up":
         assert rig.torque().sum() == 0
         assert reason or name in ("overheat", "sag", "brownout", "overload")
@@ -144,7 +144,7 @@ def test_matrix(tmp_path, name, phase):
         assert "CUT THE POWER" in rig.loop.reason
         stands_from_now(rig, struck[0])
         rig.machine.clear()
-        rig.loop._gate.off()  # as the guard process does it, once the line is back
+        rig.loop._limiter.off()  # as the watchdog process does it, once the line is back
     assert not any(servo["torque_enable"] for servo in rig.machine.servos.values() if not servo.dead)
     rig.loop.close()
     check_log(tmp_path, rig, phase, ended)
@@ -160,16 +160,16 @@ def stands_from_now(rig, struck):
 
 
 def check_log(folder, rig, phase, ended):
-    """All rows up to the end are there, in the run format, evenly spaced; and what the gate did."""
-    if rig.loop.log is None:
+    """All rows up to the end are there, in the run format, evenly spaced; and the interventions."""
+    if rig.loop.recorder.log is None:
         assert phase == "start-up"
         return
     assert not list(folder.glob("partial*"))
-    events = read_events(rig.loop.log.run)
+    events = read_events(rig.loop.recorder.log.run)
     assert events[-1]["event"] == "end"
-    if phase == "start-up" and not rig.loop.log.run.is_file():
+    if phase == "start-up" and not rig.loop.recorder.log.run.is_file():
         return
-    path = rig.loop.log.run if rig.loop.log.run.is_file() else folder / "ramp_01.csv"
+    path = rig.loop.recorder.log.run if rig.loop.recorder.log.run.is_file() else folder / "ramp_01.csv"
     run = read_run(path)
     assert ended - run["t"][-1] < 1.0
     assert np.diff(run["t"]).max() < 0.1
@@ -190,7 +190,7 @@ def test_one_percent_of_packets_lost_stops_nothing(tmp_path, seed):
     for tick in range(400):
         rig.loop.tick(np.r_[DRIVE[:4], [4.0 * np.sin(0.05 * tick)] * 4])
     rig.loop.stop()
-    assert rig.loop.phase is Phase.LIMP
+    assert rig.loop.phase is Phase.TORQUE_OFF
     assert watch.jump <= 1.0
     assert rig.loop.interventions["silence"] < 15
     assert sum(group.statistics.fallbacks for group in rig.link.servos.groups.values()) > 20
@@ -221,7 +221,7 @@ def test_wheels_stop_before_torque_goes_off():
     rig.drive(0.5)
     rig.inject("drop legs wheels")
     lost, goals = rig.machine.time, {}
-    rig.loop.spare = lambda: goals.__setitem__(round(rig.machine.time - lost, 3), rig.loop.goals[4])
+    rig.loop.operator.spare = lambda: goals.__setitem__(round(rig.machine.time - lost, 3), rig.loop.setpoints[4])
     with pytest.raises(StoppedError):
         rig.drive(2.0)
     assert all(goal == 3.0 for time, goal in goals.items() if time < 0.06)

@@ -407,7 +407,7 @@ def measured(force_in_body, known=TRUE):
 
 
 def pose(accelerometer, gyro=TRUE.gyro_bias):
-    return calibrate.Pose(np.array(gyro), np.array(accelerometer), 30.0)
+    return calibrate.RestPose(np.array(gyro), np.array(accelerometer), 30.0)
 
 
 def test_conversion_takes_the_errors_off_and_turns_into_the_body():

@@ -15,8 +15,7 @@ from robot_rig import DRIVE, JOINTS, PERIOD, Phase, Rig, StoppedError
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.read import read_dataset, read_run
 from wlr_gym.hardware.log import read_events
-from wlr_gym.hardware.loop import stop_on_signals
-from wlr_gym.hardware.operator import Keys
+from wlr_gym.hardware.operator import Keys, stop_on_signals
 from wlr_gym.hardware.timing import Pacer
 
 #: What one count of a goal register is: rad of a leg, rad/s of a wheel (e-manuals: 4096 per turn, 0.229 rpm).
@@ -30,11 +29,11 @@ def rig(tmp_path):
     rig.loop.close()
 
 
-# ---- from limp to limp -------------------------------------------------------------------------------------------------
+# ---- from torque off to torque off ------------------------------------------------------------------------------------
 
 
 def test_making_a_loop_moves_and_opens_nothing(rig):
-    assert rig.loop.phase is Phase.LIMP
+    assert rig.loop.phase is Phase.TORQUE_OFF
     assert not rig.torque().any()
     with pytest.raises(StoppedError, match="has not been started"):
         rig.loop.tick(DRIVE)
@@ -47,11 +46,11 @@ def test_a_run_from_start_to_end(rig):
     np.testing.assert_allclose(view.position[:4], [1.3, 1.3, 1.8, 1.8], atol=0.05)
     assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS] == [10] * 8
     rig.drive(1.0)
-    np.testing.assert_allclose(rig.loop.view.velocity[4:], 3.0, atol=0.1)
+    np.testing.assert_allclose(rig.loop.status.velocity[4:], 3.0, atol=0.1)
     rig.loop.stop()
-    assert rig.loop.phase is Phase.LIMP
+    assert rig.loop.phase is Phase.TORQUE_OFF
     assert not rig.torque().any()
-    assert np.abs(rig.loop.view.velocity[4:]).max() < 0.4  # of 3: wheels all but stood before torque went off
+    assert np.abs(rig.loop.status.velocity[4:]).max() < 0.4  # of 3: wheels all but stood before torque went off
     assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS] == [0] * 8
     with pytest.raises(StoppedError, match="end"):
         rig.loop.tick(DRIVE)
@@ -63,7 +62,7 @@ def test_torque_comes_on_without_a_jerk(rig):
         rig.machine.servos[joint].set("goal_position", 1500)
     start = rig.machine.plant.truth().joint_position[0, :4].copy()
     far = []
-    rig.loop.spare = lambda: far.append(np.abs(rig.machine.plant.truth().joint_position[0, :4] - start).max())
+    rig.loop.operator.spare = lambda: far.append(np.abs(rig.machine.plant.truth().joint_position[0, :4] - start).max())
     rig.loop.start()
     assert max(far) < 0.02
 
@@ -96,7 +95,7 @@ def test_start_again_after_an_end(rig):
     rig.loop.start([1.4] * 4)  # a new episode, from standing
     rig.drive(0.2)
     rig.loop.close()
-    runs = read_dataset(rig.loop.log.folder).runs
+    runs = read_dataset(rig.loop.recorder.log.folder).runs
     assert [run.name for run in runs] == ["run_01", "run_02", "run_03", "run_04"]
     np.testing.assert_allclose([run["pos_wheel_lf"][0] for run in runs], 0.0, atol=1e-12)
 
@@ -217,7 +216,7 @@ def test_the_watchdog_of_a_servo_that_does_not_confirm_torque_off_stays_armed(tm
 
 
 def test_servo_limits_are_kept(rig):
-    """Goals beyond a servo's registers would be ignored without a word; the gate reads the registers and stays inside."""
+    """A servo ignores setpoints beyond its registers; the command limiter reads the registers and stays inside."""
     for joint in JOINTS[4:]:
         rig.machine.servos[joint].set("velocity_limit", 100)  # 2.4 rad/s
     rig.loop.start()
@@ -232,31 +231,31 @@ def test_servo_limits_are_kept(rig):
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_signals_stop_in_good_order(rig, name):
     rig.loop.start()
-    with stop_on_signals(rig.loop):
+    with stop_on_signals(rig.loop.operator):
         rig.drive(0.2)
         os.kill(os.getpid(), getattr(signal, name))
         with pytest.raises(StoppedError, match=name):
             rig.drive(0.2)
-    assert rig.loop.phase is Phase.LIMP
+    assert rig.loop.phase is Phase.TORQUE_OFF
     assert not rig.torque().any()
     assert signal.getsignal(getattr(signal, name)) is not None
 
 
 def test_a_stop_that_is_asked_for_before_anything_moves(rig):
-    with stop_on_signals(rig.loop):
+    with stop_on_signals(rig.loop.operator):
         os.kill(os.getpid(), signal.SIGTERM)
         with pytest.raises(StoppedError, match="SIGTERM"):
             rig.loop.start()
     assert not rig.torque().any()
     assert rig.machine.time < 0.1
-    assert rig.loop.phase is Phase.LIMP
+    assert rig.loop.phase is Phase.TORQUE_OFF
     rig.loop.start()  # the next one is a new one
     rig.drive(0.1)
 
 
 def test_a_second_signal_interrupts_at_once(rig):
     rig.loop.start()
-    with stop_on_signals(rig.loop):
+    with stop_on_signals(rig.loop.operator):
         os.kill(os.getpid(), signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
@@ -265,7 +264,7 @@ def test_a_second_signal_interrupts_at_once(rig):
 def test_emergency_key_switches_off_in_the_same_tick(rig):
     read, write = os.pipe()
     with Keys(read) as keys:
-        rig.loop.spare = lambda: keys.serve(rig.loop)
+        rig.loop.operator.spare = lambda: keys.serve(rig.loop.operator)
         rig.loop.start()
         rig.drive(0.2)
         os.write(write, b" ")
@@ -274,7 +273,7 @@ def test_emergency_key_switches_off_in_the_same_tick(rig):
             rig.drive(1.0)
     assert rig.machine.time - before < 1.5 * PERIOD
     assert not rig.torque().any()
-    assert rig.loop.phase is Phase.LIMP
+    assert rig.loop.phase is Phase.TORQUE_OFF
     os.close(write)
     assert keys.pressed() == ""  # a closed pipe is no key
     os.close(read)
@@ -285,7 +284,7 @@ def test_stop_key(rig):
     os.write(write, b"xq")
     with Keys(read) as keys:
         rig.loop.start()
-        rig.loop.spare = lambda: keys.serve(rig.loop)
+        rig.loop.operator.spare = lambda: keys.serve(rig.loop.operator)
         with pytest.raises(StoppedError, match="stop key"):
             rig.drive(1.0)
     os.close(read)
@@ -294,17 +293,17 @@ def test_stop_key(rig):
 
 def test_deadman_holds_and_lets_go(tmp_path):
     rig = Rig(tmp_path, deadman=0.3)
-    rig.loop.spare = rig.loop.operator_is_there
+    rig.loop.operator.spare = rig.loop.operator.note_sign
     rig.loop.start()
-    rig.loop.spare = lambda: None
+    rig.loop.operator.spare = lambda: None
     rig.drive(0.2)
-    assert rig.loop.goals[4] == 3.0
+    assert rig.loop.setpoints[4] == 3.0
     rig.drive(0.3)
-    assert rig.loop.goals[4] == 0.0
+    assert rig.loop.setpoints[4] == 0.0
     assert rig.torque().all()
-    rig.loop.operator_is_there()
+    rig.loop.operator.note_sign()
     rig.drive(0.1)
-    assert rig.loop.goals[4] == 3.0
+    assert rig.loop.setpoints[4] == 3.0
     rig.loop.close()
 
 
@@ -319,11 +318,11 @@ def test_any_exception_ends_with_torque_off(tmp_path, error, where):
     def play():
         with rig.loop:
             if where == "ramp":
-                rig.loop.spare = lambda: fail() if rig.loop.phase is Phase.RAMP else None
+                rig.loop.operator.spare = lambda: fail() if rig.loop.phase is Phase.RAMP else None
             rig.loop.start()
             rig.drive(0.1)
             if where == "spare":
-                rig.loop.spare = fail
+                rig.loop.operator.spare = fail
                 rig.drive(0.1)
             fail()
 
@@ -339,14 +338,14 @@ def test_any_exception_ends_with_torque_off(tmp_path, error, where):
 @pytest.mark.parametrize(
     ("bad", "words"),
     [
-        (np.full(8, np.nan), "finite: goal of leg_lf is nan"),
-        (np.r_[DRIVE[:7], np.inf], "finite: goal of wheel_rr is inf"),
+        (np.full(8, np.nan), "finite: setpoint of leg_lf is nan"),
+        (np.r_[DRIVE[:7], np.inf], "finite: setpoint of wheel_rr is inf"),
         (np.zeros(7), "shape"),
         ("fast", "no numbers"),
         (None, "finite|no numbers|shape"),
     ],
 )
-def test_goals_that_are_none_stop_the_robot(rig, bad, words):
+def test_setpoints_that_are_none_stop_the_robot(rig, bad, words):
     rig.loop.start()
     rig.drive(0.2)
     before = rig.goal_counts()
@@ -369,9 +368,9 @@ def test_single_motors_off_and_on_again(rig):
     np.testing.assert_array_equal(rig.torque(), free)
     rig.drive(1.0)
     assert rig.torque().all()
-    np.testing.assert_allclose(rig.loop.view.velocity[4:], 3.0, atol=0.2)
+    np.testing.assert_allclose(rig.loop.status.velocity[4:], 3.0, atol=0.2)
     rig.loop.stop()
-    run = read_run(rig.loop.log.run)
+    run = read_run(rig.loop.recorder.log.run)
     assert np.isnan(run["cmd_wheel_lf"][:10]).all()
     assert np.isfinite(run["cmd_wheel_lf"][10:]).all()
 
@@ -383,14 +382,14 @@ def test_the_log_has_what_was_sent_and_read(rig):
     rig.loop.start()
     seen, sent = [], []
     for k in range(50):
-        seen.append(rig.loop.view)
+        seen.append(rig.loop.status)
         rig.loop.tick(np.r_[DRIVE[:4], [0.05 * k] * 4])
-        sent.append(rig.loop.goals)
-    partial = rig.loop.log.folder / "partial_run_01.csv"
+        sent.append(rig.loop.setpoints)
+    partial = rig.loop.recorder.log.folder / "partial_run_01.csv"
     assert len(read_run(partial).table) == 50  # while it is running, and after kill -9
     assert not read_run(partial).path.name.startswith("run_")
     rig.loop.stop()
-    run = read_run(rig.loop.log.run)
+    run = read_run(rig.loop.recorder.log.run)
     assert len(run.table) == 50 + 30
     for k, joint in enumerate(JOINTS):
         count = ANGLE_COUNT if k < 4 else SPEED_COUNT  # the register holds whole counts, and that is what the servo follows
@@ -401,11 +400,11 @@ def test_the_log_has_what_was_sent_and_read(rig):
     np.testing.assert_array_equal(run["gyro_z"][:50], [view.gyro[2] for view in seen])
     np.testing.assert_allclose(np.diff(run["t"]), PERIOD, atol=1e-9)
     assert {finding.kind for finding in run.findings} <= {"constant"}
-    events = read_events(rig.loop.log.run)
+    events = read_events(rig.loop.recorder.log.run)
     phases = [event["phase"] for event in events if event["event"] == "phase"]
     assert phases == ["ramp", "running", "stopping", "limp"]
     assert events[-1]["statistics"]["ticks"] == rig.loop.statistics()["ticks"]
-    assert not list(rig.loop.log.folder.glob("partial*"))
+    assert not list(rig.loop.recorder.log.folder.glob("partial*"))
 
 
 def test_interventions_are_counted_and_logged_where_they_begin(rig):
@@ -415,7 +414,7 @@ def test_interventions_are_counted_and_logged_where_they_begin(rig):
         rig.drive(0.1, np.r_[DRIVE[:4], [6.0] * 4])
         rig.drive(0.1, np.r_[DRIVE[:4], [0.0] * 4])
     rig.loop.stop()
-    events = [event for event in read_events(rig.loop.log.run) if event.get("rule") == "slew"]
+    events = [event for event in read_events(rig.loop.recorder.log.run) if event.get("rule") == "slew"]
     assert len(events) == 6
     assert rig.loop.interventions["slew"] >= 6
     assert events[-1]["joints"] == list(JOINTS[4:])
@@ -458,7 +457,7 @@ def test_deadlines_do_not_drift_and_are_not_caught_up():
 
 def test_a_computer_that_does_not_keep_up_stops_the_robot(rig):
     rig.loop.start()
-    rig.loop.spare = lambda: rig.link.clock.wait_until(rig.machine.time + 0.045)
+    rig.loop.operator.spare = lambda: rig.link.clock.wait_until(rig.machine.time + 0.045)
     with pytest.raises(StoppedError, match="deadlines: 5 ticks in a row late"):
         rig.drive(1.0)
     assert not rig.torque().any()

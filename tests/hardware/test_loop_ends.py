@@ -19,10 +19,9 @@ from wlr_gym.data.excitations import excite
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.deployment import deploy, loop_of
 from wlr_gym.hardware.driving import drive_robot
-from wlr_gym.hardware.loop import stop_on_signals
-from wlr_gym.hardware.operator import Keys
+from wlr_gym.hardware.limits import SafetyLimits
+from wlr_gym.hardware.operator import Keys, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
-from wlr_gym.hardware.safety.limits import Safety
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 from wlr_gym.policy import make_policy
@@ -47,18 +46,18 @@ def in_phase(loop, phase, act):
         if loop.phase is phase and waiting:
             waiting.pop()()
 
-    loop.spare = spare
+    loop.operator.spare = spare
 
 
 def before_off(loop, act):
     """Do something while torque is switched off."""
-    off = loop._gate.off
+    off = loop._limiter.off
 
     def watched():
         act()
         return off()
 
-    loop._gate.off = watched
+    loop._limiter.off = watched
 
 
 def interrupt():
@@ -101,7 +100,7 @@ def test_a_normal_end_without_confirmed_torque_off_is_no_success(rig, capsys):
 
 def test_a_requested_end_without_confirmed_torque_off_is_none_either(rig, capsys):
     rig.loop.start()
-    rig.loop.ask_to_stop("stop key")
+    rig.loop.operator.ask_to_stop("stop key")
     before_off(rig.loop, lambda: unplug(rig.loop))
     with pytest.raises(StoppedError, match="stop: stop key; " + ADVICE):
         rig.drive(0.1)
@@ -184,7 +183,7 @@ def test_a_stop_asked_for_at_the_very_end_ends_the_command(tmp_path, when):
         in_phase(plant.loop, Phase.STOPPING, interrupt)
     else:
         ticks = iter(range(len(motion.goals)))
-        plant.loop.spare = lambda: (
+        plant.loop.operator.spare = lambda: (
             interrupt() if plant.loop.phase is Phase.RUNNING and next(ticks) == len(motion.goals) - 1 else None
         )
     drive = drive_robot(plant, motion)
@@ -210,7 +209,7 @@ def test_a_stop_in_the_last_motion_tick_starts_no_other(tmp_path, monkeypatch):
 
 def test_a_signal_after_torque_off_interrupts_like_any_other(rig):
     def play():
-        with stop_on_signals(rig.loop):
+        with stop_on_signals(rig.loop.operator):
             rig.loop.start()
             rig.loop.stop()
             interrupt()
@@ -222,7 +221,7 @@ def test_a_signal_after_torque_off_interrupts_like_any_other(rig):
 def test_a_stop_asked_for_between_two_starts_counts(rig):
     rig.loop.start()
     rig.loop.stop()
-    rig.loop.ask_to_stop("SIGINT")
+    rig.loop.operator.ask_to_stop("SIGINT")
     with pytest.raises(StoppedError, match="SIGINT"):
         rig.loop.start()
     assert not rig.torque().any()
@@ -247,7 +246,7 @@ def test_keys_are_looked_at_before_torque_comes_on(rig, key, words):
     read, write = os.pipe()
     os.write(write, key)
     with Keys(read) as keys:
-        rig.loop.spare = lambda: keys.serve(rig.loop)
+        rig.loop.operator.spare = lambda: keys.serve(rig.loop.operator)
         with pytest.raises(StoppedError, match=words):
             rig.loop.start()
     os.close(read)
@@ -266,7 +265,7 @@ def test_a_fault_during_a_requested_stop_is_the_reason(rig, fault, words):
     rig = Rig(off_time=0.1, stop_time=2.0)  # time to fall
     rig.loop.start()
     in_phase(rig.loop, Phase.STOPPING, lambda: fault(rig))
-    rig.loop.ask_to_stop("stop key")
+    rig.loop.operator.ask_to_stop("stop key")
     with pytest.raises(StoppedError, match=f"^{words}.*while stopping: stop: stop key"):
         rig.drive(0.1)
     assert rig.loop.phase is Phase.FAULT
@@ -282,10 +281,10 @@ def test_a_fault_in_the_tick_of_a_request_is_no_good_end(rig):
     asked = []
 
     def spare():
-        if rig.loop._gate._memory.tilted >= rig.loop.limits.tilt_time and not asked:
-            asked.append(rig.loop.ask_to_stop("stop key"))
+        if rig.loop._limiter._memory.tilted >= rig.loop.limits.tilt_time and not asked:
+            asked.append(rig.loop.operator.ask_to_stop("stop key"))
 
-    rig.loop.spare = spare
+    rig.loop.operator.spare = spare
     with pytest.raises(StoppedError, match=r"^tilt: "):
         rig.drive(3.0)
     assert not rig.loop.ended_well
@@ -304,7 +303,7 @@ def hold(rig, joint):
 
 def test_a_leg_that_is_not_at_the_start_pose_stops_the_robot(rig):
     hold(rig, "leg_rf")
-    words = r"^start pose: leg_rf is at 1\.\d\d rad, its goal is 1\.00 rad \(limit 0\.3 rad\)$"
+    words = r"^start pose: leg_rf is at 1\.\d\d rad, its setpoint is 1\.00 rad \(limit 0\.3 rad\)$"
     with pytest.raises(StoppedError, match=words):
         rig.loop.start([1.0] * 4)
     assert rig.loop.phase is Phase.FAULT
@@ -329,14 +328,14 @@ def test_the_way_to_the_start_pose_waits_for_slow_servos():
     """The paper's profile is slower than the ramp would be."""
     plant = RobotPlant(ROBOT, 1, PlantOptions(), RobotOptions(emulated=True), meta=RunMeta(robot=ROBOT.name, profile=PROFILE))
     plant.loop.start([1.0, 1.0, 2.1, 2.1])
-    assert plant.loop.view is not None
-    np.testing.assert_allclose(plant.loop.view.position[:4], [1.0, 1.0, 2.1, 2.1], atol=0.05)
+    assert plant.loop.status is not None
+    np.testing.assert_allclose(plant.loop.status.position[:4], [1.0, 1.0, 2.1, 2.1], atol=0.05)
     plant.close()
 
 
 def test_a_limit_of_nothing_is_refused():
     with pytest.raises(ValidationError, match="start_error"):
-        Safety(start_error=0.0)
+        SafetyLimits(start_error=0.0)
 
 
 def test_the_way_to_the_start_pose_waits_for_the_operator(tmp_path):
@@ -346,14 +345,14 @@ def test_the_way_to_the_start_pose_waits_for_the_operator(tmp_path):
 
     def look():
         if rig.loop.phase is Phase.RAMP:
-            held.append(rig.loop.goals[0])
+            held.append(rig.loop.setpoints[0])
             if len(held) >= 50:  # a second later
-                rig.loop.operator_is_there()
+                rig.loop.operator.note_sign()
 
-    rig.loop.spare = look
+    rig.loop.operator.spare = look
     rig.loop.start([1.0, 1.0, 2.1, 2.1])
-    assert rig.loop.view is not None
-    np.testing.assert_allclose(rig.loop.view.position[:4], [1.0, 1.0, 2.1, 2.1], atol=0.05)
+    assert rig.loop.status is not None
+    np.testing.assert_allclose(rig.loop.status.position[:4], [1.0, 1.0, 2.1, 2.1], atol=0.05)
     assert np.ptp(held[20:49]) == 0.0
     assert held[40] > 1.1
     rig.loop.close()

@@ -14,10 +14,10 @@ from robot_rig import DRIVE, HARDWARE, JOINTS, PERIOD, ROBOT, Phase, Rig, Stoppe
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.read import read_run
-from wlr_gym.hardware.log import Table, read_events
-from wlr_gym.hardware.loop import STOP_SIGNALS, stop_on_signals
+from wlr_gym.hardware.log import CsvTable, read_events
+from wlr_gym.hardware.operator import STOP_SIGNALS, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
-from wlr_gym.hardware.safety import preflight as checks
+from wlr_gym.hardware.safety import preflight
 from wlr_gym.hardware.safety.limiter import CALM_SPEED
 from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 
@@ -63,19 +63,19 @@ def wheel_speeds_at_off(rig):
 @pytest.mark.parametrize("phase", ["ramp", "running", "stopping"])
 def test_a_full_disk_stops_the_robot_in_good_order(rig, phase):
     if phase == "ramp":
-        rig.loop.spare = lambda: fill_the_disk(rig.loop.log)
+        rig.loop.operator.spare = lambda: fill_the_disk(rig.loop.recorder.log)
         with pytest.raises(StoppedError, match=r"computer: the log cannot be written: .*No space left"):
             rig.loop.start()
     else:
         rig.loop.start()
         rig.drive(0.3)
-        fill_the_disk(rig.loop.log)
+        fill_the_disk(rig.loop.recorder.log)
     speeds = wheel_speeds_at_off(rig)
     if phase == "running":
         with pytest.raises(StoppedError, match=r"computer: the log cannot be written: .*No space left"):
             rig.drive(0.2)
     rig.loop.stop()
-    assert rig.loop.phase in (Phase.LIMP, Phase.FAULT)
+    assert rig.loop.phase in (Phase.TORQUE_OFF, Phase.FAULT)
     assert not rig.torque().any()
     if phase != "ramp":
         assert np.abs(speeds[-1]).max() < 0.4  # of 3: the wheels were stopped before
@@ -93,7 +93,7 @@ class FillingDisk(io.FileIO):
 
 
 def test_a_log_ends_in_a_whole_row_when_the_disk_fills_up(tmp_path):
-    table = Table(tmp_path / "run_01.csv", ["t", "value"])
+    table = CsvTable(tmp_path / "run_01.csv", ["t", "value"])
     table._file.close()
     table._file = FillingDisk(tmp_path / "partial_run_01.csv", "a")
     table.add(np.array([0.0, 0.125]))
@@ -112,7 +112,7 @@ def test_a_terminal_that_is_gone_stops_the_robot_in_good_order(rig):
     rig.loop.start()
     rig.drive(0.5)
     speeds = wheel_speeds_at_off(rig)
-    rig.loop.spare = gone
+    rig.loop.operator.spare = gone
     with pytest.raises(StoppedError, match="computer: the operator's terminal is gone"):
         rig.drive(0.5)
     assert not rig.torque().any()
@@ -123,29 +123,29 @@ def test_no_signal_interrupts_switching_off(rig):
     """Ctrl-C pressed again and again: each motor is off all the same."""
     rig.loop.start()
     rig.drive(0.2)
-    off = rig.loop._gate.off
+    off = rig.loop._limiter.off
 
     def off_with_an_impatient_operator():
         for _ in range(3):
             os.kill(os.getpid(), signal.SIGINT)
         return off()
 
-    rig.loop._gate.off = off_with_an_impatient_operator
-    with stop_on_signals(rig.loop):
+    rig.loop._limiter.off = off_with_an_impatient_operator
+    with stop_on_signals(rig.loop.operator):
         os.kill(os.getpid(), signal.SIGINT)
         with pytest.raises((StoppedError, KeyboardInterrupt), match="SIGINT"):
             rig.drive(0.2)
         assert not rig.torque().any()
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
-    assert rig.loop.phase is Phase.LIMP
+    assert rig.loop.phase is Phase.TORQUE_OFF
 
 
 @pytest.mark.parametrize("name", STOP_SIGNALS)
 def test_every_way_to_end_or_stop_a_program_stops_the_robot(rig, name):
     """Ctrl-Z too: a program that sleeps would leave torque on."""
     rig.loop.start()
-    with stop_on_signals(rig.loop):
+    with stop_on_signals(rig.loop.operator):
         os.kill(os.getpid(), getattr(signal, name))
         with pytest.raises(StoppedError, match=name):
             rig.drive(0.2)
@@ -153,17 +153,17 @@ def test_every_way_to_end_or_stop_a_program_stops_the_robot(rig, name):
 
 
 def test_motors_that_are_off_stay_off_in_a_stop(rig):
-    """Somebody may hold a limp leg."""
+    """Somebody may hold the leg."""
     rig.loop.start()
     on = np.ones(8, bool)
     on[0] = False
     for _ in range(5):
         rig.loop.tick(DRIVE, on)
     seen = []
-    rig.loop.spare = lambda: seen.append(rig.torque())
+    rig.loop.operator.spare = lambda: seen.append(rig.torque())
     rig.loop.stop()
     np.testing.assert_array_equal(seen, np.tile(on, (len(seen), 1)))
-    assert np.isnan(read_run(rig.loop.log.run)["cmd_leg_lf"]).all()
+    assert np.isnan(read_run(rig.loop.recorder.log.run)["cmd_leg_lf"]).all()
 
 
 # ---- watchdogs that have stopped the motors ----------------------------------------------------------------------------
@@ -177,7 +177,7 @@ def test_servos_that_stopped_themselves_are_noticed_when_they_are_back(rig):
     with pytest.raises(StoppedError, match="watchdog: wheel_lf, wheel_rf, wheel_lr, wheel_rr heard nothing"):
         rig.drive(1.0)
     assert not rig.torque().any()
-    assert any(event.get("rule") == "watchdog" for event in read_events(rig.loop.log.run))
+    assert any(event.get("rule") == "watchdog" for event in read_events(rig.loop.recorder.log.run))
 
 
 def test_lost_answers_alone_latch_no_watchdog(rig):
@@ -187,14 +187,14 @@ def test_lost_answers_alone_latch_no_watchdog(rig):
     rig.inject("drop wheels duration=0.3")
     rig.drive(1.0)
     assert rig.loop.interventions["silence"] > 10
-    assert rig.loop.goals[4] == 3.0
+    assert rig.loop.setpoints[4] == 3.0
 
 
 @pytest.mark.parametrize("when", [3, 200])
 def test_a_display_that_hangs_is_noticed(rig, when):
     """Between sending and reading, in the first second too (where the share of late ticks is not known yet)."""
     ticks = iter(range(1000))
-    rig.loop.spare = lambda: rig.link.clock.wait_until(rig.machine.time + 0.3 * (next(ticks) == when))
+    rig.loop.operator.spare = lambda: rig.link.clock.wait_until(rig.machine.time + 0.3 * (next(ticks) == when))
 
     def play():
         rig.loop.start()
@@ -216,12 +216,12 @@ def test_a_leg_outside_its_limits_comes_back_slowly(rig, angle):
     rig.link.servos.close()
     low, high = ROBOT.leg_limits
     rig.loop.start()
-    ramp = read_run(rig.loop.log.folder / "partial_ramp_01.csv")
+    ramp = read_run(rig.loop.recorder.log.folder / "partial_ramp_01.csv")
     goals = np.r_[ramp["pos_leg_lf"][0], ramp["cmd_leg_lf"]]
     assert not low <= goals[0] <= high
     count = 2.0 * np.pi / 4096  # goals are whole counts of the register
     assert np.abs(np.diff(goals)).max() <= CALM_SPEED * HARDWARE.safety.start_speed * PERIOD + count
-    np.testing.assert_allclose(rig.loop.view.position[0], ROBOT.home.leg_angle, atol=0.05)
+    np.testing.assert_allclose(rig.loop.status.position[0], ROBOT.home.leg_angle, atol=0.05)
 
 
 def test_a_leg_outside_its_servos_limits_does_not_start(rig):
@@ -253,7 +253,7 @@ def test_mending_leaves_servos_alone_that_are_on(rig):
         rig.machine.servos[joint].set("bus_watchdog", -1)
     rig.machine.servos["wheel_rr"].set("torque_enable", 1)
     servos = rig.link.servos
-    left = checks.mend(servos, checks.check_servos(servos, ROBOT, HARDWARE))
+    left = preflight.mend(servos, preflight.check_servos(servos, ROBOT, HARDWARE))
     assert {(check.where, check.what) for check in left} == {("wheel_rr", "watchdog"), ("wheel_rr", "torque")}
     assert [servos.get(joint, "bus_watchdog") for joint in ("leg_lf", "wheel_rr")] == [0, -1]
     rig.link.close()

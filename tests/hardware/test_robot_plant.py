@@ -90,7 +90,7 @@ def test_reset_goes_to_the_state_and_zeroes_the_wheels():
     assert np.isfinite(sensors.values).all()
     plant.close()
     plant.close()
-    assert plant.loop.phase is Phase.LIMP
+    assert plant.loop.phase is Phase.TORQUE_OFF
 
 
 @pytest.mark.parametrize("count", [0, 2, 1.5, True])
@@ -192,7 +192,7 @@ def test_a_robot_adds_no_delay_and_no_noise_of_ours(env):
     assert not core._bias.any()
     names = [column["name"] for column in core.contract()["observation"]]
     column = names.index("leg_position[leg_lf]")
-    assert core.observation[0, column] == np.float32(core.plant.loop.view.position[0] - np.pi / 2)
+    assert core.observation[0, column] == np.float32(core.plant.loop.status.position[0] - np.pi / 2)
 
 
 def test_a_policy_fits_robot_and_simulator_alike(env):
@@ -239,7 +239,7 @@ def test_a_robot_is_not_scored(env):
     core = env.unwrapped.core
     with pytest.raises(InputError, match="no truth to score by"):
         roll_out(core, make_policy("do_nothing", core.contract()))
-    assert core.plant.loop.phase is Phase.LIMP
+    assert core.plant.loop.phase is Phase.TORQUE_OFF
 
 
 def test_hardware_is_for_the_robot():

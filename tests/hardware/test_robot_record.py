@@ -23,7 +23,7 @@ pytest.importorskip("serial")
 
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.link import emulated_link
+from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.log import read_events
 
 ROBOT = load_robot()
@@ -44,7 +44,7 @@ def test_the_emulated_robot_is_driven_and_logged(tmp_path, capsys):
         near = motion.goals[: len(logged)]
         assert len(near) == 100
         np.testing.assert_array_equal(np.isnan(logged[:100]), np.isnan(near))
-        half_count = np.pi / 4096  # the gate has nothing against them; the registers round them
+        half_count = np.pi / 4096  # the command limiter leaves them as they are; the registers round them
         np.testing.assert_allclose(logged[:100, :4], near[:, :4], rtol=0.0, atol=1.001 * half_count)
         assert np.diff(run["t"]) == pytest.approx(0.02, abs=1e-9)
         assert {finding.kind for finding in run.findings} <= {"constant"}

@@ -30,7 +30,7 @@ COMMANDS = {
     "paper": "run the paper's experiments in several models and check its claims",
     "vision": "measure pose and slip from a video of the robot with ring markers",
     "calibrate": "calibrate the robot's joints, its IMU or a camera, or write the marker sheets to print",
-    "deploy": "drive the robot with a policy, behind the safety gate",
+    "deploy": "drive the robot with a policy, through the command limiter",
     "doctor": "look at a robot before it drives: ports, servos, IMU, policy; names the first fault and its remedy",
     "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults on command",
     "bench": "measure the speed of the engine, the environments and training on this machine",

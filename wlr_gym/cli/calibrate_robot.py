@@ -20,7 +20,7 @@ from wlr_gym.robot import JOINTS, LEGS
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from wlr_gym.hardware.calibration import Pose
+    from wlr_gym.hardware.calibration import RestPose
     from wlr_gym.hardware.config import Hardware, ImuCalibration, Mounting
     from wlr_gym.hardware.link import Link
     from wlr_gym.hardware.servos import Servos
@@ -39,7 +39,7 @@ _READS = 20
 
 @dataclass(frozen=True)
 class JointsOptions(RobotOption):
-    """Find sign and zero of each servo by moving the limp robot by hand. Put it on a stand, wheels off the ground.
+    """Find sign and zero of each servo by moving the robot by hand, torque off. Put it on a stand, wheels off the ground.
 
     Attributes:
         out: hardware file to write; may be the one of --hardware.
@@ -158,7 +158,7 @@ def calibrate_joints(options: JointsOptions, ask: Ask = ask_terminal) -> int:
 def _calibrate_joints(options: JointsOptions, robot: Robot, hardware: Hardware, source: Path, link: Link, ask: Ask) -> int:
     from wlr_gym.hardware.calibration import with_mountings
 
-    _require_limp(link.servos, ask)
+    _require_torque_off(link.servos, ask)
     print("Put the robot on a stand, wheels off the ground. Enter goes on, s skips a joint, q ends without a file.")
     wanted = options.only or JOINTS
     found = {joint: _calibrate(joint, robot, hardware, link.servos, ask) for joint in JOINTS if joint in wanted}
@@ -170,7 +170,7 @@ def _calibrate_joints(options: JointsOptions, robot: Robot, hardware: Hardware, 
     return _save(options.out, source, lambda file: with_mountings(file, mountings), "joints", note, ask)
 
 
-def _require_limp(servos: Servos, ask: Ask) -> None:
+def _require_torque_off(servos: Servos, ask: Ask) -> None:
     """Have all motors off; what is on is switched off only when the operator holds the robot and says so."""
     on = [joint for joint in JOINTS if servos.get(joint, "torque_enable")]
     if not on:
@@ -272,11 +272,11 @@ def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, as
     )
 
 
-def _pose(options: ImuOptions, link: Link, ask: Ask, text: str) -> Pose:
+def _pose(options: ImuOptions, link: Link, ask: Ask, text: str) -> RestPose:
     from wlr_gym.hardware.calibration import rest_pose
     from wlr_gym.hardware.safety.preflight import sample_imu
 
-    def look() -> Pose:
+    def look() -> RestPose:
         _answer(ask, text)
         samples = sample_imu(link.imu, link.clock, options.seconds)
         return rest_pose(samples.gyro, samples.accelerometer, samples.temperature)

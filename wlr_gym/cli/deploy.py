@@ -1,4 +1,4 @@
-"""Drive the robot with a policy: check, ramp to the start pose, run at 50 Hz behind the safety gate, stop, torque off.
+"""Drive the robot with a policy: check, ramp to the start pose, run at 50 Hz through the command limiter, stop, torque off.
 
 Space switches the motors off at once, q stops, and so do Ctrl-C, SIGTERM and SIGHUP. Try it without a robot: --emulated. Wheels
 off the ground the first time; see docs/robot.md.
@@ -174,9 +174,9 @@ def _emulator(options: Options, console: Console) -> Iterator[dict[str, str]]:
 
 
 def _signals(loop: ControlLoop) -> contextlib.AbstractContextManager[None]:
-    from wlr_gym.hardware.loop import stop_on_signals
+    from wlr_gym.hardware.operator import stop_on_signals
 
-    return stop_on_signals(loop)
+    return stop_on_signals(loop.operator)
 
 
 def _say_what_is_not_known(core: Core, console: Console) -> None:
@@ -201,17 +201,17 @@ def _status(loop: ControlLoop, core: Core, keys: Any, show: bool, console: Conso
 
     def spare() -> None:
         nonlocal count
-        keys.serve(loop)
+        keys.serve(loop.operator)
         count += 1
         if live is not None and count % _STATUS_TICKS == 0:
             live.update(status_table(loop, core), refresh=True)
 
-    loop.spare = spare
+    loop.operator.spare = spare
     with live or contextlib.nullcontext():
         try:
             yield
         finally:
-            loop.spare = None
+            loop.operator.spare = None
 
 
 def status_table(loop: ControlLoop, core: Core) -> Any:
@@ -224,17 +224,26 @@ def status_table(loop: ControlLoop, core: Core) -> Any:
     table = Table(
         box=None, title=f"{loop.phase.value}  {core.ticks[0] * core.task.config.control_period:.1f} s", title_justify="left"
     )
-    for name in ("joint", "angle rad", "goal", "speed rad/s", "effort N m", "degC", "V"):
+    for name in ("joint", "angle rad", "setpoint", "speed rad/s", "effort N m", "degC", "V"):
         table.add_column(name, justify="left" if name == "joint" else "right")
-    view = loop.view
-    if view is None:
+    status = loop.status
+    if status is None:
         return table
     for k, joint in enumerate(JOINTS):
-        numbers = (view.position[k], loop.goals[k], view.velocity[k], view.effort[k], view.temperature[k], view.voltage[k])
-        table.add_row(joint, *(f"{number:.2f}" for number in numbers), style="red" if view.silence[k] > 0 else "")
+        numbers = (
+            status.position[k],
+            loop.setpoints[k],
+            status.velocity[k],
+            status.effort[k],
+            status.temperature[k],
+            status.voltage[k],
+        )
+        table.add_row(joint, *(f"{number:.2f}" for number in numbers), style="red" if status.silence[k] > 0 else "")
     command = "  ".join(f"{name} {value:+.2f}" for name, value in zip(core.task.commands, core.command[0], strict=True))
     limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
-    table.caption = f"{command}\ntilt {tilt_of(view.up):.2f} rad  ticks missed {loop.pacer.missed}\nsafety gate: {limited}"
+    table.caption = (
+        f"{command}\ntilt {tilt_of(status.up):.2f} rad  ticks missed {loop.pacer.missed}\ncommand limiter: {limited}"
+    )
     table.caption_justify = "left"
     return table
 
@@ -254,6 +263,6 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
             table.add_row(name, *(f"{value:.2f}" for value in values.values()))
     console.print(table)
     limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
-    console.print(f"safety gate, ticks: {limited}")
+    console.print(f"command limiter, steps: {limited}")
     if result.run is not None:
         console.print(f"written: {result.run}", soft_wrap=True)

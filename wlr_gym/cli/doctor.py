@@ -77,29 +77,29 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: Options, cons
     """Return all checks of ports, adapters, servos, buses and IMU; mends and scans on the way, where that was asked for."""
     from wlr_gym.hardware.dynamixel.errors import BusGoneError
     from wlr_gym.hardware.loop import TIMED_READS
-    from wlr_gym.hardware.safety import preflight as checks
+    from wlr_gym.hardware.safety import preflight
 
-    ports = checks.open_ports(link.servos, link.imu, hardware)
-    found = ports if options.emulated else ports + checks.check_latency_timers(hardware)
+    ports = preflight.open_ports(link.servos, link.imu, hardware)
+    found = ports if options.emulated else ports + preflight.check_latency_timers(hardware)
     open_here = {check.where for check in ports if check.ok}
     buses = [name for name in hardware.buses if name in open_here]
     joints = [joint for name in buses for joint in hardware.buses[name].joints]
     try:
         if options.scan:
             _scan(link, hardware, buses, console)
-        servos = checks.check_servos(link.servos, robot, hardware, joints)
+        servos = preflight.check_servos(link.servos, robot, hardware, joints)
         if options.mend:
-            left = checks.mend(link.servos, servos)
+            left = preflight.mend(link.servos, servos)
             console.print(f"mended: {sum(not check.ok for check in servos) - len(left)}, left: {len(left)}")
-            servos = checks.check_servos(link.servos, robot, hardware, joints)
+            servos = preflight.check_servos(link.servos, robot, hardware, joints)
         found += servos
         if len(buses) == len(hardware.buses) and all(check.ok for check in servos if check.what == "answer"):
             link.servos.set_patience(hardware.safety.patience)  # as while driving
-            found.append(checks.check_bus_speed(link.servos, TIMED_READS, hardware.safety.read_time, link.clock.now))
+            found.append(preflight.check_bus_speed(link.servos, TIMED_READS, hardware.safety.read_time, link.clock.now))
     except (BusGoneError, InputError) as error:  # the latter: gone when a scan opens it again
-        found.append(checks.Check("robot", "bus", False, str(error), "a bus that stays", "Check plugs and supply."))
+        found.append(preflight.Check("robot", "bus", False, str(error), "a bus that stays", "Check plugs and supply."))
     if "imu" in open_here:
-        found += checks.check_imu(link.imu, hardware.imu, link.clock)
+        found += preflight.check_imu(link.imu, hardware.imu, link.clock)
     return found
 
 

@@ -120,7 +120,7 @@ def _drive(model: str, robot: Robot, options: Options, console: Console) -> dict
 def _drive_robot(robot: Robot, options: Options, console: Console) -> dict[str, Record]:
     """Guarded and logged; between the tests the operator carries the robot back."""
     from wlr_gym.data.format import RunMeta
-    from wlr_gym.hardware.loop import stop_on_signals
+    from wlr_gym.hardware.operator import stop_on_signals
     from wlr_gym.physics.effects import load_patch
     from wlr_gym.robot.parameters import Parameters
     from wlr_gym.studies.paper.experiments import PROFILE, TESTS, drive_plant
@@ -130,7 +130,7 @@ def _drive_robot(robot: Robot, options: Options, console: Console) -> dict[str, 
         if not (options.emulated or options.yes):
             confirm(test.motion(), robot, console)
         plant = options.plant_of(robot, options.out / "runs", meta, load_patch(None))
-        with stop_on_signals(plant.loop), contextlib.closing(plant):
+        with stop_on_signals(plant.loop.operator), contextlib.closing(plant):
             records[name] = drive_plant(plant, test, Parameters.nominal(robot))
             plant.loop.finish("the test is over")
     return records

@@ -1,7 +1,7 @@
 """Record measured runs: drive the robot, an emulated one or a simulator through a motion, and log it in the run format.
 
 ``--list`` shows the excitations: motions that bring out what a robot is made of. A motion may also come from a file
-(``--commands``), and be written into one (``--commands-only``). On a robot everything goes through the safety gate; Ctrl-C
+(``--commands``), and be written into one (``--commands-only``). On a robot everything goes through the command limiter; Ctrl-C
 stops it in good order.
 """
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from wlr_gym.data.excitations import Motion
     from wlr_gym.data.format import RunMeta
-    from wlr_gym.hardware.driving import Drive
+    from wlr_gym.hardware.driving import DriveResult
     from wlr_gym.robot import Robot
 
 
@@ -32,12 +32,12 @@ class Options(RobotOption, EffectsOption):
 
     Attributes:
         excitation: motions to drive, by name; several make a data set.
-        commands: files with goals to drive: of --commands-only, or of whole runs.
+        commands: files with setpoints to drive: of --commands-only, or of whole runs.
         out: folder for the runs; made if it is not there.
         backend: dynamixel = the robot (with --emulated an emulated one), or a simulator: gibbs_appell, mujoco.
         seed: of the motions, and of a simulator's noise.
         seconds: cut each motion off after this long.
-        commands_only: write the goals only, one file per motion.
+        commands_only: write the setpoints only, one file per motion.
         list: show the excitations.
         ground: what the floor is like, for meta.yaml.
         notes: free text for meta.yaml.
@@ -116,7 +116,7 @@ def read_motions(options: Options, robot: Robot) -> Sequence[Motion]:
 
 
 def _record_robot(options: Options, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
-    """Guarded and logged; between the motions the operator carries the robot back."""
+    """Limited and logged; between the motions the operator carries the robot back."""
     from wlr_gym.hardware.driving import drive_robot
 
     assert options.out is not None
@@ -136,7 +136,7 @@ def _record_robot(options: Options, motions: Sequence[Motion], robot: Robot, met
     return OK if well else FAILED
 
 
-def _report(motion: Motion, drive: Drive, console: Console) -> None:
+def _report(motion: Motion, drive: DriveResult, console: Console) -> None:
     from wlr_gym.data import read_run
 
     ended = drive.reason or "to its end"
@@ -145,7 +145,7 @@ def _report(motion: Motion, drive: Drive, console: Console) -> None:
     )
     changed = drive.statistics["interventions"]
     if changed:
-        console.print(f"  safety gate: {', '.join(f'{rule} in {count} ticks' for rule, count in changed.items())}")
+        console.print(f"  command limiter: {', '.join(f'{rule} in {count} steps' for rule, count in changed.items())}")
     if drive.run is not None:
         console.print(f"  written: {drive.run}")
         for finding in read_run(drive.run).findings if drive.ticks > 1 else ():

@@ -52,7 +52,8 @@ class HardwareOption:
         Raises:
             InputError: a patch for a real robot.
         """
-        from wlr_gym.hardware.link import emulated_link, emulated_robot, serial_link
+        from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot
+        from wlr_gym.hardware.link import serial_link
 
         if not self.emulated:
             if patch is not None and patch.effects:
@@ -65,7 +66,7 @@ class HardwareOption:
         return emulated_link(Machine(robot, hardware))
 
     def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
-        """Return the robot as a plant, limp; every start is logged in a new run of ``log``."""
+        """Return the robot as a plant, torque off; every start is logged in a new run of ``log``."""
         from wlr_gym.hardware.plant import RobotPlant
         from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 
@@ -106,7 +107,7 @@ class RobotOption(HardwareOption):
 
 
 def confirm(motion: Motion, robot: Robot, console: Console) -> None:
-    """Say what the robot is about to do, and wait for Enter; before every motion: after one the robot stands elsewhere, limp.
+    """Say what the robot is about to do, and wait for Enter; before every motion: after one it lies elsewhere, torque off.
 
     Raises:
         InputError: nobody there.

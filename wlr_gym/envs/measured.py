@@ -37,7 +37,7 @@ def measured_truth(sensors: Sensors) -> Array:
 def measurable(task: Task) -> tuple[Task, tuple[str, ...]]:
     """Return the task with the rewards, terminations and measures that a robot can measure, and the names of those it cannot.
 
-    A robot does not know its speed over the floor, its slip, or the height of its body. It is the safety gate that watches its
+    A robot does not know its speed over the floor, its slip, or the height of its body. It is the safety rules that watch its
     tilt. The slip observer runs on its sensors, without a camera.
 
     Raises:

@@ -21,16 +21,25 @@ from wlr_gym.robot import JOINTS
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
-#: Standard deviations (rad/s, m/s2) above which an IMU is not at rest: ten times the sensor's own at 44 Hz.
-GYRO_REST, ACCEL_REST = 0.015, 0.4
-#: What a healthy chip may be off before calibration: rad/s, part, m/s2 (data sheet: 20 deg/s, and twice its 3 % and 80 mg).
-LARGEST_BIAS, LARGEST_SCALE, LARGEST_OFFSET = 0.35, 0.06, 1.6
+#: rad/s: standard deviation of the gyroscope above which an IMU is not at rest: ten times the sensor's own at 44 Hz.
+GYRO_REST = 0.015
+#: m/s2: the same of the accelerometer.
+ACCEL_REST = 0.4
+#: rad/s that a healthy gyroscope may be off before calibration (data sheet: 20 deg/s).
+LARGEST_BIAS = 0.35
+#: Part that a healthy accelerometer's scale may be off before calibration (twice the data sheet's 3 %).
+LARGEST_SCALE = 0.06
+#: m/s2 that a healthy accelerometer may be off before calibration (twice the data sheet's 80 mg).
+LARGEST_OFFSET = 1.6
 #: Fewest samples of a pose.
 SAMPLES = 50
-#: rad: a body tilted by less does not tell where front is.
+#: rad: from a smaller tilt the forward direction cannot be found.
 LEAST_TILT = np.deg2rad(10.0)
-#: Counts a joint must be moved by hand (20 deg); another one may move by a part of it.
-LEAST_MOVE, LARGEST_SHARE = 228, 0.5
+#: Counts a joint must be moved by hand (20 deg).
+LEAST_MOVE = 228
+#: Part of a joint's move by which another one may move.
+LARGEST_SHARE = 0.5
+#: Counts of a servo's turn.
 COUNTS = 4096
 
 
@@ -38,7 +47,7 @@ COUNTS = 4096
 
 
 @dataclass(frozen=True)
-class Pose:
+class RestPose:
     """An IMU at rest in one pose, sensor axes, uncalibrated.
 
     Attributes:
@@ -51,7 +60,7 @@ class Pose:
     temperature: float
 
 
-def rest_pose(gyro: ArrayLike, accelerometer: ArrayLike, temperature: float) -> Pose:
+def rest_pose(gyro: ArrayLike, accelerometer: ArrayLike, temperature: float) -> RestPose:
     """Average samples (T, 3) of an IMU at rest.
 
     Raises:
@@ -64,7 +73,7 @@ def rest_pose(gyro: ArrayLike, accelerometer: ArrayLike, temperature: float) -> 
         moved = motion(values)
         if moved > limit:
             raise InputError(f"the robot was moved: the {name} varies by {moved:.3g} {unit}, expected below {limit:g}")
-    return Pose(rates.mean(axis=0), forces.mean(axis=0), temperature)
+    return RestPose(rates.mean(axis=0), forces.mean(axis=0), temperature)
 
 
 def motion(values: Array) -> float:
@@ -74,12 +83,14 @@ def motion(values: Array) -> float:
     return float(max(values.std(axis=0).max(), drift.max()))
 
 
-def mean_pose(poses: list[Pose]) -> Pose:
+def mean_pose(poses: list[RestPose]) -> RestPose:
     """Return the mean of several poses: of use for what does not depend on the pose, the gyroscope's bias."""
-    return Pose(*(np.mean([vars(pose)[name] for pose in poses], axis=0) for name in ("gyro", "accelerometer", "temperature")))
+    return RestPose(
+        *(np.mean([vars(pose)[name] for pose in poses], axis=0) for name in ("gyro", "accelerometer", "temperature"))
+    )
 
 
-def gyro_bias(pose: Pose) -> Vector:
+def gyro_bias(pose: RestPose) -> Vector:
     """Return what the gyroscope reads at rest, rad/s.
 
     Raises:
@@ -90,7 +101,7 @@ def gyro_bias(pose: Pose) -> Vector:
     return _vector(pose.gyro)
 
 
-def six_positions(poses: list[Pose]) -> tuple[Vector, Vector]:
+def six_positions(poses: list[RestPose]) -> tuple[Vector, Vector]:
     """Return offset (m/s2) and scale of the accelerometer from six or more poses at rest, each axis up and down once.
 
     Only the length of gravity is used, so the poses need not be exact: |scale (measured - offset)| = g in each.
@@ -152,7 +163,7 @@ def _angles(to_body: NDArray[Any]) -> Vector:
     )
 
 
-def level_offset(pose: Pose, known: ImuCalibration, to_body: Array) -> Vector:
+def level_offset(pose: RestPose, known: ImuCalibration, to_body: Array) -> Vector:
     """Return the accelerometer's offset (m/s2) that makes a level robot read (0, 0, g); scale and mounting stay.
 
     One pose cannot tell offset from tilt: on a floor that is off level by 1 degree the offset is wrong by 0.17 m/s2.

@@ -10,11 +10,13 @@ from pydantic import Field, model_validator
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import SettingsModel, parse_config, read_config
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, load_table
-from wlr_gym.hardware.safety.limits import Safety
+from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.robot import JOINTS, LEGS, Vector3
 
-#: Operating modes of legs and wheels: what the safety gate writes goals for. In another one a goal means something else.
-POSITION_MODE, VELOCITY_MODE = 3, 1
+#: Operating mode of the legs. Setpoints are written for these modes; in another one they would be another quantity.
+POSITION_MODE = 3
+#: Operating mode of the wheels.
+VELOCITY_MODE = 1
 
 
 class Bus(SettingsModel):
@@ -98,7 +100,7 @@ class Hardware(SettingsModel):
     buses: dict[str, Bus]
     imu: ImuPort
     joints: dict[str, Mounting]
-    safety: Safety = Safety()
+    safety: SafetyLimits = SafetyLimits()
 
     @model_validator(mode="after")
     def _every_joint_is_wired_once(self) -> Hardware:
@@ -108,7 +110,7 @@ class Hardware(SettingsModel):
         return self
 
     @model_validator(mode="after")
-    def _goals_mean_what_is_written(self) -> Hardware:
+    def _modes_are_those_of_the_setpoints(self) -> Hardware:
         for name, bus in self.buses.items():
             found = bus.eeprom.get("operating_mode", load_table(bus.model)["operating_mode"].default)
             for joint in bus.joints:

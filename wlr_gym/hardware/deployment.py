@@ -36,10 +36,10 @@ class Deployment:
     Attributes:
         reason: why it ended; ``time is over`` when nothing happened.
         well: it ended as it was asked to: time over, key or signal; and torque is confirmed off.
-        ticks: control ticks that the policy drove.
+        ticks: control steps that the policy drove.
         run: its log; None = none was written.
         statistics: of the control loop.
-        inference: s that the policy took per tick, (ticks,).
+        inference: s that the policy took per step, (ticks,).
     """
 
     reason: str
@@ -91,12 +91,11 @@ def deploy(core: Core, policy: Policy, seed: int = 0, command: Mapping[str, floa
             pass  # it is in the loop's reason
         finally:
             loop.stop("exception")
-    run = loop.log.run if loop.log is not None and loop.log.run.is_file() else None
-    return Deployment(loop.reason, loop.ended_well, len(inference), run, loop.statistics(), np.array(inference))
+    return Deployment(loop.reason, loop.ended_well, len(inference), loop.recorder.run, loop.statistics(), np.array(inference))
 
 
 def _log(core: Core, loop: ControlLoop, action: NDArray[np.float32]) -> None:
-    loop.log_policy(policy_columns(core), np.concatenate([core.command[0], np.asarray(action, np.float64)[0]]))
+    loop.recorder.policy(policy_columns(core), np.concatenate([core.command[0], np.asarray(action, np.float64)[0]]))
 
 
 def policy_columns(core: Core) -> list[str]:
@@ -106,7 +105,7 @@ def policy_columns(core: Core) -> list[str]:
 
 @contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """Collect now, and not again before it is over: a collection takes longer than a tick's slack."""
+    """Collect now, and not again before it is over: a collection takes longer than a control step's slack."""
     was_on = gc.isenabled()
     gc.collect()
     gc.disable()

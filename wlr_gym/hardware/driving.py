@@ -1,4 +1,4 @@
-"""Drive the real robot through a motion, behind the safety gate, with a log in the measured-run format."""
+"""Drive the real robot through a motion, through the command limiter, with a log in the measured-run format."""
 
 from __future__ import annotations
 
@@ -10,22 +10,24 @@ import numpy as np
 
 from wlr_gym.data.excitations import Motion
 from wlr_gym.data.record import start_goals
-from wlr_gym.hardware.loop import StoppedError, stop_on_signals
+from wlr_gym.hardware.loop import StoppedError
+from wlr_gym.hardware.operator import stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.physics.plants.base import standing_state
+from wlr_gym.robot import LEG_SLICE
 from wlr_gym.robot.parameters import Parameters
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveResult:
     """How a drive ended.
 
     Attributes:
         run: its log, whole or up to where it stopped; None where nothing was logged.
         reason: why it stopped early, or not in good order; empty = neither. Drive no other motion then.
         well: it ended at the motion's end, or because somebody asked for it; and torque is confirmed off.
-        ticks: control ticks driven.
-        statistics: of the control loop, with what the safety gate changed.
+        ticks: control steps driven.
+        statistics: of the control loop, with what the command limiter changed.
     """
 
     run: Path | None
@@ -35,29 +37,28 @@ class Drive:
     statistics: dict[str, Any]
 
 
-def drive_robot(plant: RobotPlant, motion: Motion) -> Drive:
+def drive_robot(plant: RobotPlant, motion: Motion) -> DriveResult:
     """Go to the motion's first pose, drive it, stop; torque is off afterwards.
 
     Args:
-        plant: the robot, limp.
-        motion: goals; NaN = that motor off. Its servo profile must be the plant's.
+        plant: the robot, torque off.
+        motion: setpoints; NaN = that motor off. Its servo profile must be the plant's.
     """
     loop, robot = plant.loop, plant.robot
     state = standing_state(robot, Parameters.nominal(robot))
-    state.joint_position[0, :4] = start_goals(motion, robot)[:4]
+    state.joint_position[0, LEG_SLICE] = start_goals(motion, robot)[LEG_SLICE]
     reason, ticks = "", 0
     torque_on = np.isfinite(motion.goals)
-    goals = np.nan_to_num(motion.goals)
-    with stop_on_signals(loop):
+    setpoints = np.nan_to_num(motion.goals)
+    with stop_on_signals(loop.operator):
         try:
             plant.reset(state=state)
-            for tick in range(len(goals)):
-                plant.step(goals[tick : tick + 1], torque_on[tick : tick + 1])
+            for tick in range(len(setpoints)):
+                plant.step(setpoints[tick : tick + 1], torque_on[tick : tick + 1])
                 ticks += 1
             loop.finish("the motion is over")
         except StoppedError as error:
             reason = str(error)
         finally:
             loop.stop("exception")
-    run = loop.log.run if loop.log is not None and loop.log.run.is_file() else None
-    return Drive(run, reason, loop.ended_well, ticks, loop.statistics())
+    return DriveResult(loop.recorder.run, reason, loop.ended_well, ticks, loop.statistics())

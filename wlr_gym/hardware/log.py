@@ -1,15 +1,18 @@
-"""Logs of runs on the robot: measured runs, written row by row while it moves, with what the safety gate did beside them.
+"""Logs of runs on the robot: measured runs, written row by row while it moves, and the interventions of the command limiter.
 
-Each row and event goes to the file at once, so that a process that is killed leaves all it saw. While a run is going on its
+Each row and event goes to the file at once, so that a process that is killed leaves all it read. While a run is going on its
 files are called ``partial_run_01.csv`` and so on, which no data set takes for a run; they can be read all the same.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
 import re
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +23,15 @@ from wlr_gym.base.files import make_output_folder
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, RunMeta
 from wlr_gym.data.sensor_columns import SENSED, channels
 from wlr_gym.data.write import write_meta
-from wlr_gym.hardware.safety.rules import View
+from wlr_gym.hardware.safety.rules import RobotStatus
+from wlr_gym.hardware.step import StepRecord
+from wlr_gym.hardware.timing import Clock
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
+from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS
 
 PARTIAL = "partial_"
+#: Phases of the control loop that begin a table, and its kind.
+_TABLES = {"ramp": "ramp", "running": "run"}
 _HEADER = [name for name in COLUMNS if name == "t" or name in COMMANDS or (name in SENSED and name not in CAMERA)]
 _ORDER = [("t", *COMMANDS, *SENSED).index(name) for name in _HEADER]
 
@@ -41,7 +49,7 @@ def _append(file: io.FileIO, line: str) -> None:
         raise
 
 
-class Table:
+class CsvTable:
     """A CSV file that grows row by row, under its partial name until it is finished.
 
     Args:
@@ -92,7 +100,7 @@ class RunLog:
         write_meta(folder, meta)
         self.folder = folder
         self.number = 1 + max((_number(path) for path in folder.iterdir()), default=0)
-        self._tables: dict[str, Table] = {}
+        self._tables: dict[str, CsvTable] = {}
         self._current = ""
         self._last = -np.inf
         self.events_path = folder / f"{PARTIAL}{self.name('run')}.events.jsonl"
@@ -111,19 +119,19 @@ class RunLog:
         """Write rows to ``ramp`` or ``run`` from here on."""
         self._current = kind
         if kind not in self._tables:
-            self._tables[kind] = Table(self.folder / f"{self.name(kind)}.csv", _HEADER)
+            self._tables[kind] = CsvTable(self.folder / f"{self.name(kind)}.csv", _HEADER)
 
-    def row(self, time: float, sensors: Sensors, goals: np.ndarray) -> None:
+    def row(self, time: float, sensors: Sensors, setpoints: np.ndarray) -> None:
         """Write what was read at ``time`` (s) and what was then asked for; NaN = motor off."""
-        if self._current and time > self._last:  # a tick that was interrupted is looked at twice
+        if self._current and time > self._last:  # a control step that was interrupted is written twice
             self._last = time
-            values = np.concatenate([[time], goals, channels(sensors, 0)])
+            values = np.concatenate([[time], setpoints, channels(sensors, 0)])
             self._tables[self._current].add(values[_ORDER])
 
     def policy(self, names: list[str], values: np.ndarray) -> None:
         """Write what the policy was commanded and answered for the row that comes next."""
         if "policy" not in self._tables:
-            self._tables["policy"] = Table(self.folder / f"{self.name('run')}.policy.csv", names)
+            self._tables["policy"] = CsvTable(self.folder / f"{self.name('run')}.policy.csv", names)
         self._tables["policy"].add(values)
 
     def event(self, time: float, kind: str, **content: Any) -> None:
@@ -154,19 +162,120 @@ def read_events(run: Path) -> list[dict[str, Any]]:
         raise InputError(f"{path}: cannot be read: {error}") from None
 
 
-def sensors_of(view: View, wheel_zero: np.ndarray, started: float) -> Sensors:
-    """Return what was seen as a plant's sensors (1, W); wheels from where they stood at the run's start.
+class RunRecorder:
+    """Logs the runs of a control loop. A log that cannot be written (a full disk) is noted, and prevents nothing.
+
+    Args:
+        folder: of the logs; None = none is written.
+        meta: of the runs.
+        clock: of the runs.
+
+    Attributes:
+        log: of the present or last run.
+        trouble: why the log cannot be written; empty = it can.
+        origin: what wheel angles and the camera's age count from.
+    """
+
+    def __init__(self, folder: Path | None, meta: RunMeta, clock: Clock) -> None:
+        self.folder, self.meta = folder, meta
+        self.log: RunLog | None = None
+        self.trouble = ""
+        self.origin = RunOrigin(0.0, np.zeros(len(WHEELS)))
+        self._clock = clock
+        self._checks: list[str] = []
+        self._rules: frozenset[str] = frozenset()
+
+    @property
+    def run(self) -> Path | None:
+        """The last run, once it is finished; None where nothing was logged."""
+        return self.log.run if self.log is not None and self.log.run.is_file() else None
+
+    def new_run(self, checks: list[str] | None = None) -> None:
+        """Begin a log with what the preflight found; None = it was not made again."""
+        self._checks = self._checks if checks is None else checks
+        if self.folder is None:
+            return
+        if self.log is not None:
+            self.log.finish()
+        self.trouble = ""
+        self.log = RunLog(self.folder, self.meta)
+        self.log.event(self._clock.now(), "checks", found=self._checks)
+
+    def phase(self, name: str, reason: str) -> None:
+        """Note that a phase begins; ``ramp`` and ``running`` begin a table."""
+        if self.log is None or self.trouble:
+            return
+        with self._noting_trouble():
+            self.log.event(self._clock.now(), "phase", phase=name, reason=reason)
+            if name in _TABLES:
+                self.log.begin(_TABLES[name])
+
+    def step(self, record: StepRecord) -> None:
+        """Write the row of a control step, and an event for each rule that begins to act."""
+        if self.log is None or self.trouble:
+            return
+        with self._noting_trouble():
+            status, decision = record.status, record.decision
+            self.log.row(status.time, sensors_of(status, self.origin), record.setpoints)
+            rules = {verdict.rule: {"level": verdict.level.name, "text": verdict.text} for verdict in decision.verdicts}
+            rules |= {rule: {"joints": [JOINTS[k] for k in np.flatnonzero(mask)]} for rule, mask in decision.limited.items()}
+            for rule in rules.keys() - self._rules:
+                self.log.event(status.time, "intervention", rule=rule, row=record.count, **rules[rule])
+            self._rules = frozenset(rules)
+
+    def policy(self, names: list[str], values: np.ndarray) -> None:
+        """Write what the policy was commanded and answered for the row that comes next."""
+        if self.log is not None and not self.trouble:
+            with self._noting_trouble():
+                self.log.policy(names, values)
+
+    def end(self, reason: str, statistics: dict[str, Any]) -> None:
+        """Write how the run ended, and finish the files."""
+        if self.log is not None:
+            with self._noting_trouble():
+                self.log.event(self._clock.now(), "end", reason=reason, statistics=statistics)
+            with self._noting_trouble():
+                self.log.finish()
+
+    @contextlib.contextmanager
+    def _noting_trouble(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self.trouble = self.trouble or f"the log cannot be written: {error}"
+
+
+@dataclass(frozen=True)
+class RunOrigin:
+    """Where and when a run began.
+
+    Attributes:
+        time: s.
+        wheel_position: (4,) rad.
+    """
+
+    time: float
+    wheel_position: np.ndarray
+
+
+def origin_of(status: RobotStatus) -> RunOrigin:
+    """Return the origin of a run that begins now."""
+    return RunOrigin(status.time, status.position[WHEEL_SLICE].copy())
+
+
+def sensors_of(status: RobotStatus, origin: RunOrigin) -> Sensors:
+    """Return what was read as a plant's sensors (1, W); wheels from where they stood at the run's start.
 
     There is no camera: its pose stays 0 and is never new, its age counts from the start.
     """
     sensors = Sensors(np.zeros((1, SENSOR_LAYOUT.width)))
-    sensors.joint_position[0] = view.position
-    sensors.joint_position[0, 4:] -= wheel_zero
-    sensors.joint_velocity[0], sensors.joint_effort[0] = view.velocity, view.effort
-    sensors.gyro[0], sensors.accelerometer[0] = view.gyro, view.accelerometer
-    sensors.supply_voltage[0] = np.mean(view.voltage)
-    sensors.joint_age[0], sensors.imu_age[0] = view.silence.max(), view.imu_silence
-    sensors.camera_age[0] = view.time - started
+    sensors.joint_position[0] = status.position
+    sensors.joint_position[0, WHEEL_SLICE] -= origin.wheel_position
+    sensors.joint_velocity[0], sensors.joint_effort[0] = status.velocity, status.effort
+    sensors.gyro[0], sensors.accelerometer[0] = status.gyro, status.accelerometer
+    sensors.supply_voltage[0] = np.mean(status.voltage)
+    sensors.joint_age[0], sensors.imu_age[0] = status.silence.max(), status.imu_silence
+    sensors.camera_age[0] = status.time - origin.time
     return sensors
 
 

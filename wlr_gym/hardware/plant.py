@@ -8,21 +8,20 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.config import Hardware, load_hardware, with_ports
-from wlr_gym.hardware.link import Link, emulated_robot, serial_link
-from wlr_gym.hardware.log import sensors_of
+from wlr_gym.hardware.link import Link, serial_link
 from wlr_gym.hardware.loop import ControlLoop
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, RobotOptions, Sensors, Truth
-from wlr_gym.robot import JOINTS, Robot
-from wlr_gym.robot.parameters import Parameters
+from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
+from wlr_gym.robot.parameters import ELEMENTS, Parameters
 
 Array = NDArray[np.float64]
 
 
 class RobotPlant:
-    """One robot behind the safety gate; see :class:`wlr_gym.physics.plants.base.Plant`.
+    """One robot behind the command limiter; see :class:`wlr_gym.physics.plants.base.Plant`.
 
-    Making it moves nothing. ``reset`` (or the first ``step``) makes the start-up checks, switches torque on and brings the
-    robot to its start pose; ``close`` stops it and switches torque off. A robot that the safety gate has stopped raises
+    Making it moves nothing. ``reset`` (or the first ``step``) makes the preflight checks, switches torque on and brings the
+    robot to its start pose; ``close`` stops it and switches torque off. A robot that the safety rules have stopped raises
     :class:`wlr_gym.hardware.loop.StoppedError`.
 
     Args:
@@ -71,11 +70,9 @@ class RobotPlant:
             self.options.control_period,
             dry_run=chosen.dry_run,
             log=chosen.log,
-            guard=chosen.guard,
+            watchdog=chosen.guard,
             meta=meta,
         )
-        self._wheel_zero = np.zeros(4)
-        self._started = 0.0
 
     @property
     def count(self) -> int:
@@ -98,37 +95,31 @@ class RobotPlant:
             state: its leg angles are the start pose; where the robot stands is where it stands. None = home.
 
         Raises:
-            StoppedError: a start-up check failed, or the robot had to stop.
+            StoppedError: a preflight check failed, or the robot had to stop.
             InputError: parameters that differ, ports that cannot be opened.
         """
         if parameters is not None:
             self.set_parameters(parameters)
         if mask is None or np.asarray(mask).all():
-            view = self.loop.start(None if state is None else state.joint_position[0, :4])
-            self._wheel_zero, self._started = view.position[4:].copy(), view.time
-        return self._readings()
+            self.loop.start(None if state is None else state.joint_position[0, LEG_SLICE])
+        return self.loop.sensors()
 
     def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
-        """Send goals through the safety gate, wait for the deadline, read; see :meth:`wlr_gym.physics.plants.base.Plant.step`.
+        """Send goals through the command limiter, wait for the deadline, read; see
+        :meth:`wlr_gym.physics.plants.base.Plant.step`.
 
-        Goals that are no numbers are the gate's business: they stop the robot.
+        Goals that are no numbers stop the robot.
 
         Raises:
             StoppedError: the robot has stopped, and torque is off.
         """
-        if self.loop.view is None:
+        if self.loop.status is None:
             self.reset()
         shape = np.shape(goals)
         if shape != (1, len(JOINTS)) or (torque_on is not None and np.shape(torque_on) != shape):
             raise InputError(f"goals have shape {shape}, expected (1, {len(JOINTS)}), and torque_on the same")
         self.loop.tick(np.asarray(goals)[0], None if torque_on is None else np.asarray(torque_on)[0])
-        return self._readings()
-
-    def _readings(self) -> Sensors:
-        view = self.loop.view
-        if view is None:
-            raise InputError("the robot has not been started")
-        return sensors_of(view, self._wheel_zero, self._started)
+        return self.loop.sensors()
 
     def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
         """Refuse whatever differs from the robot file.
@@ -140,8 +131,6 @@ class RobotPlant:
             raise InputError(f"parameters hold {len(parameters)} robots, the plant 1")
         different = np.flatnonzero(parameters.values[0] != self.parameters.values[0])
         if len(different):
-            from wlr_gym.robot.parameter_table import ELEMENTS
-
             raise InputError(
                 f"{ELEMENTS[different[0]]}: parameters of a real robot cannot be set (no randomisation, no effects)"
             )
@@ -162,4 +151,6 @@ class RobotPlant:
 def _link(robot: Robot, hardware: Hardware, chosen: RobotOptions, options: PlantOptions) -> Link:
     if not chosen.emulated:
         return serial_link(robot, hardware)
+    from wlr_gym.hardware.emulator.link import emulated_robot  # needs the optional dynamixel-sdk
+
     return emulated_robot(robot, hardware, chosen.effects, sensor_noise=options.sensor_noise)

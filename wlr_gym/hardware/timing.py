@@ -1,23 +1,48 @@
-"""Control ticks against absolute deadlines, and statistics of what they took."""
+"""Clocks; control steps against absolute deadlines, and statistics of what they took."""
 
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 import numpy as np
 
-from wlr_gym.hardware.link import Clock
-
-#: Parts of a tick that are timed; latency is from the readings to the goals that answer them.
+#: Parts of a control step that are timed; latency is from the readings to the setpoints that answer them.
 PARTS = ("read", "think", "write", "slack", "latency")
 _PERCENTILES = (50, 95, 99, 100)
 
 
+class Clock(Protocol):
+    """Time as the robot sees it."""
+
+    def now(self) -> float:
+        """Return s since any start; never goes back."""
+        ...
+
+    def wait_until(self, moment: float) -> None:
+        """Return at ``moment`` (s), or at once when it is later."""
+        ...
+
+
+class MonotonicClock:
+    """This computer's monotonic clock."""
+
+    def now(self) -> float:
+        """Return s."""
+        return time.monotonic()
+
+    def wait_until(self, moment: float) -> None:
+        """Sleep until then."""
+        if (left := moment - time.monotonic()) > 0.0:
+            time.sleep(left)
+
+
 class Pacer:
-    """Starts ticks at ``origin + k * period``: lateness never adds up, and ticks that were missed are left out, not caught up.
+    """Starts control steps at ``origin + k * period``: lateness never adds up, and steps that were missed are left out.
 
     Args:
         clock: of the run.
@@ -29,7 +54,7 @@ class Pacer:
     """
 
     def __init__(self, clock: Clock, period: float) -> None:
-        self._clock, self.period = clock, period
+        self.clock, self.period = clock, period
         self.missed = 0
         self.late_ticks = 0
         self._deadline = clock.now()
@@ -45,18 +70,18 @@ class Pacer:
 
     def start(self) -> None:
         """Count from now; statistics go on."""
-        self._deadline = self._woke = self._clock.now()
+        self._deadline = self._woke = self.clock.now()
         self._recent.clear()
         self.late_ticks = 0
 
     def wait(self) -> None:
         """Return at the next deadline; at once when it has passed, and with the ticks in between left out."""
         self._deadline += self.period
-        slack = self._deadline - self._clock.now()
+        slack = self._deadline - self.clock.now()
         left_out = math.floor(-slack / self.period + 1e-9) if slack < 0.0 else 0
         self._deadline += left_out * self.period
-        self._clock.wait_until(self._deadline)
-        now = self._clock.now()
+        self.clock.wait_until(self._deadline)
+        now = self.clock.now()
         self._times["slack"].append(slack)
         self._times["jitter"].append(now - self._deadline)
         self._times["period"].append(now - self._woke)
@@ -68,11 +93,11 @@ class Pacer:
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
         """Time a part of a tick."""
-        start = self._clock.now()
+        start = self.clock.now()
         try:
             yield
         finally:
-            self.note(part, self._clock.now() - start)
+            self.note(part, self.clock.now() - start)
 
     def note(self, part: str, seconds: float) -> None:
         """Take the time of a part of a tick (s)."""

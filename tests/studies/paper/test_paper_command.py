@@ -90,7 +90,7 @@ def test_a_robot_is_stopped_while_signals_are_looked_at(tmp_path, monkeypatch, c
         phases.append(plant.loop.phase)
         plant.reset()
         plant.step(np.r_[[np.pi / 2] * 4, [0.0] * 4][None])
-        plant.loop.spare = lambda: phases.append((plant.loop.phase, signal.getsignal(signal.SIGINT) is not handler))
+        plant.loop.operator.spare = lambda: phases.append((plant.loop.phase, signal.getsignal(signal.SIGINT) is not handler))
         for _ in range(signals):
             os.kill(os.getpid(), signal.SIGINT)
 
@@ -106,5 +106,5 @@ def test_a_robot_is_stopped_while_signals_are_looked_at(tmp_path, monkeypatch, c
     else:
         with pytest.raises(RuntimeError, match="both were driven"):
             run_command("paper", arguments)
-    assert phases.count(Phase.LIMP) == 2 - signals
-    assert set(phases) == {Phase.LIMP, (Phase.STOPPING, True)}
+    assert phases.count(Phase.TORQUE_OFF) == 2 - signals
+    assert set(phases) == {Phase.TORQUE_OFF, (Phase.STOPPING, True)}

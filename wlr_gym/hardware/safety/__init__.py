@@ -1,1 +1,1 @@
-"""Safety: limits, rules that stop the robot, the command limiter, preflight checks, the watchdog process."""
+"""Safety: rules that stop the robot, the command limiter, preflight checks, the watchdog process."""

@@ -1,4 +1,4 @@
-"""The safety gate: the only thing that writes goals and torque. Nothing can be driven but through it, and it cannot be off.
+"""The command limiter: the only one that writes setpoints and torque. Nothing drives but through it; nothing switches it off.
 
 What is safe is decided in :mod:`wlr_gym.hardware.safety.rules`, by pure functions; here decisions are carried out.
 """
@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import Profile
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
-from wlr_gym.hardware.link import Clock
-from wlr_gym.hardware.safety import preflight as checks
-from wlr_gym.hardware.safety import rules as safety
-from wlr_gym.hardware.safety.rules import Decision, Memory, View
+from wlr_gym.hardware.dynamixel.bus import NoAnswerError, RefusedError
+from wlr_gym.hardware.safety import preflight, rules
+from wlr_gym.hardware.safety.rules import Decision, Memory, RobotStatus
 from wlr_gym.hardware.servos import JointReadings, Servos
+from wlr_gym.hardware.timing import Clock
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 
 Array = NDArray[np.float64]
@@ -40,9 +39,9 @@ _PREPARED = (
 )
 #: s of Bus Watchdog per count (e-manual).
 WATCHDOG_UNIT = 0.02
-#: s an answer may take while nothing moves: where no tick waits for it, a slow computer is no dead servo.
+#: s an answer may take while nothing moves: where no control step waits for it, a slow computer is no dead servo.
 CALM_PATIENCE = 0.05
-#: Fastest goals of legs on the way to the start pose, over ``start_speed``: a minimum-jerk path needs 1.9 of it.
+#: Fastest setpoints of legs on the way to the start pose, over ``start_speed``: a minimum-jerk path needs 1.9 of it.
 CALM_SPEED = 2.0
 #: Times that the watchdogs are written and looked at.
 _ARM_TRIES = 10
@@ -50,21 +49,21 @@ _ARM_TRIES = 10
 _OFF_PAUSE = 0.05
 
 
-class Gate:
-    """Guards the servos.
+class CommandLimiter:
+    """Decides, limits and writes what the servos are sent.
 
     Args:
         servos: taken over; nobody else may keep them.
         robot, hardware: limits and registers.
         clock: of the run.
-        period: s of a control tick.
+        period: s of a control step.
         dry_run: decide, but write nothing.
         profile: of the servos; all 0 = step references.
 
     Attributes:
-        interventions: rule -> ticks in which it changed or stopped something.
-        goals: (8,) last goals. torque_on: (8,) motors that are on.
-        frame: what the limits are about.
+        interventions: rule -> control steps in which it changed or stopped something.
+        setpoints: (8,) last setpoints. torque_on: (8,) motors that are on.
+        ratings: of the motors, with the limits of the servos' registers.
         is_calm: legs may move no faster than on the way to the start pose, whatever is asked for.
     """
 
@@ -83,10 +82,10 @@ class Gate:
         self.dry_run = dry_run
         self.profile = profile or Profile()
         self.interventions: Counter[str] = Counter()
-        self.goals = np.zeros(len(JOINTS))
+        self.setpoints = np.zeros(len(JOINTS))
         self.torque_on = np.zeros(len(JOINTS), bool)
         self._clock = clock
-        self.frame = safety.make_frame(robot, period)
+        self.ratings = rules.ratings_of(robot, period)
         self._memory = Memory()
         self._armed = False
         self.is_calm = False
@@ -103,14 +102,6 @@ class Gate:
         """Return voltages and temperatures; see :meth:`Servos.read_health`."""
         return self.__servos.read_health()
 
-    def hardware_errors(self) -> dict[str, list[str]]:
-        """Return joint -> hardware errors, of the joints that answer and have some."""
-        found = {}
-        for joint in JOINTS:
-            with contextlib.suppress(NoAnswerError, RefusedError, ConnectionError):
-                found[joint] = self.__servos.hardware_errors(joint)
-        return {joint: errors for joint, errors in found.items() if errors}
-
     def latched(self, joints: Iterable[str]) -> list[str]:
         """Return those of the joints whose watchdog has stopped them, or that do not say."""
         return [joint for joint in joints if not self._listens(joint)]
@@ -121,22 +112,22 @@ class Gate:
         except (NoAnswerError, RefusedError):
             return False
 
-    def check(self, reads: int) -> list[checks.Check]:
-        """Return all start-up checks. A watchdog that an earlier run left latched is cleared, where nothing else is wrong."""
+    def check(self, reads: int) -> list[preflight.Check]:
+        """Return all preflight checks. A watchdog that an earlier run left latched is cleared, where nothing else is wrong."""
         self.__servos.set_patience(CALM_PATIENCE)
         found = self._examine()
         wrong = [check for check in found if not check.ok and check.is_fatal]
         if wrong and not self.dry_run and all(check.what == "watchdog" for check in wrong):
-            checks.mend(self.__servos, wrong)
+            preflight.mend(self.__servos, wrong)
             found = self._examine()
             wrong = [check for check in found if not check.ok and check.is_fatal]
         if not wrong:
             self.__servos.set_patience(self.limits.patience)
-            found.append(checks.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
+            found.append(preflight.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
         return found
 
-    def _examine(self) -> list[checks.Check]:
-        return checks.check_servos(self.__servos, self.robot, self.hardware)
+    def _examine(self) -> list[preflight.Check]:
+        return preflight.check_servos(self.__servos, self.robot, self.hardware)
 
     # ---- life ----
 
@@ -153,18 +144,18 @@ class Gate:
         """
         self._memory = Memory()
         self.__servos.set_patience(CALM_PATIENCE)
-        self.frame = safety.make_frame(self.robot, self.frame.period, *self._register_limits())
+        self.ratings = rules.ratings_of(self.robot, self.ratings.period, *self._register_limits())
         self._armed = True
         if not self.dry_run:
             self._prepare()
-        self.goals = safety.resting(self._positions())
+        self.setpoints = rules.resting(self._positions())
         self.torque_on[:] = True
         if self.dry_run:
             self.__servos.set_patience(self.limits.patience)
             return
         servos = self.__servos
-        servos.write_goals(self._within_registers(self.goals))
-        self._confirm_goals()
+        servos.write_goals(self._within_registers(self.setpoints))
+        self._confirm_setpoints()
         for joint in JOINTS:
             servos.set(joint, "torque_enable", 1)
         self.__servos.set_patience(self.limits.patience)
@@ -210,9 +201,9 @@ class Gate:
                 return position
         raise NoAnswerError(f"no answer from {', '.join(JOINTS[k] for k in np.flatnonzero(np.isnan(position)))}")
 
-    def _confirm_goals(self) -> None:
-        """Raise :class:`InputError` where a servo holds another goal than the one that asks for no motion."""
-        counts = self.__servos.joint_map.goals(self._within_registers(self.goals))
+    def _confirm_setpoints(self) -> None:
+        """Raise :class:`InputError` where a servo holds another setpoint than the one that asks for no motion."""
+        counts = self.__servos.joint_map.goals(self._within_registers(self.setpoints))
         for joint, count in zip(JOINTS, counts.tolist(), strict=True):
             item = "goal_position" if joint in LEGS else "goal_velocity"
             held = self.__servos.get(joint, item)
@@ -220,7 +211,7 @@ class Gate:
                 raise InputError(f"{joint}: {item} is {held} after {count} was written; nothing was switched on")
 
     def _register_limits(self) -> tuple[Array, Array]:
-        """Goals (8,) that the servos take, lowest and highest, rad and rad/s."""
+        """Setpoints (8,) that the servos take, lowest and highest, rad and rad/s."""
         get, joint_map = self.__servos.get, self.__servos.joint_map
         ends = np.zeros((2, len(JOINTS)))
         for k, joint in enumerate(JOINTS):
@@ -236,38 +227,38 @@ class Gate:
 
     @property
     def written(self) -> Array:
-        """Last goals (8,) as the servos' registers hold them: what they really follow."""
-        return self.__servos.joint_map.written(self._within_registers(self.goals))
+        """Last setpoints (8,) as the servos' registers hold them: what they really follow."""
+        return self.__servos.joint_map.written(self._within_registers(self.setpoints))
 
-    def _within_registers(self, goals: Array) -> Array:
-        return np.clip(goals, self.frame.low, self.frame.high)
+    def _within_registers(self, setpoints: Array) -> Array:
+        return np.clip(setpoints, self.ratings.low, self.ratings.high)
 
-    def write(self, wanted: object, view: View, torque_on: NDArray[np.bool_] | None = None) -> Decision:
+    def write(self, wanted: object, status: RobotStatus, torque_on: NDArray[np.bool_] | None = None) -> Decision:
         """Decide on what was asked for, send what is allowed, and count what was changed.
 
         Nothing is sent on ``OFF``: the caller calls :meth:`off`.
 
         Raises:
             BusGoneError, NoAnswerError, RefusedError: a servo did not take it.
-            InputError: the gate is not armed.
+            InputError: it is not armed.
         """
         if not self._armed:
-            raise InputError("the safety gate is not armed: nothing is written")
+            raise InputError("the command limiter is not armed: nothing is written")
         limits = self._calm_limits if self.is_calm else self.limits
-        decision = safety.decide(limits, self.frame, view, self._memory, self.goals, wanted, torque_on)
+        decision = rules.decide(limits, self.ratings, status, self._memory, self.setpoints, wanted, torque_on)
         self._memory = decision.memory
         self.interventions.update({*decision.limited, *(verdict.rule for verdict in decision.verdicts)})
-        if decision.level == safety.Level.OFF:
+        if decision.level == rules.Level.OFF:
             return decision
-        self.goals = decision.goals
+        self.setpoints = decision.setpoints
         if not self.dry_run:
-            self.__servos.write_goals(self._within_registers(decision.goals))
+            self.__servos.write_goals(self._within_registers(decision.setpoints))
             self._switch(decision.torque_on)
         self.torque_on = decision.torque_on.copy()
         return decision
 
     def _switch(self, torque_on: NDArray[np.bool_]) -> None:
-        """Switch single motors; their goals, just written, ask for what they are to do."""
+        """Switch single motors; their setpoints, just written, ask for what they are to do."""
         for k in np.flatnonzero(torque_on != self.torque_on):
             self.__servos.set(JOINTS[k], "torque_enable", int(torque_on[k]))
 
@@ -289,6 +280,6 @@ class Gate:
             self._clock.wait_until(self._clock.now() + _OFF_PAUSE)
             servos.reopen_gone()
         with contextlib.suppress(ConnectionError):
-            # it goes on guarding a motor that may still be on
+            # it stays armed where a motor may still be on
             servos.write_item("bus_watchdog", {joint: 0 for joint in JOINTS if joint not in left})
         return left

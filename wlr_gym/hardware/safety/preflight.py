@@ -1,4 +1,4 @@
-"""What must be true of ports, servos and IMU before anything moves: a list of checks, each with its remedy. Reads only."""
+"""Preflight: checks of ports, servos and IMU before anything moves, each with its remedy. Reads only."""
 
 from __future__ import annotations
 
@@ -25,15 +25,24 @@ from wlr_gym.hardware.servos import Servos
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
 if TYPE_CHECKING:
-    from wlr_gym.hardware.link import Clock
+    from wlr_gym.hardware.timing import Clock
 
-FIRST_FIRMWARE, FAST_READ_FIRMWARE = 42, 45
+#: Oldest firmware that is driven.
+FIRST_FIRMWARE = 42
+#: Oldest firmware with fast reads.
+FAST_READ_FIRMWARE = 45
 #: degC at which a servo is too warm to start with: below the XL430's shutdown at 72 by enough for a run.
 WARM = 60
 #: Reads before the timed ones: the bus finds out whether its servos know fast reads.
 _UNTIMED_READS = 5
-#: s an IMU is looked at; rad/s it may be off at rest once calibrated; rad and part that gravity may be off.
-LOOK, LARGEST_RATE, LARGEST_TILT, LARGEST_SCALE = 1.0, 0.02, math.radians(10.0), 0.05
+#: s an IMU is looked at.
+LOOK_TIME = 1.0
+#: rad/s a calibrated gyroscope may read at rest.
+LARGEST_RATE = 0.02
+#: rad that gravity may be off the vertical.
+LARGEST_TILT = math.radians(10.0)
+#: Part that gravity's length may be off.
+LARGEST_LENGTH_ERROR = 0.05
 
 
 class Check(NamedTuple):
@@ -75,7 +84,7 @@ class _Rule:
 
 
 _RULES = (
-    _Rule("operating_mode", None, "goals would be read as another quantity"),
+    _Rule("operating_mode", None, "setpoints would be read as another quantity"),
     _Rule("drive_mode", 0, "direction and profile units belong in the hardware file, torque must not come on by itself"),
     _Rule(
         "homing_offset",
@@ -195,7 +204,7 @@ def _check_state(servos: Servos, joint: str) -> Iterator[Check]:
     remedy = "Find the cause, let the servo cool, then reboot it; the latch is there for a reason."
     yield Check(joint, "hardware error", not errors, ", ".join(errors) or "none", "none", remedy)
     latched = servos.get(joint, "bus_watchdog") < 0
-    remedy = "Write bus_watchdog = 0: the line went silent in an earlier run, goals are refused until then."
+    remedy = "Write bus_watchdog = 0: the line went silent in an earlier run, setpoints are refused until then."
     yield Check(joint, "watchdog", not latched, "latched" if latched else "clear", "clear", remedy, True, ("bus_watchdog", 0))
     on = bool(servos.get(joint, "torque_enable"))
     remedy = "Something else drives the robot, or a run ended badly. Switching off may drop it: hold it first."
@@ -248,7 +257,7 @@ def check_latency_timers(hardware: Hardware, system: Path = Path("/sys")) -> lis
 
 
 class ImuSamples(NamedTuple):
-    """What an IMU said over a while.
+    """Readings of an IMU over a while.
 
     Attributes:
         gyro, accelerometer: (T, 3) rad/s and m/s2.
@@ -262,7 +271,7 @@ class ImuSamples(NamedTuple):
     seconds: float
 
 
-def sample_imu(imu: Imu, clock: Clock, seconds: float = LOOK, period: float = 0.005) -> ImuSamples:
+def sample_imu(imu: Imu, clock: Clock, seconds: float = LOOK_TIME, period: float = 0.005) -> ImuSamples:
     """Listen to an IMU and return each new reading once.
 
     Raises:
@@ -282,7 +291,7 @@ def sample_imu(imu: Imu, clock: Clock, seconds: float = LOOK, period: float = 0.
     return ImuSamples(table[:, :3], table[:, 3:6], temperature, clock.now() - start)
 
 
-def check_imu(imu: Imu, port: ImuPort, clock: Clock, seconds: float = LOOK) -> list[Check]:
+def check_imu(imu: Imu, port: ImuPort, clock: Clock, seconds: float = LOOK_TIME) -> list[Check]:
     """Listen to the IMU of a robot that stands still on a level floor.
 
     Args:
@@ -326,8 +335,8 @@ def _check_rest(samples: ImuSamples) -> list[Check]:
     length = float(np.linalg.norm(force))
     tilt = math.acos(min(1.0, max(-1.0, float(force[2]) / length))) if length > 0.0 else math.pi
     calibrate = "Run wlr calibrate imu"
-    right, level = abs(length / STANDARD_GRAVITY - 1.0) < LARGEST_SCALE, f"{math.degrees(LARGEST_TILT):g} deg"
-    gravity = f"{STANDARD_GRAVITY:.2f} within {LARGEST_SCALE:.0%}"
+    right, level = abs(length / STANDARD_GRAVITY - 1.0) < LARGEST_LENGTH_ERROR, f"{math.degrees(LARGEST_TILT):g} deg"
+    gravity = f"{STANDARD_GRAVITY:.2f} within {LARGEST_LENGTH_ERROR:.0%}"
     scale = f"{calibrate} --poses 6; is accel_range the sensor's?"
     stand = "Stand the robot on a level floor; if it does, the sensor is mounted otherwise: wlr calibrate imu --mounting."
     return [

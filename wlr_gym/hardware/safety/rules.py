@@ -1,6 +1,6 @@
 """What is safe to ask of the robot: pure functions of what was wanted and what was last seen. No I/O, no clock.
 
-:func:`decide` puts them together once a control tick. :mod:`wlr_gym.hardware.safety.limiter` carries its decisions out.
+:func:`decide` puts them together once per control step. :mod:`wlr_gym.hardware.safety.limiter` carries its decisions out.
 """
 
 from __future__ import annotations
@@ -13,18 +13,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.hardware.safety.limits import Safety
+from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
+from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.physics.servo import motor_constants
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-STANDARD_GRAVITY = 9.80665
-#: s over which the accelerometer pulls the gyroscope's vertical to its own, and m/s2 it may differ from gravity to be asked.
-VERTICAL_TIME, VERTICAL_BAND = 0.5, 2.0
-#: A joint cannot turn faster than this many times its motor's no-load speed; a reading that says so is none. Counts of noise.
-OUTLIER_SPEED, OUTLIER_NOISE = 2.0, 0.03
+#: s over which the accelerometer corrects the gyroscope's vertical.
+VERTICAL_TIME = 0.5
+#: m/s2 that the accelerometer may differ from gravity while it is used for that.
+VERTICAL_BAND = 2.0
+#: Fastest believable speed of a joint, over its motor's no-load speed; a faster reading is an outlier.
+OUTLIER_SPEED = 2.0
+#: rad a reading may jump by noise alone.
+OUTLIER_NOISE = 0.03
 _N = len(JOINTS)
 _IS_LEG = np.arange(_N) < len(LEGS)
 
@@ -33,7 +37,7 @@ class Level(IntEnum):
     """What the robot may do, from harmless to worst; the worst verdict counts."""
 
     DRIVE = 0  #: as asked, within limits
-    COAST = 1  #: the last goals hold
+    COAST = 1  #: the last setpoints hold
     HOLD = 2  #: wheels stop, legs stay; goes on when the reason is over
     STOP = 3  #: as HOLD, then torque off for good
     OFF = 4  #: torque off now
@@ -47,25 +51,26 @@ class Verdict(NamedTuple):
     text: str
 
 
-#: What is found where nothing is; rules that somebody asks for, and that are no faults.
+#: The verdict where nothing is found.
 FINE = Verdict(Level.DRIVE, "", "")
+#: Rules that somebody asks for: they are no faults.
 REQUESTS = ("stop", "emergency stop")
 
 
 @dataclass(frozen=True)
-class View:
-    """What is known of the robot at a tick. Arrays are in joint order.
+class RobotStatus:
+    """What is known of the robot at a control step. Arrays are in joint order.
 
     Attributes:
         time: s.
         position, velocity, effort: (8,) last good readings, rad, rad/s, N m.
-        silence: (8,) s since the joint's last good reading; 0 = it answered in this tick.
+        silence: (8,) s since the joint's last good reading; 0 = it answered in this step.
         alert, restarted: (8,) hardware error; rebooted since the last reading.
         voltage, temperature: (8,) V, degC, as last read.
         gyro, accelerometer: (3,) rad/s, m/s2, body frame.
         imu_silence: s since the IMU's last reading.
         up: (3,) the vertical in the body frame.
-        late_ticks: ticks in a row that started a period late or more. late_share: of the last second's.
+        late_ticks: control steps in a row that started a period late or more. late_share: of the last second's.
         operator_silence: s since the operator's last sign. idle: s for which nothing was sent to the servos.
         lost: ports that are gone, in words. latched: joints that their watchdog has stopped, in words.
         trouble: why log or terminal failed.
@@ -98,7 +103,7 @@ class View:
 
 @dataclass(frozen=True)
 class Memory:
-    """What lasts from tick to tick: how long things have been beyond their limits, s."""
+    """What lasts from step to step: how long things have been beyond their limits, s."""
 
     loaded: Array = field(default_factory=lambda: np.zeros(_N))
     current: float = 0.0
@@ -108,14 +113,14 @@ class Memory:
 
 
 @dataclass(frozen=True)
-class Frame:
-    """What the limits are about: the robot's numbers and what its servos' registers allow.
+class Ratings:
+    """Ratings of the robot's motors, and what its servos' registers allow.
 
     Attributes:
-        low, high: (8,) goals the servos take, rad and rad/s.
+        low, high: (8,) setpoints the servos take, rad and rad/s.
         leg_limits: rad, of the robot file.
         stall_torque: (8,) N m. amperes: (8,) A per N m. no_load_speed: (8,) rad/s.
-        period: s of a control tick.
+        period: s of a control step.
     """
 
     low: Array
@@ -127,13 +132,13 @@ class Frame:
     period: float
 
 
-def make_frame(robot: Robot, period: float, low: Array | None = None, high: Array | None = None) -> Frame:
-    """Return the frame of a robot; without register limits (``low``, ``high``) all goals are possible."""
+def ratings_of(robot: Robot, period: float, low: Array | None = None, high: Array | None = None) -> Ratings:
+    """Return the ratings of a robot; without register limits (``low``, ``high``) all setpoints are possible."""
     motors = (robot.servo.leg, robot.servo.wheel)
     stall = np.repeat([motor.stall_torque for motor in motors], 4)
     speed = np.repeat([motor.no_load_speed for motor in motors], 4)
     constant, _ = motor_constants(stall, speed, robot.servo.supply_voltage)
-    return Frame(
+    return Ratings(
         np.full(_N, -np.inf) if low is None else low,
         np.full(_N, np.inf) if high is None else high,
         robot.leg_limits,
@@ -149,99 +154,104 @@ class Decision(NamedTuple):
 
     Attributes:
         level: what the robot may do.
-        goals: (8,) rad and rad/s, finite.
+        setpoints: (8,) rad and rad/s, finite.
         torque_on: (8,) motors that are on.
         verdicts: findings above DRIVE.
-        limited: rule -> joints whose goals it changed.
-        memory: for the next tick.
+        limited: rule -> joints whose setpoints it changed.
+        memory: for the next step.
     """
 
     level: Level
-    goals: Array
+    setpoints: Array
     torque_on: Mask
     verdicts: tuple[Verdict, ...]
     limited: dict[str, Mask]
     memory: Memory
 
+    @property
+    def worst(self) -> Verdict:
+        """The worst verdict; of equals, what was asked for: a stop in good order is one whatever else would have stopped."""
+        return max(self.verdicts, key=lambda verdict: (verdict.level, verdict.rule in REQUESTS, verdict), default=FINE)
+
 
 def decide(
-    limits: Safety,
-    frame: Frame,
-    view: View,
+    limits: SafetyLimits,
+    ratings: Ratings,
+    status: RobotStatus,
     memory: Memory,
     previous: Array,
     wanted: object,
     torque_on: Mask | None = None,
 ) -> Decision:
-    """Decide on one control tick.
+    """Decide on one control step.
 
     Args:
         limits: the robot's.
-        frame: see :func:`make_frame`.
-        view: what was last seen.
-        memory: of the tick before.
-        previous: (8,) goals of the tick before, finite.
-        wanted: goals asked for: anything; only eight finite numbers are taken.
-        torque_on: (8,) motors that are to be on; goals of the others are not looked at. None = all.
+        ratings: the robot's.
+        status: what was last seen.
+        memory: of the step before.
+        previous: (8,) setpoints of the step before, finite.
+        wanted: setpoints asked for: anything; only eight finite numbers are taken.
+        torque_on: (8,) motors that are to be on; setpoints of the others are not looked at. None = all.
     """
     on = np.ones(_N, bool) if torque_on is None else np.asarray(torque_on, bool)
-    goals, refusal = take_request(wanted, on, view.position, previous)
-    memory = remember(limits, frame, view, memory)
-    found = list(judge(limits, view, memory))
+    setpoints, refusal = take_request(wanted, on, status.position, previous)
+    memory = remember(limits, ratings, status, memory)
+    found = list(judge(limits, status, memory))
     verdicts = (*found, refusal) if refusal else tuple(found)
     level = max((verdict.level for verdict in verdicts), default=Level.DRIVE)
     if level == Level.COAST:
-        goals = previous
+        setpoints = previous
     elif level >= Level.HOLD:
-        goals = np.where(_IS_LEG, previous, 0.0)
-    start = np.where(on, previous, resting(view.position))
-    goals, limited = limit_goals(limits, frame, goals, start, view.position, slow_down(limits, view))
-    return Decision(level, goals, on, verdicts, limited if level == Level.DRIVE else {}, memory)
+        setpoints = np.where(_IS_LEG, previous, 0.0)
+    start = np.where(on, previous, resting(status.position))
+    setpoints, limited = limit_setpoints(limits, ratings, setpoints, start, status.position, slow_down(limits, status))
+    return Decision(level, setpoints, on, verdicts, limited if level == Level.DRIVE else {}, memory)
 
 
 # ---- the request ----
 
 
 def resting(position: Array) -> Array:
-    """Return goals (8,) that ask for no motion: legs where they are, wheels still."""
+    """Return setpoints (8,) that ask for no motion: legs where they are, wheels still."""
     return np.where(_IS_LEG, position, 0.0)
 
 
 def take_request(wanted: object, on: Mask, position: Array, previous: Array) -> tuple[Array, Verdict | None]:
-    """Return what was asked for as goals (8,), or the previous ones and why it was refused."""
+    """Return what was asked for as setpoints (8,), or the previous ones and why it was refused."""
     try:
-        goals = np.asarray(wanted, np.float64)
+        setpoints = np.asarray(wanted, np.float64)
     except (TypeError, ValueError):
-        return previous, Verdict(Level.STOP, "finite", f"goals of type {type(wanted).__name__} are no numbers")
-    if goals.shape != (_N,):
-        return previous, Verdict(Level.STOP, "shape", f"goals have shape {goals.shape}, expected ({_N},)")
-    goals = np.where(on, goals, resting(position))
-    if not np.isfinite(goals).all():
-        bad = int(np.flatnonzero(~np.isfinite(goals))[0])
-        return previous, Verdict(Level.STOP, "finite", f"goal of {JOINTS[bad]} is {goals[bad]}")
-    return goals, None
+        return previous, Verdict(Level.STOP, "finite", f"setpoints of type {type(wanted).__name__} are no numbers")
+    if setpoints.shape != (_N,):
+        return previous, Verdict(Level.STOP, "shape", f"setpoints have shape {setpoints.shape}, expected ({_N},)")
+    setpoints = np.where(on, setpoints, resting(position))
+    if not np.isfinite(setpoints).all():
+        bad = int(np.flatnonzero(~np.isfinite(setpoints))[0])
+        return previous, Verdict(Level.STOP, "finite", f"setpoint of {JOINTS[bad]} is {setpoints[bad]}")
+    return setpoints, None
 
 
-def limit_goals(
-    limits: Safety, frame: Frame, goals: Array, previous: Array, position: Array, wheel_share: float
+def limit_setpoints(
+    limits: SafetyLimits, ratings: Ratings, setpoints: Array, previous: Array, position: Array, wheel_share: float
 ) -> tuple[Array, dict[str, Mask]]:
-    """Return goals within all limits, and rule -> joints that it changed.
+    """Return setpoints within all limits, and rule -> joints that it changed.
 
-    The slew limit comes last, so no goal ever jumps: not even back into range from outside.
+    The slew limit comes last, so no setpoint ever jumps: not even back into range from outside.
 
     Args:
-        limits, frame: see there.
-        goals, previous: (8,) finite.
+        limits, ratings: the robot's.
+        setpoints, previous: (8,) finite.
         position: (8,) rad, as last read.
         wheel_share: of the wheel speed limit that is left.
     """
-    low = np.where(_IS_LEG, frame.leg_limits[0] + limits.leg_margin, -limits.wheel_speed * wheel_share)
-    high = np.where(_IS_LEG, frame.leg_limits[1] - limits.leg_margin, limits.wheel_speed * wheel_share)
-    low, high = np.maximum(low, frame.low), np.minimum(high, frame.high)
-    inside = np.clip(goals, low, high)
+    low = np.where(_IS_LEG, ratings.leg_limits[0] + limits.leg_margin, -limits.wheel_speed * wheel_share)
+    high = np.where(_IS_LEG, ratings.leg_limits[1] - limits.leg_margin, limits.wheel_speed * wheel_share)
+    low, high = np.maximum(low, ratings.low), np.minimum(high, ratings.high)
+    inside = np.clip(setpoints, low, high)
     near = np.clip(inside, position - limits.leg_lead, position + limits.leg_lead)
     near = np.where(_IS_LEG, np.clip(near, low, high), inside)
-    step = frame.period * np.where(_IS_LEG, limits.leg_speed, limits.wheel_acceleration)
+    step = ratings.period * np.where(_IS_LEG, limits.leg_speed, limits.wheel_acceleration)
     to_low, to_high = np.where(_IS_LEG, (previous - low, high - previous), np.inf)
     tapered = np.clip(
         near,
@@ -251,94 +261,94 @@ def limit_goals(
     slewed = np.clip(near, previous - step, previous + step)
     # beyond a limit the way back is never barred
     final = np.where(_IS_LEG & (previous >= low) & (previous <= high), tapered, slewed)
-    changes = {"limit": goals != inside, "lead": inside != near, "slew": near != slewed, "taper": final != slewed}
+    changes = {"limit": setpoints != inside, "lead": inside != near, "slew": near != slewed, "taper": final != slewed}
     return final, {rule: mask for rule, mask in changes.items() if mask.any()}
 
 
-def slow_down(limits: Safety, view: View) -> float:
+def slow_down(limits: SafetyLimits, status: RobotStatus) -> float:
     """Return the share of the wheel speed limit that the hottest servo leaves, 1 to 0."""
-    hottest = np.nanmax(view.temperature, initial=-np.inf)
+    hottest = np.nanmax(status.temperature, initial=-np.inf)
     return float(np.clip((limits.hot - hottest) / (limits.hot - limits.warm), 0.0, 1.0))
 
 
 # ---- supervision ----
 
 
-def remember(limits: Safety, frame: Frame, view: View, memory: Memory) -> Memory:
+def remember(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: Memory) -> Memory:
     """Count on how long things have been beyond their limits; loads and currents cool down as fast as they heat up."""
-    period = frame.period
-    over = np.abs(view.effort) > limits.load * frame.stall_torque
+    period = ratings.period
+    over = np.abs(status.effort) > limits.load * ratings.stall_torque
     loaded = np.maximum(memory.loaded + np.where(over, period, -period), 0.0)
-    amperes = float(np.abs(view.effort) @ frame.amperes)
+    amperes = float(np.abs(status.effort) @ ratings.amperes)
     current = max(memory.current + (period if amperes > limits.current else -period), 0.0)
-    sagging = bool(np.nanmin(view.voltage, initial=np.inf) < limits.low_voltage)
-    tilting = max(tilt_of(view.up), tilt_of(turned(view.up, view.gyro, limits.tilt_horizon))) > limits.tilt
+    sagging = bool(np.nanmin(status.voltage, initial=np.inf) < limits.low_voltage)
+    tilting = max(tilt_of(status.up), tilt_of(turned(status.up, status.gyro, limits.tilt_horizon))) > limits.tilt
     return Memory(
         loaded,
         current,
         memory.sagged + period if sagging else 0.0,
-        memory.tilted + period if tilt_of(view.up) > limits.tilt else 0.0,
+        memory.tilted + period if tilt_of(status.up) > limits.tilt else 0.0,
         memory.tilting + period if tilting else 0.0,
     )
 
 
-def judge(limits: Safety, view: View, memory: Memory) -> Iterator[Verdict]:
-    """Yield every finding of a tick."""
-    if view.asked_off:
-        yield Verdict(Level.OFF, "emergency stop", view.asked_off)
-    if view.asked_to_stop:
-        yield Verdict(Level.STOP, "stop", view.asked_to_stop)
-    if view.lost:
-        yield Verdict(Level.OFF, "port", view.lost)
-    if view.idle > limits.watchdog:
-        text = f"nothing was sent for {view.idle:.2f} s: the servos' watchdog has stopped them, and they refuse goals"
+def judge(limits: SafetyLimits, status: RobotStatus, memory: Memory) -> Iterator[Verdict]:
+    """Yield every finding of a control step."""
+    if status.asked_off:
+        yield Verdict(Level.OFF, "emergency stop", status.asked_off)
+    if status.asked_to_stop:
+        yield Verdict(Level.STOP, "stop", status.asked_to_stop)
+    if status.lost:
+        yield Verdict(Level.OFF, "port", status.lost)
+    if status.idle > limits.watchdog:
+        text = f"nothing was sent for {status.idle:.2f} s: the servos' watchdog has stopped them, and they refuse setpoints"
         yield Verdict(Level.OFF, "idle", text)
-    if view.latched:
-        text = f"{view.latched} heard nothing for too long: the servos' watchdog has stopped them, and they refuse goals"
+    if status.latched:
+        text = f"{status.latched} heard nothing for too long: the servos' watchdog has stopped them, and they refuse setpoints"
         yield Verdict(Level.STOP, "watchdog", text)
-    if view.trouble:
-        yield Verdict(Level.STOP, "computer", view.trouble)
-    yield from _judge_answers(limits, view)
-    yield from _judge_servos(limits, view, memory)
-    lean = f"{tilt_of(view.up):.2f} rad, turning at {np.linalg.norm(view.gyro[:2]):.1f} rad/s"
+    if status.trouble:
+        yield Verdict(Level.STOP, "computer", status.trouble)
+    yield from _judge_answers(limits, status)
+    yield from _judge_servos(limits, status, memory)
+    lean = f"{tilt_of(status.up):.2f} rad, turning at {np.linalg.norm(status.gyro[:2]):.1f} rad/s"
     if memory.tilted > limits.tilt_time:
         yield Verdict(Level.OFF, "tilt", f"{lean}, limit {limits.tilt:g}")
     elif memory.tilting > limits.tilt_time:
         yield Verdict(Level.STOP, "tilt ahead", f"{lean}, will pass {limits.tilt:g}")
-    if limits.deadman is not None and view.operator_silence > limits.deadman:
-        yield Verdict(Level.HOLD, "deadman", f"no sign of the operator for {view.operator_silence:.1f} s")
+    if limits.deadman is not None and status.operator_silence > limits.deadman:
+        yield Verdict(Level.HOLD, "deadman", f"no sign of the operator for {status.operator_silence:.1f} s")
     # lost answers make ticks late: the silence is judged then, not the lateness
-    if not view.silence.any() and (view.late_ticks >= limits.late or view.late_share > limits.late_share):
-        text = f"{view.late_ticks} ticks in a row late, {view.late_share:.0%} of the last second's"
+    if not status.silence.any() and (status.late_ticks >= limits.late or status.late_share > limits.late_share):
+        text = f"{status.late_ticks} ticks in a row late, {status.late_share:.0%} of the last second's"
         yield Verdict(Level.STOP, "deadlines", text)
 
 
-def _judge_answers(limits: Safety, view: View) -> Iterator[Verdict]:
+def _judge_answers(limits: SafetyLimits, status: RobotStatus) -> Iterator[Verdict]:
     """Communication ladder: coast, hold, off."""
-    longest = float(view.silence.max())
+    longest = float(status.silence.max())
     if longest > 0.0:
-        joints = ", ".join(JOINTS[k] for k in np.flatnonzero(view.silence > 0.0))
+        joints = ", ".join(JOINTS[k] for k in np.flatnonzero(status.silence > 0.0))
         text = f"no answer from {joints} for {longest:.2f} s"
         level = Level.OFF if longest > limits.silence else Level.HOLD if longest > limits.coast else Level.COAST
         yield Verdict(level, "silence", text)
-    if view.imu_silence > limits.imu_silence:
-        yield Verdict(Level.STOP, "imu", f"no reading for {view.imu_silence:.2f} s")
+    if status.imu_silence > limits.imu_silence:
+        yield Verdict(Level.STOP, "imu", f"no reading for {status.imu_silence:.2f} s")
 
 
-def _judge_servos(limits: Safety, view: View, memory: Memory) -> Iterator[Verdict]:
-    for k in np.flatnonzero(view.restarted):
+def _judge_servos(limits: SafetyLimits, status: RobotStatus, memory: Memory) -> Iterator[Verdict]:
+    for k in np.flatnonzero(status.restarted):
         yield Verdict(Level.OFF, "restart", f"{JOINTS[k]} was rebooted or had no power")
-    for k in np.flatnonzero(view.alert):
+    for k in np.flatnonzero(status.alert):
         yield Verdict(Level.STOP, "alert", f"{JOINTS[k]} has a hardware error")
-    for k in np.flatnonzero(view.temperature >= limits.hot):
-        yield Verdict(Level.STOP, "temperature", f"{JOINTS[k]} has {view.temperature[k]:.0f} degC, limit {limits.hot:g}")
+    for k in np.flatnonzero(status.temperature >= limits.hot):
+        yield Verdict(Level.STOP, "temperature", f"{JOINTS[k]} has {status.temperature[k]:.0f} degC, limit {limits.hot:g}")
     for k in np.flatnonzero(memory.loaded > limits.load_time):
-        text = f"{JOINTS[k]} gives {abs(view.effort[k]):.2f} N m, above {limits.load:.0%} of stall for {limits.load_time:g} s"
+        text = f"{JOINTS[k]} gives {abs(status.effort[k]):.2f} N m, above {limits.load:.0%} of stall for {limits.load_time:g} s"
         yield Verdict(Level.STOP, "load", text)
     if memory.current > limits.current_time:
         yield Verdict(Level.STOP, "current", f"motors above {limits.current:g} A for {limits.current_time:g} s")
     if memory.sagged > limits.low_voltage_time:
-        lowest = np.nanmin(view.voltage)
+        lowest = np.nanmin(status.voltage)
         yield Verdict(Level.STOP, "voltage", f"supply at {lowest:.1f} V, limit {limits.low_voltage:g}")
 
 
@@ -371,8 +381,8 @@ def tilt_of(up: Array) -> float:
 # ---- readings ----
 
 
-def plausible(frame: Frame, before: View, position: Array, time: float) -> Mask:
+def plausible(ratings: Ratings, before: RobotStatus, position: Array, time: float) -> Mask:
     """Return which positions (8,) a joint can have reached since the last look; NaN is none."""
-    elapsed = np.maximum(time - before.time, frame.period) + before.silence
-    reach = OUTLIER_SPEED * frame.no_load_speed * elapsed + OUTLIER_NOISE
+    elapsed = np.maximum(time - before.time, ratings.period) + before.silence
+    reach = OUTLIER_SPEED * ratings.no_load_speed * elapsed + OUTLIER_NOISE
     return np.abs(position - before.position) <= reach

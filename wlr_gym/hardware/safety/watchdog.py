@@ -23,20 +23,25 @@ from wlr_gym.hardware.dynamixel.bus import BusGroup
 from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.robot import Robot
 
-#: s the guard may take to start, s to go on trying to reach a servo, and s between looks at whether its parent lives.
-START_TIME, TRY_TIME, LOOK_TIME = 30.0, 60.0, 0.05
+#: s the process may take to start.
+START_TIME = 30.0
+#: s to go on trying to reach a servo.
+TRY_TIME = 60.0
+#: s between looks at whether its parent lives.
+LOOK_TIME = 0.05
+#: s between tries to switch off.
 _PAUSE = 0.05
 
 
-class Guard:
-    """The driving process's end.
+class WatchdogProcess:
+    """The watchdog process, seen from the driving one.
 
     Args:
         robot, hardware: ids and ports.
-        log: folder in which the guard notes what it did (``guard.jsonl``); None = nowhere.
+        log: folder in which the process notes what it did (``guard.jsonl``); None = nowhere.
 
     Raises:
-        InputError: the guard does not start.
+        InputError: the process does not start.
     """
 
     def __init__(self, robot: Robot, hardware: Hardware, log: Path | None = None) -> None:
@@ -66,10 +71,10 @@ class Guard:
         if not is_up or self.process.stdout.readline() != b"ready\n":
             self.process.kill()
             self.process.wait()
-            raise InputError("the guard process does not start; without it nothing is driven")
+            raise InputError("the watchdog process does not start; without it nothing is driven")
 
     def release(self) -> None:
-        """Tell the guard that torque is off, and let it end."""
+        """Report that torque is off, and let the process end."""
         assert self.process.stdin is not None
         with contextlib.suppress(OSError):
             self.process.stdin.write(b"done\n")
@@ -111,7 +116,7 @@ def _wait_for_the_end(parent: int) -> bool:
 
 
 def main() -> int:
-    """Guard; 1 = servos were left that did not confirm."""
+    """Watch the driving process; 1 = servos were left that did not confirm."""
     parent = os.getppid()
     for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(name, signal.SIG_IGN)

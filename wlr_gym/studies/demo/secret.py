@@ -65,7 +65,7 @@ def drive(demo: Demo, tell: Tell) -> Section:
     runs = read_dataset(demo.measured).runs
     seconds = sum(float(run["t"][-1] - run["t"][0]) for run in runs)
     html = paragraph(
-        "An emulated robot, servo by servo and register by register, is driven like a real one: start-up checks, safety gate, "
+        "An emulated robot, servo by servo and register by register, is driven like a real one: preflight, command limiter, "
         f"50 Hz, a log of what was sent and read. {_told(drivers)} Something about this robot is not in its file: drawn from "
         "the seed of this demo, and told to nobody until the end of this page."
     )

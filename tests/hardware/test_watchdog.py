@@ -1,4 +1,4 @@
-"""Real processes on real (pseudo-)terminals: kill -9, signals, and the guard. Few and short; times are bounds, not claims."""
+"""Real processes on real (pseudo-)terminals: kill -9, signals, the watchdog process. Few and short."""
 
 import os
 import signal
@@ -19,26 +19,27 @@ from wlr_gym.hardware.dynamixel.bus import BusGroup
 from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.safety.watchdog import Guard, switch_off
+from wlr_gym.hardware.safety.watchdog import WatchdogProcess, switch_off
 
 DRIVER = """
 import sys, numpy as np
 from pathlib import Path
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
-from wlr_gym.hardware.loop import StoppedError, stop_on_signals
+from wlr_gym.hardware.loop import StoppedError
+from wlr_gym.hardware.operator import stop_on_signals
 from wlr_gym.robot import load_robot
 
 options = RobotOptions(hardware=sys.argv[1], log=Path(sys.argv[2]))
 plant = make_plant("dynamixel", load_robot(), 1, PlantOptions(), hardware=options)
 try:
-    with stop_on_signals(plant.loop):
+    with stop_on_signals(plant.loop.operator):
         plant.reset()
         goals = np.array([[1.5, 1.6, 1.5, 1.6, 2.0, 2.0, 2.0, 2.0]])
         for tick in range(100000):
             plant.step(goals)
             if tick == 10:
-                print("driving", plant.loop._guard.process.pid, flush=True)
+                print("driving", plant.loop._watchdog.process.pid, flush=True)
 except StoppedError as stop:
     print("stopped:", stop)
 finally:
@@ -54,7 +55,7 @@ def server():
 
 
 def start_driver(folder, server, **safety):
-    """Return the driving process, once it drives, and its guard's process id."""
+    """Return the driving process, once it drives, and its watchdog's process id."""
     words = [sys.executable, "-c", DRIVER, str(hardware_file(folder, server.ports, **safety)), str(folder / "log")]
     driver = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True)
     assert driver.stdout is not None
@@ -89,12 +90,12 @@ def alive(pid):
 
 
 def test_kill_9_is_no_way_past_torque_off(tmp_path, server):
-    driver, guard = start_driver(tmp_path, server)
+    driver, watchdog = start_driver(tmp_path, server)
     assert all(torque(server))
     driver.kill()
     driver.wait()
     wait_until(lambda: not any(torque(server)), 10.0)
-    wait_until(lambda: not alive(guard), 10.0)
+    wait_until(lambda: not alive(watchdog), 10.0)
     assert (tmp_path / "log" / "guard.jsonl").read_text().count("torque off") == 1
     run = read_run(tmp_path / "log" / "partial_run_01.csv")  # all that was seen, readable as it is
     assert len(run.table) >= 10
@@ -102,27 +103,27 @@ def test_kill_9_is_no_way_past_torque_off(tmp_path, server):
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_signals_end_a_driving_process_in_good_order(tmp_path, server, name):
-    driver, guard = start_driver(tmp_path, server)
+    driver, watchdog = start_driver(tmp_path, server)
     driver.send_signal(getattr(signal, name))
     output, _ = driver.communicate(timeout=20)
     assert driver.returncode == 0
     assert f"stopped: stop: {name}" in output
     assert not any(torque(server))
-    wait_until(lambda: not alive(guard), 10.0)
+    wait_until(lambda: not alive(watchdog), 10.0)
     assert len(read_run(tmp_path / "log" / "run_01.csv").table) > 10
     assert not (tmp_path / "log" / "guard.jsonl").exists()  # nothing was left for it
 
 
-def test_the_guard_ends_when_it_is_told(server):
-    guard = Guard(ROBOT, HARDWARE)
-    guard.process.send_signal(signal.SIGINT)  # the terminal's Ctrl-C is not for it
-    guard.process.send_signal(signal.SIGTERM)
-    assert guard.process.poll() is None
-    guard.release()
-    assert guard.process.wait(5.0) == 0
+def test_the_watchdog_process_ends_when_it_is_told(server):
+    watchdog = WatchdogProcess(ROBOT, HARDWARE)
+    watchdog.process.send_signal(signal.SIGINT)  # the terminal's Ctrl-C is not for it
+    watchdog.process.send_signal(signal.SIGTERM)
+    assert watchdog.process.poll() is None
+    watchdog.release()
+    assert watchdog.process.wait(5.0) == 0
 
 
-def test_the_guard_waits_for_an_adapter_that_is_gone(server):
+def test_the_watchdog_process_waits_for_an_adapter_that_is_gone(server):
     groups = [
         BusGroup(
             name, server.ports[name], bus.baud_rate, {ROBOT.dynamixel_ids[j]: load_table(bus.model) for j in bus.joints}, 0.1

@@ -1,4 +1,4 @@
-"""What the safety gate holds the robot to: the ``safety`` section of ``configs/hardware/*.yaml``."""
+"""The robot's safety limits: the ``safety`` section of ``configs/hardware/*.yaml``."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from pydantic import Field, model_validator
 from wlr_gym.base.settings import SettingsModel
 
 
-class Safety(SettingsModel):
-    """Limits of the safety gate. SI units; the reasons stand in ``configs/hardware/nominal.yaml``.
+class SafetyLimits(SettingsModel):
+    """Limits of a robot, SI units; the reasons stand in ``configs/hardware/nominal.yaml``.
 
     Attributes:
-        leg_margin, leg_taper: rad that leg goals stay inside the robot file's limits, and over which they slow down before.
-        leg_speed: rad/s that leg goals may change by.
-        leg_lead: rad that a leg's goal may be ahead of the leg.
-        wheel_speed, wheel_acceleration: rad/s and rad/s2 of wheel goals.
+        leg_margin, leg_taper: rad that leg setpoints stay inside the robot file's limits, and over which they slow down before.
+        leg_speed: rad/s that leg setpoints may change by.
+        leg_lead: rad that a leg's setpoint may be ahead of the leg.
+        wheel_speed, wheel_acceleration: rad/s and rad/s2 of wheel setpoints.
         load, load_time: share of stall torque, and for how long (s) a motor may be above it.
         current, current_time: A of all motors together, and for how long (s) they may be above it.
         tilt, tilt_time, tilt_horizon: rad the body may lean, s it must last, s that the tilt is predicted ahead.
         warm, hot: degC from which wheels are slowed down, and at which the robot stops.
         low_voltage, low_voltage_time: V, and for how long (s) the supply may be below.
-        coast, silence: s without an answer for which old goals hold, and after which torque goes off.
+        coast, silence: s without an answer for which old setpoints hold, and after which torque goes off.
         imu_silence: s without a reading of the IMU.
         late, late_share: ticks in a row, and share of the last second's, that may start more than a period late.
         deadman: s that the operator may be silent; None = no operator needed.
@@ -65,7 +65,7 @@ class Safety(SettingsModel):
     off_time: float = Field(default=2.0, ge=0.0)
 
     @model_validator(mode="after")
-    def _limits_are_in_order(self) -> Safety:
+    def _limits_are_in_order(self) -> SafetyLimits:
         if not self.coast < self.silence:
             raise ValueError(f"coast {self.coast:g} s must be shorter than silence {self.silence:g} s")
         if not self.warm < self.hot:

@@ -1,4 +1,4 @@
-"""Start-up checks on the emulator: a good robot passes all; each fault fails its check alone and names a remedy."""
+"""Preflight checks on the emulator: a good robot passes all; each fault fails its check alone and names a remedy."""
 
 import pytest
 
@@ -11,7 +11,7 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware.safety import preflight as checks
+from wlr_gym.hardware.safety import preflight
 from wlr_gym.hardware.servos import Servos
 
 ROBOT = load_robot()
@@ -32,11 +32,11 @@ def servos(server):
 
 
 def failed(servos):
-    return [check for check in checks.check_servos(servos, ROBOT, HARDWARE) if not check.ok]
+    return [check for check in preflight.check_servos(servos, ROBOT, HARDWARE) if not check.ok]
 
 
 def test_a_good_robot_passes(servos):
-    found = checks.check_servos(servos, ROBOT, HARDWARE)
+    found = preflight.check_servos(servos, ROBOT, HARDWARE)
     assert [str(check) for check in found if not check.ok] == []
     assert len(found) == 8 * 17 + 4  # legs: position too
 
@@ -69,7 +69,7 @@ def test_each_fault_is_found_alone_and_mended_where_it_can_be(server, servos, it
     assert check.remedy.endswith(".")
     assert ("FAULT" if is_fatal else "warning") in str(check)
     if mendable is not None:
-        assert checks.mend(servos, [check]) == ([] if mendable else [check])
+        assert preflight.mend(servos, [check]) == ([] if mendable else [check])
         assert (failed(servos) == []) == mendable
 
 
@@ -95,7 +95,7 @@ def test_eeprom_stays_locked_under_torque(server, servos):
     servo = server.machine.servos["leg_lf"]
     servo.set("return_delay_time", 100)
     servo.set("torque_enable", 1)
-    left = checks.mend(servos, failed(servos))
+    left = preflight.mend(servos, failed(servos))
     assert {check.what for check in left} == {"torque", "return_delay_time"}
 
 
@@ -107,11 +107,11 @@ def test_old_firmware_warns_and_very_old_fails():
 
 
 def test_bus_speed_names_losses(server, servos):
-    assert checks.check_bus_speed(servos, reads=20, budget=1.0).ok
+    assert preflight.check_bus_speed(servos, reads=20, budget=1.0).ok
     for group in servos.groups.values():
         group.fast = False
     server.machine.inject("drop leg_lf")
-    check = checks.check_bus_speed(servos, reads=3, budget=9.0)
+    check = preflight.check_bus_speed(servos, reads=3, budget=9.0)
     assert not check.ok
     assert "3 of 24 answers lost" in check.found
 
@@ -121,5 +121,5 @@ def test_latency_timer(tmp_path):
     setting.parent.mkdir(parents=True)
     for value, ok in (("16", False), ("1", True)):
         setting.write_text(value + "\n")
-        (check,) = checks.check_latency_timers(HARDWARE, tmp_path)  # the wheels' port has no such file
+        (check,) = preflight.check_latency_timers(HARDWARE, tmp_path)  # the wheels' port has no such file
         assert (check.where, check.ok) == ("legs", ok)
