@@ -22,6 +22,7 @@ API = {
     "Scalar operations": "wlr_gym.physics.codegen.ops",
     "Robot": "wlr_gym.robot",
     "Parameters": "wlr_gym.robot.parameters",
+    "The parameter table": "wlr_gym.robot.parameter_table",
     "Plants": "wlr_gym.physics.plants",
     "The contract of a plant": "wlr_gym.physics.plants.base",
     "Effects": "wlr_gym.physics.effects",

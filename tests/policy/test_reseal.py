@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,8 +27,8 @@ FIRST_SERVO = "c8636cc4d3b45309"
 @pytest.fixture
 def old(tmp_path):
     """A shipped policy and its card as they were: first form of the hash, and without keys that have a default."""
-    path = shutil.copy(find_policy("velocity_blind"), tmp_path / "velocity_blind.onnx")
-    card = shutil.copy(find_policy("velocity_blind").with_suffix(".md"), tmp_path / "velocity_blind.md")
+    path = Path(shutil.copy(find_policy("velocity_blind"), tmp_path))
+    card = Path(shutil.copy(find_policy("velocity_blind").with_suffix(".md"), tmp_path))
     before, content = file_hash(path), contract_of(path)
     content["environment"]["robot"] = {"name": "wlr-nominal", "hash": FIRST_ROBOT, "servo": FIRST_SERVO}
     for column in content["environment"]["observation"]:

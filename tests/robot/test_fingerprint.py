@@ -21,14 +21,14 @@ class LaterMotor(Motor):
 
 
 class LaterServo(Servo):
-    leg: LaterMotor
+    leg: LaterMotor  # pyright: ignore[reportIncompatibleVariableOverride]
     fuse: float = Field(default=10.0, gt=0)
 
 
 class LaterRobot(Robot):
     """A robot of a later version: with fields that today's files do not have."""
 
-    servo: LaterServo
+    servo: LaterServo  # pyright: ignore[reportIncompatibleVariableOverride]
     flow: FlowSensor = Field(default_factory=FlowSensor)
     toe: tuple[float, float] = (0.0, 0.0)
 

@@ -18,8 +18,9 @@ from wlr_gym.base.files import make_output_folder
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import environment_of
 
-#: Robots and s of the episodes whose observations are compared.
-ROBOTS, SECONDS = 16, 4.0
+#: Episodes whose observations are compared, and their length, s.
+ROBOTS = 16
+SECONDS = 4.0
 #: Options of ``wlr train`` that say where and how it ran, not what it did.
 ELSEWHERE = ("--out", "--resume", "--max-minutes")
 

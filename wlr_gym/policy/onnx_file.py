@@ -22,9 +22,11 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 SUFFIX = ".onnx"
-OBSERVATION, ACTION = "observation", "action"
+OBSERVATION = "observation"
+ACTION = "action"
 #: Keys of the metadata. The fingerprint is the SHA-256 of the whole file with the fingerprint's own digits set to zero.
-CONTRACT_KEY, FINGERPRINT_KEY = "wlr_gym.contract", "wlr_gym.sha256"
+CONTRACT_KEY = "wlr_gym.contract"
+FINGERPRINT_KEY = "wlr_gym.sha256"
 BLANK = b"0" * 64
 #: As protobuf writes a metadata entry: the key, then field 2, 64 bytes long.
 FINGERPRINT = re.compile(re.escape(FINGERPRINT_KEY.encode()) + rb"\x12\x40([0-9a-f]{64})")
@@ -39,7 +41,7 @@ class OnnxPolicy:
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return actions (N, 8) for observations (N, D)."""
         (actions,) = self._session.run([ACTION], {OBSERVATION: np.ascontiguousarray(observations, np.float32)})
-        return actions  # type: ignore[return-value]
+        return np.asarray(actions, np.float32)
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
         """Nothing to forget: the graph has no memory."""

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.robot import CORNER_SIGNS
+from wlr_gym.robot.joints import CORNER_SIGNS, LEG_SLICE, WHEEL_SLICE
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -91,7 +91,7 @@ def rolling_speed(parameters: Parameters, angular_velocity_in_body: Array, joint
         angular_velocity_in_body: (N, 3) rad/s.
         joint_velocity: (N, 8) rad/s, wheels relative to their leg.
     """
-    spin = angular_velocity_in_body[:, 1:2] + joint_velocity[:, :4] + joint_velocity[:, 4:]
+    spin = angular_velocity_in_body[:, 1:2] + joint_velocity[:, LEG_SLICE] + joint_velocity[:, WHEEL_SLICE]
     return parameters["wheel.radius"] * spin
 
 
@@ -122,7 +122,7 @@ def contact_slip_velocity(
     heading = np.cross(down, _AXLE)
     left = np.cross(normal, heading)
 
-    angle = joint_position[:, :4]
+    angle = joint_position[:, LEG_SLICE]
     along_leg = np.stack([np.cos(angle), np.zeros_like(angle), -np.sin(angle)], axis=-1)
     leg = parameters["leg.length"][:, :, None] * along_leg
     to_contact = parameters["wheel.radius"][:, :, None] * down[:, None, :]
@@ -131,8 +131,8 @@ def contact_slip_velocity(
     velocity = (
         linear_velocity_in_body[:, None, :]
         + np.cross(angular_velocity_in_body[:, None, :], contact)
-        + joint_velocity[:, :4, None] * np.cross(_AXLE, leg + to_contact)
-        + joint_velocity[:, 4:, None] * np.cross(_AXLE, to_contact)
+        + joint_velocity[:, LEG_SLICE, None] * np.cross(_AXLE, leg + to_contact)
+        + joint_velocity[:, WHEEL_SLICE, None] * np.cross(_AXLE, to_contact)
     )
     return np.stack([np.einsum("nwk,nk->nw", velocity, axis) for axis in (heading, left)], axis=-1)
 

@@ -69,7 +69,8 @@ def test_a_robot_file_with_other_units_is_drawn_from_as_it_says(tmp_path, key, t
     (tmp_path / "robot.yaml").write_text(f"base: nominal\nname: other\ntolerances: {{{key}: {text}}}\n")
     env = gym.make("WLR-Velocity-v0", robot=tmp_path / "robot.yaml", randomization="nominal")
     env.reset(seed=1)
-    off = np.abs(env.unwrapped.core.plant.parameters[key] - Parameters.nominal(load_robot())[key])
+    core: Any = env.unwrapped.core  # pyright: ignore[reportAttributeAccessIssue]
+    off = np.abs(core.parameters[key] - Parameters.nominal(load_robot())[key])
     env.close()
     assert 0.0 < off.max() <= largest * (1 + 1e-9)
 

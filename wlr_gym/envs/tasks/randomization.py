@@ -22,7 +22,7 @@ from wlr_gym.envs.tasks.draws import stream_numbers, uniforms
 from wlr_gym.envs.tasks.entries import DISTRIBUTION_KEYS, Entry, EventConfig, Sampler, elements_of, entries_of
 from wlr_gym.envs.tasks.identified import identified_events
 from wlr_gym.physics.plants.base import PlantState, standing_state
-from wlr_gym.robot import LEGS, Robot
+from wlr_gym.robot import LEG_SLICE, LEGS, Robot
 from wlr_gym.robot.parameter_table import ELEMENTS, TABLE, XYZ
 from wlr_gym.robot.parameters import Parameters
 
@@ -300,10 +300,10 @@ class Randomization:
         if not self._state_width.any():
             return state
         offsets = spread * self._state_width * (2.0 * uniforms(episode_seeds, self._state_streams) - 1.0)
-        home = state.joint_position[:, :4].copy()
-        angles = np.clip(home + offsets[:, :4], *self.robot.leg_limits)
+        home = state.joint_position[:, LEG_SLICE].copy()
+        angles = np.clip(home + offsets[:, LEG_SLICE], *self.robot.leg_limits)
         state.position[:, 2] += (parameters["leg.length"] * (np.sin(angles) - np.sin(home))).mean(axis=1)
-        state.joint_position[:, :4] = state.reference_position[:, :4] = angles
+        state.joint_position[:, LEG_SLICE] = state.reference_position[:, LEG_SLICE] = angles
         state.quaternion[:, 0], state.quaternion[:, 3] = np.cos(0.5 * offsets[:, 4]), np.sin(0.5 * offsets[:, 4])
         state.linear_velocity_in_body[:], state.angular_velocity_in_body[:] = offsets[:, 5:8], offsets[:, 8:11]
         return state

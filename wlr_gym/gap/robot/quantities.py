@@ -20,9 +20,10 @@ Array = NDArray[np.float64]
 SHARED = {"ground.mu": ("ground.mu_x", "ground.mu_y"), "command.delay": ("command.delay",)}
 #: Numbers of the contact spring, of which the robot's file has a guess and no tolerance: one sigma, relative, all wheels alike.
 GUESSED = {"ground.normal_stiffness": 0.2, "ground.normal_damping": 0.5}
-#: Tolerances by which calibration may move a number; what needs more is a missing effect. Biases of the IMU are drawn each time
-#: it is switched on, and from no one's workshop: they get more room.
-REACH, REACH_OF_BIAS = 2.5, 4.0
+#: Tolerances by which calibration may move a number; what needs more is a missing effect.
+REACH = 2.5
+#: The same of the biases of the IMU. They are drawn each time it is switched on: they get more room.
+REACH_OF_BIAS = 4.0
 #: m/s; one sigma of the creep that any tyre has, all wheels alike: an effect is what goes beyond.
 CREEP = 0.001
 #: A leg's own inertia is a hundredth of its rotor's: no run shows it.
