@@ -60,6 +60,6 @@ def resolutions(robot: Robot) -> dict[str, ComparedSignal]:
         "total_turn": ComparedSignal("N m", tread * robot.hip_position.y, "friction of all wheels about the body's vertical"),
         "friction_along": ComparedSignal("N", tread, "floor on a wheel, along its heading", shared=True),
         "friction_across": ComparedSignal("N", tread, "floor on a wheel, along its axle", shared=True),
-        "slip_along": ComparedSignal("m/s", slip, "slip velocity along a wheel's heading"),
-        "slip_across": ComparedSignal("m/s", slip, "slip velocity along a wheel's axle"),
+        "slip_along": ComparedSignal("m/s", slip, "longitudinal slip velocity of a wheel"),
+        "slip_across": ComparedSignal("m/s", slip, "lateral slip velocity of a wheel"),
     }

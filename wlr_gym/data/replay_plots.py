@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -66,8 +66,10 @@ def _draw(axes: Axes, result: ReplayResult, name: str) -> None:
     run, error = result.run, result.errors[name]
     t = run["t"]
     known = np.isfinite(run[name])
-    style = {"marker": ".", "markersize": 2.5, "linestyle": ""} if COLUMNS[name].may_be_nan else {"linewidth": 2.2}
-    axes.plot(t[known], run[name][known], color=_MEASURED, label="measured", **style)  # type: ignore[arg-type]
+    style: dict[str, Any] = (
+        {"marker": ".", "markersize": 2.5, "linestyle": ""} if COLUMNS[name].may_be_nan else {"linewidth": 2.2}
+    )
+    axes.plot(t[known], run[name][known], color=_MEASURED, label="measured", **style)
     axes.plot(t, result.full[name], color=_FULL, linewidth=0.9, label="full run")
     pieces = result.segments[name].copy()
     pieces[list(result.starts)] = np.nan  # lift the pen between segments

@@ -73,7 +73,7 @@ def test_what_a_policy_is_not_fed_stays_away_under_a_condition_on_the_task():
     [
         (
             {"task": {"commands": {"terms": {"yaw_rate": [-0.5, 0.5]}}}},
-            r"seed 10.* gets another command from control tick \d+",
+            r"seed 10.* gets another command from environment step \d+",
         ),
         ({"randomization": "wide"}, r"seed 100: .* is .* and "),
         ({"randomization": {"base": "slippery", "initial_state": {"yaw": 0.1}}}, "starts in another state"),
@@ -82,7 +82,7 @@ def test_what_a_policy_is_not_fed_stays_away_under_a_condition_on_the_task():
 )
 def test_other_episodes_are_refused(monkeypatch, own, message):
     environments(monkeypatch, constant_command=own)
-    long = {"episode_length": 9.0} if "control tick" in message else SHORT
+    long = {"episode_length": 9.0} if "environment step" in message else SHORT
     with pytest.raises(InputError, match=f"'idle' and 'constant_command' were not given the same episodes: .*{message}"):
         play(ID, SUBJECTS, [Condition("main", long, episodes=2)], 100)
 

@@ -12,7 +12,7 @@ LEFT, RIGHT = [0, 2], [1, 3]
 
 
 def given(name: str, task: str) -> list[tuple[float, Rollout]]:
-    """The first, middle and last point of a sweep: its value, and two episodes of two control ticks."""
+    """The first, middle and last point of a sweep: its value, and two episodes of two environment steps."""
     sweep = SWEEPS[name]
     chosen = [sweep.points[k] for k in (0, len(sweep.points) // 2, -1)]
     conditions = {condition.label: condition for condition in sweep.conditions({"episode_length": 0.04}, 2)}

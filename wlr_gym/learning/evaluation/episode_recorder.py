@@ -15,6 +15,7 @@ from wlr_gym.data.simulation_record import ParameterChange, Simulation, departur
 from wlr_gym.data.write import write_run
 from wlr_gym.learning.evaluation.rollout import roll_out
 from wlr_gym.physics.effects import EFFECTS
+from wlr_gym.robot import FIRST_WHEEL
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -103,7 +104,9 @@ class EpisodeRecorder:
         parameters = Parameters(self._parameters[None])
         velocity, acceleration = (parameters[f"servo.profile_{name}"][0] for name in ("velocity", "acceleration"))
         return Profile(
-            leg_velocity=float(velocity[0]), leg_acceleration=float(acceleration[0]), wheel_acceleration=float(acceleration[4])
+            leg_velocity=float(velocity[0]),
+            leg_acceleration=float(acceleration[0]),
+            wheel_acceleration=float(acceleration[FIRST_WHEEL]),
         )
 
 

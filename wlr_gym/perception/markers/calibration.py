@@ -67,6 +67,7 @@ def calibrate(images: Iterable[tuple[str, NDArray[np.uint8]]], board: Board) -> 
     good = np.flatnonzero(keep)
     found = first if keep.all() else _solve([object_points[k] for k in good], [image_points[k] for k in good], size)
     matrix, deviations = found["matrix"], found["deviations"]
+    k1, k2, p1, p2, k3 = (float(k) for k in found["distortion"])
     tilt = math.sqrt(2 * max(0.0, 1 - float(np.linalg.norm(found["normals"].mean(axis=0)))))
     if tilt < _LEAST_TILT:
         raise InputError(
@@ -78,7 +79,7 @@ def calibrate(images: Iterable[tuple[str, NDArray[np.uint8]]], board: Board) -> 
         height=size[1],
         focal=(float(matrix[0, 0]), float(matrix[1, 1])),
         centre=(float(matrix[0, 2]), float(matrix[1, 2])),
-        distortion=tuple(float(k) for k in found["distortion"]),  # type: ignore[arg-type]
+        distortion=(k1, k2, p1, p2, k3),
         quality=Quality(
             views=int(keep.sum()),
             rejected=int((~keep).sum()),

@@ -57,7 +57,7 @@ def see_rolling(robot: Any, r: Any) -> None:
     """Take in how the wheels roll: wheel ``i`` rolls at v + c_i."""
     for k in range(2):
         p = r.covariance[k]
-        for i in range(4):  # one that jumps away from what the IMU tells has slipped
+        for i in range(4):  # one that jumps away from the IMU's prediction has slipped
             innovation = r.rolling[i, k] - r.velocity[k] - r.slip[k, i]
             noise = _QUIET**2 + (RADIUS * r.rolling[i, k]) ** 2
             excess = innovation * innovation - _WHEEL_GATE * (kalman.see_wheel(p, i, r.column) + noise)

@@ -159,7 +159,7 @@ def _grip(r: Any) -> None:
     """Judge which wheels grip, ``r.grips`` (4,) 0 to 1, and whether they can: ``r.loose`` 0 to 1, else.
 
     Wheels that grip must hold against those that slip: |sum of N_j s_j/|s_j|| over these, at most sum N_i over those where all
-    are on one floor. Where they would have to hold much more, the robot is on skids with all four.
+    are on one floor. Where they would have to hold much more, the robot skid-steers on all four.
     """
     held_x, held_y, holds, r.mean_square = 0.0, 0.0, 1e-12, 0.0
     for i in range(4):

@@ -30,14 +30,14 @@ def paper_pose(
         floor_rotation, floor_position: floor to camera frame. height: m, of the marker plane over the floor, taken as fixed.
         near: (M, 2) px, where each marker is, roughly (identity is given to the method).
     """
-    pixels = [_contour_mean(image, point) for point in near]
-    if any(pixel is None for pixel in pixels):
+    pixels = [pixel for point in near if (pixel := _contour_mean(image, point)) is not None]
+    if len(pixels) < len(near):
         return None
     inverse = np.linalg.inv(camera.matrix)
     eye = -floor_rotation.T @ floor_position
     points = []
     for pixel in pixels:
-        ray = floor_rotation.T @ inverse @ np.array([*pixel, 1.0])  # type: ignore[misc]
+        ray = floor_rotation.T @ inverse @ np.array([*pixel, 1.0])
         points.append((eye + ray * (height - eye[2]) / ray[2])[:2])
     places = np.array(points)
     x, y = places.mean(axis=0)
