@@ -123,7 +123,7 @@ class RunLog:
 
     def row(self, time: float, sensors: Sensors, setpoints: np.ndarray) -> None:
         """Write what was read at ``time`` (s) and what was then asked for; NaN = motor off."""
-        if self._current and time > self._last:  # a control step that was interrupted is written twice
+        if self._current and time > self._last:  # the readings of an interrupted control step come twice
             self._last = time
             values = np.concatenate([[time], setpoints, channels(sensors, 0)])
             self._tables[self._current].add(values[_ORDER])
