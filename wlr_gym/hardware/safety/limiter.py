@@ -163,7 +163,7 @@ class Gate:
             self.__servos.set_patience(self.limits.patience)
             return
         servos = self.__servos
-        servos.write_goals(self._within_registers(self.goals))
+        servos.write_setpoints(self._within_registers(self.goals))
         self._confirm_goals()
         for joint in JOINTS:
             servos.set(joint, "torque_enable", 1)
@@ -212,7 +212,7 @@ class Gate:
 
     def _confirm_goals(self) -> None:
         """Raise :class:`InputError` where a servo holds another goal than the one that asks for no motion."""
-        counts = self.__servos.joint_map.goals(self._within_registers(self.goals))
+        counts = self.__servos.joint_map.setpoint_counts(self._within_registers(self.goals))
         for joint, count in zip(JOINTS, counts.tolist(), strict=True):
             item = "goal_position" if joint in LEGS else "goal_velocity"
             held = self.__servos.get(joint, item)
@@ -261,7 +261,7 @@ class Gate:
             return decision
         self.goals = decision.goals
         if not self.dry_run:
-            self.__servos.write_goals(self._within_registers(decision.goals))
+            self.__servos.write_setpoints(self._within_registers(decision.goals))
             self._switch(decision.torque_on)
         self.torque_on = decision.torque_on.copy()
         return decision
@@ -283,7 +283,7 @@ class Gate:
             return []
         servos = self.__servos
         for _ in range(2):
-            servos.shout_off()
+            servos.torque_off_unacknowledged()
         end = self._clock.now() + self.limits.off_time
         while (left := servos.torque_off(1)) and self._clock.now() < end:
             self._clock.wait_until(self._clock.now() + _OFF_PAUSE)
