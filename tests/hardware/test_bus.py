@@ -55,6 +55,11 @@ def connect(server, patience=PATIENCE):
     return BusGroup("legs", server.ports["legs"], 1_000_000, LEGS, patience, lambda: server.machine.time)
 
 
+def read_all(group, block):
+    group.ask_all(block)
+    return group.answers()
+
+
 # --- what it is for
 
 
@@ -77,9 +82,9 @@ def test_blocks_of_all_servos_fast_and_not(group, server):
     block = Block(TABLE, "profile_acceleration", "goal_position")
     for fast in (True, False):
         group.fast = fast
-        assert {id: r.counts["profile_velocity"] for id, r in group.read_all(block).items()} == {id: 10 + id for id in LEGS}
+        assert {id: r.counts["profile_velocity"] for id, r in read_all(group, block).items()} == {id: 10 + id for id in LEGS}
     assert group.statistics.fallbacks == 0
-    readings = group.read_all(FAST_BLOCK)
+    readings = read_all(group, FAST_BLOCK)
     assert set(readings) == set(LEGS)
     assert readings[2].counts["present_position"] == server.machine.servos["leg_lf"]["present_position"]
     assert "moving_status" in readings[2].counts
@@ -87,7 +92,7 @@ def test_blocks_of_all_servos_fast_and_not(group, server):
 
 def test_block_with_gaps_decodes_like_single_items(group):
     block = Block(TABLE, "torque_enable", "position_p_gain")
-    counts = group.read_all(block)[3].counts
+    counts = read_all(group, block)[3].counts
     assert counts["position_p_gain"] == 800
     assert counts == {name: group.read(3, name) for name in counts}
 
@@ -113,7 +118,7 @@ def test_fast_reads_fall_back_for_good_on_old_firmware():
     machine = Machine(load_robot(), load_hardware(), MachineOptions(firmware=44, timing=NO_TIME))
     with Server(machine, real_time=False) as server, connect(server) as group:
         for _ in range(4):
-            assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+            assert set(read_all(group, FAST_BLOCK)) == set(LEGS)
         assert not group.fast
         assert group.statistics.fallbacks == 3
 
@@ -128,13 +133,13 @@ def test_stuffed_counts_come_through_both_ways(server, group):
     for k, byte in enumerate(data):
         server.machine.servos["leg_lf"].set(f"indirect_data_{k + 1}", byte)
     group.fast = False
-    assert bytes(group.read_all(Block(TABLE, "indirect_data_1", "indirect_data_6"))[2].counts.values()) == data
+    assert bytes(read_all(group, Block(TABLE, "indirect_data_1", "indirect_data_6"))[2].counts.values()) == data
 
 
 def test_an_alert_shows_in_group_reads(server, group):
     server.machine.inject("overload leg_rf duration=0.005")
     server.advance(0.01)
-    readings = group.read_all(FAST_BLOCK)
+    readings = read_all(group, FAST_BLOCK)
     assert {id for id, reading in readings.items() if reading.alert} == {3}
     assert group.statistics.alerts == {3: 1}
 
@@ -142,7 +147,7 @@ def test_an_alert_shows_in_group_reads(server, group):
 def test_one_missing_servo_costs_only_itself(server, group):
     server.machine.inject("drop leg_rf")  # its answer is lost; the others were heard on the line
     group.fast = False
-    assert set(group.read_all(FAST_BLOCK)) == {1, 2, 4}
+    assert set(read_all(group, FAST_BLOCK)) == {1, 2, 4}
     assert group.statistics.missing == {3: 1}
 
 
@@ -152,7 +157,7 @@ def test_an_exception_in_the_middle_does_not_block_torque_off(server, group, mon
     with monkeypatch.context() as patch:
         patch.setattr(DynamixelPort, "readPort", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
-            group.read_all(FAST_BLOCK)
+            read_all(group, FAST_BLOCK)
     assert group.torque_off() == set()
     assert not any(server.machine.servos[joint]["torque_enable"] for joint in ("leg_lf", "leg_rf", "leg_lr", "leg_rr"))
 
@@ -219,14 +224,14 @@ def test_defect_3_in_group_reads(server, group):
     line.receive = lambda data, now, baud=None: [type(e)(e.time, late + e.data) for e in answer(data, now, baud)]
     for fast in (True, False):
         group.fast = fast
-        assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+        assert set(read_all(group, FAST_BLOCK)) == set(LEGS)
 
 
 def test_defect_4_unplugging_is_one_kind_of_error(server, group):
     group.ping(2)
     server.command("unplug legs")
     server.advance(0.002)
-    for act in (lambda: group.ping(2), lambda: group.read_all(FAST_BLOCK), group.torque_off):
+    for act in (lambda: group.ping(2), lambda: read_all(group, FAST_BLOCK), group.torque_off):
         with pytest.raises(BusGoneError, match="is gone"):
             act()
 
@@ -287,7 +292,7 @@ def test_what_must_not_matter(server, group, fault):
     for fast in (True, False):
         group.fast = fast
         for _ in range(5):
-            assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+            assert set(read_all(group, FAST_BLOCK)) == set(LEGS)
     group.write(2, "led", 1)
     assert group.read(2, "led") == 1
 
@@ -300,7 +305,7 @@ def test_what_is_lost_is_reported_missing_and_never_wrong(server, fault):
         truth = {id: server.machine.servos[joint]["present_position"] for joint, id in load_robot().dynamixel_ids.items()}
         seen = 0
         for _ in range(40):
-            for id, reading in group.read_all(FAST_BLOCK).items():
+            for id, reading in read_all(group, FAST_BLOCK).items():
                 assert reading.counts["present_position"] == truth[id]
                 seen += 1
         assert 80 < seen < 158
@@ -346,7 +351,7 @@ def test_torque_off_goes_out_on_a_line_that_never_falls_quiet():
         group.write_all("torque_enable", dict.fromkeys(LEGS, 0))
         assert time.monotonic() - start < 10.0
         assert protocol.sync_write(64, dict.fromkeys(LEGS, b"\0")) in sent()
-        assert group.read_all(FAST_BLOCK) == {}
+        assert read_all(group, FAST_BLOCK) == {}
         assert group.scan() == {}
 
 
@@ -359,7 +364,7 @@ def test_a_line_that_never_falls_quiet_does_not_keep_the_other_bus_from_torque_o
         for sent in (to_legs, to_wheels):
             sent()
         start = time.monotonic()
-        servos.shout_off()
+        servos.torque_off_unacknowledged()
         assert time.monotonic() - start < 10.0
         for sent, ids in ((to_legs, LEGS), (to_wheels, (6, 7, 5, 8))):
             assert protocol.sync_write(64, dict.fromkeys(ids, b"\0")) in sent()
@@ -405,7 +410,7 @@ def test_an_answer_that_waited_for_us_is_old_but_not_stale(server):
     waited = 0.0
     group = BusGroup("legs", server.ports["legs"], 1_000_000, LEGS, PATIENCE, lambda: server.machine.time + waited)
     with group:
-        assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+        assert set(read_all(group, FAST_BLOCK)) == set(LEGS)
         group.ask_all(FAST_BLOCK)
         waited = 0.05
         readings = group.answers()
@@ -418,15 +423,15 @@ def test_stale_readings_are_dropped_and_counted(server, group):
     group.fast = False
     line = server.machine.lines["legs"]
     receive = line.receive
-    assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+    assert set(read_all(group, FAST_BLOCK)) == set(LEGS)
     old = receive(protocol.sync_read(FAST_BLOCK.address, FAST_BLOCK.length, list(LEGS)), 0.0)
     server.advance(0.1)
     line.receive = lambda data, now, baud=None: old
-    assert group.read_all(FAST_BLOCK) == {}
+    assert read_all(group, FAST_BLOCK) == {}
     assert group.statistics.stale == dict.fromkeys(LEGS, 1)
     line.receive = receive
     server.advance(0.02)
-    assert set(group.read_all(FAST_BLOCK)) == set(LEGS)
+    assert set(read_all(group, FAST_BLOCK)) == set(LEGS)
 
 
 def test_defect_6_waits_without_end_for_a_device_that_takes_no_bytes():

@@ -360,12 +360,13 @@ def test_every_limit_does_something():
 # ---- nothing gets past it ----------------------------------------------------------------------------------------------
 
 #: Functions that can move servos, and the modules that may call them (the benchmark of the bus: on the emulator only).
-WRITERS = {"write_goals", "write_item", "write_all", "syncWriteTxOnly"}
+WRITERS = {"write_setpoints", "write_item", "write_all", "send_packet"}
 ALLOWED = {
     "hardware/safety/limiter.py",
     "hardware/safety/watchdog.py",
-    "hardware/dynamixel/servos.py",
+    "hardware/servos.py",
     "hardware/dynamixel/bus.py",
+    "hardware/dynamixel/port.py",
     "studies/bench/bus.py",
 }
 

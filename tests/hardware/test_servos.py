@@ -18,7 +18,7 @@ from wlr_gym.hardware.servos import JointMap, Servos
 
 ROBOT = load_robot()
 HARDWARE = load_hardware()
-GOALS = np.array([1.3, 1.4, 1.7, 1.8, 2.0, -2.0, 1.5, 3.0])
+SETPOINTS = np.array([1.3, 1.4, 1.7, 1.8, 2.0, -2.0, 1.5, 3.0])
 
 
 @pytest.fixture
@@ -39,10 +39,10 @@ def servos(server):
 
 
 def drive(servos):
-    """Torque on and goals; reading something afterwards makes sure that the unacknowledged goals have arrived."""
+    """Torque on and setpoints; reading something afterwards makes sure that the unacknowledged setpoints have arrived."""
     for joint in JOINTS:
         servos.set(joint, "torque_enable", 1)
-    servos.write_goals(GOALS)
+    servos.write_setpoints(SETPOINTS)
     servos.read()
 
 
@@ -62,20 +62,20 @@ def test_readings_are_the_plants_own_sensors(server, servos):
     assert np.abs(readings.velocity[4:]).min() > 0.5
 
 
-def test_goals_go_where_they_should(server, servos):
+def test_setpoints_go_where_they_should(server, servos):
     drive(servos)
     server.advance(1.5)
     truth = server.machine.plant.truth()
-    np.testing.assert_allclose(truth.joint_position[0, :4], GOALS[:4], atol=0.06)  # what the position gain leaves under load
-    assert (np.sign(truth.joint_velocity[0, 4:]) == np.sign(GOALS[4:])).all()
+    np.testing.assert_allclose(truth.joint_position[0, :4], SETPOINTS[:4], atol=0.06)  # the gain leaves that under load
+    assert (np.sign(truth.joint_velocity[0, 4:]) == np.sign(SETPOINTS[4:])).all()
 
 
 def test_counts_and_si_values_are_inverse():
     joint_map = JointMap(ROBOT, HARDWARE)
-    counts = joint_map.goals(GOALS)
+    counts = joint_map.setpoint_counts(SETPOINTS)
     assert counts.tolist() == [1871, 2159, 2132, 1899, 83, 83, 63, -125]
-    np.testing.assert_allclose(joint_map.position(counts)[:4], GOALS[:4], atol=0.5 * 2 * np.pi / 4096)
-    np.testing.assert_allclose(joint_map.velocity(counts)[4:], GOALS[4:], atol=0.5 * 0.023981)
+    np.testing.assert_allclose(joint_map.position(counts)[:4], SETPOINTS[:4], atol=0.5 * 2 * np.pi / 4096)
+    np.testing.assert_allclose(joint_map.velocity(counts)[4:], SETPOINTS[4:], atol=0.5 * 0.023981)
     np.testing.assert_allclose(
         joint_map.effort(np.ones(8)), [s * e for s, e in zip([1, -1] * 4, effort_counts(ROBOT), strict=True)]
     )
@@ -83,20 +83,20 @@ def test_counts_and_si_values_are_inverse():
 
 def test_straight_down_is_the_middle_of_the_servo():
     joint_map = JointMap(ROBOT, HARDWARE)
-    assert joint_map.goals([np.pi / 2] * 4 + [0.0] * 4).tolist() == [2048] * 4 + [0] * 4
+    assert joint_map.setpoint_counts([np.pi / 2] * 4 + [0.0] * 4).tolist() == [2048] * 4 + [0] * 4
 
 
 @pytest.mark.parametrize(
-    ("goals", "words"),
+    ("setpoints", "words"),
     [
         ([1.0] * 7, r"shape \(7,\)"),
-        ([1.0, np.nan] + [0.0] * 6, "goal of leg_rf is nan"),
+        ([1.0, np.nan] + [0.0] * 6, "setpoint of leg_rf is nan"),
         ([1.0] * 7 + [np.inf], "wheel_rr is inf"),
     ],
 )
-def test_goals_that_are_none(servos, goals, words):
+def test_setpoints_that_are_none(servos, setpoints, words):
     with pytest.raises(InputError, match=words):
-        servos.write_goals(goals)
+        servos.write_setpoints(setpoints)
 
 
 def test_health_and_errors(server, servos):

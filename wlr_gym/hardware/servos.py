@@ -17,15 +17,17 @@ from wlr_gym.hardware.dynamixel.bus import PATIENCE, Block, BlockReading, BusGro
 from wlr_gym.hardware.dynamixel.errors import BusGoneError, NoAnswerError
 from wlr_gym.hardware.dynamixel.tables import HARDWARE_ERRORS, ControlTable, load_table
 from wlr_gym.physics.servo import effort_counts
-from wlr_gym.robot import JOINTS, LEGS, Robot
+from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 
 if TYPE_CHECKING:
     from wlr_gym.hardware.dynamixel.port import DynamixelPort
 
 Array = NDArray[np.float64]
 
-#: Read every tick, and read now and then.
+_IS_LEG = np.arange(len(JOINTS)) < len(LEGS)
+#: First and last item of what is read every tick ...
 _MOTION = ("realtime_tick", "present_position")
+#: ... and now and then.
 _HEALTH = ("present_input_voltage", "present_temperature")
 #: Times that a single item is asked for again.
 RETRIES = 2
@@ -60,26 +62,25 @@ class JointMap:
         """Return motor torques (8,) in N m by the nominal torque constants, before gear friction."""
         return self._sign * np.asarray(counts, np.float64) * self._effort
 
-    def goals(self, goals: ArrayLike) -> NDArray[np.int64]:
-        """Return goal counts (8,) of leg angles (rad) and wheel speeds (rad/s): Goal Position and Goal Velocity.
+    def setpoint_counts(self, setpoints: ArrayLike) -> NDArray[np.int64]:
+        """Return the counts (8,) of leg angles (rad) and wheel speeds (rad/s): Goal Position and Goal Velocity.
 
         Raises:
-            InputError: wrong shape, or a goal that is not finite; names the joint.
+            InputError: wrong shape, or a setpoint that is not finite; names the joint.
         """
-        values = np.asarray(goals, np.float64)
+        values = np.asarray(setpoints, np.float64)
         if values.shape != (len(JOINTS),):
-            raise InputError(f"goals have shape {values.shape}, expected ({len(JOINTS)},)")
+            raise InputError(f"setpoints have shape {values.shape}, expected ({len(JOINTS)},)")
         if not np.isfinite(values).all():
             bad = int(np.flatnonzero(~np.isfinite(values))[0])
-            raise InputError(f"goal of {JOINTS[bad]} is {values[bad]}, expected a finite number")
-        legs = np.arange(len(JOINTS)) < len(LEGS)
-        counts = self._sign * values / np.where(legs, self._position, self._velocity) + np.where(legs, self._zero, 0.0)
+            raise InputError(f"setpoint of {JOINTS[bad]} is {values[bad]}, expected a finite number")
+        counts = self._sign * values / np.where(_IS_LEG, self._position, self._velocity) + np.where(_IS_LEG, self._zero, 0.0)
         return np.rint(counts).astype(np.int64)
 
-    def written(self, goals: ArrayLike) -> Array:
-        """Return goals (8,) as the registers hold them: rounded to whole counts, in rad and rad/s; see :meth:`goals`."""
-        counts = self.goals(goals)
-        return np.where(np.arange(len(JOINTS)) < len(LEGS), self.position(counts), self.velocity(counts))
+    def written(self, setpoints: ArrayLike) -> Array:
+        """Return setpoints (8,) as the registers hold them: rounded to whole counts, in rad and rad/s."""
+        counts = self.setpoint_counts(setpoints)
+        return np.where(_IS_LEG, self.position(counts), self.velocity(counts))
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ class Servos:
     """All servos of a robot.
 
     Use as a context manager, or :meth:`open` and :meth:`close`. Nothing here decides what is safe: callers other than the
-    safety gate read only.
+    command limiter read only.
 
     Args:
         robot: its ``dynamixel_ids``.
@@ -258,16 +259,18 @@ class Servos:
 
     # ---- writing ----
 
-    def write_goals(self, goals: ArrayLike) -> None:
-        """Write goals (8,): leg angles in rad, wheel speeds in rad/s. Not acknowledged; out of range is ignored by the servo.
+    def write_setpoints(self, setpoints: ArrayLike) -> None:
+        """Write setpoints (8,): leg angles in rad, wheel speeds in rad/s.
+
+        Nothing is acknowledged; a servo ignores a setpoint out of its range.
 
         Raises:
-            InputError: wrong shape, or a goal that is not finite.
+            InputError: wrong shape, or a setpoint that is not finite.
             BusGoneError: a port is gone.
         """
-        counts = dict(zip(JOINTS, self.joint_map.goals(goals).tolist(), strict=True))
-        for item, joints in (("goal_position", LEGS), ("goal_velocity", JOINTS[len(LEGS) :])):
-            self.write_item(item, {joint: counts[joint] for joint in joints})
+        counts = self.joint_map.setpoint_counts(setpoints).tolist()
+        self.write_item("goal_position", dict(zip(LEGS, counts[LEG_SLICE], strict=True)))
+        self.write_item("goal_velocity", dict(zip(WHEELS, counts[WHEEL_SLICE], strict=True)))
 
     def write_item(self, item: str, counts: Mapping[str, int]) -> None:
         """Write joint -> count of one item, all joints of a bus in one packet. Not acknowledged.
@@ -280,8 +283,8 @@ class Servos:
             if here:
                 group.write_all(item, here)
 
-    def shout_off(self) -> None:
-        """Tell every motor to switch off, without waiting for anybody; a bus that is gone does not keep the others."""
+    def torque_off_unacknowledged(self) -> None:
+        """Send torque off to every servo and wait for no answer; a bus that is gone does not keep the others."""
         for group in self.groups.values():
             with contextlib.suppress(BusGoneError):
                 group.write_all("torque_enable", dict.fromkeys(group.servos, 0))

@@ -186,7 +186,7 @@ class BusGroup:
     def scan(self) -> dict[int, tuple[int, int]]:
         """Return id -> (model number, firmware) of every servo that answers; takes about 0.8 s."""
         port = self._port
-        port.send(protocol.ping(), is_answered=True)
+        port.send_packet(protocol.ping(), is_answered=True)
         port.setPacketTimeoutMillis(protocol.MAX_ID * ((_PING_DATA + 11) * port.tx_time_per_byte + _PING_SPACING) + _PING_START)
         found: dict[int, tuple[int, int]] = {}
         while (packet := port.next_answer()) is not None:
@@ -263,7 +263,7 @@ class BusGroup:
         self._asked, self._asked_at = block, self._clock()
         self.statistics.exchanges += 1
         count = len(self.servos)
-        self._port.send(protocol.sync_read(block.address, block.length, self.servos, self.fast), is_answered=True)
+        self._port.send_packet(protocol.sync_read(block.address, block.length, self.servos, self.fast), is_answered=True)
         self._port.setPacketTimeout((block.length + 11) * count + 14 + count)
 
     def answers(self) -> dict[int, BlockReading]:
@@ -295,15 +295,6 @@ class BusGroup:
         oldest = now - self._asked_at + STALE  # an answer may have waited for us, but was not given before we asked
         return {id: reading for id, reading in readings.items() if self._is_good(id, reading, oldest)}
 
-    def read_all(self, block: Block) -> dict[int, BlockReading]:
-        """Return id -> reading of every servo that answers; :meth:`ask_all` and :meth:`answers` in one.
-
-        Raises:
-            BusGoneError: the port is gone.
-        """
-        self.ask_all(block)
-        return self.answers()
-
     def _reading(self, block: Block, status: Status, now: float) -> BlockReading:
         counts = block.decode(status.data)
         age, restarted = 0.0, False
@@ -329,7 +320,7 @@ class BusGroup:
         """
         data = {id: self._table(id)[item].encode(count) for id, count in counts.items()}
         row = self._table(next(iter(counts)))[item]
-        self._port.send(protocol.sync_write(row.address, data), is_answered=False)
+        self._port.send_packet(protocol.sync_write(row.address, data), is_answered=False)
 
     def torque_off(self, retries: int = 5) -> set[int]:
         """Switch every motor off, whatever happened before; return the ids that did not confirm it.

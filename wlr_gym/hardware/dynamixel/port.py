@@ -136,7 +136,7 @@ class DynamixelPort(sdk.PortHandler):
 
     # ---- packets ----
 
-    def send(self, raw: bytes, *, is_answered: bool) -> None:
+    def send_packet(self, raw: bytes, *, is_answered: bool) -> None:
         """Send a packet; what came in before it is forgotten where that could be taken for its answer.
 
         Raises:
@@ -166,7 +166,7 @@ class DynamixelPort(sdk.PortHandler):
             raw: instruction.
             length: data bytes of a good answer.
         """
-        self.send(raw, is_answered=True)
+        self.send_packet(raw, is_answered=True)
         self.setPacketTimeout(len(raw) + 11 + (length or 3))
         while (packet := self.next_answer()) is not None:
             status = protocol.as_status(packet)

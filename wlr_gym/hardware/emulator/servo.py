@@ -31,15 +31,6 @@ BOOT_TIME = 0.3
 #: Distance from Goal Position that counts as arrived, counts.
 IN_POSITION = 16
 
-_GAINS = (
-    "velocity_i_gain",
-    "velocity_p_gain",
-    "position_d_gain",
-    "position_i_gain",
-    "position_p_gain",
-    "feedforward_2nd_gain",
-    "feedforward_1st_gain",
-)
 #: One count of Bus Watchdog, s.
 _WATCHDOG_UNIT = 0.02
 _KEPT = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}
@@ -240,10 +231,9 @@ class EmulatedServo:
             self.set("torque_enable", 0)
 
     def _enter_mode(self) -> None:
-        for name in _GAINS:
-            default = self.table[name].default
-            assert isinstance(default, int)
-            self.set(name, default)
+        for name, item in self.table.items.items():
+            if name.endswith("_gain") and isinstance(item.default, int):
+                self.set(name, item.default)
         self.set("profile_velocity", 0)
         self.set("profile_acceleration", 0)
         self.set("goal_pwm", self._get("pwm_limit"))

@@ -154,7 +154,7 @@ class CommandLimiter:
             self.__servos.set_patience(self.limits.patience)
             return
         servos = self.__servos
-        servos.write_goals(self._within_registers(self.setpoints))
+        servos.write_setpoints(self._within_registers(self.setpoints))
         self._confirm_setpoints()
         for joint in JOINTS:
             servos.set(joint, "torque_enable", 1)
@@ -203,7 +203,7 @@ class CommandLimiter:
 
     def _confirm_setpoints(self) -> None:
         """Raise :class:`InputError` where a servo holds another setpoint than the one that asks for no motion."""
-        counts = self.__servos.joint_map.goals(self._within_registers(self.setpoints))
+        counts = self.__servos.joint_map.setpoint_counts(self._within_registers(self.setpoints))
         for joint, count in zip(JOINTS, counts.tolist(), strict=True):
             item = "goal_position" if joint in LEGS else "goal_velocity"
             held = self.__servos.get(joint, item)
@@ -252,7 +252,7 @@ class CommandLimiter:
             return decision
         self.setpoints = decision.setpoints
         if not self.dry_run:
-            self.__servos.write_goals(self._within_registers(decision.setpoints))
+            self.__servos.write_setpoints(self._within_registers(decision.setpoints))
             self._switch(decision.torque_on)
         self.torque_on = decision.torque_on.copy()
         return decision
@@ -274,7 +274,7 @@ class CommandLimiter:
             return []
         servos = self.__servos
         for _ in range(2):
-            servos.shout_off()
+            servos.torque_off_unacknowledged()
         end = self._clock.now() + self.limits.off_time
         while (left := servos.torque_off(1)) and self._clock.now() < end:
             self._clock.wait_until(self._clock.now() + _OFF_PAUSE)

@@ -1,4 +1,4 @@
-"""Speed of a bus cycle: read all eight servos and write all goals, ours against dynamixel-sdk's own group classes.
+"""Speed of a bus cycle: read all eight servos and write all setpoints, ours against dynamixel-sdk's own group classes.
 
 The other side is a process of its own that answers on pseudo-terminals with what the emulator answered to the same bytes the
 first time, so that little but the host's side is measured: no wire time, no USB latency, no emulator at work.
@@ -33,7 +33,9 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.emulator import Machine
 
 _PEER = "dynamixel-sdk, GroupSyncRead (fast) and GroupSyncWrite"
-_FIRST, _LAST = "realtime_tick", "present_position"
+#: First and last item of what is read every tick.
+_FIRST = "realtime_tick"
+_LAST = "present_position"
 _TICKS_PER_SECOND = 50
 #: s beyond its own that a drive may take to start, to ramp up and to stop; one that takes longer hangs.
 _GRACE = 60.0
@@ -58,7 +60,7 @@ def measure_bus(size: Size) -> list[Measurement]:
 
 
 def _measure_cycle(size: Size) -> list[Measurement]:
-    """Cycles per second, processor time of a cycle, and the time from the readings' arrival to the goals' departure."""
+    """Cycles per second, processor time of a cycle, and the time from the readings' arrival to the setpoints' departure."""
     cycles = size(1000, 20)
     robot, hardware = load_robot(), load_hardware()
     with _answering(robot, hardware) as ports, contextlib.ExitStack() as stack:
@@ -83,7 +85,7 @@ def _measure_cycle(size: Size) -> list[Measurement]:
 
 
 def _measure_deadlines(size: Size) -> list[Measurement]:
-    """Ticks that drives at 50 Hz missed, of all rounds; how late the others started and how long goals took, once a round."""
+    """Ticks that drives at 50 Hz missed, of all rounds; how late the others started and setpoints left, once a round."""
     seconds = size(60, 2)
     drives = [_drive(seconds) for _ in range(size.rounds)]
     what = f"{seconds} s at {_TICKS_PER_SECOND} Hz on the emulated robot"
@@ -138,21 +140,21 @@ def _latency(delay: Callable[[], float], count: int) -> list[float]:
 
 @contextlib.contextmanager
 def _our_cycle(robot: Robot, hardware: Hardware) -> Iterator[tuple[Cycle, Callable[[], float]]]:
-    """A cycle of :class:`Servos`, and one that returns the s from its readings to its goals on their way."""
+    """A cycle of :class:`Servos`, and one that returns the s from its readings to its setpoints on their way."""
     from wlr_gym.hardware.servos import Servos
 
-    goals = np.array([np.pi / 2] * 4 + [1.0] * 4)
+    setpoints = np.where(np.arange(len(JOINTS)) < len(LEGS), np.pi / 2, 1.0)
     with Servos(robot, hardware, 1.0, lambda: 0.0) as servos:  # recorded answers: the servos' clocks stand still
 
         def cycle() -> None:
             if not servos.read().answered.all():
                 raise RuntimeError("an answer was lost on a pseudo-terminal")
-            servos.write_goals(goals)
+            servos.write_setpoints(setpoints)
 
         def delay() -> float:
             servos.read()
             start = time.perf_counter()
-            servos.write_goals(goals)
+            servos.write_setpoints(setpoints)
             return time.perf_counter() - start
 
         yield cycle, delay
@@ -160,7 +162,7 @@ def _our_cycle(robot: Robot, hardware: Hardware) -> Iterator[tuple[Cycle, Callab
 
 @contextlib.contextmanager
 def _sdk_cycle(robot: Robot, hardware: Hardware) -> Iterator[Cycle]:
-    """The same cycle as a user of the SDK writes it: read, values in SI units, goals in counts, write, bus after bus."""
+    """The same cycle as a user of the SDK writes it: read, values in SI units, setpoints in counts, write, bus after bus."""
     buses = [_SdkBus(robot, hardware, name) for name in hardware.buses]
 
     def cycle() -> None:
@@ -207,9 +209,9 @@ class _SdkBus:
         value = self.reader.getData(id, item.address, item.size)
         return value - (1 << 8 * item.size) if item.signed and value >> (8 * item.size - 1) else value
 
-    def write(self, goal: float) -> None:
-        """Write the same goal (rad, rad/s) to each servo."""
-        count = round(goal / self.goal_count)
+    def write(self, setpoint: float) -> None:
+        """Write the same setpoint (rad, rad/s) to each servo."""
+        count = round(setpoint / self.goal_count)
         for id in self.ids:
             self.writer.addParam(id, list(count.to_bytes(4, "little")))
         self.writer.txPacket()
