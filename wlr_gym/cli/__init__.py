@@ -1,4 +1,7 @@
-"""The ``wlr`` command. Each sub-command is a module with a frozen dataclass ``Options`` and ``run(options) -> exit code``."""
+"""The ``wlr`` command. Each sub-command is a module with its options, a frozen dataclass, and ``run(options) -> exit code``.
+
+The options of ``wlr train`` are ``train.TrainOptions``, and so on.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,16 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError, MissingPackageError, unknown_name
 
-OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+#: Exit codes; an interrupted command ends as a shell reports SIGINT (128 + 2).
+OK = 0
+FAILED = 1
+BAD_INPUT = 2
+INTERRUPTED = 130
 
 #: Modules that this command's ``--import`` named: one that starts another process hands them on.
 IMPORTED: list[str] = []
@@ -82,11 +90,17 @@ def _import_modules(words: list[str]) -> list[str]:
 
 def run_command(name: str, arguments: Sequence[str]) -> int:
     """Parse the arguments of one command and run it."""
+    module = importlib.import_module(f"wlr_gym.cli.{name}")
+    return module.run(parse(name, arguments))
+
+
+def parse(name: str, arguments: Sequence[str]) -> Any:
+    """Return the options of one command; SystemExit after ``--help`` and arguments that do not parse."""
     import tyro
 
     module = importlib.import_module(f"wlr_gym.cli.{name}")
-    options = tyro.cli(module.Options, prog=f"wlr {name}", description=module.__doc__, args=list(arguments))
-    return module.run(options)
+    kind = getattr(module, f"{name.capitalize()}Options")
+    return tyro.cli(kind, prog=f"wlr {name}", description=module.__doc__, args=list(arguments))
 
 
 def usage() -> str:

@@ -46,7 +46,7 @@ SCHEMA = 1
 
 
 @dataclass(frozen=True)
-class Options:
+class BenchOptions:
     what: tyro.conf.Positional[tuple[str, ...]] = ()
     """Measurements to make, as with --only."""
     only: tuple[str, ...] = ()
@@ -68,7 +68,7 @@ class Options:
     """gap: answers.json of another folder; its sets are not analysed again, but for those that failed."""
 
 
-def run(options: Options) -> int:
+def run(options: BenchOptions) -> int:
     """Measure, print, write."""
     asked = (*options.what, *options.only)
     for name in asked:
@@ -95,7 +95,7 @@ def run(options: Options) -> int:
     return OK
 
 
-def _blind_test(options: Options, asked: tuple[str, ...]) -> int:
+def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     """Test the gap workflow on data sets with sealed truths; print and write its score."""
     from wlr_gym.studies.bench import gap
 

@@ -29,7 +29,7 @@ STEPS, QUICK_STEPS = 3_000_000, 16_384
 
 
 @dataclass(frozen=True)
-class Options:
+class DemoOptions:
     out: Path = Path("out/demo")
     """Folder for the page and everything it was made from; a demo already in it is replaced."""
     seed: int = 0
@@ -42,7 +42,7 @@ class Options:
     """Show progress and the remaining time."""
 
 
-def run(options: Options) -> int:
+def run(options: DemoOptions) -> int:
     """Run all stages, write the page; the path of the page is the last line.
 
     Raises:
@@ -69,7 +69,7 @@ def run(options: Options) -> int:
     return INTERRUPTED if outcome.interrupted else _code(outcome.sections)
 
 
-def _demo(options: Options) -> Demo:
+def _demo(options: DemoOptions) -> Demo:
     from wlr_gym.studies.demo.settings import Demo
 
     if options.seed < 0:

@@ -25,7 +25,7 @@ ELSEWHERE = ("--out", "--resume", "--max-minutes")
 
 
 @dataclass(frozen=True)
-class Options:
+class ExportOptions:
     policy: tyro.conf.Positional[str]
     """Policy folder or run folder; with --card: policy file, or name of a shipped policy."""
     out: Path | None = None
@@ -34,7 +34,7 @@ class Options:
     """Folder that wlr evaluate --out has written: instead, write the model card beside the policy file."""
 
 
-def run(options: Options) -> int:
+def run(options: ExportOptions) -> int:
     """Export, compare, say what was written."""
     if options.card is None:
         _export(options.policy, options.out or Path("policy.onnx"))

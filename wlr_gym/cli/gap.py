@@ -17,7 +17,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.options import PatchOption
 from wlr_gym.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Options(EffectsOption):
+class GapOptions(PatchOption):
     data: tyro.conf.Positional[Path]
     """Folder of measured runs; with --rig, of recordings of the rig."""
     out: Path
@@ -45,7 +45,7 @@ class Options(EffectsOption):
     """Worker threads; default: one per core."""
 
 
-def run(options: Options) -> int:
+def run(options: GapOptions) -> int:
     """Analyse, print, write; 0 for every verdict but ``bad_data``, which is 1.
 
     Raises:
@@ -80,7 +80,7 @@ def run(options: Options) -> int:
     return FAILED if analysis.verdict == BAD_DATA else OK
 
 
-def _check(options: Options) -> None:
+def _check(options: GapOptions) -> None:
     from wlr_gym.gap.workflow import RIGS
     from wlr_gym.physics.plants import SIMULATORS
     from wlr_gym.robot import load_robot
@@ -92,7 +92,7 @@ def _check(options: Options) -> None:
         raise unknown_name("simulator", options.backend, SIMULATORS, "--backend")
     if options.rig is not None and options.rig not in RIGS:
         raise unknown_name("rig", options.rig, RIGS)
-    if options.rig is not None and (options.backend != Options.backend or options.robot is not None):
+    if options.rig is not None and (options.backend != GapOptions.backend or options.robot is not None):
         raise InputError(f"--rig {options.rig}: the rig has a simulator of its own: leave --backend and --robot out")
     if options.robot is not None:
         load_robot(options.robot)
@@ -103,7 +103,7 @@ def _check(options: Options) -> None:
         raise InputError(f"--threads {options.threads}: expected 1 or more")
 
 
-def _known(options: Options) -> Patch:
+def _known(options: GapOptions) -> Patch:
     """The effects given as known, in the vocabulary of the robot or of the rig."""
     try:
         if options.rig is None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EffectsOption:
+class PatchOption:
     """``--effects`` of every command that simulates."""
 
     effects: tuple[str, ...] = ()

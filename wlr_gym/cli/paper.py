@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Options(HardwareOption):
+class PaperOptions(HardwareOption):
     out: Path
     """Folder for the report; made if it is not there."""
     plant: tuple[str, ...] = ("reduced", "gibbs_appell", "mujoco")
@@ -46,7 +46,7 @@ class Options(HardwareOption):
     """Write figures."""
 
 
-def run(options: Options) -> int:
+def run(options: PaperOptions) -> int:
     """Drive, check, search, write; 0 when done, 1 when a robot had to stop.
 
     Raises:
@@ -90,7 +90,7 @@ def run(options: Options) -> int:
     return OK
 
 
-def _check(options: Options) -> None:
+def _check(options: PaperOptions) -> None:
     from wlr_gym.physics.plants import REAL
     from wlr_gym.studies.paper.experiments import MODELS
 
@@ -109,7 +109,7 @@ def _check(options: Options) -> None:
             raise InputError(f"--{name} {value}: expected {low} to {high}")
 
 
-def _drive(model: str, robot: Robot, options: Options, console: Console) -> dict[str, Record]:
+def _drive(model: str, robot: Robot, options: PaperOptions, console: Console) -> dict[str, Record]:
     from wlr_gym.physics.plants import REAL
     from wlr_gym.studies.paper.experiments import drive_both
 
@@ -117,7 +117,7 @@ def _drive(model: str, robot: Robot, options: Options, console: Console) -> dict
     return _drive_robot(robot, options, console) if model in REAL else drive_both(model, robot)
 
 
-def _drive_robot(robot: Robot, options: Options, console: Console) -> dict[str, Record]:
+def _drive_robot(robot: Robot, options: PaperOptions, console: Console) -> dict[str, Record]:
     """Guarded and logged; between the tests the operator carries the robot back."""
     from wlr_gym.data.format import RunMeta
     from wlr_gym.hardware.loop import stop_on_signals
@@ -136,7 +136,7 @@ def _drive_robot(robot: Robot, options: Options, console: Console) -> dict[str, 
     return records
 
 
-def _search(robot: Robot, options: Options, console: Console) -> list[Finding]:
+def _search(robot: Robot, options: PaperOptions, console: Console) -> list[Finding]:
     from wlr_gym.studies.paper.open_question import search
 
     if options.draws == 0:

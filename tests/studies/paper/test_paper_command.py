@@ -35,7 +35,7 @@ def test_report_is_written(tmp_path, capsys):
 def test_a_robot_is_asked_for_and_guarded(tmp_path, monkeypatch):
     """Like every command that moves a robot: nothing is driven without somebody there."""
     made = []
-    monkeypatch.setattr("wlr_gym.cli.paper.Options.plant_of", lambda *given: made.append(given))
+    monkeypatch.setattr("wlr_gym.cli.paper.PaperOptions.plant_of", lambda *given: made.append(given))
     monkeypatch.setattr("builtins.input", lambda *_: (_ for _ in ()).throw(EOFError))
     with pytest.raises(InputError, match="nobody there to start the robot"):
         run_command("paper", ["--out", str(tmp_path / "out"), "--plant", "dynamixel", "--draws", "0"])
