@@ -19,7 +19,7 @@ from wlr_gym.studies.bench.measure import Measurement, Size, machine
 
 if TYPE_CHECKING:
     from wlr_gym.studies.bench.convergence import Deviation
-    from wlr_gym.studies.bench.vision import Result
+    from wlr_gym.studies.bench.vision import VisionResult
 
 #: Measurement -> function. Imported when it is run.
 MEASUREMENTS = {
@@ -160,7 +160,7 @@ def _convergence_table(rows: Sequence[Deviation]) -> Table:
     return table
 
 
-def _vision_table(rows: Sequence[Result]) -> Table:
+def _vision_table(rows: Sequence[VisionResult]) -> Table:
     table = Table("what", "method", "value", "bar", "met", "samples", box=None, title="vision (rendered)", title_justify="left")
     for row in rows:
         bar = "-" if row.bar is None else f"{'>=' if row.least else '<='} {row.bar:g}"

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from wlr_gym.studies.demo.settings import Demo
     from wlr_gym.studies.demo.stage import Section
 
-STEPS, QUICK_STEPS = 3_000_000, 16_384
+STEPS = 3_000_000
+QUICK_STEPS = 16_384
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,9 @@ class DemoOptions:
     out: Path = Path("out/demo")
     """Folder for the page and everything it was made from; a demo already in it is replaced."""
     seed: int = 0
-    """Seed of everything random: training, episodes, and what the robot hides."""
+    """Seed of everything random: training, episodes, and the hidden fault."""
     steps: int | None = None
-    """Control ticks to train for, all robots together; default: three million."""
+    """Environment steps to train for, all robots together; default: three million."""
     quick: bool = False
     """Everything as short as can be, to see that it works: nothing is learnt, and nothing need be found."""
     progress: bool = True
@@ -52,15 +53,17 @@ def run(options: DemoOptions) -> int:
 
     from wlr_gym.gap.report.text import duration
     from wlr_gym.studies.demo.page import write_page
-    from wlr_gym.studies.demo.workers import LANES, run_lanes
+    from wlr_gym.studies.demo.workers import WORKERS, run_workers
 
     demo = _demo(options)
     _clear(demo.out)
     record_provenance(demo.out, {"seed": demo.seed, "steps": demo.steps, "quick": options.quick}, demo.seed)
     console, began = Console(highlight=False, soft_wrap=True), time.monotonic()
-    console.print("A policy learns; slip-aware and blind drive on ice; a robot hides a fault; the gap workflow looks for it.")
-    with progress(console, tuple(LANES), options.progress) as tell:
-        outcome = run_lanes(demo, tell)
+    console.print(
+        "A policy learns; slip-aware and blind drive on ice; a robot has a hidden fault; the gap workflow looks for it."
+    )
+    with progress(console, tuple(WORKERS), options.progress) as tell:
+        outcome = run_workers(demo, tell)
     write_page(demo, outcome.sections, outcome.interrupted)
     for one in outcome.sections:
         console.print(f"{one.title}: {one.headline or one.verdict}", markup=False)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from wlr_gym.robot import Robot
     from wlr_gym.studies.paper.experiments import Record
-    from wlr_gym.studies.paper.open_question import Finding
+    from wlr_gym.studies.paper.slip_search import SearchFinding
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,8 @@ def run(options: PaperOptions) -> int:
     from wlr_gym.hardware.loop import StoppedError
     from wlr_gym.robot import load_robot
     from wlr_gym.studies.paper import report
-    from wlr_gym.studies.paper.claims import check_all, gather
+    from wlr_gym.studies.paper.claims import check_all
+    from wlr_gym.studies.paper.evidence import gather
     from wlr_gym.studies.paper.experiments import write_tests
 
     _check(options)
@@ -136,8 +137,8 @@ def _drive_robot(robot: Robot, options: PaperOptions, console: Console) -> dict[
     return records
 
 
-def _search(robot: Robot, options: PaperOptions, console: Console) -> list[Finding]:
-    from wlr_gym.studies.paper.open_question import search
+def _search(robot: Robot, options: PaperOptions, console: Console) -> list[SearchFinding]:
+    from wlr_gym.studies.paper.slip_search import search
 
     if options.draws == 0:
         return []

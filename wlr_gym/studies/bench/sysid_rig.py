@@ -24,7 +24,7 @@ from wlr_gym.gap.rig.problem import ENCODER_NOISE, RigProblem
 from wlr_gym.gap.rig.recording import Recording
 from wlr_gym.gap.rig.replay import STEP, Replay
 from wlr_gym.physics import servo
-from wlr_gym.studies.bench.sysid import Contest, PeerProblem, PeerRun, contest_between
+from wlr_gym.studies.bench.sysid_contest import Contest, PeerProblem, PeerRun, contest_between
 
 Array = NDArray[np.float64]
 

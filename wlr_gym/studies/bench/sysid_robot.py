@@ -35,7 +35,7 @@ from wlr_gym.physics.plants.base import PlantOptions, standing_state
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.mujoco_loop import build_servo_model
-from wlr_gym.studies.bench.sysid import Contest, PeerProblem, PeerRun, contest_between
+from wlr_gym.studies.bench.sysid_contest import Contest, PeerProblem, PeerRun, contest_between
 
 Array = NDArray[np.float64]
 
