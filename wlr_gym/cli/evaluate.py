@@ -52,11 +52,16 @@ from wlr_gym.policy import shipped_names, trained_environment
 from wlr_gym.render.video import check_video
 
 BACKENDS = ("gibbs_appell", "mujoco")
-BASELINES, FULL_BASELINES = ("do_nothing", "pid"), ("do_nothing", "constant_command", "pid", "slip_compensating")
 #: What is played where no option says otherwise: quickly, and with --full.
-EPISODES, FULL_EPISODES = 64, 256
-SEEDS, FULL_SEEDS = 1, 5
-SWEEP_EPISODES, OTHER_EPISODES = 64, 64
+BASELINES = ("do_nothing", "pid")
+FULL_BASELINES = ("do_nothing", "constant_command", "pid", "slip_compensating")
+EPISODES = 64
+FULL_EPISODES = 256
+SEEDS = 1
+FULL_SEEDS = 5
+#: Episodes of each value of a sweep, and of each other condition.
+SWEEP_EPISODES = 64
+OTHER_EPISODES = 64
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Write what docs/slip_observer.md shows: ``python tests/observer/observer_page.py FIGURE.png`` prints its table."""
+"""Write what docs/slip_observer.md shows: ``python tests/perception/observer/observer_page.py FIGURE.png`` prints its table."""
 
 from __future__ import annotations
 

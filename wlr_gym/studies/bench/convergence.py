@@ -25,7 +25,10 @@ CASES = {
 }
 STEPS = (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3)
 SWEEP_COUNTS = (2, 3, 4, 6, 8)
-REFERENCE_STEP, REFERENCE_SWEEPS, MANY_SWEEPS = 1e-5, 8, 300
+#: s, and sweeps of it: the reference of steps; sweeps of the reference of sweeps.
+REFERENCE_STEP = 1e-5
+REFERENCE_SWEEPS = 8
+MANY_SWEEPS = 300
 
 
 @dataclass(frozen=True)

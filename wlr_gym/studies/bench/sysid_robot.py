@@ -43,7 +43,11 @@ Array = NDArray[np.float64]
 FREE = ("body.mass", "body.com_offset", "wheel.radius", "servo.armature", "servo.coulomb_friction")
 #: Channels that are compared.
 COMPARED = tuple(name for name in CHANNELS if name.startswith(("pos_", "vel_")) or name in ("cam_x", "cam_y", "cam_yaw"))
-RUNS, PERIOD, STEP = 2, 0.02, 0.001
+RUNS = 2
+#: s between two rows of a run.
+PERIOD = 0.02
+#: s, step that both sides fit with.
+STEP = 0.001
 #: s that the robot stands before a run begins.
 REST = 0.5
 #: MuJoCo orders joints along the tree: leg, wheel, leg, wheel, ...

@@ -21,11 +21,14 @@ from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-_WHITE, _BLACK = (0.9, 0.9, 0.9, 1.0), (0.05, 0.05, 0.05, 1.0)
+_WHITE = (0.9, 0.9, 0.9, 1.0)
+_BLACK = (0.05, 0.05, 0.05, 1.0)
 _STEP = 1e-4  # m between a disc and the one on it, so that they do not flicker through each other
 #: m; height of the markers over the body's origin: MuJoCo's robot wears a deck that the default 0.04 m would put them under.
 DECK = 0.06
-_NEAR, _FAR = 0.1, 20.0
+#: m; what the camera draws.
+_NEAR = 0.1
+_FAR = 20.0
 _SLICES = 128  # sides of what is drawn for a circle
 
 

@@ -33,7 +33,9 @@ from wlr_gym.studies.paper import reduced
 Array = NDArray[np.float64]
 
 #: Register counts of the paper's commands: 18.32 rpm, 214.577 rev/min2, 3.435 rpm.
-WHEEL_SPEED_COUNTS, WHEEL_ACCELERATION_COUNTS, LEG_SPEED_COUNTS = 80, 1, 15
+WHEEL_SPEED_COUNTS = 80
+WHEEL_ACCELERATION_COUNTS = 1
+LEG_SPEED_COUNTS = 15
 TURNS = 4
 #: rad/s, rad/s2, rad/s.
 WHEEL_SPEED = from_register("XL430-W250-T", "profile_velocity", WHEEL_SPEED_COUNTS)
@@ -41,7 +43,9 @@ WHEEL_ACCELERATION = from_register("XL430-W250-T", "profile_acceleration", WHEEL
 LEG_SPEED = from_register("XM540-W150-R", "profile_velocity", LEG_SPEED_COUNTS)
 PROFILE = Profile(wheel_acceleration=WHEEL_ACCELERATION, leg_velocity=LEG_SPEED, leg_acceleration=0.0)
 #: s per tick; s of rest before the commands, in which the robot settles on its gears, and after the wheels stopped.
-PERIOD, SETTLE, AFTER = 0.02, 1.0, 1.0
+PERIOD = 0.02
+SETTLE = 1.0
+AFTER = 1.0
 #: The nine-velocity model of :mod:`wlr_gym.studies.paper.reduced`, beside the plants of
 #: :data:`wlr_gym.physics.plants.BACKENDS`.
 REDUCED = "reduced"
@@ -82,7 +86,9 @@ class PaperTest:
         return Motion(self.name, goals, PERIOD, PROFILE)
 
 
-_LOW, _HIGH = math.radians(30), math.radians(150)
+#: Leg angles.
+_LOW = math.radians(30)
+_HIGH = math.radians(150)
 TESTS: Mapping[str, PaperTest] = {
     "test_1": PaperTest("test_1", "first test: rear legs turn", (_LOW, _LOW), (_LOW, _HIGH), (7, 8, 9, 10, 11), 0.115, 0.011),
     "test_2": PaperTest(

@@ -29,13 +29,16 @@ from wlr_gym.studies.paper.rubbing import rub
 
 Array = NDArray[np.float64]
 
-VX, VY, YAW, VZ, PITCH, FRONT, REAR = range(7)
+VX, VY, YAW, VZ, PITCH, FRONT, REAR = range(7)  # indices of u11; the wheels follow
 _WHEELS = slice(7, 11)
 #: Columns of u9 in u11, and where legs and wheels stand in u9.
 _KEPT = [VX, VY, YAW, FRONT, REAR, 7, 8, 9, 10]
-_LEGS9, _WHEELS9 = slice(3, 5), slice(5, 9)
+_LEGS9 = slice(3, 5)
+_WHEELS9 = slice(5, 9)
 #: Of the corners lf, rf, lr, rr: ahead, to the left, and which leg.
-_AHEAD, _LEFT, _LEG = np.array([1.0, 1.0, -1.0, -1.0]), np.array([1.0, -1.0, 1.0, -1.0]), np.array([0, 0, 1, 1])
+_AHEAD = np.array([1.0, 1.0, -1.0, -1.0])
+_LEFT = np.array([1.0, -1.0, 1.0, -1.0])
+_LEG = np.array([0, 0, 1, 1])
 
 
 def constants_of(parameters: Parameters) -> PaperConstants:
