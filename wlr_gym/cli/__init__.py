@@ -31,18 +31,18 @@ COMMANDS = {
     "evaluate": "score a policy or agent over many episodes, against baselines, with confidence intervals",
     "export": "write a trained policy as one file (ONNX with its contract) that runs without torch, or its model card",
     "play": "drive a robot in a window with keys or a gamepad, or into a video",
-    "replay": "drive a simulator with the commands of measured runs and report where they part",
-    "compare": "drive two plants with the same goals and report where they part, in noise units",
-    "gap": "find what the model lacks: compare with measured runs, name the missing effect, prove it on runs kept aside",
+    "replay": "drive a simulator with the commands of measured runs and report where they diverge",
+    "compare": "drive two plants with the same setpoints and report where they diverge, in noise units",
+    "gap": "find what the model lacks: compare with measured runs, name the missing effect, validate it on held-out runs",
     "record": "drive a robot or simulator through an excitation and write the measured run",
     "paper": "run the paper's experiments in several models and check its claims",
     "vision": "measure pose and slip from a video of the robot with ring markers",
     "calibrate": "calibrate the robot's joints, its IMU or a camera, or write the marker sheets to print",
-    "deploy": "drive the robot with a policy, behind the safety gate",
+    "deploy": "drive the robot with a policy, behind the command limiter",
     "doctor": "look at a robot before it drives: ports, servos, IMU, policy; names the first fault and its remedy",
     "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults on command",
     "bench": "measure the speed of the engine, the environments and training on this machine",
-    "demo": "the whole loop in about three minutes: learn, drive on ice, find the hidden fault of a robot; ends with one page",
+    "demo": "the whole loop in about three minutes: learn, drive on ice, find the hidden fault of a robot; one page",
 }
 
 

@@ -38,7 +38,7 @@ MEASUREMENTS = {
 }
 #: Measurements with rows of their own kind; each has its list in the report.
 _OWN_ROWS = ("convergence", "vision")
-#: Take long or need packages that few have: only made when they are asked for.
+#: Take long or need packages that few have: only made when named.
 _ON_REQUEST = ("vision", "bus", "learning", "sysid")
 #: Its own kind: hours, resumable, with a folder of results. See docs/gap_benchmark.md.
 BLIND_TEST = "gap"
@@ -59,7 +59,7 @@ class BenchOptions:
     quick: bool = False
     """Tiny sizes: shows that it runs; the numbers mean nothing."""
     out: Path | None = None
-    """gap: folder for results, truths and the score; an interrupted test goes on from it."""
+    """gap: folder for results, truths and the score; an interrupted test resumes from it."""
     sets: int = 240
     """gap: data sets."""
     processes: int = 2
@@ -96,7 +96,7 @@ def run(options: BenchOptions) -> int:
 
 
 def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
-    """Test the gap workflow on data sets with sealed truths; print and write its score."""
+    """Test the gap workflow on data sets with hidden truths; print and write its score."""
     from wlr_gym.studies.bench import gap
 
     if len(asked) > 1:

@@ -1,4 +1,4 @@
-"""Drive two plants with the same goals and parameters, and report where they part, in units of sensor noise.
+"""Drive two plants with the same setpoints and parameters, and report where they diverge, in units of sensor noise.
 
 Writes compare.json, report.md, a map of all differences, a figure per motion, config.yaml and provenance.yaml. docs/compare.md
 says how to read them.

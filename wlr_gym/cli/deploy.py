@@ -1,4 +1,4 @@
-"""Drive the robot with a policy: check, ramp to the start pose, run at 50 Hz behind the safety gate, stop, torque off.
+"""Drive the robot with a policy: check, ramp to the start pose, run at 50 Hz behind the command limiter, stop, torque off.
 
 Space switches the motors off at once, q stops, and so do Ctrl-C, SIGTERM and SIGHUP. Try it without a robot: --emulated. Wheels
 off the ground the first time; see docs/robot.md.
@@ -224,7 +224,7 @@ def status_table(loop: ControlLoop, core: Core) -> Any:
     table = Table(
         box=None, title=f"{loop.phase.value}  {core.ticks[0] * core.task.config.control_period:.1f} s", title_justify="left"
     )
-    for name in ("joint", "angle rad", "goal", "speed rad/s", "effort N m", "degC", "V"):
+    for name in ("joint", "angle rad", "setpoint", "speed rad/s", "effort N m", "degC", "V"):
         table.add_column(name, justify="left" if name == "joint" else "right")
     view = loop.view
     if view is None:
@@ -234,7 +234,7 @@ def status_table(loop: ControlLoop, core: Core) -> Any:
         table.add_row(joint, *(f"{number:.2f}" for number in numbers), style="red" if view.silence[k] > 0 else "")
     command = "  ".join(f"{name} {value:+.2f}" for name, value in zip(core.task.commands, core.command[0], strict=True))
     limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
-    table.caption = f"{command}\ntilt {tilt_of(view.up):.2f} rad  ticks missed {loop.pacer.missed}\nsafety gate: {limited}"
+    table.caption = f"{command}\ntilt {tilt_of(view.up):.2f} rad  ticks missed {loop.pacer.missed}\ncommand limiter: {limited}"
     table.caption_justify = "left"
     return table
 
@@ -254,6 +254,6 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
             table.add_row(name, *(f"{value:.2f}" for value in values.values()))
     console.print(table)
     limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
-    console.print(f"safety gate, ticks: {limited}")
+    console.print(f"command limiter, ticks: {limited}")
     if result.run is not None:
         console.print(f"written: {result.run}", soft_wrap=True)

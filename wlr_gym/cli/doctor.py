@@ -74,7 +74,7 @@ def run(options: DoctorOptions) -> int:
 
 
 def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions, console: Console) -> list[Check]:
-    """Return all checks of ports, adapters, servos, buses and IMU; mends and scans on the way, where that was asked for."""
+    """Return all checks of ports, adapters, servos, buses and IMU; mends and scans on the way, where the options say so."""
     from wlr_gym.hardware.dynamixel.sdk import BusGoneError
     from wlr_gym.hardware.loop import TIMED_READS
     from wlr_gym.hardware.safety import preflight as checks

@@ -20,7 +20,7 @@ Tell = Callable[[str, str, float], None]
 def progress(console: Console, workers: Sequence[str] = ("",), shown: bool = True) -> Iterator[Tell]:
     """Show a bar for each worker; without a terminal, a line whenever another stage of a worker begins.
 
-    A stage's name ends at the first colon of what is told.
+    A stage's name ends at the first colon of its text.
     """
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 

@@ -1,7 +1,7 @@
 """Record measured runs: drive the robot, an emulated one or a simulator through a motion, and log it in the run format.
 
 ``--list`` shows the excitations: motions that bring out what a robot is made of. A motion may also come from a file
-(``--commands``), and be written into one (``--commands-only``). On a robot everything goes through the safety gate; Ctrl-C
+(``--commands``), and be written into one (``--commands-only``). On a robot everything goes through the command limiter; Ctrl-C
 stops it in good order.
 """
 
@@ -32,12 +32,12 @@ class RecordOptions(RobotOption, PatchOption):
 
     Attributes:
         excitation: motions to drive, by name; several make a data set.
-        commands: files with goals to drive: of --commands-only, or of whole runs.
+        commands: files with setpoints to drive: of --commands-only, or of whole runs.
         out: folder for the runs; made if it is not there.
         backend: dynamixel = the robot (with --emulated an emulated one), or a simulator: gibbs_appell, mujoco.
         seed: of the motions, and of a simulator's noise.
         seconds: cut each motion off after this long.
-        commands_only: write the goals only, one file per motion.
+        commands_only: write the setpoints only, one file per motion.
         list: show the excitations.
         ground: what the floor is like, for meta.yaml.
         notes: free text for meta.yaml.
@@ -95,7 +95,7 @@ def run(options: RecordOptions) -> int:
 
 
 def read_motions(options: RecordOptions, robot: Robot) -> Sequence[Motion]:
-    """Return the motions that were asked for.
+    """Return the chosen motions.
 
     Raises:
         InputError: none, or one that cannot be read.
@@ -145,7 +145,7 @@ def _report(motion: Motion, drive: Drive, console: Console) -> None:
     )
     changed = drive.statistics["interventions"]
     if changed:
-        console.print(f"  safety gate: {', '.join(f'{rule} in {count} ticks' for rule, count in changed.items())}")
+        console.print(f"  command limiter: {', '.join(f'{rule} in {count} ticks' for rule, count in changed.items())}")
     if drive.run is not None:
         console.print(f"  written: {drive.run}")
         for finding in read_run(drive.run).findings if drive.ticks > 1 else ():

@@ -1,7 +1,7 @@
-"""Drive a simulator, or the robot, with the commands of measured runs and report where the two part.
+"""Drive a simulator, or the robot, with the commands of measured runs and report where the two diverge.
 
-``--backend dynamixel`` is the robot (with ``--emulated`` an emulated one): goals go through the safety gate, and its log is
-compared with the run.
+``--backend dynamixel`` is the robot (with ``--emulated`` an emulated one): setpoints go through the command limiter, and its log
+is compared with the run.
 
 Writes errors.json (run, channel: errors in units and in sensor noise), overlay plots, config.yaml and provenance.yaml.
 """
@@ -161,7 +161,7 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
             plant.close()
         interventions = drive.statistics["interventions"]
         changed = ", ".join(f"{rule} in {count} ticks" for rule, count in interventions.items()) or "nothing changed"
-        console.print(f"{measured.name}: {drive.ticks} of {len(motion.goals)} ticks driven; safety gate: {changed}")
+        console.print(f"{measured.name}: {drive.ticks} of {len(motion.goals)} ticks driven; command limiter: {changed}")
         if drive.reason or drive.run is None:
             console.print(f"stopped: {drive.reason or 'nothing was logged'}", style="red")
             return

@@ -34,7 +34,7 @@ class HardwareOption:
     """An emulated robot in this process and in emulated time, instead of the ports."""
 
     def load_hardware(self) -> Hardware:
-        """Return the hardware, with the ports asked for.
+        """Return the hardware, with the ports of ``--port``.
 
         Raises:
             InputError: unknown or broken file, a port that is not name=value, or a name that is no bus.
@@ -65,7 +65,7 @@ class HardwareOption:
         return emulated_link(Machine(robot, hardware))
 
     def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
-        """Return the robot as a plant, limp; every start is logged in a new run of ``log``."""
+        """Return the robot as a plant, torque off; every start is logged in a new run of ``log``."""
         from wlr_gym.hardware.plant import RobotPlant
         from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 
@@ -82,7 +82,7 @@ class RobotOption(HardwareOption):
     """Robot file or config name."""
 
     def load(self) -> tuple[Robot, Hardware]:
-        """Return the robot and its hardware, with the ports asked for; see :meth:`load_hardware`."""
+        """Return the robot and its hardware, with the ports of ``--port``; see :meth:`load_hardware`."""
         from wlr_gym.robot import load_robot
 
         return load_robot(self.robot), self.load_hardware()
@@ -106,7 +106,7 @@ class RobotOption(HardwareOption):
 
 
 def confirm(motion: Motion, robot: Robot, console: Console) -> None:
-    """Say what the robot is about to do, and wait for Enter; before every motion: after one the robot stands elsewhere, limp.
+    """Say what the robot is about to do, and wait for Enter; before every motion: after one it is elsewhere, torque off.
 
     Raises:
         InputError: nobody there.

@@ -1,4 +1,4 @@
-"""Train an agent on an environment. Ctrl-C saves a checkpoint; --resume goes on from the newest one."""
+"""Train an agent on an environment. Ctrl-C saves a checkpoint; --resume continues from the newest one."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class TrainOptions(PatchOption):
     out: Path | None = None
     """Run folder; default: runs_out/<env>_<config or agent>_<seed>."""
     resume: Path | None = None
-    """Run folder to go on with; its own environment, agent and settings are used."""
+    """Run folder to resume; its own environment, agent and settings are used."""
     max_minutes: float | None = None
     """Stop in good order after this time."""
     progress: bool = True

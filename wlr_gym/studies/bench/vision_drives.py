@@ -18,7 +18,7 @@ from wlr_gym.perception.scene import Look, Patch, Pose, Renderer, plate_patch, r
 from wlr_gym.perception.vision.track import Frame
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, standing_state
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -123,7 +123,7 @@ def _drive(
         leg_goals, wheel_goals = goals(time - time % (ROW * TICK) if tick % ROW else time)
         goal = np.array([[*leg_goals, *wheel_goals]])
         truth = plant.truth()
-        truths.append(np.concatenate([truth.position[0], truth.quaternion[0], truth.joint_position[0, :4]]))
+        truths.append(np.concatenate([truth.position[0], truth.quaternion[0], truth.joint_position[0, LEG_SLICE]]))
         if tick > 0:
             slips[tick] = slips[tick - 1] + truth.slip_displacement[0].reshape(4, 2)
         if tick % ROW == 0:
@@ -138,8 +138,8 @@ def _drive(
 
 def _start(robot: Robot, parameters: Parameters, legs: list[float], x: float) -> PlantState:
     state = standing_state(robot, parameters, legs[0])  # sin is the same for all legs, so the body is level
-    state.joint_position[:, :4] = legs
-    state.reference_position[:, :4] = legs
+    state.joint_position[:, LEG_SLICE] = legs
+    state.reference_position[:, LEG_SLICE] = legs
     state.position[:, 0] = x
     return state
 

@@ -16,7 +16,7 @@ from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.scene import PLATE, Look, Pose, circles_of, develop
 from wlr_gym.render.gl import Canvas
 from wlr_gym.render.stage import Stage
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import LEGS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ class MujocoStudio:
         self._scene = mujoco.MjvScene(model, maxgeom=600)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_HAZE):
             self._scene.flags[flag] = 0
-        self._joints = [int(model.joint(joint).qposadr[0]) for joint in JOINTS[:4]]
+        self._joints = [int(model.joint(joint).qposadr[0]) for joint in LEGS]
 
     def frame(self, pose: Pose, look: Look, seed: int) -> NDArray[np.uint8]:
         """Draw the robot at ``pose`` (H, W), then let ``look`` blur it and add noise."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.paper import printed, reduced
 from wlr_gym.studies.paper.evidence import DRAG, VARIANTS, PaperEvidence
@@ -167,7 +168,7 @@ def _coefficient(e: PaperEvidence) -> tuple[str, str]:
 
 
 def _four_turns(e: PaperEvidence) -> tuple[str, str]:
-    turns = np.array([e.plant[test].joint_position[-1, 0, 4:] / (2 * math.pi) for test in TESTS])
+    turns = np.array([e.plant[test].joint_position[-1, 0, WHEEL_SLICE] / (2 * math.pi) for test in TESTS])
     four = np.abs(turns - 4.0) < 0.05
     return (
         f"{WHEEL_SPEED * _RPM:.2f} rpm = 80 counts, {WHEEL_ACCELERATION * 3600 / (2 * math.pi):.2f} rev/min2 = 1 count, "
@@ -303,10 +304,10 @@ def _oversteer(e: PaperEvidence) -> tuple[str, str]:
 
 
 def _limits(e: PaperEvidence) -> tuple[str, str]:
-    hip = max(float(np.abs(e.plant[test].torque[..., :4]).max()) for test in TESTS)
-    wheel = max(float(np.abs(e.plant[test].torque[..., 4:]).max()) for test in TESTS)
+    hip = max(float(np.abs(e.plant[test].torque[..., LEG_SLICE]).max()) for test in TESTS)
+    wheel = max(float(np.abs(e.plant[test].torque[..., WHEEL_SLICE]).max()) for test in TESTS)
     rates = [np.abs(e.plant[test].joint_velocity[e.plant[test].time > 0.0]) * _RPM for test in TESTS]
-    leg_rate, wheel_rate = (max(float(rate[..., part].max()) for rate in rates) for part in (slice(0, 4), slice(4, 8)))
+    leg_rate, wheel_rate = (max(float(rate[..., part].max()) for rate in rates) for part in (LEG_SLICE, WHEEL_SLICE))
     return (
         f"hips {hip:.2f} of 7.3 N m and {leg_rate:.1f} rpm, wheels {wheel:.2f} of 1.5 N m and {wheel_rate:.1f} rpm; 66 rpm "
         "belongs to 14.8 V, 53 rpm to 12 V",

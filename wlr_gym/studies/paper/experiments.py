@@ -25,7 +25,7 @@ from wlr_gym.physics.plants.base import Plant, PlantOptions, RobotOptions, Senso
 from wlr_gym.physics.plants.forces import Force
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.physics.servo import from_register
-from wlr_gym.robot import Robot
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import no_slip_error
 from wlr_gym.studies.paper import reduced
@@ -80,7 +80,7 @@ class PaperTest:
         times = PERIOD * np.arange(round((SETTLE + duration() + AFTER) / PERIOD)) - SETTLE
         commanded = (times > -0.5 * PERIOD)[:, None]
         goals = np.full((len(times), 8), np.nan)
-        goals[:, :4] = np.where(commanded, np.repeat(self.end, 2), np.repeat(self.start, 2))
+        goals[:, LEG_SLICE] = np.where(commanded, np.repeat(self.end, 2), np.repeat(self.start, 2))
         driven = slice(4, 8) if self.rear_driven else slice(4, 6)
         goals[:, driven] = np.where(commanded[:, 0] & (times < stop_time() - 0.5 * PERIOD), WHEEL_SPEED, 0.0)[:, None]
         return Motion(self.name, goals, PERIOD, PROFILE)
@@ -319,7 +319,7 @@ def _record(model: str, test: PaperTest, rows: list[Row], every: int) -> Record:
     found = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     time = np.asarray(PERIOD * every * np.arange(len(rows)) - SETTLE, dtype=np.float64)
     start = int(np.argmin(np.abs(time)))
-    found["joint_position"][:, :, 4:] -= found["joint_position"][start, :, 4:]
+    found["joint_position"][:, :, WHEEL_SLICE] -= found["joint_position"][start, :, WHEEL_SLICE]
     found["position"][:, :, :2] -= found["position"][start, :, :2]
     found["slip_path"] = found["slip_path"] - found["slip_path"][start]
     found["attitude"][:, :, 0] = np.unwrap(found["attitude"][:, :, 0], axis=0)
