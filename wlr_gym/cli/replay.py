@@ -1,7 +1,7 @@
 """Drive a simulator, or the robot, with the commands of measured runs and report where the two diverge.
 
-``--backend dynamixel`` is the robot (with ``--emulated`` an emulated one): setpoints go through the command limiter, and its log
-is compared with the run.
+``--backend dynamixel`` is the robot (with ``--emulated`` an emulated one): setpoints go through the command limiter, and its
+log is compared with the run.
 
 Writes errors.json (run, channel: errors in units and in sensor noise), overlay plots, config.yaml and provenance.yaml.
 """
