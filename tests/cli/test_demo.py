@@ -12,12 +12,12 @@ import pytest
 from wlr_gym.cli import INTERRUPTED, main
 from wlr_gym.data import read_dataset
 from wlr_gym.physics.effects import load_patch
-from wlr_gym.studies.demo import workers as lanes
+from wlr_gym.studies.demo import workers
 from wlr_gym.studies.demo.settings import Demo
 from wlr_gym.studies.demo.stage import SKIPPED
 
 COMMAND = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "demo", "--quick"]
-TITLES = [stage.title for stages in lanes.LANES.values() for stage in stages]
+TITLES = [stage.title for stages in workers.WORKERS.values() for stage in stages]
 
 
 @pytest.mark.slow
@@ -42,12 +42,12 @@ def test_the_whole_loop_ends_in_one_page(tmp_path, capsys):
 
 def test_what_is_not_installed_is_left_out_and_said(tmp_path, monkeypatch):
     def missing(package, extra):
-        raise lanes.MissingPackageError(f"this needs the package '{package}': pip install 'wlr-gym[{extra}]'")
+        raise workers.MissingPackageError(f"this needs the package '{package}': pip install 'wlr-gym[{extra}]'")
 
-    monkeypatch.setattr(lanes, "require_package", missing)
+    monkeypatch.setattr(workers, "require_package", missing)
     sent = []
-    for lane in lanes.LANES:
-        lanes.work(lane, Demo(tmp_path), sent.append)
+    for worker in workers.WORKERS:
+        workers.work(worker, Demo(tmp_path), sent.append)
     sections = [message["section"] for message in sent if "section" in message]
     assert [one["title"] for one in sections] == TITLES
     assert [one["verdict"] for one in sections[:3]] == [SKIPPED] * 3
@@ -60,18 +60,20 @@ def test_a_stage_that_fails_does_not_take_the_others_with_it(tmp_path, monkeypat
     def broken(demo, tell):
         raise RuntimeError("boom")
 
-    monkeypatch.setattr(lanes, "LANES", {"one": (lanes.Stage("bad", broken, 0.5), lanes.Stage("good", _good, 0.5))})
+    monkeypatch.setattr(
+        workers, "WORKERS", {"one": (workers.DemoStage("bad", broken, 0.5), workers.DemoStage("good", _good, 0.5))}
+    )
     sent = []
-    lanes.work("one", Demo(tmp_path), sent.append)
+    workers.work("one", Demo(tmp_path), sent.append)
     bad, good = (message["section"] for message in sent if "section" in message)
-    assert (bad["verdict"], good["verdict"]) == (lanes.FAILED, "shown")
+    assert (bad["verdict"], good["verdict"]) == (workers.FAILED, "shown")
     assert "RuntimeError: boom" in bad["html"]
     assert "RuntimeError: boom" in capsys.readouterr().err
 
 
 def _good(demo, tell):
     tell("working", 0.5)
-    return lanes.Section("good", "it works", "<p>fine</p>")
+    return workers.Section("good", "it works", "<p>fine</p>")
 
 
 @pytest.mark.slow

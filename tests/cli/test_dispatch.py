@@ -29,7 +29,7 @@ def command(monkeypatch):
             return outcome
 
         module = types.ModuleType("wlr_gym.cli.probe")
-        module.__dict__.update(Options=NoOptions, run=run)
+        module.__dict__.update(ProbeOptions=NoOptions, run=run)
         monkeypatch.setitem(sys.modules, "wlr_gym.cli.probe", module)
         monkeypatch.setitem(cli.COMMANDS, "probe", "for tests")
 
@@ -125,6 +125,6 @@ def test_an_emulator_of_its_own_process_imports_the_same(monkeypatch):
 
     monkeypatch.setattr("subprocess.Popen", start)
     monkeypatch.setattr(deploy, "IMPORTED", ["mine"])
-    with pytest.raises(OSError, match="today"), deploy._emulator(deploy.Options("pid", emulated=True), Console()):
+    with pytest.raises(OSError, match="today"), deploy._emulator(deploy.DeployOptions("pid", emulated=True), Console()):
         pass
     assert asked[3:6] == ["--import", "mine", "emulate"]

@@ -13,7 +13,7 @@ pytest.importorskip("termios")
 
 
 def options(**changes):
-    return emulate.Options(**{"seconds": 0.05, **changes})
+    return emulate.EmulateOptions(**{"seconds": 0.05, **changes})
 
 
 def test_prints_ports_and_ends(tmp_path, capsys):
@@ -49,7 +49,7 @@ def test_effects_are_taken_by_name_and_refused_when_unknown():
 
 
 def test_takes_command_lines_from_a_pipe():
-    script = "from wlr_gym.cli import emulate; emulate.run(emulate.Options(stepped=True, seconds=1.0))"
+    script = "from wlr_gym.cli import emulate; emulate.run(emulate.EmulateOptions(stepped=True, seconds=1.0))"
     text = "drop legs probability=0.5\nfaults\nstep 0.25\nnonsense\n"
     done = subprocess.run([sys.executable, "-c", script], input=text, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr

@@ -108,7 +108,7 @@ def test_commands_beyond_the_tasks_are_taken_with_a_note(capsys):
         ("0.15,0", "linear_velocity_x = 0.15 m/s is outside what the task commands, [-0.1, 0.1]"),
         ("0.1,0", ""),
     ):
-        play_module._driver(play_module.Options(command=command), core)
+        play_module._driver(play_module.PlayOptions(command=command), core)
         shown = capsys.readouterr().err
         assert note in shown
         assert bool(note) == bool(shown)
@@ -151,7 +151,7 @@ class Window:
 
 def test_keys_drive_the_robot_until_the_window_is_closed(monkeypatch):
     monkeypatch.setattr("wlr_gym.render.viewer.time.sleep", lambda seconds: None)
-    options = play_module.Options(randomization="none")
+    options = play_module.PlayOptions(randomization="none")
     core = make_core("WLR-Velocity-v0", 1, {"randomization": "none"})
     driver = play_module._driver(options, core)
     windows = []

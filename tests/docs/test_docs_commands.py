@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 import shlex
 
 import pytest
-import tyro
 from blocks import PAGES, ROOT, Block, blocks
 
-from wlr_gym.cli import COMMANDS
+from wlr_gym.cli import COMMANDS, parse
 
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]+)?\)")
 #: Pages that exist on the documentation site only (.ci/docs/pages.py).
@@ -42,9 +40,8 @@ def test_command_parses(command: str, capsys: pytest.CaptureFixture[str]) -> Non
     if name == "--import":
         _, name, *arguments = arguments
     assert name in COMMANDS, f"no command '{name}'"
-    module = importlib.import_module(f"wlr_gym.cli.{name}")
     try:
-        tyro.cli(module.Options, args=arguments)
+        parse(name, arguments)
     except SystemExit:
         pytest.fail(capsys.readouterr().err or capsys.readouterr().out)
 

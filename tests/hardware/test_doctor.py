@@ -32,7 +32,7 @@ def machine(monkeypatch):
 
 
 def look(capsys, **options):
-    code = doctor.run(doctor.Options(emulated=True, **options))
+    code = doctor.run(doctor.DoctorOptions(emulated=True, **options))
     return code, capsys.readouterr().out
 
 
@@ -118,7 +118,7 @@ def test_on_ports_with_a_scan(capsys, monkeypatch):
     monkeypatch.setattr(servo_setup, "find_servos", partial(servo_setup.find_servos, baud_rates=rates))
     with Server(machine, real_time=False) as server:
         ports = tuple(f"{name}={path}" for name, path in server.ports.items())
-        code = doctor.run(doctor.Options(port=ports, scan=True))
+        code = doctor.run(doctor.DoctorOptions(port=ports, scan=True))
     text = capsys.readouterr().out
     assert (code, "First: wheel_lf, answer: none" in text) == (1, True)
     assert "wheels: id 42 at 1000000 bit/s: model 1060, firmware 45" in text
@@ -127,15 +127,15 @@ def test_on_ports_with_a_scan(capsys, monkeypatch):
 
 def test_what_cannot_be_asked_for(tmp_path):
     with pytest.raises(InputError, match="--scan: the emulated robot"):
-        doctor.run(doctor.Options(emulated=True, scan=True))
+        doctor.run(doctor.DoctorOptions(emulated=True, scan=True))
     with pytest.raises(InputError, match="--port legs: expected name=value, such as legs=/dev/ttyUSB1"):
-        doctor.run(doctor.Options(port=("legs",)))
+        doctor.run(doctor.DoctorOptions(port=("legs",)))
     with pytest.raises(InputError, match="one or the other"):
-        doctor.run(doctor.Options(port=("legs=/dev/x",), emulated=True))
+        doctor.run(doctor.DoctorOptions(port=("legs=/dev/x",), emulated=True))
     with pytest.raises(InputError, match="no bus 'leg'"):
-        doctor.run(doctor.Options(port=("leg=/dev/x",)))
+        doctor.run(doctor.DoctorOptions(port=("leg=/dev/x",)))
     with pytest.raises(InputError, match="does not exist"):
-        doctor.run(doctor.Options(json=tmp_path / "no" / "checks.json"))
+        doctor.run(doctor.DoctorOptions(json=tmp_path / "no" / "checks.json"))
 
 
 def test_ports_that_are_there_are_named(tmp_path):

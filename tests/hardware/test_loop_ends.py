@@ -154,17 +154,17 @@ def unplugged_at_the_end(monkeypatch):
 
 
 def test_no_motion_is_recorded_after_that(tmp_path, unplugged_at_the_end, capsys):
-    options = record.Options(excitation=("straight", "turns"), out=tmp_path, emulated=True, seconds=0.2)
+    options = record.RecordOptions(excitation=("straight", "turns"), out=tmp_path, emulated=True, seconds=0.2)
     assert record.run(options) == FAILED
     assert unplugged_at_the_end == ["straight"]
     assert ADVICE in capsys.readouterr().out
 
 
 def test_no_run_is_repeated_after_that(tmp_path, monkeypatch, request, capsys):
-    options = record.Options(excitation=("straight", "turns"), out=tmp_path / "runs", emulated=True, seconds=0.4)
+    options = record.RecordOptions(excitation=("straight", "turns"), out=tmp_path / "runs", emulated=True, seconds=0.4)
     assert record.run(options) == OK
     driven = request.getfixturevalue("unplugged_at_the_end")
-    again = replay.Options(tmp_path / "runs", tmp_path / "out", backend="dynamixel", plots=False, emulated=True)
+    again = replay.ReplayOptions(tmp_path / "runs", tmp_path / "out", backend="dynamixel", plots=False, emulated=True)
     assert replay.run(again) == FAILED
     assert len(driven) == 1
     assert ADVICE in " ".join(capsys.readouterr().out.split())
@@ -202,7 +202,7 @@ def test_a_stop_in_the_last_motion_tick_starts_no_other(tmp_path, monkeypatch):
         return drive_robot(plant, motion)
 
     monkeypatch.setattr("wlr_gym.hardware.driving.drive_robot", drive)
-    options = record.Options(excitation=("straight", "turns"), out=tmp_path, emulated=True, seconds=0.2)
+    options = record.RecordOptions(excitation=("straight", "turns"), out=tmp_path, emulated=True, seconds=0.2)
     assert record.run(options) == OK
     assert driven == ["straight"]
 

@@ -30,12 +30,12 @@ ROBOT = load_robot()
 def run(tmp_path_factory):
     """A run of the emulated robot: 4 s of spins and arcs."""
     out = tmp_path_factory.mktemp("measured")
-    assert record.run(record.Options(excitation=("turns",), out=out, emulated=True, seconds=4.0)) == 0
+    assert record.run(record.RecordOptions(excitation=("turns",), out=out, emulated=True, seconds=4.0)) == 0
     return read_run(out / "run_01.csv")
 
 
 def again(run, out, **options):
-    code = replay.run(replay.Options(run.path, out, backend="dynamixel", plots=False, **{"emulated": True, **options}))
+    code = replay.run(replay.ReplayOptions(run.path, out, backend="dynamixel", plots=False, **{"emulated": True, **options}))
     return code, json.loads((out / "errors.json").read_text())["run_01"]
 
 
@@ -70,7 +70,7 @@ def test_a_robot_that_stops_ends_it(run, tmp_path, monkeypatch, capsys):
     machine = Machine(ROBOT, HardwareOption().load_hardware(), MachineOptions(timing=NO_TIME))
     machine.inject("dead wheel_lf after=2.5")
     monkeypatch.setattr(HardwareOption, "link_to", lambda *args: emulated_link(machine))
-    options = replay.Options(run.path, tmp_path, backend="dynamixel", plots=False, emulated=True)
+    options = replay.ReplayOptions(run.path, tmp_path, backend="dynamixel", plots=False, emulated=True)
     assert replay.run(options) == 1
     assert "stopped: " in capsys.readouterr().out
     assert len(read_run(tmp_path / "robot/run_01/run_01.csv").table) > 10
@@ -103,4 +103,4 @@ def test_segments_forgive_what_wheels_drifted_and_nothing_else(tmp_path):
 )
 def test_refusals(run, tmp_path, options, words):
     with pytest.raises(InputError, match=words):
-        replay.run(replay.Options(run.path, tmp_path / "out", **{"backend": "dynamixel", "emulated": True, **options}))
+        replay.run(replay.ReplayOptions(run.path, tmp_path / "out", **{"backend": "dynamixel", "emulated": True, **options}))

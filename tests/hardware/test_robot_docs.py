@@ -33,7 +33,7 @@ def test_every_fault_is_listed_with_its_default():
 
 def test_every_option_named_exists():
     part = PAGE.split("## Emulator", 1)[1].split("### Faults", 1)[0]
-    options = {field.name for field in fields(emulate.Options)}
+    options = {field.name for field in fields(emulate.EmulateOptions)}
     named = {name.replace("-", "_") for name in re.findall(r"`--([\w-]+)", part)}
     assert named
     assert named <= options

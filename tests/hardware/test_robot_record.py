@@ -30,7 +30,7 @@ ROBOT = load_robot()
 
 
 def recorded(out, **options):
-    return record.run(record.Options(out=out, **{"emulated": True, "seconds": 2.0, **options}))
+    return record.run(record.RecordOptions(out=out, **{"emulated": True, "seconds": 2.0, **options}))
 
 
 def test_the_emulated_robot_is_driven_and_logged(tmp_path, capsys):
@@ -167,7 +167,7 @@ def test_command_files_that_are_none(tmp_path, text, words):
 
 
 def test_list_shows_every_excitation(capsys):
-    assert record.run(record.Options(list=True)) == 0
+    assert record.run(record.RecordOptions(list=True)) == 0
     text = capsys.readouterr().out
     assert all(name in text for name in EXCITATIONS)
 
@@ -239,7 +239,7 @@ def test_every_repeated_run_of_a_real_robot_is_asked_for(tmp_path, monkeypatch, 
     recorded(tmp_path / "runs", excitation=("straight", "turns"), emulated=True, seconds=0.2)
     operator = Operator(1)
     monkeypatch.setattr("builtins.input", operator)
-    options = replay.Options(tmp_path / "runs", tmp_path / "out", backend="dynamixel", plots=False)
+    options = replay.ReplayOptions(tmp_path / "runs", tmp_path / "out", backend="dynamixel", plots=False)
     with pytest.raises(InputError, match="nobody there to start the robot"):
         replay.run(options)
     assert len(operator.asked) == 2

@@ -1,4 +1,7 @@
-"""The ``wlr`` command. Each sub-command is a module with a frozen dataclass ``Options`` and ``run(options) -> exit code``."""
+"""The ``wlr`` command. Each sub-command is a module with its options, a frozen dataclass, and ``run(options) -> exit code``.
+
+The options of ``wlr train`` are ``train.TrainOptions``, and so on.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,16 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError, MissingPackageError, unknown_name
 
-OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+#: Exit codes; an interrupted command ends as a shell reports SIGINT (128 + 2).
+OK = 0
+FAILED = 1
+BAD_INPUT = 2
+INTERRUPTED = 130
 
 #: Modules that this command's ``--import`` named: one that starts another process hands them on.
 IMPORTED: list[str] = []
@@ -23,9 +31,9 @@ COMMANDS = {
     "evaluate": "score a policy or agent over many episodes, against baselines, with confidence intervals",
     "export": "write a trained policy as one file (ONNX with its contract) that runs without torch, or its model card",
     "play": "drive a robot in a window with keys or a gamepad, or into a video",
-    "replay": "drive a simulator with the commands of measured runs and report where they part",
-    "compare": "drive two plants with the same goals and report where they part, in noise units",
-    "gap": "find what the model lacks: compare with measured runs, name the missing effect, prove it on runs kept aside",
+    "replay": "drive a simulator with the commands of measured runs and report where they diverge",
+    "compare": "drive two plants with the same setpoints and report where they diverge, in noise units",
+    "gap": "find what the model lacks: compare with measured runs, name the missing effect, validate it on held-out runs",
     "record": "drive a robot or simulator through an excitation and write the measured run",
     "paper": "run the paper's experiments in several models and check its claims",
     "vision": "measure pose and slip from a video of the robot with ring markers",
@@ -34,7 +42,7 @@ COMMANDS = {
     "doctor": "look at a robot before it drives: ports, servos, IMU, policy; names the first fault and its remedy",
     "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults on command",
     "bench": "measure the speed of the engine, the environments and training on this machine",
-    "demo": "the whole loop in about three minutes: learn, drive on ice, find the hidden fault of a robot; ends with one page",
+    "demo": "the whole loop in about three minutes: learn, drive on ice, find the hidden fault of a robot; one page",
 }
 
 
@@ -82,11 +90,17 @@ def _import_modules(words: list[str]) -> list[str]:
 
 def run_command(name: str, arguments: Sequence[str]) -> int:
     """Parse the arguments of one command and run it."""
+    module = importlib.import_module(f"wlr_gym.cli.{name}")
+    return module.run(parse(name, arguments))
+
+
+def parse(name: str, arguments: Sequence[str]) -> Any:
+    """Return the options of one command; SystemExit after ``--help`` and arguments that do not parse."""
     import tyro
 
     module = importlib.import_module(f"wlr_gym.cli.{name}")
-    options = tyro.cli(module.Options, prog=f"wlr {name}", description=module.__doc__, args=list(arguments))
-    return module.run(options)
+    kind = getattr(module, f"{name.capitalize()}Options")
+    return tyro.cli(kind, prog=f"wlr {name}", description=module.__doc__, args=list(arguments))
 
 
 def usage() -> str:

@@ -19,7 +19,7 @@ from wlr_gym.studies.bench.measure import Measurement, Size, machine
 
 if TYPE_CHECKING:
     from wlr_gym.studies.bench.convergence import Deviation
-    from wlr_gym.studies.bench.vision import Result
+    from wlr_gym.studies.bench.vision import VisionResult
 
 #: Measurement -> function. Imported when it is run.
 MEASUREMENTS = {
@@ -38,7 +38,7 @@ MEASUREMENTS = {
 }
 #: Measurements with rows of their own kind; each has its list in the report.
 _OWN_ROWS = ("convergence", "vision")
-#: Take long or need packages that few have: only made when they are asked for.
+#: Take long or need packages that few have: only made when named.
 _ON_REQUEST = ("vision", "bus", "learning", "sysid")
 #: Its own kind: hours, resumable, with a folder of results. See docs/gap_benchmark.md.
 BLIND_TEST = "gap"
@@ -46,7 +46,7 @@ SCHEMA = 1
 
 
 @dataclass(frozen=True)
-class Options:
+class BenchOptions:
     what: tyro.conf.Positional[tuple[str, ...]] = ()
     """Measurements to make, as with --only."""
     only: tuple[str, ...] = ()
@@ -59,7 +59,7 @@ class Options:
     quick: bool = False
     """Tiny sizes: shows that it runs; the numbers mean nothing."""
     out: Path | None = None
-    """gap: folder for results, truths and the score; an interrupted test goes on from it."""
+    """gap: folder for results, truths and the score; an interrupted test resumes from it."""
     sets: int = 240
     """gap: data sets."""
     processes: int = 2
@@ -68,7 +68,7 @@ class Options:
     """gap: answers.json of another folder; its sets are not analysed again, but for those that failed."""
 
 
-def run(options: Options) -> int:
+def run(options: BenchOptions) -> int:
     """Measure, print, write."""
     asked = (*options.what, *options.only)
     for name in asked:
@@ -95,8 +95,8 @@ def run(options: Options) -> int:
     return OK
 
 
-def _blind_test(options: Options, asked: tuple[str, ...]) -> int:
-    """Test the gap workflow on data sets with sealed truths; print and write its score."""
+def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
+    """Test the gap workflow on data sets with hidden truths; print and write its score."""
     from wlr_gym.studies.bench import gap
 
     if len(asked) > 1:
@@ -160,7 +160,7 @@ def _convergence_table(rows: Sequence[Deviation]) -> Table:
     return table
 
 
-def _vision_table(rows: Sequence[Result]) -> Table:
+def _vision_table(rows: Sequence[VisionResult]) -> Table:
     table = Table("what", "method", "value", "bar", "met", "samples", box=None, title="vision (rendered)", title_justify="left")
     for row in rows:
         bar = "-" if row.bar is None else f"{'>=' if row.least else '<='} {row.bar:g}"

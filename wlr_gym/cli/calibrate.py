@@ -49,7 +49,7 @@ class TargetsOptions:
     floor: str = "floor"
 
 
-Options = (
+CalibrateOptions = (
     Annotated[CameraOptions, tyro.conf.subcommand("camera", description="lens of a camera, from views of a board")]
     | Annotated[TargetsOptions, tyro.conf.subcommand("targets", description="sheets to print: markers and calibration board")]
     | Annotated[ServoOptions, tyro.conf.subcommand("servo", description="id and baud rate of a new servo")]

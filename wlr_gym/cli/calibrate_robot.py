@@ -31,7 +31,7 @@ Ask = Callable[[str], str]
 Result = TypeVar("Result")
 
 _SIDES = ("left front", "right front", "left rear", "right rear")
-#: Which side of the sensor points up, in the order asked for.
+#: Which side of the sensor points up, in the order of the poses.
 _UP = ("z up (as it stands)", "z down", "x up", "x down", "y up", "y down")
 #: Reads averaged for one angle.
 _READS = 20
@@ -159,7 +159,7 @@ def _calibrate_joints(options: JointsOptions, robot: Robot, hardware: Hardware, 
     from wlr_gym.hardware.calibration import with_mountings
 
     _require_torque_off(link.servos, ask)
-    print("Put the robot on a stand, wheels off the ground. Enter goes on, s skips a joint, q ends without a file.")
+    print("Put the robot on a stand, wheels off the ground. Enter continues, s skips a joint, q ends without a file.")
     wanted = options.only or JOINTS
     found = {joint: _calibrate(joint, robot, hardware, link.servos, ask) for joint in JOINTS if joint in wanted}
     mountings = {joint: mounting for joint, mounting in found.items() if mounting is not None}
@@ -228,7 +228,7 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
     try:
         with _dialogue():
             link.imu.open()
-            print("Enter goes on, q ends without a file.")
+            print("Enter continues, q ends without a file.")
             calibration = _find_calibration(options, hardware.imu.calibration, link, ask)
         for name, value in calibration.model_dump(exclude_unset=True).items():
             print(f"{name:13} {value}")

@@ -1,4 +1,4 @@
-"""Drive two plants with the same goals and parameters, and report where they diverge, in units of sensor noise.
+"""Drive two plants with the same setpoints and parameters, and report where they diverge, in units of sensor noise.
 
 Writes compare.json, report.md, a map of all differences, a figure per motion, config.yaml and provenance.yaml. docs/compare.md
 says how to read them.
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.options import PatchOption
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Options(EffectsOption):
+class CompareOptions(PatchOption):
     out: Path
     """Folder for the report; made if it is not there."""
     plants: tuple[str, str] = ("gibbs_appell", "mujoco")
@@ -61,7 +61,7 @@ class Options(EffectsOption):
     the joint torques; at half the steps where --halve is given."""
 
 
-def run(options: Options) -> int:
+def run(options: CompareOptions) -> int:
     """Compare, print the tables, write the files; 0 when done, with ``--strict`` 1 when a bound is broken.
 
     Raises:
@@ -96,7 +96,7 @@ def run(options: Options) -> int:
     return FAILED if options.strict and any(comparison.broken for comparison in comparisons) else OK
 
 
-def _motions(options: Options) -> tuple[list[Motion], Robot]:
+def _motions(options: CompareOptions) -> tuple[list[Motion], Robot]:
     from wlr_gym.data import read_dataset, read_run
     from wlr_gym.data.excitations import EXCITATIONS, excite
     from wlr_gym.data.record import motion_of
@@ -117,7 +117,7 @@ def _motions(options: Options) -> tuple[list[Motion], Robot]:
     return [motion_of(measured).cut(options.seconds) for measured in runs], robot_of(runs[0], options.robot)
 
 
-def _patches(options: Options, motions: Sequence[Motion], robot: Robot) -> list[Patch]:
+def _patches(options: CompareOptions, motions: Sequence[Motion], robot: Robot) -> list[Patch]:
     """Return what to compare with, each tried on the parameters first so that a refusal leaves no folder behind."""
     from wlr_gym.data.comparison import severe_patch
     from wlr_gym.physics.effects import EFFECTS, apply_patch, compose
@@ -133,7 +133,7 @@ def _patches(options: Options, motions: Sequence[Motion], robot: Robot) -> list[
 
 
 def _compare_all(
-    options: Options,
+    options: CompareOptions,
     motions: Sequence[Motion],
     plants: tuple[ComparedPlant, ComparedPlant],
     robot: Robot,
@@ -157,7 +157,7 @@ def _compare_all(
         yield found
 
 
-def _resolved(options: Options, motions: Sequence[Motion], robot: Robot, patch: Patch) -> dict[str, object]:
+def _resolved(options: CompareOptions, motions: Sequence[Motion], robot: Robot, patch: Patch) -> dict[str, object]:
     given = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
     return {
         **given,

@@ -25,24 +25,25 @@ if TYPE_CHECKING:
     from wlr_gym.studies.demo.settings import Demo
     from wlr_gym.studies.demo.stage import Section
 
-STEPS, QUICK_STEPS = 3_000_000, 16_384
+STEPS = 3_000_000
+QUICK_STEPS = 16_384
 
 
 @dataclass(frozen=True)
-class Options:
+class DemoOptions:
     out: Path = Path("out/demo")
     """Folder for the page and everything it was made from; a demo already in it is replaced."""
     seed: int = 0
-    """Seed of everything random: training, episodes, and what the robot hides."""
+    """Seed of everything random: training, episodes, and the hidden fault."""
     steps: int | None = None
-    """Control ticks to train for, all robots together; default: three million."""
+    """Environment steps to train for, all robots together; default: three million."""
     quick: bool = False
     """Everything as short as can be, to see that it works: nothing is learnt, and nothing need be found."""
     progress: bool = True
     """Show progress and the remaining time."""
 
 
-def run(options: Options) -> int:
+def run(options: DemoOptions) -> int:
     """Run all stages, write the page; the path of the page is the last line.
 
     Raises:
@@ -52,15 +53,17 @@ def run(options: Options) -> int:
 
     from wlr_gym.gap.report.text import duration
     from wlr_gym.studies.demo.page import write_page
-    from wlr_gym.studies.demo.workers import LANES, run_lanes
+    from wlr_gym.studies.demo.workers import WORKERS, run_workers
 
     demo = _demo(options)
     _clear(demo.out)
     record_provenance(demo.out, {"seed": demo.seed, "steps": demo.steps, "quick": options.quick}, demo.seed)
     console, began = Console(highlight=False, soft_wrap=True), time.monotonic()
-    console.print("A policy learns; slip-aware and blind drive on ice; a robot hides a fault; the gap workflow looks for it.")
-    with progress(console, tuple(LANES), options.progress) as tell:
-        outcome = run_lanes(demo, tell)
+    console.print(
+        "A policy learns; slip-aware and blind drive on ice; a robot has a hidden fault; the gap workflow looks for it."
+    )
+    with progress(console, tuple(WORKERS), options.progress) as tell:
+        outcome = run_workers(demo, tell)
     write_page(demo, outcome.sections, outcome.interrupted)
     for one in outcome.sections:
         console.print(f"{one.title}: {one.headline or one.verdict}", markup=False)
@@ -69,7 +72,7 @@ def run(options: Options) -> int:
     return INTERRUPTED if outcome.interrupted else _code(outcome.sections)
 
 
-def _demo(options: Options) -> Demo:
+def _demo(options: DemoOptions) -> Demo:
     from wlr_gym.studies.demo.settings import Demo
 
     if options.seed < 0:

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.options import EffectsOption, environment_of, pairs
+from wlr_gym.cli.options import PatchOption, environment_of, pairs
 from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ _STATUS_TICKS = 10
 
 
 @dataclass(frozen=True)
-class Options(EffectsOption):
+class DeployOptions(PatchOption):
     policy: tyro.conf.Positional[str]
     """Policy file or folder, run folder, or name of an agent or shipped policy."""
     env: str | None = None
@@ -65,7 +65,7 @@ class Options(EffectsOption):
     """Show a live status."""
 
 
-def run(options: Options) -> int:
+def run(options: DeployOptions) -> int:
     """Deploy; 0 = ended as it was asked to, 1 = something stopped the robot.
 
     Raises:
@@ -112,7 +112,7 @@ def run(options: Options) -> int:
     return OK if result.well else FAILED
 
 
-def _check(options: Options) -> dict[str, float]:
+def _check(options: DeployOptions) -> dict[str, float]:
     """Return the held command, from options that make sense."""
     if not 0.0 < options.seconds < float("inf"):
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
@@ -142,7 +142,7 @@ def _machine_of(loop: ControlLoop) -> Any:
 
 
 @contextlib.contextmanager
-def _emulator(options: Options, console: Console) -> Iterator[dict[str, str]]:
+def _emulator(options: DeployOptions, console: Console) -> Iterator[dict[str, str]]:
     """Start ``wlr emulate`` as a process of its own; yield its ports."""
     import subprocess
     import tempfile

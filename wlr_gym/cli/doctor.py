@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Options(RobotOption):
+class DoctorOptions(RobotOption):
     """Look at a robot.
 
     Attributes:
@@ -44,7 +44,7 @@ class Options(RobotOption):
     verbose: bool = False
 
 
-def run(options: Options) -> int:
+def run(options: DoctorOptions) -> int:
     """Look and print; 0 when nothing stands against driving.
 
     Raises:
@@ -73,7 +73,7 @@ def run(options: Options) -> int:
     return FAILED if any(check.is_fatal and not check.ok for check in checks) else OK
 
 
-def examine(link: Link, robot: Robot, hardware: Hardware, options: Options, console: Console) -> list[Check]:
+def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions, console: Console) -> list[Check]:
     """Return all checks of ports, adapters, servos, buses and IMU; mends and scans on the way, where that was asked for."""
     from wlr_gym.hardware.dynamixel.errors import BusGoneError
     from wlr_gym.hardware.loop import TIMED_READS

@@ -25,14 +25,14 @@ from wlr_gym.robot.parameters import Parameters
 
 
 @dataclass(frozen=True)
-class Options:
+class EffectsOptions:
     words: tyro.conf.Positional[tuple[str, ...]] = ()
     """Names of effects, or: check FILE ..."""
     robot: str = "nominal"
     """Robot that check applies the patches to: name in configs/robot/ or path."""
 
 
-def run(options: Options) -> int:
+def run(options: EffectsOptions) -> int:
     """Print the library, one effect, or what patch files change."""
     match options.words:
         case ():

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.options import PatchOption
 
 if TYPE_CHECKING:
     from wlr_gym.hardware.emulator import Server
 
 
 @dataclass(frozen=True)
-class Options(EffectsOption):
+class EmulateOptions(PatchOption):
     """Emulate the robot.
 
     Attributes:
@@ -56,7 +56,7 @@ class Options(EffectsOption):
     seconds: float = 0.0
 
 
-def run(options: Options) -> int:
+def run(options: EmulateOptions) -> int:
     """Emulate until Ctrl-C; 0 then.
 
     Raises:

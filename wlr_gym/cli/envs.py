@@ -21,7 +21,7 @@ PICTURES = (".png", ".svg", ".pdf")
 
 
 @dataclass(frozen=True)
-class Options:
+class EnvsOptions:
     env: tyro.conf.Positional[str | None] = None
     """Environment id to describe; without one all are listed."""
     randomization: str | None = None
@@ -30,7 +30,7 @@ class Options:
     """Picture of eight floors that the randomization draws (.png, .svg, .pdf)."""
 
 
-def run(options: Options) -> int:
+def run(options: EnvsOptions) -> int:
     """Print the list or the description."""
     if options.env is not None:
         task = _task(options.env)

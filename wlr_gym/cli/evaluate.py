@@ -19,7 +19,7 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import EffectsOption, environment_of
+from wlr_gym.cli.options import PatchOption, environment_of
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.settings import read_settings
@@ -52,15 +52,20 @@ from wlr_gym.policy import shipped_names, trained_environment
 from wlr_gym.render.video import check_video
 
 BACKENDS = ("gibbs_appell", "mujoco")
-BASELINES, FULL_BASELINES = ("do_nothing", "pid"), ("do_nothing", "constant_command", "pid", "slip_compensating")
 #: What is played where no option says otherwise: quickly, and with --full.
-EPISODES, FULL_EPISODES = 64, 256
-SEEDS, FULL_SEEDS = 1, 5
-SWEEP_EPISODES, OTHER_EPISODES = 64, 64
+BASELINES = ("do_nothing", "pid")
+FULL_BASELINES = ("do_nothing", "constant_command", "pid", "slip_compensating")
+EPISODES = 64
+FULL_EPISODES = 256
+SEEDS = 1
+FULL_SEEDS = 5
+#: Episodes of each value of a sweep, and of each other condition.
+SWEEP_EPISODES = 64
+OTHER_EPISODES = 64
 
 
 @dataclass(frozen=True)
-class Options(EffectsOption):
+class EvaluateOptions(PatchOption):
     policy: tyro.conf.Positional[str]
     """Agent, policy file (.onnx), policy or run folder, or shipped policy. NAME=POLICY names it; NAME=POLICY,POLICY,... is one
     agent trained with several seeds."""
@@ -105,7 +110,7 @@ class Options(EffectsOption):
     """Show a progress bar."""
 
 
-def run(options: Options) -> int:
+def run(options: EvaluateOptions) -> int:
     """Play, print the card, write it."""
     options = _complete(options)
     _check(options)
@@ -129,7 +134,7 @@ def run(options: Options) -> int:
     return OK
 
 
-def _complete(options: Options) -> Options:
+def _complete(options: EvaluateOptions) -> EvaluateOptions:
     """Return the options with nothing left open that --full and the policy decide."""
     full = options.full
     policy = read_subjects([options.policy])[0].sources[0]
@@ -150,7 +155,7 @@ def _full_baselines(environment: str) -> tuple[str, ...]:
     return (*FULL_BASELINES, *(name for name in shipped_names() if trained_environment(name) == environment))
 
 
-def _check(options: Options) -> None:
+def _check(options: EvaluateOptions) -> None:
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
     if options.backend not in (*BACKENDS, "both"):
@@ -168,7 +173,7 @@ def _plain(value: Any) -> Any:
 
 
 def _play(
-    options: Options, subjects: Sequence[Subject], keywords: Mapping[str, Any], others: Sequence[str], effects: str
+    options: EvaluateOptions, subjects: Sequence[Subject], keywords: Mapping[str, Any], others: Sequence[str], effects: str
 ) -> tuple[Card, Rollout]:
     """Play everything; returns the card, and the first block of the first subject."""
     task = task_name_of(str(options.env))
@@ -188,7 +193,7 @@ def _play(
 
 
 def _conditions(
-    options: Options, sweeps: Sequence[Sweep], keywords: Mapping[str, Any], others: Sequence[str]
+    options: EvaluateOptions, sweeps: Sequence[Sweep], keywords: Mapping[str, Any], others: Sequence[str]
 ) -> list[Condition]:
     """Return the main condition, those of the sweeps, and the main one in the other simulator."""
     episodes = options.episodes or 0
@@ -199,7 +204,7 @@ def _conditions(
     return conditions + [Condition(OTHER_PLANT, {**keywords, "backend": other}, episodes=fewer) for other in others]
 
 
-def _said(options: Options, conditions: Sequence[Condition], effects: str) -> dict[str, Any]:
+def _said(options: EvaluateOptions, conditions: Sequence[Condition], effects: str) -> dict[str, Any]:
     """Return what the card says about how it was played."""
     main, last = conditions[0], conditions[-1]
     said = {
@@ -232,7 +237,7 @@ def _write(folder: Path, card: Card, samples: Rollout, seed: int) -> None:
     print(f"written to {folder}: {', '.join(names)}")
 
 
-def _record(options: Options, subject: Subject, folder: Path, keywords: Mapping[str, Any]) -> None:
+def _record(options: EvaluateOptions, subject: Subject, folder: Path, keywords: Mapping[str, Any]) -> None:
     """Write the first episodes of the policy as runs."""
     core, policy = make_player(str(options.env), subject.sources[0], options.record, keywords)
     try:
@@ -242,7 +247,7 @@ def _record(options: Options, subject: Subject, folder: Path, keywords: Mapping[
     print(f"written: {len(written)} runs in {folder}")
 
 
-def _film(options: Options, subjects: Sequence[Subject], path: Path, keywords: Mapping[str, Any]) -> None:
+def _film(options: EvaluateOptions, subjects: Sequence[Subject], path: Path, keywords: Mapping[str, Any]) -> None:
     """Write the first episode of up to two subjects, side by side."""
     from wlr_gym.learning.evaluation.film import film_beside
 

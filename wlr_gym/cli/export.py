@@ -21,12 +21,12 @@ from wlr_gym.cli.options import environment_of
 #: Episodes whose observations are compared, and their length, s.
 ROBOTS = 16
 SECONDS = 4.0
-#: Options of ``wlr train`` that say where and how it ran, not what it did.
+#: ExportOptions of ``wlr train`` that say where and how it ran, not what it did.
 ELSEWHERE = ("--out", "--resume", "--max-minutes")
 
 
 @dataclass(frozen=True)
-class Options:
+class ExportOptions:
     policy: tyro.conf.Positional[tuple[str, ...]]
     """Policy folder or run folder; with --card or --reseal: policy file, or name of a shipped policy."""
     out: Path | None = None
@@ -39,7 +39,7 @@ class Options:
     """With --reseal: name or path of the robot that they were trained with; default: as their contract says."""
 
 
-def run(options: Options) -> int:
+def run(options: ExportOptions) -> int:
     """Export and compare, or write the card, or reseal; say what was written."""
     if options.reseal:
         _reseal(options)
@@ -57,7 +57,7 @@ def run(options: Options) -> int:
     return OK
 
 
-def _reseal(options: Options) -> None:
+def _reseal(options: ExportOptions) -> None:
     from wlr_gym.policy import find_policy, reseal
 
     if options.out is not None or options.card is not None:

@@ -1,4 +1,4 @@
-"""Find what the model lacks: compare it with measured runs, name the missing effect, prove it on runs kept aside.
+"""Find what the model lacks: compare it with measured runs, name the missing effect, validate it on held-out runs.
 
 Writes report.html, result.json, patch.yaml (the effects found, for --effects), plots, config.yaml and provenance.yaml.
 docs/gap.md says how to read the report.
@@ -17,7 +17,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.options import PatchOption
 from wlr_gym.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Options(EffectsOption):
+class GapOptions(PatchOption):
     data: tyro.conf.Positional[Path]
     """Folder of measured runs; with --rig, of recordings of the rig."""
     out: Path
@@ -40,12 +40,12 @@ class Options(EffectsOption):
     backend: str = "gibbs_appell"
     """Simulator of the robot: gibbs_appell or mujoco."""
     heldout: tuple[str, ...] = ()
-    """Runs to keep aside for the proof; default: chosen by what they can tell."""
+    """Held-out runs, for validation; default: chosen by what they can show."""
     threads: int | None = None
     """Worker threads; default: one per core."""
 
 
-def run(options: Options) -> int:
+def run(options: GapOptions) -> int:
     """Analyse, print, write; 0 for every verdict but ``bad_data``, which is 1.
 
     Raises:
@@ -80,7 +80,7 @@ def run(options: Options) -> int:
     return FAILED if analysis.verdict == BAD_DATA else OK
 
 
-def _check(options: Options) -> None:
+def _check(options: GapOptions) -> None:
     from wlr_gym.gap.workflow import RIGS
     from wlr_gym.physics.plants import SIMULATORS
     from wlr_gym.robot import load_robot
@@ -92,7 +92,7 @@ def _check(options: Options) -> None:
         raise unknown_name("simulator", options.backend, SIMULATORS, "--backend")
     if options.rig is not None and options.rig not in RIGS:
         raise unknown_name("rig", options.rig, RIGS)
-    if options.rig is not None and (options.backend != Options.backend or options.robot is not None):
+    if options.rig is not None and (options.backend != GapOptions.backend or options.robot is not None):
         raise InputError(f"--rig {options.rig}: the rig has a simulator of its own: leave --backend and --robot out")
     if options.robot is not None:
         load_robot(options.robot)
@@ -103,7 +103,7 @@ def _check(options: Options) -> None:
         raise InputError(f"--threads {options.threads}: expected 1 or more")
 
 
-def _known(options: Options) -> Patch:
+def _known(options: GapOptions) -> Patch:
     """The effects given as known, in the vocabulary of the robot or of the rig."""
     try:
         if options.rig is None:
@@ -143,13 +143,13 @@ def _numbers(analysis: Analysis) -> Iterator[str]:
 
     for effect in analysis.effects:
         values = ", ".join(f"{name} {estimate(found)}" for name, found in effect.parameters.items())
-        told = [effect.formula, values, f"confidence {percent(effect.confidence)}"]
-        yield f"  {plain(effect.name)} at {places(effect.where)}: {'; '.join(filter(None, told))}"
+        facts = [effect.formula, values, f"selection frequency {percent(effect.confidence)}"]
+        yield f"  {plain(effect.name)} at {places(effect.where)}: {'; '.join(filter(None, facts))}"
     gap = analysis.gap
     if gap is not None:
         steps = [f"{error(gap.heldout_before)} as given", f"{error(gap.heldout_calibrated)} calibrated"]
         steps += [f"{error(gap.heldout_after)} with the effects"] if analysis.added else []
-        yield f"  error of the runs kept aside, 1 = sensor noise: {', '.join(steps)}; noise floor {error(gap.noise_floor)}"
+        yield f"  error of the held-out runs, 1 = sensor noise: {', '.join(steps)}; noise floor {error(gap.noise_floor)}"
         if analysis.added:
             yield f"  removed of the avoidable error: {removed(analysis)}"
 
@@ -158,6 +158,7 @@ def _advice(analysis: Analysis) -> Iterator[str]:
     from wlr_gym.gap.report.text import listed, plain
 
     for group in analysis.equivalent:
-        yield f"  cannot tell {listed([plain(name) for name in group.names], 'from')}; this run would: {group.separating_run}"
+        names = listed([plain(name) for name in group.names])
+        yield f"  not distinguishable: {names}; discriminating experiment: {group.separating_run}"
     for one in analysis.recommendations:
         yield f"  record next: {one.excitation}: {one.why}"

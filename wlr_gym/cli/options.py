@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EffectsOption:
+class PatchOption:
     """``--effects`` of every command that simulates."""
 
     effects: tuple[str, ...] = ()
@@ -47,7 +47,7 @@ def pairs(option: str, words: Sequence[str], example: str) -> dict[str, str]:
 
 
 def environment_of(env: str | None, policy: str | Path) -> str:
-    """Return the environment id asked for; else the one a policy was trained in; else ``WLR-Velocity-v0``.
+    """Return the given environment id; else the one a policy was trained in; else ``WLR-Velocity-v0``.
 
     Raises:
         InputError: see :func:`wlr_gym.policy.trained_environment`.

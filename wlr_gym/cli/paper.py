@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
     from wlr_gym.robot import Robot
     from wlr_gym.studies.paper.experiments import Record
-    from wlr_gym.studies.paper.open_question import Finding
+    from wlr_gym.studies.paper.slip_search import SearchFinding
 
 
 @dataclass(frozen=True)
-class Options(HardwareOption):
+class PaperOptions(HardwareOption):
     out: Path
     """Folder for the report; made if it is not there."""
     plant: tuple[str, ...] = ("reduced", "gibbs_appell", "mujoco")
@@ -46,7 +46,7 @@ class Options(HardwareOption):
     """Write figures."""
 
 
-def run(options: Options) -> int:
+def run(options: PaperOptions) -> int:
     """Drive, check, search, write; 0 when done, 1 when a robot had to stop.
 
     Raises:
@@ -60,7 +60,8 @@ def run(options: Options) -> int:
     from wlr_gym.hardware.loop import StoppedError
     from wlr_gym.robot import load_robot
     from wlr_gym.studies.paper import report
-    from wlr_gym.studies.paper.claims import check_all, gather
+    from wlr_gym.studies.paper.claims import check_all
+    from wlr_gym.studies.paper.evidence import gather
     from wlr_gym.studies.paper.experiments import write_tests
 
     _check(options)
@@ -90,7 +91,7 @@ def run(options: Options) -> int:
     return OK
 
 
-def _check(options: Options) -> None:
+def _check(options: PaperOptions) -> None:
     from wlr_gym.physics.plants import REAL
     from wlr_gym.studies.paper.experiments import MODELS
 
@@ -109,7 +110,7 @@ def _check(options: Options) -> None:
             raise InputError(f"--{name} {value}: expected {low} to {high}")
 
 
-def _drive(model: str, robot: Robot, options: Options, console: Console) -> dict[str, Record]:
+def _drive(model: str, robot: Robot, options: PaperOptions, console: Console) -> dict[str, Record]:
     from wlr_gym.physics.plants import REAL
     from wlr_gym.studies.paper.experiments import drive_both
 
@@ -117,7 +118,7 @@ def _drive(model: str, robot: Robot, options: Options, console: Console) -> dict
     return _drive_robot(robot, options, console) if model in REAL else drive_both(model, robot)
 
 
-def _drive_robot(robot: Robot, options: Options, console: Console) -> dict[str, Record]:
+def _drive_robot(robot: Robot, options: PaperOptions, console: Console) -> dict[str, Record]:
     """Guarded and logged; between the tests the operator carries the robot back."""
     from wlr_gym.data.format import RunMeta
     from wlr_gym.hardware.operator import stop_on_signals
@@ -136,8 +137,8 @@ def _drive_robot(robot: Robot, options: Options, console: Console) -> dict[str, 
     return records
 
 
-def _search(robot: Robot, options: Options, console: Console) -> list[Finding]:
-    from wlr_gym.studies.paper.open_question import search
+def _search(robot: Robot, options: PaperOptions, console: Console) -> list[SearchFinding]:
+    from wlr_gym.studies.paper.slip_search import search
 
     if options.draws == 0:
         return []

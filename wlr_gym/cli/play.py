@@ -11,7 +11,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import EffectsOption, environment_of
+from wlr_gym.cli.options import PatchOption, environment_of
 from wlr_gym.render.display import require_display
 from wlr_gym.render.view import View
 
@@ -30,7 +30,7 @@ FPS = 25.0
 
 
 @dataclass(frozen=True)
-class Options(EffectsOption):
+class PlayOptions(PatchOption):
     env: tyro.conf.Positional[str | None] = None
     """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
     agent: str = "pid"
@@ -65,7 +65,7 @@ class Options(EffectsOption):
     """In a video: also draw where the robot went and where its commands would have taken it."""
 
 
-def run(options: Options) -> int:
+def run(options: PlayOptions) -> int:
     """Play, until the window is closed or the video is written."""
     from wlr_gym.learning.evaluation import make_core
     from wlr_gym.policy import make_policy, policy_environment
@@ -88,7 +88,7 @@ def run(options: Options) -> int:
     return OK
 
 
-def _check(options: Options) -> None:
+def _check(options: PlayOptions) -> None:
     from wlr_gym.physics.plants import REAL
     from wlr_gym.render.video import check_video
 
@@ -111,11 +111,11 @@ def _check(options: Options) -> None:
         require_display()
 
 
-def _view(options: Options) -> View:
+def _view(options: PlayOptions) -> View:
     return View(size=options.size, camera=options.camera, forces=options.forces, path=options.path)
 
 
-def _driver(options: Options, core: Core) -> Driver | None:
+def _driver(options: PlayOptions, core: Core) -> Driver | None:
     from wlr_gym.render.teleop import Gamepad, Keyboard, Script
 
     names = core.task.commands
@@ -147,7 +147,7 @@ def _check_speed(script: Script, ranges: Ranges, robot: Robot) -> None:
         )
 
 
-def _film(options: Options, core: Core, policy: Policy, driver: Driver | None) -> None:
+def _film(options: PlayOptions, core: Core, policy: Policy, driver: Driver | None) -> None:
     from rich.progress import track
 
     from wlr_gym.learning.evaluation.film import film, film_length
@@ -162,7 +162,7 @@ def _film(options: Options, core: Core, policy: Policy, driver: Driver | None) -
     print(f"written: {options.video} ({count} pictures, {count / fps:g} s)")
 
 
-def _film_beside(options: Options, keywords: dict[str, Any]) -> None:
+def _film_beside(options: PlayOptions, keywords: dict[str, Any]) -> None:
     from rich.progress import track
 
     from wlr_gym.learning.evaluation import read_subjects
@@ -185,7 +185,7 @@ def _film_beside(options: Options, keywords: dict[str, Any]) -> None:
     print(f"written: {options.video}")
 
 
-def show(options: Options, core: Core, policy: Policy, driver: Driver | None, open: OpenWindow | None = None) -> None:
+def show(options: PlayOptions, core: Core, policy: Policy, driver: Driver | None, open: OpenWindow | None = None) -> None:
     """Play in a window until it is closed, or for ``options.seconds``; ``open`` is how it is opened (tests)."""
     from wlr_gym.learning.evaluation.film import commands, drive, present_time
     from wlr_gym.render.teleop import HELP, Keyboard

@@ -12,15 +12,15 @@ if TYPE_CHECKING:
 
 #: Share of the work that must be done before the remaining time is shown.
 LEAST_SHARE = 0.05
-#: Told of the lane, of what is going on in it, and of the share of its work that is done.
+#: Called with the worker, what it is doing, and the share of its work that is done.
 Tell = Callable[[str, str, float], None]
 
 
 @contextmanager
-def progress(console: Console, lanes: Sequence[str] = ("",), shown: bool = True) -> Iterator[Tell]:
-    """Show a bar for each lane of work; without a terminal, a line whenever another stage of a lane begins.
+def progress(console: Console, workers: Sequence[str] = ("",), shown: bool = True) -> Iterator[Tell]:
+    """Show a bar for each worker; without a terminal, a line whenever another stage of a worker begins.
 
-    A stage's name ends at the first colon of what is told.
+    A stage's name ends at the first colon of its text.
     """
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
@@ -28,24 +28,24 @@ def progress(console: Console, lanes: Sequence[str] = ("",), shown: bool = True)
         TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
         TextColumn("{task.fields[left]}"),
     )  # fmt: skip
-    begin, last = time.monotonic(), dict.fromkeys(lanes, "")
+    begin, last = time.monotonic(), dict.fromkeys(workers, "")
     live = shown and console.is_terminal
     with Progress(*columns, console=console, transient=True, disable=not live) as bar:
-        tasks = {lane: bar.add_task("", total=1.0, left="") for lane in lanes}
+        tasks = {worker: bar.add_task("", total=1.0, left="") for worker in workers}
 
-        def tell(lane: str, text: str, share: float) -> None:
+        def tell(worker: str, text: str, share: float) -> None:
             left = time_left(time.monotonic() - begin, share)
-            bar.update(tasks[lane], description=text, completed=share, left=left)
+            bar.update(tasks[worker], description=text, completed=share, left=left)
             stage = text.partition(":")[0]
-            if shown and not live and stage != last[lane]:
+            if shown and not live and stage != last[worker]:
                 console.print(f"{100.0 * share:3.0f} %  {stage}{left and '; '}{left}", markup=False)
-            last[lane] = stage
+            last[worker] = stage
 
         yield tell
 
 
 def time_left(passed: float, share: float) -> str:
-    """Return the remaining time in words; empty while nobody can know."""
+    """Return the remaining time in words; empty while it is not known."""
     from wlr_gym.gap.report.text import duration
 
     return f"about {duration(passed * (1.0 - share) / share)} left" if LEAST_SHARE <= share < 1.0 and passed > 1.0 else ""

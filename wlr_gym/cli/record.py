@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.options import PatchOption
 from wlr_gym.cli.robot_options import RobotOption, confirm
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Options(RobotOption, EffectsOption):
+class RecordOptions(RobotOption, PatchOption):
     """Record runs.
 
     Attributes:
@@ -57,7 +57,7 @@ class Options(RobotOption, EffectsOption):
     yes: bool = False
 
 
-def run(options: Options) -> int:
+def run(options: RecordOptions) -> int:
     """Record; 0 when every motion was driven to its end or stopped by the operator, 1 when something stopped the robot.
 
     Raises:
@@ -94,8 +94,8 @@ def run(options: Options) -> int:
     return _record_simulations(options, motions, robot, meta, console)
 
 
-def read_motions(options: Options, robot: Robot) -> Sequence[Motion]:
-    """Return the motions that were asked for.
+def read_motions(options: RecordOptions, robot: Robot) -> Sequence[Motion]:
+    """Return the chosen motions.
 
     Raises:
         InputError: none, or one that cannot be read.
@@ -115,7 +115,7 @@ def read_motions(options: Options, robot: Robot) -> Sequence[Motion]:
 # ---- the robot -------------------------------------------------------------------------------------------------------
 
 
-def _record_robot(options: Options, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
+def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
     """Limited and logged; between the motions the operator carries the robot back."""
     from wlr_gym.hardware.driving import drive_robot
 
@@ -155,7 +155,9 @@ def _report(motion: Motion, drive: DriveResult, console: Console) -> None:
 # ---- simulators ------------------------------------------------------------------------------------------------------
 
 
-def _record_simulations(options: Options, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
+def _record_simulations(
+    options: RecordOptions, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console
+) -> int:
     from wlr_gym.base.files import make_output_folder
     from wlr_gym.base.random import spawn_seeds
     from wlr_gym.data.record import next_run, record_simulation

@@ -1,4 +1,4 @@
-"""Drive a simulator, or the robot, with the commands of measured runs and report where the two part.
+"""Drive a simulator, or the robot, with the commands of measured runs and report where the two diverge.
 
 ``--backend dynamixel`` is the robot (with ``--emulated`` an emulated one): setpoints go through the command limiter, and its
 log is compared with the run.
@@ -17,7 +17,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.options import PatchOption
 from wlr_gym.cli.robot_options import HardwareOption, confirm
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ ERRORS_FILE = "errors.json"
 
 
 @dataclass(frozen=True)
-class Options(HardwareOption, EffectsOption):
+class ReplayOptions(HardwareOption, PatchOption):
     """Replay measured runs.
 
     Attributes:
@@ -57,7 +57,7 @@ class Options(HardwareOption, EffectsOption):
     yes: bool = False
 
 
-def run(options: Options) -> int:
+def run(options: ReplayOptions) -> int:
     """Replay, print the tables, write the files; 0 when done, 1 when something stopped the robot.
 
     Raises:
@@ -103,7 +103,7 @@ def run(options: Options) -> int:
     return OK if len(results) == len(runs) else FAILED
 
 
-def _film(options: Options, path: Path, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
+def _film(options: ReplayOptions, path: Path, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
     from rich.progress import track
 
     from wlr_gym.data.film import FPS, film_length, replay_film
@@ -128,7 +128,7 @@ def _read(path: Path) -> Sequence[Run]:
     return read_dataset(path).runs if path.is_dir() else [read_run(path)]
 
 
-def _replay_all(options: Options, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
+def _replay_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
     from rich.progress import track
 
     from wlr_gym.data.replay import replay
@@ -137,7 +137,7 @@ def _replay_all(options: Options, runs: Sequence[Run], patch: Patch, console: Co
         yield replay(measured, options.backend, options.robot, effects=patch, segment=options.segment)
 
 
-def _repeat_all(options: Options, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
+def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
     """Drive the robot with each run's commands, log to ``out/robot``, compare; ends with the first run that is stopped."""
     from wlr_gym.data import read_run
     from wlr_gym.data.format import RunMeta
@@ -167,7 +167,7 @@ def _repeat_all(options: Options, runs: Sequence[Run], patch: Patch, console: Co
         yield compare_repeat(measured, read_run(drive.run), options.robot, options.segment)
 
 
-def _resolved(options: Options, results: Sequence[ReplayResult], patch: Patch) -> dict[str, object]:
+def _resolved(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch) -> dict[str, object]:
     return {
         **{name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()},
         "robot": results[0].robot.name,

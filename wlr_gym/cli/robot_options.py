@@ -34,7 +34,7 @@ class HardwareOption:
     """An emulated robot in this process and in emulated time, instead of the ports."""
 
     def load_hardware(self) -> Hardware:
-        """Return the hardware, with the ports asked for.
+        """Return the hardware, with the ports of ``--port``.
 
         Raises:
             InputError: unknown or broken file, a port that is not name=value, or a name that is no bus.
@@ -83,7 +83,7 @@ class RobotOption(HardwareOption):
     """Robot file or config name."""
 
     def load(self) -> tuple[Robot, Hardware]:
-        """Return the robot and its hardware, with the ports asked for; see :meth:`load_hardware`."""
+        """Return the robot and its hardware, with the ports of ``--port``; see :meth:`load_hardware`."""
         from wlr_gym.robot import load_robot
 
         return load_robot(self.robot), self.load_hardware()

@@ -1,4 +1,4 @@
-"""Train an agent on an environment. Ctrl-C saves a checkpoint; --resume goes on from the newest one."""
+"""Train an agent on an environment. Ctrl-C saves a checkpoint; --resume continues from the newest one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import EffectsOption
+from wlr_gym.cli.options import PatchOption
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.policy import Training, load_agent_config
 from wlr_gym.policy.agents import agent_function
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Options(EffectsOption):
+class TrainOptions(PatchOption):
     env: tyro.conf.Positional[str] = "WLR-Velocity-v0"
     """Environment id; see: wlr envs."""
     agent: str = "ppo"
@@ -38,14 +38,14 @@ class Options(EffectsOption):
     out: Path | None = None
     """Run folder; default: runs_out/<env>_<config or agent>_<seed>."""
     resume: Path | None = None
-    """Run folder to go on with; its own environment, agent and settings are used."""
+    """Run folder to resume; its own environment, agent and settings are used."""
     max_minutes: float | None = None
     """Stop in good order after this time."""
     progress: bool = True
     """Show a progress bar."""
 
 
-def run(options: Options) -> int:
+def run(options: TrainOptions) -> int:
     """Train and print where the policy is."""
     if options.max_minutes is not None and not options.max_minutes > 0:
         raise InputError(f"--max-minutes {options.max_minutes:g}: expected more than 0")
@@ -56,7 +56,7 @@ def run(options: Options) -> int:
     return OK
 
 
-def _new(options: Options) -> tuple[str, Training]:
+def _new(options: TrainOptions) -> tuple[str, Training]:
     config = load_agent_config(options.config or options.agent, options.set, task_name_of(options.env))
     if options.seed is not None:
         config["seed"] = options.seed
@@ -76,7 +76,7 @@ def add_effects(config: dict[str, Any], patch: Patch) -> None:
         config["environment"] = (config.get("environment") or {}) | {"effects": patch.content()["effects"]}
 
 
-def _resumed(options: Options) -> tuple[str, Training]:
+def _resumed(options: TrainOptions) -> tuple[str, Training]:
     folder = options.resume
     assert folder is not None
     own = (options.out, options.config, options.seed, options.backend)
@@ -94,6 +94,6 @@ def _resumed(options: Options) -> tuple[str, Training]:
     return saved["agent"], _training(options, saved["environment"], folder, saved["settings"], resume=True)
 
 
-def _training(options: Options, environment: str, folder: Path, config: dict, *, resume: bool) -> Training:
+def _training(options: TrainOptions, environment: str, folder: Path, config: dict, *, resume: bool) -> Training:
     seconds = None if options.max_minutes is None else 60.0 * options.max_minutes
     return Training(environment, folder, config, resume=resume, max_seconds=seconds, progress=options.progress)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Options:
+class VisionOptions:
     """Video to pose and slip.
 
     Attributes:
@@ -63,7 +63,7 @@ class Options:
     annotate: bool = True
 
 
-def run(options: Options) -> int:
+def run(options: VisionOptions) -> int:
     """Analyse, print, write; 0 when done.
 
     Raises:
@@ -104,7 +104,7 @@ def run(options: Options) -> int:
     return OK
 
 
-def _filmed(options: Options, camera: Camera, console: Console) -> Options:
+def _filmed(options: VisionOptions, camera: Camera, console: Console) -> VisionOptions:
     """Film, and say how to analyse the film (again); returns the options for that."""
     from wlr_gym.perception.vision.live_camera import film
 
@@ -117,7 +117,9 @@ def _filmed(options: Options, camera: Camera, console: Console) -> Options:
     return replace(options, video=str(video), times=times)
 
 
-def _analyse(options: Options, measured: Run, camera: Camera, body: Target, floor: Target, console: Console) -> VideoAnalysis:
+def _analyse(
+    options: VisionOptions, measured: Run, camera: Camera, body: Target, floor: Target, console: Console
+) -> VideoAnalysis:
     from contextlib import nullcontext
 
     from wlr_gym.perception.vision import Frames, analyse

@@ -11,12 +11,12 @@ from wlr_gym.learning.evaluation.tuning import tracking_score
 from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
 from wlr_gym.robot import load_robot
 from wlr_gym.studies.paper import corrected
-from wlr_gym.studies.paper.quantities import Constants, State
+from wlr_gym.studies.paper.quantities import PaperConstants, State
 
 ENVIRONMENT = "WLR-Velocity-v0"
 LEFT, RIGHT = [4, 6], [5, 7]
 ROBOT = load_robot()
-MASSLESS_LEGS = Constants(m_l=0.0)
+MASSLESS_LEGS = PaperConstants(m_l=0.0)
 
 
 @pytest.fixture(scope="module")

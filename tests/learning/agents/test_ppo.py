@@ -207,7 +207,7 @@ def test_runs_of_different_settings_have_different_folders(tmp_path, monkeypatch
 
     monkeypatch.chdir(tmp_path)
     for config, folder in ((None, "WLR-Velocity-v0_ppo_0"), ("ppo_blind", "WLR-Velocity-v0_ppo_blind_0")):
-        assert command._new(command.Options(config=config))[1].folder.name == folder
+        assert command._new(command.TrainOptions(config=config))[1].folder.name == folder
 
 
 def test_a_full_folder_is_not_overwritten(run, capsys):

@@ -11,7 +11,8 @@ from wlr_gym.perception.markers.detection import detect
 from wlr_gym.perception.markers.pose import circle_centres, find_target
 from wlr_gym.perception.markers.targets import CODE_NAMES, load_target
 from wlr_gym.perception.scene import Look, ScenePose, project
-from wlr_gym.studies.bench.vision import _centre_error, clutter
+from wlr_gym.studies.bench.vision import _centre_error
+from wlr_gym.studies.bench.vision_clutter import clutter
 
 CAMERA = Camera(width=1280, height=720, focal=(800.0, 800.0), centre=(639.5, 359.5))
 
@@ -67,7 +68,7 @@ def test_light_and_noise_do_not_hide_the_robot(studio, look):
 
 def test_no_pose_in_clutter():
     for seed in range(6):
-        detections = detect(clutter(seed), CAMERA)
+        detections = detect(clutter(seed, CAMERA), CAMERA)
         for name in ("body", "floor"):
             assert find_target(detections, load_target(name), CAMERA) is None
 

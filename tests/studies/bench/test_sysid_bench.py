@@ -12,7 +12,7 @@ from wlr_gym.cli import main
 from wlr_gym.gap.estimation.fit import SETTLED
 from wlr_gym.gap.problem import Quantity, Setting
 from wlr_gym.studies.bench import sysid
-from wlr_gym.studies.bench.sysid import Contest, Fitted, rows, settled
+from wlr_gym.studies.bench.sysid_contest import Contest, Fitted, rows, settled
 
 mujoco_sysid = pytest.importorskip("mujoco.sysid")
 needs_sysid = pytest.mark.skipif(not hasattr(mujoco_sysid, "optimize"), reason="MuJoCo lacks what its calibration needs")

@@ -5,14 +5,14 @@ from dataclasses import fields
 import numpy as np
 import sympy as sp
 
-from wlr_gym.studies.paper.quantities import WHEELS, Constants, State
+from wlr_gym.studies.paper.quantities import WHEELS, PaperConstants, State
 
 PER_WHEEL = {field.name for field in fields(State) if "PerWheel" in str(field.type)}
 
 
-def constants() -> Constants:
+def constants() -> PaperConstants:
     """Every constant a positive symbol of its own name."""
-    return Constants(**{field.name: sp.Symbol(field.name, positive=True) for field in fields(Constants)})
+    return PaperConstants(**{field.name: sp.Symbol(field.name, positive=True) for field in fields(PaperConstants)})
 
 
 def state(**replaced) -> State:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from wlr_gym.robot import load_robot
-from wlr_gym.studies.paper.claims import CLAIMS, FAILS, HOLDS, OPEN, PARTLY, VARIANTS, check_all, claims_table, gather
+from wlr_gym.studies.paper.claims import CLAIMS, FAILS, HOLDS, OPEN, PARTLY, check_all, claims_table
+from wlr_gym.studies.paper.evidence import VARIANTS, gather
 from wlr_gym.studies.paper.experiments import drive_both, select
 from wlr_gym.studies.paper.verdicts import CONDITIONAL, CORRECT, EQUATIONS, INCOMPLETE, MISPRINT, WRONG, verdict_table
 

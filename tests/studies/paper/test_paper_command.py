@@ -35,7 +35,7 @@ def test_report_is_written(tmp_path, capsys):
 def test_a_robot_is_asked_for_and_guarded(tmp_path, monkeypatch):
     """Like every command that moves a robot: nothing is driven without somebody there."""
     made = []
-    monkeypatch.setattr("wlr_gym.cli.paper.Options.plant_of", lambda *given: made.append(given))
+    monkeypatch.setattr("wlr_gym.cli.paper.PaperOptions.plant_of", lambda *given: made.append(given))
     monkeypatch.setattr("builtins.input", lambda *_: (_ for _ in ()).throw(EOFError))
     with pytest.raises(InputError, match="nobody there to start the robot"):
         run_command("paper", ["--out", str(tmp_path / "out"), "--plant", "dynamixel", "--draws", "0"])
@@ -96,7 +96,7 @@ def test_a_robot_is_stopped_while_signals_are_looked_at(tmp_path, monkeypatch, c
 
     monkeypatch.setattr("wlr_gym.studies.paper.experiments.drive_plant", drive)
     monkeypatch.setattr("wlr_gym.cli.paper._search", lambda *_: (_ for _ in ()).throw(RuntimeError("both were driven")))
-    monkeypatch.setattr("wlr_gym.studies.paper.claims.gather", lambda *_: None)
+    monkeypatch.setattr("wlr_gym.studies.paper.evidence.gather", lambda *_: None)
     monkeypatch.setattr("wlr_gym.studies.paper.claims.check_all", lambda *_: [])
     arguments = ["--out", str(tmp_path / "out"), "--plant", "dynamixel", "--emulated", "--draws", "0"]
     monkeypatch.setattr("wlr_gym.studies.paper.experiments.drive_both", lambda *_: {})

@@ -9,7 +9,7 @@ import pytest
 from wlr_gym.studies.paper import printed
 from wlr_gym.studies.paper.experiments import LEG_SPEED, TESTS, WHEEL_ACCELERATION, WHEEL_SPEED, duration, paper_test, stop_time
 from wlr_gym.studies.paper.ideal import ideal_motion
-from wlr_gym.studies.paper.quantities import Constants
+from wlr_gym.studies.paper.quantities import PaperConstants
 
 ONE, TWO = (ideal_motion(test) for test in TESTS.values())
 RPM = 60 / (2 * math.pi)
@@ -57,7 +57,7 @@ def test_posture():
     np.testing.assert_allclose([TWO.posture.height[0], TWO.posture.height.max()], [0.1015, 0.1690], atol=1e-4)
     np.testing.assert_allclose([ONE.posture.wheelbase[0], ONE.posture.wheelbase[-1]], [0.350, 0.584], atol=1e-3)
     np.testing.assert_allclose([TWO.posture.wheelbase[0], TWO.posture.wheelbase[-1]], [0.584, 0.116], atol=1e-3)
-    assert TWO.posture.wheelbase[-1] > 2 * Constants().a  # wheels do not touch
+    assert TWO.posture.wheelbase[-1] > 2 * PaperConstants().a  # wheels do not touch
 
 
 def test_loads_and_torques():
@@ -114,9 +114,9 @@ def test_the_traction_that_21_to_24_lack_is_most_of_a_front_wheels_torque():
     """Cruising up: a F_x against I_o (theta'' + ...), which is all that the printed equations keep on a true motion."""
     found = ONE.inverse_dynamics()
     k = at(ONE, 3.0)
-    traction = abs(Constants().a * found.along[k, 0])
+    traction = abs(PaperConstants().a * found.along[k, 0])
     assert traction > 0.8 * abs(found.wheel_torque[k, 0])
     s = ONE.state()
     absolute = {wheel: s.theta_dd[wheel] + s.absolute_leg(wheel)[2] for wheel in s.theta_dd}
     left = printed.eq21_torque_of_the_right_front_wheel(ONE.constants, replace(s, theta_dd=absolute))[k]
-    assert left == pytest.approx(Constants().I_o * absolute["rf"][k], rel=1e-3)
+    assert left == pytest.approx(PaperConstants().I_o * absolute["rf"][k], rel=1e-3)

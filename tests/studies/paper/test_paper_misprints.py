@@ -13,7 +13,7 @@ sp = pytest.importorskip("sympy")
 from paper_symbols import constants, same, state  # noqa: E402
 
 from wlr_gym.studies.paper import printed, repaired  # noqa: E402
-from wlr_gym.studies.paper.quantities import WHEELS, Constants, State, ahead, to_the_right  # noqa: E402
+from wlr_gym.studies.paper.quantities import WHEELS, PaperConstants, State, ahead, to_the_right  # noqa: E402
 
 C, S = constants(), state()
 T = sp.Symbol("t")
@@ -157,7 +157,7 @@ def test_27_has_one_wrong_sign_and_28_a_wrong_denominator():
 
 def test_the_misprinted_denominator_adds_metres_to_a_number_and_even_passes_zero():
     """Audit: 1.333 for 0.584 at alpha 30, beta 150 degrees. In the first test it changes sign on the way."""
-    c = Constants()
+    c = PaperConstants()
     far = State(alpha=math.radians(30), beta=math.radians(150))
     assert printed._base(c, far) == pytest.approx(0.584, abs=1e-3)
     assert printed._misprinted_base(c, far) == pytest.approx(1.333, abs=1e-3)
@@ -231,4 +231,4 @@ def test_brackets_of_the_text():
 
 def test_sides_and_signs():
     assert [to_the_right(wheel) for wheel in WHEELS] == [1, -1, 1, -1]
-    assert np.all([printed.wheel_vector(Constants(), State(), w)[0][1] * to_the_right(w) < 0 for w in WHEELS])
+    assert np.all([printed.wheel_vector(PaperConstants(), State(), w)[0][1] * to_the_right(w) < 0 for w in WHEELS])

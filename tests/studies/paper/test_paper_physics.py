@@ -12,7 +12,7 @@ from paper_symbols import constants, same, state  # noqa: E402
 
 from wlr_gym.physics.model import derivation  # noqa: E402
 from wlr_gym.studies.paper import corrected, printed, reduced, repaired  # noqa: E402
-from wlr_gym.studies.paper.quantities import WHEELS, Constants, Forces, State, lever, wheelbase  # noqa: E402
+from wlr_gym.studies.paper.quantities import WHEELS, Forces, PaperConstants, State, lever, wheelbase  # noqa: E402
 
 C, S = constants(), state()
 #: u11' in the order of the reduced model, wheels lf, rf, lr, rr.
@@ -50,8 +50,8 @@ def rows():
     return appell_rows()
 
 
-def random_robot(rng) -> Constants:
-    return Constants(
+def random_robot(rng) -> PaperConstants:
+    return PaperConstants(
         l_x=rng.uniform(0.2, 0.5), l_y=rng.uniform(0.2, 0.5), l=rng.uniform(0.08, 0.2), a=rng.uniform(0.02, 0.05),
         M_G=rng.uniform(1, 4), I_o=rng.uniform(1e-4, 1e-2), I_ly=rng.uniform(1e-3, 1e-2), I_lx=rng.uniform(1e-3, 1e-2),
         I_Gy=rng.uniform(0.01, 0.1), I_Gz=rng.uniform(0.01, 0.1), m_l=rng.uniform(0.05, 0.5), I_Gx=rng.uniform(0.01, 0.1),
@@ -234,7 +234,7 @@ def test_14_must_not_take_the_velocity_of_the_wheel():
 
 
 def test_15_is_a_box_the_ellipse_fits_in():
-    c = Constants(mu_dx=0.5, mu_dy=0.5)
+    c = PaperConstants(mu_dx=0.5, mu_dy=0.5)
     s = State(x_s_d=dict.fromkeys(WHEELS, 0.01), y_f_d=0.01, y_r_d=0.01)
     box, ellipse = repaired.eq15_dissipation(c, s, 5.0, 5.0), corrected.eq15_dissipation(c, s, 5.0, 5.0)
     assert box == pytest.approx(math.sqrt(2) * ellipse)
@@ -300,7 +300,7 @@ def test_potential_and_loads_say_the_same():
         total = sp.diff(v, angle) + sp.diff(v, S.psi) * psi_of[angle]
         assert same(total, 2 * C.l * sp.cos(angle + S.psi) * (load(C, S) - C.m_l * C.g / 2))
     start = State(alpha=math.radians(30), beta=math.radians(30))
-    c = Constants()
+    c = PaperConstants()
     partial = c.g * c.l * (c.m_l + c.M_G / 2) * math.cos(start.alpha)
     true = [2 * c.l * math.cos(start.alpha) * (n - c.m_l * c.g / 2)
             for n in (printed.eq16_normal_force_in_front(c, start), printed.eq17_normal_force_behind(c, start))]  # fmt: skip
@@ -371,7 +371,7 @@ def test_inverse_dynamics_balances_every_row():
 
 def test_a_pair_of_legs_is_half_as_heavy_with_each_motor():
     """At rest (19) is 2 l cos f (N_f - m_l g/2): both motors together, all gravity and floor, no inertia."""
-    c, s = Constants(), State(alpha=math.radians(30), beta=math.radians(30))
+    c, s = PaperConstants(), State(alpha=math.radians(30), beta=math.radians(30))
     f = Forces(n_f=printed.eq16_normal_force_in_front(c, s), n_r=printed.eq17_normal_force_behind(c, s))
     assert corrected.eq19_torque_of_the_front_legs(c, s, f) / 2 == pytest.approx(0.276, abs=1e-3)
     assert corrected.eq20_torque_of_the_rear_legs(c, s, f) / 2 == pytest.approx(1.387, abs=1e-3)

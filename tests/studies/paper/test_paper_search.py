@@ -5,9 +5,10 @@ import pytest
 
 from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.robot import load_robot
-from wlr_gym.studies.paper import open_question as module
-from wlr_gym.studies.paper import report
-from wlr_gym.studies.paper.open_question import CANDIDATES, READINGS, Outcomes, make_parameters, outcomes, search
+from wlr_gym.studies.paper import report, slip_outcomes, slip_search
+from wlr_gym.studies.paper.slip_candidates import CANDIDATES, READINGS, make_parameters
+from wlr_gym.studies.paper.slip_outcomes import Outcomes, outcomes
+from wlr_gym.studies.paper.slip_search import search
 
 ROBOT = load_robot()
 BY_NAME = {candidate.name: candidate for candidate in CANDIDATES}
@@ -17,9 +18,9 @@ CHOSEN = [BY_NAME["radius"], BY_NAME["camera"]]
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """The reference precision only, no second kernel to compile; a short search."""
-    monkeypatch.setattr(module, "_FAST", (0.002, "float64"))
-    monkeypatch.setattr(module, "_EXACT", (0.002, "float64"))
-    monkeypatch.setattr(module, "ROUNDS", 1)
+    monkeypatch.setattr(slip_outcomes, "_FAST", (0.002, "float64"))
+    monkeypatch.setattr(slip_outcomes, "_EXACT", (0.002, "float64"))
+    monkeypatch.setattr(slip_search, "ROUNDS", 1)
 
 
 def made(error, lateral):
@@ -67,7 +68,7 @@ def test_search_is_reproducible_covers_pairs_and_closes_in(tmp_path):
         np.testing.assert_array_equal(a.values, b.values)
         np.testing.assert_array_equal(a.outcomes.lateral, b.outcomes.lateral)
     pair = first[2]
-    assert len(pair.values) == 3 + module.ROUNDS * 12
+    assert len(pair.values) == 3 + slip_search.ROUNDS * 12
     low, high = (np.array([getattr(dial, end) for dial in pair.dials]) for end in ("low", "high"))
     assert (pair.values >= low).all()
     assert (pair.values <= high).all()

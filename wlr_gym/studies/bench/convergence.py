@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.physics.plants.base import PlantOptions, standing_state
 from wlr_gym.physics.plants.gibbs_appell.plant import SWEEPS, GibbsAppellPlant
-from wlr_gym.robot import load_robot
+from wlr_gym.robot import LEG_SLICE, load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.measure import Size
 
@@ -25,7 +25,10 @@ CASES = {
 }
 STEPS = (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3)
 SWEEP_COUNTS = (2, 3, 4, 6, 8)
-REFERENCE_STEP, REFERENCE_SWEEPS, MANY_SWEEPS = 1e-5, 8, 300
+#: s, and sweeps of it: the reference of steps; sweeps of the reference of sweeps.
+REFERENCE_STEP = 1e-5
+REFERENCE_SWEEPS = 8
+MANY_SWEEPS = 300
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ def _goals(case: str, ticks: int, count: int) -> list[Array]:
     if case == "profile":
         return [first if (tick // 15) % 2 == 0 else second for tick in range(ticks)]
     if case == "skid":
-        first[:, :4] = np.pi / 2
+        first[:, LEG_SLICE] = np.pi / 2
     return [first] * ticks
 
 

@@ -28,7 +28,7 @@ from wlr_gym.physics.plants.base import (
 )
 from wlr_gym.physics.plants.mujoco.mjcf import build_model
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
-from wlr_gym.robot import JOINTS, LEGS, Robot
+from wlr_gym.robot import FIRST_WHEEL, JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import contact_slip_velocity
 
@@ -79,7 +79,7 @@ def _add_servos(robot: Robot, parameters: Parameters) -> Callable[[mujoco.MjSpec
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
             is_leg = name in LEGS
             _add_actuator(spec, name, kp[index], [0.0, -kp[index], -kd[index] if is_leg else 0.0], integrates=not is_leg)
-        for index, name in enumerate(JOINTS[4:], 4):
+        for index, name in enumerate(WHEELS, FIRST_WHEEL):
             _add_actuator(spec, name, kd[index], [0.0, 0.0, -kd[index]], integrates=False)
 
     return add
@@ -166,14 +166,14 @@ class MujocoLoopPlant:
         data.qpos[:3], data.qpos[3:7], data.qpos[7:] = state.position[0], state.quaternion[0], state.joint_position[0, _MUJOCO]
         mujoco.mju_rotVecQuat(data.qvel[:3], state.linear_velocity_in_body[0], state.quaternion[0])
         data.qvel[3:6], data.qvel[6:] = state.angular_velocity_in_body[0], state.joint_velocity[0, _MUJOCO]
-        data.act[:] = state.reference_position[0, 4:]
+        data.act[:] = state.reference_position[0, WHEEL_SLICE]
 
     def get_state(self) -> PlantState:
         """Return a copy of the mechanical and servo state."""
         truth = self._truth
         reference, speed = truth.joint_position.copy(), np.zeros((1, 8))
-        reference[0, :4], reference[0, 4:] = self._data.ctrl[:4], self._data.act
-        speed[0, 4:] = self._data.ctrl[4:8]
+        reference[0, LEG_SLICE], reference[0, WHEEL_SLICE] = self._data.ctrl[LEG_SLICE], self._data.act
+        speed[0, WHEEL_SLICE] = self._data.ctrl[WHEEL_SLICE]
         return PlantState(
             truth.position.copy(), truth.quaternion.copy(), truth.linear_velocity_in_body.copy(),
             truth.angular_velocity_in_body.copy(), truth.joint_position.copy(), truth.joint_velocity.copy(), reference, speed,
@@ -183,7 +183,7 @@ class MujocoLoopPlant:
         """Advance one control tick with the servos as actuators."""
         row = check_goals(goals, 1)[0]
         self._data.ctrl[:8] = row
-        self._data.ctrl[8:] = row[4:]
+        self._data.ctrl[8:] = row[WHEEL_SLICE]
         mujoco.mj_step(self._model, self._data, nstep=self.options.substeps)
         self._look()
         self._sensors.measure(self._raw, self._readings.values)

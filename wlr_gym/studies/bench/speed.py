@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import wlr_gym  # noqa: F401  (registers the environments)
 from wlr_gym.physics.plants.base import PlantOptions, standing_state
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
-from wlr_gym.robot import load_robot
+from wlr_gym.robot import WHEEL_SLICE, load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.measure import Contender, Measurement, Size, against_fastest, interleave, rate
 from wlr_gym.studies.bench.mujoco_loop import BACKEND, build_servo_model, register_backend
@@ -87,7 +87,7 @@ def mujoco_batch(count: int, ticks: int, *, soft: bool) -> Contender:
     def drive() -> None:
         for row in goals:
             control[:, :8] = row
-            control[:, 8:] = row[:, 4:]
+            control[:, 8:] = row[:, WHEEL_SLICE]
             batch.step(nstep=SUBSTEPS)
 
     def run() -> float:

@@ -24,7 +24,7 @@ from wlr_gym.gap.rig.problem import ENCODER_NOISE, RigProblem
 from wlr_gym.gap.rig.recording import Recording
 from wlr_gym.gap.rig.replay import STEP, Replay
 from wlr_gym.physics import servo
-from wlr_gym.studies.bench.sysid import Contest, PeerProblem, PeerRun, contest_between
+from wlr_gym.studies.bench.sysid_contest import Contest, PeerProblem, PeerRun, contest_between
 
 Array = NDArray[np.float64]
 
@@ -32,10 +32,13 @@ Array = NDArray[np.float64]
 KNOWN = ("no_load_speed", "delay")
 _FREE = np.array([quantity.name not in KNOWN for quantity in QUANTITIES])
 _NOMINAL = np.array([quantity.nominal for quantity in QUANTITIES])
-#: Substeps of the recordings' simulation in one step of the fits, and steps between two rows.
-FINE, ROW = 20, 5
+#: Substeps of the recordings' simulation in one step of the fits.
+FINE = 20
+#: Steps between two rows.
+ROW = 5
 #: Load (kg), distance from the axis (m) and P gain register of each run.
 RUNS = ((0.1, 0.15, 200.0), (0.2, 0.1, 400.0), (0.1, 0.1, 800.0), (0.3, 0.1, 300.0))
+#: V.
 SUPPLY = 5.0
 
 

@@ -32,10 +32,10 @@ from wlr_gym.gap.robot.problem import RobotProblem
 from wlr_gym.gap.robot.windows import anchored_residuals
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, standing_state
-from wlr_gym.robot import JOINTS, load_robot
+from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS, load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.mujoco_loop import build_servo_model
-from wlr_gym.studies.bench.sysid import Contest, PeerProblem, PeerRun, contest_between
+from wlr_gym.studies.bench.sysid_contest import Contest, PeerProblem, PeerRun, contest_between
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,11 @@ Array = NDArray[np.float64]
 FREE = ("body.mass", "body.com_offset", "wheel.radius", "servo.armature", "servo.coulomb_friction")
 #: Channels that are compared.
 COMPARED = tuple(name for name in CHANNELS if name.startswith(("pos_", "vel_")) or name in ("cam_x", "cam_y", "cam_yaw"))
-RUNS, PERIOD, STEP = 2, 0.02, 0.001
+RUNS = 2
+#: s between two rows of a run.
+PERIOD = 0.02
+#: s, step that both sides fit with.
+STEP = 0.001
 #: s that the robot stands before a run begins.
 REST = 0.5
 #: MuJoCo orders joints along the tree: leg, wheel, leg, wheel, ...
@@ -94,7 +98,7 @@ def _recorded(parameters: Parameters, seconds: float, run: int, rng: np.random.G
             readings = plant.step(goal[None])
     finally:
         plant.close()
-    table[:, 4:8] -= table[0, 4:8]
+    table[:, WHEEL_SLICE] -= table[0, WHEEL_SLICE]
     frame = pandas.DataFrame(np.hstack([goals, table]), columns=[*COMMANDS, *SENSED])
     frame.insert(0, "t", PERIOD * np.arange(rows))
     return Run(frame, RunMeta(), Path(f"run_{run}.parquet"))
@@ -106,7 +110,7 @@ def _goals(t: Array, home: float, rng: np.random.Generator) -> Array:
     waves = [_wave(t, rng) for _ in range(6)]
     legs = [home + 0.25 * begin * wave for wave in waves[:4]]
     left, right = (4.0 * begin * wave for wave in waves[4:])
-    return np.stack([*legs, *(left if "_l" in joint else right for joint in JOINTS[4:])], axis=1)
+    return np.stack([*legs, *(left if "_l" in joint else right for joint in WHEELS)], axis=1)
 
 
 def _wave(t: Array, rng: np.random.Generator) -> Array:
@@ -149,7 +153,7 @@ def _peer_run(problem: FewNumbers, run: int, build: Callable[[Array], mujoco.MjM
         found = anchored_residuals(t, measured, _channels(state, rows, shown, model)[None], problem.noise, window)[0]
         return np.nan_to_num(found)
 
-    control = np.hstack([goals, goals[:, 4:]])
+    control = np.hstack([goals, goals[:, WHEEL_SLICE]])
     return PeerRun(
         model, build, STEP * np.arange(steps + 1), control, _start(problem.clocks[run].run, problem, nominal, model), residual
     )
@@ -160,7 +164,7 @@ def _start(run: Run, problem: FewNumbers, nominal: Parameters, model: mujoco.MjM
     begin, data = start_state(run, problem.robot, nominal), mujoco.MjData(model)
     data.qpos[:3], data.qpos[3:7] = begin.position[0], begin.quaternion[0]
     data.qpos[7:][_JOINTS] = begin.joint_position[0]
-    data.act[:] = begin.reference_position[0, 4:]
+    data.act[:] = begin.reference_position[0, WHEEL_SLICE]
     return np.concatenate([[0.0], data.qpos, data.qvel, data.act])
 
 

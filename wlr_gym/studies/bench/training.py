@@ -31,8 +31,10 @@ EPOCHS = 4
 #: Reward per second of simulated time, exploration included, from which the task counts as learnt: both tracking kernels are
 #: beyond 0.93 then, where errors at the limits of success (0.02 m/s, 0.06 rad/s) would give 0.90 and 0.91.
 SOLVED = 1.7
-#: Frames over which it is averaged. Frames after which a run is given up.
-WINDOW, MOST_FRAMES = 16_384, 4_000_000
+#: Frames over which it is averaged.
+WINDOW = 16_384
+#: Frames after which a run is given up.
+MOST_FRAMES = 4_000_000
 #: A peer is given up after so many times our wall time.
 PATIENCE = 10.0
 #: Settings with which each learnt fastest of those tried (docs/learning.md): many robots, few large minibatches; few robots,

@@ -18,14 +18,12 @@ from numpy.typing import NDArray
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import detect, refine
 from wlr_gym.perception.markers.pose import circle_centres, find_target
-from wlr_gym.perception.markers.targets import CODES, Target, load_target, ring_radii
+from wlr_gym.perception.markers.targets import Target, load_target, ring_radii
 from wlr_gym.perception.scene import (
     Facet,
-    Image,
     Look,
     Renderer,
     ScenePose,
-    develop,
     floor_facets,
     plate_facet,
     project,
@@ -40,20 +38,25 @@ from wlr_gym.perception.vision.tracking import Tracker, VideoFrame, angles, loca
 from wlr_gym.robot import Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.measure import Size
-from wlr_gym.studies.bench.vision_drives import Drive, film, paper_test, skid_turn
+from wlr_gym.studies.bench.vision_clutter import clutter
+from wlr_gym.studies.bench.vision_drives import FilmedDrive, film, paper_test, skid_turn
 
 Array = NDArray[np.float64]
 
 CAMERA = Camera(width=1280, height=720, focal=(800.0, 800.0), centre=(639.5, 359.5))
+#: Distortion (k1, k2, p1, p2, k3) of the camera in most scenes, and of two strong lenses.
 LENS = (-0.1, 0.02, 0.001, -0.001, 0.0)
 STRONG_LENSES = ((-0.3, 0.1, 0.0, 0.0, 0.0), (0.3, -0.05, 0.0, 0.0, 0.0))
+#: m, the body's origin above the floor with the legs at home.
 HOME_HEIGHT = 0.169
+#: s between the film's clock and the log's.
 TRUE_OFFSET = 0.137
+#: m.
 TAG_SIDE = 0.06
 
 
 @dataclass(frozen=True)
-class Result:
+class VisionResult:
     """One line of the report.
 
     Attributes:
@@ -81,14 +84,14 @@ class Result:
         return {**vars(self), "met": self.met}
 
 
-def measure_vision(size: Size) -> list[Result]:
+def measure_vision(size: Size) -> list[VisionResult]:
     """Measure everything."""
     import cv2
 
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        parts: Sequence[Callable[[Size], list[Result]]] = (
+        parts: Sequence[Callable[[Size], list[VisionResult]]] = (
             measure_centres, measure_poses, measure_recall, measure_false_poses, measure_rate, measure_drives,
         )  # fmt: skip
         return [result for part in parts for result in part(size)]
@@ -99,7 +102,7 @@ def measure_vision(size: Size) -> list[Result]:
 # --- centres ----------------------------------------------------------------------------------------------------------
 
 
-def measure_centres(size: Size) -> list[Result]:
+def measure_centres(size: Size) -> list[VisionResult]:
     """Error of a single marker's centre, given its tilt: rms over both axes together, px."""
     count = size(200, 6)
     strong = [CAMERA.model_copy(update={"distortion": lens}) for lens in STRONG_LENSES]
@@ -113,7 +116,7 @@ def measure_centres(size: Size) -> list[Result]:
     for what, cameras, look, bar in cases:
         errors = np.array([_centre_error(cameras[k % len(cameras)], look, k) for k in range(count)])
         found = errors[np.isfinite(errors)]
-        results.append(Result(what, "ours", float(np.sqrt(np.mean(found**2))), "px", bar, count=len(found)))
+        results.append(VisionResult(what, "ours", float(np.sqrt(np.mean(found**2))), "px", bar, count=len(found)))
     return results
 
 
@@ -156,7 +159,7 @@ def _crop(camera: Camera, middle: Array, half: int = 60) -> tuple[Camera, Array]
 # --- poses ------------------------------------------------------------------------------------------------------------
 
 
-def measure_poses(size: Size) -> list[Result]:
+def measure_poses(size: Size) -> list[VisionResult]:
     """Error of the body's pose in the floor frame from 2 m: ours, square tags, the paper's method."""
     results = []
     for name, tilt, bars in (("overhead", 0.0, (0.1, 0.01)), ("45 deg", math.pi / 4, (0.3, 0.02))):
@@ -171,16 +174,16 @@ def measure_poses(size: Size) -> list[Result]:
     return results
 
 
-def _pose_lines(label: str, method: str, errors: Array, bars: tuple[float, float] | None) -> list[Result]:
+def _pose_lines(label: str, method: str, errors: Array, bars: tuple[float, float] | None) -> list[VisionResult]:
     """Lines for xy (mm, rms of the distance) and yaw (deg, rms); ``errors`` is (F, 3) in m and rad."""
     if not len(errors):
-        return [Result(f"body xy, {label}", method, math.nan, "mm")]
+        return [VisionResult(f"body xy, {label}", method, math.nan, "mm")]
     xy = 1e3 * float(np.sqrt(np.mean(np.sum(errors[:, :2] ** 2, axis=1))))
     yaw = math.degrees(float(np.sqrt(np.mean(errors[:, 2] ** 2))))
     first, second = bars or (None, None)
     count = len(errors)
-    return [Result(f"body xy, {label}", method, xy, "mm", first, count=count),
-            Result(f"body yaw, {label}", method, yaw, "deg", second, count=count)]  # fmt: skip
+    return [VisionResult(f"body xy, {label}", method, xy, "mm", first, count=count),
+            VisionResult(f"body yaw, {label}", method, yaw, "deg", second, count=count)]  # fmt: skip
 
 
 def _random_pose(rng: np.random.Generator, height: float | None = None) -> ScenePose:
@@ -279,7 +282,7 @@ def _tag_error(seen: dict[int, Any], shift: float, body: Target, camera: Camera,
 # --- recall, false poses, rate ----------------------------------------------------------------------------------------
 
 
-def measure_recall(size: Size) -> list[Result]:
+def measure_recall(size: Size) -> list[VisionResult]:
     """Share of markers found in whole images, at 12 to 16 px (the long axis), tilt up to 45 degrees, noise up to 10."""
     body, robot = load_target("body"), load_robot()
     rng, found, shown = np.random.default_rng(5), 0, 0
@@ -297,70 +300,25 @@ def measure_recall(size: Size) -> list[Result]:
                 shown += 1
                 found += any(d.code == code and np.hypot(*(d.ellipse[:2] - place)) < 1.0 for d in detections)
     what = "recall, r >= 12 px, tilt <= 45 deg, noise <= 10"
-    return [Result(what, "ours", 100 * found / shown, "%", 99.0, least=True, count=shown)]
+    return [VisionResult(what, "ours", 100 * found / shown, "%", 99.0, least=True, count=shown)]
 
 
-def measure_false_poses(size: Size) -> list[Result]:
+def measure_false_poses(size: Size) -> list[VisionResult]:
     """Poses found in cluttered frames without markers; should be none."""
     body, floor = load_target("body"), load_target("floor")
     poses = markers = 0
     count = size(1000, 5)
     for k in range(count):
-        detections = detect(clutter(k), CAMERA)
+        detections = detect(clutter(k, CAMERA), CAMERA)
         markers += len(detections)
         poses += sum(find_target(detections, target, CAMERA) is not None for target in (body, floor))
     return [
-        Result(f"false poses in {count} cluttered frames", "ours", poses, "", 0, count=count),
-        Result(f"single false markers in {count} cluttered frames", "ours", markers, "", count=count),
+        VisionResult(f"false poses in {count} cluttered frames", "ours", poses, "", 0, count=count),
+        VisionResult(f"single false markers in {count} cluttered frames", "ours", markers, "", count=count),
     ]
 
 
-def clutter(seed: int) -> Image:
-    """A frame full of discs, rings, targets with other radii, boxes, lines and words, but without our markers."""
-    import cv2
-
-    rng = np.random.default_rng(seed)
-    height, width = CAMERA.height, CAMERA.width
-    image: Any = cv2.resize(rng.uniform(60, 200, (9, 16)).astype(np.uint8), (width, height), interpolation=cv2.INTER_CUBIC)
-
-    def place() -> tuple[int, int]:
-        return int(rng.integers(0, width)), int(rng.integers(0, height))
-
-    for _ in range(60):
-        shade, (x, y) = float(rng.choice([20, 235, rng.uniform(0, 255)])), place()
-        kind = rng.integers(0, 6)
-        if kind == 0:
-            cv2.rectangle(image, (x, y), (x + int(rng.integers(5, 160)), y + int(rng.integers(5, 120))), shade, -1)
-        elif kind == 1:
-            axes = int(rng.integers(4, 50)), int(rng.integers(4, 50))
-            cv2.ellipse(image, (x, y), axes, rng.uniform(0, 180), 0, 360, shade, int(rng.choice([-1, 2, 5])), cv2.LINE_AA)
-        elif kind == 2:
-            cv2.line(image, (x, y), place(), shade, int(rng.integers(1, 6)), cv2.LINE_AA)
-        elif kind == 3:
-            cv2.putText(image, "R0BO0 8@Q", (x, y), cv2.FONT_HERSHEY_DUPLEX, rng.uniform(0.4, 2.5), shade, 2, cv2.LINE_AA)
-        else:
-            _other_rings(image, rng, (x, y))
-    return develop(image.astype(np.float32), Look(blur=rng.uniform(0.3, 2), noise=rng.uniform(0, 10)), seed)
-
-
-def _other_rings(image: Image, rng: np.random.Generator, place: tuple[int, int]) -> None:
-    """Draw concentric discs whose radii are no code's (or light on dark, or too many)."""
-    import cv2
-
-    radius, aspect, turn = rng.uniform(8, 60), rng.uniform(0.5, 1), rng.uniform(0, 180)
-    while True:
-        shares = np.sort(rng.uniform(0.1, 0.95, int(rng.integers(1, 5))))[::-1]
-        dark_outside = bool(rng.integers(0, 2))
-        alike = len(shares) == 2 and dark_outside and min(np.hypot(*(shares - code)) for code in CODES.values()) < 0.15
-        if not alike:
-            break
-    for k, share in enumerate((1.0, *shares)):
-        axes = max(1, int(radius * share)), max(1, int(radius * share * aspect))
-        shade = 20.0 if (k % 2 == 0) == dark_outside else 235.0
-        cv2.ellipse(image, place, axes, turn, 0, 360, shade, -1, cv2.LINE_AA)
-
-
-def measure_rate(size: Size) -> list[Result]:
+def measure_rate(size: Size) -> list[VisionResult]:
     """Frames per second of the tracker on one core, once it has found the robot, 1280 x 720, images in memory."""
     body, floor, robot = load_target("body"), load_target("floor"), load_robot()
     renderer = Renderer(CAMERA, view(0.2, 2.0), floor_facets(floor))
@@ -380,20 +338,20 @@ def measure_rate(size: Size) -> list[Result]:
             tracker(frame)
         rates.append((len(frames) - 2) / (time.perf_counter() - start))
     what = "tracked frames per second, 1280 x 720, one core"
-    return [Result(what, "ours", float(np.median(rates)), "1/s", 60, least=True, count=len(rates) * (len(frames) - 2))]
+    return [VisionResult(what, "ours", float(np.median(rates)), "1/s", 60, least=True, count=len(rates) * (len(frames) - 2))]
 
 
 # --- whole drives -----------------------------------------------------------------------------------------------------
 
 
-def measure_drives(size: Size) -> list[Result]:
+def measure_drives(size: Size) -> list[VisionResult]:
     """Film drives with known slip (30 Hz, 5 ms exposure) and measure it, clocks apart by an unknown offset."""
     robot = load_robot()
     makers = (lambda: paper_test(1, robot), lambda: paper_test(2, robot), lambda: skid_turn(robot))
     return [line for make in makers[size(0, 2) :] for line in measure_drive(make())]
 
 
-def measure_drive(drive: Drive, tilt: float = 0.0, look: Look | None = None) -> list[Result]:
+def measure_drive(drive: FilmedDrive, tilt: float = 0.0, look: Look | None = None) -> list[VisionResult]:
     """Lines for one filmed drive: worst error of the accumulated slip of any wheel at any time, and the clocks' offset."""
     body, floor = load_target("body"), load_target("floor")
     camera = CAMERA.model_copy(update={"distortion": LENS})
@@ -406,23 +364,25 @@ def measure_drive(drive: Drive, tilt: float = 0.0, look: Look | None = None) -> 
     error = 1e3 * np.abs(slip.slip - true_slip(drive, slip.time))
     final = 1e3 * (slip.slip[-1] - true_slip(drive, slip.time)[-1])
     largest = 1e3 * np.abs(drive.slip[-1]).max(axis=0)
-    lines: list[Result] = []
+    lines: list[VisionResult] = []
     for axis, name in enumerate(("longitudinal", "lateral")):
         what = f"{drive.name}: accumulated {name} slip (up to {largest[axis]:.0f} mm)"
         lines.append(
-            Result(f"{what}, worst wheel and time", "ours", float(error[:, :, axis].max()), "mm", 1.0, count=len(samples))
+            VisionResult(f"{what}, worst wheel and time", "ours", float(error[:, :, axis].max()), "mm", 1.0, count=len(samples))
         )
         lines.append(
-            Result(f"{what}, worst wheel, end", "ours", float(np.abs(final[:, axis]).max()), "mm", 1.0, count=len(samples))
+            VisionResult(
+                f"{what}, worst wheel, end", "ours", float(np.abs(final[:, axis]).max()), "mm", 1.0, count=len(samples)
+            )
         )
     late = 1e3 * abs(found.offset - TRUE_OFFSET)
     return [
         *lines,
-        Result(f"{drive.name}: clock offset (± {1e3 * found.std:.1f})", "ours", late, "ms", 2.0, count=len(samples)),
+        VisionResult(f"{drive.name}: clock offset (± {1e3 * found.std:.1f})", "ours", late, "ms", 2.0, count=len(samples)),
     ]
 
 
-def true_slip(drive: Drive, at: Array) -> Array:
+def true_slip(drive: FilmedDrive, at: Array) -> Array:
     """(K, 4, 2) m, true accumulated slip from the first of the times on."""
     flat = drive.slip.reshape(len(drive.time), 8)
     values = np.stack([np.interp(at, drive.time, column) for column in flat.T], axis=1).reshape(-1, 4, 2)

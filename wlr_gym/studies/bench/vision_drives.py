@@ -18,21 +18,26 @@ from wlr_gym.perception.scene import Facet, Look, Renderer, ScenePose, plate_fac
 from wlr_gym.perception.vision.tracking import VideoFrame
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, standing_state
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-#: s; the truth's clock, and the run's period in ticks of it.
-TICK, ROW = 0.002, 10
+#: s, period of the truth's clock.
+TICK = 0.002
+#: Period of the run, in ticks of that clock.
+ROW = 10
 #: rad/s, rad/s2, rad/s: registers 80, 1 and 15 of the paper's servos; four turns of the driven wheels.
-PAPER_SPEED, PAPER_ACCELERATION, PAPER_LEG_SPEED = 1.918474, 0.374508, 0.359712
+PAPER_SPEED = 1.918474
+PAPER_ACCELERATION = 0.374508
+PAPER_LEG_SPEED = 0.359712
+#: s at rest before the motion.
 _REST = 1.0
 _SETTLING = 1.0  # s before the log starts: legs and tyres take the weight
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class FilmedDrive:
     """A drive and its truth.
 
     Attributes:
@@ -52,7 +57,7 @@ class Drive:
     slip: Array
 
 
-def paper_test(number: int, robot: Robot) -> Drive:
+def paper_test(number: int, robot: Robot) -> FilmedDrive:
     """The paper's first or second test: front wheels drive four turns, rear wheels run free, legs sweep 120 degrees.
 
     Rear gear friction and floor are chosen so that it slips; the left rear gear is stiffer, so that it drifts sideways.
@@ -72,7 +77,7 @@ def paper_test(number: int, robot: Robot) -> Drive:
     return _drive(f"paper test {number}", robot, parameters, start, goals, stop + ramp + 0.5, free, -0.55)
 
 
-def skid_turn(robot: Robot) -> Drive:
+def skid_turn(robot: Robot) -> FilmedDrive:
     """Forward, a turn on the spot with the wheels against each other, forward again; the legs move all the time."""
     parameters = Parameters.nominal(robot)
     parameters["ground.mu_x"] = parameters["ground.mu_y"] = 0.4
@@ -102,7 +107,7 @@ def _drive(
     duration: float,
     torque_on: NDArray[np.bool_],
     x: float,
-) -> Drive:
+) -> FilmedDrive:
     import pandas
 
     plant = make_plant("gibbs_appell", robot, 1, PlantOptions(control_period=TICK, physics_step=0.001))
@@ -118,7 +123,7 @@ def _drive(
         leg_goals, wheel_goals = goals(time - time % (ROW * TICK) if tick % ROW else time)
         goal = np.array([[*leg_goals, *wheel_goals]])
         truth = plant.truth()
-        truths.append(np.concatenate([truth.position[0], truth.quaternion[0], truth.joint_position[0, :4]]))
+        truths.append(np.concatenate([truth.position[0], truth.quaternion[0], truth.joint_position[0, LEG_SLICE]]))
         if tick > 0:
             slips[tick] = slips[tick - 1] + truth.slip_displacement[0].reshape(4, 2)
         if tick % ROW == 0:
@@ -128,13 +133,13 @@ def _drive(
     found = np.array(truths)
     run = Run(pandas.DataFrame(rows), RunMeta(robot=robot.name), Path(f"{name.replace(' ', '_')}.parquet"))
     time = np.asarray(TICK * np.arange(count + 1), np.float64)
-    return Drive(name, run, robot, parameters, time, found[:, :3], _matrices(found[:, 3:7]), found[:, 7:], slips)
+    return FilmedDrive(name, run, robot, parameters, time, found[:, :3], _matrices(found[:, 3:7]), found[:, 7:], slips)
 
 
 def _start(robot: Robot, parameters: Parameters, legs: list[float], x: float) -> PlantState:
     state = standing_state(robot, parameters, legs[0])  # sin is the same for all legs, so the body is level
-    state.joint_position[:, :4] = legs
-    state.reference_position[:, :4] = legs
+    state.joint_position[:, LEG_SLICE] = legs
+    state.reference_position[:, LEG_SLICE] = legs
     state.position[:, 0] = x
     return state
 
@@ -158,7 +163,7 @@ def _matrices(quaternion: Array) -> Array:
 
 
 def film(
-    drive: Drive,
+    drive: FilmedDrive,
     renderer: Renderer,
     body: Target,
     look: Look,
@@ -184,7 +189,7 @@ def film(
         yield VideoFrame(index, time - offset, renderer.frame(moving, look, seed + index))
 
 
-def pose_at(drive: Drive, time: float) -> ScenePose:
+def pose_at(drive: FilmedDrive, time: float) -> ScenePose:
     """True pose of the body at a servo time: linear between ticks."""
     from scipy.spatial.transform import Rotation, Slerp
 
@@ -195,7 +200,7 @@ def pose_at(drive: Drive, time: float) -> ScenePose:
     return ScenePose(position, turn, legs)
 
 
-def _robot_at(drive: Drive, time: float, body: Target) -> list[Facet]:
+def _robot_at(drive: FilmedDrive, time: float, body: Target) -> list[Facet]:
     pose = pose_at(drive, time)
     facets = [*robot_facets(drive.robot, pose.legs), plate_facet(body)]
     return [facet.moved(pose.position, pose.rotation) for facet in facets]

@@ -16,16 +16,19 @@ from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.scene import PLATE, Look, ScenePose, circles_of, develop
 from wlr_gym.render.gl import Canvas
 from wlr_gym.render.stage import Stage
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import LEGS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-_WHITE, _BLACK = (0.9, 0.9, 0.9, 1.0), (0.05, 0.05, 0.05, 1.0)
+_WHITE = (0.9, 0.9, 0.9, 1.0)
+_BLACK = (0.05, 0.05, 0.05, 1.0)
 _STEP = 1e-4  # m between a disc and the one on it, so that they do not flicker through each other
 #: m; height of the markers over the body's origin: MuJoCo's robot wears a deck that the default 0.04 m would put them under.
 DECK = 0.06
-_NEAR, _FAR = 0.1, 20.0
+#: m; what the camera draws.
+_NEAR = 0.1
+_FAR = 20.0
 _SLICES = 128  # sides of what is drawn for a circle
 
 
@@ -48,7 +51,7 @@ class MujocoStudio:
         self._scene = mujoco.MjvScene(model, maxgeom=600)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_HAZE):
             self._scene.flags[flag] = 0
-        self._joints = [int(model.joint(joint).qposadr[0]) for joint in JOINTS[:4]]
+        self._joints = [int(model.joint(joint).qposadr[0]) for joint in LEGS]
 
     def frame(self, pose: ScenePose, look: Look, seed: int) -> NDArray[np.uint8]:
         """Draw the robot at ``pose`` (H, W), then let ``look`` blur it and add noise."""

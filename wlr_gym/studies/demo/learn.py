@@ -42,18 +42,18 @@ def train(demo: Demo, tell: Tell) -> Section:
     robots, period = int(config["num_envs"]), 0.02
     hours = curve[-1]["steps"] * period / 3600.0
     headline = (
-        f"A new policy learnt from nothing in {curve[-1]['steps'] / 1e6:.1f} million control ticks: "
+        f"A new policy learnt from nothing in {curve[-1]['steps'] / 1e6:.1f} million environment steps: "
         f"reward {first:.2f} to {last:.2f} per second of at most {BEST:g}."
     )
     html = paragraph(
-        f"PPO (Stable-Baselines3) drives {robots} simulated robots at once, on floors from slippery to grippy, and is asked to "
+        f"PPO (Stable-Baselines3) drives {robots} simulated robots at once, on floors from slippery to grippy, and is to "
         f"follow commands of forward velocity and yaw rate. It saw {hours:.1f} hours of driving, simulated on one core. It is "
         "one of the policies on ice below."
     )
     html += drawn(
         plots.learning_curve(curve, references),
         demo.out / "learning_curve.png",
-        "Left: reward per second of simulated time, over control ticks of all robots together; the references play whole "
+        "Left: reward per second of simulated time, over environment steps of all robots together; the references play whole "
         "episodes of the same task without exploring. Right: what the reward is made of.",
     )
     chosen = _liveliest(episodes)
@@ -67,7 +67,7 @@ def train(demo: Demo, tell: Tell) -> Section:
 
 @contextmanager
 def _watched(demo: Demo, tell: Tell) -> Iterator[None]:
-    """Tell of the training's progress, by its learning curve, until it is over."""
+    """Report the training's progress, by its learning curve, until it is over."""
     from wlr_gym.learning.evaluation import read_curve
 
     over = threading.Event()
@@ -80,7 +80,7 @@ def _watched(demo: Demo, tell: Tell) -> Iterator[None]:
                 continue
             reward = f"reward {done['reward_per_second']:.2f} per second"
             tell(
-                f"training: {done['steps'] / 1e6:.1f} of {demo.steps / 1e6:.1f} million ticks, {reward}",
+                f"training: {done['steps'] / 1e6:.1f} of {demo.steps / 1e6:.1f} million steps, {reward}",
                 0.93 * done["steps"] / demo.steps,
             )
 
@@ -109,7 +109,7 @@ def _reward_per_second(rollout: Rollout) -> float:
 
 
 def _liveliest(rollout: Rollout) -> int:
-    """Return the episode that was asked for the most driving and turning: the most to see."""
+    """Return the episode whose commands have the most driving and turning: the most to see."""
     largest = np.maximum(np.abs(rollout.command).max(axis=(0, 1)), 1e-9)
     effort = (np.abs(rollout.command) / largest).sum(axis=-1)
     return int(np.argmax(np.where(rollout.active, effort, 0.0).sum(axis=0)))

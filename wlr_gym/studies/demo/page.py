@@ -38,7 +38,7 @@ def page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> 
     )
     footer = (
         f"<footer><p>wlr_gym {escape(__version__)}, seed {demo.seed}: the same seed gives the same numbers on one machine. "
-        f"Another secret: <code>wlr demo --seed {demo.seed + 1}</code>.</p></footer>"
+        f"Another hidden fault: <code>wlr demo --seed {demo.seed + 1}</code>.</p></footer>"
     )
     return document(title, _COLOURS[worst], [header, *(section(one.title, one.html) for one in sections), footer])
 

@@ -15,7 +15,7 @@ class Demo:
     Attributes:
         out: folder of all results.
         seed: of everything random: training, episodes, commands, and what the robot hides.
-        steps: control ticks to train for, all robots together.
+        steps: environment steps to train for, all robots together.
         episodes: of each policy in the comparison.
         film_seconds: length of the film.
         run_seconds: length of each measured run.
@@ -46,7 +46,7 @@ class Demo:
         return self.out / "gap"
 
     @property
-    def secret(self) -> Path:
+    def hidden(self) -> Path:
         """Patch file with what the robot hides."""
         return self.out / "hidden.yaml"
 

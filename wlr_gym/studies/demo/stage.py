@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 #: Told of what is going on and of the share of the stage that is done.
 Tell = Callable[[str, float], None]
 #: Verdicts of a section: what it set out to show was shown, was not, was not tried, or went wrong.
-SHOWN, NOT_SHOWN, SKIPPED, FAILED = "shown", "not shown", "skipped", "failed"
+SHOWN = "shown"
+NOT_SHOWN = "not shown"
+SKIPPED = "skipped"
+FAILED = "failed"
 _MEDIA = {".png": "image/png", ".webp": "image/webp"}
 
 
@@ -39,13 +42,13 @@ class Section:
 
 
 @dataclass(frozen=True)
-class Stage:
+class DemoStage:
     """One stage.
 
     Attributes:
         title: of its section.
         work: does it.
-        share: of the time of its lane.
+        share: of the time of its worker.
         needs: (package, extra) it cannot do without.
     """
 

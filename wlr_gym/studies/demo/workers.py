@@ -1,6 +1,6 @@
-"""Stages in two lanes, each a process of its own on one core: what one lane breaks or leaks does not harm the other.
+"""Stages in two workers, each a process of its own on one core: what one worker breaks or leaks does not harm the other.
 
-A lane tells its parent of progress and of finished sections in lines of JSON. Whatever else it prints goes to a log file.
+A worker reports progress and finished sections to its parent in lines of JSON. Whatever else it prints goes to a log file.
 """
 
 from __future__ import annotations
@@ -19,28 +19,32 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from wlr_gym.base.errors import InputError, MissingPackageError, require_package
-from wlr_gym.studies.demo import answer, ice, learn, secret
+from wlr_gym.studies.demo import diagnosis, hidden_fault, ice_comparison, learn
 from wlr_gym.studies.demo.settings import Demo
-from wlr_gym.studies.demo.stage import FAILED, SKIPPED, Section, Stage, paragraph
+from wlr_gym.studies.demo.stage import FAILED, SKIPPED, DemoStage, Section, paragraph
 
-#: The shipped policies are ONNX files; the emulated robot is driven by the servo library.
-_POLICIES, _ROBOT = (("onnxruntime", "export"),), (("dynamixel_sdk", "robot"), ("serial", "robot"))
-#: Lane -> its stages, one after the other. Shares: measured on a quiet core.
-LANES: Mapping[str, tuple[Stage, ...]] = {
+#: The shipped policies are ONNX files.
+_POLICIES = (("onnxruntime", "export"),)
+#: The emulated robot is driven by the servo library.
+_ROBOT = (("dynamixel_sdk", "robot"), ("serial", "robot"))
+#: Worker -> its stages, one after the other. Shares: measured on a quiet core.
+WORKERS: Mapping[str, tuple[DemoStage, ...]] = {
     "policies": (
-        Stage(learn.TITLE, learn.train, 0.6, (("torch", "train"), ("stable_baselines3", "train"), ("tensorboard", "train"))),
-        Stage(ice.TITLE, ice.compare, 0.4, _POLICIES),
+        DemoStage(
+            learn.TITLE, learn.train, 0.6, (("torch", "train"), ("stable_baselines3", "train"), ("tensorboard", "train"))
+        ),
+        DemoStage(ice_comparison.TITLE, ice_comparison.compare, 0.4, _POLICIES),
     ),
     "robot": (
-        Stage(secret.TITLE, secret.drive, 0.25, (*_POLICIES, *_ROBOT)),
-        Stage(answer.NAME_TITLE, answer.name, 0.7),
-        Stage(answer.CHECK_TITLE, answer.check, 0.05),
+        DemoStage(hidden_fault.TITLE, hidden_fault.drive, 0.25, (*_POLICIES, *_ROBOT)),
+        DemoStage(diagnosis.NAME_TITLE, diagnosis.name, 0.7),
+        DemoStage(diagnosis.CHECK_TITLE, diagnosis.check, 0.05),
     ),
 }
-#: Told of the lane, of what is going on, and of the share of the lane's work that is done.
-TellLane = Callable[[str, str, float], None]
+#: Called with the worker, what it is doing, and the share of its work that is done.
+TellWorker = Callable[[str, str, float], None]
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")
-#: s that a lane has to come to an end after Ctrl-C, before it is killed.
+#: s that a worker has to come to an end after Ctrl-C, before it is killed.
 _PATIENCE = 20.0
 
 
@@ -55,13 +59,13 @@ class Outcome:
 # ---- the parent ------------------------------------------------------------------------------------------------------
 
 
-def run_lanes(demo: Demo, tell: TellLane) -> Outcome:
-    """Run all lanes at once and return what they found; Ctrl-C ends them in good order."""
+def run_workers(demo: Demo, tell: TellWorker) -> Outcome:
+    """Run all workers at once and return what they found; Ctrl-C ends them in good order."""
     inbox: queue.Queue[tuple[str, dict[str, Any] | None]] = queue.Queue()
-    found: dict[str, list[Section]] = {lane: [] for lane in LANES}
+    found: dict[str, list[Section]] = {worker: [] for worker in WORKERS}
     interrupted = False
     log = (demo.out / "log.txt").open("w", encoding="utf-8")
-    running = {lane: _start(lane, demo, log, inbox) for lane in LANES}
+    running = {worker: _start(worker, demo, log, inbox) for worker in WORKERS}
     try:
         while running:
             try:
@@ -73,12 +77,12 @@ def run_lanes(demo: Demo, tell: TellLane) -> Outcome:
         for process in running.values():
             process.kill()
         log.close()
-    return Outcome([section for lane in LANES for section in _complete(lane, found[lane], interrupted)], interrupted)
+    return Outcome([section for worker in WORKERS for section in _complete(worker, found[worker], interrupted)], interrupted)
 
 
-def _start(lane: str, demo: Demo, log: TextIO, inbox: queue.Queue[Any]) -> subprocess.Popen[str]:
-    """Start a lane in a session of its own: Ctrl-C reaches it through its parent, once."""
-    task = {"lane": lane, "demo": {**asdict(demo), "out": str(demo.out)}}
+def _start(worker: str, demo: Demo, log: TextIO, inbox: queue.Queue[Any]) -> subprocess.Popen[str]:
+    """Start a worker in a session of its own: Ctrl-C reaches it through its parent, once."""
+    task = {"worker": worker, "demo": {**asdict(demo), "out": str(demo.out)}}
     process = subprocess.Popen(
         [sys.executable, "-m", "wlr_gym.studies.demo.workers", json.dumps(task)],
         stdin=subprocess.DEVNULL,
@@ -92,8 +96,8 @@ def _start(lane: str, demo: Demo, log: TextIO, inbox: queue.Queue[Any]) -> subpr
     def read() -> None:
         assert process.stdout is not None
         for line in process.stdout:
-            inbox.put((lane, json.loads(line)))
-        inbox.put((lane, None))
+            inbox.put((worker, json.loads(line)))
+        inbox.put((worker, None))
 
     threading.Thread(target=read, daemon=True).start()
     return process
@@ -103,20 +107,20 @@ def _take(
     inbox: queue.Queue[tuple[str, dict[str, Any] | None]],
     running: dict[str, subprocess.Popen[str]],
     found: dict[str, list[Section]],
-    tell: TellLane,
+    tell: TellWorker,
 ) -> None:
-    """Take one message of a lane."""
-    lane, message = inbox.get()
+    """Take one message of a worker."""
+    worker, message = inbox.get()
     if message is None:
-        running.pop(lane).wait()
+        running.pop(worker).wait()
     elif "section" in message:
-        found[lane].append(Section(**message["section"]))
+        found[worker].append(Section(**message["section"]))
     else:
-        tell(lane, message["text"], message["share"])
+        tell(worker, message["text"], message["share"])
 
 
 def _interrupt(running: Mapping[str, subprocess.Popen[str]]) -> None:
-    """Ask the lanes to end, and see to it that they do."""
+    """Ask the workers to end, and see to it that they do."""
     for process in running.values():
         process.send_signal(signal.SIGINT)
         killer = threading.Timer(_PATIENCE, process.kill)
@@ -124,30 +128,30 @@ def _interrupt(running: Mapping[str, subprocess.Popen[str]]) -> None:
         killer.start()
 
 
-def _complete(lane: str, sections: list[Section], interrupted: bool) -> list[Section]:
-    """Return a section for each stage of a lane: those that were not reached say so."""
-    text = "Not reached: the demo was stopped." if interrupted else "Not reached: this lane ended early; log.txt says why."
+def _complete(worker: str, sections: list[Section], interrupted: bool) -> list[Section]:
+    """Return a section for each stage of a worker: those that were not reached say so."""
+    text = "Not reached: the demo was stopped." if interrupted else "Not reached: this worker ended early; log.txt says why."
     verdict = SKIPPED if interrupted else FAILED
-    missing = [Section(stage.title, "", paragraph(text), verdict) for stage in LANES[lane][len(sections) :]]
+    missing = [Section(stage.title, "", paragraph(text), verdict) for stage in WORKERS[worker][len(sections) :]]
     return sections + missing
 
 
-# ---- a lane ----------------------------------------------------------------------------------------------------------
+# ---- a worker --------------------------------------------------------------------------------------------------------
 
 
-def work(lane: str, demo: Demo, send: Callable[[dict[str, Any]], None]) -> None:
-    """Do the stages of a lane; one that cannot be done says why and lets the others go on."""
+def work(worker: str, demo: Demo, send: Callable[[dict[str, Any]], None]) -> None:
+    """Do the stages of a worker; one that cannot be done says why and the others continue."""
     done = 0.0
-    for stage in LANES[lane]:
+    for stage in WORKERS[worker]:
 
-        def tell(text: str, share: float, base: float = done, stage: Stage = stage) -> None:
+        def tell(text: str, share: float, base: float = done, stage: DemoStage = stage) -> None:
             send({"text": text, "share": base + stage.share * share})
 
         send({"section": asdict(_attempt(stage, demo, tell))})
         done += stage.share
 
 
-def _attempt(stage: Stage, demo: Demo, tell: Callable[[str, float], None]) -> Section:
+def _attempt(stage: DemoStage, demo: Demo, tell: Callable[[str, float], None]) -> Section:
     try:
         for package, extra in stage.needs:
             require_package(package, extra)
@@ -170,9 +174,9 @@ def _main(task: Mapping[str, Any]) -> None:
 
     demo = Demo(**{**task["demo"], "out": Path(task["demo"]["out"])})
     try:
-        work(task["lane"], demo, send)
+        work(task["worker"], demo, send)
     except KeyboardInterrupt as interruption:
-        print(f"{task['lane']}: stopped {interruption}", file=sys.stderr)
+        print(f"{task['worker']}: stopped {interruption}", file=sys.stderr)
 
 
 if __name__ == "__main__":

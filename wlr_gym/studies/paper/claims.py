@@ -1,111 +1,40 @@
 """The paper's claims that a simulation can check: what it says, what comes out here, and whether that is the same.
 
 Verdicts: ``holds``, ``does not hold``, ``partly``, ``open`` (depends on something the paper does not give; see
-:mod:`wlr_gym.studies.paper.open_question`). Every claim states what it would take to hold; the verdict follows from the
+:mod:`wlr_gym.studies.paper.slip_search`). Every claim states what it would take to hold; the verdict follows from the
 numbers, but for the three that are about words or counting (3, 9, 25).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wlr_gym.physics.effects import Patch, apply_patch, load_patch
-from wlr_gym.robot import Robot
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.paper import printed, reduced
+from wlr_gym.studies.paper.evidence import DRAG, VARIANTS, PaperEvidence
 from wlr_gym.studies.paper.experiments import (
     LEG_SPEED,
     TESTS,
     WHEEL_ACCELERATION,
     WHEEL_SPEED,
-    PaperTest,
     Record,
-    drive,
     duration,
     error_of_ignoring_slip,
     no_slip_travel,
 )
-from wlr_gym.studies.paper.ideal import IdealMotion, ideal_motion
 from wlr_gym.studies.paper.quantities import State
 
-HOLDS, FAILS, PARTLY, OPEN = "holds", "does not hold", "partly", "open"
+HOLDS = "holds"
+FAILS = "does not hold"
+PARTLY = "partly"
+OPEN = "open"
+#: rev/min in 1 rad/s.
 _RPM = 60.0 / (2.0 * math.pi)
-#: N m; dry friction added to the gear of each free rear wheel, so that there is slip to speak of.
-DRAG = 0.07
-#: Straight on, in the posture the first test starts with: most of the weight on the rear wheels.
-_STRAIGHT = PaperTest("straight", "legs at 30 degrees", TESTS["test_1"].start, TESTS["test_1"].start)
-
-
-def _drag(left: float = DRAG, right: float = DRAG) -> list[dict[str, object]]:
-    return [
-        {"name": "coulomb_friction", "where": [wheel], "parameters": {"torque": torque}}
-        for wheel, torque in (("wheel_lr", left), ("wheel_rr", right))
-    ]
-
-
-def _with(name: str, where: Sequence[str], **parameters: float) -> dict[str, object]:
-    return {"name": name, "where": list(where), "parameters": parameters}
-
-
-_AXLES = (("wheel_lr", "wheel_rr"), ("wheel_lf", "wheel_rf"))
-
-
-def _unequal(left: str, right: str) -> Patch:
-    return load_patch([_with("wheel_radius_error", [wheel], scale=scale) for wheel, scale in ((left, 0.95), (right, 1.05))])
-
-
-#: Robots of the side experiments: label -> patch. "drag" is what each of the others is compared with.
-VARIANTS: Mapping[str, Patch] = {
-    "drag": load_patch(_drag()),
-    "mu 0.3": load_patch([*_drag(), _with("friction_level", ["ground"], mu=0.3)]),
-    "mu 0.9": load_patch([*_drag(), _with("friction_level", ["ground"], mu=0.9)]),
-    "centre of mass 3 cm back": load_patch([*_drag(), _with("com_offset", ["body"], x=-0.03)]),
-    "centre of mass 3 cm ahead": load_patch([*_drag(), _with("com_offset", ["body"], x=0.03)]),
-    "2 kg more": load_patch([*_drag(), _with("payload", ["body"], mass=2.0)]),
-    "more drag left": load_patch(_drag(0.12, 0.02)),
-    "left front wheel 2 % small": load_patch([_with("wheel_radius_error", ["wheel_lf"], scale=0.98)]),
-}
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """What claims are checked with.
-
-    Attributes:
-        robot: nominal. plant: records of both tests on one simulator. ideal: both tests without slip.
-        variants: both tests with :data:`VARIANTS`, one robot each. free, driven: yaw (rad) at the end of a straight drive, rear
-            wheels free or driven, of two robots: left wheel 5 % small and right one 5 % large, behind or in front.
-    """
-
-    robot: Robot
-    plant: Mapping[str, Record]
-    ideal: Mapping[str, IdealMotion]
-    variants: Mapping[str, Record]
-    free: tuple[float, float]
-    driven: tuple[float, float]
-
-    def variant_error(self, test: str, label: str) -> float:
-        """Error of ignoring slip of one of the variants."""
-        return float(error_of_ignoring_slip(self.robot, self.variants[test])[list(VARIANTS).index(label)])
-
-
-def gather(robot: Robot, plant: Mapping[str, Record], threads: int = 1) -> Evidence:
-    """Make the side experiments on the Gibbs-Appell engine; ``plant``: both tests on a nominal robot."""
-    nominal = Parameters.nominal(robot)
-    rows = Parameters(np.concatenate([apply_patch(patch, nominal).values for patch in VARIANTS.values()]))
-    variants = {name: drive("gibbs_appell", test, robot, rows, threads=threads) for name, test in TESTS.items()}
-    uneven = Parameters(np.concatenate([apply_patch(_unequal(*axle), nominal).values for axle in _AXLES]))
-    yaw = []
-    for rear_driven in (False, True):
-        record = drive("gibbs_appell", replace(_STRAIGHT, rear_driven=rear_driven), robot, uneven, threads=threads)
-        behind, in_front = map(float, record.attitude[-1, :, 0])
-        yaw.append((behind, in_front))
-    ideal = {name: ideal_motion(test) for name, test in TESTS.items()}
-    return Evidence(robot, plant, ideal, variants, *yaw)
 
 
 @dataclass(frozen=True)
@@ -116,7 +45,7 @@ class Claim:
     text: str
     paper: str
     holds_if: str
-    check: Callable[[Evidence], tuple[str, str]]
+    check: Callable[[PaperEvidence], tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -131,7 +60,7 @@ class CheckedClaim:
     verdict: str
 
 
-def check_all(evidence: Evidence) -> list[CheckedClaim]:
+def check_all(evidence: PaperEvidence) -> list[CheckedClaim]:
     """Check every claim of :data:`CLAIMS`."""
     return [CheckedClaim(claim.number, claim.text, claim.paper, claim.holds_if, *claim.check(evidence)) for claim in CLAIMS]
 
@@ -154,8 +83,8 @@ def _after(record: Record, time: float) -> int:
     return int(np.searchsorted(record.time, time - 1e-9))
 
 
-def _slip_error(test: str, paper: float) -> Callable[[Evidence], tuple[str, str]]:
-    def check(e: Evidence) -> tuple[str, str]:
+def _slip_error(test: str, paper: float) -> Callable[[PaperEvidence], tuple[str, str]]:
+    def check(e: PaperEvidence) -> tuple[str, str]:
         error = 100 * float(error_of_ignoring_slip(e.robot, e.plant[test])[0])
         near = abs(abs(error) - paper) < 1.5
         return f"{error:.2f} % with rigid Coulomb friction", HOLDS if near else OPEN
@@ -163,14 +92,14 @@ def _slip_error(test: str, paper: float) -> Callable[[Evidence], tuple[str, str]
     return check
 
 
-def _wording(e: Evidence) -> tuple[str, str]:
+def _wording(e: PaperEvidence) -> tuple[str, str]:
     return (
         "abstract: error of neglecting slip; conclusion: of a constant slip coefficient. One number cannot be both",
         FAILS,
     )
 
 
-def _lateral(e: Evidence) -> tuple[str, str]:
+def _lateral(e: PaperEvidence) -> tuple[str, str]:
     own = [1000 * abs(float(e.plant[test].end[0, 1])) for test in TESTS]
     k = list(VARIANTS).index("more drag left")
     uneven = [100 * float(e.variants[test].end[k, 1]) for test in TESTS]
@@ -187,7 +116,7 @@ def _half_way(record: Record, robot: int) -> float:
     return float(x[reached] / x[-1])
 
 
-def _early_drift(e: Evidence) -> tuple[str, str]:
+def _early_drift(e: PaperEvidence) -> tuple[str, str]:
     record = e.variants["test_1"]
     share = _half_way(record, list(VARIANTS).index("more drag left"))
     load = float(e.plant["test_1"].force[_after(e.plant["test_1"], 0.0), 0, :2, 2].sum())
@@ -199,7 +128,7 @@ def _early_drift(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _late_drift(e: Evidence) -> tuple[str, str]:
+def _late_drift(e: PaperEvidence) -> tuple[str, str]:
     record = e.variants["test_2"]
     share = _half_way(record, list(VARIANTS).index("left front wheel 2 % small"))
     base = float(e.ideal["test_2"].posture.wheelbase[-1])
@@ -209,7 +138,7 @@ def _late_drift(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _posture_and_slip(e: Evidence) -> tuple[str, str]:
+def _posture_and_slip(e: PaperEvidence) -> tuple[str, str]:
     errors = [100 * e.variant_error(test, "drag") for test in TESTS]
     loads = [float(e.ideal[test].inverse_dynamics().normal[0, 0]) for test in TESTS]
     return (
@@ -219,7 +148,7 @@ def _posture_and_slip(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _centre_of_mass(e: Evidence) -> tuple[str, str]:
+def _centre_of_mass(e: PaperEvidence) -> tuple[str, str]:
     labels = ("centre of mass 3 cm back", "drag", "centre of mass 3 cm ahead")
     errors = [100 * e.variant_error("test_1", label) for label in labels]
     at_centre_least = abs(errors[1]) < min(abs(errors[0]), abs(errors[2]))
@@ -229,7 +158,7 @@ def _centre_of_mass(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _coefficient(e: Evidence) -> tuple[str, str]:
+def _coefficient(e: PaperEvidence) -> tuple[str, str]:
     c = reduced.constants_of(Parameters.nominal(e.robot))
     start = State(alpha=TESTS["test_1"].start[0], beta=TESTS["test_1"].start[1])
     as_printed = replace(c, m_l=c.m_l + c.m_w, m_w=0.0)  # legs and wheels as one mass at mid-leg
@@ -238,8 +167,8 @@ def _coefficient(e: Evidence) -> tuple[str, str]:
     return f"mu is the floor's; the force limit mu F_n changes: front {loads[0]:.2f} to {loads[1]:.2f} N times mu", FAILS
 
 
-def _four_turns(e: Evidence) -> tuple[str, str]:
-    turns = np.array([e.plant[test].joint_position[-1, 0, 4:] / (2 * math.pi) for test in TESTS])
+def _four_turns(e: PaperEvidence) -> tuple[str, str]:
+    turns = np.array([e.plant[test].joint_position[-1, 0, WHEEL_SLICE] / (2 * math.pi) for test in TESTS])
     four = np.abs(turns - 4.0) < 0.05
     return (
         f"{WHEEL_SPEED * _RPM:.2f} rpm = 80 counts, {WHEEL_ACCELERATION * 3600 / (2 * math.pi):.2f} rev/min2 = 1 count, "
@@ -249,7 +178,7 @@ def _four_turns(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _rear_speed(e: Evidence) -> tuple[str, str]:
+def _rear_speed(e: PaperEvidence) -> tuple[str, str]:
     record = e.plant["test_1"]
     speed = record.joint_velocity[:, 0, 6] * _RPM
     backwards = float(speed[_after(record, 0.0) : _after(record, 1.0)].min())
@@ -261,7 +190,7 @@ def _rear_speed(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _rear_stops(e: Evidence) -> tuple[str, str]:
+def _rear_stops(e: PaperEvidence) -> tuple[str, str]:
     record = e.plant["test_2"]
     at = _after(record, 6.5)
     speed = float(record.joint_velocity[at, 0, 6]) * _RPM
@@ -271,7 +200,7 @@ def _rear_stops(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _legs_stop(e: Evidence) -> tuple[str, str]:
+def _legs_stop(e: PaperEvidence) -> tuple[str, str]:
     record = e.plant["test_1"]
     moving = np.abs(record.joint_velocity[:, 0, 2]) > 0.1 * LEG_SPEED
     last = float(record.time[moving].max(initial=0.0))
@@ -279,7 +208,7 @@ def _legs_stop(e: Evidence) -> tuple[str, str]:
     return f"{last:.2f} s (120 degrees at 15 counts: {profile:.2f} s)", _graded(abs(last - profile) < 0.15)
 
 
-def _leg_torque(e: Evidence) -> tuple[str, str]:
+def _leg_torque(e: PaperEvidence) -> tuple[str, str]:
     torque = e.ideal["test_1"].inverse_dynamics().leg_torque / 2
     less = np.abs(torque[-1]) < np.abs(torque[0])
     return (
@@ -289,7 +218,7 @@ def _leg_torque(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _free_wheel_torque(e: Evidence) -> tuple[str, str]:
+def _free_wheel_torque(e: PaperEvidence) -> tuple[str, str]:
     largest = max(float(np.abs(e.ideal[test].u_dot[:, 9:]).max()) * e.ideal[test].constants.I_o for test in TESTS)
     return (
         f"motor 0; I_o theta'' of the rear wheels up to {1000 * largest:.1f} mN m in a 0.1 s leg start, else their drag",
@@ -297,7 +226,7 @@ def _free_wheel_torque(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _wheel_torque(e: Evidence) -> tuple[str, str]:
+def _wheel_torque(e: PaperEvidence) -> tuple[str, str]:
     away = []
     for test in TESTS:
         motion = e.ideal[test]
@@ -309,7 +238,7 @@ def _wheel_torque(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _height(e: Evidence) -> tuple[str, str]:
+def _height(e: PaperEvidence) -> tuple[str, str]:
     rise = [100 * float(np.ptp(e.ideal[test].posture.height)) for test in TESTS]
     own = [100 * float(np.ptp(e.plant[test].position[:, 0, 2])) for test in TESTS]
     return f"{rise[0]:.2f} and {rise[1]:.2f} cm by geometry; {own[0]:.2f} and {own[1]:.2f} cm with legs that give", _graded(
@@ -317,7 +246,7 @@ def _height(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _pitch(e: Evidence) -> tuple[str, str]:
+def _pitch(e: PaperEvidence) -> tuple[str, str]:
     most = [math.degrees(float(e.ideal[test].posture.pitch.max())) for test in TESTS]
     own = [math.degrees(float(np.abs(e.plant[test].attitude[:, 0, 1]).max())) for test in TESTS]
     return f"{most[0]:.2f} (nose down) and {most[1]:.2f} degrees by geometry; {own[0]:.2f} and {own[1]:.2f} simulated", _graded(
@@ -325,7 +254,7 @@ def _pitch(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _roll(e: Evidence) -> tuple[str, str]:
+def _roll(e: PaperEvidence) -> tuple[str, str]:
     own = max(math.degrees(float(np.abs(e.plant[test].attitude[:, 0, 2]).max())) for test in TESTS)
     k = list(VARIANTS).index("more drag left")
     uneven = max(math.degrees(float(np.abs(e.variants[test].attitude[:, k, 2]).max())) for test in TESTS)
@@ -337,7 +266,7 @@ def _roll(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _two_simulations(e: Evidence) -> tuple[str, str]:
+def _two_simulations(e: PaperEvidence) -> tuple[str, str]:
     record = e.plant["test_2"]
     apart = 100 * float(no_slip_travel(e.robot, record, True)[-1, 0] - no_slip_travel(e.robot, record, False)[-1, 0])
     return (
@@ -347,7 +276,7 @@ def _two_simulations(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _heavier(e: Evidence) -> tuple[str, str]:
+def _heavier(e: PaperEvidence) -> tuple[str, str]:
     light, heavy = (100 * e.variant_error("test_1", label) for label in ("drag", "2 kg more"))
     return (
         f"against gear drag, yes: {light:.1f} to {heavy:.1f} % with 2 kg more; inertia alone does not slip at any mass",
@@ -355,7 +284,7 @@ def _heavier(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _grip(e: Evidence) -> tuple[str, str]:
+def _grip(e: PaperEvidence) -> tuple[str, str]:
     errors = [100 * e.variant_error("test_1", label) for label in ("mu 0.3", "drag", "mu 0.9")]
     less = abs(errors[2]) < abs(errors[1]) < abs(errors[0])
     return (
@@ -364,7 +293,7 @@ def _grip(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _oversteer(e: Evidence) -> tuple[str, str]:
+def _oversteer(e: PaperEvidence) -> tuple[str, str]:
     free, driven = np.degrees(e.free), np.degrees(e.driven)
     less = np.abs(free) < 0.5 * np.abs(driven)
     return (
@@ -374,11 +303,11 @@ def _oversteer(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _limits(e: Evidence) -> tuple[str, str]:
-    hip = max(float(np.abs(e.plant[test].torque[..., :4]).max()) for test in TESTS)
-    wheel = max(float(np.abs(e.plant[test].torque[..., 4:]).max()) for test in TESTS)
+def _limits(e: PaperEvidence) -> tuple[str, str]:
+    hip = max(float(np.abs(e.plant[test].torque[..., LEG_SLICE]).max()) for test in TESTS)
+    wheel = max(float(np.abs(e.plant[test].torque[..., WHEEL_SLICE]).max()) for test in TESTS)
     rates = [np.abs(e.plant[test].joint_velocity[e.plant[test].time > 0.0]) * _RPM for test in TESTS]
-    leg_rate, wheel_rate = (max(float(rate[..., part].max()) for rate in rates) for part in (slice(0, 4), slice(4, 8)))
+    leg_rate, wheel_rate = (max(float(rate[..., part].max()) for rate in rates) for part in (LEG_SLICE, WHEEL_SLICE))
     return (
         f"hips {hip:.2f} of 7.3 N m and {leg_rate:.1f} rpm, wheels {wheel:.2f} of 1.5 N m and {wheel_rate:.1f} rpm; 66 rpm "
         "belongs to 14.8 V, 53 rpm to 12 V",
@@ -386,7 +315,7 @@ def _limits(e: Evidence) -> tuple[str, str]:
     )
 
 
-def _fewer(e: Evidence) -> tuple[str, str]:
+def _fewer(e: PaperEvidence) -> tuple[str, str]:
     return "nine velocities suffice; the twelve are dependent (rank 9), and three equations of the body are missing", FAILS
 
 

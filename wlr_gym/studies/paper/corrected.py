@@ -1,7 +1,7 @@
 """Equations (1) to (30) with the right physics: the paper's assumptions, everything that follows from them.
 
 Legs pairwise equal, no roll, four wheels on a level floor. (7) to (11) are the whole Gibbs function with its velocity terms;
-(19) to (30) are its Appell equations, solved for what the paper asks for. tests/paper derives them symbolically.
+(19) to (30) are its Appell equations, solved for what the paper asks for. tests/studies/paper derives them symbolically.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 from wlr_gym.studies.paper import printed
 from wlr_gym.studies.paper.quantities import (
     WHEELS,
-    Constants,
     Forces,
+    PaperConstants,
     State,
     Value,
     Vector,
@@ -35,28 +35,28 @@ def eq2_velocity_of_the_body(velocity_in_floor: Vector, yaw: Value) -> Vector:
     return x * cos(yaw) + y * sin(yaw), y * cos(yaw) - x * sin(yaw), z
 
 
-def _contact_slip(c: Constants, s: State, wheel: str) -> Vector:
+def _contact_slip(c: PaperConstants, s: State, wheel: str) -> Vector:
     """Velocity of the wheel's contact point over the floor: wheel centre minus rolling, with the ABSOLUTE spin rate."""
     v = printed.eq1_velocity_of_a_wheel_centre((s.x_d, s.y_d, s.z_d), s.yaw_d, *printed.wheel_vector(c, s, wheel))
     return v[0] - c.a * (s.theta_d[wheel] + s.absolute_leg(wheel)[1]), v[1], v[2]
 
 
-def eq3_slip_of_the_right_front_wheel(c: Constants, s: State) -> Vector:
+def eq3_slip_of_the_right_front_wheel(c: PaperConstants, s: State) -> Vector:
     """(3): slip velocity (x_s', y_s', z_s' = 0 on the floor) of the contact point: what the printed left side leaves open."""
     return _contact_slip(c, s, "rf")
 
 
-def eq4_slip_of_the_left_front_wheel(c: Constants, s: State) -> Vector:
+def eq4_slip_of_the_left_front_wheel(c: PaperConstants, s: State) -> Vector:
     """(4): as (3)."""
     return _contact_slip(c, s, "lf")
 
 
-def eq5_slip_of_the_right_rear_wheel(c: Constants, s: State) -> Vector:
+def eq5_slip_of_the_right_rear_wheel(c: PaperConstants, s: State) -> Vector:
     """(5): as (3)."""
     return _contact_slip(c, s, "rr")
 
 
-def eq6_slip_of_the_left_rear_wheel(c: Constants, s: State) -> Vector:
+def eq6_slip_of_the_left_rear_wheel(c: PaperConstants, s: State) -> Vector:
     """(6): as (3)."""
     return _contact_slip(c, s, "lr")
 
@@ -64,7 +64,7 @@ def eq6_slip_of_the_left_rear_wheel(c: Constants, s: State) -> Vector:
 # ---- Gibbs function --------------------------------------------------------------------------------------------------
 
 
-def point_acceleration(c: Constants, s: State, wheel: str, distance: Value) -> Vector:
+def point_acceleration(c: PaperConstants, s: State, wheel: str, distance: Value) -> Vector:
     """Acceleration of the point ``distance`` from the hip on a wheel's leg, yaw frame, z up, turning of the frame included."""
     phi, phi_d, phi_dd = s.absolute_leg(wheel)
     hip = ahead(wheel) * c.l_x / 2
@@ -99,7 +99,7 @@ def _translational(mass: Value, acceleration: Vector) -> Value:
     return mass / 2 * sum(component**2 for component in acceleration)
 
 
-def eq7_gibbs_function_of_the_wheels(c: Constants, s: State) -> Value:
+def eq7_gibbs_function_of_the_wheels(c: PaperConstants, s: State) -> Value:
     """(7): absolute spin of the disc, relative spin of the rotor, diametral inertia, mass."""
     total = 0
     for wheel in WHEELS:
@@ -109,7 +109,7 @@ def eq7_gibbs_function_of_the_wheels(c: Constants, s: State) -> Value:
     return total
 
 
-def eq8_gibbs_function_of_the_legs(c: Constants, s: State) -> Value:
+def eq8_gibbs_function_of_the_legs(c: PaperConstants, s: State) -> Value:
     """(8): absolute rates and angles, velocity terms, acceleration of the leg's own centre of mass, hip rotors."""
     total = c.J_h * (s.alpha_dd**2 + s.beta_dd**2)
     for wheel in WHEELS:
@@ -119,14 +119,14 @@ def eq8_gibbs_function_of_the_legs(c: Constants, s: State) -> Value:
     return total
 
 
-def eq9_gibbs_function_of_the_body(c: Constants, s: State) -> Value:
+def eq9_gibbs_function_of_the_body(c: PaperConstants, s: State) -> Value:
     """(9): with Psi''^2, the inertia about x of a pitched body, and its velocity terms."""
     inertia = (c.I_Gx, c.I_Gy, c.I_Gz)
     rotation = rotational_gibbs(inertia, s.psi, s.psi_d, s.psi_dd, s.yaw_d, s.yaw_dd)
     return rotation + _translational(c.M_G, eq11_acceleration_of_the_body(s))
 
 
-def eq10_gibbs_function(c: Constants, s: State) -> Value:
+def eq10_gibbs_function(c: PaperConstants, s: State) -> Value:
     """(10): the sum."""
     wheels = eq7_gibbs_function_of_the_wheels(c, s)
     return wheels + eq8_gibbs_function_of_the_legs(c, s) + eq9_gibbs_function_of_the_body(c, s)
@@ -137,7 +137,7 @@ def eq11_acceleration_of_the_body(s: State) -> Vector:
     return s.x_dd - s.yaw_d * s.y_d, s.y_dd + s.yaw_d * s.x_d, s.z_dd
 
 
-def eq12_potential(c: Constants, s: State) -> Value:
+def eq12_potential(c: PaperConstants, s: State) -> Value:
     """(12): the whole potential on a level floor, J, constants included; psi follows from alpha and beta."""
     raised = sin(s.alpha + s.psi) + sin(s.beta + s.psi)
     body = c.M_G * (c.a + c.l / 2 * raised)
@@ -159,7 +159,7 @@ def eq14_coulomb_friction(mu: Value, f_n: Value, slip: tuple[Value, Value]) -> t
     return -mu * f_n * slip[0] / speed, -mu * f_n * slip[1] / speed
 
 
-def eq15_dissipation(c: Constants, s: State, f_nf: Value, f_nr: Value) -> Value:
+def eq15_dissipation(c: PaperConstants, s: State, f_nf: Value, f_nr: Value) -> Value:
     """(15): power lost on the friction ELLIPSE, sum F_n sqrt((mu_x x_s')^2 + (mu_y y_s')^2); the printed box adds them up."""
     total = 0
     for wheel in WHEELS:
@@ -169,14 +169,14 @@ def eq15_dissipation(c: Constants, s: State, f_nf: Value, f_nr: Value) -> Value:
     return total
 
 
-def eq16_normal_force_in_front(c: Constants, s: State) -> Value:
+def eq16_normal_force_in_front(c: PaperConstants, s: State) -> Value:
     """(16): on one front wheel at rest, N; as printed, with the leg's centre of mass at ``lam`` and the wheel's weight."""
     hips, front, rear = c.l_x * cos(s.psi), c.l * cos(s.alpha + s.psi), c.l * cos(s.beta + s.psi)
     moment = c.M_G * c.g / 2 * (hips / 2 - rear) + c.m_l * c.g * (hips + c.lam * front - (2 - c.lam) * rear)
     return moment / wheelbase(c, s) + c.m_w * c.g
 
 
-def eq17_normal_force_behind(c: Constants, s: State) -> Value:
+def eq17_normal_force_behind(c: PaperConstants, s: State) -> Value:
     """(17): on one rear wheel at rest, N; likewise."""
     hips, front, rear = c.l_x * cos(s.psi), c.l * cos(s.alpha + s.psi), c.l * cos(s.beta + s.psi)
     moment = c.M_G * c.g / 2 * (hips / 2 + front) + c.m_l * c.g * (hips + (2 - c.lam) * front - c.lam * rear)
@@ -189,15 +189,15 @@ eq18_generalised_force = printed.eq18_generalised_force
 # ---- equations of motion ---------------------------------------------------------------------------------------------
 
 
-def _k1(c: Constants) -> Value:
+def _k1(c: PaperConstants) -> Value:
     return (c.lam * c.m_l + c.m_w) * c.l
 
 
-def _k2(c: Constants) -> Value:
+def _k2(c: PaperConstants) -> Value:
     return (c.lam**2 * c.m_l + c.m_w) * c.l**2
 
 
-def _leg_torque(c: Constants, s: State, f: Forces, right: str, left: str) -> Value:
+def _leg_torque(c: PaperConstants, s: State, f: Forces, right: str, left: str) -> Value:
     """Row of a pair of legs: inertia, gravity, normal forces and traction; the sum of both motors."""
     phi, _, _ = s.absolute_leg(right)
     angle, _, leg_dd = s.leg(right)
@@ -219,71 +219,71 @@ def _leg_torque(c: Constants, s: State, f: Forces, right: str, left: str) -> Val
     return inertia + turning - 2 * k1 * c.g * cos(phi) + loads
 
 
-def eq19_torque_of_the_front_legs(c: Constants, s: State, f: Forces) -> Value:
+def eq19_torque_of_the_front_legs(c: PaperConstants, s: State, f: Forces) -> Value:
     """(19): sum of both front hip motors, N m. At rest 2 l cos(alpha + psi) (N_f - lam m_l g - m_w g)."""
     return _leg_torque(c, s, f, "rf", "lf")
 
 
-def eq20_torque_of_the_rear_legs(c: Constants, s: State, f: Forces) -> Value:
+def eq20_torque_of_the_rear_legs(c: PaperConstants, s: State, f: Forces) -> Value:
     """(20): sum of both rear hip motors, N m."""
     return _leg_torque(c, s, f, "rr", "lr")
 
 
-def spin_inertia_torque(c: Constants, s: State, wheel: str) -> Value:
+def spin_inertia_torque(c: PaperConstants, s: State, wheel: str) -> Value:
     """I_o (theta'' + leg'' + psi'') + J_w theta'': what a wheel takes without any traction, N m."""
     return c.I_o * (s.theta_dd[wheel] + s.absolute_leg(wheel)[2]) + c.J_w * s.theta_dd[wheel]
 
 
-def _wheel_torque(c: Constants, s: State, f: Forces, wheel: str) -> Value:
+def _wheel_torque(c: PaperConstants, s: State, f: Forces, wheel: str) -> Value:
     return spin_inertia_torque(c, s, wheel) + c.a * f.x[wheel]
 
 
-def eq21_torque_of_the_right_front_wheel(c: Constants, s: State, f: Forces) -> Value:
+def eq21_torque_of_the_right_front_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
     """(21): I_o (theta'' + alpha'' + psi'') + J_w theta'' + a F_x, N m."""
     return _wheel_torque(c, s, f, "rf")
 
 
-def eq22_torque_of_the_left_front_wheel(c: Constants, s: State, f: Forces) -> Value:
+def eq22_torque_of_the_left_front_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
     """(22): as (21)."""
     return _wheel_torque(c, s, f, "lf")
 
 
-def eq23_torque_of_the_right_rear_wheel(c: Constants, s: State, f: Forces) -> Value:
+def eq23_torque_of_the_right_rear_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
     """(23): as (21) with beta; of a free wheel it is minus its gear's drag."""
     return _wheel_torque(c, s, f, "rr")
 
 
-def eq24_torque_of_the_left_rear_wheel(c: Constants, s: State, f: Forces) -> Value:
+def eq24_torque_of_the_left_rear_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
     """(24): as (23)."""
     return _wheel_torque(c, s, f, "lr")
 
 
-def _longitudinal_force(c: Constants, s: State, f: Forces, wheel: str) -> Value:
+def _longitudinal_force(c: PaperConstants, s: State, f: Forces, wheel: str) -> Value:
     """The same row read the other way: what the floor does to a wheel whose motor torque is known, sticking or not."""
     return (f.tau_theta[wheel] - spin_inertia_torque(c, s, wheel)) / c.a
 
 
-def eq25_force_on_the_right_front_wheel(c: Constants, s: State, f: Forces) -> Value:
+def eq25_force_on_the_right_front_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
     """(25): (tau - I_o (theta'' + alpha'' + psi'') - J_w theta'')/a, N; within mu F_n, and equal to it against the slip."""
     return _longitudinal_force(c, s, f, "rf")
 
 
-def eq26_force_on_the_left_front_wheel(c: Constants, s: State, f: Forces) -> Value:
+def eq26_force_on_the_left_front_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
     """(26): as (25)."""
     return _longitudinal_force(c, s, f, "lf")
 
 
-def eq27_force_on_the_right_rear_wheel(c: Constants, s: State, f: Forces) -> Value:
+def eq27_force_on_the_right_rear_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
     """(27): as (25) with beta."""
     return _longitudinal_force(c, s, f, "rr")
 
 
-def eq28_force_on_the_left_rear_wheel(c: Constants, s: State, f: Forces) -> Value:
+def eq28_force_on_the_left_rear_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
     """(28): as (27)."""
     return _longitudinal_force(c, s, f, "lr")
 
 
-def lateral_balance(c: Constants, s: State) -> tuple[Value, Value]:
+def lateral_balance(c: PaperConstants, s: State) -> tuple[Value, Value]:
     """Inertia in the rows of y and yaw: the force to the left and the moment about the vertical that the floor must give."""
     _, a_y, _ = eq11_acceleration_of_the_body(s)
     force, moment = c.M_G * a_y, body_yaw_moment(c, s)
@@ -299,25 +299,25 @@ def lateral_balance(c: Constants, s: State) -> tuple[Value, Value]:
     return force, moment
 
 
-def body_yaw_moment(c: Constants, s: State) -> Value:
+def body_yaw_moment(c: PaperConstants, s: State) -> Value:
     """dS_3/dtheta'': moment that the platform's own inertia takes, N m."""
     inertia = c.I_Gx * sin(s.psi) ** 2 + c.I_Gz * cos(s.psi) ** 2
     return inertia * s.yaw_dd + 2 * (c.I_Gx - c.I_Gz) * sin(s.psi) * cos(s.psi) * s.psi_d * s.yaw_d
 
 
-def eq29_lateral_force_in_front(c: Constants, s: State, f: Forces) -> Value:
+def eq29_lateral_force_in_front(c: PaperConstants, s: State, f: Forces) -> Value:
     """(29): on both front wheels, to the left, N: from the rows of y and yaw, given the forces along the wheels."""
     force, moment = _lateral(c, s, f)
     return (moment - lever(c, s, "rr") * force) / wheelbase(c, s)
 
 
-def eq30_lateral_force_behind(c: Constants, s: State, f: Forces) -> Value:
+def eq30_lateral_force_behind(c: PaperConstants, s: State, f: Forces) -> Value:
     """(30): on both rear wheels, likewise."""
     force, moment = _lateral(c, s, f)
     return (lever(c, s, "rf") * force - moment) / wheelbase(c, s)
 
 
-def _lateral(c: Constants, s: State, f: Forces) -> tuple[Value, Value]:
+def _lateral(c: PaperConstants, s: State, f: Forces) -> tuple[Value, Value]:
     """Balance with the moment of the forces along the wheels, x_i at y_i: -y_i x_i, taken off."""
     force, moment = lateral_balance(c, s)
     return force, moment - sum(to_the_right(wheel) * c.l_y / 2 * f.x[wheel] for wheel in WHEELS)

@@ -25,7 +25,7 @@ from wlr_gym.physics.plants.base import Plant, PlantOptions, RobotOptions, Senso
 from wlr_gym.physics.plants.forces import Force
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.physics.servo import from_register
-from wlr_gym.robot import Robot
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import no_slip_error
 from wlr_gym.studies.paper import reduced
@@ -33,7 +33,9 @@ from wlr_gym.studies.paper import reduced
 Array = NDArray[np.float64]
 
 #: Register counts of the paper's commands: 18.32 rpm, 214.577 rev/min2, 3.435 rpm.
-WHEEL_SPEED_COUNTS, WHEEL_ACCELERATION_COUNTS, LEG_SPEED_COUNTS = 80, 1, 15
+WHEEL_SPEED_COUNTS = 80
+WHEEL_ACCELERATION_COUNTS = 1
+LEG_SPEED_COUNTS = 15
 TURNS = 4
 #: rad/s, rad/s2, rad/s.
 WHEEL_SPEED = from_register("XL430-W250-T", "profile_velocity", WHEEL_SPEED_COUNTS)
@@ -41,7 +43,9 @@ WHEEL_ACCELERATION = from_register("XL430-W250-T", "profile_acceleration", WHEEL
 LEG_SPEED = from_register("XM540-W150-R", "profile_velocity", LEG_SPEED_COUNTS)
 PROFILE = Profile(wheel_acceleration=WHEEL_ACCELERATION, leg_velocity=LEG_SPEED, leg_acceleration=0.0)
 #: s per tick; s of rest before the commands, in which the robot settles on its gears, and after the wheels stopped.
-PERIOD, SETTLE, AFTER = 0.02, 1.0, 1.0
+PERIOD = 0.02
+SETTLE = 1.0
+AFTER = 1.0
 #: The nine-velocity model of :mod:`wlr_gym.studies.paper.reduced`, beside the plants of
 #: :data:`wlr_gym.physics.plants.BACKENDS`.
 REDUCED = "reduced"
@@ -76,13 +80,15 @@ class PaperTest:
         times = PERIOD * np.arange(round((SETTLE + duration() + AFTER) / PERIOD)) - SETTLE
         commanded = (times > -0.5 * PERIOD)[:, None]
         goals = np.full((len(times), 8), np.nan)
-        goals[:, :4] = np.where(commanded, np.repeat(self.end, 2), np.repeat(self.start, 2))
+        goals[:, LEG_SLICE] = np.where(commanded, np.repeat(self.end, 2), np.repeat(self.start, 2))
         driven = slice(4, 8) if self.rear_driven else slice(4, 6)
         goals[:, driven] = np.where(commanded[:, 0] & (times < stop_time() - 0.5 * PERIOD), WHEEL_SPEED, 0.0)[:, None]
         return Motion(self.name, goals, PERIOD, PROFILE)
 
 
-_LOW, _HIGH = math.radians(30), math.radians(150)
+#: Leg angles.
+_LOW = math.radians(30)
+_HIGH = math.radians(150)
 TESTS: Mapping[str, PaperTest] = {
     "test_1": PaperTest("test_1", "first test: rear legs turn", (_LOW, _LOW), (_LOW, _HIGH), (7, 8, 9, 10, 11), 0.115, 0.011),
     "test_2": PaperTest(
@@ -313,7 +319,7 @@ def _record(model: str, test: PaperTest, rows: list[Row], every: int) -> Record:
     found = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     time = np.asarray(PERIOD * every * np.arange(len(rows)) - SETTLE, dtype=np.float64)
     start = int(np.argmin(np.abs(time)))
-    found["joint_position"][:, :, 4:] -= found["joint_position"][start, :, 4:]
+    found["joint_position"][:, :, WHEEL_SLICE] -= found["joint_position"][start, :, WHEEL_SLICE]
     found["position"][:, :, :2] -= found["position"][start, :, :2]
     found["slip_path"] = found["slip_path"] - found["slip_path"][start]
     found["attitude"][:, :, 0] = np.unwrap(found["attitude"][:, :, 0], axis=0)

@@ -20,7 +20,8 @@ from wlr_gym.studies.paper import printed
 from wlr_gym.studies.paper.experiments import MODELS, REDUCED, PaperTest, Record, duration
 from wlr_gym.studies.paper.ideal import IdealMotion
 from wlr_gym.studies.paper.measured import FromMeasurement
-from wlr_gym.studies.paper.open_question import READINGS, Finding
+from wlr_gym.studies.paper.slip_candidates import READINGS
+from wlr_gym.studies.paper.slip_search import SearchFinding
 
 Array = NDArray[np.float64]
 
@@ -228,7 +229,7 @@ def slip_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
     return _over_time(figure, axes)
 
 
-def question_figure(findings: Sequence[Finding]) -> Figure:
+def question_figure(findings: Sequence[SearchFinding]) -> Figure:
     """What each departure from the nominal robot can do to the paper's four numbers: every draw, error against lateral."""
     alone = [finding for finding in findings if len(finding.names) == 1]
     best = sorted((f for f in findings if len(f.names) > 1), key=lambda f: min(f.closest(r) for r in READINGS))[:6]

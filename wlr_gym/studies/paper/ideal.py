@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.studies.paper import printed, reduced
 from wlr_gym.studies.paper.experiments import LEG_SPEED, WHEEL_ACCELERATION, WHEEL_SPEED, PaperTest, duration, stop_time
-from wlr_gym.studies.paper.quantities import Constants, State
+from wlr_gym.studies.paper.quantities import PaperConstants, State
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ class IdealMotion:
     """
 
     test: PaperTest
-    constants: Constants
+    constants: PaperConstants
     time: Array
     front: Array
     rear: Array
@@ -73,13 +73,13 @@ class IdealMotion:
         return printed.forces_as_used(self.constants, self.state())
 
 
-def ideal_motion(test: PaperTest, constants: Constants | None = None, leg_ramp: float = LEG_RAMP) -> IdealMotion:
+def ideal_motion(test: PaperTest, constants: PaperConstants | None = None, leg_ramp: float = LEG_RAMP) -> IdealMotion:
     """Return one test without slip.
 
     Args:
         test: which. constants: of the robot; None = the paper's. leg_ramp: s.
     """
-    c = constants or Constants()
+    c = constants or PaperConstants()
     time = np.arange(-0.2, duration() + 0.5, _TICK)
     front, front_rate = _leg(time, test.start[0], test.end[0], leg_ramp)
     rear, rear_rate = _leg(time, test.start[1], test.end[1], leg_ramp)

@@ -10,7 +10,7 @@ from typing import Any
 
 from wlr_gym.studies.paper.quantities import (
     WHEELS,
-    Constants,
+    PaperConstants,
     State,
     Value,
     Vector,
@@ -34,7 +34,7 @@ def eq2_velocity_of_the_body(s: State) -> Vector:
     return s.x_d, s.y_d, s.z_d
 
 
-def wheel_vector(c: Constants, s: State, wheel: str) -> tuple[Vector, Vector]:
+def wheel_vector(c: PaperConstants, s: State, wheel: str) -> tuple[Vector, Vector]:
     """r and r' of a wheel's centre from G, yaw frame, z up; (3)-(6) name them and do not print them."""
     phi, phi_d, _ = s.absolute_leg(wheel)
     hip = ahead(wheel) * c.l_x / 2
@@ -44,37 +44,37 @@ def wheel_vector(c: Constants, s: State, wheel: str) -> tuple[Vector, Vector]:
     return (x, -to_the_right(wheel) * c.l_y / 2, z), (x_d, 0.0, z_d)
 
 
-def _wheel_velocity(c: Constants, s: State, wheel: str) -> Vector:
+def _wheel_velocity(c: PaperConstants, s: State, wheel: str) -> Vector:
     v = (s.x_d - s.x_s_d[wheel] - c.a * s.theta_d[wheel], s.y_d - s.y_s_d[wheel], s.z_d - s.z_s_d[wheel])
     return eq1_velocity_of_a_wheel_centre(v, s.yaw_d, *wheel_vector(c, s, wheel))
 
 
-def eq3_velocity_of_the_right_front_wheel(c: Constants, s: State) -> Vector:
+def eq3_velocity_of_the_right_front_wheel(c: PaperConstants, s: State) -> Vector:
     """(3): (x' - x_s' - a theta') i + (y' - y_s') j + (z' - z_s') k + theta' k x r + r'."""
     return _wheel_velocity(c, s, "rf")
 
 
-def eq4_velocity_of_the_left_front_wheel(c: Constants, s: State) -> Vector:
+def eq4_velocity_of_the_left_front_wheel(c: PaperConstants, s: State) -> Vector:
     """(4): as (3)."""
     return _wheel_velocity(c, s, "lf")
 
 
-def eq5_velocity_of_the_right_rear_wheel(c: Constants, s: State) -> Vector:
+def eq5_velocity_of_the_right_rear_wheel(c: PaperConstants, s: State) -> Vector:
     """(5): as (3)."""
     return _wheel_velocity(c, s, "rr")
 
 
-def eq6_velocity_of_the_left_rear_wheel(c: Constants, s: State) -> Vector:
+def eq6_velocity_of_the_left_rear_wheel(c: PaperConstants, s: State) -> Vector:
     """(6): as (3)."""
     return _wheel_velocity(c, s, "lr")
 
 
-def eq7_gibbs_function_of_the_wheels(c: Constants, s: State) -> Value:
+def eq7_gibbs_function_of_the_wheels(c: PaperConstants, s: State) -> Value:
     """(7): I_o/2 sum theta_i''^2."""
     return c.I_o / 2 * sum(s.theta_dd[wheel] ** 2 for wheel in WHEELS)
 
 
-def leg_acceleration(c: Constants, s: State, wheel: str, z_down: bool = True) -> Vector:
+def leg_acceleration(c: PaperConstants, s: State, wheel: str, z_down: bool = True) -> Vector:
     """What the paper takes for the acceleration a_i of a leg: d/dt of the components of (3)-(6), without theta' x v.
 
     The lateral part keeps the terms of theta' k x r; no equation of the paper uses it.
@@ -95,7 +95,7 @@ def leg_acceleration(c: Constants, s: State, wheel: str, z_down: bool = True) ->
     return x, y, z
 
 
-def eq8_gibbs_function_of_the_legs(c: Constants, s: State, accelerations: dict[str, Vector]) -> Value:
+def eq8_gibbs_function_of_the_legs(c: PaperConstants, s: State, accelerations: dict[str, Vector]) -> Value:
     """(8): I_ly (alpha''^2 + beta''^2) + I_lx theta''^2 (cos^2 alpha + cos^2 beta) + m_l/2 sum a_i^2."""
     squares = sum(component**2 for wheel in WHEELS for component in accelerations[wheel])
     return (
@@ -105,12 +105,12 @@ def eq8_gibbs_function_of_the_legs(c: Constants, s: State, accelerations: dict[s
     )
 
 
-def eq9_gibbs_function_of_the_body(c: Constants, s: State) -> Value:
+def eq9_gibbs_function_of_the_body(c: PaperConstants, s: State) -> Value:
     """(9): 1/2 (I_Gz theta''^2 + I_Gy Psi'^2 + M_G a_G^2), with the Psi' that (10) prints as Psi''."""
     return (c.I_Gz * s.yaw_dd**2 + c.I_Gy * s.psi_d**2 + c.M_G * _squared(eq11_acceleration_of_the_body(s))) / 2
 
 
-def eq10_gibbs_function(c: Constants, s: State, accelerations: dict[str, Vector]) -> Value:
+def eq10_gibbs_function(c: PaperConstants, s: State, accelerations: dict[str, Vector]) -> Value:
     """(10): the sum of (7), (8) and (9), with Psi''^2."""
     body = (c.I_Gz * s.yaw_dd**2 + c.I_Gy * s.psi_dd**2 + c.M_G * _squared(eq11_acceleration_of_the_body(s))) / 2
     return eq7_gibbs_function_of_the_wheels(c, s) + eq8_gibbs_function_of_the_legs(c, s, accelerations) + body
@@ -121,7 +121,7 @@ def eq11_acceleration_of_the_body(s: State) -> Vector:
     return s.x_dd, s.y_dd + s.yaw_d * s.x_d, s.z_dd
 
 
-def eq12_potential(c: Constants, s: State) -> Value:
+def eq12_potential(c: PaperConstants, s: State) -> Value:
     """(12): g l (m_l (sin alpha + sin beta) + M_G/2 (sin(alpha + psi) + sin(beta + psi)))."""
     legs = c.m_l * (sin(s.alpha) + sin(s.beta))
     return c.g * c.l * (legs + c.M_G / 2 * (sin(s.alpha + s.psi) + sin(s.beta + s.psi)))
@@ -137,7 +137,7 @@ def eq14_coulomb_friction(mu: Value, f_n: Value, velocity: Value) -> Value:
     return -mu * f_n * sign(velocity)
 
 
-def eq15_dissipation(c: Constants, s: State, f_nf: Value, f_nr: Value) -> Value:
+def eq15_dissipation(c: PaperConstants, s: State, f_nf: Value, f_nr: Value) -> Value:
     """(15), whose bracket after mu_dx is never closed: it would take the lateral part in, times mu_dx."""
     return c.mu_dx * (_along(s, f_nf, f_nr) + 2 * c.mu_dy * _across(s, f_nf, f_nr))
 
@@ -154,33 +154,33 @@ def _squared(vector: Vector) -> Value:
     return sum(component**2 for component in vector)
 
 
-def front_moment(c: Constants, s: State) -> Value:
+def front_moment(c: PaperConstants, s: State) -> Value:
     """The numerator of (16), N m."""
     hips, front, rear = c.l_x * cos(s.psi), c.l * cos(s.alpha + s.psi), c.l * cos(s.beta + s.psi)
     return c.M_G * c.g / 2 * (hips / 2 - rear) + c.m_l * c.g * (hips + front / 2 - 3 * rear / 2)
 
 
-def rear_moment(c: Constants, s: State) -> Value:
+def rear_moment(c: PaperConstants, s: State) -> Value:
     """The numerator of (17), N m."""
     hips, front, rear = c.l_x * cos(s.psi), c.l * cos(s.alpha + s.psi), c.l * cos(s.beta + s.psi)
     return c.M_G * c.g / 2 * (hips / 2 + front) + c.m_l * c.g * (hips + 3 * front / 2 - rear / 2)
 
 
-def _base(c: Constants, s: State) -> Value:
+def _base(c: PaperConstants, s: State) -> Value:
     return c.l_x * cos(s.psi) + c.l * (cos(s.alpha + s.psi) - cos(s.beta + s.psi))
 
 
-def _misprinted_base(c: Constants, s: State) -> Value:
+def _misprinted_base(c: PaperConstants, s: State) -> Value:
     """The denominator of (28)-(30), where "l(" is lost."""
     return c.l_x * cos(s.psi) + c.l * cos(s.alpha + s.psi) - cos(s.beta + s.psi)
 
 
-def eq16_normal_force_in_front(c: Constants, s: State) -> Value:
+def eq16_normal_force_in_front(c: PaperConstants, s: State) -> Value:
     """(16): on one front wheel, N."""
     return front_moment(c, s) / _base(c, s)
 
 
-def eq17_normal_force_behind(c: Constants, s: State) -> Value:
+def eq17_normal_force_behind(c: PaperConstants, s: State) -> Value:
     """(17): on one rear wheel, N."""
     return rear_moment(c, s) / _base(c, s)
 
@@ -190,7 +190,7 @@ def eq18_generalised_force(ds: Value, dd: Value, dv: Value) -> Value:
     return ds + dd + dv
 
 
-def _leg_torque(c: Constants, s: State, right: str, left: str) -> Value:
+def _leg_torque(c: PaperConstants, s: State, right: str, left: str) -> Value:
     """(19) and (20): one bracket for each wheel of the axle, all inside 1/2 m_l(...), the z-part with 1/2 over all of it."""
     phi, phi_d, phi_dd = s.absolute_leg(right)
     sigma, leg_dd = ahead(right) * c.l_x, s.leg(right)[2]
@@ -207,41 +207,41 @@ def _leg_torque(c: Constants, s: State, right: str, left: str) -> Value:
     return 2 * c.I_ly * leg_dd + c.m_l * total / 2
 
 
-def eq19_torque_of_the_front_legs(c: Constants, s: State) -> Value:
+def eq19_torque_of_the_front_legs(c: PaperConstants, s: State) -> Value:
     """(19): sum of both front hip motors, N m."""
     return _leg_torque(c, s, "rf", "lf")
 
 
-def eq20_torque_of_the_rear_legs(c: Constants, s: State) -> Value:
+def eq20_torque_of_the_rear_legs(c: PaperConstants, s: State) -> Value:
     """(20): sum of both rear hip motors, N m."""
     return _leg_torque(c, s, "rr", "lr")
 
 
-def _wheel_torque(c: Constants, s: State, wheel: str) -> Value:
+def _wheel_torque(c: PaperConstants, s: State, wheel: str) -> Value:
     return c.I_o * s.theta_dd[wheel] - c.m_l * c.a * leg_acceleration(c, s, wheel)[0]
 
 
-def eq21_torque_of_the_right_front_wheel(c: Constants, s: State) -> Value:
+def eq21_torque_of_the_right_front_wheel(c: PaperConstants, s: State) -> Value:
     """(21), its last bracket closed at the end: I_o theta'' - m_l a (x'' - ...), N m."""
     return _wheel_torque(c, s, "rf")
 
 
-def eq22_torque_of_the_left_front_wheel(c: Constants, s: State) -> Value:
+def eq22_torque_of_the_left_front_wheel(c: PaperConstants, s: State) -> Value:
     """(22): as (21)."""
     return _wheel_torque(c, s, "lf")
 
 
-def eq23_torque_of_the_right_rear_wheel(c: Constants, s: State) -> Value:
+def eq23_torque_of_the_right_rear_wheel(c: PaperConstants, s: State) -> Value:
     """(23): as (21)."""
     return _wheel_torque(c, s, "rr")
 
 
-def eq24_torque_of_the_left_rear_wheel(c: Constants, s: State) -> Value:
+def eq24_torque_of_the_left_rear_wheel(c: PaperConstants, s: State) -> Value:
     """(24): as (21)."""
     return _wheel_torque(c, s, "lr")
 
 
-def _longitudinal_force(c: Constants, s: State, wheel: str, yaw_sign: int, friction: Value) -> Value:
+def _longitudinal_force(c: PaperConstants, s: State, wheel: str, yaw_sign: int, friction: Value) -> Value:
     """(25)-(28): m_l/2 (-2 x'' + 2 x_s'' + 2 a theta'' + yaw_sign theta'' l_y ...) + mu_dx F_n, without sgn."""
     phi, phi_d, phi_dd = s.absolute_leg(wheel)
     sigma = ahead(wheel) * c.l_x
@@ -253,37 +253,37 @@ def _longitudinal_force(c: Constants, s: State, wheel: str, yaw_sign: int, frict
     return c.m_l * inertia / 2 + c.mu_dx * friction
 
 
-def eq25_force_on_the_right_front_wheel(c: Constants, s: State) -> Value:
+def eq25_force_on_the_right_front_wheel(c: PaperConstants, s: State) -> Value:
     """(25): N."""
     return _longitudinal_force(c, s, "rf", -1, eq16_normal_force_in_front(c, s))
 
 
-def eq26_force_on_the_left_front_wheel(c: Constants, s: State) -> Value:
+def eq26_force_on_the_left_front_wheel(c: PaperConstants, s: State) -> Value:
     """(26): N."""
     return _longitudinal_force(c, s, "lf", +1, eq16_normal_force_in_front(c, s))
 
 
-def eq27_force_on_the_right_rear_wheel(c: Constants, s: State) -> Value:
+def eq27_force_on_the_right_rear_wheel(c: PaperConstants, s: State) -> Value:
     """(27): N. Prints + theta'' l_y where (23) and (25) have it with the other sign."""
     return _longitudinal_force(c, s, "rr", +1, eq17_normal_force_behind(c, s))
 
 
-def eq28_force_on_the_left_rear_wheel(c: Constants, s: State) -> Value:
+def eq28_force_on_the_left_rear_wheel(c: PaperConstants, s: State) -> Value:
     """(28): over a denominator that adds metres to a pure number."""
     return _longitudinal_force(c, s, "lr", +1, rear_moment(c, s) / _misprinted_base(c, s))
 
 
-def eq29_lateral_force_in_front(c: Constants, s: State) -> Value:
+def eq29_lateral_force_in_front(c: PaperConstants, s: State) -> Value:
     """(29): both front wheels, over the same denominator as (28), N."""
     return 2 * c.mu_dy * front_moment(c, s) / _misprinted_base(c, s)
 
 
-def eq30_lateral_force_behind(c: Constants, s: State) -> Value:
+def eq30_lateral_force_behind(c: PaperConstants, s: State) -> Value:
     """(30): both rear wheels, N."""
     return 2 * c.mu_dy * rear_moment(c, s) / _misprinted_base(c, s)
 
 
-def forces_as_used(c: Constants, s: State) -> dict[str, Any]:
+def forces_as_used(c: PaperConstants, s: State) -> dict[str, Any]:
     """Return (19)-(28) at one state, as the paper uses them: driven by measured motion and slip."""
     wheel_torques = (
         eq21_torque_of_the_right_front_wheel, eq22_torque_of_the_left_front_wheel,

@@ -73,7 +73,7 @@ def _zeros() -> dict[str, Value]:
 
 
 @dataclass(frozen=True)
-class Constants:
+class PaperConstants:
     """The robot. Table I as printed where it prints a number; else what the audit of the paper recommends.
 
     Attributes:
@@ -182,12 +182,12 @@ class Forces:
         return self.n_f if is_front(wheel) else self.n_r
 
 
-def wheelbase(c: Constants, s: State) -> Value:
+def wheelbase(c: PaperConstants, s: State) -> Value:
     """Distance of the axles along the floor, L: the denominator of (16) and (17), m."""
     return c.l_x * cos(s.psi) + c.l * (cos(s.alpha + s.psi) - cos(s.beta + s.psi))
 
 
-def lever(c: Constants, s: State, wheel: str, distance: Value | None = None) -> Value:
+def lever(c: PaperConstants, s: State, wheel: str, distance: Value | None = None) -> Value:
     """X_i: how far a point on the wheel's leg, ``distance`` from the hip (None = the wheel's centre), is ahead of G; m."""
     reach = c.l if distance is None else distance
     return ahead(wheel) * c.l_x / 2 * cos(s.psi) + reach * cos(s.leg(wheel)[0] + s.psi)

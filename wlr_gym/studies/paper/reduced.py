@@ -24,25 +24,28 @@ from numpy.typing import NDArray
 from wlr_gym.physics import servo
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
-from wlr_gym.studies.paper.quantities import Constants
+from wlr_gym.studies.paper.quantities import PaperConstants
 from wlr_gym.studies.paper.rubbing import rub
 
 Array = NDArray[np.float64]
 
-VX, VY, YAW, VZ, PITCH, FRONT, REAR = range(7)
+VX, VY, YAW, VZ, PITCH, FRONT, REAR = range(7)  # indices of u11; the wheels follow
 _WHEELS = slice(7, 11)
 #: Columns of u9 in u11, and where legs and wheels stand in u9.
 _KEPT = [VX, VY, YAW, FRONT, REAR, 7, 8, 9, 10]
-_LEGS9, _WHEELS9 = slice(3, 5), slice(5, 9)
+_LEGS9 = slice(3, 5)
+_WHEELS9 = slice(5, 9)
 #: Of the corners lf, rf, lr, rr: ahead, to the left, and which leg.
-_AHEAD, _LEFT, _LEG = np.array([1.0, 1.0, -1.0, -1.0]), np.array([1.0, -1.0, 1.0, -1.0]), np.array([0, 0, 1, 1])
+_AHEAD = np.array([1.0, 1.0, -1.0, -1.0])
+_LEFT = np.array([1.0, -1.0, 1.0, -1.0])
+_LEG = np.array([0, 0, 1, 1])
 
 
-def constants_of(parameters: Parameters) -> Constants:
+def constants_of(parameters: Parameters) -> PaperConstants:
     """Return the paper's symbols (N,) of robots with pairwise equal legs; mu of the left front wheel."""
     hip, leg = parameters["hip.position"], parameters["leg.inertia"]
     body, armature = parameters["body.inertia"], parameters["servo.armature"]
-    return Constants(
+    return PaperConstants(
         l_x=2 * hip[:, 0], l_y=2 * hip[:, 1], l=parameters["leg.length"][:, 0], a=parameters["wheel.radius"][:, 0],
         M_G=parameters["body.mass"], I_o=parameters["wheel.spin_inertia"][:, 0], I_ly=leg[:, 1], I_lx=leg[:, 0],
         I_Gy=body[:, 1], I_Gz=body[:, 2], m_l=parameters["leg.mass"][:, 0], I_Gx=body[:, 0], I_along=leg[:, 2],
@@ -66,7 +69,7 @@ class Posture:
     height: Array
 
 
-def posture(c: Constants, front: Array, rear: Array) -> Posture:
+def posture(c: PaperConstants, front: Array, rear: Array) -> Posture:
     """Return the posture with all wheels on a level floor, for leg angles (N,) relative to the body."""
     pitch = np.arctan2(c.l * (np.sin(rear) - np.sin(front)), c.l_x + c.l * (np.cos(front) - np.cos(rear)))
     f, r = front + pitch, rear + pitch
@@ -74,7 +77,7 @@ def posture(c: Constants, front: Array, rear: Array) -> Posture:
     return Posture(pitch, f, r, base, c.a + c.l / 2 * (np.sin(f) + np.sin(r)))
 
 
-def mass_matrix_and_bias(c: Constants, front: Array, rear: Array, pitch: Array, u: Array) -> tuple[Array, Array]:
+def mass_matrix_and_bias(c: PaperConstants, front: Array, rear: Array, pitch: Array, u: Array) -> tuple[Array, Array]:
     """Return M (N, 11, 11) and h (N, 11), gravity included, at any pitch.
 
     Args:
@@ -136,7 +139,7 @@ def _put(m: Array, row: int, column: int, value: Array) -> None:
     m[:, row, column] = m[:, column, row] = value
 
 
-def reduction(c: Constants, p: Posture, u: Array) -> tuple[Array, Array]:
+def reduction(c: PaperConstants, p: Posture, u: Array) -> tuple[Array, Array]:
     """Return B (N, 11, 9) and its time derivative: psi' and v_z of wheels that stay on the floor. ``u`` (N, 9)."""
     sf, cf, sr, cr = np.sin(p.f), np.cos(p.f), np.sin(p.r), np.cos(p.r)
     by_front, by_rear = -c.l * cf / p.wheelbase, c.l * cr / p.wheelbase
@@ -156,7 +159,7 @@ def reduction(c: Constants, p: Posture, u: Array) -> tuple[Array, Array]:
     return b, b_dot
 
 
-def contact_rows(c: Constants, p: Posture, radius: Array) -> tuple[Array, Array, Array]:
+def contact_rows(c: PaperConstants, p: Posture, radius: Array) -> tuple[Array, Array, Array]:
     """Return J_x, J_y, J_n (N, 4, 11): velocity of each wheel's contact point along its heading, to its left, and up."""
     phi = np.where(_LEG == 0, p.f[:, None], p.r[:, None])
     l_x, l_y, length = (np.broadcast_to(value, p.f.shape)[:, None] for value in (c.l_x, c.l_y, c.l))
@@ -207,7 +210,7 @@ class InverseDynamics:
 
 
 def inverse_dynamics(
-    c: Constants, front: Array, rear: Array, pitch: Array, u: Array, u_dot: Array, rear_wheel_torque: Array
+    c: PaperConstants, front: Array, rear: Array, pitch: Array, u: Array, u_dot: Array, rear_wheel_torque: Array
 ) -> InverseDynamics:
     """Return torques and floor forces from measured motion: the paper's use of its equations, with the right ones.
 
@@ -237,7 +240,7 @@ def inverse_dynamics(
     return InverseDynamics(rest[:, [FRONT, REAR]], rest[:, _WHEELS], along, lateral, normal)
 
 
-def _base_and_height(c: Constants, front: Array, rear: Array, pitch: Array) -> tuple[Array, Array]:
+def _base_and_height(c: PaperConstants, front: Array, rear: Array, pitch: Array) -> tuple[Array, Array]:
     f, r = front + pitch, rear + pitch
     return c.l_x * np.cos(pitch) + c.l * (np.cos(f) - np.cos(r)), c.a + c.l / 2 * (np.sin(f) + np.sin(r))
 

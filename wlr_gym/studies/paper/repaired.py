@@ -8,28 +8,28 @@ from __future__ import annotations
 
 from wlr_gym.studies.paper import printed
 from wlr_gym.studies.paper.printed import eq11_acceleration_of_the_body, eq16_normal_force_in_front, eq17_normal_force_behind
-from wlr_gym.studies.paper.quantities import Constants, State, Value, cos, is_front, sign, sin
+from wlr_gym.studies.paper.quantities import PaperConstants, State, Value, cos, is_front, sign, sin
 
 
-def eq9_gibbs_function_of_the_body(c: Constants, s: State) -> Value:
+def eq9_gibbs_function_of_the_body(c: PaperConstants, s: State) -> Value:
     """(9) with Psi''^2, as in (10)."""
     squared = sum(component**2 for component in eq11_acceleration_of_the_body(s))
     return (c.I_Gz * s.yaw_dd**2 + c.I_Gy * s.psi_dd**2 + c.M_G * squared) / 2
 
 
-def eq12_potential(c: Constants, s: State) -> Value:
+def eq12_potential(c: PaperConstants, s: State) -> Value:
     """(12) with alpha + psi and beta + psi in the legs' term too."""
     return c.g * c.l * (c.m_l + c.M_G / 2) * (sin(s.alpha + s.psi) + sin(s.beta + s.psi))
 
 
-def eq15_dissipation(c: Constants, s: State, f_nf: Value, f_nr: Value) -> Value:
+def eq15_dissipation(c: PaperConstants, s: State, f_nf: Value, f_nr: Value) -> Value:
     """(15) with the bracket after mu_dx closed before the lateral part."""
     along = sum((f_nf if is_front(w) else f_nr) * slip * sign(slip) for w, slip in s.x_s_d.items())
     across = f_nf * s.y_f_d * sign(s.y_f_d) + f_nr * s.y_r_d * sign(s.y_r_d)
     return c.mu_dx * along + 2 * c.mu_dy * across
 
 
-def _leg_torque(c: Constants, s: State, right: str, left: str) -> Value:
+def _leg_torque(c: PaperConstants, s: State, right: str, left: str) -> Value:
     phi, leg_dd = s.absolute_leg(right)[0], s.leg(right)[2]
     total = 0
     for wheel in (right, left):
@@ -38,46 +38,46 @@ def _leg_torque(c: Constants, s: State, right: str, left: str) -> Value:
     return 2 * c.I_ly * leg_dd + c.m_l * c.l * total
 
 
-def eq19_torque_of_the_front_legs(c: Constants, s: State) -> Value:
+def eq19_torque_of_the_front_legs(c: PaperConstants, s: State) -> Value:
     """(19): 2 I_ly alpha'' + m_l l sum(-A_x sin + A_z cos): the factor 2 of the z-part back, the leg out of its 1/2."""
     return _leg_torque(c, s, "rf", "lf")
 
 
-def eq20_torque_of_the_rear_legs(c: Constants, s: State) -> Value:
+def eq20_torque_of_the_rear_legs(c: PaperConstants, s: State) -> Value:
     """(20): likewise."""
     return _leg_torque(c, s, "rr", "lr")
 
 
-def _longitudinal(c: Constants, s: State, wheel: str) -> Value:
+def _longitudinal(c: PaperConstants, s: State, wheel: str) -> Value:
     normal = eq16_normal_force_in_front(c, s) if is_front(wheel) else eq17_normal_force_behind(c, s)
     return -c.m_l * printed.leg_acceleration(c, s, wheel)[0] + c.mu_dx * normal * sign(s.x_s_d[wheel])
 
 
-def eq25_force_on_the_right_front_wheel(c: Constants, s: State) -> Value:
+def eq25_force_on_the_right_front_wheel(c: PaperConstants, s: State) -> Value:
     """(25): -m_l A_x + mu F_n sgn(x_s'): the sgn back."""
     return _longitudinal(c, s, "rf")
 
 
-def eq26_force_on_the_left_front_wheel(c: Constants, s: State) -> Value:
+def eq26_force_on_the_left_front_wheel(c: PaperConstants, s: State) -> Value:
     """(26): likewise."""
     return _longitudinal(c, s, "lf")
 
 
-def eq27_force_on_the_right_rear_wheel(c: Constants, s: State) -> Value:
+def eq27_force_on_the_right_rear_wheel(c: PaperConstants, s: State) -> Value:
     """(27): likewise, with -theta'' l_y."""
     return _longitudinal(c, s, "rr")
 
 
-def eq28_force_on_the_left_rear_wheel(c: Constants, s: State) -> Value:
+def eq28_force_on_the_left_rear_wheel(c: PaperConstants, s: State) -> Value:
     """(28): likewise, over l_x cos psi + l (cos - cos)."""
     return _longitudinal(c, s, "lr")
 
 
-def eq29_lateral_force_in_front(c: Constants, s: State) -> Value:
+def eq29_lateral_force_in_front(c: PaperConstants, s: State) -> Value:
     """(29): 2 mu_dy F_nf sgn(y_f'), over the right denominator."""
     return 2 * c.mu_dy * eq16_normal_force_in_front(c, s) * sign(s.y_f_d)
 
 
-def eq30_lateral_force_behind(c: Constants, s: State) -> Value:
+def eq30_lateral_force_behind(c: PaperConstants, s: State) -> Value:
     """(30): 2 mu_dy F_nr sgn(y_r'), over the right denominator."""
     return 2 * c.mu_dy * eq17_normal_force_behind(c, s) * sign(s.y_r_d)

@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from wlr_gym.base.files import replace_file, write_json
 from wlr_gym.physics.plants import SIMULATORS
 from wlr_gym.robot import Robot
-from wlr_gym.studies.paper import open_question
-from wlr_gym.studies.paper.claims import VARIANTS, CheckedClaim, Evidence, claims_table
+from wlr_gym.studies.paper import slip_search
+from wlr_gym.studies.paper.claims import CheckedClaim, claims_table
+from wlr_gym.studies.paper.evidence import VARIANTS, PaperEvidence
 from wlr_gym.studies.paper.experiments import REDUCED, TESTS, Record, error_of_ignoring_slip
 from wlr_gym.studies.paper.measured import inverse_from_record
-from wlr_gym.studies.paper.open_question import OBSERVABLES, READINGS, Finding, Reading
+from wlr_gym.studies.paper.slip_candidates import READINGS, PaperReading
+from wlr_gym.studies.paper.slip_outcomes import ERROR_TOLERANCE, LATERAL_TOLERANCE
+from wlr_gym.studies.paper.slip_search import OBSERVABLES, SearchFinding
 from wlr_gym.studies.paper.verdicts import verdict_table
 
 Array = NDArray[np.float64]
@@ -63,12 +66,12 @@ def _apart(a: Record, b: Record) -> dict[str, float]:
 # ---- what would decide -----------------------------------------------------------------------------------------------
 
 
-def what_would_decide(robot: Robot, findings: Sequence[Finding], threads: int = 2) -> dict[str, Decisive]:
+def what_would_decide(robot: Robot, findings: Sequence[SearchFinding], threads: int = 2) -> dict[str, Decisive]:
     """Return, per reading, what the matching robots of every finding would show in other measurements."""
     decisive = {}
     for reading in READINGS:
-        found = open_question.matching(findings, reading)
-        shown = open_question.observables(robot, found, reading, threads=threads)
+        found = slip_search.matching(findings, reading)
+        shown = slip_search.observables(robot, found, reading, threads=threads)
         decisive[reading.name] = {
             finding.label: {name: (float(values.min()), float(values.max())) for name, values in own.items()}
             for finding, own in zip(found, shown, strict=True)
@@ -79,7 +82,7 @@ def what_would_decide(robot: Robot, findings: Sequence[Finding], threads: int = 
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
-def write_figures(folder: Path, records: Records, evidence: Evidence, findings: Sequence[Finding]) -> None:
+def write_figures(folder: Path, records: Records, evidence: PaperEvidence, findings: Sequence[SearchFinding]) -> None:
     """Write all figures as PNG."""
     from wlr_gym.studies.paper import figures
 
@@ -103,7 +106,7 @@ def write_report(
     robot: Robot,
     records: Records,
     claims: Sequence[CheckedClaim],
-    findings: Sequence[Finding],
+    findings: Sequence[SearchFinding],
     decisive: Mapping[str, Decisive],
 ) -> None:
     """Write report.md, claims.json, agreement.json and search.json."""
@@ -155,24 +158,24 @@ def _agreement_table(apart: Mapping[str, Mapping[str, Mapping[str, float]]]) -> 
     return lines
 
 
-def question_lines(findings: Sequence[Finding], decisive: Mapping[str, Decisive]) -> list[str]:
+def question_lines(findings: Sequence[SearchFinding], decisive: Mapping[str, Decisive]) -> list[str]:
     """Return the answer to the open question as Markdown: closest misses, matches with their ranges, what would decide."""
     draws = sum(len(finding.values) for finding in findings)
     lines = [
         f"{len(findings)} departures from the nominal robot, alone and together; {draws} robots drove both tests. A miss of 1 "
-        f"or less is a match: both errors within {100 * open_question.ERROR_TOLERANCE:.1f} points, both lateral displacements "
-        f"within {1e3 * open_question.LATERAL_TOLERANCE:.0f} mm.",
+        f"or less is a match: both errors within {100 * ERROR_TOLERANCE:.1f} points, both lateral displacements "
+        f"within {1e3 * LATERAL_TOLERANCE:.0f} mm.",
         "",
     ]
     for reading in READINGS:
-        lines += [f"### Reading: {reading.doc}", "", *_closest(findings, reading), "", *_ranges(findings, reading)]
+        lines += [f"### PaperReading: {reading.doc}", "", *_closest(findings, reading), "", *_ranges(findings, reading)]
         found = decisive.get(reading.name, {})
         if len(found) > 1:
             lines += [*_decisive(found), ""]
     return lines
 
 
-def _closest(findings: Sequence[Finding], reading: Reading) -> list[str]:
+def _closest(findings: Sequence[SearchFinding], reading: PaperReading) -> list[str]:
     lines = ["| at once | closest | miss | matches |", "|---|---|---|---|"]
     for count in sorted({len(finding.names) for finding in findings}):
         of_count = sorted((f for f in findings if len(f.names) == count), key=lambda f: f.closest(reading))
@@ -181,9 +184,9 @@ def _closest(findings: Sequence[Finding], reading: Reading) -> list[str]:
     return lines
 
 
-def _ranges(findings: Sequence[Finding], reading: Reading) -> list[str]:
+def _ranges(findings: Sequence[SearchFinding], reading: PaperReading) -> list[str]:
     lines: list[str] = []
-    for finding in open_question.matching(findings, reading):
+    for finding in slip_search.matching(findings, reading):
         entry: dict[str, Any] = finding.as_dict()["readings"][reading.name]
         ranges = "; ".join(
             f"{name} {span['low']:.3g} to {span['high']:.3g} {span['unit']}".rstrip(" -")

@@ -13,9 +13,14 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 #: m/s and rad/s: what sticks may creep at most: 20 um in a test, far below an encoder count at the tread.
-CREEP, JOINT_CREEP = 1e-6, 1e-5
-_ITERATIONS, _TOLERANCE = 60, 1e-7
-_SIZE, _WHEELS, _FIRST_JOINT = 9, 4, 3
+CREEP = 1e-6
+JOINT_CREEP = 1e-5
+_ITERATIONS = 60
+_TOLERANCE = 1e-7
+#: Velocities of the model; wheels; index of the first joint among the velocities.
+_SIZE = 9
+_WHEELS = 4
+_FIRST_JOINT = 3
 
 
 @njit(cache=True)

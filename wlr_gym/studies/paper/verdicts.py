@@ -1,7 +1,8 @@
 """The verdict on every equation of the paper, with its functions as printed, with misprints undone, and corrected.
 
 Verdicts: ``correct``; ``conditional`` (true under a condition the paper does not state); ``misprint`` (print or OCR: which of
-the two cannot be told from the text); ``incomplete`` (terms are missing); ``wrong`` (physics). tests/paper proves each of them.
+the two cannot be told from the text); ``incomplete`` (terms are missing); ``wrong`` (physics). tests/studies/paper proves
+each of them.
 Source: Korayem, Nikseresht, Asadi 2024, "Vision-based dynamic modeling of wheeled-legged robot considering slippage using
 Gibbs-Appell formulation", Robotica.
 """
@@ -14,7 +15,11 @@ from typing import Any
 
 from wlr_gym.studies.paper import corrected, printed, repaired
 
-CORRECT, CONDITIONAL, MISPRINT, INCOMPLETE, WRONG = "correct", "conditional", "misprint", "incomplete", "wrong"
+CORRECT = "correct"
+CONDITIONAL = "conditional"
+MISPRINT = "misprint"
+INCOMPLETE = "incomplete"
+WRONG = "wrong"
 
 
 @dataclass(frozen=True)

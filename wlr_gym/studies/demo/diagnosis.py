@@ -1,4 +1,4 @@
-"""Last stages: the gap workflow names what the robot hides, its patch is tried on a run kept aside, and the secret is told."""
+"""Last stages: the gap workflow names the hidden fault, its patch is tried on held-out runs, and the truth is shown."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-NAME_TITLE, CHECK_TITLE = "4. What does the simulator lack?", "5. Does it hold?"
+NAME_TITLE = "4. What does the simulator lack?"
+CHECK_TITLE = "5. Does it hold?"
 #: Channels in the picture of a replay.
 _SHOWN = 3
 
@@ -41,13 +42,13 @@ def name(demo: Demo, tell: Tell) -> Section:
         raise InputError("no measured runs: the robot was not driven")
     found = analyse(demo.measured, demo.gap, tell=lambda text, share: tell(f"gap workflow: {text}", share))
     html = paragraph(
-        "The gap workflow gets the folder of measured runs. It calibrates the simulator within its tolerances, weighs every "
-        "effect of its library at every place, and keeps one run or two aside that no fit has seen."
+        "The gap workflow gets the folder of measured runs. It calibrates the simulator within its tolerances, tests every "
+        "effect of its library at every place, and holds out one run or two that no fit has seen."
     )
     html += f"<p><b>{escape(sentence(found))}</b></p>"
     plots = demo.gap / "plots"
     for kind, caption in (
-        ("evidence", "What each explanation would buy; the one that was taken is dark."),
+        ("evidence", "How much each explanation improves the fit; the selected one is dark."),
         ("overlays_1", "Measured channels, and the same runs replayed by the simulator as given, calibrated, and with what was "
          "found; below each the error that is left. Green: two standard deviations of sensor noise."),
     ):  # fmt: skip
@@ -62,7 +63,7 @@ def name(demo: Demo, tell: Tell) -> Section:
 
 
 def check(demo: Demo, tell: Tell) -> Section:
-    """Replay the runs kept aside with and without the patch, then tell the secret."""
+    """Replay the held-out runs with and without the patch, then show the hidden fault."""
     from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, read_result
     from wlr_gym.physics.effects import load_patch
 
@@ -70,9 +71,9 @@ def check(demo: Demo, tell: Tell) -> Section:
         raise InputError("no result of the gap workflow to check")
     result = read_result(demo.gap / RESULT_FILE)
     html, agrees = _replayed(demo, result, load_patch(demo.gap / PATCH_FILE), tell)
-    hidden = load_patch(demo.secret).effects[0]
+    hidden = load_patch(demo.hidden).effects[0]
     answer = judge(hidden, result.effects, result.equivalent)
-    html += heading("The secret") + _revealed(hidden, result.effects, answer)
+    html += heading("The hidden fault") + _revealed(hidden, result.effects, answer)
     return Section(CHECK_TITLE, f"{answer.sentence} {agrees}", html, SHOWN if answer.right else NOT_SHOWN)
 
 
@@ -83,10 +84,10 @@ def _replayed(demo: Demo, result: Result, patch: Any, tell: Tell) -> tuple[str, 
 
     runs = [run for run in read_dataset(demo.measured).runs if run.name in result.runs.heldout]
     if not runs:
-        return paragraph("No run was kept aside."), ""
+        return paragraph("No run was held out."), ""
     pairs = []
     for index, run in enumerate(runs):
-        tell(f"replaying {run.name}, kept aside", index / len(runs))
+        tell(f"replaying {run.name}, held out", index / len(runs))
         pairs.append((replay(run), replay(run, effects=patch)))
 
     def error(replayed: ReplayResult) -> float:
@@ -95,10 +96,10 @@ def _replayed(demo: Demo, result: Result, patch: Any, tell: Tell) -> tuple[str, 
     rows = [(one.run.name, number(error(one)), number(error(other))) for one, other in pairs]
     before, after = (float(np.sqrt(np.mean([error(pair[k]) ** 2 for pair in pairs]))) for k in range(2))
     text = paragraph(
-        "The simulator as its file has it, not calibrated, drives the runs kept aside once more: with nothing added, and with "
+        "The simulator as its file has it, not calibrated, drives the held-out runs once more: with nothing added, and with "
         "patch.yaml, as any command takes it (--effects). Pieces of one second, each begun where the robot was."
     )
-    text += table(("run kept aside", "error as given (1 = sensor noise)", "with the patch (1 = sensor noise)"), rows, (1, 2))
+    text += table(("held-out run", "error as given (1 = sensor noise)", "with the patch (1 = sensor noise)"), rows, (1, 2))
     text += drawn(
         _replay_picture(*pairs[0]),
         demo.out / "replay.png",
@@ -106,7 +107,7 @@ def _replayed(demo: Demo, result: Result, patch: Any, tell: Tell) -> tuple[str, 
     )
     verb = "fell" if after < before else "rose"
     numbers = f"from {number(before)} to {number(after)} (1 = sensor noise)"
-    return text, f"With the patch the simulator's error on runs kept aside {verb} {numbers}."
+    return text, f"With the patch the simulator's error on held-out runs {verb} {numbers}."
 
 
 def _replay_picture(before: ReplayResult, after: ReplayResult) -> Figure:
@@ -137,16 +138,16 @@ def _replay_picture(before: ReplayResult, after: ReplayResult) -> Figure:
     return figure
 
 
-# ---- the secret ------------------------------------------------------------------------------------------------------
+# ---- the hidden fault ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Answer:
-    """How good an answer was.
+class Diagnosis:
+    """How good a diagnosis is.
 
     Attributes:
         named, placed: the hidden effect is among those found; at its place.
-        near: another name was taken, and the report said that these data cannot tell it from the hidden one.
+        near: another name was selected, and the report says that these data do not distinguish it from the hidden one.
         sizes: parameter -> (hidden, found, low, high); the interval is NaN where there is none.
         extra: names found that were not hidden.
     """
@@ -179,13 +180,13 @@ class Answer:
         )
 
 
-def judge(hidden: PatchEffect, found: Sequence[EffectEntry], equivalent: Sequence[Sequence[str]] = ()) -> Answer:
+def judge(hidden: PatchEffect, found: Sequence[EffectEntry], equivalent: Sequence[Sequence[str]] = ()) -> Diagnosis:
     """Compare what was found with what was hidden.
 
     Args:
         hidden: the effect.
         found: entries of the result file.
-        equivalent: groups of names that the data could not tell apart.
+        equivalent: groups of names that the data do not distinguish.
     """
     same = [one for one in found if one.name == hidden.name]
     best = next((one for one in same if set(one.where) == set(hidden.where)), same[0] if same else None)
@@ -194,7 +195,7 @@ def judge(hidden: PatchEffect, found: Sequence[EffectEntry], equivalent: Sequenc
         for parameter, value in hidden.parameters.items():
             entry = best.parameters[parameter]
             sizes[parameter] = (value, entry.value, *(entry.ci95 or (np.nan, np.nan)))
-    return Answer(
+    return Diagnosis(
         named=best is not None,
         placed=best is not None and set(best.where) == set(hidden.where),
         near=best is None and any(hidden.name in group for group in equivalent),
@@ -203,7 +204,7 @@ def judge(hidden: PatchEffect, found: Sequence[EffectEntry], equivalent: Sequenc
     )
 
 
-def _revealed(hidden: PatchEffect, found: Sequence[EffectEntry], answer: Answer) -> str:
+def _revealed(hidden: PatchEffect, found: Sequence[EffectEntry], answer: Diagnosis) -> str:
     from wlr_gym.physics.effects import EFFECTS
 
     named = [plain(one.name) for one in found] or ["nothing"]

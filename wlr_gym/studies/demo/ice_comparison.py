@@ -11,7 +11,9 @@ from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
 from wlr_gym.studies.demo.stage import Section, Tell, paragraph, picture
 
 TITLE = "2. On ice"
-OURS, BLIND, NEW = "velocity_slip_aware", "velocity_blind", "trained just now"
+OURS = "velocity_slip_aware"
+BLIND = "velocity_blind"
+NEW = "trained just now"
 SHIPPED = (OURS, BLIND, "pid")
 _WHO = {
     OURS: "shipped; sees its slip (observer with a camera above the floor)",
@@ -31,12 +33,15 @@ _COLUMNS = {
 SPLIT = "split"
 FLOORS = {
     MAIN: "Ice everywhere: friction coefficient 0.05 to 0.2",
-    SPLIT: "Split floor: left of a line another friction coefficient than right of it, each 0.05 to 0.9",
+    SPLIT: "Split floor: one friction coefficient left of a line, another one right of it, each 0.05 to 0.9",
 }
 _WHERE = {MAIN: "on ice", SPLIT: "on split floors"}
 #: The film: with the left wheels onto ice, then a turn to the right.
-SHEET, SCHEDULE = "ice_sheet", "0:0.1,0; 4:0.1,-0.3"
-PICTURES_PER_SECOND, SIZE = 10.0, (400, 330)
+SHEET = "ice_sheet"
+SCHEDULE = "0:0.1,0; 4:0.1,-0.3"
+PICTURES_PER_SECOND = 10.0
+#: Pixels.
+SIZE = (400, 330)
 
 
 def compare(demo: Demo, tell: Tell) -> Section:
@@ -100,7 +105,7 @@ def _headline(card: Card) -> str:
 
 def _lower(better: Estimate) -> str:
     if not better.excludes_zero:
-        return "not told apart"
+        return "not distinguishable"
     return f"{abs(better.mean):.0f} % {'lower' if better.mean > 0 else 'higher'}"
 
 
@@ -134,5 +139,5 @@ def _film(demo: Demo, tell: Tell) -> str:
 _CAPTION = (
     "The same ice (blue, under the left wheels) and the same commands for both: drive on, after 4 s turn right as well. "
     "Arrows: where each wheel slips to, 0.1 m for 0.05 m/s; the redder, the faster. Pink: the path of the robot; dashed: the "
-    "path that was commanded. Turning on skids needs slip; what counts is who follows. One scene; averages: the table."
+    "path that was commanded. Skid-steering needs slip; what counts is which robot follows. One scene; averages: the table."
 )

@@ -1,9 +1,9 @@
-"""What the demo's robot hides, and how an answer is judged."""
+"""The hidden fault of the demo's robot, and how a diagnosis is judged."""
 
 from wlr_gym.gap.report.result import EffectEntry, ParameterEntry
 from wlr_gym.physics.effects import load_patch
-from wlr_gym.studies.demo.answer import judge
-from wlr_gym.studies.demo.secret import hide
+from wlr_gym.studies.demo.diagnosis import judge
+from wlr_gym.studies.demo.hidden_fault import hide
 
 
 def found(name, where, **values):

@@ -1,11 +1,8 @@
 """What could make the robot slip as the paper reports? A search with the effect library on the Gibbs-Appell engine.
 
 A rigid robot on Coulomb friction makes both tests with no slip and no drift. The paper reports 11.5 % and 1.1 cm in the first
-test, 5 % and 5.2 cm in the second. Each :class:`Candidate` is a plausible departure from the nominal robot: named effects, each
-number of them drawn from a range. Candidates are tried alone and in pairs, by random draws that close in on the paper's four
+test, 5 % and 5.2 cm in the second. Candidates are tried alone and in pairs, by random draws that close in on the paper's four
 numbers. What is reported are the ranges of all draws that give all four at once: not the best one, and not a cause.
-
-How the paper's numbers are meant is open in two ways, so every result is given for each :class:`Reading`.
 """
 
 from __future__ import annotations
@@ -19,219 +16,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.random import generator
-from wlr_gym.physics.effects import EFFECTS, apply_patch, load_patch
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
-from wlr_gym.robot.slip import no_slip_error
-from wlr_gym.studies.paper.experiments import TESTS, PaperTest, Record, drive, no_slip_travel, select
+from wlr_gym.studies.paper.experiments import PaperTest
+from wlr_gym.studies.paper.slip_candidates import (
+    CANDIDATES,
+    FLOOR_DIAL,
+    READINGS,
+    Dial,
+    PaperReading,
+    SlipCandidate,
+    make_parameters,
+)
+from wlr_gym.studies.paper.slip_outcomes import Outcomes, measure, outcomes
 
 Array = NDArray[np.float64]
 
-#: What counts as a match: error of ignoring slip within 1.5 percentage points, lateral displacement within 5 mm. [chosen: the
-#: paper gives one run each, and no repeatability.]
-ERROR_TOLERANCE, LATERAL_TOLERANCE = 0.015, 0.005
-#: Floor: the paper gives no coefficient; every draw has one of its own.
-FLOOR = (0.3, 0.9)
 #: Share of draws that are made anew in every round; the rest are made near the best so far, closer each round.
-_FRESH, _ELITE = 0.15, 8
-BEAM, ROUNDS = 4, 3
-#: s, and precision: of the search, four times as fast. What comes near a match is driven again with 1 ms in float64.
-_FAST, _EXACT = (0.002, "float32"), (0.001, "float64")
+_FRESH = 0.15
+#: Best draws of each reading that new ones are made near.
+_ELITE = 8
+#: Combinations that are drawn again for each reading, and rounds of it.
+BEAM = 4
+ROUNDS = 3
 #: In tolerances: what comes near a match.
 _NEAR = 1.5
-_DOWN = (np.pi / 2, np.pi / 2)
-#: Legs straight down, same wheels: a third drive that any of the candidates could be told by.
-CONTROL = PaperTest("control", "control: legs straight down", _DOWN, _DOWN)
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What the paper may mean by its errors.
-
-    Attributes:
-        name, doc: key, sentence.
-        encoder_on_leg: the no-slip prediction counts the wheel angle relative to the leg, as the servo reads it (True), or
-            takes it for the absolute angle, as (3) is printed (False).
-        sign: +1 the robot falls short of the prediction in both tests, 0 the error is unsigned.
-    """
-
-    name: str
-    doc: str
-    encoder_on_leg: bool
-    sign: int
-
-
-READINGS = (
-    Reading("short, encoder", "falls short of a prediction that knows the wheel angle is relative to the leg", True, 1),
-    Reading("short, printed", "falls short of the prediction of (3) as printed", False, 1),
-    Reading(
-        "unsigned, encoder", "differs either way from a prediction that knows the wheel angle is relative to the leg", True, 0
-    ),
-    Reading("unsigned, printed", "differs either way from the prediction of (3) as printed", False, 0),
-)
-
-
-@dataclass(frozen=True)
-class Dial:
-    """One number of one effect, drawn from [low, high]; ``where`` are its places, of the effect library."""
-
-    effect: str
-    where: tuple[str, ...]
-    parameter: str
-    low: float
-    high: float
-
-    @property
-    def label(self) -> str:
-        """``coulomb_friction[wheel_lr].torque``."""
-        return f"{self.effect}[{', '.join(self.where)}].{self.parameter}"
-
-    @property
-    def unit(self) -> str:
-        """SI unit."""
-        return EFFECTS[self.effect].parameters[self.parameter].unit
-
-    def entry(self, value: float) -> dict[str, Any]:
-        """Return the effect as a patch holds it."""
-        return {"name": self.effect, "where": list(self.where), "parameters": {self.parameter: float(value)}}
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A plausible departure from the nominal robot: what it is, and its dials."""
-
-    name: str
-    doc: str
-    dials: tuple[Dial, ...]
-
-
-def _each(effect: str, parameter: str, places: Sequence[str], low: float, high: float) -> tuple[Dial, ...]:
-    return tuple(Dial(effect, (place,), parameter, low, high) for place in places)
-
-
-_FRONT, _REAR = ("wheel_lf", "wheel_rf"), ("wheel_lr", "wheel_rr")
-_ALL = (*_FRONT, *_REAR)
-_PAIRWISE = ("leg_lf", "leg_rf", "leg_lr", "leg_rr")
-CANDIDATES: tuple[Candidate, ...] = (
-    Candidate("rear drag", "gears of the free rear wheels, each its own", _each("coulomb_friction", "torque", _REAR, 0.0, 0.2)),
-    Candidate("radius", "tyres of the front wheels, each its own", _each("wheel_radius_error", "scale", _FRONT, 0.9, 1.1)),
-    Candidate("creep", "tyres that creep under load, each its own", _each("tyre_creep", "creep_speed", _ALL, 0.0, 0.1)),
-    Candidate("grip", "wheels on unequal floor or tread", _each("friction_asymmetry", "mu", _ALL, 0.1, 1.0)),
-    Candidate("rolling", "rolling resistance, each wheel its own", _each("rolling_resistance", "coefficient", _ALL, 0.0, 0.15)),
-    Candidate("zeros", "zeros of the leg encoders", _each("joint_zero_offset", "angle", _PAIRWISE, -0.1, 0.1)),
-    Candidate(
-        "load",
-        "centre of mass, and the power source that the paper's 3 kg leave out",
-        (
-            Dial("com_offset", ("body",), "x", -0.05, 0.05),
-            Dial("com_offset", ("body",), "y", -0.05, 0.05),
-            Dial("payload", ("body",), "mass", 0.0, 1.0),
-        ),
-    ),
-    Candidate(
-        "pull",
-        "slope of the floor and pull of cables",
-        (
-            Dial("external_force", ("body",), "fx", -3.0, 3.0),
-            Dial("external_force", ("body",), "fy", -3.0, 3.0),
-            Dial("floor_slope", ("ground",), "pitch", -0.03, 0.03),
-            Dial("floor_slope", ("ground",), "roll", -0.03, 0.03),
-        ),
-    ),
-    Candidate(
-        "servo",
-        "delay, play and torque of the front wheels' servos",
-        (
-            *_each("command_delay", "delay", _FRONT, 0.0, 0.06),
-            *_each("backlash", "angle", _FRONT, 0.0, 0.1),
-            *_each("weak_motor", "scale", _FRONT, 0.3, 1.0),
-        ),
-    ),
-    Candidate(
-        "camera",
-        "camera's frame turned against the start heading, and scaled",
-        (
-            Dial("camera_misalignment", ("sensor",), "yaw", -0.1, 0.1),
-            Dial("camera_misalignment", ("sensor",), "scale", 0.9, 1.1),
-        ),
-    ),
-)
 
 
 @dataclass(frozen=True, eq=False)
-class Outcomes:
-    """What the paper would have measured on N robots: both tests side by side (N, 2).
-
-    Attributes:
-        error_encoder, error_printed: of ignoring slip, positive = falls short. lateral: m. yaw: at the end, rad.
-        rear_turns: encoder turns of the rear wheels, mean of both. front_effort: mean motor torque of a front wheel, N m.
-    """
-
-    error_encoder: Array
-    error_printed: Array
-    lateral: Array
-    yaw: Array
-    rear_turns: Array
-    front_effort: Array
-
-    def miss(self, reading: Reading) -> Array:
-        """Return the worst of the four departures from the paper's numbers (N,), in tolerances; 1 or less is a match."""
-        error = self.error_encoder if reading.encoder_on_leg else self.error_printed
-        error = np.abs(error) if reading.sign == 0 else error
-        targets, sideways = (np.array([getattr(test, name) for test in TESTS.values()]) for name in ("error", "lateral"))
-        misses = [np.abs(error - targets) / ERROR_TOLERANCE, np.abs(np.abs(self.lateral) - sideways) / LATERAL_TOLERANCE]
-        return np.nan_to_num(np.concatenate(misses, axis=1).max(axis=1), nan=np.inf)
-
-    def take(self, rows: NDArray[np.intp]) -> Outcomes:
-        """Return some of the robots."""
-        return Outcomes(**{name: value[rows] for name, value in vars(self).items()})
-
-
-def outcomes(robot: Robot, parameters: Parameters, threads: int = 2, exact: bool = True) -> Outcomes:
-    """Drive both tests on N robots and return what the paper reports of them; not ``exact`` = four times as fast."""
-    columns = [measure(robot, parameters, test, threads, exact) for test in TESTS.values()]
-    return Outcomes(**{name: np.stack([column[name] for column in columns], axis=1) for name in columns[0]})
-
-
-def measure(robot: Robot, parameters: Parameters, test: PaperTest, threads: int = 2, exact: bool = True) -> dict[str, Array]:
-    """Drive one test on N robots; return the fields of :class:`Outcomes`, each (N,).
-
-    One robot more goes with every batch, with something of every candidate: all batches then need the same compiled kernel.
-    """
-    step, precision = _EXACT if exact else _FAST
-    batch = Parameters(np.concatenate([parameters.values, _everything(robot).values]))
-    record = drive("gibbs_appell", test, robot, batch, (), step, every=50, threads=threads, precision=precision)
-    record = select(record, np.arange(len(parameters)))
-    x, y = _seen_by_camera(record, parameters)
-    turns = record.joint_position[-1, :, 6:].mean(axis=1) / (2 * np.pi)
-    return {
-        "error_encoder": no_slip_error(x, no_slip_travel(robot, record, True)[-1]),
-        "error_printed": no_slip_error(x, no_slip_travel(robot, record, False)[-1]),
-        "lateral": y,
-        "yaw": record.attitude[-1, :, 0],
-        "rear_turns": turns,
-        "front_effort": record.torque[record.time > 0.0][:, :, 4:6].mean(axis=(0, 2)),
-    }
-
-
-def _everything(robot: Robot) -> Parameters:
-    """One robot with every dial of every candidate a tenth on its way."""
-    dials = [dial for candidate in CANDIDATES for dial in candidate.dials]
-    low, high = (np.array([[getattr(dial, end) for dial in dials]]) for end in ("low", "high"))
-    return make_parameters(robot, dials, low + 0.1 * (high - low))
-
-
-def _seen_by_camera(record: Record, parameters: Parameters) -> tuple[Array, Array]:
-    x, y = record.end.T
-    yaw, scale = parameters["camera.mount_yaw"], parameters["camera.scale"]
-    return scale * (np.cos(yaw) * x + np.sin(yaw) * y), scale * (np.cos(yaw) * y - np.sin(yaw) * x)
-
-
-# ---- the search ------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Finding:
+class SearchFinding:
     """One candidate, or a pair of them.
 
     Attributes:
@@ -249,11 +62,11 @@ class Finding:
         """``rear drag + radius``."""
         return " + ".join(self.names)
 
-    def matches(self, reading: Reading) -> NDArray[np.intp]:
+    def matches(self, reading: PaperReading) -> NDArray[np.intp]:
         """Return the draws that give all four numbers."""
         return np.flatnonzero(self.outcomes.miss(reading) <= 1.0)
 
-    def closest(self, reading: Reading) -> float:
+    def closest(self, reading: PaperReading) -> float:
         """Return the smallest miss, in tolerances."""
         return float(self.outcomes.miss(reading).min())
 
@@ -277,27 +90,14 @@ class Finding:
         return found
 
 
-_FLOOR_DIAL = Dial("friction_level", ("ground",), "mu", *FLOOR)
-
-
-def make_parameters(robot: Robot, dials: Sequence[Dial], values: Array) -> Parameters:
-    """Return robots (N) with the dials (N, dials) set, by the effect library."""
-    nominal = Parameters.nominal(robot)
-    rows = [
-        apply_patch(load_patch([dial.entry(value) for dial, value in zip(dials, row, strict=True)]), nominal).values
-        for row in values
-    ]
-    return Parameters(np.concatenate(rows))
-
-
 def search(
     robot: Robot,
     draws: int = 16,
     levels: int = 3,
     seed: int = 0,
-    candidates: Sequence[Candidate] = CANDIDATES,
+    candidates: Sequence[SlipCandidate] = CANDIDATES,
     threads: int = 2,
-) -> list[Finding]:
+) -> list[SearchFinding]:
     """Try every candidate alone, every pair, then the pairs that came closest together with every third.
 
     Each level starts with ``draws`` draws for each of its combinations; the :data:`BEAM` that come closest to each reading are
@@ -315,7 +115,7 @@ def search(
     Returns:
         One finding per combination; no choice is made among them.
     """
-    findings: list[Finding] = []
+    findings: list[SearchFinding] = []
     matched: list[_Trial] = []
     for level in range(1, levels + 1):
         if level < 3:
@@ -338,7 +138,7 @@ def search(
     return [spread.get(found.names, found) for found in findings]
 
 
-def _survivors(findings: Sequence[Finding]) -> list[Finding]:
+def _survivors(findings: Sequence[SearchFinding]) -> list[SearchFinding]:
     """The findings that come closest to each reading, each once."""
     near = {}
     for reading in READINGS:
@@ -347,7 +147,7 @@ def _survivors(findings: Sequence[Finding]) -> list[Finding]:
     return list(near.values())
 
 
-def _extended(findings: Sequence[Finding], candidates: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
+def _extended(findings: Sequence[SearchFinding], candidates: Sequence[SlipCandidate]) -> list[tuple[SlipCandidate, ...]]:
     """Every finding with each candidate that it lacks, in the candidates' own order."""
     names = {
         frozenset({*found.names, other.name}) for found in findings for other in candidates if other.name not in found.names
@@ -359,9 +159,9 @@ def _extended(findings: Sequence[Finding], candidates: Sequence[Candidate]) -> l
 class _Trial:
     """A combination while it is searched: its draws in the unit cube, and what came of them."""
 
-    def __init__(self, combo: Sequence[Candidate], stream: np.random.Generator, draws: int) -> None:
+    def __init__(self, combo: Sequence[SlipCandidate], stream: np.random.Generator, draws: int) -> None:
         self.names = tuple(candidate.name for candidate in combo)
-        self.dials = (*(dial for candidate in combo for dial in candidate.dials), _FLOOR_DIAL)
+        self.dials = (*(dial for candidate in combo for dial in candidate.dials), FLOOR_DIAL)
         self.stream = stream
         self.seen, self.parts = np.zeros((0, len(self.dials))), list[Outcomes]()
         self.waiting: Array = stream.uniform(size=(draws, len(self.dials)))
@@ -384,9 +184,9 @@ class _Trial:
         """Whether a draw matches, in any reading."""
         return any(len(self.finding().matches(reading)) for reading in READINGS)
 
-    def finding(self) -> Finding:
+    def finding(self) -> SearchFinding:
         """Return all there is so far."""
-        return Finding(self.names, self.dials, _scaled(self.dials, self.seen), _joined(self.parts))
+        return SearchFinding(self.names, self.dials, _scaled(self.dials, self.seen), _joined(self.parts))
 
 
 def _drive_all(robot: Robot, trials: Sequence[_Trial], threads: int) -> None:
@@ -436,6 +236,10 @@ def _joined(parts: Sequence[Outcomes]) -> Outcomes:
 
 # ---- what would decide -----------------------------------------------------------------------------------------------
 
+_DOWN = (np.pi / 2, np.pi / 2)
+#: Legs straight down, same wheels: a third drive that any of the candidates could be told by.
+CONTROL = PaperTest("control", "control: legs straight down", _DOWN, _DOWN)
+
 #: What else could have been measured: name -> meaning and unit.
 OBSERVABLES: Mapping[str, tuple[str, str]] = {
     "control_error": ("error of ignoring slip with all legs straight down, same wheels", "%"),
@@ -449,7 +253,7 @@ OBSERVABLES: Mapping[str, tuple[str, str]] = {
 
 
 def observables(
-    robot: Robot, findings: Sequence[Finding], reading: Reading, most: int = 32, threads: int = 2
+    robot: Robot, findings: Sequence[SearchFinding], reading: PaperReading, most: int = 32, threads: int = 2
 ) -> list[dict[str, Array]]:
     """Return what the matching robots of each finding would have shown elsewhere: :data:`OBSERVABLES`, each (matches,).
 
@@ -481,7 +285,7 @@ def observables(
     return shown
 
 
-def matching(findings: Sequence[Finding], reading: Reading) -> list[Finding]:
+def matching(findings: Sequence[SearchFinding], reading: PaperReading) -> list[SearchFinding]:
     """Return the findings with a match, most matches first."""
     ordered = sorted(findings, key=lambda finding: -len(finding.matches(reading)))
     return [finding for finding in ordered if len(finding.matches(reading))]

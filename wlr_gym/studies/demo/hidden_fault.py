@@ -1,4 +1,4 @@
-"""Third stage: an emulated robot that hides something, driven by a shipped policy and logged as a real one would be."""
+"""Third stage: an emulated robot with a hidden fault, driven by a shipped policy and logged as a real one would be."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from wlr_gym.data import Run
 
-TITLE = "3. A robot with a secret"
+TITLE = "3. A robot with a hidden fault"
 POLICY = "velocity_slip_aware_no_camera"
 #: What each run is driven by: the policy, or a motion that brings out what a robot is made of.
 DRIVERS = ("posture", POLICY, "turns", "stop_and_go")
@@ -27,10 +27,10 @@ _CORNER_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red")
 
 
 def hide(seed: int) -> dict[str, Any]:
-    """Return what the robot hides: an effect, its place and its size, all drawn from the seed."""
+    """Return the hidden fault: an effect, its place and its size, all drawn from the seed."""
     from wlr_gym.base.random import generator
 
-    draw = generator(seed, "demo", "secret")
+    draw = generator(seed, "demo", "secret")  # the name of the stream decides what a seed draws
     return _HIDDEN[int(draw.integers(len(_HIDDEN)))](draw)
 
 
@@ -48,13 +48,13 @@ _HIDDEN: tuple[Callable[[Draw], dict[str, Any]], ...] = (_friction, _delay)
 
 
 def drive(demo: Demo, tell: Tell) -> Section:
-    """Drive the robot and log its runs; what it hides is written where nothing looks before the end."""
+    """Drive the robot and log its runs; the hidden fault is written to a file that is read at the end only."""
     from wlr_gym.data import read_dataset
     from wlr_gym.physics.effects import load_patch, save_patch
 
     shutil.rmtree(demo.measured, ignore_errors=True)
     patch = load_patch([hide(demo.seed)])
-    save_patch(patch, demo.secret)
+    save_patch(patch, demo.hidden)
     drivers = DRIVERS[: demo.runs]
     for index, driver in enumerate(drivers):
         tell(f"emulated robot: run {index + 1} of {len(drivers)}", index / len(drivers))
@@ -141,7 +141,7 @@ def _picture(run: Run) -> Figure:
             axes.plot(t, run[f"cmd_{joint}"], color=colour, linewidth=0.7, linestyle=":")
         axes.set_ylabel(label)
         axes.legend(
-            loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False, title="dotted: goal", title_fontsize=8
+            loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False, title="dotted: setpoint", title_fontsize=8
         )
     rows[2].plot(t, run["gyro_z"], color="black", linewidth=1.0)
     rows[2].set(ylabel="yaw rate, gyro (rad/s)", xlabel="time (s)")
