@@ -10,7 +10,7 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.gap.report import report as module
+from wlr_gym.gap.report import report
 
 workflow = importlib.import_module("wlr_gym.gap.workflow")
 
@@ -33,13 +33,13 @@ def answer(monkeypatch):
             tell("calibrating", 0.3)
             tell("naming", 0.7)
             asked.update(options, data=folder)
-            module.save_analysis(analysis, out)
+            report.save_analysis(analysis, out)
             return analysis
 
         monkeypatch.setattr(workflow, "analyse", analyse)
         return asked
 
-    monkeypatch.setattr(module, "draw", lambda analysis: {"gap": b"\x89PNG"})
+    monkeypatch.setattr(report, "draw", lambda analysis: {"gap": b"\x89PNG"})
     return give
 
 

@@ -18,7 +18,7 @@ from wlr_gym.data.record import record_simulation
 from wlr_gym.data.replay import replay
 from wlr_gym.data.write import write_run
 from wlr_gym.gap.analysis import Estimate
-from wlr_gym.gap.estimation.fit import Model, nominal_model
+from wlr_gym.gap.estimation.model import Model, nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.report.result import write_result
 from wlr_gym.gap.robot.candidates import ripple_order, robot_candidates

@@ -11,7 +11,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.envs.tasks.identified import identified_events
 from wlr_gym.gap.analysis import Calibrated, Equivalent, Estimate, FoundEffect, RunGap
-from wlr_gym.gap.report import result as module
+from wlr_gym.gap.report import result
 from wlr_gym.gap.report.result import patch_of, read_result, result_of, write_result
 from wlr_gym.gap.robot.quantities import knobs
 from wlr_gym.physics.effects import load_patch
@@ -177,7 +177,7 @@ def test_result_comes_last(tmp_path, monkeypatch):
         assert (tmp_path / "patch.yaml").exists()
         raise InputError("disk full")
 
-    monkeypatch.setattr(module, "write_json", fail)
+    monkeypatch.setattr(result, "write_json", fail)
     with pytest.raises(InputError, match="disk full"):
         write_result(examples.EFFECT_FOUND, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["patch.yaml"]

@@ -7,7 +7,8 @@ import pytest
 from rig_bench import Bench, write
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.gap.estimation.fit import Model, fit, nominal_model
+from wlr_gym.gap.estimation.fit import fit
+from wlr_gym.gap.estimation.model import Model, nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.rig import RIG_EFFECTS, RigProblem, read_recordings
 from wlr_gym.gap.rig.candidates import rig_candidates

@@ -10,7 +10,7 @@ from rig_bench import Bench, contents, write
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.gap.analysis import Analysis, Estimate, FoundEffect
-from wlr_gym.gap.estimation.fit import nominal_model
+from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.report.result import patch_of
 from wlr_gym.gap.rig import RigProblem, findings, open_rig, read_recordings, rig_patch

@@ -30,19 +30,22 @@ from wlr_gym.gap.analysis import (
     IntakeFinding,
     Turning,
 )
-from wlr_gym.gap.estimation.fit import Fit, fit, nominal_model, widened
-from wlr_gym.gap.estimation.uncertainty import confidence, detectable, equivalents, estimates, half_widths
+from wlr_gym.gap.estimation.fit import Fit, fit, widened
+from wlr_gym.gap.estimation.model import nominal_model
+from wlr_gym.gap.estimation.uncertainty import estimates, half_widths
 from wlr_gym.gap.problem import Candidate, Problem
-from wlr_gym.gap.report.localisation import localise
 from wlr_gym.gap.report.recommendation import recommend, separating_run
 from wlr_gym.gap.report.relations import relations
-from wlr_gym.gap.report.traces import telling_traces
 from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
+from wlr_gym.gap.selection.detectability import detectable
+from wlr_gym.gap.selection.equivalence import confidence, equivalents
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.search import Naming, Round, name_effects
 from wlr_gym.gap.validation.data_split import informative_split, named_split
 from wlr_gym.gap.validation.held_out import mean_of_runs, mean_squares, noise_floor, prove
+from wlr_gym.gap.validation.localisation import localise
 from wlr_gym.gap.validation.residual_tests import adequacy_of
+from wlr_gym.gap.validation.traces import telling_traces
 from wlr_gym.gap.validation.turning import turning
 from wlr_gym.physics.effects import Source, load_patch
 

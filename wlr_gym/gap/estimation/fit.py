@@ -9,14 +9,23 @@ of a step are simulated as one batch; between two simulations of them they are c
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, minus_two_log_likelihood, run_scatter
-from wlr_gym.gap.problem import Candidate, Problem, Setting
-from wlr_gym.physics.effects import PatchEffect
+from wlr_gym.gap.estimation.least_squares import corrected, gauss_newton_step, normal_equations
+from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, run_scatter
+from wlr_gym.gap.estimation.model import (
+    Model,
+    moved,
+    on_bounds,
+    prior_tightness,
+    scaled_numbers,
+    tightness_once,
+    total_cost,
+)
+from wlr_gym.gap.problem import Problem
 
 Array = NDArray[np.float64]
 
@@ -35,39 +44,6 @@ PINNED = 1e9
 SETTLED, RENEWED = 0.5, 2.0
 #: A number of which the data say less than this share of what its tolerance says hardly moves: columns once simulated will do.
 IDLE = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Model:
-    """Quantities, and effects with the values of their unknowns."""
-
-    quantities: Array
-    effects: tuple[tuple[Candidate, tuple[float, ...]], ...] = ()
-
-    @property
-    def setting(self) -> Setting:
-        """What the simulator is asked for."""
-        return Setting(self.quantities, self.patch)
-
-    @property
-    def patch(self) -> tuple[PatchEffect, ...]:
-        """The effects as a patch's."""
-        return tuple(candidate.effect(values) for candidate, values in self.effects)
-
-    @property
-    def size(self) -> int:
-        """Number of fitted numbers."""
-        return len(self.quantities) + sum(len(values) for _, values in self.effects)
-
-    def with_effect(self, candidate: Candidate, values: Sequence[float]) -> Model:
-        """Return the model with one effect more."""
-        return replace(self, effects=(*self.effects, (candidate, tuple(values))))
-
-    def without_effect(self, index: int) -> Model:
-        """Return the model with one effect less."""
-        effects = list(self.effects)
-        del effects[index]
-        return replace(self, effects=tuple(effects))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,72 +76,9 @@ class Fit:
         return np.asarray(np.linalg.inv(self.precision), np.float64)
 
 
-def _relaxed(
-    problem: Problem,
-    runs: Sequence[int],
-    model: Model,
-    columns: Sequence[NDArray[np.float32]],
-    residuals: list[Array],
-    memory: Array | None,
-    scatter: float,
-) -> tuple[Model, list[Array]]:
-    """Take full steps that a rough cost hides: along what the data cannot tell apart, tolerances alone decide."""
-    for _ in range(RELAXATIONS):
-        noise = estimate_noise(residuals, memory, scatter)
-        cost = total_cost(problem, model, residuals, noise.memory)
-        other = moved(problem, model, gauss_newton_step(problem, model, columns, residuals, noise))
-        found = [r[0] for r in problem.residuals([other.setting], runs)]
-        if total_cost(problem, other, found, noise.memory) > cost + ROUGH:
-            break
-        model, residuals = other, found
-    return model, residuals
-
-
-def scales(problem: Problem, model: Model) -> Array:
-    """Return what one scaled number is worth (numbers): tolerances, then steps of the unknowns."""
-    steps = [unknown.step for candidate, _ in model.effects for unknown in candidate.unknowns]
-    return np.array([*(quantity.sigma for quantity in problem.quantities), *steps])
-
-
-def nominal_model(problem: Problem) -> Model:
-    """Return the model as its file says."""
-    return Model(np.array([quantity.nominal for quantity in problem.quantities]))
-
-
-def untouched(problem: Problem, model: Model) -> Model:
-    """Return the model with its effects, and its numbers as the file says, but for those that drift."""
-    drifts = np.array([quantity.drifts for quantity in problem.quantities])
-    return replace(model, quantities=np.where(drifts, model.quantities, nominal_model(problem).quantities))
-
-
-def prior_cost(problem: Problem, model: Model) -> float:
-    """Return the squared distance of all numbers from nominal or neutral, in what is known beforehand."""
-    away = scaled_numbers(problem, model) - scaled_nominal(problem, model)
-    return float(prior_tightness(problem, model) @ away**2)
-
-
-def total_cost(problem: Problem, model: Model, residuals: Sequence[Array], memory: Array) -> float:
-    """Return minus two log posterior."""
-    return minus_two_log_likelihood(residuals, memory) + prior_cost(problem, model)
-
-
 def cheapest(problem: Problem, fits: Sequence[Fit], memory: Array) -> Fit:
     """Return the fit with the lowest cost under one memory: each under its own would compare nothing."""
     return min(fits, key=lambda whole: total_cost(problem, whole.model, whole.residuals, memory))
-
-
-def moved(problem: Problem, model: Model, change: Array) -> Model:
-    """Return the model moved by scaled numbers, kept within bounds and plausible ranges."""
-    count = len(problem.quantities)
-    sigma, low, high = (np.array([getattr(q, name) for q in problem.quantities]) for name in ("sigma", "low", "high"))
-    quantities = np.clip(model.quantities + sigma * change[:count], low, high)
-    effects, at = [], count
-    for candidate, values in model.effects:
-        steps = np.array([unknown.step for unknown in candidate.unknowns])
-        new = np.array(values) + steps * change[at : at + len(values)]
-        effects.append((candidate, candidate.kept(new.tolist())))
-        at += len(values)
-    return Model(quantities, tuple(effects))
 
 
 def linearise(
@@ -217,38 +130,10 @@ def idle_numbers(problem: Problem, model: Model, columns: Sequence[NDArray[np.fl
     return idle
 
 
-def scaled_numbers(problem: Problem, model: Model) -> Array:
-    """Values of all numbers, scaled."""
-    values = np.array([*model.quantities, *(v for _, values in model.effects for v in values)])
-    return values / scales(problem, model)
-
-
-def normal_equations(columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise) -> tuple[Array, Array]:
-    """Return ``C W C^T`` (numbers, numbers) and ``C W r`` (numbers) over all runs."""
-    size = len(columns[0])
-    matrix, vector = np.zeros((size, size)), np.zeros(size)
-    root = np.sqrt(noise.weight)
-    for column, residual in zip(columns, residuals, strict=True):
-        weights = np.broadcast_to(root, residual.shape).ravel()
-        weighted = column * weights
-        matrix += weighted @ weighted.T
-        vector += weighted @ (np.nan_to_num(residual).ravel() * weights)
-    return matrix, vector
-
-
 def equations_by_run(found: Fit) -> tuple[Array, Array]:
     """Return each run's own normal equations: (runs, numbers, numbers) and (runs, numbers)."""
     parts = [normal_equations([c], [r], found.noise) for c, r in zip(found.columns, found.residuals, strict=True)]
     return np.stack([matrix for matrix, _ in parts]), np.stack([vector for _, vector in parts])
-
-
-def cross_products(columns: Sequence[NDArray[np.float32]], others: Sequence[Array], noise: Noise) -> Array:
-    """Return ``C W D^T`` of known columns with a few others (D: per run (k, rows, channels)), over all runs."""
-    total = 0.0
-    for column, other in zip(columns, others, strict=True):
-        weighted = (np.nan_to_num(other) * noise.weight).reshape(len(other), -1).astype(np.float32)
-        total = total + column @ weighted.T
-    return np.asarray(total, np.float64)
 
 
 def fit(
@@ -296,7 +181,7 @@ def fit(
     matrix, _ = normal_equations(columns, residuals, noise)
     pinned = np.diag(PINNED * on_bounds(problem, model))
     hessian = matrix + np.diag(prior_tightness(problem, model)) + pinned
-    precision = matrix / problem.firmness + np.diag(_tightness_once(problem, model)) + pinned
+    precision = matrix / problem.firmness + np.diag(tightness_once(problem, model)) + pinned
     cost = total_cost(problem, model, residuals, noise.memory)
     return Fit(model, residuals, noise, cost, columns, hessian, precision, bool(gained < RENEWED))
 
@@ -332,11 +217,25 @@ def _descend(
     return model, residuals, top - cost
 
 
-def corrected(columns: NDArray[np.float32], taken: Array, before: Array, after: Array) -> NDArray[np.float32]:
-    """Return one run's columns with the least change that predicts what the step ``taken`` (scaled) really did."""
-    change = taken.astype(np.float32)
-    missed = np.nan_to_num(after - before).ravel() - change @ columns
-    return (columns + np.outer(change / (change @ change), missed.astype(np.float32))).astype(np.float32, copy=False)
+def _relaxed(
+    problem: Problem,
+    runs: Sequence[int],
+    model: Model,
+    columns: Sequence[NDArray[np.float32]],
+    residuals: list[Array],
+    memory: Array | None,
+    scatter: float,
+) -> tuple[Model, list[Array]]:
+    """Take full steps that a rough cost hides: along what the data cannot tell apart, tolerances alone decide."""
+    for _ in range(RELAXATIONS):
+        noise = estimate_noise(residuals, memory, scatter)
+        cost = total_cost(problem, model, residuals, noise.memory)
+        other = moved(problem, model, gauss_newton_step(problem, model, columns, residuals, noise))
+        found = [r[0] for r in problem.residuals([other.setting], runs)]
+        if total_cost(problem, other, found, noise.memory) > cost + ROUGH:
+            break
+        model, residuals = other, found
+    return model, residuals
 
 
 def widened(problem: Problem, runs: Sequence[int], found: Fit) -> Fit:
@@ -346,79 +245,3 @@ def widened(problem: Problem, runs: Sequence[int], found: Fit) -> Fit:
     differ = run_scatter(matrices[:, free][:, :, free], vectors[:, free])
     scatter = found.noise.scatter if differ is None else max(problem.firmness * found.noise.scatter * differ, 1.0)
     return fit(problem, runs, found.model, scatter=scatter, columns=found.columns, steps=1)
-
-
-def prior_tightness(problem: Problem, model: Model) -> Array:
-    """Weight (numbers) of what is known beforehand, scaled: tolerances; unknowns lie within half their range of neutral.
-
-    It counts ``problem.firmness`` times, but for numbers that drift.
-    """
-    drifts = [quantity.drifts for quantity in problem.quantities]
-    firmness = np.where([*drifts, *(False,) * (model.size - len(drifts))], 1.0, problem.firmness)
-    return firmness * _tightness_once(problem, model)
-
-
-def _tightness_once(problem: Problem, model: Model) -> Array:
-    unknowns = [4.0 * (u.step / (u.high - u.low)) ** 2 for candidate, _ in model.effects for u in candidate.unknowns]
-    return np.array([1.0] * len(problem.quantities) + unknowns)
-
-
-def gauss_newton_step(
-    problem: Problem, model: Model, columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise
-) -> Array:
-    """Step (numbers), scaled; numbers that would leave their bounds stay on them and the rest is solved anew."""
-    return constrained_step(problem, model, *normal_equations(columns, residuals, noise))
-
-
-def constrained_step(problem: Problem, model: Model, matrix: Array, vector: Array) -> Array:
-    """Return the step that solves these normal equations, tolerances added, within bounds; see :func:`gauss_newton_step`."""
-    tight = prior_tightness(problem, model)
-    nominal = scaled_nominal(problem, model)
-    here = scaled_numbers(problem, model)
-    gradient = vector + tight * (here - nominal)
-    return bounded_minimum(matrix + np.diag(tight), gradient, *room(problem, model))
-
-
-def bounded_minimum(matrix: Array, gradient: Array, low: Array, high: Array) -> Array:
-    """Return the x within bounds that minimises ``x matrix x / 2 + gradient x``: what leaves them is held there, one by one."""
-    free = np.ones(len(gradient), bool)
-    x = np.zeros(len(gradient))
-    for _ in range(8):
-        held = gradient + matrix @ np.where(free, 0.0, x)
-        x[free] = -np.linalg.solve(matrix[np.ix_(free, free)], held[free])
-        out = free & ((x < low - 1e-12) | (x > high + 1e-12))
-        if not out.any():
-            break
-        x[out] = np.clip(x, low, high)[out]
-        free &= ~out
-    return np.clip(x, low, high)
-
-
-def scaled_nominal(problem: Problem, model: Model) -> Array:
-    """Nominal values of all numbers, scaled; effects' unknowns at neutral."""
-    neutral = [u.neutral for candidate, _ in model.effects for u in candidate.unknowns]
-    return np.array([*(q.nominal for q in problem.quantities), *neutral]) / scales(problem, model)
-
-
-def room(problem: Problem, model: Model) -> tuple[Array, Array]:
-    """Return how far each scaled number may still move down and up (numbers)."""
-    low, high = _bounds(problem, model)
-    here = scaled_numbers(problem, model)
-    return low - here, high - here
-
-
-def on_bounds(problem: Problem, model: Model) -> NDArray[np.bool_]:
-    """Which quantities (numbers) calibration has moved as far as it may; unknowns of effects do not count."""
-    low, high = _bounds(problem, model)
-    here = scaled_numbers(problem, model)
-    known = np.arange(model.size) < len(problem.quantities)
-    nominal = scaled_nominal(problem, model)
-    return known & (((here <= low + 1e-9) & (low != nominal)) | ((here >= high - 1e-9) & (high != nominal)))
-
-
-def _bounds(problem: Problem, model: Model) -> tuple[Array, Array]:
-    unknowns = [u for candidate, _ in model.effects for u in candidate.unknowns]
-    scale = scales(problem, model)
-    low = np.array([*(q.low for q in problem.quantities), *(u.low for u in unknowns)]) / scale
-    high = np.array([*(q.high for q in problem.quantities), *(u.high for u in unknowns)]) / scale
-    return low, high

@@ -12,20 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.fit import (
-    Fit,
-    Model,
-    cheapest,
-    constrained_step,
-    equations_by_run,
-    fit,
-    moved,
-    on_bounds,
-    scaled_numbers,
-    total_cost,
-    untouched,
-)
+from wlr_gym.gap.estimation.fit import Fit, cheapest, equations_by_run, fit
+from wlr_gym.gap.estimation.least_squares import constrained_step
 from wlr_gym.gap.estimation.likelihood import estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.estimation.model import Model, moved, on_bounds, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
 from wlr_gym.gap.selection.screening import LEAST_GAIN, least_gain

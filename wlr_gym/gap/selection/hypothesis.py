@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.fit import Model
 from wlr_gym.gap.estimation.likelihood import Noise
+from wlr_gym.gap.estimation.model import Model
 from wlr_gym.gap.problem import Candidate, Problem
 
 Array = NDArray[np.float64]

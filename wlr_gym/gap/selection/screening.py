@@ -12,15 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.fit import (
-    Fit,
-    bounded_minimum,
-    normal_equations,
-    prior_tightness,
-    room,
-    scaled_nominal,
-    scaled_numbers,
-)
+from wlr_gym.gap.estimation.fit import Fit
+from wlr_gym.gap.estimation.least_squares import bounded_minimum, normal_equations
+from wlr_gym.gap.estimation.model import prior_tightness, room, scaled_nominal, scaled_numbers
 from wlr_gym.gap.problem import Candidate, Probe, Problem, Setting, Start
 
 Array = NDArray[np.float64]

@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.fit import Fit, Model, cheapest, fit, linearise, total_cost, untouched, widened
+from wlr_gym.gap.estimation.fit import Fit, cheapest, fit, linearise, widened
 from wlr_gym.gap.estimation.likelihood import estimate_noise
-from wlr_gym.gap.estimation.refit import refit, refit_thoroughly
+from wlr_gym.gap.estimation.model import Model, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.selection.cross_validation import Final, accept, beside, finalists
 from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.refit import refit, refit_thoroughly
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, least_gain, responses, screen
 
 Tell = Callable[[str], None]

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.gap.estimation.fit import linearise, nominal_model
+from wlr_gym.gap.estimation.fit import linearise
+from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Problem
 
 #: Share of the runs that is kept sealed, and runs a fit needs at least.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
-from wlr_gym.gap.estimation.fit import Model
+from wlr_gym.gap.estimation.model import Model
 from wlr_gym.gap.estimation.uncertainty import two_sided_95
 from wlr_gym.gap.problem import Problem, Setting
 

@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import Adequacy, Pulled, Statistic
-from wlr_gym.gap.estimation.fit import Fit, on_bounds, prior_tightness
+from wlr_gym.gap.estimation.fit import Fit
 from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, run_scatter
+from wlr_gym.gap.estimation.model import on_bounds, prior_tightness
 from wlr_gym.gap.problem import Problem
 
 Array = NDArray[np.float64]

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import MissingPackageError
-from wlr_gym.gap.estimation.fit import SETTLED, fit, nominal_model
+from wlr_gym.gap.estimation.fit import SETTLED, fit
+from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Problem, Quantity
 from wlr_gym.studies.bench.measure import Measurement, Size, against_fastest
 

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
-from wlr_gym.gap.estimation.fit import fit, nominal_model, normal_equations, on_bounds
-from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95, confidence, detectable, estimates, half_widths, two_sided_95
+from wlr_gym.gap.estimation.fit import fit
+from wlr_gym.gap.estimation.least_squares import normal_equations
+from wlr_gym.gap.estimation.model import nominal_model, on_bounds
+from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95, estimates, half_widths, two_sided_95
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
+from wlr_gym.gap.selection.detectability import detectable
+from wlr_gym.gap.selection.equivalence import confidence
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, least_gain, responses, screen
 from wlr_gym.gap.selection.search import name_effects

@@ -8,20 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.fit import (
-    SETTLED,
-    Fit,
-    Model,
-    constrained_step,
-    cross_products,
-    fit,
-    moved,
-    normal_equations,
-    scaled_numbers,
-    total_cost,
-    untouched,
-)
+from wlr_gym.gap.estimation.fit import SETTLED, Fit, fit
+from wlr_gym.gap.estimation.least_squares import constrained_step, cross_products, normal_equations
 from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.estimation.model import Model, moved, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem, Setting
 from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score

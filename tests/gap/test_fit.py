@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from toy_problem import NOMINAL, QUANTITIES, REACH, SIGMA, STRENGTH, Toy, candidate, coloured
 
-from wlr_gym.gap.estimation.fit import (
+from wlr_gym.gap.estimation.fit import fit, linearise
+from wlr_gym.gap.estimation.least_squares import corrected
+from wlr_gym.gap.estimation.likelihood import LONGEST, estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.estimation.model import (
     Model,
-    corrected,
-    fit,
-    linearise,
     moved,
     nominal_model,
     on_bounds,
@@ -19,7 +19,6 @@ from wlr_gym.gap.estimation.fit import (
     total_cost,
     untouched,
 )
-from wlr_gym.gap.estimation.likelihood import LONGEST, estimate_noise, minus_two_log_likelihood
 
 
 def all_runs(problem):

@@ -5,9 +5,10 @@ import pytest
 from toy_problem import CHANNELS, NOISE, Toy, candidate, sized
 
 from wlr_gym.gap.analysis import Place
-from wlr_gym.gap.estimation.fit import fit, nominal_model
-from wlr_gym.gap.report.traces import MOST, telling_traces
+from wlr_gym.gap.estimation.fit import fit
+from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.validation.held_out import _interval, level, mean_squares, prove, reduction
+from wlr_gym.gap.validation.traces import MOST, telling_traces
 
 FITTED, SEALED = [0, 1, 2, 4], [3, 5, 6]
 

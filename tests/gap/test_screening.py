@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from toy_problem import CHANNELS, DECOYS, NOMINAL, REACH, SIGMA, STRENGTH, Toy, candidate, sized
 
-from wlr_gym.gap.estimation.fit import fit, nominal_model
+from wlr_gym.gap.estimation.fit import fit
+from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Candidate, Start, Unknown
 from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
 

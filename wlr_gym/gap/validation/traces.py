@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from wlr_gym.gap.analysis import Place, Trace
-from wlr_gym.gap.estimation.fit import Model
+from wlr_gym.gap.estimation.model import Model
 from wlr_gym.gap.problem import Problem
 
 #: Traces of an analysis.

@@ -8,16 +8,16 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap.analysis import NOT_EXCITED
-from wlr_gym.gap.estimation.fit import Fit, fit, linearise, nominal_model, total_cost, untouched
+from wlr_gym.gap.estimation.fit import Fit, fit, linearise
 from wlr_gym.gap.estimation.likelihood import estimate_noise
-from wlr_gym.gap.estimation.refit import refit
-from wlr_gym.gap.estimation.uncertainty import EQUIVALENT, equivalents
+from wlr_gym.gap.estimation.model import nominal_model, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
 from wlr_gym.gap.report.text import sentence
-from wlr_gym.gap.selection import cross_validation as judge
-from wlr_gym.gap.selection import search as naming_module
+from wlr_gym.gap.selection import cross_validation, search
 from wlr_gym.gap.selection.cross_validation import Final, carries_over, finalists, looked_around, settle, told_by_others
+from wlr_gym.gap.selection.equivalence import EQUIVALENT, equivalents
 from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.refit import refit
 from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
 from wlr_gym.gap.selection.search import MOST_EFFECTS, PER_NAME, SHORTLIST, drop_idle, name_effects, shortlist
 from wlr_gym.gap.workflow import analyse_problem, evidence_of
@@ -110,8 +110,8 @@ def test_two_effects_are_both_named():
 def test_looking_for_a_second_effect_starts_from_how_numbers_act_beside_the_first(monkeypatch):
     """Also where the known numbers are as the file says."""
     problem = Toy({}, [sized("play", 1.3), sized("decoy_4", -0.7)], error=0.5)
-    seen, refitting = [], naming_module.refit
-    monkeypatch.setattr(naming_module, "refit", lambda *args: seen.append((args[2], args[4])) or refitting(*args))
+    seen, refitting = [], search.refit
+    monkeypatch.setattr(search, "refit", lambda *args: seen.append((args[2], args[4])) or refitting(*args))
     named(problem)
     assert len(seen[-1][0].model.effects) == 2
     for current, given in seen:
@@ -233,7 +233,7 @@ def test_number_whose_place_an_effect_takes_is_a_rival_of_it():
 
 @pytest.mark.parametrize(("effects", "names"), [([], []), ([sized("drag", 0.8, "right")], ["drag right"])])
 def test_stuck_calibration_is_done_anew_from_where_refits_have_been(monkeypatch, effects, names):
-    monkeypatch.setattr(naming_module, "shortlist", lambda scores, cost: scores[:2])  # also where none promises anything
+    monkeypatch.setattr(search, "shortlist", lambda scores, cost: scores[:2])  # also where none promises anything
     problem = Toy({"gain": 2.0, "offset": -2.0}, effects, rows=400)
     stuck, free, given = stuck_and_free(problem)
     naming = name_effects(problem, RUNS, stuck, given=given)
@@ -285,7 +285,7 @@ def test_effect_that_settles_looks_around_for_its_place(monkeypatch):
     base = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
     found = Hypothesis(bump, lost.model, 1.0, np.ones(5), 1.0, lost.residuals, base.model, base.residuals)
     # with fits that hardly move
-    monkeypatch.setattr(judge, "fit", lambda *arguments, **options: fit(*arguments, **options | {"steps": 0}))
+    monkeypatch.setattr(cross_validation, "fit", lambda *arguments, **options: fit(*arguments, **options | {"steps": 0}))
     settled, _ = settle(problem, RUNS, Final(found, lost), base, lambda text: None)
     assert settled.hypothesis.values[1] == pytest.approx(100.0, abs=2.0)
 
@@ -298,9 +298,11 @@ def test_what_has_converged_is_not_fitted_from_there_again(monkeypatch, converge
     whole = fit(problem, RUNS, nominal_model(problem).with_effect(own, (0.5,)), steps=problem.steps)
     found = Hypothesis(own, whole.model, 1.0, np.ones(5), 1.0, whole.residuals, base.model, base.residuals)
     starts = []
-    monkeypatch.setattr(judge, "fit", lambda *args, **options: starts.append(options["steps"]) or fit(*args, **options))
+    monkeypatch.setattr(
+        cross_validation, "fit", lambda *args, **options: starts.append(options["steps"]) or fit(*args, **options)
+    )
     settle(problem, RUNS, Final(found, replace(whole, converged=converged)), base, lambda text: None)
-    assert starts.count(judge.SETTLING) == fits
+    assert starts.count(cross_validation.SETTLING) == fits
 
 
 def test_known_numbers_that_a_whole_fit_finds_count_for_nothing():
@@ -350,13 +352,13 @@ def test_finalists_are_judged_against_the_same_model(monkeypatch):
     def fitted(problem, runs, model, **_):
         return levelled(model, levels[model.effects[-1][0].name][0])
 
-    monkeypatch.setattr(judge, "fit", fitted)
-    monkeypatch.setattr(judge, "_afresh", lambda *_: [])
+    monkeypatch.setattr(cross_validation, "fit", fitted)
+    monkeypatch.setattr(cross_validation, "_afresh", lambda *_: [])
 
     def left(problem, runs, whole, found, memory):
         return levelled(nominal, levels[found.name][1])
 
-    monkeypatch.setattr(judge, "_left", left)
+    monkeypatch.setattr(cross_validation, "_left", left)
     current = levelled(nominal, 20.0)
     effects = [candidate(problem, name) for name in levels]
     hypotheses = [
@@ -429,16 +431,16 @@ def test_what_one_run_alone_shows_is_said_and_not_taken():
 def test_better_model_that_settling_finds_is_calibrated_from(monkeypatch):
     problem = Toy({"gain": 2.0}, [sized("drag", 0.8, "right")], rows=400)
     stuck, free, given = stuck_and_free(problem)
-    accepting, asked = naming_module.accept, []
+    accepting, asked = search.accept, []
 
     def found_late(*arguments):
         accepted, finals, bare = accepting(*arguments)
         asked.append(1)
         return accepted, finals, free if len(asked) == 1 else bare
 
-    monkeypatch.setattr(naming_module, "_without_more", lambda problem, current, hypotheses: current)
-    monkeypatch.setattr(naming_module, "finalists", keep_bare(naming_module.finalists))
-    monkeypatch.setattr(naming_module, "accept", found_late)
+    monkeypatch.setattr(search, "_without_more", lambda problem, current, hypotheses: current)
+    monkeypatch.setattr(search, "finalists", keep_bare(search.finalists))
+    monkeypatch.setattr(search, "accept", found_late)
     naming = name_effects(problem, RUNS, stuck, given=given)
     assert naming.calibrated is not stuck
     assert naming.calibrated.model.quantities == pytest.approx(free.model.quantities, abs=0.5 * SIGMA.min())
@@ -456,13 +458,13 @@ def keep_bare(finding):
 def test_effect_is_taken_only_once_it_has_settled(monkeypatch):
     problem = Toy({}, [sized("drag", 0.8, "right")])
     assert labels(named(problem)) == ["drag right"]
-    settling = judge.settle
+    settling = cross_validation.settle
 
     def gone(*arguments):
         final, bare = settling(*arguments)
         return replace(final, hypothesis=replace(final.hypothesis, tolerable=True)), bare
 
-    monkeypatch.setattr(judge, "settle", gone)
+    monkeypatch.setattr(cross_validation, "settle", gone)
     assert labels(named(problem)) == []
 
 
