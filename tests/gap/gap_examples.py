@@ -14,12 +14,12 @@ from wlr_gym.gap.analysis import (
     ChannelGap,
     Detectable,
     Equivalent,
-    Estimate,
     Evidence,
     FoundEffect,
     GapFigures,
     HeatMap,
     IntakeFinding,
+    ParameterEstimate,
     Place,
     Pulled,
     Recommendation,
@@ -134,7 +134,11 @@ EFFECT_FOUND = Analysis(
     heldout_runs=HELDOUT,
     effects=(
         FoundEffect(
-            "rolling_resistance", ("wheel_lf", "wheel_rf"), {"coefficient": Estimate(0.0412, 0.0383, 0.0447, "-")}, 0.97, 5312.4
+            "rolling_resistance",
+            ("wheel_lf", "wheel_rf"),
+            {"coefficient": ParameterEstimate(0.0412, 0.0383, 0.0447, "-")},
+            0.97,
+            5312.4,
         ),
     ),
     equivalent=(
@@ -197,7 +201,8 @@ UNKNOWN_EFFECT = replace(
     effects=(
         FoundEffect(
             "unknown_effect", ("leg_lr",),
-            {"k": Estimate(0.81, 0.74, 0.88, "N m/rad"), "a0": Estimate(1.21, 1.17, 1.25, "rad")}, 0.9, 2210.0,
+            {"k": ParameterEstimate(0.81, 0.74, 0.88, "N m/rad"),
+             "a0": ParameterEstimate(1.21, 1.17, 1.25, "rad")}, 0.9, 2210.0,
             "-k * (leg_angle - a0)", {"k": "N m/rad", "a0": "rad"}, {"leg_angle_lr": Range(0.9, 2.1, "rad")},
         ),
     ),

@@ -10,7 +10,7 @@ from wlr_gym.gap.estimation.fit import fit, linearise
 from wlr_gym.gap.estimation.least_squares import corrected
 from wlr_gym.gap.estimation.likelihood import LONGEST, estimate_noise, minus_two_log_likelihood
 from wlr_gym.gap.estimation.model import (
-    Model,
+    FittedModel,
     moved,
     nominal_model,
     on_bounds,
@@ -84,7 +84,7 @@ def test_columns_are_the_responses():
 
 def test_columns_at_a_bound_are_taken_inwards():
     problem = Toy()
-    high = Model(NOMINAL + REACH * SIGMA)
+    high = FittedModel(NOMINAL + REACH * SIGMA)
     _, columns = linearise(problem, high, [0])
     assert columns[0][0] == pytest.approx(-STRENGTH * problem.shape("gain")[0].ravel(), abs=1e-5)
 

@@ -10,7 +10,7 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.gap.report import report
+from wlr_gym.gap.report.folder import save_analysis
 
 workflow = importlib.import_module("wlr_gym.gap.workflow")
 
@@ -33,13 +33,13 @@ def answer(monkeypatch):
             tell("calibrating", 0.3)
             tell("naming", 0.7)
             asked.update(options, data=folder)
-            report.save_analysis(analysis, out)
+            save_analysis(analysis, out)
             return analysis
 
         monkeypatch.setattr(workflow, "analyse", analyse)
         return asked
 
-    monkeypatch.setattr(report, "draw", lambda analysis: {"gap": b"\x89PNG"})
+    monkeypatch.setattr("wlr_gym.gap.report.folder.draw", lambda analysis: {"gap": b"\x89PNG"})
     return give
 
 

@@ -13,10 +13,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CHANNELS, COLUMNS
-from wlr_gym.gap.analysis import Analysis, ChannelGap, Estimate, Evidence, FoundEffect, HeatMap, IntakeFinding, Place
-from wlr_gym.gap.report import report as module
+from wlr_gym.gap.analysis import Analysis, ChannelGap, Evidence, FoundEffect, HeatMap, IntakeFinding, ParameterEstimate, Place
+from wlr_gym.gap.report import folder
+from wlr_gym.gap.report.folder import check_folder, save_analysis
+from wlr_gym.gap.report.page import report
 from wlr_gym.gap.report.plots import draw, figures
-from wlr_gym.gap.report.report import check_folder, report, save_analysis
 from wlr_gym.gap.report.result import result_of
 from wlr_gym.gap.report.text import (
     _GROUPS,
@@ -217,7 +218,7 @@ def test_texts_are_escaped(tmp_path):
         intake=(IntakeFinding(evil, evil, evil, evil),),
         evidence=(Evidence(1, evil, (evil,), {evil: 1.0}, 1.0, 1.0, "taken", evil),),
         localisation=(Place(evil, 0.5, evil),),
-        effects=(FoundEffect(evil, (evil,), {evil: Estimate(1.0, 0.0, 2.0, evil)}, 0.5, 1.0, evil),),
+        effects=(FoundEffect(evil, (evil,), {evil: ParameterEstimate(1.0, 0.0, 2.0, evil)}, 0.5, 1.0, evil),),
         gap=replace(examples.GAP, metric=evil),
         provenance={evil: evil},
         seconds={evil: 3.0},
@@ -333,8 +334,8 @@ def test_numbers_in_words():
     angle = examples.UNKNOWN_EFFECT.effects[0].parameters["a0"]
     assert estimate(angle) == "1.21 (1.17 to 1.25) rad = 69.3°"
     assert estimate(replace(angle, low=float("nan"))) == "1.21 rad = 69.3°"
-    assert estimate(Estimate(1.021709, 1.0173, 1.0261, "-")) == "1.022 (1.017 to 1.026)"
-    assert estimate(Estimate(0.0, -0.1, 0.1, "m")) == "0 (-0.1 to 0.1) m"
+    assert estimate(ParameterEstimate(1.021709, 1.0173, 1.0261, "-")) == "1.022 (1.017 to 1.026)"
+    assert estimate(ParameterEstimate(0.0, -0.1, 0.1, "m")) == "0 (-0.1 to 0.1) m"
 
 
 # ---- pictures --------------------------------------------------------------------------------------------------------
@@ -414,7 +415,7 @@ def test_what_has_no_numbers_is_not_drawn():
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(module, "draw", lambda analysis: dict(PICTURE))
+    monkeypatch.setattr(folder, "draw", lambda analysis: dict(PICTURE))
 
 
 def test_files_are_written(tmp_path, quick):
@@ -453,18 +454,18 @@ def test_files_of_the_same_names_are_not_an_analysis(tmp_path, quick):
 
 def test_folders_that_cannot_be_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    for folder in (tmp_path / "file", tmp_path / "file" / "deeper"):
+    for place in (tmp_path / "file", tmp_path / "file" / "deeper"):
         with pytest.raises(InputError, match="file is a file; expected a folder"):
-            check_folder(folder)
+            check_folder(place)
     check_folder(tmp_path / "new" / "deep")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_failure_leaves_the_earlier_results_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "draw", lambda analysis: dict(PICTURE))
+    monkeypatch.setattr(folder, "draw", lambda analysis: dict(PICTURE))
     save_analysis(examples.EFFECT_FOUND, tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    monkeypatch.setattr(module, "draw", lambda analysis: 1 / 0)
+    monkeypatch.setattr(folder, "draw", lambda analysis: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         save_analysis(examples.NOTHING_MISSING, tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

@@ -8,7 +8,7 @@ from rig_bench import Bench, write
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.gap.estimation.fit import fit
-from wlr_gym.gap.estimation.model import Model, nominal_model
+from wlr_gym.gap.estimation.model import FittedModel, nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.rig import RIG_EFFECTS, RigProblem, read_recordings
 from wlr_gym.gap.rig.candidates import rig_candidates
@@ -241,7 +241,7 @@ def best_fit(problem, runs, effects, memory=None):
         stronger[names.index(name)] = value
     fits = []
     for quantities in (nominal(problem), stronger):
-        model = Model(quantities)
+        model = FittedModel(quantities)
         for name, values in effects.items():
             model = model.with_effect(candidates[name], values)
         fits.append(fit(problem, runs, model, memory=memory, steps=25))

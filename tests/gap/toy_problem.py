@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from wlr_gym.gap.problem import Candidate, Probe, Quantity, Signal, Start, Unknown
+from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Start, Unknown
 from wlr_gym.physics.effects import PatchEffect
 
 NOISE = np.array([0.1, 2.0, 0.001])
@@ -70,7 +70,7 @@ class Toy:
     def __init__(self, truth=None, effects=(), seed=0, *, runs=5, rows=200, white=1.0, error=0.0, memory=0.9, reach=REACH):
         self.runs = tuple(f"run_{k + 1}" for k in range(runs))
         self.rows, self.calls = rows, 0
-        self.signals = tuple(Signal(c, "1", n, "all") for c, n in zip(CHANNELS, NOISE, strict=True))
+        self.signals = tuple(MeasuredSignal(c, "1", n, "all") for c, n in zip(CHANNELS, NOISE, strict=True))
         self.quantities = tuple(
             Quantity(name, "1", n, s, n - reach * s, n + reach * s)
             for name, n, s in zip(QUANTITIES, NOMINAL, SIGMA, strict=True)

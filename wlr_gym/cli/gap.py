@@ -55,7 +55,7 @@ def run(options: Options) -> int:
 
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.gap.analysis import BAD_DATA
-    from wlr_gym.gap.report.report import check_folder
+    from wlr_gym.gap.report.folder import check_folder
     from wlr_gym.gap.workflow import analyse
 
     _check(options)
@@ -119,7 +119,7 @@ def _known(options: Options) -> Patch:
 
 
 def _print(analysis: Analysis, out: Path, console: Console) -> None:
-    from wlr_gym.gap.report.report import REPORT_FILE
+    from wlr_gym.gap.report.folder import REPORT_FILE
     from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
     from wlr_gym.gap.report.text import closure, sentence, title
 

@@ -39,7 +39,7 @@ class IntakeFinding:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ParameterEstimate:
     """A fitted number with its 95 % interval."""
 
     value: float
@@ -62,7 +62,7 @@ class FoundEffect:
 
     name: str
     where: tuple[str, ...]
-    parameters: Mapping[str, Estimate]
+    parameters: Mapping[str, ParameterEstimate]
     confidence: float
     gain: float
     formula: str = ""

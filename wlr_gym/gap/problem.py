@@ -174,7 +174,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Signal:
+class MeasuredSignal:
     """One measured channel.
 
     Attributes:
@@ -228,7 +228,7 @@ class Problem(Protocol):
     sealed: tuple[str, ...]
     turning: Mapping[str, tuple[str, tuple[str, ...]]]
     runs: tuple[str, ...]
-    signals: tuple[Signal, ...]
+    signals: tuple[MeasuredSignal, ...]
     quantities: tuple[Quantity, ...]
 
     def times(self, run: int) -> Array:

@@ -24,10 +24,10 @@ from wlr_gym.gap.analysis import (
     Analysis,
     Calibrated,
     Equivalent,
-    Estimate,
     Evidence,
     FoundEffect,
     IntakeFinding,
+    ParameterEstimate,
     Turning,
 )
 from wlr_gym.gap.estimation.fit import Fit, fit, widened
@@ -96,7 +96,7 @@ def analyse(
             into; the last before the work begins.
     """
     if out is not None:
-        from wlr_gym.gap.report.report import check_folder
+        from wlr_gym.gap.report.folder import check_folder
 
         check_folder(Path(out))
     tell("reading", STAGES["reading"])
@@ -120,7 +120,7 @@ def analyse(
         else analyse_problem(problem, str(data), findings, heldout=heldout, tell=tell, known=known)
     )
     if out is not None:
-        from wlr_gym.gap.report.report import save_analysis
+        from wlr_gym.gap.report.folder import save_analysis
 
         tell("drawing", STAGES["drawing"])
         save_analysis(done, Path(out))
@@ -263,10 +263,10 @@ def _effects(problem: Problem, naming: Naming, fitted: Sequence[int]) -> tuple[F
     return tuple(sorted(found, key=lambda effect: -effect.gain))
 
 
-def found_effect(candidate: Candidate, own: Mapping[str, Estimate], confidence: float, gain: float) -> FoundEffect:
+def found_effect(candidate: Candidate, own: Mapping[str, ParameterEstimate], confidence: float, gain: float) -> FoundEffect:
     """Return a fitted candidate as it is written; constants of its formula that were not fitted have no width."""
     fixed = candidate.fixed if candidate.formula else {}
-    given = {name: Estimate(value, value, value, candidate.units[name]) for name, value in fixed.items()}
+    given = {name: ParameterEstimate(value, value, value, candidate.units[name]) for name, value in fixed.items()}
     parameters = {**own, **given}
     return FoundEffect(candidate.name, candidate.where, parameters, confidence, gain, candidate.formula, dict(candidate.units))
 

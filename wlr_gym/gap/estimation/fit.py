@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from wlr_gym.gap.estimation.least_squares import corrected, gauss_newton_step, normal_equations
 from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, run_scatter
 from wlr_gym.gap.estimation.model import (
-    Model,
+    FittedModel,
     moved,
     on_bounds,
     prior_tightness,
@@ -62,7 +62,7 @@ class Fit:
         converged: whether new columns would hardly lead any further.
     """
 
-    model: Model
+    model: FittedModel
     residuals: list[Array]
     noise: Noise
     cost: float
@@ -83,7 +83,7 @@ def cheapest(problem: Problem, fits: Sequence[Fit], memory: Array) -> Fit:
 
 def linearise(
     problem: Problem,
-    model: Model,
+    model: FittedModel,
     runs: Sequence[int],
     near: Sequence[NDArray[np.float32]] | None = None,
     noise: Noise | None = None,
@@ -118,7 +118,9 @@ def linearise(
     return [r[0] for r in found], columns
 
 
-def idle_numbers(problem: Problem, model: Model, columns: Sequence[NDArray[np.float32]], noise: Noise) -> NDArray[np.bool_]:
+def idle_numbers(
+    problem: Problem, model: FittedModel, columns: Sequence[NDArray[np.float32]], noise: Noise
+) -> NDArray[np.bool_]:
     """Return of which numbers (numbers) the data say little beside their tolerances; unknowns of effects never are."""
     count, channels = len(problem.quantities), len(noise.weight)
     told = np.zeros(count)
@@ -139,7 +141,7 @@ def equations_by_run(found: Fit) -> tuple[Array, Array]:
 def fit(
     problem: Problem,
     runs: Sequence[int],
-    model: Model,
+    model: FittedModel,
     *,
     memory: Array | None = None,
     scatter: float = 1.0,
@@ -189,12 +191,12 @@ def fit(
 def _descend(
     problem: Problem,
     runs: Sequence[int],
-    model: Model,
+    model: FittedModel,
     columns: Sequence[NDArray[np.float32]],
     residuals: list[Array],
     memory: Array | None,
     scatter: float,
-) -> tuple[Model, list[Array], float]:
+) -> tuple[FittedModel, list[Array], float]:
     """Go downhill from ``model``, whose residuals are given, with the columns simulated there; return also how far it went."""
     memory = estimate_noise(residuals, scatter=scatter).memory if memory is None else memory  # one hill, not another each step
     secant, cost = list(columns), total_cost(problem, model, residuals, memory)
@@ -220,12 +222,12 @@ def _descend(
 def _relaxed(
     problem: Problem,
     runs: Sequence[int],
-    model: Model,
+    model: FittedModel,
     columns: Sequence[NDArray[np.float32]],
     residuals: list[Array],
     memory: Array | None,
     scatter: float,
-) -> tuple[Model, list[Array]]:
+) -> tuple[FittedModel, list[Array]]:
     """Take full steps that a rough cost hides: along what the data cannot tell apart, tolerances alone decide."""
     for _ in range(RELAXATIONS):
         noise = estimate_noise(residuals, memory, scatter)

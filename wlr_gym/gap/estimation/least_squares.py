@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.estimation.likelihood import Noise
-from wlr_gym.gap.estimation.model import Model, prior_tightness, room, scaled_nominal, scaled_numbers
+from wlr_gym.gap.estimation.model import FittedModel, prior_tightness, room, scaled_nominal, scaled_numbers
 from wlr_gym.gap.problem import Problem
 
 Array = NDArray[np.float64]
@@ -37,13 +37,13 @@ def cross_products(columns: Sequence[NDArray[np.float32]], others: Sequence[Arra
 
 
 def gauss_newton_step(
-    problem: Problem, model: Model, columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise
+    problem: Problem, model: FittedModel, columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise
 ) -> Array:
     """Step (numbers), scaled; numbers that would leave their bounds stay on them and the rest is solved anew."""
     return constrained_step(problem, model, *normal_equations(columns, residuals, noise))
 
 
-def constrained_step(problem: Problem, model: Model, matrix: Array, vector: Array) -> Array:
+def constrained_step(problem: Problem, model: FittedModel, matrix: Array, vector: Array) -> Array:
     """Return the step that solves these normal equations, tolerances added, within bounds; see :func:`gauss_newton_step`."""
     tight = prior_tightness(problem, model)
     nominal = scaled_nominal(problem, model)

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class FittedModel:
     """Quantities, and effects with the values of their unknowns."""
 
     quantities: Array
@@ -37,47 +37,47 @@ class Model:
         """Number of fitted numbers."""
         return len(self.quantities) + sum(len(values) for _, values in self.effects)
 
-    def with_effect(self, candidate: Candidate, values: Sequence[float]) -> Model:
+    def with_effect(self, candidate: Candidate, values: Sequence[float]) -> FittedModel:
         """Return the model with one effect more."""
         return replace(self, effects=(*self.effects, (candidate, tuple(values))))
 
-    def without_effect(self, index: int) -> Model:
+    def without_effect(self, index: int) -> FittedModel:
         """Return the model with one effect less."""
         effects = list(self.effects)
         del effects[index]
         return replace(self, effects=tuple(effects))
 
 
-def nominal_model(problem: Problem) -> Model:
+def nominal_model(problem: Problem) -> FittedModel:
     """Return the model as its file says."""
-    return Model(np.array([quantity.nominal for quantity in problem.quantities]))
+    return FittedModel(np.array([quantity.nominal for quantity in problem.quantities]))
 
 
-def untouched(problem: Problem, model: Model) -> Model:
+def untouched(problem: Problem, model: FittedModel) -> FittedModel:
     """Return the model with its effects, and its numbers as the file says, but for those that drift."""
     drifts = np.array([quantity.drifts for quantity in problem.quantities])
     return replace(model, quantities=np.where(drifts, model.quantities, nominal_model(problem).quantities))
 
 
-def scales(problem: Problem, model: Model) -> Array:
+def scales(problem: Problem, model: FittedModel) -> Array:
     """Return what one scaled number is worth (numbers): tolerances, then steps of the unknowns."""
     steps = [unknown.step for candidate, _ in model.effects for unknown in candidate.unknowns]
     return np.array([*(quantity.sigma for quantity in problem.quantities), *steps])
 
 
-def scaled_numbers(problem: Problem, model: Model) -> Array:
+def scaled_numbers(problem: Problem, model: FittedModel) -> Array:
     """Values of all numbers, scaled."""
     values = np.array([*model.quantities, *(v for _, values in model.effects for v in values)])
     return values / scales(problem, model)
 
 
-def scaled_nominal(problem: Problem, model: Model) -> Array:
+def scaled_nominal(problem: Problem, model: FittedModel) -> Array:
     """Nominal values of all numbers, scaled; effects' unknowns at neutral."""
     neutral = [u.neutral for candidate, _ in model.effects for u in candidate.unknowns]
     return np.array([*(q.nominal for q in problem.quantities), *neutral]) / scales(problem, model)
 
 
-def moved(problem: Problem, model: Model, change: Array) -> Model:
+def moved(problem: Problem, model: FittedModel, change: Array) -> FittedModel:
     """Return the model moved by scaled numbers, kept within bounds and plausible ranges."""
     count = len(problem.quantities)
     sigma, low, high = (np.array([getattr(q, name) for q in problem.quantities]) for name in ("sigma", "low", "high"))
@@ -88,17 +88,17 @@ def moved(problem: Problem, model: Model, change: Array) -> Model:
         new = np.array(values) + steps * change[at : at + len(values)]
         effects.append((candidate, candidate.kept(new.tolist())))
         at += len(values)
-    return Model(quantities, tuple(effects))
+    return FittedModel(quantities, tuple(effects))
 
 
-def room(problem: Problem, model: Model) -> tuple[Array, Array]:
+def room(problem: Problem, model: FittedModel) -> tuple[Array, Array]:
     """Return how far each scaled number may still move down and up (numbers)."""
     low, high = _bounds(problem, model)
     here = scaled_numbers(problem, model)
     return low - here, high - here
 
 
-def on_bounds(problem: Problem, model: Model) -> NDArray[np.bool_]:
+def on_bounds(problem: Problem, model: FittedModel) -> NDArray[np.bool_]:
     """Which quantities (numbers) calibration has moved as far as it may; unknowns of effects do not count."""
     low, high = _bounds(problem, model)
     here = scaled_numbers(problem, model)
@@ -107,7 +107,7 @@ def on_bounds(problem: Problem, model: Model) -> NDArray[np.bool_]:
     return known & (((here <= low + 1e-9) & (low != nominal)) | ((here >= high - 1e-9) & (high != nominal)))
 
 
-def _bounds(problem: Problem, model: Model) -> tuple[Array, Array]:
+def _bounds(problem: Problem, model: FittedModel) -> tuple[Array, Array]:
     unknowns = [u for candidate, _ in model.effects for u in candidate.unknowns]
     scale = scales(problem, model)
     low = np.array([*(q.low for q in problem.quantities), *(u.low for u in unknowns)]) / scale
@@ -115,7 +115,7 @@ def _bounds(problem: Problem, model: Model) -> tuple[Array, Array]:
     return low, high
 
 
-def prior_tightness(problem: Problem, model: Model) -> Array:
+def prior_tightness(problem: Problem, model: FittedModel) -> Array:
     """Weight (numbers) of what is known beforehand, scaled: tolerances; unknowns lie within half their range of neutral.
 
     It counts ``problem.firmness`` times, but for numbers that drift.
@@ -125,18 +125,18 @@ def prior_tightness(problem: Problem, model: Model) -> Array:
     return firmness * tightness_once(problem, model)
 
 
-def tightness_once(problem: Problem, model: Model) -> Array:
+def tightness_once(problem: Problem, model: FittedModel) -> Array:
     """The same without tempering."""
     unknowns = [4.0 * (u.step / (u.high - u.low)) ** 2 for candidate, _ in model.effects for u in candidate.unknowns]
     return np.array([1.0] * len(problem.quantities) + unknowns)
 
 
-def prior_cost(problem: Problem, model: Model) -> float:
+def prior_cost(problem: Problem, model: FittedModel) -> float:
     """Return the squared distance of all numbers from nominal or neutral, in what is known beforehand."""
     away = scaled_numbers(problem, model) - scaled_nominal(problem, model)
     return float(prior_tightness(problem, model) @ away**2)
 
 
-def total_cost(problem: Problem, model: Model, residuals: Sequence[Array], memory: Array) -> float:
+def total_cost(problem: Problem, model: FittedModel, residuals: Sequence[Array], memory: Array) -> float:
     """Return minus two log posterior."""
     return minus_two_log_likelihood(residuals, memory) + prior_cost(problem, model)

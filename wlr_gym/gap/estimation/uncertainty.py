@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from wlr_gym.gap.analysis import Estimate
+from wlr_gym.gap.analysis import ParameterEstimate
 from wlr_gym.gap.estimation.fit import PINNED, Fit, equations_by_run
 from wlr_gym.gap.estimation.model import on_bounds, prior_tightness, scaled_nominal, scaled_numbers, scales
 from wlr_gym.gap.problem import Candidate, Problem
@@ -58,7 +58,7 @@ def half_widths(problem: Problem, fit: Fit) -> Array:
     return np.where(on_bounds(problem, fit.model), beforehand, np.where(held, np.minimum(halves, beforehand), halves))
 
 
-def estimates(problem: Problem, fit: Fit) -> list[dict[str, Estimate]]:
+def estimates(problem: Problem, fit: Fit) -> list[dict[str, ParameterEstimate]]:
     """Return the parameters of each of the model's effects with 95 % intervals.
 
     To what the data leave open comes what two simulators of one system disagree by (``problem.disagreement``), the same share
@@ -83,7 +83,7 @@ def _untold(candidate: Candidate) -> Array:
     return np.array([0.0 if one is None or one.replaces else one.size**2 / len(one.quantities) for one in met])
 
 
-def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[str, Estimate]:
+def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[str, ParameterEstimate]:
     """Parameters of one effect: their slopes in the fitted values carry the covariance over."""
     here = candidate.parameters(values.tolist())
     errors = np.sqrt(np.maximum(np.diag(spread), 0.0))
@@ -102,5 +102,5 @@ def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[
     found = {}
     for name, value in here.items():
         half = TWO_SIDED_95 * float(np.sqrt(max(slopes[name] @ spread @ slopes[name], 0.0)))
-        found[name] = Estimate(value, value - half, value + half, units.get(name, "-"))
+        found[name] = ParameterEstimate(value, value - half, value + half, units.get(name, "-"))
     return found

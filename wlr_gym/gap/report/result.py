@@ -19,7 +19,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
-from wlr_gym.gap.analysis import Adequacy, Analysis, Calibrated, Estimate, Evidence, FoundEffect, GapFigures, Statistic
+from wlr_gym.gap.analysis import Adequacy, Analysis, Calibrated, Evidence, FoundEffect, GapFigures, ParameterEstimate, Statistic
 from wlr_gym.gap.report.text import closure, sentence, unit_of
 from wlr_gym.physics.effects import Patch, PatchEffect, save_patch
 from wlr_gym.physics.plants.forces import COORDINATES
@@ -299,7 +299,7 @@ def _effect(effect: FoundEffect) -> dict[str, Any]:
     return entry
 
 
-def _parameter(found: Estimate) -> dict[str, Any]:
+def _parameter(found: ParameterEstimate) -> dict[str, Any]:
     known = math.isfinite(found.low) and math.isfinite(found.high)
     interval = [min(found.low, found.value), max(found.high, found.value)] if known else None
     return {"value": found.value, "ci95": interval, "unit": found.unit}

@@ -15,8 +15,8 @@ from wlr_gym.gap.analysis import (
     Adequacy,
     Analysis,
     ChannelGap,
-    Estimate,
     FoundEffect,
+    ParameterEstimate,
     Statistic,
     Turning,
 )
@@ -146,7 +146,7 @@ def unit_of(unit: str) -> str:
     return "" if unit in ("", "-") else f" {unit}"
 
 
-def estimate(found: Estimate) -> str:
+def estimate(found: ParameterEstimate) -> str:
     """Return ``0.041 (0.038 to 0.045) N m``; angles in degrees, too."""
     known = math.isfinite(found.low) and math.isfinite(found.high)
     digits = _digits(found.value, 0.5 * (found.high - found.low)) if known else 3

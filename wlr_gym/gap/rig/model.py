@@ -148,14 +148,14 @@ def unknowns(name: str) -> tuple[Unknown, ...]:
 
 
 @dataclass(frozen=True)
-class Model:
+class RigModel:
     """Numbers of a model by name, SI, and the formula forces on its joint."""
 
     numbers: Numbers
     forces: tuple[Force, ...] = ()
 
 
-def model_of(setting: Setting, quantities: Sequence[Quantity], known: Sequence[PatchEffect] = ()) -> Model:
+def model_of(setting: Setting, quantities: Sequence[Quantity], known: Sequence[PatchEffect] = ()) -> RigModel:
     """Return the model of a setting: its quantities, then the effects that are known, then its own.
 
     Raises:
@@ -171,7 +171,7 @@ def model_of(setting: Setting, quantities: Sequence[Quantity], known: Sequence[P
             apply_effect(numbers, effect)
         else:
             raise unknown_name("effect of the test rig", effect.name, RIG_EFFECTS)
-    return Model(numbers, tuple(forces))
+    return RigModel(numbers, tuple(forces))
 
 
 def apply_effect(numbers: Numbers, effect: PatchEffect) -> None:
@@ -186,7 +186,7 @@ def apply_effect(numbers: Numbers, effect: PatchEffect) -> None:
     law_of.apply(numbers, values)
 
 
-def pack(models: Sequence[Model], recording: Recording, step: float) -> Array:
+def pack(models: Sequence[RigModel], recording: Recording, step: float) -> Array:
     """Return what the compiled law reads (models, len(law.PARAMETERS)) for one recording's load and gain."""
     table = {name: np.array([model.numbers[name] for model in models]) for name in models[0].numbers}
     arm, length = table["arm_mass"], recording.length + table["length_error"]

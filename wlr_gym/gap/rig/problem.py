@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import generator
-from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal, since_reversal
+from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, since_reversal
 from wlr_gym.gap.rig.candidates import rig_candidates
 from wlr_gym.gap.rig.formula import lanes_read, rig_force
 from wlr_gym.gap.rig.kernel import OUTPUTS
@@ -62,7 +62,7 @@ class RigProblem:
         self.recordings = tuple(recordings)
         self.known = tuple(known)
         self.runs = tuple(recording.name for recording in recordings)
-        self.signals = tuple(Signal(name, "rad", ENCODER_NOISE, "position") for name in HORIZONS)
+        self.signals = tuple(MeasuredSignal(name, "rad", ENCODER_NOISE, "position") for name in HORIZONS)
         self.quantities: tuple[Quantity, ...] = tuple(
             quantity for quantity in QUANTITIES if friction_is_known or not quantity.name.endswith("friction")
         )

@@ -15,7 +15,7 @@ from wlr_gym.data.format import CHANNELS, COLUMNS
 from wlr_gym.data.noise import channel_noise, noise_parts
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters, robot_of
-from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal, since_reversal
+from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, since_reversal
 from wlr_gym.gap.report.recommendation import SHOWN_BY
 from wlr_gym.gap.robot.candidates import robot_candidates
 from wlr_gym.gap.robot.clock import RunClock
@@ -91,7 +91,7 @@ class RobotProblem:
         self._knobs: tuple[Knob, ...] = knobs(self.robot, PHYSICS_STEP)
         self.quantities: tuple[Quantity, ...] = tuple(knob.quantity for knob in self._knobs)
         noise = channel_noise(self.robot)
-        self.signals = tuple(Signal(name, COLUMNS[name].unit, noise[name], COLUMNS[name].group) for name in CHANNELS)
+        self.signals = tuple(MeasuredSignal(name, COLUMNS[name].unit, noise[name], COLUMNS[name].group) for name in CHANNELS)
         self._noise = np.array([signal.noise for signal in self.signals])
         if not self._noise.all():
             name = self.signals[int(np.argmin(self._noise))].name

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from wlr_gym.gap.estimation.fit import Fit, cheapest, equations_by_run, fit
 from wlr_gym.gap.estimation.least_squares import constrained_step
 from wlr_gym.gap.estimation.likelihood import estimate_noise, minus_two_log_likelihood
-from wlr_gym.gap.estimation.model import Model, moved, on_bounds, scaled_numbers, total_cost, untouched
+from wlr_gym.gap.estimation.model import FittedModel, moved, on_bounds, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
 from wlr_gym.gap.selection.screening import LEAST_GAIN, least_gain
@@ -89,7 +89,7 @@ def finalists(
     return sorted(found, key=lambda final: -final.hypothesis.gain), bare
 
 
-def _far_apart(problem: Problem, one: Model, other: Model) -> bool:
+def _far_apart(problem: Problem, one: FittedModel, other: FittedModel) -> bool:
     """Whether a number of two models differs by more than a tolerance, or an unknown by more than a step."""
     return bool(np.abs(scaled_numbers(problem, one) - scaled_numbers(problem, other)).max(initial=0.0) > 1.0)
 
@@ -142,7 +142,12 @@ def _left(problem: Problem, runs: Sequence[int], whole: Fit, candidate: Candidat
 
 
 def _plain(
-    problem: Problem, runs: Sequence[int], near: Fit, model: Model, columns: list[NDArray[np.float32]] | None, memory: Array
+    problem: Problem,
+    runs: Sequence[int],
+    near: Fit,
+    model: FittedModel,
+    columns: list[NDArray[np.float32]] | None,
+    memory: Array,
 ) -> Fit:
     """One descent of a model, with the columns of a fit near it where they are known."""
     return fit(problem, runs, model, memory=memory, scatter=near.noise.scatter, columns=columns, steps=1)
@@ -180,7 +185,7 @@ def _carried(found: Sequence[Array], memory: Array) -> float:
     return before - after
 
 
-def told_by_others(problem: Problem, found: Fit) -> list[Model]:
+def told_by_others(problem: Problem, found: Fit) -> list[FittedModel]:
     """The model as it would be without each run in turn, to first order."""
     matrices, vectors = equations_by_run(found)
     matrix, vector = matrices.sum(axis=0), vectors.sum(axis=0)
@@ -242,7 +247,7 @@ def settle(problem: Problem, runs: Sequence[int], final: Final, bare: Fit, tell:
     return _judged(problem, runs, final.hypothesis, best, bare, memory), bare
 
 
-def looked_around(problem: Problem, runs: Sequence[int], found: Fit) -> Model:
+def looked_around(problem: Problem, runs: Sequence[int], found: Fit) -> FittedModel:
     """The model with the last effect where it explains most: steps apart in each unknown that does not say how large it is."""
     candidate, values = found.model.effects[-1]
     steps = [np.array(LOOKS) * u.step if not u.is_size else np.zeros(1) for u in candidate.unknowns]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.estimation.likelihood import Noise
-from wlr_gym.gap.estimation.model import Model
+from wlr_gym.gap.estimation.model import FittedModel
 from wlr_gym.gap.problem import Candidate, Problem
 
 Array = NDArray[np.float64]
@@ -37,12 +37,12 @@ class Hypothesis:
     """
 
     candidate: Candidate
-    model: Model
+    model: FittedModel
     gain: float
     by_run: Array
     screened: float
     residuals: list[Array] = field(repr=False)
-    base: Model = field(repr=False)
+    base: FittedModel = field(repr=False)
     base_residuals: list[Array] = field(repr=False)
     carries_over: bool = True
     tolerable: bool = False
@@ -73,7 +73,7 @@ class Hypothesis:
         return bool(harm <= MOST_HARM * help_)
 
 
-def within_tolerance(problem: Problem, model: Model) -> bool:
+def within_tolerance(problem: Problem, model: FittedModel) -> bool:
     """Whether the tolerances of the numbers that the last effect meets allow what number and effect do together."""
     candidate, values = model.effects[-1]
     if not any(candidate.tolerances):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from wlr_gym.gap.estimation.fit import SETTLED, Fit, fit
 from wlr_gym.gap.estimation.least_squares import constrained_step, cross_products, normal_equations
 from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, minus_two_log_likelihood
-from wlr_gym.gap.estimation.model import Model, moved, scaled_numbers, total_cost, untouched
+from wlr_gym.gap.estimation.model import FittedModel, moved, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem, Setting
 from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score
@@ -47,7 +47,7 @@ class _Trial:
     of: int
     known: Sequence[NDArray[np.float32]] = field(repr=False)
     whole: Sequence[NDArray[np.float32]] = field(repr=False)
-    model: Model
+    model: FittedModel
     residuals: list[Array] = field(default_factory=list, repr=False)
     corrections: tuple[tuple[Array, list[Array]], ...] = field(default=(), repr=False)
     settled: bool = False
@@ -262,7 +262,7 @@ def _bordered(
 
 
 def _ranked(
-    problem: Problem, scores: Sequence[Score], models: Sequence[Model], residuals: Sequence[list[Array]], memory: Array
+    problem: Problem, scores: Sequence[Score], models: Sequence[FittedModel], residuals: Sequence[list[Array]], memory: Array
 ) -> list[Hypothesis]:
     """Hypotheses from refitted models, the last of which has no effect more; best first."""
     base = total_cost(problem, models[-1], residuals[-1], memory)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.gap.estimation.fit import Fit, cheapest, fit, linearise, widened
 from wlr_gym.gap.estimation.likelihood import estimate_noise
-from wlr_gym.gap.estimation.model import Model, total_cost, untouched
+from wlr_gym.gap.estimation.model import FittedModel, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.selection.cross_validation import Final, accept, beside, finalists
 from wlr_gym.gap.selection.hypothesis import Hypothesis
@@ -138,7 +138,7 @@ def _as_given(
     return linearise(problem, untouched(problem, current.model), runs, current.columns, current.noise)[1]
 
 
-def _settled(model: Model, candidate: Candidate) -> bool:
+def _settled(model: FittedModel, candidate: Candidate) -> bool:
     """Whether the model has the candidate, or an unknown law on every joint where it acts.
 
     What a name buys beside a formula at one joint is what the formula has got wrong of the law.
@@ -199,7 +199,7 @@ def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tu
     return swaps
 
 
-def _same(one: Model, other: Model) -> bool:
+def _same(one: FittedModel, other: FittedModel) -> bool:
     return [candidate.label for candidate, _ in one.effects] == [candidate.label for candidate, _ in other.effects]
 
 

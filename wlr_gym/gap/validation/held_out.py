@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
-from wlr_gym.gap.estimation.model import Model
+from wlr_gym.gap.estimation.model import FittedModel
 from wlr_gym.gap.estimation.uncertainty import two_sided_95
 from wlr_gym.gap.problem import Problem, Setting
 
@@ -54,7 +54,7 @@ def noise_floor(problem: Problem, setting: Setting, runs: Sequence[int]) -> floa
 
 
 def prove(
-    problem: Problem, fitted: Sequence[int], heldout: Sequence[int], models: Sequence[Model], floor: float
+    problem: Problem, fitted: Sequence[int], heldout: Sequence[int], models: Sequence[FittedModel], floor: float
 ) -> tuple[GapFigures, tuple[RunGap, ...], tuple[ChannelGap, ...]]:
     """Compare three models on fitted and held-out runs.
 

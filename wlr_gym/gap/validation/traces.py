@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from wlr_gym.gap.analysis import Place, Trace
-from wlr_gym.gap.estimation.model import Model
+from wlr_gym.gap.estimation.model import FittedModel
 from wlr_gym.gap.problem import Problem
 
 #: Traces of an analysis.
@@ -17,7 +17,7 @@ USUAL = ("gyro_z", "cam_x", "eff_leg_lf", "vel_wheel_lf", "position")
 
 
 def telling_traces(
-    problem: Problem, heldout: Sequence[int], models: Sequence[Model], places: Sequence[Place]
+    problem: Problem, heldout: Sequence[int], models: Sequence[FittedModel], places: Sequence[Place]
 ) -> tuple[Trace, ...]:
     """Return measured and replayed traces of held-out runs, channels in the order of their share of the gap.
 

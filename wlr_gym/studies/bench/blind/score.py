@@ -174,7 +174,7 @@ def score(results: Mapping[str, Result], truths: Mapping[str, Truth]) -> dict[st
     Args:
         results: contents of ``result.json``, or ``{"verdict": "refused" | "failed", "message": ...}``; under ``blind_test`` the
             commit that analysed it, where that is known.
-        truths: as of ``cases.Case.as_dict``; those without a result are left out.
+        truths: as of ``cases.BlindCase.as_dict``; those without a result are left out.
 
     Returns:
         Plain data: shares with bounds, lists of errors' quantiles, the confusion matrix.

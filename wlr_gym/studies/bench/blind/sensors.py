@@ -33,7 +33,7 @@ def log(
     """Turn the records of a simulated run into the table of a measured one.
 
     Args:
-        records: as of ``drive.simulate``.
+        records: as of ``simulation.simulate``.
         times: (n,) host clock of the rows, s.
         goals: (n, 8) written in these rows.
     """

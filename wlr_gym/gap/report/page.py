@@ -1,12 +1,8 @@
-"""The report of an analysis: one HTML page with its pictures inside, for an engineer who never saw the tool.
-
-:func:`save_analysis` writes everything an analysis leaves behind.
-"""
+"""The report of an analysis: one HTML page with its pictures inside, for an engineer who never saw the tool."""
 
 from __future__ import annotations
 
 import math
-import os
 import shlex
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -14,8 +10,6 @@ from pathlib import Path
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, replace_file
-from wlr_gym.base.provenance import CONFIG_FILE, PROVENANCE_FILE
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.gap.analysis import (
     BAD_DATA,
@@ -28,24 +22,20 @@ from wlr_gym.gap.analysis import (
     Calibrated,
     ChannelGap,
     Detectable,
-    Evidence,
-    FoundEffect,
     GapFigures,
     RunGap,
     Statistic,
 )
-from wlr_gym.gap.problem import Range
+from wlr_gym.gap.report.evidence import evidence_section
 from wlr_gym.gap.report.html import commands, document, folded, heading, pictures_of, section, table
-from wlr_gym.gap.report.plots import SCREENED_OUT, draw
 from wlr_gym.gap.report.recommendation import record_commands
-from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, patch_of, read_result, result_of, write_result
+from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, patch_of
 from wlr_gym.gap.report.text import (
     adequacy,
     channel,
     closure,
     duration,
     error,
-    estimate,
     interval,
     listed,
     number,
@@ -59,11 +49,8 @@ from wlr_gym.gap.report.text import (
     unit_of,
 )
 from wlr_gym.gap.validation.held_out import LEAST_FOR_INTERVAL
-from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, load_patch
+from wlr_gym.physics.effects import EFFECTS, load_patch
 from wlr_gym.robot.parameters import TABLE
-
-REPORT_FILE, PLOTS = "report.html", "plots"
-_OWN = {RESULT_FILE, PATCH_FILE, REPORT_FILE, PLOTS, CONFIG_FILE, PROVENANCE_FILE}
 
 _COLOURS = {
     BAD_DATA: "#b03030", NOT_EXCITED: "#8a6d00", NOTHING_MISSING: "#2e7d32", EFFECT_FOUND: "#1f4e9c", UNKNOWN: "#7b3fa0",
@@ -71,7 +58,7 @@ _COLOURS = {
 
 #: Tolerances by which a calibrated number must have moved to be shown at once.
 _FAR = 0.5
-_CAPTIONS = {
+CAPTIONS = {
     "where": "In which states the calibrated model is wrong: each row a measured channel, each column a range of what is named "
     "below. The numbers are rms errors; about 1 is what sensor noise alone would leave, grey is a range without data.",
     "localisation": "Which measured channels hold the gap, and how much of it.",
@@ -88,67 +75,6 @@ _CAPTIONS = {
 }
 
 
-# ---- the folder ------------------------------------------------------------------------------------------------------
-
-
-def check_folder(folder: Path) -> None:
-    """Refuse, before the work, a folder that the results cannot go into; nothing is made.
-
-    Raises:
-        InputError: a file, a folder without rights, or one with contents that no earlier analysis wrote.
-    """
-    if folder.is_dir():
-        _require_own(folder)
-    nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-    if not nearest.is_dir():
-        raise InputError(f"--out {folder}: {nearest} is a file; expected a folder")
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise InputError(f"--out {folder}: cannot be written to")
-
-
-def _require_own(folder: Path) -> None:
-    there = sorted(path.name for path in folder.iterdir())
-    strange = [name for name in there if name not in _OWN] or ([] if _is_analysis(folder) else there)
-    if strange:
-        raise InputError(f"--out {folder}: '{strange[0]}' in it is not of an analysis; expected a new folder or an earlier one")
-
-
-def _is_analysis(folder: Path) -> bool:
-    """Whether an analysis wrote a folder: files of these names alone may be anybody's."""
-    if not (folder / RESULT_FILE).exists():  # one that was interrupted, before anything but pictures was there
-        return (folder / PROVENANCE_FILE).exists() or not any((folder / name).exists() for name in (PATCH_FILE, CONFIG_FILE))
-    try:
-        read_result(folder / RESULT_FILE)
-    except InputError:
-        return False
-    return True
-
-
-def save_analysis(analysis: Analysis, folder: Path) -> Path:
-    """Write report, pictures, patch and result into ``folder``, and return the path of the result.
-
-    Everything is made before anything is written, and ``result.json`` comes last: a folder that holds one is whole.
-
-    Raises:
-        InputError: see :func:`check_folder`, or a folder that cannot be written to.
-    """
-    check_folder(folder)
-    result_of(analysis)
-    pictures = draw(analysis)
-    page = report(analysis, pictures, folder)
-    make_output_folder(folder / PLOTS)
-    # the provenance stays until there is a result: it tells whose the folder is
-    for stale in (RESULT_FILE, PATCH_FILE, CONFIG_FILE):
-        (folder / stale).unlink(missing_ok=True)
-    for stale in (folder / PLOTS).glob("*.png"):
-        if stale.stem.rstrip("_0123456789") in _CAPTIONS:
-            stale.unlink()
-    for name, picture in pictures.items():
-        replace_file(folder / PLOTS / f"{name}.png", lambda temporary, picture=picture: temporary.write_bytes(picture))
-    replace_file(folder / REPORT_FILE, lambda temporary: temporary.write_text(page, encoding="utf-8"))
-    return write_result(analysis, folder)
-
-
 # ---- the page --------------------------------------------------------------------------------------------------------
 
 
@@ -163,7 +89,7 @@ def report(analysis: Analysis, pictures: Mapping[str, bytes], folder: Path) -> s
     body = [
         _header(analysis),
         _where(analysis, pictures),
-        _what(analysis, pictures),
+        evidence_section(analysis, _pictures("evidence", pictures)),
         _how_much(analysis, pictures),
         _how_sure(analysis),
         _next(analysis),
@@ -176,7 +102,7 @@ def report(analysis: Analysis, pictures: Mapping[str, bytes], folder: Path) -> s
 
 
 def _pictures(kind: str, pictures: Mapping[str, bytes]) -> str:
-    return pictures_of(kind, pictures, _CAPTIONS[kind])
+    return pictures_of(kind, pictures, CAPTIONS[kind])
 
 
 def _header(analysis: Analysis) -> str:
@@ -216,7 +142,7 @@ def _tiles(analysis: Analysis) -> str:
     )
 
 
-# ---- where, what -----------------------------------------------------------------------------------------------------
+# ---- where ----------------------------------------------------------------------------------------------------------
 
 
 def _where(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
@@ -233,88 +159,6 @@ def _where(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
         text += f"<p>With the final model, {escape(turned(analysis.turning))}.</p>"
     headings = ("channel", "", "share of the gap", "how it depends on the state")
     return section("Where", text, table(headings, rows, {2}), *shown)
-
-
-def _what(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
-    parts = [_effect(effect) for effect in analysis.effects]
-    if analysis.equivalent:
-        rows = [(listed([plain(name) for name in group.names], "or"), group.separating_run) for group in analysis.equivalent]
-        parts += [heading("What these data cannot tell apart"), table(("one of", "the run that would tell"), rows)]
-    if analysis.evidence:
-        rounds = sorted({one.round for one in analysis.evidence})
-        parts += [heading("What was weighed"), _WEIGHED, _pictures("evidence", pictures)]
-        parts += [_evidence([one for one in analysis.evidence if one.round == turn], turn) for turn in rounds]
-    return section("What", *parts)
-
-
-_WEIGHED = """<p>Every candidate was scored by what it promises to add to the calibrated model (a linear estimate). The best
-were added and refitted together with all known numbers: their <i>gain</i> is the fall of minus two log posterior, of which
-chance alone buys about 1 for each fitted number. One effect is taken per round, then the search starts again.</p>"""
-
-
-def _effect(effect: FoundEffect) -> str:
-    known = EFFECTS.get(effect.name)
-    if effect.name == UNKNOWN_EFFECT:
-        meaning = "Nothing in the library explains it."
-    else:
-        meaning = f"What is missing: {known.doc}." if known else "An effect of the test rig's own model."
-    law = effect.formula or (known.equation if known else "")
-    unlawful = "<p>No formula was found that holds.</p>" if effect.name == UNKNOWN_EFFECT else ""
-    rows = [(name, estimate(found)) for name, found in effect.parameters.items()]
-    return "\n".join(
-        [
-            heading(f"{plain(effect.name).capitalize()}: {places(effect.where)}"),
-            f"<p>{escape(meaning)} In files: <code>{escape(effect.name)}</code>, where <code>{escape(', '.join(effect.where))}"
-            f"</code>. Confidence {percent(effect.confidence)}.</p>",
-            f"<p>Law: <code>{escape(law)}</code></p>" if law else unlawful,
-            *([f"<p>Tried where {_tried(effect.validity)}; beyond, nothing is known of it.</p>"] if effect.validity else []),
-            table(("parameter", "value (95 % interval)"), rows),
-        ]
-    )
-
-
-def _tried(validity: Mapping[str, Range]) -> str:
-    texts = [f"{plain(name)} is {number(one.low)} to {number(one.high)}{unit_of(one.unit)}" for name, one in validity.items()]
-    return escape(listed(texts, "and"))
-
-
-def _evidence(evidence: Sequence[Evidence], turn: int) -> str:
-    fitted = sorted((one for one in evidence if one.outcome != SCREENED_OUT), key=_rank)
-    rows = [
-        (plain(one.name), places(one.where), _values(one), number(one.gain), number(one.screened), one.outcome, one.reason)
-        for one in fitted
-    ]
-    rows += [_screened_out(alike) for alike in _by_name([one for one in evidence if one.outcome == SCREENED_OUT])]
-    classes = ["taken" if one.outcome == "taken" else "" for one in fitted] + [""] * (len(rows) - len(fitted))
-    headings = ("candidate", "where", "values", "gain", "promised", "outcome", "why")
-    return (
-        heading(f"Round {turn}: {len(evidence)} explanation{'s' if len(evidence) > 1 else ''} weighed")
-        + "\n"
-        + table(headings, rows, {3, 4}, classes)
-    )
-
-
-def _rank(one: Evidence) -> tuple[bool, float]:
-    """Order of the fitted: the taken one, then by gain."""
-    return one.outcome != "taken", -one.gain if math.isfinite(one.gain) else math.inf
-
-
-def _by_name(evidence: Sequence[Evidence]) -> list[list[Evidence]]:
-    """Put the places of an effect together; what promised most first, within and without."""
-    ordered = sorted(evidence, key=lambda one: -one.screened if math.isfinite(one.screened) else math.inf)
-    return [[one for one in ordered if one.name == name] for name in dict.fromkeys(one.name for one in ordered)]
-
-
-def _screened_out(alike: Sequence[Evidence]) -> tuple[str, ...]:
-    best, others = alike[0], len(alike) - 1
-    more = f"; less at {others} other place{'s' if others > 1 else ''}" if others else ""
-    return plain(best.name), f"{places(best.where)}{more}", "", "-", number(best.screened), best.outcome, best.reason
-
-
-def _values(one: Evidence) -> str:
-    known = EFFECTS[one.name].parameters if one.name in EFFECTS else {}
-    units = {name: unit_of(known[name].unit) if name in known else "" for name in one.values}
-    return ", ".join(f"{name} {number(value)}{units[name]}" for name, value in one.values.items())
 
 
 # ---- how much, how sure, what next -----------------------------------------------------------------------------------
