@@ -65,11 +65,14 @@ def test_what_was_found_is_printed(data, tmp_path, answer, capsys):
     assert main(["gap", str(data), "--out", str(tmp_path / "out")]) == 0
     shown = printed(capsys)
     assert "Missing effect found The model lacks rolling resistance (both front wheels)" in shown
-    assert "rolling resistance at both front wheels: coefficient 0.0412 (0.0383 to 0.0447); confidence 97 %" in shown
+    assert "rolling resistance at both front wheels: coefficient 0.0412 (0.0383 to 0.0447); selection frequency 97 %" in shown
     assert "7.91 as given, 5.24 calibrated, 1.21 with the effects; noise floor 1.00" in shown
     assert "removed of the avoidable error: 95 % (95 % interval 91 to 97 %)" in shown
     assert "data: run_02: 3 rows are missing" in shown
-    assert "cannot tell rolling resistance from coulomb friction; this run would: straight with a payload" in shown
+    assert (
+        "not distinguishable: rolling resistance and coulomb friction; discriminating experiment: straight with a payload"
+        in shown
+    )
     assert "record next: straight: with 0.5 kg" in shown
     assert shown.count("calibrating") == 1
     assert "70 % naming" in shown
@@ -168,7 +171,7 @@ def test_what_is_left_is_printed(data, tmp_path, answer, capsys):
     answer(replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, heldout_after=2.2)))
     assert main(["gap", str(data), "--out", str(tmp_path / "out")]) == 0
     shown = printed(capsys)
-    assert "Not all is explained: in runs kept aside an error of 2.20 is left" in shown
+    assert "Not all is explained: an error of 2.20 is left in the held-out runs" in shown
 
 
 def test_effects_known_to_the_rig_are_read_as_the_rig_s(data, tmp_path, answer):

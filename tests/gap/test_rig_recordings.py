@@ -172,9 +172,9 @@ def test_what_goes_together_over_the_runs_is_said(made):
 
 def test_held_out_runs_cover_gains_and_trajectories(made):
     recordings = read_recordings(made)
-    sealed = RigProblem(recordings).sealed
-    held = [recording for recording in recordings if recording.name in sealed]
-    assert len(held) == len(sealed) == 2
+    held_out = RigProblem(recordings).held_out
+    held = [recording for recording in recordings if recording.name in held_out]
+    assert len(held) == len(held_out) == 2
     assert len({recording.gain for recording in held}) == 2
     assert len({recording.trajectory for recording in held}) == 2
 

@@ -1,4 +1,4 @@
-"""Find what the model lacks: compare it with measured runs, name the missing effect, prove it on runs kept aside.
+"""Find what the model lacks: compare it with measured runs, name the missing effect, validate it on held-out runs.
 
 Writes report.html, result.json, patch.yaml (the effects found, for --effects), plots, config.yaml and provenance.yaml.
 docs/gap.md says how to read the report.
@@ -40,7 +40,7 @@ class Options(EffectsOption):
     backend: str = "gibbs_appell"
     """Simulator of the robot: gibbs_appell or mujoco."""
     heldout: tuple[str, ...] = ()
-    """Runs to keep aside for the proof; default: chosen by what they can tell."""
+    """Runs to hold out for validation; default: chosen by how informative the other runs are."""
     threads: int | None = None
     """Worker threads; default: one per core."""
 
@@ -143,13 +143,13 @@ def _numbers(analysis: Analysis) -> Iterator[str]:
 
     for effect in analysis.effects:
         values = ", ".join(f"{name} {estimate(found)}" for name, found in effect.parameters.items())
-        told = [effect.formula, values, f"confidence {percent(effect.confidence)}"]
+        told = [effect.formula, values, f"selection frequency {percent(effect.confidence)}"]
         yield f"  {plain(effect.name)} at {places(effect.where)}: {'; '.join(filter(None, told))}"
     gap = analysis.gap
     if gap is not None:
         steps = [f"{error(gap.heldout_before)} as given", f"{error(gap.heldout_calibrated)} calibrated"]
         steps += [f"{error(gap.heldout_after)} with the effects"] if analysis.added else []
-        yield f"  error of the runs kept aside, 1 = sensor noise: {', '.join(steps)}; noise floor {error(gap.noise_floor)}"
+        yield f"  error of the held-out runs, 1 = sensor noise: {', '.join(steps)}; noise floor {error(gap.noise_floor)}"
         if analysis.added:
             yield f"  removed of the avoidable error: {removed(analysis)}"
 
@@ -158,6 +158,7 @@ def _advice(analysis: Analysis) -> Iterator[str]:
     from wlr_gym.gap.report.text import listed, plain
 
     for group in analysis.equivalent:
-        yield f"  cannot tell {listed([plain(name) for name in group.names], 'from')}; this run would: {group.separating_run}"
+        names = listed([plain(name) for name in group.names])
+        yield f"  not distinguishable: {names}; discriminating experiment: {group.separating_run}"
     for one in analysis.recommendations:
         yield f"  record next: {one.excitation}: {one.why}"

@@ -1,9 +1,9 @@
 """Fit a model to runs: quantities within their tolerances, and the unknowns of the effects it has.
 
-Maximum a posteriori by Gauss-Newton steps: residuals weighted by level and memory (:mod:`wlr_gym.gap.estimation.likelihood`),
-quantities drawn to their nominal values by their tolerances, unknowns of effects free within their plausible range. All columns
-of a step are simulated as one batch; between two simulations of them they are corrected by what each step really changed
-(Broyden's secant update), which costs nothing and keeps steps from creeping.
+Maximum a posteriori by Gauss-Newton steps: residuals weighted by level and autocorrelation
+(:mod:`wlr_gym.gap.estimation.likelihood`), quantities drawn to their nominal values by their tolerances, unknowns of effects
+free within their plausible range. All columns of a step are simulated as one batch; between two simulations of them they are
+corrected by what each step really changed (Broyden's secant update), which costs nothing and keeps steps from creeping.
 """
 
 from __future__ import annotations
@@ -31,18 +31,20 @@ Array = NDArray[np.float64]
 
 #: Step of finite differences in a quantity, in tolerances.
 STEP = 0.5
-#: Shares of a step that are tried; the best is taken.
+#: Shares of a step that are tried; the best is used.
 SHARES = (2.0, 1.0, 0.5, 0.2, 0.05)
 #: Steps that are taken before the columns are simulated anew.
 CHORDS = 10
-#: Sticking friction makes the cost rough on this scale; so many full steps are taken in the end if it rises by no more.
-ROUGH, RELAXATIONS = 3.0, 2
+#: Sticking friction makes the cost rough on this scale: RELAXATIONS full steps are taken in the end if it rises by no more.
+ROUGH = 3.0
+RELAXATIONS = 2
 #: Stiffness, in tolerances, that holds a number on its bound.
 PINNED = 1e9
-#: A step that gains less than this (in minus two log posterior) is the last with its columns; new columns that gain less than
-#: RENEWED are the last of a fit.
-SETTLED, RENEWED = 0.5, 2.0
-#: A number of which the data say less than this share of what its tolerance says hardly moves: columns once simulated will do.
+#: A step that gains less than this (in minus two log posterior) is the last with its columns.
+CONVERGED = 0.5
+#: New columns that gain less than this are the last of a fit.
+RENEWED = 2.0
+#: A number whose information in the data is below this share of that in its tolerance hardly moves: its first columns suffice.
 IDLE = 1.0
 
 
@@ -54,7 +56,7 @@ class Fit:
         model: the best found.
         residuals: of it, one (rows, channels) per run.
         noise: of these residuals.
-        cost: minus two log posterior, up to a constant that is the same for all models with the same ``memory``.
+        cost: minus two log posterior, up to a constant that is the same for all models with the same ``autocorrelation_time``.
         columns: one (numbers, rows x channels) array per run: change of the residuals per scaled number (quantities in
             tolerances, unknowns in their steps), at or near the best model; unweighted, NaN as 0.
         hessian: (numbers, numbers) of half the cost, scaled numbers, tolerances included; numbers on their bounds are pinned.
@@ -72,13 +74,13 @@ class Fit:
     converged: bool = False
 
     def covariance(self) -> Array:
-        """Covariance (numbers, numbers) of the scaled numbers: an imperfect simulator's word counts less, tolerances once."""
+        """Covariance (numbers, numbers) of the scaled numbers: the likelihood tempered, tolerances counted once."""
         return np.asarray(np.linalg.inv(self.precision), np.float64)
 
 
-def cheapest(problem: Problem, fits: Sequence[Fit], memory: Array) -> Fit:
-    """Return the fit with the lowest cost under one memory: each under its own would compare nothing."""
-    return min(fits, key=lambda whole: total_cost(problem, whole.model, whole.residuals, memory))
+def cheapest(problem: Problem, fits: Sequence[Fit], autocorrelation_time: Array) -> Fit:
+    """Return the fit with the lowest cost under one autocorrelation time: otherwise costs are not comparable."""
+    return min(fits, key=lambda whole: total_cost(problem, whole.model, whole.residuals, autocorrelation_time))
 
 
 def linearise(
@@ -123,12 +125,12 @@ def idle_numbers(
 ) -> NDArray[np.bool_]:
     """Return of which numbers (numbers) the data say little beside their tolerances; unknowns of effects never are."""
     count, channels = len(problem.quantities), len(noise.weight)
-    told = np.zeros(count)
+    information = np.zeros(count)
     for column in columns:
         known = column[:count].reshape(count, -1, channels)
-        told += np.einsum("krc,krc->kc", known, known) @ noise.weight
+        information += np.einsum("krc,krc->kc", known, known) @ noise.weight
     idle = np.zeros(model.size, bool)
-    idle[:count] = told < IDLE * prior_tightness(problem, model)[:count]
+    idle[:count] = information < IDLE * prior_tightness(problem, model)[:count]
     return idle
 
 
@@ -143,7 +145,7 @@ def fit(
     runs: Sequence[int],
     model: FittedModel,
     *,
-    memory: Array | None = None,
+    autocorrelation_time: Array | None = None,
     scatter: float = 1.0,
     columns: list[NDArray[np.float32]] | None = None,
     near: Fit | None = None,
@@ -157,13 +159,13 @@ def fit(
         problem: the system.
         runs: which of its runs.
         model: where to start, with the effects to be fitted.
-        memory: of the residuals where it is known already, and must be the same; None = estimated where each descent begins.
+        autocorrelation_time: of the models that this one is compared with; None = estimated where each descent begins.
         scatter: of the runs; see :class:`wlr_gym.gap.estimation.likelihood.Noise`.
         columns: responses near ``model`` where they are known.
         near: a fit of the same numbers, or of all but the last of them, whose columns serve for idle ones.
         steps: at most this many Gauss-Newton steps.
         renew: simulate the columns, but idle ones, anew at every step; otherwise only once, where ``columns`` are missing.
-        tell: told of progress.
+        tell: information of progress.
     """
     if columns is not None:
         residuals = [r[0] for r in problem.residuals([model.setting], runs)]
@@ -173,18 +175,18 @@ def fit(
         residuals, columns = linearise(problem, model, runs)
     gained = np.inf
     for step in range(steps):
-        model, residuals, gained = _descend(problem, runs, model, columns, residuals, memory, scatter)
+        model, residuals, gained = _descend(problem, runs, model, columns, residuals, autocorrelation_time, scatter)
         tell(f"step {step + 1} of {steps}: {gained:.0f} better")
         if gained < RENEWED or not renew or step == steps - 1:
             break
-        residuals, columns = linearise(problem, model, runs, columns, estimate_noise(residuals, memory, scatter))
-    model, residuals = _relaxed(problem, runs, model, columns, residuals, memory, scatter)
-    noise = estimate_noise(residuals, memory, scatter)
+        residuals, columns = linearise(problem, model, runs, columns, estimate_noise(residuals, autocorrelation_time, scatter))
+    model, residuals = _relaxed(problem, runs, model, columns, residuals, autocorrelation_time, scatter)
+    noise = estimate_noise(residuals, autocorrelation_time, scatter)
     matrix, _ = normal_equations(columns, residuals, noise)
     pinned = np.diag(PINNED * on_bounds(problem, model))
     hessian = matrix + np.diag(prior_tightness(problem, model)) + pinned
-    precision = matrix / problem.firmness + np.diag(tightness_once(problem, model)) + pinned
-    cost = total_cost(problem, model, residuals, noise.memory)
+    precision = matrix / problem.tempering + np.diag(tightness_once(problem, model)) + pinned
+    cost = total_cost(problem, model, residuals, noise.autocorrelation_time)
     return Fit(model, residuals, noise, cost, columns, hessian, precision, bool(gained < RENEWED))
 
 
@@ -194,26 +196,30 @@ def _descend(
     model: FittedModel,
     columns: Sequence[NDArray[np.float32]],
     residuals: list[Array],
-    memory: Array | None,
+    autocorrelation_time: Array | None,
     scatter: float,
 ) -> tuple[FittedModel, list[Array], float]:
     """Go downhill from ``model``, whose residuals are given, with the columns simulated there; return also how far it went."""
-    memory = estimate_noise(residuals, scatter=scatter).memory if memory is None else memory  # one hill, not another each step
-    secant, cost = list(columns), total_cost(problem, model, residuals, memory)
+    autocorrelation_time = (
+        estimate_noise(residuals, scatter=scatter).autocorrelation_time
+        if autocorrelation_time is None
+        else autocorrelation_time
+    )  # the same cost in all steps
+    secant, cost = list(columns), total_cost(problem, model, residuals, autocorrelation_time)
     top = cost
     for _ in range(CHORDS):
-        noise = estimate_noise(residuals, memory, scatter)
+        noise = estimate_noise(residuals, autocorrelation_time, scatter)
         change = gauss_newton_step(problem, model, secant, residuals, noise)
         tries = [moved(problem, model, share * change) for share in SHARES]
         found = problem.residuals([m.setting for m in tries], runs)
-        costs = [total_cost(problem, m, [r[k] for r in found], memory) for k, m in enumerate(tries)]
+        costs = [total_cost(problem, m, [r[k] for r in found], autocorrelation_time) for k, m in enumerate(tries)]
         best = int(np.argmin(costs))
         gained = cost - costs[best]
         if not gained > 0.0:
             break
         taken = scaled_numbers(problem, tries[best]) - scaled_numbers(problem, model)
         before, model, residuals, cost = residuals, tries[best], [r[best] for r in found], costs[best]
-        if gained < SETTLED:
+        if gained < CONVERGED:
             break
         secant = [corrected(c, taken, old, new) for c, old, new in zip(secant, before, residuals, strict=True)]
     return model, residuals, top - cost
@@ -225,16 +231,16 @@ def _relaxed(
     model: FittedModel,
     columns: Sequence[NDArray[np.float32]],
     residuals: list[Array],
-    memory: Array | None,
+    autocorrelation_time: Array | None,
     scatter: float,
 ) -> tuple[FittedModel, list[Array]]:
-    """Take full steps that a rough cost hides: along what the data cannot tell apart, tolerances alone decide."""
+    """Take full steps that a rough cost hides: where the data cannot distinguish numbers, tolerances alone decide."""
     for _ in range(RELAXATIONS):
-        noise = estimate_noise(residuals, memory, scatter)
-        cost = total_cost(problem, model, residuals, noise.memory)
+        noise = estimate_noise(residuals, autocorrelation_time, scatter)
+        cost = total_cost(problem, model, residuals, noise.autocorrelation_time)
         other = moved(problem, model, gauss_newton_step(problem, model, columns, residuals, noise))
         found = [r[0] for r in problem.residuals([other.setting], runs)]
-        if total_cost(problem, other, found, noise.memory) > cost + ROUGH:
+        if total_cost(problem, other, found, noise.autocorrelation_time) > cost + ROUGH:
             break
         model, residuals = other, found
     return model, residuals
@@ -245,5 +251,5 @@ def widened(problem: Problem, runs: Sequence[int], found: Fit) -> Fit:
     free = ~on_bounds(problem, found.model)
     matrices, vectors = equations_by_run(found)
     differ = run_scatter(matrices[:, free][:, :, free], vectors[:, free])
-    scatter = found.noise.scatter if differ is None else max(problem.firmness * found.noise.scatter * differ, 1.0)
+    scatter = found.noise.scatter if differ is None else max(problem.tempering * found.noise.scatter * differ, 1.0)
     return fit(problem, runs, found.model, scatter=scatter, columns=found.columns, steps=1)

@@ -118,11 +118,11 @@ def _bounds(problem: Problem, model: FittedModel) -> tuple[Array, Array]:
 def prior_tightness(problem: Problem, model: FittedModel) -> Array:
     """Weight (numbers) of what is known beforehand, scaled: tolerances; unknowns lie within half their range of neutral.
 
-    It counts ``problem.firmness`` times, but for numbers that drift.
+    It counts ``problem.tempering`` times, but for numbers that drift.
     """
     drifts = [quantity.drifts for quantity in problem.quantities]
-    firmness = np.where([*drifts, *(False,) * (model.size - len(drifts))], 1.0, problem.firmness)
-    return firmness * tightness_once(problem, model)
+    tempering = np.where([*drifts, *(False,) * (model.size - len(drifts))], 1.0, problem.tempering)
+    return tempering * tightness_once(problem, model)
 
 
 def tightness_once(problem: Problem, model: FittedModel) -> Array:
@@ -137,6 +137,6 @@ def prior_cost(problem: Problem, model: FittedModel) -> float:
     return float(prior_tightness(problem, model) @ away**2)
 
 
-def total_cost(problem: Problem, model: FittedModel, residuals: Sequence[Array], memory: Array) -> float:
+def total_cost(problem: Problem, model: FittedModel, residuals: Sequence[Array], autocorrelation_time: Array) -> float:
     """Return minus two log posterior."""
-    return minus_two_log_likelihood(residuals, memory) + prior_cost(problem, model)
+    return minus_two_log_likelihood(residuals, autocorrelation_time) + prior_cost(problem, model)

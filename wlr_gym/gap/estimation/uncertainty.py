@@ -18,7 +18,7 @@ TWO_SIDED_95 = 1.96
 
 
 def two_sided_95(degrees: int) -> float:
-    """Return Student's t: half of a 95 % interval in standard errors that so many degrees of freedom tell."""
+    """Return Student's t: half of a 95 % interval in standard errors known to so many degrees of freedom."""
     return float(stdtrit(degrees, 0.975))
 
 
@@ -26,8 +26,8 @@ def covariance(problem: Problem, fit: Fit) -> Array:
     """Return the covariance (numbers, numbers) of all numbers, in their units, as wide as 1.96 of its sigmas must be for 95 %.
 
     From the curvature of the likelihood; where leaving out one run after the other (jackknife, one Newton step each) shows more
-    spread, which is what differs from run to run, the number's row and column are widened to that. A spread that a few runs
-    tell is known to a few degrees of freedom only: it counts Student's t over 1.96 times.
+    spread, which is what differs from run to run, the number's row and column are widened to that. A spread of a few runs
+    is known to a few degrees of freedom only: it is multiplied by Student's t over 1.96.
     """
     curvature = fit.covariance()
     matrices, vectors = equations_by_run(fit)
@@ -49,7 +49,7 @@ def covariance(problem: Problem, fit: Fit) -> Array:
 def half_widths(problem: Problem, fit: Fit) -> Array:
     """Return half of the 95 % interval of every number (numbers), in its unit; see :func:`covariance`.
 
-    A known number is never known less than beforehand, to 1.96 tolerances, unless it drifts; and on its bound no better.
+    A calibrated parameter is never known less than by its prior, to 1.96 tolerances, unless it drifts; on its bound no better.
     """
     halves = TWO_SIDED_95 * np.sqrt(np.diag(covariance(problem, fit)))
     beforehand = TWO_SIDED_95 * scales(problem, fit.model)
@@ -61,9 +61,9 @@ def half_widths(problem: Problem, fit: Fit) -> Array:
 def estimates(problem: Problem, fit: Fit) -> list[dict[str, ParameterEstimate]]:
     """Return the parameters of each of the model's effects with 95 % intervals.
 
-    To what the data leave open comes what two simulators of one system disagree by (``problem.disagreement``), the same share
-    of all unknowns that say how large an effect is. An unknown that adds to known numbers is known no better than they are:
-    data tell the sum, and only the small errors of simulated responses make it look otherwise.
+    Added to the uncertainty of the fit is the disagreement of two simulators of one system (``problem.disagreement``), the same
+    share of all unknowns that say how large an effect is. An unknown that adds to calibrated parameters is known no better than
+    they are: only the sum is identifiable, up to the small errors of simulated responses.
     """
     spread = covariance(problem, fit)
     found, at = [], len(problem.quantities)
@@ -71,14 +71,14 @@ def estimates(problem: Problem, fit: Fit) -> list[dict[str, ParameterEstimate]]:
         own = slice(at, at + len(values))
         sizes = [(v - u.neutral) * u.is_size for u, v in zip(candidate.unknowns, values, strict=True)]
         away = problem.disagreement * np.array(sizes)
-        untold = np.diag(np.maximum(_untold(candidate) - np.diag(spread)[own], 0.0))
-        found.append(_with_intervals(candidate, np.array(values), spread[own, own] + np.outer(away, away) + untold))
+        hidden = np.diag(np.maximum(_unidentifiable(candidate) - np.diag(spread)[own], 0.0))
+        found.append(_with_intervals(candidate, np.array(values), spread[own, own] + np.outer(away, away) + hidden))
         at += len(values)
     return found
 
 
-def _untold(candidate: Candidate) -> Array:
-    """Least variance (unknowns) of what is told only as a sum with known numbers: that of their mean."""
+def _unidentifiable(candidate: Candidate) -> Array:
+    """Least variance (unknowns) of what is identifiable only as a sum with calibrated parameters: that of their mean."""
     met = candidate.tolerances or (None,) * len(candidate.unknowns)
     return np.array([0.0 if one is None or one.replaces else one.size**2 / len(one.quantities) for one in met])
 

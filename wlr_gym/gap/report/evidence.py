@@ -6,10 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from wlr_gym.gap.analysis import Analysis, Evidence, FoundEffect
+from wlr_gym.gap.analysis import REJECTED, SELECTED, Analysis, Evidence, FoundEffect
 from wlr_gym.gap.problem import Range
 from wlr_gym.gap.report.html import heading, section, table
-from wlr_gym.gap.report.plots import SCREENED_OUT
 from wlr_gym.gap.report.text import estimate, listed, number, percent, places, plain, unit_of
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT
 
@@ -19,17 +18,18 @@ def evidence_section(analysis: Analysis, picture: str) -> str:
     parts = [_effect(effect) for effect in analysis.effects]
     if analysis.equivalent:
         rows = [(listed([plain(name) for name in group.names], "or"), group.separating_run) for group in analysis.equivalent]
-        parts += [heading("What these data cannot tell apart"), table(("one of", "the run that would tell"), rows)]
+        parts += [heading("Effects not distinguishable in these data"), table(("one of", "discriminating experiment"), rows)]
     if analysis.evidence:
         rounds = sorted({one.round for one in analysis.evidence})
-        parts += [heading("What was weighed"), _WEIGHED, picture]
+        parts += [heading("Candidates compared"), _COMPARED, picture]
         parts += [_evidence([one for one in analysis.evidence if one.round == turn], turn) for turn in rounds]
     return section("What", *parts)
 
 
-_WEIGHED = """<p>Every candidate was scored by what it promises to add to the calibrated model (a linear estimate). The best
-were added and refitted together with all known numbers: their <i>gain</i> is the fall of minus two log posterior, of which
-chance alone buys about 1 for each fitted number. One effect is taken per round, then the search starts again.</p>"""
+_COMPARED = """<p>Every candidate was scored by its <i>predicted</i> improvement of the calibrated model (score test, a linear
+estimate). The best were added and refitted together with all calibrated parameters: their <i>gain</i> is the fall of minus two
+log posterior, of which chance alone gives about 1 for each fitted number. One effect is selected per round, then the search
+starts again.</p>"""
 
 
 def _effect(effect: FoundEffect) -> str:
@@ -45,9 +45,9 @@ def _effect(effect: FoundEffect) -> str:
         [
             heading(f"{plain(effect.name).capitalize()}: {places(effect.where)}"),
             f"<p>{escape(meaning)} In files: <code>{escape(effect.name)}</code>, where <code>{escape(', '.join(effect.where))}"
-            f"</code>. Confidence {percent(effect.confidence)}.</p>",
+            f"</code>. Selection frequency {percent(effect.confidence)}.</p>",
             f"<p>Law: <code>{escape(law)}</code></p>" if law else unlawful,
-            *([f"<p>Tried where {_tried(effect.validity)}; beyond, nothing is known of it.</p>"] if effect.validity else []),
+            *([f"<p>Tried where {_tried(effect.validity)}; beyond, it is untested.</p>"] if effect.validity else []),
             table(("parameter", "value (95 % interval)"), rows),
         ]
     )
@@ -59,33 +59,33 @@ def _tried(validity: Mapping[str, Range]) -> str:
 
 
 def _evidence(evidence: Sequence[Evidence], turn: int) -> str:
-    fitted = sorted((one for one in evidence if one.outcome != SCREENED_OUT), key=_rank)
+    fitted = sorted((one for one in evidence if one.outcome != REJECTED), key=_rank)
     rows = [
         (plain(one.name), places(one.where), _values(one), number(one.gain), number(one.screened), one.outcome, one.reason)
         for one in fitted
     ]
-    rows += [_screened_out(alike) for alike in _by_name([one for one in evidence if one.outcome == SCREENED_OUT])]
-    classes = ["taken" if one.outcome == "taken" else "" for one in fitted] + [""] * (len(rows) - len(fitted))
-    headings = ("candidate", "where", "values", "gain", "promised", "outcome", "why")
+    rows += [_rejected(alike) for alike in _by_name([one for one in evidence if one.outcome == REJECTED])]
+    classes = ["selected" if one.outcome == SELECTED else "" for one in fitted] + [""] * (len(rows) - len(fitted))
+    headings = ("candidate", "where", "values", "gain", "predicted", "outcome", "reason")
     return (
-        heading(f"Round {turn}: {len(evidence)} explanation{'s' if len(evidence) > 1 else ''} weighed")
+        heading(f"Round {turn}: {len(evidence)} candidate{'s' if len(evidence) > 1 else ''} compared")
         + "\n"
         + table(headings, rows, {3, 4}, classes)
     )
 
 
 def _rank(one: Evidence) -> tuple[bool, float]:
-    """Order of the fitted: the taken one, then by gain."""
-    return one.outcome != "taken", -one.gain if math.isfinite(one.gain) else math.inf
+    """Order of the fitted: the selected one, then by gain."""
+    return one.outcome != SELECTED, -one.gain if math.isfinite(one.gain) else math.inf
 
 
 def _by_name(evidence: Sequence[Evidence]) -> list[list[Evidence]]:
-    """Put the places of an effect together; what promised most first, within and without."""
+    """Put the places of an effect together, the largest predicted improvement first."""
     ordered = sorted(evidence, key=lambda one: -one.screened if math.isfinite(one.screened) else math.inf)
     return [[one for one in ordered if one.name == name] for name in dict.fromkeys(one.name for one in ordered)]
 
 
-def _screened_out(alike: Sequence[Evidence]) -> tuple[str, ...]:
+def _rejected(alike: Sequence[Evidence]) -> tuple[str, ...]:
     best, others = alike[0], len(alike) - 1
     more = f"; less at {others} other place{'s' if others > 1 else ''}" if others else ""
     return plain(best.name), f"{places(best.where)}{more}", "", "-", number(best.screened), best.outcome, best.reason

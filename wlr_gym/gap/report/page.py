@@ -62,16 +62,16 @@ CAPTIONS = {
     "where": "In which states the calibrated model is wrong: each row a measured channel, each column a range of what is named "
     "below. The numbers are rms errors; about 1 is what sensor noise alone would leave, grey is a range without data.",
     "localisation": "Which measured channels hold the gap, and how much of it.",
-    "relations": "Which relations of the model could hold the gap: what the best law that acts there alone promises. The true "
-    "place is among the longest bars; others are long because they move the robot in a similar way.",
+    "relations": "Which relations of the model could hold the gap: the predicted improvement by the best law that acts there "
+    "alone. The true place is among the longest bars; others are long because they move the robot in a similar way.",
     "overlays": "Measured runs, and the same runs replayed by the model. Below each: the error as it is counted "
     "(pose and wheel angles: since a window of some 2 s began, x and y along and across its heading; what shakes on the tyres: "
     "averaged, noise keeps its size); the green band is two standard deviations of sensor noise.",
-    "gap": "Error of replayed runs. Left: over the runs kept aside, with the 95 % interval of what the effects bought. Right: "
-    "run by run.",
-    "channels": "The same for each measured channel, over the runs kept aside.",
-    "evidence": "What each candidate would buy: all that were fitted, and the best that were not. Long bars are good "
-    "explanations; the one that was taken is dark.",
+    "gap": "Error of replayed runs. Left: over the held-out runs, with the 95 % interval of the reduction by the effects. "
+    "Right: run by run.",
+    "channels": "The same for each measured channel, over the held-out runs.",
+    "evidence": "By how much each candidate improves the fit: all that were fitted, and the best that were not. The "
+    "selected one is dark.",
 }
 
 
@@ -110,7 +110,7 @@ def _header(analysis: Analysis) -> str:
     if analysis.fit_runs:
         facts.append(f"fitted to {_runs(analysis.fit_runs)}")
     if analysis.heldout_runs:
-        facts.append(f"checked on {_runs(analysis.heldout_runs)}, which no fit and no decision has seen")
+        facts.append(f"validated on {_runs(analysis.heldout_runs)}, held out from every fit and decision")
     known = [str(effect.get("name", "")) for effect in analysis.known_effects]
     if known:
         facts.append(f"known from the start: {escape(listed([plain(name) for name in known]))}")
@@ -132,12 +132,12 @@ def _tiles(analysis: Analysis) -> str:
     tiles = [(error(gap.heldout_before), "error of the model as given"), (error(gap.heldout_calibrated), "after calibration")]
     if analysis.added:
         tiles.append((error(gap.heldout_after), "with the effects added"))
-    tiles.append((error(gap.noise_floor), "noise floor: as good as it can get"))
+    tiles.append((error(gap.noise_floor), "noise floor: what a perfect model reaches"))
     if analysis.added:
         tiles.append((percent(gap.reduction), f"of the avoidable error removed; {interval(analysis)}"))
     items = "".join(f"<li><b>{escape(value)}</b>{escape(text)}</li>" for value, text in tiles)
     return (
-        f'<ul class="figures">{items}</ul>\n<p class="small">Errors are of the runs kept aside, replayed by the model with the '
+        f'<ul class="figures">{items}</ul>\n<p class="small">Errors are of the held-out runs, replayed by the model with the '
         f"commands of the measured run: {escape(gap.metric)}; 1 = the noise of the sensors.</p>"
     )
 
@@ -152,8 +152,8 @@ def _where(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
     if not any((rows, *shown)):
         return ""
     text = (
-        "<p>First the model was calibrated: its known numbers were moved within their tolerances until it fits the runs as "
-        "well as it can. What is still wrong then is shown here.</p>"
+        "<p>First the model was calibrated: its parameters were moved within their tolerances until it fits the runs as well "
+        "as it can. The error that is left is shown here.</p>"
     )
     if analysis.turning:
         text += f"<p>With the final model, {escape(turned(analysis.turning))}.</p>"
@@ -171,7 +171,7 @@ def _how_much(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
     headings = ("as given", "calibrated", "with effects")[: 3 if analysis.added else 2]
     of_runs = (*headings, "removed") if analysis.added else headings
     runs = [
-        (one.run, "kept aside" if one.heldout else "fitted", *(*_errors(one), percent(one.reduction))[: len(of_runs)])
+        (one.run, "held out" if one.heldout else "fitted", *(*_errors(one), percent(one.reduction))[: len(of_runs)])
         for one in analysis.run_gaps
     ]
     channels = [
@@ -196,15 +196,16 @@ def _gap_in_words(gap: GapFigures, analysis: Analysis) -> str:
     added = f", {error(gap.heldout_after)} with the effects" if analysis.added else ""
     text = (
         f"<p>Error of replayed runs ({escape(gap.metric)}; 1 = sensor noise). Runs that were fitted: {error(gap.fit_before)} "
-        f"before, {error(gap.fit_after)} after. Runs kept aside: {error(gap.heldout_before)} as given, "
+        f"before, {error(gap.fit_after)} after. Held-out runs: {error(gap.heldout_before)} as given, "
         f"{error(gap.heldout_calibrated)} calibrated{added}; noise floor {error(gap.noise_floor)}.</p>"
     )
     if not analysis.added:
         return text
     return (
-        f"{text}\n<p>What was found removes {removed(analysis)} of the avoidable error of the runs kept aside: of the distance "
-        "from the calibrated model to the noise floor. Negative would be: it makes them worse. The interval is Student's, with "
-        f"as many degrees of freedom as there are runs kept aside, less one; fewer than {LEAST_FOR_INTERVAL} give none.</p>"
+        f"{text}\n<p>What was found removes {removed(analysis)} of the avoidable error of the held-out runs: of the distance "
+        "from the calibrated model to the noise floor. A negative value means that it makes them worse. The interval is "
+        "Student's, with as many degrees of freedom as there are held-out runs, less one; fewer than "
+        f"{LEAST_FOR_INTERVAL} give none.</p>"
     )
 
 
@@ -212,7 +213,7 @@ def _how_sure(analysis: Analysis) -> str:
     parts = []
     if analysis.effects:
         rows = [(plain(effect.name), places(effect.where), percent(effect.confidence)) for effect in analysis.effects]
-        parts += [_SURE, table(("effect", "where", "confidence"), rows, {2})]
+        parts += [_SELECTION_FREQUENCY, table(("effect", "where", "selection frequency"), rows, {2})]
     if analysis.adequacy:
         parts += [heading("Is anything left?"), _adequacy(analysis.adequacy)]
     if analysis.detectable:
@@ -231,9 +232,9 @@ def _adequacy(found: Adequacy) -> str:
     pulled = found.pulled
     rows = [
         ("level", "error of all channels, units of sensor noise", *_statistic(found.level)),
-        ("whiteness", "rows that say the same, geometric mean of the channels", *_statistic(found.whiteness)),
-        ("constancy", "scatter of the runs over what their rows promise", *_statistic(found.constancy)),
-        ("", f"standard errors by which {pulled.run} pulls {pulled.number}: the most", *_statistic(pulled.errors)),
+        ("whiteness", "integrated autocorrelation time in rows, geometric mean of the channels", *_statistic(found.whiteness)),
+        ("constancy", "scatter of the runs' estimates over what their rows predict", *_statistic(found.constancy)),
+        ("", f"standard errors by which {pulled.run} pulls {pulled.number}: the largest", *_statistic(pulled.errors)),
     ]
     rows += [(f"level: {name}", channel(name), *_statistic(level)) for name, (level, _) in left]
     rows += [(f"whiteness: {name}", channel(name), *_statistic(white)) for name, (_, white) in left]
@@ -248,15 +249,14 @@ def _statistic(found: Statistic) -> tuple[str, ...]:
     return error(found.value), error(found.expected), error(found.limit), error(found.ratio), error(found.p)
 
 
-_ADEQUACY = """<p>This decides nothing. No simulator is right to the last digit, and such tests notice the last digit: with real
-runs they always reject. What counts is how many times larger than expected. Of runs that another simulator of the same robot
-made, with nothing missing, it was 1.1 to 1.7 (level, whiteness) and 1.4 to 1.5 (constancy); where one wheel stood on a slippery
-floor 10, 3.7 and 5.2 before that was in the model, and 2.1, 2.0 and 1.8 with it. One channel in 20 lies beyond its limit by
-chance.</p>"""
-_SURE = """<p>Confidence: the fitted runs are drawn again and again, with replacement, each with its part in what every
-explanation buys (nothing is fitted anew). It is the share of these draws in which the effect buys enough, the runs agree, and
-no other effect buys more; of an effect without a formula, in which it is as clear. A 95 % interval misses the true number in
-one of 20 cases, provided that nothing else is wrong with the model.</p>"""
+_ADEQUACY = """<p>No decision depends on this. No simulator is exact, and such tests notice that: with real runs they always
+reject. What matters is how many times larger than expected. Of runs that another simulator of the same robot made, with
+nothing missing, it was 1.1 to 1.7 (level, whiteness) and 1.4 to 1.5 (constancy); where one wheel stood on a slippery floor 10,
+3.7 and 5.2 before that was in the model, and 2.1, 2.0 and 1.8 with it. One channel in 20 exceeds its limit by chance.</p>"""
+_SELECTION_FREQUENCY = """<p>Selection frequency (bootstrap): the fitted runs are drawn again and again, with replacement, each
+with its part in the gain of every candidate (nothing is refitted). It is the share of these draws in which the effect improves
+the fit enough, the runs agree, and no other effect improves it more; of an effect without a formula, in which it is as clear.
+A 95 % interval misses the true number in one of 20 cases, provided that nothing else is wrong with the model.</p>"""
 _DETECTABLE = """<p>The smallest size of each effect that would have been noticed, at the place where it is hardest to see.
 Smaller ones may be there. Of an effect with several directions (a displaced mass: x, y, z) it is the direction that shows best:
 in another it may stay hidden at any size.</p>"""
@@ -270,11 +270,8 @@ def _next(analysis: Analysis) -> str:
         if known:
             parts.append("<p>Drive them on the robot, or write their command files with <code>--commands-only</code>:</p>")
             parts.append(commands(record_commands(known)))
-    items = [
-        f"<li>{escape(group.separating_run)}: tells {escape(listed([plain(name) for name in group.names], 'from'))}.</li>"
-        for group in analysis.equivalent
-        if group.separating_run
-    ]
+    named = [(one.separating_run, listed([plain(name) for name in one.names], "from")) for one in analysis.equivalent]
+    items = [f"<li>{escape(run)}: distinguishes {escape(names)}.</li>" for run, names in named if run]
     return section("What to run next", *parts, f"<ul>{''.join(items)}</ul>" if items else "")
 
 
@@ -285,9 +282,9 @@ def _calibration(analysis: Analysis) -> str:
     if not analysis.calibration:
         return ""
     text = (
-        "<p>Numbers of the model that are known only to a tolerance were fitted before anything was called missing. "
+        "<p>Parameters that are known only to a tolerance were fitted before anything was called missing. "
         "<i>Moved</i> counts in tolerances: where a number has moved as far as it may (2.5; biases of sensors 4), doubt the "
-        "tolerance or the model; its interval is set to 1.96 tolerances, as the fit tells none.</p>"
+        "tolerance or the model; its interval is set to 1.96 tolerances, as the fit gives none.</p>"
     )
     headings, right = ("number", "unit", "nominal", "fitted", "± (95 %)", "tolerance (1 sigma)", "moved"), {2, 3, 4, 5, 6}
     ordered = sorted(analysis.calibration.items(), key=lambda pair: -abs(_shift(pair[1])))

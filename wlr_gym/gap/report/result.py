@@ -65,7 +65,11 @@ class RangeEntry(_Entry):
 
 
 class EffectEntry(_Entry):
-    """One missing effect; ``formula`` is text with units, of unknown effects only, ``validity`` where it was tried."""
+    """One missing effect.
+
+    ``confidence`` is its selection frequency; ``formula`` is text with units, of unknown effects only, ``validity`` where
+    it was tried.
+    """
 
     name: str
     where: list[str]
@@ -77,7 +81,7 @@ class EffectEntry(_Entry):
 
 
 class CalibrationEntry(_Entry):
-    """A known number that calibration moved; ``sigma`` is its tolerance."""
+    """A calibrated parameter; ``sigma`` is its tolerance."""
 
     nominal: Number
     fitted: Number
@@ -97,7 +101,7 @@ class GapEntry(_Entry):
     """The gap: rms error of replayed runs, 1.0 = sensor noise.
 
     ``reduction`` lies in 0..1; ``reduction_signed`` is negative where the effects make held-out runs worse, and null where
-    calibration leaves nothing to remove and in results of versions that did not tell it. The interval is that of
+    calibration leaves nothing to remove and in results of versions without it. The interval is that of
     ``reduction_signed``, null where held-out runs are too few.
     """
 
@@ -114,7 +118,7 @@ class GapEntry(_Entry):
 
 
 class RelationEntry(_Entry):
-    """A relation of the model and what the best law there promises, as a fall of minus two log posterior."""
+    """A relation of the model and the predicted improvement of the best law there, as a fall of minus two log posterior."""
 
     name: str
     law: str
@@ -123,7 +127,7 @@ class RelationEntry(_Entry):
 
 
 class RunsEntry(_Entry):
-    """Names of the runs that were fitted to, and of those kept aside."""
+    """Names of the runs that were fitted to, and of the held-out ones."""
 
     fit: list[str]
     heldout: list[str]
@@ -165,13 +169,13 @@ class PulledEntry(StatisticEntry):
 
 
 class ConstancyEntry(StatisticEntry):
-    """How many times more than their rows promise the runs differ in where they pull the model's numbers."""
+    """Scatter of the runs' estimates of the model's numbers, over what their rows predict."""
 
     pulled_most: PulledEntry
 
 
 class TurningEntry(_Entry):
-    """What the final model leaves of a signal goes with its joint's turning; ``amplitude`` in noise units."""
+    """A signal's residual is periodic in its joint's angle; ``amplitude``: noise units, ``confidence``: selection frequency."""
 
     joint: str
     signal: str

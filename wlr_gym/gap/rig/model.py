@@ -1,7 +1,7 @@
-"""The rig's known numbers, the effects that may act in it, and what the compiled law reads of both.
+"""The rig's calibrated parameters, the effects that may act in it, and what the compiled law reads of both.
 
 Servo: XL330-M288-T by its data sheet (ROBOTIS e-manual: stall torque 0.52 N m, no load 103 rev/min, both at 5 V). That its gear
-has dry and viscous friction is known; how much, the runs must say.
+has dry and viscous friction is known; how much is fitted.
 """
 
 from __future__ import annotations

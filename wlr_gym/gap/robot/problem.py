@@ -39,7 +39,7 @@ CAP, STEPS = 50.0, 3
 LOST = 1e3
 #: See :class:`wlr_gym.gap.problem.Problem`: with 1, what two simulators of one robot do not share moves numbers by two to three
 #: tolerances.
-FIRMNESS = 3.0
+TEMPERING = 3.0
 #: Two simulators of one robot found sizes that differed by so much (root mean square over eight development sets).
 DISAGREEMENT = 0.04
 #: Settings that are worth a replay of their own by a faster kernel.
@@ -77,9 +77,9 @@ class RobotProblem:
         self.metric = f"RMS over channels of measured minus replayed, in units of sensor noise, windows of {window:g} s"
         if any(run.meta.profile != runs[0].meta.profile for run in runs):
             raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
-        self.cap, self.steps, self.firmness = CAP, STEPS, FIRMNESS
+        self.cap, self.steps, self.tempering = CAP, STEPS, TEMPERING
         self.disagreement = DISAGREEMENT
-        self.thorough, self.sealed, self.motions = False, (), SHOWN_BY
+        self.thorough, self.held_out, self.motions = False, (), SHOWN_BY
         self.turning: Mapping[str, tuple[str, tuple[str, ...]]] = {
             wheel: (f"joint_position[{wheel}]", tuple(f"{kind}_{wheel}" for kind in ("pos", "vel", "eff"))) for wheel in WHEELS
         }
