@@ -25,7 +25,7 @@ COMMANDS = {
     "play": "drive a robot in a window with keys or a gamepad, or into a video",
     "replay": "drive a simulator with the commands of measured runs and report where they part",
     "compare": "drive two plants with the same goals and report where they part, in noise units",
-    "gap": "find what the model lacks: compare with measured runs, name the missing effect, prove it on runs kept aside",
+    "gap": "find what the model lacks: compare with measured runs, name the missing effect, validate it on held-out runs",
     "record": "drive a robot or simulator through an excitation and write the measured run",
     "paper": "run the paper's experiments in several models and check its claims",
     "vision": "measure pose and slip from a video of the robot with ring markers",

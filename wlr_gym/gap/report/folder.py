@@ -13,9 +13,9 @@ from wlr_gym.gap.report.page import CAPTIONS, report
 from wlr_gym.gap.report.plots import draw
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, read_result, result_of, write_result
 
-REPORT_FILE, PLOTS = "report.html", "plots"
-
-
+REPORT_FILE = "report.html"
+#: Folder of the pictures.
+PLOTS = "plots"
 _OWN = {RESULT_FILE, PATCH_FILE, REPORT_FILE, PLOTS, CONFIG_FILE, PROVENANCE_FILE}
 
 

@@ -24,7 +24,8 @@ from wlr_gym.gap.report.text import closure, sentence, unit_of
 from wlr_gym.physics.effects import Patch, PatchEffect, save_patch
 from wlr_gym.physics.plants.forces import COORDINATES
 
-RESULT_FILE, PATCH_FILE = "result.json", "patch.yaml"
+RESULT_FILE = "result.json"
+PATCH_FILE = "patch.yaml"
 MADE_BY = "wlr gap"
 
 

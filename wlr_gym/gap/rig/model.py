@@ -29,7 +29,12 @@ Numbers = dict[str, float]
 
 #: The rig's one joint, where its effects act.
 JOINT = "servo"
-STALL_TORQUE, NO_LOAD_SPEED, DATA_SHEET_VOLTAGE = 0.52, 103 * 2 * math.pi / 60, 5.0
+#: Data sheet: N m at stall.
+STALL_TORQUE = 0.52
+#: Data sheet: rad/s without load.
+NO_LOAD_SPEED = 103 * 2 * math.pi / 60
+#: V, of both.
+DATA_SHEET_VOLTAGE = 5.0
 #: m/s2.
 GRAVITY = 9.81
 #: Duty per rad and unit of the Position P Gain register: counts of 2 pi/4096, /256 to PWM counts (the data confirm it).

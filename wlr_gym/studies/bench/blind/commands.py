@@ -12,7 +12,11 @@ Array = NDArray[np.float64]
 DOWN = np.pi / 2
 #: Half the span of leg angles that a run may ask for, around straight down.
 REACH = 1.12
-FRONT, REAR, LEFT, RIGHT = slice(0, 2), slice(2, 4), slice(0, 4, 2), slice(1, 4, 2)
+#: Corners, in the order left front, right front, left rear, right rear.
+FRONT = slice(0, 2)
+REAR = slice(2, 4)
+LEFT = slice(0, 4, 2)
+RIGHT = slice(1, 4, 2)
 NAMES = (
     "straight, accelerating and braking",
     "posture sweeps while driving",

@@ -16,8 +16,11 @@ from wlr_gym.studies.bench.blind.simulation import BlindProfile, simulate
 from wlr_gym.studies.bench.blind.truth import hide
 from wlr_gym.studies.bench.blind.world import build
 
-#: Profile registers a set may have; 0 = off.
-ACCELERATIONS, SPEEDS = (0.0, 7.490150, 11.235225, 14.980301, 22.470451), (0.959233, 1.438849, 1.918466)
+#: Profile registers a set may have; 0 = off. Wheels, rad/s2.
+ACCELERATIONS = (0.0, 7.490150, 11.235225, 14.980301, 22.470451)
+#: Legs, rad/s.
+SPEEDS = (0.959233, 1.438849, 1.918466)
+#: Legs, rad/s2.
 LEG_ACCELERATIONS = (0.0, 7.490150, 14.980301)
 
 
