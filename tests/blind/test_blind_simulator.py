@@ -9,14 +9,14 @@ from scipy.linalg import expm
 
 import wlr_gym.studies.bench.blind as blind
 from wlr_gym.base.paths import data_directory
-from wlr_gym.studies.bench.blind import cases, drive
+from wlr_gym.studies.bench.blind import cases, drive, simulation
 from wlr_gym.studies.bench.blind.copies import Copy, draw, nominal, read_robot
 from wlr_gym.studies.bench.blind.truth import NAMED, STRANGE, hide
 from wlr_gym.studies.bench.blind.world import build
 
 ROBOT = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
 DOWN = np.full(4, np.pi / 2)
-SHARP = drive.Profile(0.0, 0.0, 0.0)
+SHARP = simulation.BlindProfile(0.0, 0.0, 0.0)
 MASS = 3.0
 GRAVITY = 9.81
 WHEELS = ["wheel_lf", "wheel_rf", "wheel_lr", "wheel_rr"]
@@ -34,7 +34,9 @@ def simulate(goals, duration, effects=(), copy: Copy | None = None, start=DOWN, 
     if goals.ndim == 1:
         goals = np.tile(np.concatenate([start, goals]), (len(times), 1))
     hidden = hide(effects, copy)
-    return drive.simulate(build(copy, hidden), copy, hidden, profile, times, goals, np.asarray(start, dtype=float), duration)
+    return simulation.simulate(
+        build(copy, hidden), copy, hidden, profile, times, goals, np.asarray(start, dtype=float), duration
+    )
 
 
 def speed(records):

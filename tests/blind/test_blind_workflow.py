@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from wlr_gym.studies.bench import gap
+from wlr_gym.studies.bench import gap, gap_score_table
 from wlr_gym.studies.bench.blind.cases import case
 from wlr_gym.studies.bench.blind.score import intervals_hold, size_error
 
@@ -18,11 +18,11 @@ SETS = int(os.environ.get("WLR_BLIND_SETS", "1"))
 def test_workflow_against_sealed_truths(tmp_path):
     """From 200 sets on, every target; before that, that nothing breaks and no good data are refused."""
     report = gap.run_blind_test(gap.Plan(tmp_path, sets=SETS, processes=2))
-    print(gap.markdown(report))
+    print(gap_score_table.markdown(report))
     assert not report["failed"]
     assert report["false_alarms"]["refused_good_data"]["hits"] == 0
     if SETS >= 200:
-        assert not [line for line in gap.lines(report) if line.met == "no"]
+        assert not [line for line in gap_score_table.lines(report) if line.met == "no"]
 
 
 def analysed(folder, one):

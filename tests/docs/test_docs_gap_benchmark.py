@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from blocks import ROOT
 
-from wlr_gym.studies.bench.gap import Plan, markdown, read_answers, run_blind_test
+from wlr_gym.studies.bench.gap import Plan, read_answers, run_blind_test
+from wlr_gym.studies.bench.gap_score_table import markdown
 
 ANSWERS = ROOT / "docs" / "data" / "gap_answers.json"
 

@@ -14,12 +14,12 @@ from wlr_gym.gap.analysis import (
     ChannelGap,
     Detectable,
     Equivalent,
-    Estimate,
     Evidence,
     FoundEffect,
     GapFigures,
     HeatMap,
     IntakeFinding,
+    ParameterEstimate,
     Place,
     Pulled,
     Recommendation,
@@ -80,15 +80,15 @@ ADEQUACY = Adequacy(
 def evidence():
     found = [
         Evidence(
-            1, "rolling_resistance", ("wheel_lf", "wheel_rf"), {"coefficient": 0.0412}, 5312.4, 5120.0, "taken",
+            1, "rolling_resistance", ("wheel_lf", "wheel_rf"), {"coefficient": 0.0412}, 5312.4, 5120.0, "selected",
             "explains more than any other, in 6 of 6 runs", dict.fromkeys(FIT, 885.4),
         ),
         Evidence(
-            1, "coulomb_friction", ("wheel_lf", "wheel_rf"), {"torque": 0.046}, 4870.0, 5003.0, "weaker",
-            "buys 92 % of what the taken one buys", dict.fromkeys(FIT, 811.0),
+            1, "coulomb_friction", ("wheel_lf", "wheel_rf"), {"torque": 0.046}, 4870.0, 5003.0, "worse fit",
+            "improves the fit by 92 % of what the selected effect does", dict.fromkeys(FIT, 811.0),
         ),
         Evidence(
-            1, "external_force", ("body",), {"fx": -0.2, "fy": 0.0}, 310.0, 402.0, "weaker",
+            1, "external_force", ("body",), {"fx": -0.2, "fy": 0.0}, 310.0, 402.0, "worse fit",
             "pulls to one side only; these runs drive both ways",
         ),
         Evidence(
@@ -98,7 +98,11 @@ def evidence():
     for k, name in enumerate(EFFECTS):
         for place in JOINTS if EFFECTS[name].where == JOINTS else EFFECTS[name].where[:1]:
             score = 200.0 * np.exp(-0.35 * k)
-            found.append(Evidence(1, name, (place,), {}, score * 0.4, score, "screened out", "promises too little"))
+            found.append(
+                Evidence(
+                    1, name, (place,), {}, score * 0.4, score, "rejected at screening", "its predicted improvement is too small"
+                )
+            )
     found.append(
         Evidence(
             2, "viscous_friction", ("leg_lr",), {"coefficient": 0.01}, 31.0, 40.0, "too little", "less than chance may give"
@@ -134,7 +138,11 @@ EFFECT_FOUND = Analysis(
     heldout_runs=HELDOUT,
     effects=(
         FoundEffect(
-            "rolling_resistance", ("wheel_lf", "wheel_rf"), {"coefficient": Estimate(0.0412, 0.0383, 0.0447, "-")}, 0.97, 5312.4
+            "rolling_resistance",
+            ("wheel_lf", "wheel_rf"),
+            {"coefficient": ParameterEstimate(0.0412, 0.0383, 0.0447, "-")},
+            0.97,
+            5312.4,
         ),
     ),
     equivalent=(
@@ -179,7 +187,7 @@ NOTHING_MISSING = replace(
     verdict="nothing_missing",
     effects=(),
     equivalent=(),
-    evidence=tuple(one for one in EFFECT_FOUND.evidence if one.outcome == "screened out"),
+    evidence=tuple(one for one in EFFECT_FOUND.evidence if one.outcome == "rejected at screening"),
     gap=replace(
         GAP, heldout_before=2.31, heldout_calibrated=1.04, heldout_after=1.04, reduction=0.0, reduction_ci95=(0.0, 0.0)
     ),
@@ -197,7 +205,8 @@ UNKNOWN_EFFECT = replace(
     effects=(
         FoundEffect(
             "unknown_effect", ("leg_lr",),
-            {"k": Estimate(0.81, 0.74, 0.88, "N m/rad"), "a0": Estimate(1.21, 1.17, 1.25, "rad")}, 0.9, 2210.0,
+            {"k": ParameterEstimate(0.81, 0.74, 0.88, "N m/rad"),
+             "a0": ParameterEstimate(1.21, 1.17, 1.25, "rad")}, 0.9, 2210.0,
             "-k * (leg_angle - a0)", {"k": "N m/rad", "a0": "rad"}, {"leg_angle_lr": Range(0.9, 2.1, "rad")},
         ),
     ),

@@ -10,7 +10,7 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.gap.report import report as module
+from wlr_gym.gap.report.folder import save_analysis
 
 workflow = importlib.import_module("wlr_gym.gap.workflow")
 
@@ -33,13 +33,13 @@ def answer(monkeypatch):
             tell("calibrating", 0.3)
             tell("naming", 0.7)
             asked.update(options, data=folder)
-            module.save_analysis(analysis, out)
+            save_analysis(analysis, out)
             return analysis
 
         monkeypatch.setattr(workflow, "analyse", analyse)
         return asked
 
-    monkeypatch.setattr(module, "draw", lambda analysis: {"gap": b"\x89PNG"})
+    monkeypatch.setattr("wlr_gym.gap.report.folder.draw", lambda analysis: {"gap": b"\x89PNG"})
     return give
 
 
@@ -171,7 +171,7 @@ def test_what_is_left_is_printed(data, tmp_path, answer, capsys):
     answer(replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, heldout_after=2.2)))
     assert main(["gap", str(data), "--out", str(tmp_path / "out")]) == 0
     shown = printed(capsys)
-    assert "Not all is explained: in runs kept aside an error of 2.20 is left" in shown
+    assert "Not all is explained: an error of 2.20 is left in the held-out runs" in shown
 
 
 def test_effects_known_to_the_rig_are_read_as_the_rig_s(data, tmp_path, answer):

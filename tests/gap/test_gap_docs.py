@@ -27,23 +27,23 @@ def test_keys_of_the_result():
 
 
 def test_outcomes():
-    explained = set(re.findall(r"^- \*([a-z ]+)\*", PAGE, re.MULTILINE))
+    explained = set(re.findall(r"^- \*([a-z -]+)\*", PAGE, re.MULTILINE))
     assert explained == {
-        "taken",
+        "selected",
         "equivalent",
-        "weaker",
+        "worse fit",
         "too little",
         "inconsistent",
-        "does not carry over",
+        "fails cross-validation",
         "implausible",
         "within tolerance",
-        "dropped",
-        "screened out",
+        "removed",
+        "rejected at screening",
     }
     assert {one.outcome for one in EFFECT_FOUND.evidence} <= explained
 
 
 def test_runs_that_give_an_interval():
-    sealed = {runs: len(informative_split(Toy(runs=runs, rows=30))[1]) for runs in (6, 7)}
-    assert sealed[6] < LEAST_FOR_INTERVAL <= sealed[7]
+    held_out = {runs: len(informative_split(Toy(runs=runs, rows=30))[1]) for runs in (6, 7)}
+    assert held_out[6] < LEAST_FOR_INTERVAL <= held_out[7]
     assert "(seven runs in all, or `--heldout`)" in PAGE

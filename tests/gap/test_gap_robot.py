@@ -17,8 +17,8 @@ from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.record import record_simulation
 from wlr_gym.data.replay import replay
 from wlr_gym.data.write import write_run
-from wlr_gym.gap.analysis import Estimate
-from wlr_gym.gap.estimation.fit import Model, nominal_model
+from wlr_gym.gap.analysis import ParameterEstimate
+from wlr_gym.gap.estimation.model import FittedModel, nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.report.result import write_result
 from wlr_gym.gap.robot.candidates import ripple_order, robot_candidates
@@ -168,7 +168,7 @@ def test_effects_that_meet_a_known_number_know_its_tolerance(tried, good):
         quantities = nominal.quantities.copy()
         for k, quantity in enumerate(problem.quantities):
             quantities[k] += tolerances * quantity.sigma * (quantity.name in moved)
-        return within_tolerance(problem, Model(quantities).with_effect(chosen, values))
+        return within_tolerance(problem, FittedModel(quantities).with_effect(chosen, values))
 
     sigma = {name: problem.quantities[names.index(name)].sigma for name in names}
     radius = sigma["wheel.radius[wheel_lf]"] / ROBOT.wheel.radius
@@ -349,7 +349,7 @@ def test_every_formula_that_is_found_can_be_written_and_loaded(tmp_path):
     times = np.linspace(0.0, 10.0, 500)
     for k, candidate in enumerate(formula_candidates([times], [np.ones((len(times), len(CHANNELS)))])[1]):
         values = candidate.effect([0.1] * len(candidate.unknowns)).parameters
-        fitted = {u.name: Estimate(values[u.name], 0.0, 0.2, u.unit) for u in candidate.unknowns}
+        fitted = {u.name: ParameterEstimate(values[u.name], 0.0, 0.2, u.unit) for u in candidate.unknowns}
         done = replace(EFFECT_FOUND, effects=(found_effect(candidate, fitted, 1.0, 50.0),))
         folder = tmp_path / str(k)
         folder.mkdir()

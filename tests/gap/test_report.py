@@ -13,10 +13,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CHANNELS, COLUMNS
-from wlr_gym.gap.analysis import Analysis, ChannelGap, Estimate, Evidence, FoundEffect, HeatMap, IntakeFinding, Place
-from wlr_gym.gap.report import report as module
+from wlr_gym.gap.analysis import Analysis, ChannelGap, Evidence, FoundEffect, HeatMap, IntakeFinding, ParameterEstimate, Place
+from wlr_gym.gap.report import folder
+from wlr_gym.gap.report.folder import check_folder, save_analysis
+from wlr_gym.gap.report.page import report
 from wlr_gym.gap.report.plots import draw, figures
-from wlr_gym.gap.report.report import check_folder, report, save_analysis
 from wlr_gym.gap.report.result import result_of
 from wlr_gym.gap.report.text import (
     _GROUPS,
@@ -120,7 +121,7 @@ def test_numbers_are_those_of_the_analysis(tmp_path):
     assert ("eff_wheel_lf", "motor torque, left front wheel", "44 %", "opposes the motion, the same at every speed") in rows
     assert ("ground.mu", "-", "0.6", "0.652", "0.016", "0.09", "+0.6") in rows
     assert ("command.delay", "s", "0.012", "0.0153", "0.00039", "0.003", "+1.1") in rows
-    assert ("run_03", "kept aside", "7.60", "5.20", "1.14", "94 %") in rows
+    assert ("run_03", "held out", "7.60", "5.20", "1.14", "94 %") in rows
     assert ("run_01", "fitted", "7.00", "5.00", "1.10", "93 %") in rows
     for one in analysis.channel_gaps:
         cells = next(row for row in page.rows if row[:2] == [one.channel, channel(one.channel)] and len(row) == 6)
@@ -129,12 +130,12 @@ def test_numbers_are_those_of_the_analysis(tmp_path):
     assert ("rolling resistance", "both front wheels", "97 %") in rows
     assert (
         "Compared with 19 sets of runs that the final model made itself, more than chance explains is left in the fitted runs: "
-        "an error of 1.19 times the sensor noise (1.17 times what is expected) and runs that differ in what they say of the "
+        "an error of 1.19 times the sensor noise (1.17 times what is expected) and scatter of the runs' estimates of the "
         "model's numbers (1.40 times what is expected). Most of the error that is not expected is in acc_z and eff_leg_lf. "
         "run_05 pulls ground.mu farthest from the others." in page.text
     )
     assert "they always reject" in page.text
-    whole = "rows that say the same, geometric mean of the channels"
+    whole = "integrated autocorrelation time in rows, geometric mean of the channels"
     assert ("whiteness", whole, "7.60", "7.00", "7.60", "1.09", "0.10") in rows
     assert ("level: acc_z", "acceleration along z", "1.31", "1.00", "1.04", "1.31", "0.05") in rows
     assert ("whiteness: acc_z", "acceleration along z", "6.90", "6.80", "7.90", "1.01", "0.25") in rows
@@ -151,20 +152,20 @@ def test_every_candidate_is_shown_with_why_it_lost(tmp_path):
         mine = [row for row in page.rows if len(row) == 7 and row[0] == plain(one.name) and row[5] == one.outcome]
         assert mine
         assert all(row[6] == one.reason for row in mine)
-        if one.outcome != "screened out":
+        if one.outcome != "rejected at screening":
             assert [number(one.gain), number(one.screened)] in [row[3:5] for row in mine if row[1] == places(one.where)]
     backlash = next(row for row in page.rows if row[0] == "backlash")
     assert backlash[1] == "left front leg; less at 7 other places"
-    assert [row[5] for row in page.rows if "5312" in row] == ["taken"]
-    taken = [value for tag, name, value in page.attributes if (tag, name) == ("tr", "class") and value == "taken"]
-    assert len(taken) == 1
+    assert [row[5] for row in page.rows if "5312" in row] == ["selected"]
+    selected = [value for tag, name, value in page.attributes if (tag, name) == ("tr", "class") and value == "selected"]
+    assert len(selected) == 1
 
 
 def test_without_effects_nothing_is_said_of_effects(tmp_path):
     page = page_of(examples.NOTHING_MISSING, tmp_path)
     assert "with the effects added" not in page.text
     assert "with effects" not in page.text
-    assert ["run_03", "kept aside", "7.60", "5.20"] in page.rows
+    assert ["run_03", "held out", "7.60", "5.20"] in page.rows
     assert "the patch is empty" in page.text
     assert ["backlash", "angle", "0.0087 rad"] in page.rows
     assert "What these runs would have shown" in page.text
@@ -204,7 +205,7 @@ def test_an_unknown_effect_has_a_formula_or_says_that_it_has_none(tmp_path):
     bare = replace(examples.UNKNOWN_EFFECT, effects=(FoundEffect("unknown_effect", ("leg_lr",), {}, 0.8, 900.0),))
     text = page_of(bare, tmp_path).text
     assert "No formula was found that holds." in text
-    assert "no formula describes it, either" in text
+    assert "no formula describes it either" in text
     assert "the patch is empty" in text
 
 
@@ -215,9 +216,9 @@ def test_texts_are_escaped(tmp_path):
         data=evil,
         summary=evil,
         intake=(IntakeFinding(evil, evil, evil, evil),),
-        evidence=(Evidence(1, evil, (evil,), {evil: 1.0}, 1.0, 1.0, "taken", evil),),
+        evidence=(Evidence(1, evil, (evil,), {evil: 1.0}, 1.0, 1.0, "selected", evil),),
         localisation=(Place(evil, 0.5, evil),),
-        effects=(FoundEffect(evil, (evil,), {evil: Estimate(1.0, 0.0, 2.0, evil)}, 0.5, 1.0, evil),),
+        effects=(FoundEffect(evil, (evil,), {evil: ParameterEstimate(1.0, 0.0, 2.0, evil)}, 0.5, 1.0, evil),),
         gap=replace(examples.GAP, metric=evil),
         provenance={evil: evil},
         seconds={evil: 3.0},
@@ -241,9 +242,9 @@ def test_sentences_say_what_was_found():
     found = sentence(examples.EFFECT_FOUND)
     assert found == (
         "The model lacks rolling resistance (both front wheels); added, it removes 95 % (95 % interval 91 to 97 %) of the "
-        "avoidable error of runs kept aside; these data cannot tell it from coulomb friction."
+        "avoidable error of the held-out runs; these data do not distinguish it from coulomb friction."
     )
-    assert "to within 1.04 times the sensor noise once its known numbers are calibrated" in sentence(examples.NOTHING_MISSING)
+    assert "to within 1.04 times the sensor noise once its parameters are calibrated" in sentence(examples.NOTHING_MISSING)
     assert "something (left rear leg) that no effect of the library explains; a formula describes it" in sentence(
         examples.UNKNOWN_EFFECT
     )
@@ -257,9 +258,9 @@ def test_sentences_say_what_was_found():
     )
     assert "it removes 95 % (run by run 94 % and 96 %; no interval) of the avoidable" in sentence(two_runs)
     worse = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=-0.27, reduction_ci95=(-0.33, -0.21)))
-    assert "added, it makes the error of runs kept aside larger: -27 % (95 % interval -33 to -21 %);" in sentence(worse)
+    assert "added, it makes the error of the held-out runs larger: -27 % (95 % interval -33 to -21 %);" in sentence(worse)
     no_room = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=float("nan")))
-    assert "; the error of runs kept aside is as small without it;" in sentence(no_room)
+    assert "; the error of the held-out runs is as small without it;" in sentence(no_room)
     two = (*examples.EFFECT_FOUND.effects, FoundEffect("payload", ("body",), {}, 0.9, 300.0))
     assert sentence(replace(examples.EFFECT_FOUND, effects=two, equivalent=())).startswith(
         "The model lacks 2 effects: rolling resistance (both front wheels) and payload (body); added, they remove 95 %"
@@ -273,7 +274,7 @@ def test_what_is_left_without_a_name_is_not_called_nothing():
     assert (title(none), title(rest)) == ("Nothing missing", "Nothing clear enough to be named")
     assert "to within 3.20 times the sensor noise" in sentence(rest)
     assert closure(rest).startswith(
-        "Not all is explained: in runs kept aside an error of 3.20 is left, where a model without error would reach 1.10; "
+        "Not all is explained: an error of 3.20 is left in the held-out runs, above the noise floor of 1.10; "
     )
     assert "lacks nothing" not in sentence(rest)
 
@@ -287,7 +288,7 @@ def test_what_is_left_is_said_with_every_verdict_and_where(verdict, tmp_path):
     assert closure(little) == result_of(little).closure == ""
     # above the floor: 3 + 5.25 of the wheels, 2.24 of the leg
     told = (
-        "Not all is explained: in runs kept aside an error of 1.60 is left, where a model without error would reach 1.00; "
+        "Not all is explained: an error of 1.60 is left in the held-out runs, above the noise floor of 1.00; "
         "79 % of it is in the motor torques of the wheels."
     )
     assert closure(much) == result_of(much).closure == told
@@ -333,8 +334,8 @@ def test_numbers_in_words():
     angle = examples.UNKNOWN_EFFECT.effects[0].parameters["a0"]
     assert estimate(angle) == "1.21 (1.17 to 1.25) rad = 69.3°"
     assert estimate(replace(angle, low=float("nan"))) == "1.21 rad = 69.3°"
-    assert estimate(Estimate(1.021709, 1.0173, 1.0261, "-")) == "1.022 (1.017 to 1.026)"
-    assert estimate(Estimate(0.0, -0.1, 0.1, "m")) == "0 (-0.1 to 0.1) m"
+    assert estimate(ParameterEstimate(1.021709, 1.0173, 1.0261, "-")) == "1.022 (1.017 to 1.026)"
+    assert estimate(ParameterEstimate(0.0, -0.1, 0.1, "m")) == "0 (-0.1 to 0.1) m"
 
 
 # ---- pictures --------------------------------------------------------------------------------------------------------
@@ -385,7 +386,7 @@ def test_pictures_show_the_numbers():
     first = found["evidence"].axes[0]
     assert max(widths(found["evidence"])) == 5312.4
     shown = {text.get_text().split("  ")[1] for text in first.texts}
-    assert shown == {"taken", "weaker", "implausible", "screened out"}
+    assert shown == {"selected", "worse fit", "implausible", "rejected at screening"}
     assert np.max(np.asarray(found["where_1"].axes[0].images[0].get_array())) == pytest.approx(
         examples.heat_map().values[:6].max()
     )
@@ -414,7 +415,7 @@ def test_what_has_no_numbers_is_not_drawn():
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(module, "draw", lambda analysis: dict(PICTURE))
+    monkeypatch.setattr(folder, "draw", lambda analysis: dict(PICTURE))
 
 
 def test_files_are_written(tmp_path, quick):
@@ -453,18 +454,18 @@ def test_files_of_the_same_names_are_not_an_analysis(tmp_path, quick):
 
 def test_folders_that_cannot_be_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    for folder in (tmp_path / "file", tmp_path / "file" / "deeper"):
+    for place in (tmp_path / "file", tmp_path / "file" / "deeper"):
         with pytest.raises(InputError, match="file is a file; expected a folder"):
-            check_folder(folder)
+            check_folder(place)
     check_folder(tmp_path / "new" / "deep")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_failure_leaves_the_earlier_results_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "draw", lambda analysis: dict(PICTURE))
+    monkeypatch.setattr(folder, "draw", lambda analysis: dict(PICTURE))
     save_analysis(examples.EFFECT_FOUND, tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    monkeypatch.setattr(module, "draw", lambda analysis: 1 / 0)
+    monkeypatch.setattr(folder, "draw", lambda analysis: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         save_analysis(examples.NOTHING_MISSING, tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

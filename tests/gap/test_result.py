@@ -10,8 +10,8 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.envs.tasks.identified import identified_events
-from wlr_gym.gap.analysis import Calibrated, Equivalent, Estimate, FoundEffect, RunGap
-from wlr_gym.gap.report import result as module
+from wlr_gym.gap.analysis import Calibrated, Equivalent, FoundEffect, ParameterEstimate, RunGap
+from wlr_gym.gap.report import result
 from wlr_gym.gap.report.result import patch_of, read_result, result_of, write_result
 from wlr_gym.gap.robot.quantities import knobs
 from wlr_gym.physics.effects import load_patch
@@ -122,7 +122,7 @@ def test_unknown_effect_without_formula_stays_out_of_the_patch(tmp_path):
 
 def test_what_is_no_number_becomes_null(tmp_path):
     (effect,) = examples.EFFECT_FOUND.effects
-    unsure = replace(effect, parameters={"coefficient": Estimate(0.04, math.nan, math.inf, "-")}, gain=math.nan)
+    unsure = replace(effect, parameters={"coefficient": ParameterEstimate(0.04, math.nan, math.inf, "-")}, gain=math.nan)
     nothing = RunGap("run_01", False, math.nan, 2.0, 1.0, math.nan)
     few_runs = replace(examples.GAP, reduction_ci95=(math.nan, math.nan))
     analysis = replace(examples.EFFECT_FOUND, effects=(unsure,), run_gaps=(nothing,), gap=few_runs)
@@ -139,7 +139,7 @@ def test_what_is_no_number_becomes_null(tmp_path):
 
 def test_interval_holds_its_value(tmp_path):
     (effect,) = examples.EFFECT_FOUND.effects
-    beside = replace(effect, parameters={"coefficient": Estimate(0.05, 0.03, 0.04, "-")})
+    beside = replace(effect, parameters={"coefficient": ParameterEstimate(0.05, 0.03, 0.04, "-")})
     content = written(replace(examples.EFFECT_FOUND, effects=(beside,)), tmp_path)
     assert content["effects"][0]["parameters"]["coefficient"]["ci95"] == [0.03, 0.05]
 
@@ -161,7 +161,7 @@ def test_a_reduction_is_a_share_and_what_got_worse_has_a_sign(tmp_path):
         replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=1.3)),
         replace(
             examples.EFFECT_FOUND,
-            effects=(FoundEffect("payload", ("body",), {"mass": Estimate(math.nan, 0, 1, "kg")}, 0.5, 1.0),),
+            effects=(FoundEffect("payload", ("body",), {"mass": ParameterEstimate(math.nan, 0, 1, "kg")}, 0.5, 1.0),),
         ),
     ],
 )
@@ -177,7 +177,7 @@ def test_result_comes_last(tmp_path, monkeypatch):
         assert (tmp_path / "patch.yaml").exists()
         raise InputError("disk full")
 
-    monkeypatch.setattr(module, "write_json", fail)
+    monkeypatch.setattr(result, "write_json", fail)
     with pytest.raises(InputError, match="disk full"):
         write_result(examples.EFFECT_FOUND, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["patch.yaml"]

@@ -7,12 +7,13 @@ import pytest
 from rig_bench import Bench, write
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.gap.estimation.fit import Model, fit, nominal_model
+from wlr_gym.gap.estimation.fit import fit
+from wlr_gym.gap.estimation.model import FittedModel, nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.rig import RIG_EFFECTS, RigProblem, read_recordings
 from wlr_gym.gap.rig.candidates import rig_candidates
 from wlr_gym.gap.rig.problem import ENCODER_NOISE, LOST
-from wlr_gym.gap.selection.search import name_effects
+from wlr_gym.gap.selection.search import search_effects
 from wlr_gym.gap.validation.data_split import named_split
 from wlr_gym.physics.effects.effect import PatchEffect
 
@@ -26,7 +27,7 @@ def loaded(tmp_path_factory):
 
 
 def split(problem):
-    return named_split(problem.runs, problem.sealed)
+    return named_split(problem.runs, problem.held_out)
 
 
 def nominal(problem):
@@ -196,7 +197,7 @@ def test_broken_formulas_are_refused(loaded, formula, message):
 def named(problem, runs):
     """Name effects by the quick way: these benches answer smoothly."""
     problem.thorough = False
-    return name_effects(problem, runs, fit(problem, runs, nominal_model(problem), steps=12))
+    return search_effects(problem, runs, fit(problem, runs, nominal_model(problem), steps=12))
 
 
 def test_hidden_load_dependent_friction_is_named_and_measured(loaded):
@@ -229,7 +230,7 @@ def real():
     return RigProblem(read_recordings(REAL))
 
 
-def best_fit(problem, runs, effects, memory=None):
+def best_fit(problem, runs, effects, autocorrelation_time=None):
     """The better of two fits: from the data sheet, and from a stronger motor with less friction."""
     candidates = {
         c.name: c for present in (("coulomb_friction",), ("load_dependent_friction",)) for c in rig_candidates(present)[1]
@@ -240,10 +241,10 @@ def best_fit(problem, runs, effects, memory=None):
         stronger[names.index(name)] = value
     fits = []
     for quantities in (nominal(problem), stronger):
-        model = Model(quantities)
+        model = FittedModel(quantities)
         for name, values in effects.items():
             model = model.with_effect(candidates[name], values)
-        fits.append(fit(problem, runs, model, memory=memory, steps=25))
+        fits.append(fit(problem, runs, model, autocorrelation_time=autocorrelation_time, steps=25))
     return min(fits, key=lambda found: found.cost)
 
 
@@ -254,9 +255,9 @@ def test_real_servo_lacks_load_dependent_friction_and_a_torque_that_falls_behind
     fitted, held = split(real)
     load, behind = {"load_dependent_friction": (0.2,)}, {"torque_saturation": (0.4,)}
     both = best_fit(real, fitted, load | behind)
-    memory = both.noise.memory
+    autocorrelation_time = both.noise.autocorrelation_time
     base, only_load, only_behind, stribeck, with_stribeck, warm = (
-        best_fit(real, fitted, effects, memory)
+        best_fit(real, fitted, effects, autocorrelation_time)
         for effects in (
             {},
             load,
@@ -267,10 +268,10 @@ def test_real_servo_lacks_load_dependent_friction_and_a_torque_that_falls_behind
         )
     )
     assert both.cost < min(only_load.cost, only_behind.cost) - 60
-    bought = {
+    gain = {
         name: base.cost - found.cost for name, found in (("load", only_load), ("behind", only_behind), ("stribeck", stribeck))
     }
-    assert bought["stribeck"] < 0.3 * min(bought["load"], bought["behind"])  # alone it takes the place of what is missing
+    assert gain["stribeck"] < 0.3 * min(gain["load"], gain["behind"])  # alone it takes the place of what is missing
     assert with_stribeck.cost > both.cost - 60
     assert warm.cost > both.cost + 60
     assert warm.model.effects[-1][1][0] == pytest.approx(0.0045)  # at the edge of what a winding can do

@@ -9,8 +9,8 @@ import pytest
 from rig_bench import Bench, contents, write
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.gap.analysis import Analysis, Estimate, FoundEffect
-from wlr_gym.gap.estimation.fit import nominal_model
+from wlr_gym.gap.analysis import Analysis, FoundEffect, ParameterEstimate
+from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.report.result import patch_of
 from wlr_gym.gap.rig import RigProblem, findings, open_rig, read_recordings, rig_patch
@@ -172,9 +172,9 @@ def test_what_goes_together_over_the_runs_is_said(made):
 
 def test_held_out_runs_cover_gains_and_trajectories(made):
     recordings = read_recordings(made)
-    sealed = RigProblem(recordings).sealed
-    held = [recording for recording in recordings if recording.name in sealed]
-    assert len(held) == len(sealed) == 2
+    held_out = RigProblem(recordings).held_out
+    held = [recording for recording in recordings if recording.name in held_out]
+    assert len(held) == len(held_out) == 2
     assert len({recording.gain for recording in held}) == 2
     assert len({recording.trajectory for recording in held}) == 2
 
@@ -206,7 +206,7 @@ def test_the_patch_that_an_analysis_of_the_rig_writes_can_be_given_back(made, tm
     found = []
     for candidate in rig_candidates({"load_dependent_friction", "coulomb_friction"})[1] + rig_candidates(())[1]:
         values = candidate.parameters(candidate.kept([0.5 * (u.low + u.high) for u in candidate.unknowns]))
-        estimates = {name: Estimate(value, value, value, "-") for name, value in values.items()}
+        estimates = {name: ParameterEstimate(value, value, value, "-") for name, value in values.items()}
         found.append(FoundEffect(candidate.name, candidate.where, estimates, 0.9, 100.0))
     written = patch_of(Analysis("made", "effect_found", "", effects=tuple(found)))
     patch = rig_patch(save_patch(written, tmp_path / "patch.yaml"))

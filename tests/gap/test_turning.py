@@ -11,7 +11,7 @@ from gap_examples import EFFECT_FOUND
 from toy_problem import Toy
 
 from wlr_gym.gap.analysis import UNKNOWN, Turning
-from wlr_gym.gap.report.report import save_analysis
+from wlr_gym.gap.report.folder import save_analysis
 from wlr_gym.gap.report.result import read_result
 from wlr_gym.gap.report.text import sentence
 from wlr_gym.gap.validation.turning import turning

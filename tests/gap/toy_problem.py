@@ -1,4 +1,4 @@
-"""A small analytic system: sums of known shapes, with numbers to calibrate, effects to find, and noise with memory.
+"""A small analytic system: sums of known shapes, with numbers to calibrate, effects to find, and coloured noise.
 
 Everything is in noise units and one tolerance of a quantity moves its shape by ``STRENGTH``. Responses are linear in quantities
 and in most effects; ``play`` starts with its square, ``ripple`` has an amplitude and a phase.
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from wlr_gym.gap.problem import Candidate, Probe, Quantity, Signal, Start, Unknown
+from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Start, Unknown
 from wlr_gym.physics.effects import PatchEffect
 
 NOISE = np.array([0.1, 2.0, 0.001])
@@ -42,12 +42,12 @@ def shapes(name, runs, rows):
     return waves
 
 
-def coloured(rng, shape, memory):
+def coloured(rng, shape, ar1):
     """AR(1) noise of unit variance along the first axis."""
     white = rng.standard_normal(shape)
     series = white.copy()
     for k in range(1, len(series)):
-        series[k] = memory * series[k - 1] + np.sqrt(1.0 - memory**2) * white[k]
+        series[k] = ar1 * series[k - 1] + np.sqrt(1.0 - ar1**2) * white[k]
     return series
 
 
@@ -58,19 +58,19 @@ class Toy:
         truth: quantities' distance from nominal in tolerances, by name.
         effects: PatchEffects that the measurements hold.
         seed: of the noise.
-        white, error: size of white noise and of the simulator's error with memory, in noise units.
-        memory: of that error, correlation of neighbouring rows.
+        white, error: size of white noise and of the simulator's coloured error, in noise units.
+        ar1: of that error, correlation of neighbouring rows.
     """
 
-    metric, cap, steps, thorough, firmness, disagreement = "RMS in noise units", 50.0, 4, False, 1.0, 0.0
-    sealed: tuple[str, ...] = ()
+    metric, cap, steps, thorough, tempering, disagreement = "RMS in noise units", 50.0, 4, False, 1.0, 0.0
+    held_out: tuple[str, ...] = ()
     turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})
     motions: Mapping[str, str] = MappingProxyType({})
 
-    def __init__(self, truth=None, effects=(), seed=0, *, runs=5, rows=200, white=1.0, error=0.0, memory=0.9, reach=REACH):
+    def __init__(self, truth=None, effects=(), seed=0, *, runs=5, rows=200, white=1.0, error=0.0, ar1=0.9, reach=REACH):
         self.runs = tuple(f"run_{k + 1}" for k in range(runs))
         self.rows, self.calls = rows, 0
-        self.signals = tuple(Signal(c, "1", n, "all") for c, n in zip(CHANNELS, NOISE, strict=True))
+        self.signals = tuple(MeasuredSignal(c, "1", n, "all") for c, n in zip(CHANNELS, NOISE, strict=True))
         self.quantities = tuple(
             Quantity(name, "1", n, s, n - reach * s, n + reach * s)
             for name, n, s in zip(QUANTITIES, NOMINAL, SIGMA, strict=True)
@@ -80,7 +80,7 @@ class Toy:
         self._measured = []
         for r in range(runs):
             clean = self._response(moved, tuple(effects), r)
-            noise = white * rng.standard_normal(clean.shape) + error * coloured(rng, clean.shape, memory)
+            noise = white * rng.standard_normal(clean.shape) + error * coloured(rng, clean.shape, ar1)
             self._measured.append((clean + noise) * NOISE)
 
     def shape(self, name):

@@ -98,6 +98,7 @@ def run(options: BenchOptions) -> int:
 def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     """Test the gap workflow on data sets with hidden truths; print and write its score."""
     from wlr_gym.studies.bench import gap
+    from wlr_gym.studies.bench.gap_score_table import markdown
 
     if len(asked) > 1:
         raise InputError(f"{BLIND_TEST} takes hours and is run alone, not with {', '.join(set(asked) - {BLIND_TEST})}")
@@ -107,7 +108,7 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     report = gap.run_blind_test(
         gap.Plan(options.out, options.sets, options.processes), say=console.print, answers=options.answers
     )
-    text = gap.markdown(report)
+    text = markdown(report)
     (options.out / "score.md").write_text(text, encoding="utf-8")
     console.print(text, markup=False, highlight=False)
     if options.json is not None:

@@ -40,7 +40,7 @@ class GapOptions(PatchOption):
     backend: str = "gibbs_appell"
     """Simulator of the robot: gibbs_appell or mujoco."""
     heldout: tuple[str, ...] = ()
-    """Held-out runs, for validation; default: chosen by what they can show."""
+    """Runs to hold out for validation; default: chosen by how informative the other runs are."""
     threads: int | None = None
     """Worker threads; default: one per core."""
 
@@ -55,7 +55,7 @@ def run(options: GapOptions) -> int:
 
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.gap.analysis import BAD_DATA
-    from wlr_gym.gap.report.report import check_folder
+    from wlr_gym.gap.report.folder import check_folder
     from wlr_gym.gap.workflow import analyse
 
     _check(options)
@@ -119,7 +119,7 @@ def _known(options: GapOptions) -> Patch:
 
 
 def _print(analysis: Analysis, out: Path, console: Console) -> None:
-    from wlr_gym.gap.report.report import REPORT_FILE
+    from wlr_gym.gap.report.folder import REPORT_FILE
     from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
     from wlr_gym.gap.report.text import closure, sentence, title
 
@@ -143,8 +143,8 @@ def _numbers(analysis: Analysis) -> Iterator[str]:
 
     for effect in analysis.effects:
         values = ", ".join(f"{name} {estimate(found)}" for name, found in effect.parameters.items())
-        facts = [effect.formula, values, f"selection frequency {percent(effect.confidence)}"]
-        yield f"  {plain(effect.name)} at {places(effect.where)}: {'; '.join(filter(None, facts))}"
+        told = [effect.formula, values, f"selection frequency {percent(effect.confidence)}"]
+        yield f"  {plain(effect.name)} at {places(effect.where)}: {'; '.join(filter(None, told))}"
     gap = analysis.gap
     if gap is not None:
         steps = [f"{error(gap.heldout_before)} as given", f"{error(gap.heldout_calibrated)} calibrated"]

@@ -14,10 +14,18 @@ from wlr_gym.gap.problem import Range
 Array = NDArray[np.float64]
 
 #: Verdicts, as in the result file.
-BAD_DATA, NOT_EXCITED, NOTHING_MISSING = "bad_data", "not_excited", "nothing_missing"
-EFFECT_FOUND, UNKNOWN = "effect_found", "unknown_effect"
-#: Outcome of what some runs show and the others do not bear out.
-NOT_CARRIED = "does not carry over"
+BAD_DATA = "bad_data"
+NOT_EXCITED = "not_excited"
+NOTHING_MISSING = "nothing_missing"
+EFFECT_FOUND = "effect_found"
+UNKNOWN = "unknown_effect"
+#: Outcomes of a candidate that the report and the workflow ask for; docs/gap.md explains all.
+SELECTED = "selected"
+EQUIVALENT = "equivalent"
+WORSE_FIT = "worse fit"
+FAILS_CROSS_VALIDATION = "fails cross-validation"
+REMOVED = "removed"
+REJECTED = "rejected at screening"
 
 
 @dataclass(frozen=True)
@@ -39,7 +47,7 @@ class IntakeFinding:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ParameterEstimate:
     """A fitted number with its 95 % interval."""
 
     value: float
@@ -53,16 +61,16 @@ class FoundEffect:
     """One effect that was added, strongest first in an analysis.
 
     Attributes:
-        confidence: 0..1: share of bootstrap samples of the fitted runs in which it buys enough, the runs agree and no other
-            name buys more; nothing is fitted anew.
-        gain: fall of minus two log posterior on the fitted runs when it was added, beside the effects taken before it.
+        confidence: 0..1: selection frequency: share of bootstrap samples of the fitted runs in which it improves the fit
+            enough, the runs agree and no other name improves it more; nothing is refitted.
+        gain: fall of minus two log posterior on the fitted runs when it was added, beside the effects selected before it.
         formula, units: of an unknown effect; empty otherwise.
-        validity: where the formula was tried, by what it reads: no run says what is beyond.
+        validity: where the formula was tried, by what it reads: beyond that it is untested.
     """
 
     name: str
     where: tuple[str, ...]
-    parameters: Mapping[str, Estimate]
+    parameters: Mapping[str, ParameterEstimate]
     confidence: float
     gain: float
     formula: str = ""
@@ -72,14 +80,15 @@ class FoundEffect:
 
 @dataclass(frozen=True)
 class Evidence:
-    """One candidate in one round, and what became of it.
+    """One candidate in one round, and its outcome.
 
     Attributes:
         round: 1 for the first effect.
-        gain: what adding it bought after a refit; ``screened`` what the first-order score had promised.
-        outcome: ``taken``, ``equivalent``, ``weaker``, ``too little``, ``inconsistent``, ``does not carry over``,
-            ``implausible``, ``within tolerance``, ``dropped`` or ``screened out``.
-        reason: one sentence: why it won or lost.
+        gain: improvement of the fit after a refit, as a fall of minus two log posterior; ``screened``: the improvement that
+            the score test predicted.
+        outcome: ``selected``, ``equivalent``, ``worse fit``, ``too little``, ``inconsistent``, ``fails cross-validation``,
+            ``implausible``, ``within tolerance``, ``removed`` or ``rejected at screening``.
+        reason: of the outcome, one sentence.
         by_run: fall of the weighted squares per fit run; empty where it was only screened.
     """
 
@@ -96,7 +105,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Equivalent:
-    """Explanations that these data cannot tell apart, and the run that would."""
+    """Effects that these data cannot distinguish, and the discriminating experiment."""
 
     names: tuple[str, ...]
     separating_run: str
@@ -113,7 +122,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Relation:
-    """A relation of the model, the law that explains most by acting there alone, and what it promises.
+    """A relation of the model, the law that explains most by acting there alone, and its predicted improvement.
 
     See :mod:`wlr_gym.gap.report.relations`.
     """
@@ -252,7 +261,7 @@ class Statistic:
 
 @dataclass(frozen=True)
 class Pulled:
-    """The number that one run pulls farthest from the other runs, in standard errors of what that run tells."""
+    """The number that one run pulls farthest from the other runs, in standard errors."""
 
     number: str
     run: str
@@ -266,9 +275,9 @@ class Adequacy:
     Attributes:
         replicates: how many sets of runs the model made.
         level: root mean square over all channels, noise units.
-        whiteness: rows that say the same, geometric mean over the channels.
-        constancy: how many times more than their rows promise the runs differ in where they pull the numbers; its value is NaN
-            where the data tell nothing of any number.
+        whiteness: integrated autocorrelation time of the residuals in rows, geometric mean over the channels.
+        constancy: scatter of the runs' estimates of the numbers over what their rows predict; its value is NaN where the data
+            are informative about no number.
         pulled: the number that is pulled most.
         channels: name -> level and whiteness of one channel.
     """
@@ -283,14 +292,14 @@ class Adequacy:
 
 @dataclass(frozen=True)
 class Turning:
-    """What is left of a signal goes with the turning of its joint; see :mod:`wlr_gym.gap.validation.turning`.
+    """Part of a signal's residual is periodic in the angle of its joint; see :mod:`wlr_gym.gap.validation.turning`.
 
     Attributes:
         joint, signal: whose.
         order: periods per turn.
-        share: of the squared residuals that the turning predicts, beyond what other orders do.
+        share: of the squared residuals that the angle predicts, beyond what other orders do.
         amplitude: noise units, root mean square over the runs.
-        confidence: 0..1: share of bootstrap samples of the runs in which it is as clear as asked for.
+        confidence: 0..1: selection frequency: share of bootstrap samples of the runs in which it is as clear as required.
     """
 
     joint: str

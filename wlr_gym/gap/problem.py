@@ -1,6 +1,6 @@
-"""What the workflow knows of a system: numbers that calibration may move, effects that may be missing, and a simulator.
+"""What the workflow knows of a system: parameters to calibrate, effects that may be missing, and a simulator.
 
-The steps of the workflow (calibrate, test, localise, name, prove) speak only to a :class:`Problem`. The robot is one
+The steps of the workflow (estimation, selection, validation) use only a :class:`Problem`. The robot is one
 (:mod:`wlr_gym.gap.robot`), a servo on a test rig another (:mod:`wlr_gym.gap.rig`).
 """
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Quantity:
-    """A known number of the model that calibration may move within its tolerance.
+    """A calibrated (nuisance) parameter of the model: calibration may move it within its tolerance.
 
     Attributes:
         name: of the parameter, ``servo.kp[leg_lf]``.
@@ -28,7 +28,7 @@ class Quantity:
         nominal: value in the model.
         sigma: tolerance, one standard deviation, in ``unit``.
         low, high: how far calibration may move it: a few tolerances, within what the simulator accepts.
-        drifts: whether it differs each time the system is switched on, as a sensor's bias: no missing effect hides in it.
+        drifts: whether it differs each time the system is switched on, as a sensor's bias: it conceals no missing effect.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How an unknown of an effect meets numbers that calibration may move.
+    """How an unknown of an effect meets calibrated parameters.
 
     Attributes:
         quantities: their names.
@@ -114,12 +114,12 @@ class Candidate:
         name: of the effect vocabulary.
         where: joints, wheels, ``body``, ``ground`` or ``sensor``.
         unknowns: its parameters, in the order of all value tuples.
-        starts: ways to a first guess; the best one is taken.
+        starts: ways to a first guess; the best one is used.
         formula, units: of an effect that the library does not hold; empty otherwise.
         fixed: parameters of the effect that are not fitted.
         convert: from fitted values to the effect's parameters, where the data are more nearly linear in other numbers (mass and
             moments of a load, not its place); None = they are the same.
-        tolerances: per unknown, the known numbers it meets; empty = it meets none.
+        tolerances: per unknown, the calibrated parameters it meets; empty = it meets none.
         within: brings values back to where the effect is plausible, where ranges of single unknowns do not say it (a load's
             moments, whose range grows with its mass); None = the ranges say it.
     """
@@ -151,7 +151,7 @@ class Candidate:
 
     @property
     def replaced(self) -> set[str]:
-        """Names of the known numbers whose place the effect takes."""
+        """Names of the calibrated parameters that the effect replaces."""
         return {name for met in self.tolerances if met is not None and met.replaces for name in met.quantities}
 
     def parameters(self, values: Sequence[float]) -> dict[str, float]:
@@ -174,7 +174,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Signal:
+class MeasuredSignal:
     """One measured channel.
 
     Attributes:
@@ -209,26 +209,27 @@ class Problem(Protocol):
         metric: what the gap's numbers are, in words.
         cap: noise units beyond which a residual counts no more in the gap's numbers.
         steps: Gauss-Newton steps of a fit, at most.
-        firmness: what a simulator gets wrong is the same in all runs, so they agree on it: what data say counts so many times
-            less than the runs' differences would let it, and what is known beforehand so many times more. 1 = it is perfect.
+        tempering: weight of the prior against the likelihood. A simulator's error is the same in all runs, so that they agree
+            on it: the likelihood counts so many times less than the scatter of the runs would allow, the prior so many times
+            more. 1 = the simulator is exact.
         disagreement: share by which a simulator and the system may differ on how large an effect is; widens intervals.
         thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
         motions: effect -> name of the motion that shows it best, for advice on what to record; may be empty.
-        sealed: names of the runs to keep for the proof, where the problem knows better than a general rule; else empty.
+        held_out: names of the runs to hold out, where the problem knows better than a general rule; else empty.
         turning: joints without end, whose angle alone changes nothing: name -> its feature, and the signals that would show it.
     """
 
     metric: str
     cap: float
     steps: int
-    firmness: float
+    tempering: float
     disagreement: float
     thorough: bool
     motions: Mapping[str, str]
-    sealed: tuple[str, ...]
+    held_out: tuple[str, ...]
     turning: Mapping[str, tuple[str, tuple[str, ...]]]
     runs: tuple[str, ...]
-    signals: tuple[Signal, ...]
+    signals: tuple[MeasuredSignal, ...]
     quantities: tuple[Quantity, ...]
 
     def times(self, run: int) -> Array:

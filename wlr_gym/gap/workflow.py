@@ -1,4 +1,4 @@
-"""The whole workflow, step by step: intake, split, calibrate, name, prove; see docs/gap.md."""
+"""The whole workflow, step by step: intake, split, calibrate, search, validate; see docs/gap.md."""
 
 from __future__ import annotations
 
@@ -17,32 +17,40 @@ from wlr_gym.base.provenance import provenance
 from wlr_gym.gap.analysis import (
     BAD_DATA,
     EFFECT_FOUND,
-    NOT_CARRIED,
+    EQUIVALENT,
+    FAILS_CROSS_VALIDATION,
     NOT_EXCITED,
     NOTHING_MISSING,
+    REJECTED,
+    REMOVED,
+    SELECTED,
     UNKNOWN,
+    WORSE_FIT,
     Analysis,
     Calibrated,
     Equivalent,
-    Estimate,
     Evidence,
     FoundEffect,
     IntakeFinding,
+    ParameterEstimate,
     Turning,
 )
-from wlr_gym.gap.estimation.fit import Fit, fit, nominal_model, widened
-from wlr_gym.gap.estimation.uncertainty import confidence, detectable, equivalents, estimates, half_widths
+from wlr_gym.gap.estimation.fit import Fit, fit, widened
+from wlr_gym.gap.estimation.model import nominal_model
+from wlr_gym.gap.estimation.uncertainty import estimates, half_widths
 from wlr_gym.gap.problem import Candidate, Problem
-from wlr_gym.gap.report.localisation import localise
 from wlr_gym.gap.report.recommendation import recommend, separating_run
 from wlr_gym.gap.report.relations import relations
-from wlr_gym.gap.report.traces import telling_traces
 from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
+from wlr_gym.gap.selection.detectability import detectable
+from wlr_gym.gap.selection.equivalence import equivalents, selection_frequency
 from wlr_gym.gap.selection.hypothesis import Hypothesis
-from wlr_gym.gap.selection.search import Naming, Round, name_effects
+from wlr_gym.gap.selection.search import Round, SearchResult, search_effects
 from wlr_gym.gap.validation.data_split import informative_split, named_split
-from wlr_gym.gap.validation.held_out import mean_of_runs, mean_squares, noise_floor, prove
+from wlr_gym.gap.validation.held_out import compare_models, mean_of_runs, mean_squares, noise_floor
+from wlr_gym.gap.validation.localisation import localise
 from wlr_gym.gap.validation.residual_tests import adequacy_of
+from wlr_gym.gap.validation.traces import informative_traces
 from wlr_gym.gap.validation.turning import turning
 from wlr_gym.physics.effects import Source, load_patch
 
@@ -50,10 +58,13 @@ Array = NDArray[np.float64]
 #: Told of the present stage and of the share of the whole work that is done.
 Tell = Callable[[str, float], None]
 
-#: Stages and the share of the work that is done when they begin (measured on eight runs of 20 s).
+#: Stages and the share of the work that is done when they begin (measured on eight runs of 20 s). Their names are keys of
+#: ``seconds`` in the result file.
 STAGES = {"reading": 0.0, "choosing runs": 0.02, "calibrating": 0.1, "naming": 0.35, "proving": 0.85, "drawing": 0.97}
-#: How many times more than their rows promise runs are taken to differ until a fit has told.
+#: Scatter of the runs, over what their rows predict, that is assumed until a fit has estimated it.
 SCATTER = 5.0
+#: Reason why a candidate is rejected at screening: calibration reproduces its response.
+CONFOUNDED = "confounded with calibrated parameters"
 #: Kinds of rigs.
 RIGS = ("pendulum",)
 #: Sums of several threads round otherwise, and a fit may end elsewhere.
@@ -84,7 +95,7 @@ def analyse(
         rig: None = the robot; ``pendulum`` = one servo that swings a pendulum.
         robot: file or config name; None = the one the runs' meta data name, else the nominal one.
         backend: simulator.
-        heldout: names of the runs to keep sealed; empty = chosen by what they can tell.
+        heldout: names of the runs to hold out; empty = chosen by how informative the other runs are.
         threads: worker threads; the result does not depend on it.
         tell: told of progress.
 
@@ -93,7 +104,7 @@ def analyse(
             into; the last before the work begins.
     """
     if out is not None:
-        from wlr_gym.gap.report.report import check_folder
+        from wlr_gym.gap.report.folder import check_folder
 
         check_folder(Path(out))
     tell("reading", STAGES["reading"])
@@ -117,7 +128,7 @@ def analyse(
         else analyse_problem(problem, str(data), findings, heldout=heldout, tell=tell, known=known)
     )
     if out is not None:
-        from wlr_gym.gap.report.report import save_analysis
+        from wlr_gym.gap.report.folder import save_analysis
 
         tell("drawing", STAGES["drawing"])
         save_analysis(done, Path(out))
@@ -125,7 +136,7 @@ def analyse(
 
 
 def _refuse_left_out(heldout: Sequence[str], findings: Sequence[IntakeFinding]) -> None:
-    """A run that cannot be used cannot be kept for the proof either."""
+    """A run that cannot be used cannot be held out either."""
     for finding in findings:
         if finding.fatal and finding.run in heldout:
             place = f"{finding.run} {finding.channel}".strip()
@@ -149,32 +160,32 @@ def analyse_problem(
     """Analyse a problem that is open already; see :func:`analyse`."""
     clock = _Clock(tell)
     clock.start("choosing runs")
-    fitted, sealed, columns = _choose_runs(problem, heldout)
+    fitted, held_out, columns = _choose_runs(problem, heldout)
     clock.start("calibrating")
-    start, scatter = nominal_model(problem), SCATTER * problem.firmness
+    start, scatter = nominal_model(problem), SCATTER * problem.tempering
     base = fit(problem, fitted, start, scatter=scatter, columns=columns, steps=problem.steps, tell=clock.detail)
     base = widened(problem, fitted, base)
     clock.start("naming")
-    naming = name_effects(problem, fitted, base, clock.detail, columns)
-    base = naming.calibrated
+    search = search_effects(problem, fitted, base, clock.detail, columns)
+    base = search.calibrated
     clock.start("proving")
-    models = (nominal_model(problem), base.model, naming.fit.model)
-    floor = noise_floor(problem, naming.fit.model.setting, sealed)
-    gap, run_gaps, channel_gaps = prove(problem, fitted, sealed, models, floor)
+    models = (nominal_model(problem), base.model, search.fit.model)
+    floor = noise_floor(problem, search.fit.model.setting, held_out)
+    gap, run_gaps, channel_gaps = compare_models(problem, fitted, held_out, models, floor)
     features = problem.features(base.model.setting, fitted)
     places, maps = localise(
         problem,
         base.residuals,
-        mean_of_runs(mean_squares(naming.fit.residuals, problem.cap)),
-        naming.fit.noise,
+        mean_of_runs(mean_squares(search.fit.residuals, problem.cap)),
+        search.fit.noise,
         features,
     )
-    adequacy = adequacy_of(problem, fitted, naming.fit)
-    shown = detectable(naming.rounds[-1].scores, naming.fit.cost)
-    turned = turning(problem, naming.fit.residuals, features)
-    effects = _effects(problem, naming, fitted) or _turned(turned)
-    kept = {candidate.label for candidate, _ in naming.fit.model.effects}
-    verdict, groups = _verdict(naming, effects), _equivalent(problem, naming)
+    adequacy = adequacy_of(problem, fitted, search.fit)
+    shown = detectable(search.rounds[-1].scores, search.fit.cost)
+    turned = turning(problem, search.fit.residuals, features)
+    effects = _effects(problem, search, fitted) or _turned(turned)
+    kept = {candidate.label for candidate, _ in search.fit.model.effects}
+    verdict, groups = _verdict(search, effects), _equivalent(problem, search)
     clock.stop()
     return Analysis(
         data=data,
@@ -182,22 +193,22 @@ def analyse_problem(
         summary="",
         intake=tuple(findings),
         fit_runs=tuple(problem.runs[k] for k in fitted),
-        heldout_runs=tuple(problem.runs[k] for k in sealed),
+        heldout_runs=tuple(problem.runs[k] for k in held_out),
         effects=effects,
         equivalent=groups,
-        calibration=_calibration(problem, naming.fit),
+        calibration=_calibration(problem, search.fit),
         evidence=tuple(
-            entry for number, look in enumerate(naming.rounds, 1) for entry in evidence_of(problem, number, look, fitted, kept)
+            entry for number, look in enumerate(search.rounds, 1) for entry in evidence_of(problem, number, look, fitted, kept)
         ),
         localisation=places,
-        relations=relations(naming.rounds[0].scores),
+        relations=relations(search.rounds[0].scores),
         heat_maps=maps,
-        traces=telling_traces(problem, sealed, models, places),
+        traces=informative_traces(problem, held_out, models, places),
         gap=gap,
         run_gaps=run_gaps,
         channel_gaps=channel_gaps,
         detectable=shown,
-        recommendations=recommend(naming, [group.names for group in groups], verdict, problem.motions),
+        recommendations=recommend(search.rounds[-1], [group.names for group in groups], verdict, problem.motions),
         adequacy=adequacy,
         turning=turned,
         known_effects=tuple(effect.content() for effect in load_patch(known).effects),
@@ -207,7 +218,7 @@ def analyse_problem(
 
 
 def _choose_runs(problem: Problem, heldout: Sequence[str]) -> tuple[list[int], list[int], list[NDArray[np.float32]] | None]:
-    """Runs to fit, runs to seal, and the columns of the first where they had to be simulated for the choice."""
+    """Runs to fit, runs to hold out, and the columns of the first where they had to be simulated for the choice."""
     return (*named_split(problem.runs, heldout), None) if heldout else informative_split(problem)
 
 
@@ -234,10 +245,10 @@ class _Clock:
             self.seconds[self._stage] = time.perf_counter() - self._since
 
 
-def _verdict(naming: Naming, effects: Sequence[FoundEffect]) -> str:
+def _verdict(search: SearchResult, effects: Sequence[FoundEffect]) -> str:
     if effects:
         return UNKNOWN if all(effect.name == UNKNOWN for effect in effects) else EFFECT_FOUND
-    last = naming.rounds[-1]
+    last = search.rounds[-1]
     if any(shown_by_some_runs_only(h, last.cost) for h in last.hypotheses):
         return NOT_EXCITED
     scores = last.scores
@@ -247,25 +258,25 @@ def _verdict(naming: Naming, effects: Sequence[FoundEffect]) -> str:
     return NOTHING_MISSING if sum(visible.values()) >= LEAST_VISIBLE * len(visible) else NOT_EXCITED
 
 
-def _effects(problem: Problem, naming: Naming, fitted: Sequence[int]) -> tuple[FoundEffect, ...]:
-    intervals = estimates(problem, naming.fit)
+def _effects(problem: Problem, search: SearchResult, fitted: Sequence[int]) -> tuple[FoundEffect, ...]:
+    intervals = estimates(problem, search.fit)
     found = []
-    setting = naming.fit.model.setting
-    for (candidate, values), own in zip(naming.fit.model.effects, intervals, strict=True):
-        look = next(r for r in naming.rounds if r.taken is not None and r.taken.candidate.label == candidate.label)
-        assert look.taken is not None
-        sure = confidence(look.taken, look.hypotheses, look.cost)
+    setting = search.fit.model.setting
+    for (candidate, values), own in zip(search.fit.model.effects, intervals, strict=True):
+        look = next(r for r in search.rounds if r.selected is not None and r.selected.candidate.label == candidate.label)
+        assert look.selected is not None
+        frequency = selection_frequency(look.selected, look.hypotheses, look.cost)
         tried = problem.reach(candidate.effect(values), setting, fitted) if candidate.formula else {}
-        found.append(replace(found_effect(candidate, own, sure, look.taken.gain), validity=tried))
+        found.append(replace(found_effect(candidate, own, frequency, look.selected.gain), validity=tried))
     return tuple(sorted(found, key=lambda effect: -effect.gain))
 
 
-def found_effect(candidate: Candidate, own: Mapping[str, Estimate], confidence: float, gain: float) -> FoundEffect:
+def found_effect(candidate: Candidate, own: Mapping[str, ParameterEstimate], frequency: float, gain: float) -> FoundEffect:
     """Return a fitted candidate as it is written; constants of its formula that were not fitted have no width."""
     fixed = candidate.fixed if candidate.formula else {}
-    given = {name: Estimate(value, value, value, candidate.units[name]) for name, value in fixed.items()}
+    given = {name: ParameterEstimate(value, value, value, candidate.units[name]) for name, value in fixed.items()}
     parameters = {**own, **given}
-    return FoundEffect(candidate.name, candidate.where, parameters, confidence, gain, candidate.formula, dict(candidate.units))
+    return FoundEffect(candidate.name, candidate.where, parameters, frequency, gain, candidate.formula, dict(candidate.units))
 
 
 def _turned(turned: Turning | None) -> tuple[FoundEffect, ...]:
@@ -273,16 +284,16 @@ def _turned(turned: Turning | None) -> tuple[FoundEffect, ...]:
     return () if turned is None else (FoundEffect(UNKNOWN, (turned.joint,), {}, turned.confidence, math.nan),)
 
 
-def _equivalent(problem: Problem, naming: Naming) -> tuple[Equivalent, ...]:
+def _equivalent(problem: Problem, search: SearchResult) -> tuple[Equivalent, ...]:
     groups = []
-    kept = {candidate.label for candidate, _ in naming.fit.model.effects}
-    for look in naming.rounds:
-        if look.taken is None or look.taken.candidate.label not in kept:
+    kept = {candidate.label for candidate, _ in search.fit.model.effects}
+    for look in search.rounds:
+        if look.selected is None or look.selected.candidate.label not in kept:
             continue
-        swapped = naming.swaps.get(look.taken.candidate.label)
-        others = equivalents(*swapped) if swapped else equivalents(look.taken, look.hypotheses)
+        swapped = search.swaps.get(look.selected.candidate.label)
+        others = equivalents(*swapped) if swapped else equivalents(look.selected, look.hypotheses)
         if others:
-            names = (look.taken.candidate.name, *(other.candidate.name for other in others))
+            names = (look.selected.candidate.name, *(other.candidate.name for other in others))
             groups.append(Equivalent(names, separating_run(names, problem.motions)))
     return tuple(groups)
 
@@ -296,11 +307,11 @@ def _calibration(problem: Problem, found: Fit) -> dict[str, Calibrated]:
 
 
 def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int], kept: Container[str]) -> list[Evidence]:
-    """Every candidate's fate in one round: the refitted ones, then the best place of every other name.
+    """Every candidate's outcome in one round: the refitted ones, then the best place of every other name.
 
-    ``kept`` are the labels of what the final model has: what was taken may have been dropped again.
+    ``kept`` are the labels of what the final model has: what was selected may have been removed again.
     """
-    equal = {h.candidate.label for h in equivalents(look.taken, look.hypotheses)} if look.taken else set()
+    equal = {h.candidate.label for h in equivalents(look.selected, look.hypotheses)} if look.selected else set()
     entries = [
         Evidence(
             number,
@@ -308,8 +319,8 @@ def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int
             h.candidate.where,
             h.candidate.parameters(h.values),
             h.gain,
-            h.screened,
-            *_fate(h, look, equal, kept),
+            h.predicted_gain,
+            *_outcome(h, look, equal, kept),
             {problem.runs[k]: float(gain) for k, gain in zip(fitted, h.by_run, strict=True)},
         )
         for h in look.hypotheses
@@ -320,29 +331,31 @@ def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int
             continue
         seen.add(score.candidate.name)
         values = score.candidate.parameters(score.values)
-        reason = "the known numbers imitate it" if score.own < 0.05 else "it promises too little of what is left"
+        reason = CONFOUNDED if score.own < 0.05 else "its predicted improvement is too small"
         entries.append(
-            Evidence(
-                number, score.candidate.name, score.candidate.where, values, score.gain, score.gain, "screened out", reason
-            )
+            Evidence(number, score.candidate.name, score.candidate.where, values, score.gain, score.gain, REJECTED, reason)
         )
     return entries
 
 
-def _fate(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Container[str]) -> tuple[str, str]:
-    best = look.taken
+def _outcome(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Container[str]) -> tuple[str, str]:
+    best = look.selected
     if best is not None and hypothesis.candidate.label == best.candidate.label:
-        return ("taken", "buys most") if best.candidate.label in kept else ("dropped", "what was found later makes it needless")
+        return (
+            (SELECTED, "improves the fit most")
+            if best.candidate.label in kept
+            else (REMOVED, "redundant beside effects selected later")
+        )
     if hypothesis.candidate.label in equal and best is not None:
-        return "equivalent", f"buys {hypothesis.gain / best.gain:.0%} of what the taken one buys"
+        return EQUIVALENT, f"improves the fit by {hypothesis.gain / best.gain:.0%} of what the selected effect does"
     if hypothesis.at_bound:
         return "implausible", "needs a value outside its plausible range"
     if hypothesis.tolerable:
-        return "within tolerance", "the tolerances of known numbers allow as much"
-    if not hypothesis.carries_over:
-        return NOT_CARRIED, "runs do not get better by what the others tell of it"
+        return "within tolerance", "the tolerances of calibrated parameters allow as much"
+    if not hypothesis.cross_validated:
+        return FAILS_CROSS_VALIDATION, "left out of the fit, runs are not replayed better with it"
     if not hypothesis.consistent:
         return "inconsistent", "helps some runs and harms others"
     if best is None:
-        return "too little", "buys less than chance and an imperfect simulator can"
-    return "weaker", f"buys {max(hypothesis.gain, 0.0) / best.gain:.0%} of what the taken one buys"
+        return "too little", "improves the fit by less than chance and an imperfect simulator can"
+    return WORSE_FIT, f"improves the fit by {max(hypothesis.gain, 0.0) / best.gain:.0%} of what the selected effect does"

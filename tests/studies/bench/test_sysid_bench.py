@@ -9,7 +9,7 @@ import pytest
 
 from wlr_gym.base.errors import MissingPackageError
 from wlr_gym.cli import main
-from wlr_gym.gap.estimation.fit import SETTLED
+from wlr_gym.gap.estimation.fit import CONVERGED
 from wlr_gym.gap.problem import Quantity, Setting
 from wlr_gym.studies.bench import sysid
 from wlr_gym.studies.bench.sysid_contest import Contest, Fitted, rows, settled
@@ -133,7 +133,7 @@ def toy_contest(name):
 
 
 def test_trace_settles_where_it_comes_near_its_least():
-    assert settled([(1.0, 100.0), (2.0, 3.5 + 2.0 * SETTLED), (3.0, 3.5 + 0.9 * SETTLED), (4.0, 3.5)]) == 3.0
+    assert settled([(1.0, 100.0), (2.0, 3.5 + 2.0 * CONVERGED), (3.0, 3.5 + 0.9 * CONVERGED), (4.0, 3.5)]) == 3.0
 
 
 def test_bar_is_the_time_to_the_same_fit_and_error_the_worst_number():

@@ -1,13 +1,13 @@
-"""How probable residuals are: each channel has a level of its own, and neighbouring rows say much the same.
+"""How probable residuals are: each channel has a level of its own, and autocorrelated residuals.
 
-A simulator is never right to the last digit, and what it gets wrong lasts for several rows. A channel of n rows whose errors
-last for tau rows is worth n/tau independent ones; its level s (in units of the sensor's noise, never below 1) is estimated.
-Up to a constant, minus twice the logarithm of the likelihood is then ``sum over channels of n/tau log s^2``. The same tau
-serves all models that are compared: who whitens each with its own compares nothing.
+A simulator is never exact, and its errors last for several rows. A channel of n rows whose residuals have an integrated
+autocorrelation time of tau rows is worth n/tau independent ones; its level s (in units of the sensor's noise, never below 1) is
+estimated. Up to a constant, minus twice the logarithm of the likelihood is then ``sum over channels of n/tau log s^2``. The
+same tau serves all models that are compared: likelihoods with different tau are not comparable.
 
-What a simulator gets wrong also differs from run to run: each run on its own would move the model's numbers farther than its
-rows promise (three to six times, in squares, between two simulators of one robot). By this factor, found by
-:func:`run_scatter`, all memories are longer.
+The errors of a simulator also differ from run to run: each run on its own would move the model's numbers farther than its
+rows predict (three to six times, in squares, between two simulators of one robot). All autocorrelation times are multiplied
+by this factor, found by :func:`run_scatter`.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Rows; longer memory than this is not looked for.
+#: Rows: the longest lag of an autocorrelation.
 LONGEST = 100
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Level and memory of every channel's residuals.
+    """Level and integrated autocorrelation time of every channel's residuals.
 
     Attributes:
         square: (channels) mean square in units of sensor noise.
-        memory: (channels) rows that say the same, at least 1, times ``scatter``.
+        autocorrelation_time: (channels) integrated, in rows, at least 1, times ``scatter``.
         rows: (channels) how many were measured.
-        scatter: how many times more than the rows promise the runs differ in what they say of the model's numbers.
+        scatter: of the runs' estimates of the model's numbers, in squares, over what their rows predict.
     """
 
     square: Array
-    memory: Array
+    autocorrelation_time: Array
     rows: Array
     scatter: float = 1.0
 
@@ -48,27 +48,38 @@ class Noise:
     @property
     def weight(self) -> Array:
         """Weight (channels) of a squared residual in the sum that fits minimise."""
-        return np.where(self.rows > 0, 1.0 / (self.level**2 * self.memory), 0.0)
+        return np.where(self.rows > 0, 1.0 / (self.level**2 * self.autocorrelation_time), 0.0)
 
 
-def estimate_noise(residuals: Sequence[Array], memory: Array | None = None, scatter: float = 1.0) -> Noise:
-    """Return level and memory of residuals, one (rows, channels) array per run; ``memory`` keeps one known before."""
+def estimate_noise(residuals: Sequence[Array], autocorrelation_time: Array | None = None, scatter: float = 1.0) -> Noise:
+    """Return level and autocorrelation time of residuals, one (rows, channels) array per run.
+
+    Args:
+        residuals: noise units, NaN where not measured.
+        autocorrelation_time: (channels) of another model that this one is compared with; None = estimated.
+        scatter: of the runs; see :class:`Noise`.
+    """
     total = np.sum([np.nansum(r * r, axis=0) for r in residuals], axis=0)
     rows = np.sum([np.isfinite(r).sum(axis=0) for r in residuals], axis=0)
-    return Noise(total / np.maximum(rows, 1), scatter * _memory(residuals) if memory is None else memory, rows, scatter)
+    return Noise(
+        total / np.maximum(rows, 1),
+        scatter * _autocorrelation_time(residuals) if autocorrelation_time is None else autocorrelation_time,
+        rows,
+        scatter,
+    )
 
 
-def minus_two_log_likelihood(residuals: Sequence[Array], memory: Array) -> float:
+def minus_two_log_likelihood(residuals: Sequence[Array], autocorrelation_time: Array) -> float:
     """Return ``sum n/tau log s^2`` over the channels of all runs together; below the sensor's own noise s^2 itself counts."""
-    noise = estimate_noise(residuals, memory)
-    return float(np.sum(noise.rows / memory * (np.log(noise.level**2) + np.minimum(noise.square, 1.0) - 1.0)))
+    noise = estimate_noise(residuals, autocorrelation_time)
+    return float(np.sum(noise.rows / autocorrelation_time * (np.log(noise.level**2) + np.minimum(noise.square, 1.0) - 1.0)))
 
 
 def run_scatter(matrices: Array, vectors: Array) -> float | None:
     """Return how many times more than expected the runs differ in where they pull the numbers.
 
     The runs' gradients at their common best fit should scatter as their curvature says (White's information equality); the mean
-    ratio over the directions that the data tell something of; None where they tell nothing.
+    ratio over the directions that the data are informative about; None where there is none.
 
     Args:
         matrices, vectors: (runs, numbers, numbers), (runs, numbers) normal equations of each run.
@@ -76,19 +87,19 @@ def run_scatter(matrices: Array, vectors: Array) -> float | None:
     runs = len(vectors)
     if runs < 2:
         return None
-    told, directions = np.linalg.eigh(matrices.sum(axis=0))
+    curvature, directions = np.linalg.eigh(matrices.sum(axis=0))
     pulls = (vectors - vectors.mean(axis=0)) @ directions
-    known = told > 1.0
+    known = curvature > 1.0
     if not known.any():
         return None
-    ratio = (pulls**2).sum(axis=0)[known] * runs / (runs - 1) / told[known]
+    ratio = (pulls**2).sum(axis=0)[known] * runs / (runs - 1) / curvature[known]
     return float(ratio.mean())
 
 
-def _memory(residuals: Sequence[Array]) -> Array:
+def _autocorrelation_time(residuals: Sequence[Array]) -> Array:
     """Integrated autocorrelation (channels) in rows: summed until it first falls below 0.05, over measured rows only."""
     channels = residuals[0].shape[1]
-    memory = np.ones(channels)
+    autocorrelation_time = np.ones(channels)
     for c in range(channels):
         series = [r[np.isfinite(r[:, c]), c] for r in residuals]
         series = [s for s in series if len(s) > 8]
@@ -99,5 +110,5 @@ def _memory(residuals: Sequence[Array]) -> Array:
             rho = sum(float(s[lag:] @ s[:-lag]) for s in series if len(s) > lag) / power
             if rho < 0.05:
                 break
-            memory[c] += 2.0 * rho
-    return memory
+            autocorrelation_time[c] += 2.0 * rho
+    return autocorrelation_time

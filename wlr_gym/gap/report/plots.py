@@ -1,4 +1,4 @@
-"""Pictures of an analysis: where the gap is, what was weighed, how much it shrank, and the runs laid over each other.
+"""Pictures of an analysis: where the gap is, the candidates, how much the gap shrank, and traces of runs.
 
 Matplotlib only, drawn without a display.
 """
@@ -8,12 +8,24 @@ from __future__ import annotations
 import io
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.analysis import Analysis, ChannelGap, Evidence, GapFigures, HeatMap, Relation, RunGap, Trace
+from wlr_gym.gap.analysis import (
+    EQUIVALENT,
+    REJECTED,
+    SELECTED,
+    Analysis,
+    ChannelGap,
+    Evidence,
+    GapFigures,
+    HeatMap,
+    Relation,
+    RunGap,
+    Trace,
+)
 from wlr_gym.gap.report.text import channel, error, feature, percent, places, plain
 
 if TYPE_CHECKING:
@@ -24,16 +36,26 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: Colours of the measurement, and of the model as given, calibrated, and with the effects added.
-MEASURED, BEFORE, CALIBRATED, AFTER = "#8c8c8c", "#b0b0b0", "#e06c00", "#1f4e9c"
-#: Outcome of a candidate that was not fitted.
-SCREENED_OUT = "screened out"
-_TAKEN, _EQUIVALENT, _LOST = "#1f4e9c", "#6d9bd1", "#c9c9c9"
+#: Colour of the measurement.
+MEASURED = "#8c8c8c"
+#: Of the model as given.
+BEFORE = "#b0b0b0"
+#: Of the calibrated model.
+CALIBRATED = "#e06c00"
+#: Of the model with the effects added.
+AFTER = "#1f4e9c"
+#: Outcome of a candidate -> colour; :data:`_OTHER_OUTCOME` for all others.
+_COLOURS = {SELECTED: "#1f4e9c", EQUIVALENT: "#6d9bd1"}
+_OTHER_OUTCOME = "#c9c9c9"
 _DPI = 110
-#: Overlays in one figure; effects shown in a round beside those that were fitted.
-_PANELS, _OTHERS = 6, 6
-#: Errors that the heat map tells apart, in noise units.
-_COLDEST, _HOTTEST = 0.7, 10.0
+#: Overlays in one figure.
+_PANELS = 6
+#: Effects shown in a round beside those that were fitted.
+_OTHERS = 6
+#: Ends of the heat map's scale, noise units.
+_COLDEST = 0.7
+_HOTTEST = 10.0
+#: Relations in one figure.
 _MOST_RELATIONS = 12
 
 
@@ -80,8 +102,8 @@ def _new(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _calm(axes: Axes, grid: str = "both") -> None:
-    axes.grid(alpha=0.25, axis=grid)  # type: ignore[arg-type]
+def _calm(axes: Axes, grid: Literal["both", "x", "y"] = "both") -> None:
+    axes.grid(alpha=0.25, axis=grid)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8)
     for side in ("top", "right"):
@@ -111,7 +133,7 @@ def _relations(shown: Sequence[Relation]) -> Figure:
     texts = [f"{one.gain:.0f}  {plain(one.law)}{f': {one.formula}' if one.formula else ''}" for one in ordered]
     axes.bar_label(bars, texts, padding=4, fontsize=8)
     axes.set_xlim(0.0, 1.7 * max(one.gain for one in shown))
-    axes.set_xlabel("promised by the best law there (fall of minus two log posterior)", fontsize=9)
+    axes.set_xlabel("predicted improvement by the best law there (fall of minus two log posterior)", fontsize=9)
     _calm(axes, "x")
     return figure
 
@@ -165,19 +187,23 @@ def _evidence(evidence: Sequence[Evidence]) -> Figure:
     for axes, turn, members in zip(panels, rounds, shown, strict=True):
         _draw_round(axes, members)
         total = sum(one.round == turn for one in evidence)
-        part = f": the strongest of {total} explanations" if total > len(members) else ""
+        part = f": the strongest of {total} candidates" if total > len(members) else ""
         axes.set_title(f"Round {turn}{part}", fontsize=10, loc="left")
-        axes.set_xlabel("gain: how much better the model explains the fitted runs (fall of -2 log posterior)", fontsize=9)
-    labels = ((_TAKEN, "taken"), (_EQUIVALENT, "equivalent: cannot be told from it"), (_LOST, "lost after its fit"))
+        axes.set_xlabel("gain: improvement of the fit (fall of -2 log posterior)", fontsize=9)
+    labels = (
+        (_COLOURS[SELECTED], "selected"),
+        (_COLOURS[EQUIVALENT], "equivalent: not distinguishable from it"),
+        (_OTHER_OUTCOME, "not selected"),
+    )
     handles = [panels[0].barh([0], [0], color=colour, label=label) for colour, label in labels]
-    handles.append(panels[0].barh([0], [0], fill=False, edgecolor=_LOST, label="promised by the first look only"))
+    handles.append(panels[0].barh([0], [0], fill=False, edgecolor=_OTHER_OUTCOME, label="not fitted: predicted improvement"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return figure
 
 
 def _strongest(evidence: Sequence[Evidence]) -> list[Evidence]:
-    """Return all that were fitted, and of the best other effects the place that promised most; weakest first."""
-    fitted = [one for one in evidence if one.outcome != SCREENED_OUT]
+    """Return all that were fitted, and of the best other effects the place with the largest prediction; weakest first."""
+    fitted = [one for one in evidence if one.outcome != REJECTED]
     named = {one.name for one in fitted}
     best: dict[str, Evidence] = {}
     for one in evidence:
@@ -187,19 +213,18 @@ def _strongest(evidence: Sequence[Evidence]) -> list[Evidence]:
 
 
 def _size(one: Evidence) -> float:
-    value = one.screened if one.outcome == SCREENED_OUT else one.gain
+    value = one.screened if one.outcome == REJECTED else one.gain
     return value if np.isfinite(value) else 0.0
 
 
 def _draw_round(axes: Axes, members: Sequence[Evidence]) -> None:
-    colours = {"taken": _TAKEN, "equivalent": _EQUIVALENT}
     rows, sizes = np.arange(len(members)), np.array([_size(one) for one in members])
-    bars = axes.barh(rows, sizes, color=[colours.get(one.outcome, _LOST) for one in members], height=0.7)
+    bars = axes.barh(rows, sizes, color=[_COLOURS.get(one.outcome, _OTHER_OUTCOME) for one in members], height=0.7)
     for row, bar, size, one in zip(rows, bars, sizes, members, strict=True):
-        if one.outcome == SCREENED_OUT:
-            bar.set(fill=False, edgecolor=_LOST)
+        if one.outcome == REJECTED:
+            bar.set(fill=False, edgecolor=_OTHER_OUTCOME)
         text = f"{size:.0f}  {one.outcome}"
-        weight = "bold" if one.outcome == "taken" else "normal"
+        weight = "bold" if one.outcome == SELECTED else "normal"
         axes.annotate(text, (max(size, 0.0), row), (5, 0), textcoords="offset points", va="center", fontsize=7.5, weight=weight)
     labels = [f"{plain(one.name)}, {places(one.where)}" for one in members]
     axes.set_yticks(rows, [textwrap.shorten(label, 48, placeholder=" …") for label in labels])
@@ -217,7 +242,7 @@ def _gap(gap: GapFigures, runs: Sequence[RunGap], *, with_effects: bool) -> Figu
     left, *right = np.atleast_1d(figure.subplots(1, 2 if runs else 1, width_ratios=(1.0, 1.25) if runs else (1.0,)))
     _draw_gap_bars(left, gap, with_effects=with_effects)
     if runs:
-        labels = [f"{one.run}{'  (kept aside)' if one.heldout else ''}" for one in runs]
+        labels = [f"{one.run}{'  (held out)' if one.heldout else ''}" for one in runs]
         handles = _draw_moves(right[0], labels, runs, with_effects=with_effects)
         right[0].set_title("each run", fontsize=10, loc="left")
         figure.legend(handles=handles, loc="outside lower right", ncols=4, fontsize=8.5, frameon=False)
@@ -249,7 +274,7 @@ def _draw_gap_bars(axes: Axes, gap: GapFigures, *, with_effects: bool) -> None:
     axes.set_yticks(rows, names)
     axes.set_xlim(0.0, 1.18 * max(end, gap.noise_floor))
     axes.set_xlabel("error of replayed runs (1 = sensor noise)", fontsize=9)
-    axes.set_title("runs kept aside", fontsize=10, loc="left")
+    axes.set_title("held-out runs", fontsize=10, loc="left")
     _calm(axes, "x")
     axes.tick_params(axis="y", labelsize=9)
 
@@ -317,8 +342,8 @@ def _overlays(traces: Sequence[Trace], noise: dict[str, float], *, with_effects:
 def _draw_trace(above: Axes, below: Axes, trace: Trace, noise: float | None, *, with_effects: bool) -> None:
     t: Array = trace.t - trace.t[0]
     known = np.isfinite(trace.measured)
-    dots = {"marker": ".", "markersize": 3.0, "linestyle": ""} if not known.all() else {"linewidth": 2.4}
-    above.plot(t[known], trace.measured[known], color=MEASURED, label="measured", **dots)  # type: ignore[arg-type]
+    dots: dict[str, Any] = {"marker": ".", "markersize": 3.0, "linestyle": ""} if not known.all() else {"linewidth": 2.4}
+    above.plot(t[known], trace.measured[known], color=MEASURED, label="measured", **dots)
     above.plot(t, trace.before, color="black", linewidth=0.8, linestyle=":", label="model as given")
     models = [(trace.calibrated, trace.calibrated_error, CALIBRATED, "calibrated")]
     models += [(trace.after, trace.after_error, AFTER, "effects added")] if with_effects else []
@@ -329,7 +354,7 @@ def _draw_trace(above: Axes, below: Axes, trace: Trace, noise: float | None, *, 
     if noise is not None:
         below.axhspan(-2.0 * noise, 2.0 * noise, color="#2e7d32", alpha=0.15, linewidth=0.0)
     below.axhline(0.0, color="black", linewidth=0.5)
-    above.set_title(f"{trace.channel} ({channel(trace.channel)})\n{trace.run}, kept aside", fontsize=9, loc="left")
+    above.set_title(f"{trace.channel} ({channel(trace.channel)})\n{trace.run}, held out", fontsize=9, loc="left")
     above.set_ylabel(trace.unit, fontsize=9)
     below.set_ylabel(f"error\n{trace.unit}", fontsize=9)
     above.tick_params(labelbottom=False)

@@ -1,4 +1,4 @@
-"""What to record next: the excitation that shows what these data could not, or separates what they could not tell apart."""
+"""What to record next: the excitation that shows what these data could not, or distinguishes equivalent effects."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.data.format import Profile
 from wlr_gym.gap.analysis import EFFECT_FOUND, Recommendation
 from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
-from wlr_gym.gap.selection.search import Naming
+from wlr_gym.gap.selection.search import Round
 
 #: Motion of :data:`wlr_gym.data.excitations.EXCITATIONS` that shows an effect best.
 SHOWN_BY: Mapping[str, str] = {
@@ -109,7 +109,7 @@ _SEPARATED_BY: Sequence[tuple[frozenset[str], frozenset[str], str, str]] = (
 
 
 def separation(chosen: str, other: str, motions: Mapping[str, str]) -> tuple[str, str] | None:
-    """Return the excitation that tells two effects apart, and why it does; None where none is known.
+    """Return the excitation that distinguishes two effects, and why it does; None where none is known.
 
     Args:
         chosen, other: names of effects.
@@ -122,7 +122,7 @@ def separation(chosen: str, other: str, motions: Mapping[str, str]) -> tuple[str
 
 
 def separating_run(names: Iterable[str], motions: Mapping[str, str]) -> str:
-    """Return, in words, the run that tells explanations apart, the chosen one from the others; see :func:`separation`."""
+    """Return the discriminating experiment in words: the run that distinguishes the chosen effect from the others."""
     chosen, *others = names
     found = dict.fromkeys(filter(None, (separation(chosen, other, motions) for other in others)))
     texts = [f"{excitation} ({EXCITATIONS[excitation].doc}): {why}" for excitation, why in found]
@@ -130,23 +130,29 @@ def separating_run(names: Iterable[str], motions: Mapping[str, str]) -> str:
 
 
 def recommend(
-    naming: Naming, equivalent: Sequence[Sequence[str]], verdict: str, motions: Mapping[str, str]
+    last: Round, equivalent: Sequence[Sequence[str]], verdict: str, motions: Mapping[str, str]
 ) -> tuple[Recommendation, ...]:
-    """Return runs worth recording: to separate equivalents, then to show effects that these data would have missed."""
+    """Return runs worth recording: to distinguish equivalent effects, then to show what these data would have missed.
+
+    Args:
+        last: the last round of the search.
+        equivalent: groups of names that the data cannot distinguish.
+        verdict: of the analysis.
+        motions: effect -> motion of the system that shows it best.
+    """
     found: dict[str, str] = {}
     for names in equivalent:
         for other in names[1:]:
             apart = separation(names[0], other, motions)
             if apart is not None:
-                found.setdefault(apart[0], f"separates {names[0]} from {other}: {apart[1]}")
-    last = naming.rounds[-1]
+                found.setdefault(apart[0], f"distinguishes {names[0]} from {other}: {apart[1]}")
     for hypothesis in last.hypotheses:
         name = hypothesis.candidate.name
         if name in motions and shown_by_some_runs_only(hypothesis, last.cost):
-            found.setdefault(motions[name], f"some runs show {name} and the others do not bear it out")
+            found.setdefault(motions[name], f"only some runs show {name}: it fails cross-validation")
     if verdict != EFFECT_FOUND:
         visible: dict[str, bool] = {}
-        for score in naming.rounds[-1].scores:
+        for score in last.scores:
             visible[score.candidate.name] = visible.get(score.candidate.name, False) or score.visible
         blind: dict[str, list[str]] = {}
         for name, shown in visible.items():

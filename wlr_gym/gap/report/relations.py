@@ -1,8 +1,8 @@
 """Which relation of the model could hold the gap: a joint's torque, a wheel's contact, a length, a time, a sensor.
 
-Laws that act on one relation alone are tried on each. A law's score (:mod:`wlr_gym.gap.selection.screening`) is what it would
-explain of the calibrated model's error, to first order, after all known numbers have been refitted. The best law of a relation
-says how much a mistake there could explain.
+Laws that act on one relation alone are tried on each. A law's score (:mod:`wlr_gym.gap.selection.screening`) is its predicted
+improvement of the calibrated model: to first order, all calibrated parameters refitted. The score of a relation is that of its
+best law.
 """
 
 from __future__ import annotations

@@ -20,12 +20,13 @@ from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.base.settings import SettingsModel
-from wlr_gym.gap.analysis import Adequacy, Analysis, Calibrated, Estimate, Evidence, FoundEffect, GapFigures, Statistic
+from wlr_gym.gap.analysis import Adequacy, Analysis, Calibrated, Evidence, FoundEffect, GapFigures, ParameterEstimate, Statistic
 from wlr_gym.gap.report.text import closure, sentence, unit_of
 from wlr_gym.physics.effects import Patch, PatchEffect, save_patch
 from wlr_gym.physics.plants.forces import COORDINATES
 
-RESULT_FILE, PATCH_FILE = "result.json", "patch.yaml"
+RESULT_FILE = "result.json"
+PATCH_FILE = "patch.yaml"
 MADE_BY = "wlr gap"
 
 
@@ -66,7 +67,11 @@ class RangeEntry(_Entry):
 
 
 class EffectEntry(_Entry):
-    """One missing effect; ``formula`` is text with units, of unknown effects only, ``validity`` where it was tried."""
+    """One missing effect.
+
+    ``confidence`` is its selection frequency; ``formula`` is text with units, of unknown effects only, ``validity`` where
+    it was tried.
+    """
 
     name: str
     where: list[str]
@@ -78,7 +83,7 @@ class EffectEntry(_Entry):
 
 
 class CalibrationEntry(_Entry):
-    """A known number that calibration moved; ``sigma`` is its tolerance."""
+    """A calibrated parameter; ``sigma`` is its tolerance."""
 
     nominal: Number
     fitted: Number
@@ -98,7 +103,7 @@ class GapEntry(_Entry):
     """The gap: rms error of replayed runs, 1.0 = sensor noise.
 
     ``reduction`` lies in 0..1; ``reduction_signed`` is negative where the effects make held-out runs worse, and null where
-    calibration leaves nothing to remove and in results of versions that did not tell it. The interval is that of
+    calibration leaves nothing to remove and in results of versions without it. The interval is that of
     ``reduction_signed``, null where held-out runs are too few.
     """
 
@@ -115,7 +120,7 @@ class GapEntry(_Entry):
 
 
 class RelationEntry(_Entry):
-    """A relation of the model and what the best law there promises, as a fall of minus two log posterior."""
+    """A relation of the model and the predicted improvement of the best law there, as a fall of minus two log posterior."""
 
     name: str
     law: str
@@ -124,7 +129,7 @@ class RelationEntry(_Entry):
 
 
 class RunsEntry(_Entry):
-    """Names of the runs that were fitted to, and of those kept aside."""
+    """Names of the runs that were fitted to, and of the held-out ones."""
 
     fit: list[str]
     heldout: list[str]
@@ -166,13 +171,13 @@ class PulledEntry(StatisticEntry):
 
 
 class ConstancyEntry(StatisticEntry):
-    """How many times more than their rows promise the runs differ in where they pull the model's numbers."""
+    """Scatter of the runs' estimates of the model's numbers, over what their rows predict."""
 
     pulled_most: PulledEntry
 
 
 class TurningEntry(_Entry):
-    """What the final model leaves of a signal goes with its joint's turning; ``amplitude`` in noise units."""
+    """A signal's residual is periodic in its joint's angle; ``amplitude``: noise units, ``confidence``: selection frequency."""
 
     joint: str
     signal: str
@@ -300,7 +305,7 @@ def _effect(effect: FoundEffect) -> dict[str, Any]:
     return entry
 
 
-def _parameter(found: Estimate) -> dict[str, Any]:
+def _parameter(found: ParameterEstimate) -> dict[str, Any]:
     known = math.isfinite(found.low) and math.isfinite(found.high)
     interval = [min(found.low, found.value), max(found.high, found.value)] if known else None
     return {"value": found.value, "ci95": interval, "unit": found.unit}

@@ -1,4 +1,4 @@
-"""What an analysis says in plain words: places, channels, effects, numbers, and the verdict as one sentence."""
+"""An analysis in plain words: places, channels, effects, numbers, and the verdict as one sentence."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from collections.abc import Callable, Sequence
 from wlr_gym.gap.analysis import (
     BAD_DATA,
     EFFECT_FOUND,
-    NOT_CARRIED,
+    FAILS_CROSS_VALIDATION,
     NOT_EXCITED,
     NOTHING_MISSING,
     UNKNOWN,
     Adequacy,
     Analysis,
     ChannelGap,
-    Estimate,
     FoundEffect,
+    ParameterEstimate,
     Statistic,
     Turning,
 )
@@ -43,7 +43,7 @@ _SIDES = {
     frozenset(("lf", "lr")): "both left",
     frozenset(("rf", "rr")): "both right",
 }
-#: Times what a model without error would reach, from which on there is something left that has no name.
+#: Times the noise floor, from which on part of the gap is unexplained.
 UNEXPLAINED = 1.5
 #: Groups of channels in words; others as they are.
 _GROUPS = {
@@ -146,7 +146,7 @@ def unit_of(unit: str) -> str:
     return "" if unit in ("", "-") else f" {unit}"
 
 
-def estimate(found: Estimate) -> str:
+def estimate(found: ParameterEstimate) -> str:
     """Return ``0.041 (0.038 to 0.045) N m``; angles in degrees, too."""
     known = math.isfinite(found.low) and math.isfinite(found.high)
     digits = _digits(found.value, 0.5 * (found.high - found.low)) if known else 3
@@ -177,12 +177,12 @@ def title(analysis: Analysis) -> str:
 
 
 def _leaves_something(analysis: Analysis) -> bool:
-    """Whether nothing was named although the error of runs kept aside is well above what a model without error would leave."""
+    """Whether nothing was named although the error of the held-out runs is well above the noise floor."""
     return analysis.verdict == NOTHING_MISSING and bool(closure(analysis))
 
 
 def closure(analysis: Analysis) -> str:
-    """Return what is left in the runs kept aside, and where, in one sentence; empty if that is hardly more than noise."""
+    """Return what is left in the held-out runs, and where, in one sentence; empty if that is hardly more than noise."""
     gap = analysis.gap
     if gap is None or not gap.heldout_after >= UNEXPLAINED * gap.noise_floor:
         return ""
@@ -193,8 +193,8 @@ def closure(analysis: Analysis) -> str:
     share = above[most] / sum(above.values()) if above and sum(above.values()) > 0.0 else math.nan
     where = f"; {percent(share)} of it is in {_GROUPS.get(most, most.replace('_', ' '))}" if math.isfinite(share) else ""
     return (
-        f"Not all is explained: in runs kept aside an error of {error(gap.heldout_after)} is left, where a model without error "
-        f"would reach {error(gap.noise_floor)}{where}."
+        f"Not all is explained: an error of {error(gap.heldout_after)} is left in the held-out runs, above the noise floor of "
+        f"{error(gap.noise_floor)}{where}."
     )
 
 
@@ -204,23 +204,23 @@ def _above(gap: ChannelGap, floor: float) -> float:
 
 
 def adequacy(found: Adequacy) -> str:
-    """Return what the final model leaves in the fitted runs: what chance does not explain, and how large it is."""
-    told = {
+    """Return the residual tests of the final model in words: what chance does not explain, and how large it is."""
+    tested = {
         f"an error of {error(found.level.value)} times the sensor noise": found.level,
-        f"{error(found.whiteness.value)} rows on end that say the same": found.whiteness,
-        "runs that differ in what they say of the model's numbers": found.constancy,
+        f"an integrated autocorrelation time of {error(found.whiteness.value)} rows": found.whiteness,
+        "scatter of the runs' estimates of the model's numbers": found.constancy,
     }
-    beyond = [f"{text} ({error(one.ratio)} times what is expected)" for text, one in told.items() if one.rejected]
+    beyond = [f"{text} ({error(one.ratio)} times what is expected)" for text, one in tested.items() if one.rejected]
     compared = f"Compared with {found.replicates} sets of runs that the final model made itself"
-    untold = "" if math.isfinite(found.constancy.p) else " Whether the runs agree could not be tested."
+    untested = "" if math.isfinite(found.constancy.p) else " Whether the runs agree could not be tested."
     if not beyond:
-        return f"{compared}, it leaves nothing in the fitted runs that chance does not explain.{untold}"
+        return f"{compared}, it leaves nothing in the fitted runs that chance does not explain.{untested}"
     levels = {name: level for name, (level, _) in found.channels.items() if level.rejected}
     most = sorted(levels, key=lambda name: -_excess(levels[name]))[:3]
     where = f" Most of the error that is not expected is in {listed(most)}." if found.level.rejected and most else ""
     apart = found.pulled.errors.rejected
     pulled = f" {found.pulled.run} pulls {found.pulled.number} farthest from the others." if apart else ""
-    return f"{compared}, more than chance explains is left in the fitted runs: {listed(beyond)}.{where}{pulled}{untold}"
+    return f"{compared}, more than chance explains is left in the fitted runs: {listed(beyond)}.{where}{pulled}{untested}"
 
 
 def _excess(level: Statistic) -> float:
@@ -241,22 +241,22 @@ def _bad_data(analysis: Analysis) -> str:
 
 def _not_excited(analysis: Analysis) -> str:
     wanted = listed([recommendation.excitation for recommendation in analysis.recommendations])
-    alone = [e for e in analysis.evidence if e.outcome == NOT_CARRIED and e.gain > LEAST_GAIN and e.by_run]
+    alone = [e for e in analysis.evidence if e.outcome == FAILS_CROSS_VALIDATION and e.gain > LEAST_GAIN and e.by_run]
     if alone:
         shown = max(alone, key=lambda evidence: evidence.gain)
         run = max(shown.by_run, key=lambda name: shown.by_run[name])
         what = f"{plain(shown.name)} ({places(shown.where)})"
         more = f", and {wanted}" if wanted else ""
-        return f"{run} shows {what}, the other runs do not bear it out: record more such runs{more}."
-    return f"These runs move too little to tell whether the model lacks anything{f'; record {wanted}' if wanted else ''}."
+        return f"Only {run} shows {what}: it fails cross-validation. Record more such runs{more}."
+    return f"These runs excite too little to show whether the model lacks anything{f'; record {wanted}' if wanted else ''}."
 
 
 def _nothing_missing(analysis: Analysis) -> str:
     gap = analysis.gap
-    calibrated = " once its known numbers are calibrated" if analysis.calibration else ""
+    calibrated = " once its parameters are calibrated" if analysis.calibration else ""
     if gap is None:
         return f"The model lacks nothing that these runs could show{calibrated}."
-    rest = f"it replays runs kept aside to within {error(gap.heldout_calibrated)} times the sensor noise"
+    rest = f"it replays the held-out runs to within {error(gap.heldout_calibrated)} times the sensor noise"
     if not _leaves_something(analysis):
         return f"The model lacks nothing that these runs could show: {rest}{calibrated}."
     return (
@@ -271,38 +271,38 @@ def _effect_found(analysis: Analysis) -> str:
     ]
     lost = names[0] if len(names) == 1 else f"{len(names)} effects: {listed(names)}"
     others = [_others(group.names, analysis.effects) for group in analysis.equivalent]
-    doubt = f"; these data cannot tell it from {listed([name for name in others if name], 'or')}" if any(others) else ""
-    return f"The model lacks {lost}{_bought(analysis)}{doubt}."
+    doubt = f"; these data do not distinguish it from {listed([name for name in others if name], 'or')}" if any(others) else ""
+    return f"The model lacks {lost}{_improvement(analysis)}{doubt}."
 
 
 def _unknown(analysis: Analysis) -> str:
     acts = f" ({places(analysis.effects[0].where)})" if analysis.effects else ""
     lacks = f"The model lacks something{acts} that no effect of the library explains"
     if any(effect.formula for effect in analysis.effects):
-        return f"{lacks}; a formula describes it{_bought(analysis)}."
-    return f"{lacks}; no formula describes it, either{f': {turned(analysis.turning)}' if analysis.turning else ''}."
+        return f"{lacks}; a formula describes it{_improvement(analysis)}."
+    return f"{lacks}; no formula describes it either{f': {turned(analysis.turning)}' if analysis.turning else ''}."
 
 
 def turned(turning: Turning) -> str:
-    """Say what goes with a joint's turning."""
+    """Return a residual that is periodic in a joint's angle in words."""
     times = {1: "once", 2: "twice"}.get(turning.order, f"{turning.order} times")
     return (
-        f"{percent(turning.share)} of what is left of {turning.signal} comes and goes {times} per turn of the "
+        f"{percent(turning.share)} of the squared residual of {turning.signal} is periodic, {times} per turn of the "
         f"{places((turning.joint,))} ({error(turning.amplitude)} times the sensor noise), as with a wheel out of round or an "
         "encoder off its centre"
     )
 
 
-def _bought(analysis: Analysis) -> str:
+def _improvement(analysis: Analysis) -> str:
     if analysis.gap is None or not analysis.added:
         return ""
     share, one = analysis.gap.reduction, len(analysis.added) == 1
     if not math.isfinite(share):
-        return "; the error of runs kept aside is as small without it"
+        return "; the error of the held-out runs is as small without it"
     if share < 0.0:
         does = "makes" if one else "make"
-        return f"; added, {'it' if one else 'they'} {does} the error of runs kept aside larger: {removed(analysis)}"
-    return f"; added, {'it removes' if one else 'they remove'} {removed(analysis)} of the avoidable error of runs kept aside"
+        return f"; added, {'it' if one else 'they'} {does} the error of the held-out runs larger: {removed(analysis)}"
+    return f"; added, {'it removes' if one else 'they remove'} {removed(analysis)} of the avoidable error of the held-out runs"
 
 
 def removed(analysis: Analysis) -> str:

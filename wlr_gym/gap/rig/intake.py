@@ -143,5 +143,5 @@ def _confounding(recordings: Sequence[Recording]) -> Iterator[IntakeFinding]:
     for (a, x), (b, y) in combinations(varied.items(), 2):
         correlation = float(np.corrcoef(x, y)[0, 1])
         if abs(correlation) > _CONFOUNDED:
-            text = f"{a} and {b} go together (correlation {correlation:+.2f}): these runs cannot tell what comes from which"
+            text = f"{a} and {b} are correlated over the runs ({correlation:+.2f}): their effects are not distinguishable"
             yield IntakeFinding("", f"{a}, {b}", "confounded", text)

@@ -1,7 +1,7 @@
-"""The rig's known numbers, the effects that may act in it, and what the compiled law reads of both.
+"""The rig's calibrated parameters, the effects that may act in it, and what the compiled law reads of both.
 
 Servo: XL330-M288-T by its data sheet (ROBOTIS e-manual: stall torque 0.52 N m, no load 103 rev/min, both at 5 V). That its gear
-has dry and viscous friction is known; how much, the runs must say.
+has dry and viscous friction is known; how much is fitted.
 """
 
 from __future__ import annotations
@@ -29,7 +29,12 @@ Numbers = dict[str, float]
 
 #: The rig's one joint, where its effects act.
 JOINT = "servo"
-STALL_TORQUE, NO_LOAD_SPEED, DATA_SHEET_VOLTAGE = 0.52, 103 * 2 * math.pi / 60, 5.0
+#: Data sheet: N m at stall.
+STALL_TORQUE = 0.52
+#: Data sheet: rad/s without load.
+NO_LOAD_SPEED = 103 * 2 * math.pi / 60
+#: V, of both.
+DATA_SHEET_VOLTAGE = 5.0
 #: m/s2.
 GRAVITY = 9.81
 #: Duty per rad and unit of the Position P Gain register: counts of 2 pi/4096, /256 to PWM counts (the data confirm it).
@@ -148,14 +153,14 @@ def unknowns(name: str) -> tuple[Unknown, ...]:
 
 
 @dataclass(frozen=True)
-class Model:
+class RigModel:
     """Numbers of a model by name, SI, and the formula forces on its joint."""
 
     numbers: Numbers
     forces: tuple[Force, ...] = ()
 
 
-def model_of(setting: Setting, quantities: Sequence[Quantity], known: Sequence[PatchEffect] = ()) -> Model:
+def model_of(setting: Setting, quantities: Sequence[Quantity], known: Sequence[PatchEffect] = ()) -> RigModel:
     """Return the model of a setting: its quantities, then the effects that are known, then its own.
 
     Raises:
@@ -171,7 +176,7 @@ def model_of(setting: Setting, quantities: Sequence[Quantity], known: Sequence[P
             apply_effect(numbers, effect)
         else:
             raise unknown_name("effect of the test rig", effect.name, RIG_EFFECTS)
-    return Model(numbers, tuple(forces))
+    return RigModel(numbers, tuple(forces))
 
 
 def apply_effect(numbers: Numbers, effect: PatchEffect) -> None:
@@ -186,7 +191,7 @@ def apply_effect(numbers: Numbers, effect: PatchEffect) -> None:
     law_of.apply(numbers, values)
 
 
-def pack(models: Sequence[Model], recording: Recording, step: float) -> Array:
+def pack(models: Sequence[RigModel], recording: Recording, step: float) -> Array:
     """Return what the compiled law reads (models, len(law.PARAMETERS)) for one recording's load and gain."""
     table = {name: np.array([model.numbers[name] for model in models]) for name in models[0].numbers}
     arm, length = table["arm_mass"], recording.length + table["length_error"]

@@ -19,7 +19,7 @@ from wlr_gym.physics.codegen.expression import finite_number
 from wlr_gym.physics.effects import UNKNOWN_EFFECT, EffectParameter, Patch, PatchEffect, Source, compose
 from wlr_gym.robot.parameter_table import range_in_words
 
-#: Recordings that an analysis needs: two to fit, one for the proof.
+#: Recordings that an analysis needs: two to fit, one to hold out.
 LEAST_RUNS = 3
 
 
@@ -40,7 +40,7 @@ def open_rig(data: str | Path, known: Patch | None = None) -> tuple[RigProblem |
     if "" in bad:
         return None, found
     if len(good) < LEAST_RUNS:
-        text = f"{len(good)} usable runs of {len(recordings)}: record {LEAST_RUNS} or more, two to fit and one for the proof"
+        text = f"{len(good)} usable runs of {len(recordings)}: record {LEAST_RUNS} or more, two to fit and one to hold out"
         return None, [*found, IntakeFinding("", "", "few_runs", text, fatal=True)]
     return RigProblem(good, known.effects if known else ()), found
 

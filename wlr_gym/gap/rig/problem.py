@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import generator
-from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal, since_reversal
+from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, since_reversal
 from wlr_gym.gap.rig.candidates import rig_candidates
 from wlr_gym.gap.rig.formula import lanes_read, rig_force
 from wlr_gym.gap.rig.kernel import OUTPUTS
 from wlr_gym.gap.rig.model import QUANTITIES, model_of
 from wlr_gym.gap.rig.recording import Recording
 from wlr_gym.gap.rig.replay import Replay
-from wlr_gym.gap.validation.data_split import SEALED_SHARE
+from wlr_gym.gap.validation.data_split import HELD_OUT_SHARE
 from wlr_gym.physics.effects.effect import PatchEffect
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ class RigProblem:
         friction_is_known: dry and viscous friction are numbers of the model. Otherwise it has none, and they are candidates.
 
     Attributes:
-        sealed: names of the runs to hold out where the user names none.
+        held_out: names of the runs to hold out where the user names none.
     """
 
     metric = "RMS over whole runs and over windows of 0.2 s of measured-minus-replayed angle, in units of sensor noise"
@@ -50,7 +50,7 @@ class RigProblem:
     cap = LOST
     steps = 20
     #: A replay costs milliseconds, and a joint that sticks answers far from linearly: every hypothesis is worth a whole fit.
-    thorough, firmness, disagreement = True, 1.0, 0.0
+    thorough, tempering, disagreement = True, 1.0, 0.0
     turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})
     motions: Mapping[str, str] = MappingProxyType({})
 
@@ -62,11 +62,11 @@ class RigProblem:
         self.recordings = tuple(recordings)
         self.known = tuple(known)
         self.runs = tuple(recording.name for recording in recordings)
-        self.signals = tuple(Signal(name, "rad", ENCODER_NOISE, "position") for name in HORIZONS)
+        self.signals = tuple(MeasuredSignal(name, "rad", ENCODER_NOISE, "position") for name in HORIZONS)
         self.quantities: tuple[Quantity, ...] = tuple(
             quantity for quantity in QUANTITIES if friction_is_known or not quantity.name.endswith("friction")
         )
-        self.sealed = spread_over_conditions(self.recordings)
+        self.held_out = spread_over_conditions(self.recordings)
         self._replays = [Replay(recording) for recording in recordings]
 
     def times(self, run: int) -> Array:
@@ -159,7 +159,7 @@ class RigProblem:
         return np.array([float(np.abs(r[0, :, 0]).mean()) * ENCODER_NOISE for r in self.residuals([setting], runs)])
 
 
-def spread_over_conditions(recordings: Sequence[Recording], share: float = SEALED_SHARE) -> tuple[str, ...]:
+def spread_over_conditions(recordings: Sequence[Recording], share: float = HELD_OUT_SHARE) -> tuple[str, ...]:
     """Return the names of runs to hold out: in turn one of every gain, each of the trajectory that is held out least so far."""
     gains = sorted({recording.gain for recording in recordings})
     chosen: list[Recording] = []

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.rig import kernel
-from wlr_gym.gap.rig.model import REFERENCE_TEMPERATURE, Model, pack
+from wlr_gym.gap.rig.model import REFERENCE_TEMPERATURE, RigModel, pack
 from wlr_gym.gap.rig.recording import Recording
 from wlr_gym.physics.plants.forces import force_values
 
@@ -47,7 +47,7 @@ class Replay:
         self._below = np.clip(place.astype(np.int64), 0, count - 2)
         self._share = place - self._below
 
-    def simulate(self, models: Sequence[Model], horizon: float | None = None) -> Array:
+    def simulate(self, models: Sequence[RigModel], horizon: float | None = None) -> Array:
         """Return (models, rows, 5) :data:`kernel.OUTPUTS` at the rows of the recording.
 
         Args:
@@ -72,7 +72,7 @@ class Replay:
         return below + (above - below) * self._share[:, None]
 
 
-def _alike(models: Sequence[Model]) -> list[list[int]]:
+def _alike(models: Sequence[RigModel]) -> list[list[int]]:
     """Group models by the formulas that act in them: each group is one compiled kernel."""
     groups: dict[tuple[object, ...], list[int]] = {}
     for k, model in enumerate(models):

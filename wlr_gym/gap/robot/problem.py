@@ -15,7 +15,7 @@ from wlr_gym.data.format import CHANNELS, COLUMNS
 from wlr_gym.data.noise import channel_noise, noise_parts
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters, robot_of
-from wlr_gym.gap.problem import Candidate, Probe, Quantity, Range, Setting, Signal, since_reversal
+from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, since_reversal
 from wlr_gym.gap.report.recommendation import SHOWN_BY
 from wlr_gym.gap.robot.candidates import robot_candidates
 from wlr_gym.gap.robot.clock import RunClock
@@ -39,7 +39,7 @@ CAP, STEPS = 50.0, 3
 LOST = 1e3
 #: See :class:`wlr_gym.gap.problem.Problem`: with 1, what two simulators of one robot do not share moves numbers by two to three
 #: tolerances.
-FIRMNESS = 3.0
+TEMPERING = 3.0
 #: Two simulators of one robot found sizes that differed by so much (root mean square over eight development sets).
 DISAGREEMENT = 0.04
 #: Settings that are worth a replay of their own by a faster kernel.
@@ -77,9 +77,9 @@ class RobotProblem:
         self.metric = f"RMS over channels of measured minus replayed, in units of sensor noise, windows of {window:g} s"
         if any(run.meta.profile != runs[0].meta.profile for run in runs):
             raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
-        self.cap, self.steps, self.firmness = CAP, STEPS, FIRMNESS
+        self.cap, self.steps, self.tempering = CAP, STEPS, TEMPERING
         self.disagreement = DISAGREEMENT
-        self.thorough, self.sealed, self.motions = False, (), SHOWN_BY
+        self.thorough, self.held_out, self.motions = False, (), SHOWN_BY
         self.turning: Mapping[str, tuple[str, tuple[str, ...]]] = {
             wheel: (f"joint_position[{wheel}]", tuple(f"{kind}_{wheel}" for kind in ("pos", "vel", "eff"))) for wheel in WHEELS
         }
@@ -91,7 +91,7 @@ class RobotProblem:
         self._knobs: tuple[Knob, ...] = knobs(self.robot, PHYSICS_STEP)
         self.quantities: tuple[Quantity, ...] = tuple(knob.quantity for knob in self._knobs)
         noise = channel_noise(self.robot)
-        self.signals = tuple(Signal(name, COLUMNS[name].unit, noise[name], COLUMNS[name].group) for name in CHANNELS)
+        self.signals = tuple(MeasuredSignal(name, COLUMNS[name].unit, noise[name], COLUMNS[name].group) for name in CHANNELS)
         self._noise = np.array([signal.noise for signal in self.signals])
         if not self._noise.all():
             name = self.signals[int(np.argmin(self._noise))].name

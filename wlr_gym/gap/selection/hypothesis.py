@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.fit import Model
 from wlr_gym.gap.estimation.likelihood import Noise
+from wlr_gym.gap.estimation.model import FittedModel
 from wlr_gym.gap.problem import Candidate, Problem
 
 Array = NDArray[np.float64]
 
 #: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
 MOST_HARM = 0.2
-#: Of an unknown that meets no known number, what counts as an effect, in its steps.
+#: Of an unknown that meets no calibrated parameter, what counts as an effect, in its steps.
 NOTICED = 0.25
 
 
@@ -29,22 +29,22 @@ class Hypothesis:
         model: with the effect.
         gain: fall of minus two log posterior.
         by_run: (runs) fall of the weighted squares in each run.
-        screened: what the first-order score had promised.
+        predicted_gain: the improvement that the score test predicted.
         residuals: of the model.
         base, base_residuals: the model without the effect, refitted as long.
-        carries_over: whether each run agrees with what the others tell (checked for finalists only).
-        tolerable: whether the tolerances of known numbers allow as much.
+        cross_validated: whether runs are replayed better by a fit to the other runs (checked for finalists only).
+        tolerable: whether the tolerances of calibrated parameters allow as much.
     """
 
     candidate: Candidate
-    model: Model
+    model: FittedModel
     gain: float
     by_run: Array
-    screened: float
+    predicted_gain: float
     residuals: list[Array] = field(repr=False)
-    base: Model = field(repr=False)
+    base: FittedModel = field(repr=False)
     base_residuals: list[Array] = field(repr=False)
-    carries_over: bool = True
+    cross_validated: bool = True
     tolerable: bool = False
 
     @property
@@ -63,8 +63,8 @@ class Hypothesis:
 
     @property
     def plausible(self) -> bool:
-        """Whether its value says that the effect is there, at a size that a robot may have, and the runs agree."""
-        return not self.at_bound and not self.tolerable and self.consistent and self.carries_over
+        """Whether its size is one that a robot may have, and more than tolerances allow, and the runs agree."""
+        return not self.at_bound and not self.tolerable and self.consistent and self.cross_validated
 
     @property
     def consistent(self) -> bool:
@@ -73,7 +73,7 @@ class Hypothesis:
         return bool(harm <= MOST_HARM * help_)
 
 
-def within_tolerance(problem: Problem, model: Model) -> bool:
+def within_tolerance(problem: Problem, model: FittedModel) -> bool:
     """Whether the tolerances of the numbers that the last effect meets allow what number and effect do together."""
     candidate, values = model.effects[-1]
     if not any(candidate.tolerances):

@@ -1,7 +1,7 @@
-"""Score every candidate at once, to first order: what would adding it buy after all known numbers have been refitted?
+"""Score every candidate at once, to first order: by how much would it improve the fit, all calibrated parameters refitted?
 
-The score test of statistics with nuisance parameters projected out. One simulation per probe serves all candidates; a
-candidate whose response the known numbers can imitate within their tolerances gets nothing.
+This is the score test with nuisance parameters projected out. One simulation per probe serves all candidates; a candidate that
+is confounded with calibrated parameters within their tolerances scores nothing.
 """
 
 from __future__ import annotations
@@ -12,29 +12,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.fit import (
-    Fit,
-    bounded_minimum,
-    normal_equations,
-    prior_tightness,
-    room,
-    scaled_nominal,
-    scaled_numbers,
-)
+from wlr_gym.gap.estimation.fit import Fit
+from wlr_gym.gap.estimation.least_squares import bounded_minimum, normal_equations
+from wlr_gym.gap.estimation.model import prior_tightness, room, scaled_nominal, scaled_numbers
 from wlr_gym.gap.problem import Candidate, Probe, Problem, Setting, Start
 
 Array = NDArray[np.float64]
 
 #: Fall of minus two log posterior below which an effect is not accepted.
 LEAST_GAIN = 16.0
-#: What an effect must buy more for every unknown beyond the first; also at least this share of minus two log posterior.
-PER_UNKNOWN, LEAST_SHARE = 3.0, 0.02
-#: A response of which less than this share is left after the known numbers have imitated it cannot be told from them.
+#: By how much more an effect must improve the fit for every unknown beyond the first.
+PER_UNKNOWN = 3.0
+#: An effect must also improve the fit by this share of minus two log posterior.
+LEAST_SHARE = 0.02
+#: A response of which calibrated parameters reproduce all but this share is not distinguishable from them.
 LEAST_OWN = 1e-4
 
 
 def least_gain(unknowns: int, cost: float = 0.0) -> float:
-    """Return what an effect with so many unknowns must buy; ``cost`` is minus two log posterior of the model without it."""
+    """Return by how much an effect with so many unknowns must improve the fit; ``cost`` is that of the model without it."""
     return max(LEAST_GAIN + PER_UNKNOWN * (unknowns - 1), LEAST_SHARE * cost)
 
 
@@ -53,8 +49,8 @@ class Score:
         candidate: the effect.
         values: first guess of its unknowns.
         gain: expected fall of minus two log likelihood.
-        own: share of its response that no known number can imitate.
-        information: of the amplitudes of its best start (k, k), known numbers projected out; 1 = the probe.
+        own: share of its response that is not confounded with calibrated parameters.
+        information: of the amplitudes of its best start (k, k), calibrated parameters projected out; 1 = the probe.
         start: that best start.
         visible: whether the data would show it somewhere in its plausible range.
     """
@@ -139,7 +135,7 @@ def _score(candidate: Candidate, found: Responses, nothing: float, cost: float) 
 
 
 def _fall(found: Responses, mix: Array) -> tuple[float, Array]:
-    """Fall of the cost if the known numbers, within their bounds, and the directions ``mix`` move together; amplitudes."""
+    """Fall of the cost if the calibrated parameters, within bounds, and the directions ``mix`` move together; amplitudes."""
     known = len(found.low)
     rows = np.vstack([np.eye(known, len(found.push)), mix])
     matrix, gradient = rows @ found.response @ rows.T, rows @ found.push

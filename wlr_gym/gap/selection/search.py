@@ -1,8 +1,8 @@
-"""Name what is missing: screen all candidates, refit the best of them, take the one that buys most, and look again.
+"""Search for missing effects: screen all candidates, refit the best of them, select the one that improves the fit most, repeat.
 
 A candidate is accepted if it lowers minus two log posterior by more than chance and an imperfect simulator can
 (:data:`LEAST_GAIN`, more for every further unknown, and :data:`LEAST_SHARE` of what is left), if the runs agree on it, and if
-its value lies inside its plausible range. In the end every effect must still be worth its place beside the others.
+its value lies inside its plausible range. Effects that become redundant beside others are removed.
 """
 
 from __future__ import annotations
@@ -13,34 +13,37 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.fit import Fit, Model, cheapest, fit, linearise, total_cost, untouched, widened
+from wlr_gym.gap.estimation.fit import Fit, cheapest, fit, linearise, widened
 from wlr_gym.gap.estimation.likelihood import estimate_noise
-from wlr_gym.gap.estimation.refit import refit, refit_thoroughly
+from wlr_gym.gap.estimation.model import FittedModel, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
-from wlr_gym.gap.selection.cross_validation import Final, accept, beside, finalists
+from wlr_gym.gap.selection.cross_validation import Finalist, accept, beside, fit_finalists
 from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.refit import refit, refit_thoroughly
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, least_gain, responses, screen
 
 Tell = Callable[[str], None]
 
-#: Hypotheses that are refitted in one round, and at most so many per name.
-SHORTLIST, PER_NAME = 8, 3
+#: Hypotheses that are refitted in one round, at most.
+SHORTLIST = 8
+#: The same per name.
+PER_NAME = 3
 #: Effects in one analysis.
 MOST_EFFECTS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One look for an effect: what was screened, what was refitted (best first), and which was taken."""
+    """One round of the search: what was screened, what was refitted (best first), and which was selected."""
 
     scores: list[Score]
     hypotheses: list[Hypothesis]
-    taken: Hypothesis | None
+    selected: Hypothesis | None
     cost: float
 
 
 @dataclass(frozen=True, eq=False)
-class Naming:
+class SearchResult:
     """Outcome: the calibrated model without effects, the final fit, and every round.
 
     ``swaps`` holds, per effect of a model of several, that effect and its rivals with the other effects kept (thorough
@@ -54,9 +57,9 @@ class Naming:
 
 
 def shortlist(scores: Sequence[Score], cost: float = 0.0) -> list[Score]:
-    """Return the best scores, at most :data:`PER_NAME` of one effect, and only those that promise something.
+    """Return the best scores, at most :data:`PER_NAME` of one effect, and only those above a threshold.
 
-    To first order an effect promises as little as a quarter of what it buys; ``cost`` is that of the model without it.
+    The improvement predicted to first order may be a quarter of the actual one; ``cost`` is that of the model without it.
     """
     least = 0.25 * least_gain(1, cost)
     chosen: list[Score] = []
@@ -69,18 +72,18 @@ def shortlist(scores: Sequence[Score], cost: float = 0.0) -> list[Score]:
     return chosen
 
 
-def name_effects(
+def search_effects(
     problem: Problem,
     runs: Sequence[int],
     start: Fit,
     tell: Tell = lambda text: None,
     given: Sequence[NDArray[np.float32]] | None = None,
-) -> Naming:
-    """Look for missing effects.
+) -> SearchResult:
+    """Search for missing effects.
 
     Args:
         problem: the system.
-        runs: those that are fitted; no other has a say.
+        runs: those that are fitted; no other is used.
         start: the calibrated model.
         tell: told of progress.
         given: columns of ``start`` without its calibration, where they are known: one (numbers, rows x channels) array per run.
@@ -91,7 +94,7 @@ def name_effects(
     models = [start.model]
     while True:
         probes, candidates = problem.candidates(current.model.setting, current.residuals, runs)
-        candidates = [candidate for candidate in candidates if not _settled(current.model, candidate)]
+        candidates = [candidate for candidate in candidates if not _is_explained(current.model, candidate)]
         tell(f"screening {len(candidates)} candidates")
         found = responses(problem, current, runs, probes)
         scores = screen(candidates, found, current.cost)
@@ -101,46 +104,46 @@ def name_effects(
             refit_thoroughly(problem, runs, current, chosen) if given is None else refit(problem, runs, current, chosen, given)
         )
         bare = _without_more(problem, current, hypotheses)
-        finals: list[Final] = []
-        accepted: Final | None = None
+        finals: list[Finalist] = []
+        accepted: Finalist | None = None
         if current is again or not _deeper(problem, current, bare):
-            finals, bare = finalists(problem, runs, current, hypotheses, bare, tell)
+            finals, bare = fit_finalists(problem, runs, current, hypotheses, bare, tell)
         if current is again or not _deeper(problem, current, bare):
             accepted, finals, bare = accept(problem, runs, current, finals, bare, tell)
         if current is not again and _deeper(problem, current, bare):
-            tell("the known numbers fit better elsewhere: calibrated anew from there")
+            tell("calibrated parameters fit better elsewhere: calibrated anew from there")
             anew = fit(problem, runs, bare.model, scatter=current.noise.scatter, steps=problem.steps)
             current = again = widened(problem, runs, anew)
             calibrated = calibrated if current.model.effects else current
             given = _as_given(problem, runs, current, given)
             continue
         merged = _merged(problem, finals, hypotheses, bare, accepted or (finals[0] if finals else None))
-        taken = None if accepted is None else _labelled(merged, accepted.hypothesis)
-        rounds.append(Round(scores, merged, taken, current.cost))
+        selected = None if accepted is None else _labelled(merged, accepted.hypothesis)
+        rounds.append(Round(scores, merged, selected, current.cost))
         if accepted is None:
             break
-        tell(f"taken: {accepted.hypothesis.candidate.label}")
-        current = widened(problem, runs, drop_idle(problem, runs, accepted.fit, tell))
+        tell(f"selected: {accepted.hypothesis.candidate.label}")
+        current = widened(problem, runs, remove_redundant(problem, runs, accepted.fit, tell))
         if len(current.model.effects) >= MOST_EFFECTS or any(_same(current.model, earlier) for earlier in models):
             break
         models.append(current.model)
         given = _as_given(problem, runs, current, given)
-    return Naming(calibrated, current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
+    return SearchResult(calibrated, current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
 
 
 def _as_given(
     problem: Problem, runs: Sequence[int], current: Fit, given: Sequence[NDArray[np.float32]] | None
 ) -> Sequence[NDArray[np.float32]] | None:
-    """Columns of the model without its calibration: beside a strong effect known numbers do other things than without it."""
+    """Columns of the model without its calibration: beside a strong effect their responses differ."""
     if given is None or not current.model.effects:
         return given
     return linearise(problem, untouched(problem, current.model), runs, current.columns, current.noise)[1]
 
 
-def _settled(model: Model, candidate: Candidate) -> bool:
+def _is_explained(model: FittedModel, candidate: Candidate) -> bool:
     """Whether the model has the candidate, or an unknown law on every joint where it acts.
 
-    What a name buys beside a formula at one joint is what the formula has got wrong of the law.
+    An improvement by a name beside a formula at one joint is an error of the formula.
     """
     unknown = {place for other, _ in model.effects if other.formula for place in other.where}
     had = {other.label for other, _ in model.effects}
@@ -158,19 +161,19 @@ def _without_more(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesi
         model=model,
         residuals=residuals,
         noise=noise,
-        cost=total_cost(problem, model, residuals, noise.memory),
+        cost=total_cost(problem, model, residuals, noise.autocorrelation_time),
         converged=False,
     )
-    return cheapest(problem, (current, found), noise.memory)
+    return cheapest(problem, (current, found), noise.autocorrelation_time)
 
 
 def _deeper(problem: Problem, current: Fit, bare: Fit) -> bool:
     """Whether a model without a further effect, in another minimum than the present one, is clearly lower."""
     if problem.thorough:
         return False
-    memory = bare.noise.memory
-    lower = total_cost(problem, current.model, current.residuals, memory) - total_cost(
-        problem, bare.model, bare.residuals, memory
+    autocorrelation_time = bare.noise.autocorrelation_time
+    lower = total_cost(problem, current.model, current.residuals, autocorrelation_time) - total_cost(
+        problem, bare.model, bare.residuals, autocorrelation_time
     )
     return lower > LEAST_GAIN
 
@@ -185,7 +188,7 @@ def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tu
             problem,
             runs,
             final.model.without_effect(index),
-            memory=final.noise.memory,
+            autocorrelation_time=final.noise.autocorrelation_time,
             scatter=final.noise.scatter,
             steps=problem.steps,
         )
@@ -198,12 +201,12 @@ def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tu
     return swaps
 
 
-def _same(one: Model, other: Model) -> bool:
+def _same(one: FittedModel, other: FittedModel) -> bool:
     return [candidate.label for candidate, _ in one.effects] == [candidate.label for candidate, _ in other.effects]
 
 
-def drop_idle(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = lambda text: None) -> Fit:
-    """Take out effects that the others have made needless, one after the other, the least useful first."""
+def remove_redundant(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = lambda text: None) -> Fit:
+    """Remove effects that are redundant beside the others, one after the other, the least useful first."""
     while len(current.model.effects) > 1:
         noise = current.noise
         kept = len(problem.quantities)
@@ -219,7 +222,7 @@ def drop_idle(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = 
                     problem,
                     runs,
                     model,
-                    memory=noise.memory,
+                    autocorrelation_time=noise.autocorrelation_time,
                     scatter=noise.scatter,
                     columns=columns,
                     steps=problem.steps,
@@ -231,19 +234,19 @@ def drop_idle(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = 
         unknowns = len(current.model.effects[least][1])
         if losses[least] > least_gain(unknowns):
             return current
-        tell(f"dropped: {current.model.effects[least][0].label}")
+        tell(f"removed: {current.model.effects[least][0].label}")
         current = fit(problem, runs, trials[least].model, scatter=noise.scatter, steps=1, tell=tell)
     return current
 
 
 def _merged(
-    problem: Problem, finals: Sequence[Final], hypotheses: Sequence[Hypothesis], bare: Fit, best: Final | None
+    problem: Problem, finals: Sequence[Finalist], hypotheses: Sequence[Hypothesis], bare: Fit, best: Finalist | None
 ) -> list[Hypothesis]:
-    """All hypotheses, those fitted in full in their final form; where one was, all as they compare under its memory."""
+    """All hypotheses, those fitted in full in their final form; where one was, all compared under its autocorrelation time."""
     final = {f.hypothesis.candidate.label: f.hypothesis for f in finals}
     merged = [final.get(h.candidate.label, h) for h in hypotheses]
     if best is not None:
-        merged = [beside(problem, hypothesis, bare, best.fit.noise.memory) for hypothesis in merged]
+        merged = [beside(problem, hypothesis, bare, best.fit.noise.autocorrelation_time) for hypothesis in merged]
     return sorted(merged, key=lambda hypothesis: -hypothesis.gain)
 
 

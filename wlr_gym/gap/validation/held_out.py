@@ -1,4 +1,4 @@
-"""Proof on sealed runs, which no fit and no decision has seen: how far are replays from measurements, before and after?
+"""Validation on held-out runs, which no fit and no decision has used: how far are replays from measurements?
 
 All numbers are root mean square residuals in units of sensor noise, over the channels of a run. A perfect model does not reach
 1.0: every window of a replay starts from measured, hence noisy, values. What it does reach is found by replaying data that the
@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
-from wlr_gym.gap.estimation.fit import Model
+from wlr_gym.gap.estimation.model import FittedModel
 from wlr_gym.gap.estimation.uncertainty import two_sided_95
 from wlr_gym.gap.problem import Problem, Setting
 
 Array = NDArray[np.float64]
 
-#: Sealed runs from which on they tell how sure their mean is.
+#: Held-out runs that an interval of their mean needs.
 LEAST_FOR_INTERVAL = 3
 #: Distance from the noise floor below which nothing is left to be removed.
 LEAST_ROOM = 1e-9
@@ -29,7 +29,7 @@ LEAST_ROOM = 1e-9
 def mean_squares(residuals: Sequence[Array], cap: float) -> Array:
     """Return the mean square (runs, channels) of residuals, one (rows, channels) array per run; NaN where not measured.
 
-    Residuals beyond ``cap`` count as that: one lost wheel must not hide all else.
+    Residuals beyond ``cap`` count as that: one lost wheel must not dominate.
     """
     with np.errstate(invalid="ignore"):
         squares = [np.nansum(np.minimum(r * r, cap**2), axis=0) / np.isfinite(r).sum(axis=0) for r in residuals]
@@ -53,8 +53,8 @@ def noise_floor(problem: Problem, setting: Setting, runs: Sequence[int]) -> floa
     return math.nan if made is None else level(mean_squares(made, problem.cap))
 
 
-def prove(
-    problem: Problem, fitted: Sequence[int], heldout: Sequence[int], models: Sequence[Model], floor: float
+def compare_models(
+    problem: Problem, fitted: Sequence[int], heldout: Sequence[int], models: Sequence[FittedModel], floor: float
 ) -> tuple[GapFigures, tuple[RunGap, ...], tuple[ChannelGap, ...]]:
     """Compare three models on fitted and held-out runs.
 
@@ -109,11 +109,11 @@ def reduction(calibrated: Array, after: Array, floor: float) -> float:
 
 
 def _interval(calibrated: Array, after: Array, floor: float) -> tuple[float, float]:
-    """95 % interval of the reduction; NaN where the runs are too few to tell.
+    """95 % interval of the reduction; NaN where the runs are too few.
 
     Student's t interval with the jackknife's standard error: ``R +- t(n-1) sqrt((n-1)/n sum (R_k - mean R_k)^2)``, with R_k the
-    reduction without run k. R counts 1 at most, as it is told; only the upper end is cut off at 1: an interval that lies above
-    it would have no width otherwise.
+    reduction without run k. R counts 1 at most, as it is reported; only the upper end is cut off at 1: an interval that lies
+    above it would have no width otherwise.
     """
     count = len(calibrated)
     if count < LEAST_FOR_INTERVAL:

@@ -1,13 +1,13 @@
 """Is the final model adequate? What it leaves in the fitted runs, beside what it would leave in runs that it made itself.
 
-Three statistics: *level*, the root mean square of the residuals; *whiteness*, how many rows say the same (their integrated
-autocorrelation, see :mod:`wlr_gym.gap.estimation.likelihood`); *constancy*, how many times more than their rows promise the
-runs differ in where they pull the model's numbers. A parametric bootstrap tells what chance alone leaves: the same runs are
+Three statistics: *level*, the root mean square of the residuals; *whiteness*, their integrated autocorrelation time in rows
+(see :mod:`wlr_gym.gap.estimation.likelihood`); *constancy*, the scatter of the runs' estimates of the model's numbers over
+what their rows predict. A parametric bootstrap shows what chance alone leaves: the same runs are
 made anew by the final model with the same sensors, the model's numbers are fitted to each such set by one linear step with the
 columns of the fit, drawn towards the numbers that made it, and the same statistics are taken.
 
-It informs and decides nothing. No simulator is right to the last digit, and such a test notices the last digit: with real runs
-it always rejects. What counts is how many times larger a statistic is than in the sets that were made.
+No decision depends on it. No simulator is exact, and such tests notice that: with real runs they always reject. What matters
+is the ratio of a statistic to its median in the sets that were made.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import Adequacy, Pulled, Statistic
-from wlr_gym.gap.estimation.fit import Fit, on_bounds, prior_tightness
+from wlr_gym.gap.estimation.fit import Fit
 from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, run_scatter
+from wlr_gym.gap.estimation.model import on_bounds, prior_tightness
 from wlr_gym.gap.problem import Problem
 
 Array = NDArray[np.float64]
 
 #: Sets of runs that the model makes: the least of which the largest is a limit of 5 %.
 REPLICATES = 19
-#: Curvature of the likelihood, scaled numbers, above which the data tell something of a number.
-TOLD = 1.0
+#: Curvature of the likelihood, scaled numbers, above which the data are informative about a number.
+INFORMATIVE = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +39,7 @@ class _Left:
 
     Attributes:
         noise: of the residuals, without scatter.
-        scatter: how many times more than their rows promise the runs differ in where they pull the numbers; NaN = no number
-            is told.
+        scatter: of the runs' estimates of the numbers over what their rows predict; NaN = the data are informative about none.
         pulls: (runs, numbers) by how many standard errors each run pulls each number away from the others.
     """
 
@@ -53,9 +53,9 @@ class _Left:
         return np.where(self.noise.rows > 0, np.sqrt(self.noise.square), np.nan)
 
     @property
-    def memory(self) -> Array:
-        """Rows that say the same (channels); NaN where not measured."""
-        return np.where(self.noise.rows > 0, self.noise.memory, np.nan)
+    def autocorrelation_time(self) -> Array:
+        """Integrated autocorrelation time in rows (channels); NaN where not measured."""
+        return np.where(self.noise.rows > 0, self.noise.autocorrelation_time, np.nan)
 
 
 class _Columns:
@@ -97,12 +97,12 @@ class _Columns:
 
 
 def _pulls(matrices: Array, vectors: Array, tight: Array) -> Array:
-    """By how many standard errors (runs, numbers) each run alone moves each number; 0 where the data tell nothing of it."""
+    """By how many standard errors (runs, numbers) each run alone moves each number; 0 where the data say nothing of it."""
     total = matrices.sum(axis=0)
     inverse = np.linalg.inv(total + np.diag(tight))
     shifts = (vectors - vectors.mean(axis=0)) @ inverse
     errors = np.sqrt(np.einsum("ij,rjk,ki->ri", inverse, matrices, inverse).clip(min=0.0))
-    return np.where((np.diag(total) > TOLD) & (errors > 0.0), np.abs(shifts) / np.where(errors > 0.0, errors, 1.0), 0.0)
+    return np.where((np.diag(total) > INFORMATIVE) & (errors > 0.0), np.abs(shifts) / np.where(errors > 0.0, errors, 1.0), 0.0)
 
 
 def adequacy_of(problem: Problem, runs: Sequence[int], found: Fit) -> Adequacy | None:
@@ -121,12 +121,15 @@ def adequacy_of(problem: Problem, runs: Sequence[int], found: Fit) -> Adequacy |
     all_left = [seen, *(columns.left(columns.refitted(residuals)) for residuals in made)]
     if len(all_left) == 1:
         return None
-    levels, memories = np.stack([one.level for one in all_left]), np.stack([one.memory for one in all_left])
+    levels, autocorrelation_times = (
+        np.stack([one.level for one in all_left]),
+        np.stack([one.autocorrelation_time for one in all_left]),
+    )
     run, which = np.unravel_index(int(np.argmax(seen.pulls)), seen.pulls.shape)
     return Adequacy(
         REPLICATES,
         compared(np.sqrt(np.nanmean(levels**2, axis=1))),
-        compared(np.exp(np.nanmean(np.log(memories), axis=1))),
+        compared(np.exp(np.nanmean(np.log(autocorrelation_times), axis=1))),
         compared(np.array([one.scatter for one in all_left])),
         Pulled(
             _number_names(problem, found)[which],
@@ -134,7 +137,7 @@ def adequacy_of(problem: Problem, runs: Sequence[int], found: Fit) -> Adequacy |
             compared(np.array([one.pulls.max() for one in all_left])),
         ),
         {
-            signal.name: (compared(levels[:, c]), compared(memories[:, c]))
+            signal.name: (compared(levels[:, c]), compared(autocorrelation_times[:, c]))
             for c, signal in enumerate(problem.signals)
             if seen.noise.rows[c] > 0
         },

@@ -1,8 +1,8 @@
-"""What no part of a model can make: errors that go with how far a joint has turned.
+"""Residuals that are periodic in the angle of a joint that turns without end.
 
-A wheel of the model is round and its encoder centred: but for a ripple of its torque, nothing depends on where in a turn it
-stands. What still does when the known numbers are calibrated is missing, whatever it is (a wheel out of round, an encoder off
-its centre, a bent axle); which law it follows is not asked.
+A wheel of the model is round and its encoder centred: but for a ripple of its torque, nothing depends on its angle. A residual
+that does after calibration is a missing effect (a wheel out of round, an encoder off its centre, a bent axle); its law is not
+identified.
 """
 
 from __future__ import annotations
@@ -17,20 +17,28 @@ from wlr_gym.gap.problem import Problem
 
 Array = NDArray[np.float64]
 
-#: Periods per turn that are tried, and how far beside them a place on the floor, which a turned wheel tells too, would be felt.
-ORDERS, BESIDE = (1, 2, 3), 0.4
+#: Periods per turn that are tried.
+ORDERS = (1, 2, 3)
+#: How far beside them a dependence on the place on the floor, which a wheel's angle follows too, would be seen.
+BESIDE = 0.4
 #: Parts of a run, each predicted from the others.
 PARTS = 4
-#: Turns that a joint must make in a run, rows, and runs in which it does.
-LEAST_TURNS, LEAST_ROWS, LEAST_RUNS = 2.5, 100, 3
-#: Bootstrap samples of the runs, and the share of them that must show it.
-SAMPLES, LEAST_CONFIDENCE = 500, 0.9
-#: Share of what is left of a signal that must go with the turning.
+#: Turns that a joint must make in a run.
+LEAST_TURNS = 2.5
+#: Rows of such a run.
+LEAST_ROWS = 100
+#: Runs in which it does.
+LEAST_RUNS = 3
+#: Bootstrap samples of the runs.
+SAMPLES = 500
+#: Selection frequency: share of them that must show it.
+LEAST_CONFIDENCE = 0.9
+#: Share of a signal's squared residual that must be periodic in the angle.
 LEAST_SHARE = 0.1
 
 
 def turning(problem: Problem, residuals: Sequence[Array], features: Sequence[Mapping[str, Array]]) -> Turning | None:
-    """Return the signal whose error goes most with its joint's turning, or None.
+    """Return the signal whose residual is most periodic in its joint's angle, or None.
 
     Args:
         problem: the system.
@@ -58,9 +66,9 @@ def _best_order(joint: str, signal: str, residuals: Sequence[Array], angles: Seq
         return None
     best, falls = max(((order, _falls(runs, order)) for order in ORDERS), key=lambda pair: _share(pair[1]))
     picks = np.random.default_rng(0).integers(0, len(runs), (SAMPLES, len(runs)))
-    sure = float(np.mean([_share(falls[:, pick]) > LEAST_SHARE for pick in picks]))
+    frequency = float(np.mean([_share(falls[:, pick]) > LEAST_SHARE for pick in picks]))
     amplitudes = [np.hypot(*_wave(residual, _waves(angle, best))) for residual, angle in runs]
-    return Turning(joint, signal, best, _share(falls), float(np.sqrt(np.mean(np.square(amplitudes)))), sure)
+    return Turning(joint, signal, best, _share(falls), float(np.sqrt(np.mean(np.square(amplitudes)))), frequency)
 
 
 def _falls(runs: Sequence[tuple[Array, Array]], order: int) -> Array:
@@ -77,7 +85,7 @@ def _steady(angle: Array) -> Array:
 
 
 def _share(falls: Array) -> float:
-    """Share that goes with the turning, less what goes as well with orders that no turned part has, or with time."""
+    """Share that is periodic in the angle, less what orders that no turning part has, or time, predict as well."""
     here, *beside, total = falls.sum(axis=1)
     return float((here - max(*beside, 0.0)) / total) if total > 0.0 else 0.0
 

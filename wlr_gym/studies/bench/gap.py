@@ -20,7 +20,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 
@@ -28,7 +28,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, replace_file, write_json
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
-from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED, Case, case
+from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED, BlindCase, case
 from wlr_gym.studies.bench.blind.score import FAILED, score
 
 #: Folder of a data set, folder for the analysis' files -> contents of result.json.
@@ -65,11 +65,11 @@ class Plan:
         if self.processes < 1:
             raise InputError(f"--processes {self.processes}: expected 1 or more")
 
-    def cases(self) -> list[Case]:
+    def cases(self) -> list[BlindCase]:
         """Return the data sets."""
         return [case(index, self.first_seed) for index in range(self.sets)]
 
-    def result_file(self, one: Case) -> Path:
+    def result_file(self, one: BlindCase) -> Path:
         """Return where the result of a set is kept."""
         return self.out / "results" / f"{one.name}.json"
 
@@ -158,7 +158,7 @@ def _check_answer(place: str, answer: Any) -> None:
         raise InputError(f"{place}: blind_test: expected a mapping with truth_sha256 and runs")
 
 
-def _answers_to(plan: Plan, cases: Sequence[Case], path: Path) -> dict[str, dict[str, Any]]:
+def _answers_to(plan: Plan, cases: Sequence[BlindCase], path: Path) -> dict[str, dict[str, Any]]:
     """Read the answers to sets of a plan; those that failed are to be analysed again.
 
     Raises:
@@ -171,7 +171,7 @@ def _answers_to(plan: Plan, cases: Sequence[Case], path: Path) -> dict[str, dict
     return {one.name: answers[one.name] for one in asked if answers[one.name]["verdict"] != FAILED}
 
 
-def seal(plan: Plan, cases: Sequence[Case]) -> str:
+def seal(plan: Plan, cases: Sequence[BlindCase]) -> str:
     """Write the truths to a file of their own, away from the data, and return its SHA-256.
 
     Raises:
@@ -200,17 +200,17 @@ def _check_seal(file: Path, truths: Mapping[str, Any]) -> None:
         )
 
 
-def _origin(plan: Plan, one: Case) -> dict[str, Any]:
+def _origin(plan: Plan, one: BlindCase) -> dict[str, Any]:
     """Return what a result is about, and the commit of the code that makes it."""
     return {"commit": git_commit(), **_subject(plan, one)}
 
 
-def _subject(plan: Plan, one: Case) -> dict[str, Any]:
+def _subject(plan: Plan, one: BlindCase) -> dict[str, Any]:
     truth = json.dumps(_plain(one.as_dict()), sort_keys=True)
     return {"truth_sha256": hashlib.sha256(truth.encode()).hexdigest(), "runs": list(plan.runs)}
 
 
-def _kept(plan: Plan, cases: Sequence[Case]) -> dict[str, dict[str, Any]]:
+def _kept(plan: Plan, cases: Sequence[BlindCase]) -> dict[str, dict[str, Any]]:
     """Read the results that are there.
 
     Raises:
@@ -225,7 +225,7 @@ def _kept(plan: Plan, cases: Sequence[Case]) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _check_origin(plan: Plan, one: Case, result: Mapping[str, Any], file: Path, advice: str) -> None:
+def _check_origin(plan: Plan, one: BlindCase, result: Mapping[str, Any], file: Path, advice: str) -> None:
     """Refuse a result of other data; results that do not say what they are about are taken as they are."""
     made, now = result.get("blind_test") or {}, _subject(plan, one)
     for key, what in (("truth_sha256", "another hidden truth"), ("runs", "other runs")):
@@ -242,7 +242,7 @@ def read_result(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def _run(plan: Plan, cases: Sequence[Case], analyser: str, say: Callable[[str], None]) -> None:
+def _run(plan: Plan, cases: Sequence[BlindCase], analyser: str, say: Callable[[str], None]) -> None:
     """Work through the sets, ``processes`` at a time, and say after each how long the rest will take."""
     begin, done, left, working = time.monotonic(), 0, list(cases), {}
     try:
@@ -264,7 +264,7 @@ def _run(plan: Plan, cases: Sequence[Case], analyser: str, say: Callable[[str], 
             process.terminate()
 
 
-def _start(plan: Plan, one: Case, analyser: str) -> subprocess.Popen[bytes]:
+def _start(plan: Plan, one: BlindCase, analyser: str) -> subprocess.Popen[bytes]:
     """Start a process for one set: what it breaks or leaks is gone with it, and it can be stopped."""
     task = {**vars(plan), "out": str(plan.out), "index": one.seed - plan.first_seed, "analyser": analyser}
     with open(_log_file(plan, one), "wb") as log:
@@ -276,11 +276,11 @@ def _start(plan: Plan, one: Case, analyser: str) -> subprocess.Popen[bytes]:
         )
 
 
-def _log_file(plan: Plan, one: Case) -> Path:
+def _log_file(plan: Plan, one: BlindCase) -> Path:
     return plan.out / "work" / f"{one.name}.log"
 
 
-def _outcome(plan: Plan, one: Case, code: int) -> str:
+def _outcome(plan: Plan, one: BlindCase, code: int) -> str:
     """Say how a set went; a process that died without a result has failed."""
     file, log = plan.result_file(one), _log_file(plan, one)
     if not file.is_file():
@@ -305,7 +305,7 @@ def _clock(seconds: float) -> str:
     return f"{minutes // 60}:{minutes % 60:02d} h" if minutes >= 60 else f"{minutes} min {int(seconds) % 60} s"
 
 
-def run_case(plan: Plan, one: Case, analyser: Analyser) -> None:
+def run_case(plan: Plan, one: BlindCase, analyser: Analyser) -> None:
     """Make one set, analyse it, keep the result.
 
     Whatever the analysis raises is its answer: an :class:`InputError` refuses the data, anything else is a failure.
@@ -332,7 +332,7 @@ def _without(out: Path, text: str) -> str:
     return text.replace(f"{out}{os.sep}", "")
 
 
-def make_data(folder: Path, one: Case, runs: Sequence[int] = range(8)) -> None:
+def make_data(folder: Path, one: BlindCase, runs: Sequence[int] = range(8)) -> None:
     """Simulate one data set and write it."""
     import numpy as np
 
@@ -346,133 +346,6 @@ def make_data(folder: Path, one: Case, runs: Sequence[int] = range(8)) -> None:
         tables = SPOIL[one.spoilt](tables, np.random.default_rng([one.seed, 5]))
     shutil.rmtree(folder, ignore_errors=True)
     write(folder, tables, meta)
-
-
-# --- report -----------------------------------------------------------------------------------------------------------
-
-
-#: Whether a target is reached: ``not shown`` is a value that reaches it with a 95 % bound that does not; empty: no target.
-Met = Literal["yes", "no", "not shown", ""]
-
-
-@dataclass(frozen=True)
-class Line:
-    """One line of the report: a number beside its target."""
-
-    what: str
-    value: str
-    target: str = ""
-    met: Met = ""
-
-
-def lines(report: Mapping[str, Any]) -> list[Line]:
-    """Return the numbers that the workflow is judged by, in the order of the targets."""
-    alarms, single, pairs, outside = report["false_alarms"], report["single"], report["pairs"], report["outside"]
-    return [
-        _at_most("false alarms, nominal robot", alarms["none"], 0.05),
-        _at_most("false alarms, parameters only", alarms["parameters"], 0.05),
-        _at_least("right name first, severity >= 2", single["top1"], 0.85),
-        _at_least("truth in the equivalence set", single["in_set"], 0.95),
-        _set_size(single["mean_set_size"]),
-        _at_most("a further name beside the right one", single["extra_name"]),
-        _confidence(single["confidence"]),
-        _at_least("right place, where named", single["place"], 0.95),
-        _at_least("both of a pair named", pairs["both"], 0.60),
-        _at_least("both of a pair and nothing else", pairs["exact"]),
-        _median("median error of size", single["size_error"], most=0.10),
-        _median("median error of place or form", single["shape_error"]),
-        _at_least("order of a ripple", single["order"]),
-        _coverage(single["interval_coverage"]),
-        _median("median gap reduction, where found", single["gap_reduction"], least=0.8),
-        _median("median gap reduction, misses as 0", single["gap_reduction_of_all"], least=0.8),
-        _none("gap grew, interval below 0", single["gap_grew_surely"]),
-        _none("gap grew by more than 2 %", single["gap_grew"]),
-        _at_least("outside the library: formula or unknown, no name", outside["unknown"], 0.90),
-        _at_least("outside the library: not misnamed", outside["not_misnamed"]),
-        _at_least("bad data caught", report["bad_data"]),
-        _none("good data refused", alarms["refused_good_data"]),
-        _none("analyses that crashed", report["crashed"]),
-    ]
-
-
-def _met(reached: bool, shown: bool) -> Met:
-    return ("yes" if shown else "not shown") if reached else "no"
-
-
-def _share(share: Mapping[str, Any], bound: str) -> str:
-    if not share["count"]:
-        return "-"
-    return f"{share['hits']}/{share['count']} = {share['share']:.0%} ({bound} {share['bound95']:.0%})"
-
-
-def _at_least(what: str, share: Mapping[str, Any], target: float | None = None) -> Line:
-    value = _share(share, "at least")
-    if target is None:
-        return Line(what, value)
-    met = _met(share["share"] >= target, share["bound95"] >= target) if share["count"] else ""
-    return Line(what, value, f">= {target:.0%}", met)
-
-
-def _at_most(what: str, share: Mapping[str, Any], target: float | None = None) -> Line:
-    value = _share(share, "at most")
-    if target is None:
-        return Line(what, value)
-    met = _met(share["share"] <= target, share["bound95"] <= target) if share["count"] else ""
-    return Line(what, value, f"<= {target:.0%}", met)
-
-
-def _none(what: str, share: Mapping[str, Any]) -> Line:
-    """Something that must not happen in any of these sets: no bound could show that it never does."""
-    return Line(what, _share(share, "at most"), "0", _met(not share["hits"], True) if share["count"] else "")
-
-
-def _coverage(coverage: Mapping[str, Any]) -> Line:
-    """Intervals may be too narrow or too wide."""
-    line = _at_least("95 % intervals that hold", coverage)
-    if not coverage["count"]:
-        return Line(line.what, line.value, "88-98 %")
-    shown = coverage["bound95"] >= 0.88 and coverage["bound95_above"] <= 0.98
-    return Line(line.what, line.value, "88-98 %", _met(0.88 <= coverage["share"] <= 0.98, shown))
-
-
-def _median(what: str, numbers: Mapping[str, Any], most: float | None = None, least: float | None = None) -> Line:
-    target = f"<= {most:g}" if most is not None else f">= {least:g}" if least is not None else ""
-    if not numbers["count"]:
-        return Line(what, "-", target)
-    word, bound = ("at least", numbers["at_least95"]) if least is not None else ("at most", numbers["at_most95"])
-    value = f"{numbers['median']:.3g} of {numbers['count']} ({'no bound' if bound is None else f'{word} {bound:.3g}'})"
-    if most is not None:
-        return Line(what, value, target, _met(numbers["median"] <= most, bound is not None and bound <= most))
-    if least is not None:
-        return Line(what, value, target, _met(numbers["median"] >= least, bound is not None and bound >= least))
-    return Line(what, value)
-
-
-def _set_size(size: float | None) -> Line:
-    what, target = "mean size of that set, where found", "<= 1.5"
-    return Line(what, "-", target) if size is None else Line(what, f"{size:.3g}", target, _met(size <= 1.5, True))
-
-
-def _confidence(numbers: Mapping[str, Any]) -> Line:
-    value = f"{numbers['mean_confidence']:.2f}, right {numbers['right']:.2f} of {numbers['count']}" if numbers["count"] else "-"
-    return Line("mean confidence of the first name", value)
-
-
-def markdown(report: Mapping[str, Any]) -> str:
-    """Return the report as Markdown tables: numbers beside targets, severities, confusion matrix."""
-    rows = [f"Sets analysed by commit: {', '.join(f'{commit} {sets}' for commit, sets in report['commits'].items())}.", ""]
-    rows += ["| | measured (95 % bound) | target | met |", "|---|---|---|---|"]
-    rows += [f"| {line.what} | {line.value} | {line.target} | {line.met} |" for line in lines(report)]
-    rows += ["", "| severity | sets | found | right name first | in the set |", "|---|---|---|---|---|"]
-    for severity, shares in report["single"]["by_severity"].items():
-        cells = [f"{shares[key]['share']:.0%}" for key in ("found", "top1", "in_set")]
-        rows.append(f"| {severity} | {shares['found']['count']} | {' | '.join(cells)} |")
-    rows += ["", "Single effects from severity 1 on; in brackets laws outside the library:", ""]
-    rows += ["| hidden | what the results say |", "|---|---|"]
-    for hidden, said in sorted(report["confusion"].items()):
-        ordered = sorted(said.items(), key=lambda item: (item[0] != hidden, -item[1], item[0]))
-        rows.append(f"| {hidden} | {', '.join(f'{name} {count}' for name, count in ordered)} |")
-    return "\n".join(rows) + "\n"
 
 
 if __name__ == "__main__":

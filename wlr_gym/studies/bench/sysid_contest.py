@@ -16,7 +16,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.fit import SETTLED, fit, nominal_model
+from wlr_gym.gap.estimation.fit import CONVERGED, fit
+from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Problem, Quantity
 from wlr_gym.studies.bench.measure import Measurement, against_fastest
 
@@ -47,7 +48,7 @@ class Fitted:
     Attributes:
         values: (numbers) SI.
         seconds: of processor time to its own convergence.
-        settled: s until its sum of squares was within ``SETTLED`` of its last; a fit of ours ends there by itself.
+        settled: s until its sum of squares was within ``CONVERGED`` of its last; a fit of ours ends there by itself.
     """
 
     values: Array
@@ -131,9 +132,9 @@ class PeerProblem:
 
 
 def settled(trace: Sequence[tuple[float, float]]) -> float:
-    """Return when (s) a trace of time and sum of squares first came within ``SETTLED`` of its least."""
+    """Return when (s) a trace of time and sum of squares first came within ``CONVERGED`` of its least."""
     least = min(cost for _, cost in trace)
-    return next(seconds for seconds, cost in trace if cost <= least + SETTLED)
+    return next(seconds for seconds, cost in trace if cost <= least + CONVERGED)
 
 
 @dataclass(frozen=True)

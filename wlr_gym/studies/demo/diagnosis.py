@@ -35,7 +35,7 @@ def name(demo: Demo, tell: Tell) -> Section:
     """Run the gap workflow on the measured runs, and nothing else."""
     from wlr_gym.gap import analyse
     from wlr_gym.gap.analysis import EFFECT_FOUND
-    from wlr_gym.gap.report.report import REPORT_FILE
+    from wlr_gym.gap.report.folder import REPORT_FILE
     from wlr_gym.gap.report.text import sentence
 
     if not demo.measured.is_dir():

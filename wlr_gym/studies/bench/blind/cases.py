@@ -29,7 +29,7 @@ Effect = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Case:
+class BlindCase:
     """One data set of a blind test.
 
     Attributes:
@@ -54,7 +54,7 @@ class Case:
         return {**vars(self), "effects": [dict(effect) for effect in self.effects]}
 
 
-def case(index: int, first_seed: int = FIRST_SCORED_SEED) -> Case:
+def case(index: int, first_seed: int = FIRST_SCORED_SEED) -> BlindCase:
     """Return number ``index`` of the sequence."""
     seed, kind = first_seed + index, CYCLE[index % len(CYCLE)]
     before = sum(other == kind for other in CYCLE[: index % len(CYCLE)])
@@ -71,7 +71,7 @@ def case(index: int, first_seed: int = FIRST_SCORED_SEED) -> Case:
         effects = (strange(list(STRANGE)[count % len(STRANGE)], severity, rng),)
     elif kind == "bad":
         spoilt = BAD[count % len(BAD)]
-    return Case(f"set_{seed:04d}", seed, kind, severity, effects, spoilt)
+    return BlindCase(f"set_{seed:04d}", seed, kind, severity, effects, spoilt)
 
 
 def _grid(count: int, names: list[str]) -> tuple[str, float]:

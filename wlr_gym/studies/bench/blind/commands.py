@@ -12,7 +12,11 @@ Array = NDArray[np.float64]
 DOWN = np.pi / 2
 #: Half the span of leg angles that a run may ask for, around straight down.
 REACH = 1.12
-FRONT, REAR, LEFT, RIGHT = slice(0, 2), slice(2, 4), slice(0, 4, 2), slice(1, 4, 2)
+#: Corners, in the order left front, right front, left rear, right rear.
+FRONT = slice(0, 2)
+REAR = slice(2, 4)
+LEFT = slice(0, 4, 2)
+RIGHT = slice(1, 4, 2)
 NAMES = (
     "straight, accelerating and braking",
     "posture sweeps while driving",
@@ -26,7 +30,7 @@ NAMES = (
 
 
 @dataclass(frozen=True)
-class Script:
+class BlindScript:
     """Goals over time.
 
     Attributes:
@@ -46,7 +50,7 @@ class Geometry:
     radius: float
 
 
-def scripts(rng: np.random.Generator, geometry: Geometry) -> list[Script]:
+def scripts(rng: np.random.Generator, geometry: Geometry) -> list[BlindScript]:
     """Draw the eight runs in the order of ``NAMES``."""
     makers = (straight, posture, skid, curves, stop_and_go, rear_legs, all_legs, random_band)
     return [maker(rng, geometry) for maker in makers]
@@ -79,15 +83,15 @@ def _with_legs(legs: Array, wheels: Callable[[Array], Array]) -> Callable[[Array
     return lambda t: np.concatenate([np.broadcast_to(legs, (len(t), 4)), wheels(t)], axis=1)
 
 
-def straight(rng: np.random.Generator, geometry: Geometry) -> Script:
+def straight(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
     """Forward and backward at several speeds, resting between."""
     speeds = rng.uniform(1.0, 5.5, 5) * np.where(rng.permutation(5) % 2, 1, -1)
     rows = [row for speed in speeds for row in (np.full(4, speed), np.zeros(4))][:-1]
     end, wheels = _phases(rng, rows, (2.0, 3.2), (0.6, 1.1))
-    return Script(end, _with_legs(_stance(rng), wheels))
+    return BlindScript(end, _with_legs(_stance(rng), wheels))
 
 
-def skid(rng: np.random.Generator, geometry: Geometry) -> Script:
+def skid(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
     """Spins in place, turns about one side, arcs."""
     rows = []
     for kind in rng.permutation([0, 0, 0, 1, 1, 2, 2]):
@@ -96,10 +100,10 @@ def skid(rng: np.random.Generator, geometry: Geometry) -> Script:
         left, right = (left, right) if turn > 0 else (right, left)
         rows += [rng.choice([-1, 1]) * np.array([left, right, left, right]), np.zeros(4)]
     end, wheels = _phases(rng, rows[:-1], (2.0, 2.9), (0.3, 0.6))
-    return Script(end, _with_legs(_stance(rng, 0.1), wheels))
+    return BlindScript(end, _with_legs(_stance(rng, 0.1), wheels))
 
 
-def curves(rng: np.random.Generator, geometry: Geometry) -> Script:
+def curves(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
     """Weaving left and right at constant speed."""
     mean, swing, period = rng.uniform(2.4, 3.4), rng.uniform(1.0, 1.8), rng.uniform(4.5, 7.0)
     direction, end, sides = rng.choice([-1, 1]), rng.uniform(16.5, 19.0), np.array([1, -1, 1, -1])
@@ -109,10 +113,10 @@ def curves(rng: np.random.Generator, geometry: Geometry) -> Script:
         wave = np.sin(2 * np.pi * (t - 1) / period)
         return direction * (envelope[:, None] * (mean + swing * wave[:, None] * sides))
 
-    return Script(end, _with_legs(_stance(rng, 0.3), wheels))
+    return BlindScript(end, _with_legs(_stance(rng, 0.3), wheels))
 
 
-def stop_and_go(rng: np.random.Generator, geometry: Geometry) -> Script:
+def stop_and_go(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
     """Random speeds for random times, straight, with stops and reversals."""
     rows: list[Array] = []
     for _ in range(rng.integers(12, 15)):
@@ -121,10 +125,10 @@ def stop_and_go(rng: np.random.Generator, geometry: Geometry) -> Script:
         stop = previous != 0 and rng.random() < 0.35
         rows.append(np.zeros(4) if stop else np.full(4, sign * rng.uniform(2.0, 5.2)))
     end, wheels = _phases(rng, rows, (0.7, 1.8), (0.3, 0.7))
-    return Script(end, _with_legs(_stance(rng), wheels))
+    return BlindScript(end, _with_legs(_stance(rng), wheels))
 
 
-def posture(rng: np.random.Generator, geometry: Geometry) -> Script:
+def posture(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
     """Front, rear and all legs swing while the robot drives; the wheels turn along so that nothing has to slip."""
     speed, start = rng.choice([-1, 1]) * rng.uniform(1.2, 2.0), _stance(rng, 0.1)
     knots, angles = [0.0, 1.5], [start, start]
@@ -149,10 +153,10 @@ def posture(rng: np.random.Generator, geometry: Geometry) -> Script:
         travel = -geometry.leg_length * np.sin(legs) * rates / geometry.radius
         return np.concatenate([legs, drive[:, None] + travel - rates], axis=1)
 
-    return Script(end, goals)
+    return BlindScript(end, goals)
 
 
-def _turning(rng: np.random.Generator, both: bool) -> Script:
+def _turning(rng: np.random.Generator, both: bool) -> BlindScript:
     """Legs turn from one end of their range to the other; front wheels driven, rear wheels free."""
     low, high = DOWN - rng.uniform(0.95, 1.06), DOWN + rng.uniform(0.95, 1.06)
     speed, turning, ramp = rng.uniform(1.4, 2.2), rng.uniform(5.0, 6.5), rng.uniform(4.0, 5.0)
@@ -167,20 +171,20 @@ def _turning(rng: np.random.Generator, both: bool) -> Script:
         free = np.full(len(t), np.nan)
         return np.stack([front_angle, front_angle, rear_angle, rear_angle, drive, drive, free, free], axis=1)
 
-    return Script(end, goals)
+    return BlindScript(end, goals)
 
 
-def rear_legs(rng: np.random.Generator, geometry: Geometry) -> Script:
+def rear_legs(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
     """Rear legs turn, front legs stay."""
     return _turning(rng, both=False)
 
 
-def all_legs(rng: np.random.Generator, geometry: Geometry) -> Script:
+def all_legs(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
     """Front and rear legs turn against each other."""
     return _turning(rng, both=True)
 
 
-def random_band(rng: np.random.Generator, geometry: Geometry) -> Script:
+def random_band(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
     """Sums of sines: wheels left and right apart, legs of an axle nearly together."""
     end, stance = rng.uniform(20.0, 23.0), _stance(rng, 0.35)
     wheel_waves = _waves(rng, 2, (0.1, 0.6), 2.4)
@@ -193,7 +197,7 @@ def random_band(rng: np.random.Generator, geometry: Geometry) -> Script:
         wheels = np.clip(envelope * wheel_waves(t)[:, [0, 1, 0, 1]], -5.6, 5.6)
         return np.concatenate([legs, wheels], axis=1)
 
-    return Script(end, goals)
+    return BlindScript(end, goals)
 
 
 def _waves(rng: np.random.Generator, count: int, band: tuple[float, float], rms: float) -> Callable[[Array], Array]:

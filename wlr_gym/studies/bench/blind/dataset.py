@@ -10,13 +10,17 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from wlr_gym.studies.bench.blind import commands, drive, sensors
+from wlr_gym.studies.bench.blind import commands, sensors
 from wlr_gym.studies.bench.blind.copies import Copy, draw, nominal, with_body_of
+from wlr_gym.studies.bench.blind.simulation import BlindProfile, simulate
 from wlr_gym.studies.bench.blind.truth import hide
 from wlr_gym.studies.bench.blind.world import build
 
-#: Profile registers a set may have; 0 = off.
-ACCELERATIONS, SPEEDS = (0.0, 7.490150, 11.235225, 14.980301, 22.470451), (0.959233, 1.438849, 1.918466)
+#: Profile registers a set may have; 0 = off. Wheels, rad/s2.
+ACCELERATIONS = (0.0, 7.490150, 11.235225, 14.980301, 22.470451)
+#: Legs, rad/s.
+SPEEDS = (0.959233, 1.438849, 1.918466)
+#: Legs, rad/s2.
 LEG_ACCELERATIONS = (0.0, 7.490150, 14.980301)
 
 
@@ -44,7 +48,7 @@ def simulate_runs(
     choose = np.random.default_rng([seed, 2])
     geometry = commands.Geometry(float(robot["leg"]["length"]), float(robot["wheel"]["radius"]))
     scripts = commands.scripts(choose, geometry)
-    profile = drive.Profile(
+    profile = BlindProfile(
         float(choose.choice(ACCELERATIONS)), float(choose.choice(SPEEDS)), float(choose.choice(LEG_ACCELERATIONS))
     )
     hidden = hide(effects, copy)
@@ -55,12 +59,12 @@ def simulate_runs(
         times = sensors.ticks(script.duration, float(robot["sensors"]["control_rate"]), noise)
         goals = script.goals(times)
         start = goals[0, :4] + 0.02 * noise.standard_normal(4)
-        records = drive.simulate(build(copy, hidden), copy, hidden, profile, times, goals, start, times[-1] + 0.01)
+        records = simulate(build(copy, hidden), copy, hidden, profile, times, goals, start, times[-1] + 0.01)
         tables.append(sensors.log(records, times, goals, copy, hidden, dict(robot), noise))
     return tables, _meta(robot, profile, runs), copy
 
 
-def _meta(robot: Mapping[str, Any], profile: drive.Profile, runs: Sequence[int]) -> dict[str, Any]:
+def _meta(robot: Mapping[str, Any], profile: BlindProfile, runs: Sequence[int]) -> dict[str, Any]:
     registers = {name: value for name, value in vars(profile).items() if value > 0}
     notes = ", ".join(f"run_{n + 1:02d} {commands.NAMES[kind]}" for n, kind in enumerate(runs))
     return {

@@ -10,7 +10,6 @@ agree. No complementarity, no impulses, half a millisecond per step.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,8 @@ import numba
 import numpy as np
 from llvmlite.binding import load_library_permanently
 from numba import types
-from numpy.typing import NDArray
 
-from wlr_gym.studies.bench.blind.copies import CORNERS, Copy
-from wlr_gym.studies.bench.blind.truth import Hidden
-from wlr_gym.studies.bench.blind.world import World, floor_gravity
-
-Array = NDArray[np.float64]
+#: s.
 STEP = 5e-4
 #: Records are this far apart, s.
 SAMPLE = 1e-3
@@ -33,13 +27,16 @@ SAMPLE = 1e-3
 SETTLE = 1.5
 #: Corner frequency of the IMU, Hz.
 BANDWIDTH = 44.0
-#: Dry friction is full from this speed on, m/s on the floor, rad/s in gears.
-CREEP, GEAR_CREEP = 5e-6, 2e-5
-#: Of the tyres, N s/m, and of meeting teeth, N m/rad and N m s/rad per rotor inertia: legs, wheels.
+#: Dry friction is full from this speed on: on the floor, m/s.
+CREEP = 5e-6
+#: The same in gears, rad/s.
+GEAR_CREEP = 2e-5
+#: Of the tyres, N s/m.
 NORMAL_DAMPING = 60.0
-TOOTH_STIFFNESS, TOOTH_DAMPING = (3000.0, 600.0), 700.0
-#: Solutions of the velocity equation per step at most, and the agreement that is enough.
-SOLUTIONS, AGREED = 12, 1e-7
+#: Solutions of the velocity equation per step, at most.
+SOLUTIONS = 12
+#: Agreement of two solutions that is enough, m/s and rad/s.
+AGREED = 1e-7
 #: Columns of a record: position 0:3, quaternion 3:7, joint angles 7:15, rates 15:23, currents 23:31, gyroscope 31:34,
 #: accelerometer 34:37, supply 37, normal forces 38:42, slip speeds 42:46.
 WIDTH = 46
@@ -66,113 +63,6 @@ _full_mass_matrix = _function("mj_fullM", types.intp)
 _com_velocity = _function("mj_comVel")
 _bias_force = _function("mj_rne", types.int32, types.intp)
 _integrate = types.ExternalFunction("mj_integratePos", types.void(types.intp, types.intp, types.intp, types.float64))
-
-
-@dataclass(frozen=True)
-class Profile:
-    """Profile registers of a data set, rad/s2, rad/s, rad/s2; 0 = off."""
-
-    wheel_acceleration: float
-    leg_velocity: float
-    leg_acceleration: float
-
-
-def simulate(
-    world: World, copy: Copy, hidden: Hidden, profile: Profile, times: Array, goals: Array, start: Array, duration: float
-) -> Array:
-    """Drive the robot through one run.
-
-    Args:
-        world: compiled model.
-        times: (n,) s, when the goals are written.
-        goals: (n, 8) rad, rad/s, NaN = torque off.
-        start: (4,) leg angles at which the robot is set down, rad, true.
-        duration: s.
-
-    Returns:
-        (samples, WIDTH) records every ``SAMPLE`` seconds from time 0.
-
-    Raises:
-        FloatingPointError: the simulated robot blew up.
-    """
-    model, data = world.model, mujoco.MjData(world.model)
-    data.qpos[world.position[:4]] = start
-    has_rotor = world.motor_position != world.position
-    data.qpos[world.motor_position[has_rotor]] = data.qpos[world.position[has_rotor]]
-    data.qpos[2] = (copy.leg_length * np.sin(start) + copy.radius * hidden.radius_scale).max()
-    records = np.zeros((round(duration / SAMPLE) + 1, WIDTH))
-    addresses = (world.position, world.rate, world.motor_rate, world.motor_position)
-    tables = (_joint_table(copy, hidden), _corner_table(copy, hidden), _general_table(copy, hidden, profile))
-    _loop(model._address, data._address, data.qpos, data.qvel, addresses, tables, times, goals, records)
-    if not np.isfinite(records).all():
-        raise FloatingPointError("the simulated robot blew up")
-    return records
-
-
-def _joint_table(copy: Copy, hidden: Hidden) -> Array:
-    constant = copy.data_sheet_voltage / copy.no_load_speed
-    resistance = constant * copy.data_sheet_voltage / copy.stall_torque
-    return np.array(
-        [
-            copy.kp,
-            copy.kd,
-            constant,
-            resistance,
-            copy.coulomb + hidden.coulomb,
-            copy.viscous + hidden.viscous,
-            hidden.stick_extra,
-            hidden.stick_speed,
-            hidden.load_ratio,
-            hidden.motor_scale,
-            *hidden.ripple,
-            copy.command_delay + hidden.delay,
-            np.concatenate([copy.joint_zero + hidden.zero, np.zeros(4)]),
-            hidden.play,
-            np.repeat(TOOTH_STIFFNESS, 4),
-            TOOTH_DAMPING * copy.armature,
-        ]
-    )
-
-
-def _corner_table(copy: Copy, hidden: Hidden) -> Array:
-    hips = CORNERS * copy.hip
-    return np.array(
-        [
-            hips[:, 0],
-            hips[:, 1],
-            copy.radius * hidden.radius_scale,
-            np.where(np.isnan(hidden.wheel_mu), copy.mu, hidden.wheel_mu),
-            hidden.creep_speed,
-            hidden.rolling,
-            hidden.out_of_round,
-            *hidden.leg_spring,
-            *hidden.elastic,
-            np.repeat(hidden.cross_ratio, 2),
-        ]
-    )
-
-
-def _general_table(copy: Copy, hidden: Hidden, profile: Profile) -> Array:
-    return np.array(
-        [
-            copy.leg_length,
-            copy.supply,
-            hidden.supply_resistance,
-            profile.wheel_acceleration,
-            profile.leg_velocity,
-            profile.leg_acceleration,
-            *hidden.force,
-            *hidden.tether,
-            hidden.drag,
-            hidden.veer,
-            *hidden.pull,
-            *hidden.patch,
-            hidden.mu_ratio,
-            *hidden.weak_slip,
-            *floor_gravity(copy, hidden),
-            copy.normal_stiffness,
-        ]
-    )
 
 
 _jit = numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -281,7 +171,7 @@ def _add_damper(matrix, row, columns, coefficient):
 
 
 @_jit
-def _loop(model, data, qpos, qvel, addresses, tables, times, goals, records):
+def drive(model, data, qpos, qvel, addresses, tables, times, goals, records):
     position, rate, motor_rate, motor_position = addresses
     joints, corners, general = tables
     kp, kd, constant, resistance, coulomb, viscous = joints[0], joints[1], joints[2], joints[3], joints[4], joints[5]

@@ -17,8 +17,10 @@ from wlr_gym.studies.bench.blind.truth import NAMED
 
 #: Verdict, and name, of a law outside the vocabulary.
 UNKNOWN = "unknown_effect"
-#: Answers that send the data back, and the one that is none: the analysis broke.
-REFUSALS, FAILED = ("refused", "bad_data", "not_excited"), "failed"
+#: Answers that reject the data.
+REFUSALS = ("refused", "bad_data", "not_excited")
+#: No answer: the analysis raised an error.
+FAILED = "failed"
 #: Parameters that do not say how large an effect is, but where it acts or what form it has. All others are its size.
 SHAPE = {
     "torque_ripple": ("order", "phase"),
@@ -28,8 +30,10 @@ SHAPE = {
     "payload": ("x", "y", "z"),
     "tether": ("x", "y"),
 }
-#: A whole number and an angle of periodic laws: neither has a relative error.
-ORDER, PHASE = "order", "phase"
+#: A whole number of periodic laws: it has no relative error.
+ORDER = "order"
+#: An angle of periodic laws: it has no relative error either.
+PHASE = "phase"
 #: A name counts as right at this severity and above, where nothing is said about severity.
 CLEAR = 2.0
 
@@ -174,7 +178,7 @@ def score(results: Mapping[str, Result], truths: Mapping[str, Truth]) -> dict[st
     Args:
         results: contents of ``result.json``, or ``{"verdict": "refused" | "failed", "message": ...}``; under ``blind_test`` the
             commit that analysed it, where that is known.
-        truths: as of ``cases.Case.as_dict``; those without a result are left out.
+        truths: as of ``cases.BlindCase.as_dict``; those without a result are left out.
 
     Returns:
         Plain data: shares with bounds, lists of errors' quantiles, the confusion matrix.
@@ -285,7 +289,7 @@ def _grew(gap: Mapping[str, Any]) -> bool:
 
 
 def _upper_end(gap: Mapping[str, Any]) -> float | None:
-    """Upper end of the reduction's interval; None where the runs kept aside were too few for one."""
+    """Upper end of the reduction's interval; None where the held-out runs were too few for one."""
     return (gap.get("reduction_ci95") or (None, None))[1]
 
 

@@ -15,8 +15,12 @@ from wlr_gym.studies.bench.blind.truth import Hidden
 Array = NDArray[np.float64]
 JITTER = 1e-3  # s, of a tick and of a camera frame's age
 LOST = 1 / 300  # share of ticks
-#: One count of the current register (A) and of the load register (share of stall torque), of the voltage register (V).
-CURRENT_COUNT, LOAD_COUNT, VOLT_COUNT = 2.69e-3, 1e-3, 0.1
+#: One count of the current register, A.
+CURRENT_COUNT = 2.69e-3
+#: One count of the load register, share of the stall torque.
+LOAD_COUNT = 1e-3
+#: One count of the voltage register, V.
+VOLT_COUNT = 0.1
 
 
 def ticks(duration: float, rate: float, rng: np.random.Generator) -> Array:
@@ -33,7 +37,7 @@ def log(
     """Turn the records of a simulated run into the table of a measured one.
 
     Args:
-        records: as of ``drive.simulate``.
+        records: as of ``simulation.simulate``.
         times: (n,) host clock of the rows, s.
         goals: (n, 8) written in these rows.
     """

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class World:
+class BlindWorld:
     """A compiled model and where things are in it.
 
     Attributes:
@@ -33,7 +33,7 @@ class World:
     motor_rate: NDArray[np.intp]
 
 
-def build(copy: Copy, hidden: Hidden) -> World:
+def build(copy: Copy, hidden: Hidden) -> BlindWorld:
     """Compile the robot copy with what is hidden in it."""
     model = mujoco.MjModel.from_xml_string(_xml(copy, hidden))
 
@@ -44,7 +44,7 @@ def build(copy: Copy, hidden: Hidden) -> World:
     position, rate = addresses(list(JOINTS))
     motors = [f"{name}_rotor" if hidden.play[k] > 0 else name for k, name in enumerate(JOINTS)]
     motor_position, motor_rate = addresses(motors)
-    return World(model, position, rate, motor_position, motor_rate)
+    return BlindWorld(model, position, rate, motor_position, motor_rate)
 
 
 def floor_gravity(copy: Copy, hidden: Hidden) -> Array:

@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
-from wlr_gym.gap.estimation.fit import fit, nominal_model, normal_equations, on_bounds
-from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95, confidence, detectable, estimates, half_widths, two_sided_95
+from wlr_gym.gap.estimation.fit import fit
+from wlr_gym.gap.estimation.least_squares import normal_equations
+from wlr_gym.gap.estimation.model import nominal_model, on_bounds
+from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95, estimates, half_widths, two_sided_95
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
+from wlr_gym.gap.selection.detectability import detectable
+from wlr_gym.gap.selection.equivalence import selection_frequency
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, least_gain, responses, screen
-from wlr_gym.gap.selection.search import name_effects
+from wlr_gym.gap.selection.search import search_effects
 
 RUNS = range(5)
 TRUTH = {"gain": 0.8, "offset": -1.2, "mass": 0.4}
@@ -22,13 +26,11 @@ def fitted(problem, size=0.7):
     return fit(problem, range(len(problem.runs)), model, steps=problem.steps)
 
 
-@pytest.mark.parametrize(("white", "error", "memory"), [(1.5, 0.0, 0.0), (1.0, 1.5, 0.6)], ids=["white", "ar1"])
-def test_intervals_cover_the_truth_as_often_as_they_say(white, error, memory):
+@pytest.mark.parametrize(("white", "error", "ar1"), [(1.5, 0.0, 0.0), (1.0, 1.5, 0.6)], ids=["white", "ar1"])
+def test_intervals_cover_the_truth_as_often_as_they_say(white, error, ar1):
     inside, draws = [], 100
     for seed in range(draws):
-        problem = Toy(
-            TRUTH, [sized("drag", 0.7, "right")], seed=seed, white=white, error=error, memory=memory, runs=6, rows=120
-        )
+        problem = Toy(TRUTH, [sized("drag", 0.7, "right")], seed=seed, white=white, error=error, ar1=ar1, runs=6, rows=120)
         found = fitted(problem, 0.5)
         inside.append(abs(found.model.effects[0][1][0] - 0.7) < half_widths(problem, found)[-1])
     assert 0.88 <= np.mean(inside) <= 0.995
@@ -75,7 +77,7 @@ def test_few_runs_that_differ_tell_little_of_how_much_they_do():
 
 
 def test_jackknife_is_leaving_one_run_out():
-    problem = Toy({"gain": 1.0}, [sized("drag", 0.7, "right")], error=1.0, memory=0.95, runs=6)
+    problem = Toy({"gain": 1.0}, [sized("drag", 0.7, "right")], error=1.0, ar1=0.95, runs=6)
     for r, more in enumerate((0.3, -0.3, 0.2, -0.2, 0.4, -0.4)):
         own = problem.effect_response(sized("drag", more, "right"), r)
         problem._measured[r] = problem._measured[r] + own * NOISE
@@ -176,13 +178,13 @@ def test_disagreement_of_simulators_adds_a_share_of_the_effect():
 
 def test_confidence_counts_the_samples_in_which_the_effect_wins():
     problem = Toy({}, [sized("drag", 0.8, "right")], error=0.5)
-    look = name_effects(problem, RUNS, fit(problem, RUNS, nominal_model(problem))).rounds[0]
-    assert look.taken is not None
-    assert confidence(look.taken, look.hypotheses) > 0.95
+    look = search_effects(problem, RUNS, fit(problem, RUNS, nominal_model(problem))).rounds[0]
+    assert look.selected is not None
+    assert selection_frequency(look.selected, look.hypotheses) > 0.95
     twin = Toy({}, [sized("drag", 0.8, "left")], error=0.5)
-    look = name_effects(twin, RUNS, fit(twin, RUNS, nominal_model(twin))).rounds[0]
-    assert look.taken is not None
-    assert confidence(look.taken, look.hypotheses) == confidence(look.taken, look.hypotheses)
+    look = search_effects(twin, RUNS, fit(twin, RUNS, nominal_model(twin))).rounds[0]
+    assert look.selected is not None
+    assert selection_frequency(look.selected, look.hypotheses) == selection_frequency(look.selected, look.hypotheses)
 
 
 def explained(problem, name, gain, by_run):
@@ -205,21 +207,21 @@ def explained(problem, name, gain, by_run):
 )
 def test_confidence_asks_of_every_sample_what_is_asked_of_an_effect(gain, by_run, cost, expected):
     problem = Toy()
-    assert confidence(explained(problem, "decoy_1", gain, by_run), [], cost) == pytest.approx(expected, abs=0.12)
+    assert selection_frequency(explained(problem, "decoy_1", gain, by_run), [], cost) == pytest.approx(expected, abs=0.12)
 
 
 def test_confidence_asks_more_of_an_effect_with_more_numbers():
     problem = Toy()
     assert LEAST_GAIN < 18.0 < least_gain(2)
-    assert confidence(explained(problem, "decoy_1", 18.0, [18 / 5] * 5), []) == 1.0
-    assert confidence(explained(problem, "ripple", 18.0, [18 / 5] * 5), []) == 0.0
+    assert selection_frequency(explained(problem, "decoy_1", 18.0, [18 / 5] * 5), []) == 1.0
+    assert selection_frequency(explained(problem, "ripple", 18.0, [18 / 5] * 5), []) == 0.0
 
 
 def test_confidence_falls_with_a_rival_that_buys_as_much():
     problem = Toy()
-    taken = explained(problem, "decoy_1", 100.0, [20] * 5)
+    selected = explained(problem, "decoy_1", 100.0, [20] * 5)
     rival = explained(problem, "decoy_2", 99.0, [60, 10, 10, 10, 9])
-    assert confidence(taken, [rival]) == pytest.approx(0.74, abs=0.06)  # the run with 60 drawn twice: 26 %
+    assert selection_frequency(selected, [rival]) == pytest.approx(0.74, abs=0.06)  # the run with 60 drawn twice: 26 %
 
 
 def screened(problem):
@@ -277,7 +279,7 @@ def test_what_is_detectable_is_a_size():
 
 
 def test_what_is_left_hides_more_effects():
-    """Two percent of what is left must be bought: what the screen calls visible asks that, too."""
+    """Two percent of what is left must be gained: what the screen calls visible requires that, too."""
     responded, candidates = screened(Toy(white=1.5))[1:]
     assert all(score.visible for score in screen(candidates, responded))
     hidden = [score for score in screen(candidates, responded, 1e9) if not score.visible]

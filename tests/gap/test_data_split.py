@@ -1,4 +1,4 @@
-"""Runs to fit and runs to seal."""
+"""Runs to fit and runs to hold out."""
 
 import itertools
 import time
@@ -8,12 +8,12 @@ import pytest
 from toy_problem import QUANTITIES, Toy
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.gap.validation.data_split import LEAST_FITTED, MEMORY, informative_split, named_split
+from wlr_gym.gap.validation.data_split import AUTOCORRELATION_TIME, LEAST_FITTED, informative_split, named_split
 
 NAMES = ("run_1", "run_2", "run_3", "run_4")
 
 
-def test_named_runs_are_sealed():
+def test_named_runs_are_held_out():
     assert named_split(NAMES, ["run_4", "run_2"]) == ([0, 2], [1, 3])
     assert named_split(NAMES, ["run_2", "run_2"]) == ([0, 2, 3], [1])
 
@@ -28,11 +28,11 @@ def test_too_many_held_out():
         named_split(NAMES, NAMES[:3])
 
 
-@pytest.mark.parametrize(("runs", "sealed"), [(3, 1), (4, 2), (5, 2), (8, 3), (10, 3)])
-def test_a_third_is_sealed_and_every_run_is_somewhere(runs, sealed):
+@pytest.mark.parametrize(("runs", "held_out"), [(3, 1), (4, 2), (5, 2), (8, 3), (10, 3)])
+def test_a_third_is_held_out_and_every_run_is_somewhere(runs, held_out):
     fitted, held, columns = informative_split(Toy(runs=runs, rows=30))
     assert sorted([*fitted, *held]) == list(range(runs))
-    assert len(held) == sealed
+    assert len(held) == held_out
     assert len(fitted) >= LEAST_FITTED
     assert columns is not None
     assert len(columns) == len(fitted)
@@ -49,7 +49,7 @@ def test_runs_left_tell_most():
     told = [problem.shape(name).reshape(6, -1) for name in QUANTITIES]
 
     def volume(kept):
-        matrix = np.eye(3) + sum(np.array([[a[k] @ b[k] for a in told] for b in told]) for k in kept) / MEMORY
+        matrix = np.eye(3) + sum(np.array([[a[k] @ b[k] for a in told] for b in told]) for k in kept) / AUTOCORRELATION_TIME
         return np.linalg.slogdet(matrix)[1]
 
     assert volume(fitted) == pytest.approx(max(volume(kept) for kept in itertools.combinations(range(6), 4)))
@@ -62,7 +62,7 @@ def test_split_does_not_look_at_the_measurements():
     assert informative_split(one)[:2] == informative_split(two)[:2]
 
 
-def test_run_without_motion_is_sealed():
+def test_run_without_motion_is_held_out():
     problem = Toy(runs=4, rows=40)
     still = {name: problem.shape(name).copy() for name in QUANTITIES}
     for shape in still.values():

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from toy_problem import CHANNELS, NOISE, Toy
 
-from wlr_gym.gap.estimation.fit import fit, nominal_model
+from wlr_gym.gap.estimation.fit import fit
+from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.report.text import adequacy
 from wlr_gym.gap.validation.held_out import noise_floor
 from wlr_gym.gap.validation.residual_tests import REPLICATES, adequacy_of, compared

@@ -1,12 +1,8 @@
-"""The report of an analysis: one HTML page with its pictures inside, for an engineer who never saw the tool.
-
-:func:`save_analysis` writes everything an analysis leaves behind.
-"""
+"""The report of an analysis: one HTML page with its pictures inside, for an engineer who never saw the tool."""
 
 from __future__ import annotations
 
 import math
-import os
 import shlex
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -14,8 +10,6 @@ from pathlib import Path
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, replace_file
-from wlr_gym.base.provenance import CONFIG_FILE, PROVENANCE_FILE
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.gap.analysis import (
     BAD_DATA,
@@ -28,24 +22,20 @@ from wlr_gym.gap.analysis import (
     Calibrated,
     ChannelGap,
     Detectable,
-    Evidence,
-    FoundEffect,
     GapFigures,
     RunGap,
     Statistic,
 )
-from wlr_gym.gap.problem import Range
+from wlr_gym.gap.report.evidence import evidence_section
 from wlr_gym.gap.report.html import commands, document, folded, heading, pictures_of, section, table
-from wlr_gym.gap.report.plots import SCREENED_OUT, draw
 from wlr_gym.gap.report.recommendation import record_commands
-from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, patch_of, read_result, result_of, write_result
+from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, patch_of
 from wlr_gym.gap.report.text import (
     adequacy,
     channel,
     closure,
     duration,
     error,
-    estimate,
     interval,
     listed,
     number,
@@ -59,11 +49,8 @@ from wlr_gym.gap.report.text import (
     unit_of,
 )
 from wlr_gym.gap.validation.held_out import LEAST_FOR_INTERVAL
-from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, load_patch
+from wlr_gym.physics.effects import EFFECTS, load_patch
 from wlr_gym.robot.parameter_table import TABLE
-
-REPORT_FILE, PLOTS = "report.html", "plots"
-_OWN = {RESULT_FILE, PATCH_FILE, REPORT_FILE, PLOTS, CONFIG_FILE, PROVENANCE_FILE}
 
 _COLOURS = {
     BAD_DATA: "#b03030", NOT_EXCITED: "#8a6d00", NOTHING_MISSING: "#2e7d32", EFFECT_FOUND: "#1f4e9c", UNKNOWN: "#7b3fa0",
@@ -71,82 +58,21 @@ _COLOURS = {
 
 #: Tolerances by which a calibrated number must have moved to be shown at once.
 _FAR = 0.5
-_CAPTIONS = {
+CAPTIONS = {
     "where": "In which states the calibrated model is wrong: each row a measured channel, each column a range of what is named "
     "below. The numbers are rms errors; about 1 is what sensor noise alone would leave, grey is a range without data.",
     "localisation": "Which measured channels hold the gap, and how much of it.",
-    "relations": "Which relations of the model could hold the gap: what the best law that acts there alone promises. The true "
-    "place is among the longest bars; others are long because they move the robot in a similar way.",
+    "relations": "Which relations of the model could hold the gap: the predicted improvement by the best law that acts there "
+    "alone. The true place is among the longest bars; others are long because they move the robot in a similar way.",
     "overlays": "Measured runs, and the same runs replayed by the model. Below each: the error as it is counted "
     "(pose and wheel angles: since a window of some 2 s began, x and y along and across its heading; what shakes on the tyres: "
     "averaged, noise keeps its size); the green band is two standard deviations of sensor noise.",
-    "gap": "Error of replayed runs. Left: over the runs kept aside, with the 95 % interval of what the effects bought. Right: "
-    "run by run.",
-    "channels": "The same for each measured channel, over the runs kept aside.",
-    "evidence": "What each candidate would buy: all that were fitted, and the best that were not. Long bars are good "
-    "explanations; the one that was taken is dark.",
+    "gap": "Error of replayed runs. Left: over the held-out runs, with the 95 % interval of the reduction by the effects. "
+    "Right: run by run.",
+    "channels": "The same for each measured channel, over the held-out runs.",
+    "evidence": "By how much each candidate improves the fit: all that were fitted, and the best that were not. The "
+    "selected one is dark.",
 }
-
-
-# ---- the folder ------------------------------------------------------------------------------------------------------
-
-
-def check_folder(folder: Path) -> None:
-    """Refuse, before the work, a folder that the results cannot go into; nothing is made.
-
-    Raises:
-        InputError: a file, a folder without rights, or one with contents that no earlier analysis wrote.
-    """
-    if folder.is_dir():
-        _require_own(folder)
-    nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-    if not nearest.is_dir():
-        raise InputError(f"--out {folder}: {nearest} is a file; expected a folder")
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise InputError(f"--out {folder}: cannot be written to")
-
-
-def _require_own(folder: Path) -> None:
-    there = sorted(path.name for path in folder.iterdir())
-    strange = [name for name in there if name not in _OWN] or ([] if _is_analysis(folder) else there)
-    if strange:
-        raise InputError(f"--out {folder}: '{strange[0]}' in it is not of an analysis; expected a new folder or an earlier one")
-
-
-def _is_analysis(folder: Path) -> bool:
-    """Whether an analysis wrote a folder: files of these names alone may be anybody's."""
-    if not (folder / RESULT_FILE).exists():  # one that was interrupted, before anything but pictures was there
-        return (folder / PROVENANCE_FILE).exists() or not any((folder / name).exists() for name in (PATCH_FILE, CONFIG_FILE))
-    try:
-        read_result(folder / RESULT_FILE)
-    except InputError:
-        return False
-    return True
-
-
-def save_analysis(analysis: Analysis, folder: Path) -> Path:
-    """Write report, pictures, patch and result into ``folder``, and return the path of the result.
-
-    Everything is made before anything is written, and ``result.json`` comes last: a folder that holds one is whole.
-
-    Raises:
-        InputError: see :func:`check_folder`, or a folder that cannot be written to.
-    """
-    check_folder(folder)
-    result_of(analysis)
-    pictures = draw(analysis)
-    page = report(analysis, pictures, folder)
-    make_output_folder(folder / PLOTS)
-    # the provenance stays until there is a result: it tells whose the folder is
-    for stale in (RESULT_FILE, PATCH_FILE, CONFIG_FILE):
-        (folder / stale).unlink(missing_ok=True)
-    for stale in (folder / PLOTS).glob("*.png"):
-        if stale.stem.rstrip("_0123456789") in _CAPTIONS:
-            stale.unlink()
-    for name, picture in pictures.items():
-        replace_file(folder / PLOTS / f"{name}.png", lambda temporary, picture=picture: temporary.write_bytes(picture))
-    replace_file(folder / REPORT_FILE, lambda temporary: temporary.write_text(page, encoding="utf-8"))
-    return write_result(analysis, folder)
 
 
 # ---- the page --------------------------------------------------------------------------------------------------------
@@ -163,7 +89,7 @@ def report(analysis: Analysis, pictures: Mapping[str, bytes], folder: Path) -> s
     body = [
         _header(analysis),
         _where(analysis, pictures),
-        _what(analysis, pictures),
+        evidence_section(analysis, _pictures("evidence", pictures)),
         _how_much(analysis, pictures),
         _how_sure(analysis),
         _next(analysis),
@@ -176,7 +102,7 @@ def report(analysis: Analysis, pictures: Mapping[str, bytes], folder: Path) -> s
 
 
 def _pictures(kind: str, pictures: Mapping[str, bytes]) -> str:
-    return pictures_of(kind, pictures, _CAPTIONS[kind])
+    return pictures_of(kind, pictures, CAPTIONS[kind])
 
 
 def _header(analysis: Analysis) -> str:
@@ -184,7 +110,7 @@ def _header(analysis: Analysis) -> str:
     if analysis.fit_runs:
         facts.append(f"fitted to {_runs(analysis.fit_runs)}")
     if analysis.heldout_runs:
-        facts.append(f"checked on {_runs(analysis.heldout_runs)}, which no fit and no decision has seen")
+        facts.append(f"validated on {_runs(analysis.heldout_runs)}, held out from every fit and decision")
     known = [str(effect.get("name", "")) for effect in analysis.known_effects]
     if known:
         facts.append(f"known from the start: {escape(listed([plain(name) for name in known]))}")
@@ -206,17 +132,17 @@ def _tiles(analysis: Analysis) -> str:
     tiles = [(error(gap.heldout_before), "error of the model as given"), (error(gap.heldout_calibrated), "after calibration")]
     if analysis.added:
         tiles.append((error(gap.heldout_after), "with the effects added"))
-    tiles.append((error(gap.noise_floor), "noise floor: as good as it can get"))
+    tiles.append((error(gap.noise_floor), "noise floor: what a perfect model reaches"))
     if analysis.added:
         tiles.append((percent(gap.reduction), f"of the avoidable error removed; {interval(analysis)}"))
     items = "".join(f"<li><b>{escape(value)}</b>{escape(text)}</li>" for value, text in tiles)
     return (
-        f'<ul class="figures">{items}</ul>\n<p class="small">Errors are of the runs kept aside, replayed by the model with the '
+        f'<ul class="figures">{items}</ul>\n<p class="small">Errors are of the held-out runs, replayed by the model with the '
         f"commands of the measured run: {escape(gap.metric)}; 1 = the noise of the sensors.</p>"
     )
 
 
-# ---- where, what -----------------------------------------------------------------------------------------------------
+# ---- where ----------------------------------------------------------------------------------------------------------
 
 
 def _where(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
@@ -226,95 +152,13 @@ def _where(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
     if not any((rows, *shown)):
         return ""
     text = (
-        "<p>First the model was calibrated: its known numbers were moved within their tolerances until it fits the runs as "
-        "well as it can. What is still wrong then is shown here.</p>"
+        "<p>First the model was calibrated: its parameters were moved within their tolerances until it fits the runs as well "
+        "as it can. The error that is left is shown here.</p>"
     )
     if analysis.turning:
         text += f"<p>With the final model, {escape(turned(analysis.turning))}.</p>"
     headings = ("channel", "", "share of the gap", "how it depends on the state")
     return section("Where", text, table(headings, rows, {2}), *shown)
-
-
-def _what(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
-    parts = [_effect(effect) for effect in analysis.effects]
-    if analysis.equivalent:
-        rows = [(listed([plain(name) for name in group.names], "or"), group.separating_run) for group in analysis.equivalent]
-        parts += [heading("What these data cannot tell apart"), table(("one of", "the run that would tell"), rows)]
-    if analysis.evidence:
-        rounds = sorted({one.round for one in analysis.evidence})
-        parts += [heading("What was weighed"), _WEIGHED, _pictures("evidence", pictures)]
-        parts += [_evidence([one for one in analysis.evidence if one.round == turn], turn) for turn in rounds]
-    return section("What", *parts)
-
-
-_WEIGHED = """<p>Every candidate was scored by what it promises to add to the calibrated model (a linear estimate). The best
-were added and refitted together with all known numbers: their <i>gain</i> is the fall of minus two log posterior, of which
-chance alone buys about 1 for each fitted number. One effect is taken per round, then the search starts again.</p>"""
-
-
-def _effect(effect: FoundEffect) -> str:
-    known = EFFECTS.get(effect.name)
-    if effect.name == UNKNOWN_EFFECT:
-        meaning = "Nothing in the library explains it."
-    else:
-        meaning = f"What is missing: {known.doc}." if known else "An effect of the test rig's own model."
-    law = effect.formula or (known.equation if known else "")
-    unlawful = "<p>No formula was found that holds.</p>" if effect.name == UNKNOWN_EFFECT else ""
-    rows = [(name, estimate(found)) for name, found in effect.parameters.items()]
-    return "\n".join(
-        [
-            heading(f"{plain(effect.name).capitalize()}: {places(effect.where)}"),
-            f"<p>{escape(meaning)} In files: <code>{escape(effect.name)}</code>, where <code>{escape(', '.join(effect.where))}"
-            f"</code>. Confidence {percent(effect.confidence)}.</p>",
-            f"<p>Law: <code>{escape(law)}</code></p>" if law else unlawful,
-            *([f"<p>Tried where {_tried(effect.validity)}; beyond, nothing is known of it.</p>"] if effect.validity else []),
-            table(("parameter", "value (95 % interval)"), rows),
-        ]
-    )
-
-
-def _tried(validity: Mapping[str, Range]) -> str:
-    texts = [f"{plain(name)} is {number(one.low)} to {number(one.high)}{unit_of(one.unit)}" for name, one in validity.items()]
-    return escape(listed(texts, "and"))
-
-
-def _evidence(evidence: Sequence[Evidence], turn: int) -> str:
-    fitted = sorted((one for one in evidence if one.outcome != SCREENED_OUT), key=_rank)
-    rows = [
-        (plain(one.name), places(one.where), _values(one), number(one.gain), number(one.screened), one.outcome, one.reason)
-        for one in fitted
-    ]
-    rows += [_screened_out(alike) for alike in _by_name([one for one in evidence if one.outcome == SCREENED_OUT])]
-    classes = ["taken" if one.outcome == "taken" else "" for one in fitted] + [""] * (len(rows) - len(fitted))
-    headings = ("candidate", "where", "values", "gain", "promised", "outcome", "why")
-    return (
-        heading(f"Round {turn}: {len(evidence)} explanation{'s' if len(evidence) > 1 else ''} weighed")
-        + "\n"
-        + table(headings, rows, {3, 4}, classes)
-    )
-
-
-def _rank(one: Evidence) -> tuple[bool, float]:
-    """Order of the fitted: the taken one, then by gain."""
-    return one.outcome != "taken", -one.gain if math.isfinite(one.gain) else math.inf
-
-
-def _by_name(evidence: Sequence[Evidence]) -> list[list[Evidence]]:
-    """Put the places of an effect together; what promised most first, within and without."""
-    ordered = sorted(evidence, key=lambda one: -one.screened if math.isfinite(one.screened) else math.inf)
-    return [[one for one in ordered if one.name == name] for name in dict.fromkeys(one.name for one in ordered)]
-
-
-def _screened_out(alike: Sequence[Evidence]) -> tuple[str, ...]:
-    best, others = alike[0], len(alike) - 1
-    more = f"; less at {others} other place{'s' if others > 1 else ''}" if others else ""
-    return plain(best.name), f"{places(best.where)}{more}", "", "-", number(best.screened), best.outcome, best.reason
-
-
-def _values(one: Evidence) -> str:
-    known = EFFECTS[one.name].parameters if one.name in EFFECTS else {}
-    units = {name: unit_of(known[name].unit) if name in known else "" for name in one.values}
-    return ", ".join(f"{name} {number(value)}{units[name]}" for name, value in one.values.items())
 
 
 # ---- how much, how sure, what next -----------------------------------------------------------------------------------
@@ -327,7 +171,7 @@ def _how_much(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
     headings = ("as given", "calibrated", "with effects")[: 3 if analysis.added else 2]
     of_runs = (*headings, "removed") if analysis.added else headings
     runs = [
-        (one.run, "kept aside" if one.heldout else "fitted", *(*_errors(one), percent(one.reduction))[: len(of_runs)])
+        (one.run, "held out" if one.heldout else "fitted", *(*_errors(one), percent(one.reduction))[: len(of_runs)])
         for one in analysis.run_gaps
     ]
     channels = [
@@ -352,15 +196,16 @@ def _gap_in_words(gap: GapFigures, analysis: Analysis) -> str:
     added = f", {error(gap.heldout_after)} with the effects" if analysis.added else ""
     text = (
         f"<p>Error of replayed runs ({escape(gap.metric)}; 1 = sensor noise). Runs that were fitted: {error(gap.fit_before)} "
-        f"before, {error(gap.fit_after)} after. Runs kept aside: {error(gap.heldout_before)} as given, "
+        f"before, {error(gap.fit_after)} after. Held-out runs: {error(gap.heldout_before)} as given, "
         f"{error(gap.heldout_calibrated)} calibrated{added}; noise floor {error(gap.noise_floor)}.</p>"
     )
     if not analysis.added:
         return text
     return (
-        f"{text}\n<p>What was found removes {removed(analysis)} of the avoidable error of the runs kept aside: of the distance "
-        "from the calibrated model to the noise floor. Negative would be: it makes them worse. The interval is Student's, with "
-        f"as many degrees of freedom as there are runs kept aside, less one; fewer than {LEAST_FOR_INTERVAL} give none.</p>"
+        f"{text}\n<p>What was found removes {removed(analysis)} of the avoidable error of the held-out runs: of the distance "
+        "from the calibrated model to the noise floor. A negative value means that it makes them worse. The interval is "
+        "Student's, with as many degrees of freedom as there are held-out runs, less one; fewer than "
+        f"{LEAST_FOR_INTERVAL} give none.</p>"
     )
 
 
@@ -368,7 +213,7 @@ def _how_sure(analysis: Analysis) -> str:
     parts = []
     if analysis.effects:
         rows = [(plain(effect.name), places(effect.where), percent(effect.confidence)) for effect in analysis.effects]
-        parts += [_SURE, table(("effect", "where", "confidence"), rows, {2})]
+        parts += [_SELECTION_FREQUENCY, table(("effect", "where", "selection frequency"), rows, {2})]
     if analysis.adequacy:
         parts += [heading("Is anything left?"), _adequacy(analysis.adequacy)]
     if analysis.detectable:
@@ -387,9 +232,9 @@ def _adequacy(found: Adequacy) -> str:
     pulled = found.pulled
     rows = [
         ("level", "error of all channels, units of sensor noise", *_statistic(found.level)),
-        ("whiteness", "rows that say the same, geometric mean of the channels", *_statistic(found.whiteness)),
-        ("constancy", "scatter of the runs over what their rows promise", *_statistic(found.constancy)),
-        ("", f"standard errors by which {pulled.run} pulls {pulled.number}: the most", *_statistic(pulled.errors)),
+        ("whiteness", "integrated autocorrelation time in rows, geometric mean of the channels", *_statistic(found.whiteness)),
+        ("constancy", "scatter of the runs' estimates over what their rows predict", *_statistic(found.constancy)),
+        ("", f"standard errors by which {pulled.run} pulls {pulled.number}: the largest", *_statistic(pulled.errors)),
     ]
     rows += [(f"level: {name}", channel(name), *_statistic(level)) for name, (level, _) in left]
     rows += [(f"whiteness: {name}", channel(name), *_statistic(white)) for name, (_, white) in left]
@@ -404,15 +249,14 @@ def _statistic(found: Statistic) -> tuple[str, ...]:
     return error(found.value), error(found.expected), error(found.limit), error(found.ratio), error(found.p)
 
 
-_ADEQUACY = """<p>This decides nothing. No simulator is right to the last digit, and such tests notice the last digit: with real
-runs they always reject. What counts is how many times larger than expected. Of runs that another simulator of the same robot
-made, with nothing missing, it was 1.1 to 1.7 (level, whiteness) and 1.4 to 1.5 (constancy); where one wheel stood on a slippery
-floor 10, 3.7 and 5.2 before that was in the model, and 2.1, 2.0 and 1.8 with it. One channel in 20 lies beyond its limit by
-chance.</p>"""
-_SURE = """<p>Confidence: the fitted runs are drawn again and again, with replacement, each with its part in what every
-explanation buys (nothing is fitted anew). It is the share of these draws in which the effect buys enough, the runs agree, and
-no other effect buys more; of an effect without a formula, in which it is as clear. A 95 % interval misses the true number in
-one of 20 cases, provided that nothing else is wrong with the model.</p>"""
+_ADEQUACY = """<p>No decision depends on this. No simulator is exact, and such tests notice that: with real runs they always
+reject. What matters is how many times larger than expected. Of runs that another simulator of the same robot made, with
+nothing missing, it was 1.1 to 1.7 (level, whiteness) and 1.4 to 1.5 (constancy); where one wheel stood on a slippery floor 10,
+3.7 and 5.2 before that was in the model, and 2.1, 2.0 and 1.8 with it. One channel in 20 exceeds its limit by chance.</p>"""
+_SELECTION_FREQUENCY = """<p>Selection frequency (bootstrap): the fitted runs are drawn again and again, with replacement, each
+with its part in the gain of every candidate (nothing is refitted). It is the share of these draws in which the effect improves
+the fit enough, the runs agree, and no other effect improves it more; of an effect without a formula, in which it is as clear.
+A 95 % interval misses the true number in one of 20 cases, provided that nothing else is wrong with the model.</p>"""
 _DETECTABLE = """<p>The smallest size of each effect that would have been noticed, at the place where it is hardest to see.
 Smaller ones may be there. Of an effect with several directions (a displaced mass: x, y, z) it is the direction that shows best:
 in another it may stay hidden at any size.</p>"""
@@ -426,11 +270,8 @@ def _next(analysis: Analysis) -> str:
         if known:
             parts.append("<p>Drive them on the robot, or write their command files with <code>--commands-only</code>:</p>")
             parts.append(commands(record_commands(known)))
-    items = [
-        f"<li>{escape(group.separating_run)}: tells {escape(listed([plain(name) for name in group.names], 'from'))}.</li>"
-        for group in analysis.equivalent
-        if group.separating_run
-    ]
+    named = [(one.separating_run, listed([plain(name) for name in one.names], "from")) for one in analysis.equivalent]
+    items = [f"<li>{escape(run)}: distinguishes {escape(names)}.</li>" for run, names in named if run]
     return section("What to run next", *parts, f"<ul>{''.join(items)}</ul>" if items else "")
 
 
@@ -441,9 +282,9 @@ def _calibration(analysis: Analysis) -> str:
     if not analysis.calibration:
         return ""
     text = (
-        "<p>Numbers of the model that are known only to a tolerance were fitted before anything was called missing. "
+        "<p>Parameters that are known only to a tolerance were fitted before anything was called missing. "
         "<i>Moved</i> counts in tolerances: where a number has moved as far as it may (2.5; biases of sensors 4), doubt the "
-        "tolerance or the model; its interval is set to 1.96 tolerances, as the fit tells none.</p>"
+        "tolerance or the model; its interval is set to 1.96 tolerances, as the fit gives none.</p>"
     )
     headings, right = ("number", "unit", "nominal", "fitted", "± (95 %)", "tolerance (1 sigma)", "moved"), {2, 3, 4, 5, 6}
     ordered = sorted(analysis.calibration.items(), key=lambda pair: -abs(_shift(pair[1])))

@@ -1,15 +1,16 @@
-"""Proof on sealed runs: bars, reduction and its interval, channels."""
+"""Validation on held-out runs: bars, reduction and its interval, channels."""
 
 import numpy as np
 import pytest
 from toy_problem import CHANNELS, NOISE, Toy, candidate, sized
 
 from wlr_gym.gap.analysis import Place
-from wlr_gym.gap.estimation.fit import fit, nominal_model
-from wlr_gym.gap.report.traces import MOST, telling_traces
-from wlr_gym.gap.validation.held_out import _interval, level, mean_squares, prove, reduction
+from wlr_gym.gap.estimation.fit import fit
+from wlr_gym.gap.estimation.model import nominal_model
+from wlr_gym.gap.validation.held_out import _interval, compare_models, level, mean_squares, reduction
+from wlr_gym.gap.validation.traces import MOST, informative_traces
 
-FITTED, SEALED = [0, 1, 2, 4], [3, 5, 6]
+FITTED, HELD_OUT = [0, 1, 2, 4], [3, 5, 6]
 
 
 def models(problem, size=0.8):
@@ -74,16 +75,16 @@ def test_interval_of_more_than_everything_keeps_its_lower_end():
 
 def test_two_runs_give_no_interval():
     problem = Toy({"gain": 1.5}, [sized("drag", 1.5, "right")], runs=7)
-    gap, runs, _ = prove(problem, FITTED, [3, 5], models(problem), 1.0)
+    gap, runs, _ = compare_models(problem, FITTED, [3, 5], models(problem), 1.0)
     assert np.isnan(gap.reduction_ci95).all()
     assert gap.reduction > 0.9
     single = [reduction(np.array([[r.calibrated**2]]), np.array([[r.after**2]]), 1.0) for r in runs]
     assert [r.reduction for r in runs] == pytest.approx(np.minimum(single, 1.0).tolist())
 
 
-def test_true_effect_closes_the_gap_on_sealed_runs():
+def test_true_effect_closes_the_gap_on_held_out_runs():
     problem = Toy({"gain": 1.5}, [sized("drag", 1.5, "right")], runs=7)
-    gap, runs, channels = prove(problem, FITTED, SEALED, models(problem), 1.0)
+    gap, runs, channels = compare_models(problem, FITTED, HELD_OUT, models(problem), 1.0)
     assert gap.heldout_before > gap.heldout_calibrated > gap.heldout_after
     assert gap.heldout_after == pytest.approx(1.0, abs=0.06)
     assert gap.fit_before > gap.fit_after
@@ -91,7 +92,7 @@ def test_true_effect_closes_the_gap_on_sealed_runs():
     low, high = gap.reduction_ci95
     assert low <= gap.reduction <= high <= 1.0
     assert low > 0.5
-    assert [(r.run, r.heldout) for r in runs] == [(f"run_{k + 1}", k in SEALED) for k in (*FITTED, *SEALED)]
+    assert [(r.run, r.heldout) for r in runs] == [(f"run_{k + 1}", k in HELD_OUT) for k in (*FITTED, *HELD_OUT)]
     assert [c.channel for c in channels] == list(CHANNELS)
     assert {c.group for c in channels} == {"all"}
     assert [c.noise for c in channels] == list(NOISE)
@@ -100,9 +101,9 @@ def test_true_effect_closes_the_gap_on_sealed_runs():
 
 def test_bars_of_runs_add_up_to_the_whole():
     problem = Toy({"gain": 1.5}, [sized("drag", 1.0, "right")], runs=7)
-    gap, runs, channels = prove(problem, FITTED, SEALED, models(problem), 1.0)
-    sealed = [r.after for r in runs if r.heldout]
-    assert np.sqrt(np.mean(np.square(sealed))) == pytest.approx(gap.heldout_after)
+    gap, runs, channels = compare_models(problem, FITTED, HELD_OUT, models(problem), 1.0)
+    held_out = [r.after for r in runs if r.heldout]
+    assert np.sqrt(np.mean(np.square(held_out))) == pytest.approx(gap.heldout_after)
     assert np.sqrt(np.mean([c.after**2 for c in channels])) == pytest.approx(gap.heldout_after)
     assert np.sqrt(np.mean([r.before**2 for r in runs if not r.heldout])) == pytest.approx(gap.fit_before)
 
@@ -111,7 +112,7 @@ def test_effect_that_makes_runs_worse_is_seen_to():
     problem = Toy({"gain": 1.0}, error=1.0, runs=7)
     nominal, calibrated, _ = models(problem)
     wrong = calibrated.with_effect(candidate(problem, "drag", ["right"]), (1.0,))
-    gap, _, _ = prove(problem, FITTED, SEALED, (nominal, calibrated, wrong), 1.0)
+    gap, _, _ = compare_models(problem, FITTED, HELD_OUT, (nominal, calibrated, wrong), 1.0)
     assert gap.heldout_after > 1.1 * gap.heldout_calibrated
     assert gap.reduction < -0.2
     assert gap.reduction_ci95[0] < gap.reduction < gap.reduction_ci95[1] < 0.0
@@ -120,18 +121,18 @@ def test_effect_that_makes_runs_worse_is_seen_to():
 def test_where_calibration_leaves_nothing_there_is_no_share_of_it():
     problem = Toy({"gain": 1.0}, runs=7)
     nominal, calibrated, _ = models(problem)
-    gap, _, _ = prove(problem, FITTED, SEALED, (nominal, calibrated, calibrated), 2.0)
+    gap, _, _ = compare_models(problem, FITTED, HELD_OUT, (nominal, calibrated, calibrated), 2.0)
     assert np.isnan([gap.reduction, *gap.reduction_ci95]).all()
 
 
 def test_effect_of_one_run_only_has_a_wide_interval():
     problem = Toy(runs=8)
-    sealed = [3, 4, 5, 6, 7]
+    held_out = [3, 4, 5, 6, 7]
     response = problem.effect_response(sized("drag", 2.0, "right"), 3)
     problem._measured[3] = problem._measured[3] + response * NOISE
     nominal = nominal_model(problem)
     whole = nominal.with_effect(candidate(problem, "drag", ["right"]), (0.9,))
-    gap = prove(problem, [0, 1, 2], sealed, (nominal, nominal, whole), 0.9)[0]
+    gap = compare_models(problem, [0, 1, 2], held_out, (nominal, nominal, whole), 0.9)[0]
     low, high = gap.reduction_ci95
     assert low < 0.0 < high
     assert low < gap.reduction < high
@@ -141,14 +142,14 @@ def test_channel_without_values_is_left_out():
     problem = Toy(runs=7)
     for measured in problem._measured:
         measured[:, 1] = np.nan
-    gap, runs, channels = prove(problem, FITTED, SEALED, models(problem), 1.0)
+    gap, runs, channels = compare_models(problem, FITTED, HELD_OUT, models(problem), 1.0)
     assert [c.channel for c in channels] == ["speed", "place"]
     assert np.isfinite([gap.heldout_after, *(r.after for r in runs)]).all()
 
 
-def test_traces_show_sealed_runs_where_the_gap_is():
+def test_traces_show_held_out_runs_where_the_gap_is():
     problem = Toy({}, [sized("drag", 1.5, "right")], runs=7)
-    traces = telling_traces(problem, SEALED, models(problem), (Place("place", 0.7, ""), Place("speed", 0.3, "")))
+    traces = informative_traces(problem, HELD_OUT, models(problem), (Place("place", 0.7, ""), Place("speed", 0.3, "")))
     assert [t.channel for t in traces] == ["place", "speed"]
     assert len(traces) <= MOST
     for trace in traces:

@@ -1,4 +1,4 @@
-"""The channels worth looking at: those that hold most of the gap, in the runs where it shows most."""
+"""Traces of the channels that hold most of the gap, each of the held-out run where it is largest."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from wlr_gym.gap.analysis import Place, Trace
-from wlr_gym.gap.estimation.fit import Model
+from wlr_gym.gap.estimation.model import FittedModel
 from wlr_gym.gap.problem import Problem
 
 #: Traces of an analysis.
@@ -16,8 +16,8 @@ MOST = 6
 USUAL = ("gyro_z", "cam_x", "eff_leg_lf", "vel_wheel_lf", "position")
 
 
-def telling_traces(
-    problem: Problem, heldout: Sequence[int], models: Sequence[Model], places: Sequence[Place]
+def informative_traces(
+    problem: Problem, heldout: Sequence[int], models: Sequence[FittedModel], places: Sequence[Place]
 ) -> tuple[Trace, ...]:
     """Return measured and replayed traces of held-out runs, channels in the order of their share of the gap.
 

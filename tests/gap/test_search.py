@@ -1,4 +1,4 @@
-"""Naming on a system whose truth is known: the right name, no name for noise, pairs, equals, idle effects."""
+"""The search on a system whose truth is known: the right name, none for noise, pairs, equivalent and redundant effects."""
 
 from dataclasses import replace
 
@@ -8,25 +8,32 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap.analysis import NOT_EXCITED
-from wlr_gym.gap.estimation.fit import Fit, fit, linearise, nominal_model, total_cost, untouched
+from wlr_gym.gap.estimation.fit import Fit, fit, linearise
 from wlr_gym.gap.estimation.likelihood import estimate_noise
-from wlr_gym.gap.estimation.refit import refit
-from wlr_gym.gap.estimation.uncertainty import EQUIVALENT, equivalents
+from wlr_gym.gap.estimation.model import nominal_model, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
 from wlr_gym.gap.report.text import sentence
-from wlr_gym.gap.selection import cross_validation as judge
-from wlr_gym.gap.selection import search as naming_module
-from wlr_gym.gap.selection.cross_validation import Final, carries_over, finalists, looked_around, settle, told_by_others
+from wlr_gym.gap.selection import cross_validation, search
+from wlr_gym.gap.selection.cross_validation import (
+    Finalist,
+    best_on_grid,
+    converge,
+    cross_validated,
+    fit_finalists,
+    without_each_run,
+)
+from wlr_gym.gap.selection.equivalence import EQUIVALENT, equivalents
 from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.refit import refit
 from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
-from wlr_gym.gap.selection.search import MOST_EFFECTS, PER_NAME, SHORTLIST, drop_idle, name_effects, shortlist
+from wlr_gym.gap.selection.search import MOST_EFFECTS, PER_NAME, SHORTLIST, remove_redundant, search_effects, shortlist
 from wlr_gym.gap.workflow import analyse_problem, evidence_of
 
 RUNS = range(5)
 
 
 def named(problem, runs=RUNS):
-    return name_effects(problem, runs, fit(problem, runs, nominal_model(problem), steps=problem.steps))
+    return search_effects(problem, runs, fit(problem, runs, nominal_model(problem), steps=problem.steps))
 
 
 def level():
@@ -37,8 +44,8 @@ def level():
     return Candidate("level", ("body",), (unknown,), (start,), tolerances=(tolerance,))
 
 
-def labels(naming):
-    return [found.label for found, _ in naming.fit.model.effects]
+def labels(found):
+    return [found.label for found, _ in found.fit.model.effects]
 
 
 @pytest.mark.parametrize(
@@ -55,22 +62,22 @@ def labels(naming):
 )
 def test_right_name_place_and_size(effect, label):
     problem = Toy({"gain": 1.0, "offset": -1.0}, [effect], error=1.0)
-    naming = named(problem)
-    chosen, values = naming.fit.model.effects[0]
+    found = named(problem)
+    chosen, values = found.fit.model.effects[0]
     if label == "drag left":  # half as much of its twin is the same
         assert chosen.label in (label, "twin body")
     else:
-        assert labels(naming) == [label]
+        assert labels(found) == [label]
         assert values == pytest.approx(list(effect.parameters.values()), abs=0.15)
-    assert naming.rounds[0].taken is not None
-    assert naming.rounds[-1].taken is None
+    assert found.rounds[0].selected is not None
+    assert found.rounds[-1].selected is None
 
 
 @pytest.mark.parametrize("error", [0.0, 1.0, 3.0])
 def test_noise_gets_no_name(error):
     found = []
     for seed in range(8):
-        problem = Toy({"gain": 1.0, "mass": -1.5}, seed=seed, error=error, memory=0.9)
+        problem = Toy({"gain": 1.0, "mass": -1.5}, seed=seed, error=error, ar1=0.9)
         found += labels(named(problem))
     assert found == []
 
@@ -78,21 +85,21 @@ def test_noise_gets_no_name(error):
 def test_scores_of_pure_noise_are_those_of_chance():
     gains = []
     for seed in range(20):
-        problem = Toy(seed=seed, white=1.5, error=1.0, memory=0.8)
+        problem = Toy(seed=seed, white=1.5, error=1.0, ar1=0.8)
         current = fit(problem, RUNS, nominal_model(problem))
         probes, candidates = problem.candidates(None, [], [])
         found = screen(candidates, responses(problem, current, RUNS, probes))
         gains += [score.gain for score in found if score.candidate.name.startswith("decoy")]
-    # chi-square of one degree of freedom; memory is estimated, so the scale may be a little off
+    # chi-square of one degree of freedom; the autocorrelation time is estimated, so the scale may be a little off
     assert 0.6 < np.mean(gains) < 1.7
     assert max(gains) < 0.5 * LEAST_GAIN
 
 
 def test_number_beyond_calibrations_reach_becomes_an_effect():
     problem = Toy({"gain": REACH + 3.0}, white=1.0)
-    naming = named(problem)
-    assert labels(naming) == ["copy body"]
-    total = (naming.fit.model.quantities[0] - NOMINAL[0]) / SIGMA[0] + naming.fit.model.effects[0][1][0]
+    found = named(problem)
+    assert labels(found) == ["copy body"]
+    total = (found.fit.model.quantities[0] - NOMINAL[0]) / SIGMA[0] + found.fit.model.effects[0][1][0]
     assert total == pytest.approx(REACH + 3.0, abs=0.1)
 
 
@@ -102,16 +109,16 @@ def test_number_within_tolerance_stays_a_number():
 
 def test_two_effects_are_both_named():
     problem = Toy({"mass": 1.0}, [sized("drag", 0.8, "right"), sized("decoy_4", -0.7)], error=0.5)
-    naming = named(problem)
-    assert sorted(labels(naming)) == ["decoy_4 body", "drag right"]
-    assert [r.taken is None for r in naming.rounds] == [False, False, True]
+    found = named(problem)
+    assert sorted(labels(found)) == ["decoy_4 body", "drag right"]
+    assert [r.selected is None for r in found.rounds] == [False, False, True]
 
 
 def test_looking_for_a_second_effect_starts_from_how_numbers_act_beside_the_first(monkeypatch):
-    """Also where the known numbers are as the file says."""
+    """Also where the calibrated parameters are as the file says."""
     problem = Toy({}, [sized("play", 1.3), sized("decoy_4", -0.7)], error=0.5)
-    seen, refitting = [], naming_module.refit
-    monkeypatch.setattr(naming_module, "refit", lambda *args: seen.append((args[2], args[4])) or refitting(*args))
+    seen, refitting = [], search.refit
+    monkeypatch.setattr(search, "refit", lambda *args: seen.append((args[2], args[4])) or refitting(*args))
     named(problem)
     assert len(seen[-1][0].model.effects) == 2
     for current, given in seen:
@@ -139,29 +146,29 @@ def test_sums_are_those_of_one_thread(monkeypatch):
 
 def test_no_more_effects_than_an_analysis_may_have():
     problem = Toy({}, [sized(f"decoy_{k}", 0.9) for k in range(5)], runs=6, rows=600)
-    naming = named(problem, range(6))
-    taken = [r.taken.candidate.label for r in naming.rounds if r.taken]
-    assert len(labels(naming)) == MOST_EFFECTS
-    assert sorted(taken) == sorted(labels(naming))  # what the evidence calls taken is in the model
+    found = named(problem, range(6))
+    selected = [r.selected.candidate.label for r in found.rounds if r.selected]
+    assert len(labels(found)) == MOST_EFFECTS
+    assert sorted(selected) == sorted(labels(found))  # what the evidence calls selected is in the model
 
 
 def test_identical_responses_are_equivalent():
     problem = Toy({}, [sized("drag", 0.8, "left")], error=0.5)
     look = named(problem).rounds[0]
-    assert look.taken is not None
-    names = {look.taken.candidate.name, *(other.candidate.name for other in equivalents(look.taken, look.hypotheses))}
+    assert look.selected is not None
+    names = {look.selected.candidate.name, *(other.candidate.name for other in equivalents(look.selected, look.hypotheses))}
     assert names == {"drag", "twin"}
     gains = {h.candidate.label: h.gain for h in look.hypotheses}
     assert gains["twin body"] == pytest.approx(gains["drag left"], rel=0.02)
-    assert gains["twin body"] > EQUIVALENT * look.taken.gain
+    assert gains["twin body"] > EQUIVALENT * look.selected.gain
 
 
 def test_implausible_size_is_not_accepted():
     problem = Toy({}, [sized("weak", 1.2)], rows=400)
-    naming = named(problem)
-    assert labels(naming) == []
-    assert naming.rounds[0].taken is None
-    first = naming.rounds[0].hypotheses[0]
+    found = named(problem)
+    assert labels(found) == []
+    assert found.rounds[0].selected is None
+    first = found.rounds[0].hypotheses[0]
     assert first.candidate.name == "weak"
     assert first.at_bound
     assert first.values == (0.5,)
@@ -172,7 +179,7 @@ def test_implausible_size_is_not_accepted():
 def test_what_a_tolerance_allows_is_no_effect(monkeypatch, size, is_effect):
     """A tolerance that counts many times makes a copy of the number cheap, whatever its size."""
     problem = Toy({"gain": size}, rows=400)
-    problem.firmness = 10.0
+    problem.tempering = 10.0
     copy = replace(candidate(problem, "copy"), tolerances=(Tolerance(("gain",), 1.0, REACH),))
     monkeypatch.setattr(Toy, "_copy", lambda self: ([], [copy]))
     look = named(problem).rounds[0]
@@ -181,13 +188,13 @@ def test_what_a_tolerance_allows_is_no_effect(monkeypatch, size, is_effect):
     assert first.values == pytest.approx((size,), abs=0.2)
     assert first.gain > LEAST_GAIN
     assert first.tolerable is not is_effect
-    assert (look.taken is not None) is is_effect
+    assert (look.selected is not None) is is_effect
 
 
-def test_effect_that_takes_the_place_of_a_number_is_refitted_without_that_number():
+def test_effect_that_replaces_a_parameter_is_refitted_without_it():
     """Calibration went as far as it may; beside the effect the number does nothing, and only its tolerance pulls it home."""
     problem = Toy({"gain": 6.0}, rows=400)
-    problem.firmness = 3.0
+    problem.tempering = 3.0
     current = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
     given = linearise(problem, nominal_model(problem), RUNS)[1]
     probes, _ = problem.candidates(None, [], [])
@@ -204,7 +211,7 @@ def stuck_and_free(problem):
     residuals = [r[0] for r in problem.residuals([nominal_model(problem).setting], RUNS)]
     free = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
     noise = estimate_noise(residuals)
-    cost = total_cost(problem, nominal_model(problem), residuals, noise.memory)
+    cost = total_cost(problem, nominal_model(problem), residuals, noise.autocorrelation_time)
     silent = [np.zeros_like(columns) for columns in given]
     stuck = replace(free, model=nominal_model(problem), residuals=residuals, columns=silent, noise=noise, cost=cost)
     return stuck, free, given
@@ -221,7 +228,7 @@ def test_what_a_hypothesis_finds_by_starting_elsewhere_is_no_evidence_for_it():
     assert abs(refitted.gain) < 0.5 * LEAST_GAIN
 
 
-def test_number_whose_place_an_effect_takes_is_a_rival_of_it():
+def test_parameter_that_an_effect_replaces_is_a_rival_of_it():
     problem = Toy({"gain": 2.0, "offset": -2.0}, rows=400)
     stuck, good, given = stuck_and_free(problem)
     probes, _ = problem.candidates(None, [], [])
@@ -233,12 +240,12 @@ def test_number_whose_place_an_effect_takes_is_a_rival_of_it():
 
 @pytest.mark.parametrize(("effects", "names"), [([], []), ([sized("drag", 0.8, "right")], ["drag right"])])
 def test_stuck_calibration_is_done_anew_from_where_refits_have_been(monkeypatch, effects, names):
-    monkeypatch.setattr(naming_module, "shortlist", lambda scores, cost: scores[:2])  # also where none promises anything
+    monkeypatch.setattr(search, "shortlist", lambda scores, cost: scores[:2])  # also where none is predicted to improve the fit
     problem = Toy({"gain": 2.0, "offset": -2.0}, effects, rows=400)
     stuck, free, given = stuck_and_free(problem)
-    naming = name_effects(problem, RUNS, stuck, given=given)
-    assert labels(naming) == names
-    assert naming.calibrated.model.quantities == pytest.approx(free.model.quantities, abs=0.5 * SIGMA.min())
+    found = search_effects(problem, RUNS, stuck, given=given)
+    assert labels(found) == names
+    assert found.calibrated.model.quantities == pytest.approx(free.model.quantities, abs=0.5 * SIGMA.min())
 
 
 class Trap(Toy):
@@ -251,18 +258,18 @@ class Trap(Toy):
         return super()._response(np.array([NOMINAL[0] + SIGMA[0] * amount, *quantities[1:]]), effects, run)
 
 
-def test_effect_that_is_taken_settles_also_from_the_model_as_given():
+def test_selected_effect_converges_also_from_the_model_as_given():
     problem = Trap({}, [sized("drag", 0.8, "right")], rows=400)
     own = candidate(problem, "drag", ["right"])
     far = nominal_model(problem).with_effect(own, (0.5,))
     trapped = fit(problem, RUNS, replace(far, quantities=far.quantities + np.array([2.4 * SIGMA[0], 0.0, 0.0])), steps=1)
     base = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
     found = Hypothesis(own, trapped.model, 1.0, np.ones(5), 1.0, trapped.residuals, base.model, base.residuals)
-    settled, _ = settle(problem, RUNS, Final(found, trapped), base, lambda text: None)
+    final, _ = converge(problem, RUNS, Finalist(found, trapped), base, lambda text: None)
     assert trapped.model.quantities[0] > NOMINAL[0] + 1.5 * SIGMA[0]
-    assert settled.fit.model.quantities[0] == pytest.approx(NOMINAL[0], abs=0.3 * SIGMA[0])
-    assert settled.hypothesis.values == settled.fit.model.effects[0][1]
-    assert settled.hypothesis.gain > LEAST_GAIN
+    assert final.fit.model.quantities[0] == pytest.approx(NOMINAL[0], abs=0.3 * SIGMA[0])
+    assert final.hypothesis.values == final.fit.model.effects[0][1]
+    assert final.hypothesis.gain > LEAST_GAIN
 
 
 class Bump(Toy):
@@ -275,19 +282,19 @@ class Bump(Toy):
         return effect.parameters["size"] * near[:, None] * np.ones(3)
 
 
-def test_effect_that_settles_looks_around_for_its_place(monkeypatch):
+def test_converging_effect_searches_a_grid_of_places(monkeypatch):
     unknowns = (Unknown("size", "1", 0.0, -10.0, 10.0, 0.5), Unknown("place", "row", 0.0, 0.0, 200.0, 8.0, is_size=False))
     bump = Candidate("bump", ("body",), unknowns, ())
     problem = Bump({}, [bump.effect((3.0, 100.0))], rows=200)
     lost = fit(problem, RUNS, nominal_model(problem).with_effect(bump, (3.0, 132.0)), steps=0)
     assert lost.model.effects[0][1][1] > 120.0
-    assert looked_around(problem, RUNS, lost).effects[0][1][1] == pytest.approx(100.0, abs=2.0)
+    assert best_on_grid(problem, RUNS, lost).effects[0][1][1] == pytest.approx(100.0, abs=2.0)
     base = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
     found = Hypothesis(bump, lost.model, 1.0, np.ones(5), 1.0, lost.residuals, base.model, base.residuals)
     # with fits that hardly move
-    monkeypatch.setattr(judge, "fit", lambda *arguments, **options: fit(*arguments, **options | {"steps": 0}))
-    settled, _ = settle(problem, RUNS, Final(found, lost), base, lambda text: None)
-    assert settled.hypothesis.values[1] == pytest.approx(100.0, abs=2.0)
+    monkeypatch.setattr(cross_validation, "fit", lambda *arguments, **options: fit(*arguments, **options | {"steps": 0}))
+    final, _ = converge(problem, RUNS, Finalist(found, lost), base, lambda text: None)
+    assert final.hypothesis.values[1] == pytest.approx(100.0, abs=2.0)
 
 
 @pytest.mark.parametrize(("converged", "fits"), [(True, 1), (False, 2)])
@@ -298,12 +305,14 @@ def test_what_has_converged_is_not_fitted_from_there_again(monkeypatch, converge
     whole = fit(problem, RUNS, nominal_model(problem).with_effect(own, (0.5,)), steps=problem.steps)
     found = Hypothesis(own, whole.model, 1.0, np.ones(5), 1.0, whole.residuals, base.model, base.residuals)
     starts = []
-    monkeypatch.setattr(judge, "fit", lambda *args, **options: starts.append(options["steps"]) or fit(*args, **options))
-    settle(problem, RUNS, Final(found, replace(whole, converged=converged)), base, lambda text: None)
-    assert starts.count(judge.SETTLING) == fits
+    monkeypatch.setattr(
+        cross_validation, "fit", lambda *args, **options: starts.append(options["steps"]) or fit(*args, **options)
+    )
+    converge(problem, RUNS, Finalist(found, replace(whole, converged=converged)), base, lambda text: None)
+    assert starts.count(cross_validation.CONVERGENCE_STEPS) == fits
 
 
-def test_known_numbers_that_a_whole_fit_finds_count_for_nothing():
+def test_improvement_by_calibrated_parameters_alone_counts_for_nothing():
     """The model without the effect was left at nominal; the whole fit has found the numbers, and there is no effect."""
     problem = Toy({"gain": 2.0, "offset": -2.0}, rows=400)
     nominal, own = nominal_model(problem), candidate(problem, "drag", ["right"])
@@ -311,13 +320,13 @@ def test_known_numbers_that_a_whole_fit_finds_count_for_nothing():
     residuals = [r[0] for r in problem.residuals([nominal.setting], RUNS)]
     left = Hypothesis(own, nominal.with_effect(own, (0.1,)), 1e3, np.ones(5), 1.0, residuals, nominal, residuals)
     stuck = replace(whole, model=nominal, residuals=residuals)
-    (final,), _ = finalists(problem, RUNS, stuck, [left], stuck)
+    (final,), _ = fit_finalists(problem, RUNS, stuck, [left], stuck)
     assert final.fit.model.quantities == pytest.approx(whole.model.quantities, abs=0.2 * SIGMA.min())
     assert abs(final.hypothesis.gain) < 0.5 * LEAST_GAIN
 
 
-@pytest.mark.parametrize(("promised", "is_fitted"), [(300.0, True), (90.0, False)])
-def test_hypothesis_that_got_stuck_short_of_its_promise_is_fitted_in_full(promised, is_fitted):
+@pytest.mark.parametrize(("predicted", "is_fitted"), [(300.0, True), (90.0, False)])
+def test_hypothesis_that_falls_short_of_its_prediction_is_fitted_in_full(predicted, is_fitted):
     problem = Toy({}, [sized("drag", 0.8, "right")], rows=400)
     current = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
 
@@ -327,14 +336,14 @@ def test_hypothesis_that_got_stuck_short_of_its_promise_is_fitted_in_full(promis
             model.effects[0][0], model, gain, np.ones(5), screened, current.residuals, current.model, current.residuals
         )
 
-    hypotheses = [refitted("decoy_1", 60.0, 100.0), refitted("drag", -5.0, promised, "right")]
-    finals, _ = finalists(problem, RUNS, current, hypotheses, current)
+    hypotheses = [refitted("decoy_1", 60.0, 100.0), refitted("drag", -5.0, predicted, "right")]
+    finals, _ = fit_finalists(problem, RUNS, current, hypotheses, current)
     assert len(finals) == 1 + is_fitted
     assert (finals[0].hypothesis.candidate.label == "drag right") is is_fitted
     assert (finals[0].hypothesis.gain > 100.0) is is_fitted
 
 
-def test_finalists_are_judged_against_the_same_model(monkeypatch):
+def test_finalists_are_compared_with_the_same_model(monkeypatch):
     """A model without any effect, found beside one finalist, is better than the other finalist."""
     problem, nominal = Toy(), nominal_model(Toy())
     ones = np.ones((200, 3)) * np.sign(np.random.default_rng(0).standard_normal((200, 3)))
@@ -344,58 +353,58 @@ def test_finalists_are_judged_against_the_same_model(monkeypatch):
         residuals = [ones * level] * 5
         noise = estimate_noise(residuals, np.full(3, 100.0))
         columns = [np.zeros((model.size, 600), np.float32)] * 5
-        cost = total_cost(problem, model, residuals, noise.memory)
+        cost = total_cost(problem, model, residuals, noise.autocorrelation_time)
         return Fit(model, residuals, noise, cost, columns, np.eye(1), np.eye(1))
 
     def fitted(problem, runs, model, **_):
         return levelled(model, levels[model.effects[-1][0].name][0])
 
-    monkeypatch.setattr(judge, "fit", fitted)
-    monkeypatch.setattr(judge, "_afresh", lambda *_: [])
+    monkeypatch.setattr(cross_validation, "fit", fitted)
+    monkeypatch.setattr(cross_validation, "_afresh", lambda *_: [])
 
-    def left(problem, runs, whole, found, memory):
+    def left(problem, runs, whole, found, autocorrelation_time):
         return levelled(nominal, levels[found.name][1])
 
-    monkeypatch.setattr(judge, "_left", left)
+    monkeypatch.setattr(cross_validation, "_left", left)
     current = levelled(nominal, 20.0)
     effects = [candidate(problem, name) for name in levels]
     hypotheses = [
         Hypothesis(c, nominal.with_effect(c, (0.1,)), 50.0, np.ones(5), 1.0, current.residuals, nominal, current.residuals)
         for c in effects
     ]
-    finals, bare = finalists(problem, RUNS, current, hypotheses, current)
+    finals, bare = fit_finalists(problem, RUNS, current, hypotheses, current)
     assert [final.hypothesis.candidate.name for final in finals] == ["decoy_0", "decoy_1"]
     assert finals[1].hypothesis.gain < 0.0 < finals[0].hypothesis.gain < LEAST_GAIN
     assert bare.residuals[0][0, 0] == pytest.approx(3.2 * ones[0, 0])
 
 
-def test_what_the_others_tell_is_the_fit_without_a_run():
+def test_model_without_each_run_is_the_fit_without_it():
     problem = Toy({"gain": 1.0}, [sized("drag", 0.8, "right")], rows=400)
     own = candidate(problem, "drag", ["right"])
     whole = fit(problem, RUNS, nominal_model(problem).with_effect(own, (0.5,)), steps=12)
-    for run, model in zip(RUNS, told_by_others(problem, whole), strict=True):
+    for run, model in zip(RUNS, without_each_run(problem, whole), strict=True):
         rest = [other for other in RUNS if other != run]
-        anew = fit(problem, rest, whole.model, memory=whole.noise.memory, steps=12)
+        anew = fit(problem, rest, whole.model, autocorrelation_time=whole.noise.autocorrelation_time, steps=12)
         assert model.effects[0][1] == pytest.approx(anew.model.effects[0][1], abs=0.01)
         assert model.quantities == pytest.approx(anew.model.quantities, abs=0.2 * SIGMA.min())
 
 
-@pytest.mark.parametrize(("seen_in", "carries"), [([0, 1, 2, 3, 4], True), ([2], False)])
-def test_effect_of_one_run_does_not_carry_over(seen_in, carries):
+@pytest.mark.parametrize(("seen_in", "passes"), [([0, 1, 2, 3, 4], True), ([2], False)])
+def test_effect_of_one_run_fails_cross_validation(seen_in, passes):
     problem = Toy(rows=400)
     for run in seen_in:
         problem._measured[run] = problem._measured[run] + 1.5 * problem.shape("drag right")[run] * NOISE
     own = candidate(problem, "drag", ["right"])
     bare = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
     whole = fit(problem, RUNS, bare.model.with_effect(own, (0.5,)), steps=problem.steps)
-    memory = whole.noise.memory
-    gain = total_cost(problem, bare.model, bare.residuals, memory) - whole.cost
+    autocorrelation_time = whole.noise.autocorrelation_time
+    gain = total_cost(problem, bare.model, bare.residuals, autocorrelation_time) - whole.cost
     assert gain > LEAST_GAIN
-    assert carries_over(problem, RUNS, bare, whole, memory) is carries
+    assert cross_validated(problem, RUNS, bare, whole, autocorrelation_time) is passes
 
 
-@pytest.mark.parametrize(("thrown_off", "carries"), [([3], True), ([1, 3], False)])
-def test_one_run_of_five_may_be_thrown_off(monkeypatch, thrown_off, carries):
+@pytest.mark.parametrize(("thrown_off", "passes"), [([3], True), ([1, 3], False)])
+def test_one_run_of_five_may_be_thrown_off(monkeypatch, thrown_off, passes):
     """A rough cost, as of play: next to the fit, one run is far from the data."""
     problem = Toy({}, [sized("drag", 1.0, "right")], rows=400)
     own = candidate(problem, "drag", ["right"])
@@ -408,7 +417,7 @@ def test_one_run_of_five_may_be_thrown_off(monkeypatch, thrown_off, carries):
         return [r + far for r in true(settings, runs)]
 
     monkeypatch.setattr(problem, "residuals", rough)
-    assert carries_over(problem, RUNS, bare, whole, whole.noise.memory) is carries
+    assert cross_validated(problem, RUNS, bare, whole, whole.noise.autocorrelation_time) is passes
 
 
 class Once(Toy):
@@ -418,30 +427,30 @@ class Once(Toy):
         return super().effect_response(effect, run) if run == 0 or effect.name != "decoy_2" else 0.0
 
 
-def test_what_one_run_alone_shows_is_said_and_not_taken():
+def test_what_one_run_alone_shows_is_reported_and_not_selected():
     problem = Once({}, [sized("decoy_2", 3.0)], rows=400, runs=8, error=0.3)
     analysis = analyse_problem(problem, "toy", heldout=("run_6", "run_7", "run_8"))
     assert analysis.verdict == NOT_EXCITED
     assert analysis.effects == ()
-    assert sentence(analysis).startswith("run_1 shows decoy 2 (body), the other runs do not bear it out: record more such runs")
+    assert sentence(analysis).startswith("Only run_1 shows decoy 2 (body): it fails cross-validation. Record more such runs")
 
 
-def test_better_model_that_settling_finds_is_calibrated_from(monkeypatch):
+def test_better_model_found_while_converging_is_calibrated_from(monkeypatch):
     problem = Toy({"gain": 2.0}, [sized("drag", 0.8, "right")], rows=400)
     stuck, free, given = stuck_and_free(problem)
-    accepting, asked = naming_module.accept, []
+    accepting, asked = search.accept, []
 
     def found_late(*arguments):
         accepted, finals, bare = accepting(*arguments)
         asked.append(1)
         return accepted, finals, free if len(asked) == 1 else bare
 
-    monkeypatch.setattr(naming_module, "_without_more", lambda problem, current, hypotheses: current)
-    monkeypatch.setattr(naming_module, "finalists", keep_bare(naming_module.finalists))
-    monkeypatch.setattr(naming_module, "accept", found_late)
-    naming = name_effects(problem, RUNS, stuck, given=given)
-    assert naming.calibrated is not stuck
-    assert naming.calibrated.model.quantities == pytest.approx(free.model.quantities, abs=0.5 * SIGMA.min())
+    monkeypatch.setattr(search, "_without_more", lambda problem, current, hypotheses: current)
+    monkeypatch.setattr(search, "fit_finalists", keep_bare(search.fit_finalists))
+    monkeypatch.setattr(search, "accept", found_late)
+    found = search_effects(problem, RUNS, stuck, given=given)
+    assert found.calibrated is not stuck
+    assert found.calibrated.model.quantities == pytest.approx(free.model.quantities, abs=0.5 * SIGMA.min())
 
 
 def keep_bare(finding):
@@ -453,16 +462,16 @@ def keep_bare(finding):
     return found
 
 
-def test_effect_is_taken_only_once_it_has_settled(monkeypatch):
+def test_effect_is_selected_only_once_it_has_converged(monkeypatch):
     problem = Toy({}, [sized("drag", 0.8, "right")])
     assert labels(named(problem)) == ["drag right"]
-    settling = judge.settle
+    converging = cross_validation.converge
 
     def gone(*arguments):
-        final, bare = settling(*arguments)
+        final, bare = converging(*arguments)
         return replace(final, hypothesis=replace(final.hypothesis, tolerable=True)), bare
 
-    monkeypatch.setattr(judge, "settle", gone)
+    monkeypatch.setattr(cross_validation, "converge", gone)
     assert labels(named(problem)) == []
 
 
@@ -475,28 +484,28 @@ def test_neutral_edge_of_a_range_is_no_bound():
     assert not zero.at_bound
 
 
-def test_idle_effect_is_dropped():
+def test_redundant_effect_is_removed():
     problem = Toy({}, [sized("drag", 0.8, "right")])
     model = nominal_model(problem)
     for name, place, value in (("decoy_0", None, 0.2), ("drag", ["right"], 0.5), ("decoy_3", None, -0.1)):
         model = model.with_effect(candidate(problem, name, place), (value,))
     told = []
-    left = drop_idle(problem, RUNS, fit(problem, RUNS, model), told.append)
+    left = remove_redundant(problem, RUNS, fit(problem, RUNS, model), told.append)
     assert [c.label for c, _ in left.model.effects] == ["drag right"]
-    assert sorted(told[k] for k in range(len(told)) if told[k].startswith("dropped")) == [
-        "dropped: decoy_0 body",
-        "dropped: decoy_3 body",
+    assert sorted(told[k] for k in range(len(told)) if told[k].startswith("removed")) == [
+        "removed: decoy_0 body",
+        "removed: decoy_3 body",
     ]
     assert left.model.effects[0][1][0] == pytest.approx(0.8, abs=0.1)
 
 
-def test_effect_that_takes_a_numbers_place_is_dropped_for_that_number():
+def test_effect_that_replaces_a_parameter_is_removed_for_that_parameter():
     problem = Toy({"gain": 2.0}, [sized("drag", 0.7, "left")], error=1.0)
     drag = candidate(problem, "drag", ["left"])
     both = fit(problem, RUNS, nominal_model(problem).with_effect(level(), (2.0,)).with_effect(drag, (0.7,)), steps=4)
-    alone = fit(problem, RUNS, both.model.without_effect(0), memory=both.noise.memory, steps=4)
+    alone = fit(problem, RUNS, both.model.without_effect(0), autocorrelation_time=both.noise.autocorrelation_time, steps=4)
     assert alone.cost - both.cost < LEAST_GAIN
-    assert [found.label for found, _ in drop_idle(problem, RUNS, both).model.effects] == [drag.label]
+    assert [found.label for found, _ in remove_redundant(problem, RUNS, both).model.effects] == [drag.label]
 
 
 def test_needed_effects_are_kept():
@@ -504,7 +513,7 @@ def test_needed_effects_are_kept():
     model = nominal_model(problem)
     for name, place in (("decoy_0", None), ("drag", ["right"])):
         model = model.with_effect(candidate(problem, name, place), (0.8,))
-    assert len(drop_idle(problem, RUNS, fit(problem, RUNS, model)).model.effects) == 2
+    assert len(remove_redundant(problem, RUNS, fit(problem, RUNS, model)).model.effects) == 2
 
 
 def test_gain_after_refit_is_the_fall_of_the_cost():
@@ -514,8 +523,10 @@ def test_gain_after_refit_is_the_fall_of_the_cost():
     scores = screen(candidates, responses(problem, current, RUNS, probes))
     given = linearise(problem, nominal_model(problem), RUNS)[1]
     best = refit(problem, RUNS, current, shortlist(scores), given)[0]
-    memory = fit(problem, RUNS, best.model).noise.memory
-    with_it, without = (fit(problem, RUNS, m, memory=memory).cost for m in (best.model, current.model))
+    autocorrelation_time = fit(problem, RUNS, best.model).noise.autocorrelation_time
+    with_it, without = (
+        fit(problem, RUNS, m, autocorrelation_time=autocorrelation_time).cost for m in (best.model, current.model)
+    )
     assert best.candidate.name == "decoy_1"
     assert best.gain == pytest.approx(without - with_it, rel=0.03)
     assert best.by_run.sum() == pytest.approx(best.gain, rel=0.5)
@@ -579,10 +590,10 @@ def test_same_data_same_bits():
     assert [h.gain for h in one.rounds[0].hypotheses] == [h.gain for h in two.rounds[0].hypotheses]
 
 
-def test_what_was_taken_and_dropped_again_is_not_told_as_taken():
+def test_what_was_selected_and_removed_again_is_reported_as_removed():
     problem = Toy({}, [sized("decoy_2", 1.0)], white=1.5)
     look = named(problem).rounds[0]
-    assert look.taken is not None
-    for kept, outcome in (({look.taken.candidate.label}, "taken"), (set(), "dropped")):
+    assert look.selected is not None
+    for kept, outcome in (({look.selected.candidate.label}, "selected"), (set(), "removed")):
         entries = evidence_of(problem, 1, look, RUNS, kept)
         assert [entry.outcome for entry in entries if entry.name == "decoy_2"] == [outcome]

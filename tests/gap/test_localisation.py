@@ -5,7 +5,7 @@ import pytest
 from toy_problem import CHANNELS, Toy
 
 from wlr_gym.gap.estimation.likelihood import estimate_noise
-from wlr_gym.gap.report.localisation import BINS, localise
+from wlr_gym.gap.validation.localisation import BINS, localise
 
 RUNS = 4
 

@@ -1,4 +1,4 @@
-"""Refit hypotheses beside all known numbers: many at once, with responses that are there or follow from the steps taken."""
+"""Refit hypotheses together with all calibrated parameters: many at once, with responses known or corrected by the steps."""
 
 from __future__ import annotations
 
@@ -8,20 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.fit import (
-    SETTLED,
-    Fit,
-    Model,
-    constrained_step,
-    cross_products,
-    fit,
-    moved,
-    normal_equations,
-    scaled_numbers,
-    total_cost,
-    untouched,
-)
+from wlr_gym.gap.estimation.fit import CONVERGED, Fit, fit
+from wlr_gym.gap.estimation.least_squares import constrained_step, cross_products, normal_equations
 from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.estimation.model import FittedModel, moved, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem, Setting
 from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score
@@ -32,11 +22,13 @@ Array = NDArray[np.float64]
 ROUNDS = 6
 #: Shares of a step that a refit tries.
 TRIED = (2.0, 1.0, 0.5, 0.2)
-#: Share of what the best hypothesis buys by which one start may be behind another of the same before it is given up.
+#: Share of the best hypothesis' improvement by which one start may be behind another of the same before it is given up.
 BEHIND = 0.5
-#: A hypothesis that has bought less than this share of the best after so many steps is not improved any further.
-HOPELESS, PATIENCE = 0.4, 2
-#: Hypotheses whose known numbers the model without an effect more tries too.
+#: A hypothesis with less than this share of the best's improvement ...
+HOPELESS = 0.4
+#: ... after so many steps is not improved any further.
+PATIENCE = 2
+#: Hypotheses whose calibrated parameters the model without an effect more tries too.
 NUDGES = 2
 
 
@@ -51,16 +43,16 @@ class _Trial:
         model, residuals: the best so far.
         corrections: of ``known``, one per step taken (Broyden): a direction (numbers) of these numbers, and by what residuals
             change more along it, one (rows, channels) per run.
-        settled: whether another step gains nothing.
+        converged: whether another step gains nothing.
     """
 
     of: int
     known: Sequence[NDArray[np.float32]] = field(repr=False)
     whole: Sequence[NDArray[np.float32]] = field(repr=False)
-    model: Model
+    model: FittedModel
     residuals: list[Array] = field(default_factory=list, repr=False)
     corrections: tuple[tuple[Array, list[Array]], ...] = field(default=(), repr=False)
-    settled: bool = False
+    converged: bool = False
 
 
 def refit(
@@ -71,11 +63,11 @@ def refit(
     given: Sequence[NDArray[np.float32]],
     rounds: int = ROUNDS,
 ) -> list[Hypothesis]:
-    """Refit every hypothesis together with all known numbers; best first.
+    """Refit every hypothesis together with all calibrated parameters; best first.
 
     Each starts twice: from the calibrated model with its first guess, and from the model as given with its probe, as
-    calibration may have taken on what the effect does, and not let go of it. The responses of the known numbers are those of
-    the two starts; those of each hypothesis' own unknowns are simulated anew. The model without an effect more is refitted too,
+    calibration may have compensated the effect and stay there. The responses of the calibrated parameters are those of the
+    two starts; those of each hypothesis' own unknowns are simulated anew. The model without an effect more is refitted too,
     in the end also from where the best hypotheses are.
 
     ``given``: columns of ``current`` without its calibration, one (numbers, rows x channels) array per run.
@@ -86,40 +78,43 @@ def refit(
     trials = _descended(problem, runs, current, trials, rounds)
     for plain in _simulated(problem, _without_effect(problem, current, trials), runs):
         trials += _descended(problem, runs, current, [plain], rounds)
-    memory = _best_memory(problem, current, trials)
-    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
+    autocorrelation_time = _best_autocorrelation_time(problem, current, trials)
+    costs = [total_cost(problem, t.model, t.residuals, autocorrelation_time) for t in trials]
     best = [
         trials[min((k for k, t in enumerate(trials) if t.of == of), key=lambda k: costs[k])] for of in (*range(len(scores)), -1)
     ]
-    return _ranked(problem, scores, [t.model for t in best], [t.residuals for t in best], memory)
+    return _ranked(problem, scores, [t.model for t in best], [t.residuals for t in best], autocorrelation_time)
 
 
 def _descended(problem: Problem, runs: Sequence[int], current: Fit, trials: list[_Trial], rounds: int) -> list[_Trial]:
-    """The trials after so many steps; those that are far behind are dropped or no longer improved."""
+    """The trials after so many steps; those that are far behind are removed or no longer improved."""
     for done in range(rounds):
-        memory = _best_memory(problem, current, trials)
+        autocorrelation_time = _best_autocorrelation_time(problem, current, trials)
         if done >= PATIENCE:
-            trials = _given_up(problem, trials, memory)
-        noise = estimate_noise(min((t.residuals for t in trials), key=lambda r: minus_two_log_likelihood(r, memory)), memory)
-        going = [trial for trial in trials if not trial.settled]
+            trials = _given_up(problem, trials, autocorrelation_time)
+        noise = estimate_noise(
+            min((t.residuals for t in trials), key=lambda r: minus_two_log_likelihood(r, autocorrelation_time)),
+            autocorrelation_time,
+        )
+        going = [trial for trial in trials if not trial.converged]
         if not going:
             break
         moved_on = _improved(problem, runs, current, going, noise)
-        trials = _hopeful(problem, [*(trial for trial in trials if trial.settled), *moved_on], memory)
+        trials = _hopeful(problem, [*(trial for trial in trials if trial.converged), *moved_on], autocorrelation_time)
     return trials
 
 
 def _without_effect(problem: Problem, current: Fit, trials: Sequence[_Trial]) -> list[_Trial]:
-    """The model without an effect more, where the best hypotheses have moved the known numbers.
+    """The model without an effect more, where the best hypotheses have moved the calibrated parameters.
 
-    The cost is rough: what lets go of a minimum may be any nudge, and then it is no evidence for the effect that gave it.
+    The cost is rough: any small change may leave a local minimum, and then it is no evidence for the effect that made it.
     """
-    memory = _best_memory(problem, current, trials)
+    autocorrelation_time = _best_autocorrelation_time(problem, current, trials)
     best: dict[int, _Trial] = {}
-    for trial in sorted(trials, key=lambda t: total_cost(problem, t.model, t.residuals, memory)):
+    for trial in sorted(trials, key=lambda t: total_cost(problem, t.model, t.residuals, autocorrelation_time)):
         if trial.of >= 0:
             best.setdefault(trial.of, trial)
-    free = [replace(t, of=-1, model=t.model.without_effect(-1), settled=False) for t in list(best.values())[:NUDGES]]
+    free = [replace(t, of=-1, model=t.model.without_effect(-1), converged=False) for t in list(best.values())[:NUDGES]]
     return [t if t.known is t.whole else replace(t, known=t.whole, corrections=()) for t in free]
 
 
@@ -133,18 +128,18 @@ def _improved(problem: Problem, runs: Sequence[int], current: Fit, trials: Seque
         change = constrained_step(problem, trial.model, *equations)
         tries += [replace(trial, model=moved(problem, trial.model, share * change)) for share in TRIED]
     tries = _simulated(problem, tries, runs)
-    costs = [total_cost(problem, t.model, t.residuals, noise.memory) for t in tries]
+    costs = [total_cost(problem, t.model, t.residuals, noise.autocorrelation_time) for t in tries]
     improved = []
     for k, (trial, own) in enumerate(zip(trials, owns, strict=True)):
         best = min(range(len(TRIED) * k, len(TRIED) * (k + 1)), key=lambda i: costs[i])
-        gained = total_cost(problem, trial.model, trial.residuals, noise.memory) - costs[best]
+        gained = total_cost(problem, trial.model, trial.residuals, noise.autocorrelation_time) - costs[best]
         better = _corrected(problem, trial, own, tries[best]) if gained > 0.0 else trial
-        improved.append(replace(better, settled=gained < SETTLED))
+        improved.append(replace(better, converged=gained < CONVERGED))
     return improved
 
 
 def _equations(matrix: Array, trial: _Trial, own: Sequence[Array], noise: Noise) -> tuple[Array, Array]:
-    """Normal equations of a trial's numbers: the known ones' matrix is given, its corrections are so many columns more."""
+    """Normal equations of a trial's numbers: the calibrated ones' matrix is given, its corrections are so many columns more."""
     size, more = len(matrix), len(trial.corrections)
     runs = range(len(trial.residuals))
     columns = [np.concatenate([own[r], *(missed[r][None] for _, missed in trial.corrections)]) for r in runs]
@@ -156,7 +151,7 @@ def _equations(matrix: Array, trial: _Trial, own: Sequence[Array], noise: Noise)
 
 
 def _corrected(problem: Problem, before: _Trial, own: Sequence[Array], after: _Trial) -> _Trial:
-    """The trial after a step, its known columns corrected by what the step did beyond what they and its own had promised."""
+    """The trial after a step, its known columns corrected by what the step did beyond what they and its own had predicted."""
     taken = scaled_numbers(problem, after.model) - scaled_numbers(problem, before.model)
     size = len(before.known[0])
     known, rest = taken[:size], taken[size:]
@@ -166,31 +161,33 @@ def _corrected(problem: Problem, before: _Trial, own: Sequence[Array], after: _T
     shares = [known @ direction for direction, _ in before.corrections]
     missed = []
     for r, (old, new) in enumerate(zip(before.residuals, after.residuals, strict=True)):
-        promised = (known.astype(np.float32) @ before.known[r]).reshape(old.shape) + np.tensordot(rest, own[r], 1)
+        predicted = (known.astype(np.float32) @ before.known[r]).reshape(old.shape) + np.tensordot(rest, own[r], 1)
         for share, (_, beyond) in zip(shares, before.corrections, strict=True):
-            promised += share * beyond[r]
-        missed.append((np.nan_to_num(new - old) - promised) / length)
+            predicted += share * beyond[r]
+        missed.append((np.nan_to_num(new - old) - predicted) / length)
     return replace(after, corrections=(*before.corrections, (known, missed)))
 
 
-def _least_costs(problem: Problem, trials: Sequence[_Trial], memory: Array) -> tuple[list[float], dict[int, float]]:
+def _least_costs(
+    problem: Problem, trials: Sequence[_Trial], autocorrelation_time: Array
+) -> tuple[list[float], dict[int, float]]:
     """Costs of the trials, and of the best trial of each hypothesis."""
-    costs = [total_cost(problem, t.model, t.residuals, memory) for t in trials]
+    costs = [total_cost(problem, t.model, t.residuals, autocorrelation_time) for t in trials]
     return costs, {of: min(c for c, t in zip(costs, trials, strict=True) if t.of == of) for of in {t.of for t in trials}}
 
 
-def _hopeful(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[_Trial]:
+def _hopeful(problem: Problem, trials: Sequence[_Trial], autocorrelation_time: Array) -> list[_Trial]:
     """Of two starts of a hypothesis the better one, if the other is far behind."""
-    costs, least = _least_costs(problem, trials, memory)
+    costs, least = _least_costs(problem, trials, autocorrelation_time)
     room = max(max(least.values()) - min(least.values()), LEAST_GAIN)
     return [t for c, t in zip(costs, trials, strict=True) if c - least[t.of] < BEHIND * room]
 
 
-def _given_up(problem: Problem, trials: Sequence[_Trial], memory: Array) -> list[_Trial]:
-    """The trials; those of hypotheses that are far behind the best are settled."""
-    _, least = _least_costs(problem, trials, memory)
+def _given_up(problem: Problem, trials: Sequence[_Trial], autocorrelation_time: Array) -> list[_Trial]:
+    """The trials; those of hypotheses that are far behind the best count as converged."""
+    _, least = _least_costs(problem, trials, autocorrelation_time)
     enough = HOPELESS * (least[-1] - min(least.values()))
-    return [replace(t, settled=t.settled or (t.of >= 0 and least[-1] - least[t.of] < enough)) for t in trials]
+    return [replace(t, converged=t.converged or (t.of >= 0 and least[-1] - least[t.of] < enough)) for t in trials]
 
 
 def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequence[NDArray[np.float32]]) -> list[_Trial]:
@@ -209,7 +206,7 @@ def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequ
 def _without_replaced(
     problem: Problem, candidate: Candidate, known: Sequence[NDArray[np.float32]]
 ) -> Sequence[NDArray[np.float32]]:
-    """Columns of the known numbers; those whose place a candidate takes do nothing beside it."""
+    """Columns of the calibrated parameters; those that a candidate replaces are zero beside it."""
     replaced = candidate.replaced
     if not replaced:
         return known
@@ -228,7 +225,7 @@ def _simulated(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) 
 
 def refit_thoroughly(problem: Problem, runs: Sequence[int], current: Fit, scores: Sequence[Score]) -> list[Hypothesis]:
     """Fit every hypothesis in full, from its first guess and from its probes; best first."""
-    memory, scatter = current.noise.memory, current.noise.scatter
+    autocorrelation_time, scatter = current.noise.autocorrelation_time, current.noise.scatter
     fits = [
         min(
             (
@@ -236,7 +233,7 @@ def refit_thoroughly(problem: Problem, runs: Sequence[int], current: Fit, scores
                     problem,
                     runs,
                     current.model.with_effect(score.candidate, values),
-                    memory=memory,
+                    autocorrelation_time=autocorrelation_time,
                     scatter=scatter,
                     steps=problem.steps,
                 )
@@ -246,10 +243,12 @@ def refit_thoroughly(problem: Problem, runs: Sequence[int], current: Fit, scores
         )
         for score in scores
     ]
-    fits.append(fit(problem, runs, current.model, memory=memory, scatter=scatter, steps=problem.steps))
+    fits.append(
+        fit(problem, runs, current.model, autocorrelation_time=autocorrelation_time, scatter=scatter, steps=problem.steps)
+    )
     trials = [_Trial(k, found.columns, found.columns, found.model, found.residuals) for k, found in enumerate(fits)]
-    memory = _best_memory(problem, current, trials)
-    return _ranked(problem, scores, [t.model for t in trials], [t.residuals for t in trials], memory)
+    autocorrelation_time = _best_autocorrelation_time(problem, current, trials)
+    return _ranked(problem, scores, [t.model for t in trials], [t.residuals for t in trials], autocorrelation_time)
 
 
 def _starting_values(score: Score) -> list[tuple[float, ...]]:
@@ -261,7 +260,7 @@ def _starting_values(score: Score) -> list[tuple[float, ...]]:
 def _bordered(
     matrix: Array, known: Sequence[NDArray[np.float32]], own: Sequence[Array], residuals: Sequence[Array], noise: Noise
 ) -> tuple[Array, Array]:
-    """Normal equations of the known numbers, whose matrix is given, and a candidate's own unknowns."""
+    """Normal equations of the calibrated parameters, whose matrix is given, and a candidate's own unknowns."""
     both = [np.concatenate([columns, residual[None]]) for columns, residual in zip(own, residuals, strict=True)]
     across = cross_products(known, both, noise)
     root = np.sqrt(noise.weight)
@@ -272,26 +271,30 @@ def _bordered(
 
 
 def _ranked(
-    problem: Problem, scores: Sequence[Score], models: Sequence[Model], residuals: Sequence[list[Array]], memory: Array
+    problem: Problem,
+    scores: Sequence[Score],
+    models: Sequence[FittedModel],
+    residuals: Sequence[list[Array]],
+    autocorrelation_time: Array,
 ) -> list[Hypothesis]:
     """Hypotheses from refitted models, the last of which has no effect more; best first."""
-    base = total_cost(problem, models[-1], residuals[-1], memory)
+    base = total_cost(problem, models[-1], residuals[-1], autocorrelation_time)
     found = []
     for score, model, residual in zip(scores, models[:-1], residuals[:-1], strict=True):
-        by_run = fall_by_run(residuals[-1], residual, estimate_noise(residual, memory))
-        gain = base - total_cost(problem, model, residual, memory)
+        by_run = fall_by_run(residuals[-1], residual, estimate_noise(residual, autocorrelation_time))
+        gain = base - total_cost(problem, model, residual, autocorrelation_time)
         hypothesis = Hypothesis(score.candidate, model, gain, by_run, score.gain, residual, models[-1], residuals[-1])
         found.append(replace(hypothesis, tolerable=within_tolerance(problem, model)))
     return sorted(found, key=lambda hypothesis: -hypothesis.gain)
 
 
-def _best_memory(problem: Problem, current: Fit, trials: Sequence[_Trial]) -> Array:
-    """Memory of the residuals of the best model so far: the same for all that are compared."""
-    memory = current.noise.memory
-    best = min(trials, key=lambda t: total_cost(problem, t.model, t.residuals, memory))
-    if total_cost(problem, best.model, best.residuals, memory) >= current.cost:
-        return memory
-    return estimate_noise(best.residuals, scatter=current.noise.scatter).memory
+def _best_autocorrelation_time(problem: Problem, current: Fit, trials: Sequence[_Trial]) -> Array:
+    """Autocorrelation time of the residuals of the best model so far: the same for all that are compared."""
+    autocorrelation_time = current.noise.autocorrelation_time
+    best = min(trials, key=lambda t: total_cost(problem, t.model, t.residuals, autocorrelation_time))
+    if total_cost(problem, best.model, best.residuals, autocorrelation_time) >= current.cost:
+        return autocorrelation_time
+    return estimate_noise(best.residuals, scatter=current.noise.scatter).autocorrelation_time
 
 
 def _own_columns(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) -> list[list[Array]]:

@@ -1,4 +1,4 @@
-"""Fit and likelihood against closed forms: weighted least squares with priors, AR(1) memory, Monte Carlo."""
+"""Fit and likelihood against closed forms: weighted least squares with priors, AR(1) residuals, Monte Carlo."""
 
 from dataclasses import replace
 
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from toy_problem import NOMINAL, QUANTITIES, REACH, SIGMA, STRENGTH, Toy, candidate, coloured
 
-from wlr_gym.gap.estimation.fit import (
-    Model,
-    corrected,
-    fit,
-    linearise,
+from wlr_gym.gap.estimation.fit import fit, linearise
+from wlr_gym.gap.estimation.least_squares import corrected
+from wlr_gym.gap.estimation.likelihood import LONGEST, estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.estimation.model import (
+    FittedModel,
     moved,
     nominal_model,
     on_bounds,
@@ -19,32 +19,31 @@ from wlr_gym.gap.estimation.fit import (
     total_cost,
     untouched,
 )
-from wlr_gym.gap.estimation.likelihood import LONGEST, estimate_noise, minus_two_log_likelihood
 
 
 def all_runs(problem):
     return range(len(problem.runs))
 
 
-def test_memory_of_white_noise_is_one_and_of_ar1_the_closed_form():
+def test_autocorrelation_time_of_white_noise_is_one_and_of_ar1_the_closed_form():
     rng = np.random.default_rng(3)
     white = [rng.standard_normal((4000, 2)) for _ in range(3)]
-    assert estimate_noise(white).memory == pytest.approx([1.0, 1.0], abs=0.15)
+    assert estimate_noise(white).autocorrelation_time == pytest.approx([1.0, 1.0], abs=0.15)
     for rho in (0.5, 0.8, 0.9):
         series = [coloured(rng, (2000, 20), rho) for _ in range(2)]
-        assert np.mean(estimate_noise(series).memory) == pytest.approx((1 + rho) / (1 - rho), rel=0.15)
+        assert np.mean(estimate_noise(series).autocorrelation_time) == pytest.approx((1 + rho) / (1 - rho), rel=0.15)
 
 
-def test_memory_counts_measured_rows_only_and_ends_somewhere():
+def test_autocorrelation_time_counts_measured_rows_only_and_ends_somewhere():
     rng = np.random.default_rng(4)
     sparse = rng.standard_normal((900, 2))
     sparse[:, 1] = np.nan
     sparse[::3, 1] = coloured(rng, (300, 1), 0.5)[:, 0]
     noise = estimate_noise([sparse])
     assert noise.rows.tolist() == [900, 300]
-    assert noise.memory[1] == pytest.approx(3.0, rel=0.35)
+    assert noise.autocorrelation_time[1] == pytest.approx(3.0, rel=0.35)
     stuck = estimate_noise([np.ones((5000, 1))])
-    assert 1.0 < stuck.memory[0] < 2 * LONGEST
+    assert 1.0 < stuck.autocorrelation_time[0] < 2 * LONGEST
 
 
 def test_level_is_the_root_mean_square_and_never_below_the_sensor():
@@ -62,10 +61,10 @@ def test_channel_that_was_not_measured_weighs_nothing():
     noise = estimate_noise([residual])
     assert noise.weight[1] == 0.0
     assert noise.weight[0] > 0.0
-    assert np.isfinite(minus_two_log_likelihood([residual], noise.memory))
+    assert np.isfinite(minus_two_log_likelihood([residual], noise.autocorrelation_time))
 
 
-def test_likelihood_is_rows_over_memory_times_log_level():
+def test_likelihood_is_rows_over_autocorrelation_time_times_log_level():
     rng = np.random.default_rng(6)
     residuals = [3.0 * rng.standard_normal((400, 1)), 3.0 * rng.standard_normal((100, 1))]
     square = np.mean(np.concatenate(residuals) ** 2)
@@ -85,14 +84,14 @@ def test_columns_are_the_responses():
 
 def test_columns_at_a_bound_are_taken_inwards():
     problem = Toy()
-    high = Model(NOMINAL + REACH * SIGMA)
+    high = FittedModel(NOMINAL + REACH * SIGMA)
     _, columns = linearise(problem, high, [0])
     assert columns[0][0] == pytest.approx(-STRENGTH * problem.shape("gain")[0].ravel(), abs=1e-5)
 
 
 @pytest.mark.parametrize(("scatter", "simulated"), [(1.0, 5), (1e9, 2)])
 def test_idle_numbers_keep_their_columns(scatter, simulated):
-    """The data say nothing of the known numbers where the runs scatter that much; what an effect does is simulated anew."""
+    """Where runs scatter that much, the data say nothing of calibrated parameters; an effect's response is simulated anew."""
     problem = Toy()
     near = linearise(problem, nominal_model(problem), all_runs(problem))[1]
     noise = estimate_noise(
@@ -143,7 +142,7 @@ def test_linear_fit_is_weighted_least_squares_with_priors(seed):
 
 def test_imperfect_simulator_moves_a_number_only_for_what_is_said_louder():
     problem = Toy({"gain": 1.2, "offset": -0.7, "mass": 0.3}, white=2.0, error=1.5)
-    problem.firmness = 30.0
+    problem.tempering = 30.0
     problem.quantities = (*problem.quantities[:2], replace(problem.quantities[2], drifts=True))
     found = fit(problem, all_runs(problem), nominal_model(problem))
     best, matrix = exact(problem, found.noise.weight, shape_columns(problem), (30.0, 30.0, 1.0))
@@ -187,10 +186,10 @@ def test_cost_is_minus_two_log_posterior_and_falls():
     found = fit(problem, all_runs(problem), start)
     residuals = [r[0] for r in problem.residuals([found.model.setting], all_runs(problem))]
     assert found.cost == pytest.approx(
-        minus_two_log_likelihood(residuals, found.noise.memory) + prior_cost(problem, found.model)
+        minus_two_log_likelihood(residuals, found.noise.autocorrelation_time) + prior_cost(problem, found.model)
     )
     before = [r[0] for r in problem.residuals([start.setting], all_runs(problem))]
-    assert found.cost < total_cost(problem, start, before, found.noise.memory) - 100.0
+    assert found.cost < total_cost(problem, start, before, found.noise.autocorrelation_time) - 100.0
     assert prior_cost(problem, found.model) == pytest.approx(np.sum(((found.model.quantities - NOMINAL) / SIGMA) ** 2))
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from toy_problem import CHANNELS, DECOYS, NOMINAL, REACH, SIGMA, STRENGTH, Toy, candidate, sized
 
-from wlr_gym.gap.estimation.fit import fit, nominal_model
+from wlr_gym.gap.estimation.fit import fit
+from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Candidate, Start, Unknown
 from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
 
@@ -104,13 +105,13 @@ def test_first_guess_stays_plausible():
     problem = Toy({}, [sized("weak", 2.0)])
     _, _, scores = screened(problem)
     assert 0.0 <= score_of(scores, "weak").values[0] <= 0.5
-    assert share_of_promise(problem) == pytest.approx(1.0, abs=0.02)
+    assert share_of_prediction(problem) == pytest.approx(1.0, abs=0.02)
     opposite = Toy({}, [sized("weak", -2.0)])
     assert score_of(screened(opposite)[2], "weak").values == (0.0,)
 
 
-def share_of_promise(problem):
-    """Gain of a shortened first guess over the fall of the cost along the way, known numbers at their best."""
+def share_of_prediction(problem):
+    """Gain of a shortened first guess over the fall of the cost along the way, calibrated parameters at their best."""
     _found, responded, scores = screened(problem)
     weak, wide = (
         score_of(scores, "weak"),

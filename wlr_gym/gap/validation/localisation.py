@@ -14,10 +14,14 @@ from wlr_gym.gap.problem import Problem
 
 Array = NDArray[np.float64]
 
-#: Bins of a feature, by its quantiles, and maps drawn.
-BINS, MAPS = 5, 4
-#: Channels named, and the least share worth naming.
-MOST_PLACES, LEAST_SHARE = 8, 0.02
+#: Bins of a feature, by its quantiles.
+BINS = 5
+#: Maps drawn.
+MAPS = 4
+#: Channels named, at most.
+MOST_PLACES = 8
+#: Share of the gap from which on a channel is named.
+LEAST_SHARE = 0.02
 #: Variance of the squared residual that a feature must explain before the text mentions it.
 LEAST_DEPENDENCE = 0.05
 
@@ -35,14 +39,14 @@ def localise(
         problem: the system.
         calibrated: residuals of the calibrated model without effects, one (rows, signals) per run.
         expected: (signals) mean squares that a complete model has: of the final model, or 1; NaN where nothing was measured.
-        noise: of the residuals; its memory says how many rows count.
+        noise: of the residuals.
         features: what residuals may depend on, rows of the same runs.
     """
     squares = np.sum([np.nansum(np.minimum(r * r, problem.cap**2), axis=0) for r in calibrated], axis=0) / np.maximum(
         noise.rows, 1
     )
     floor = np.where(np.isfinite(expected), np.maximum(expected, 1.0), 1.0)
-    excess = np.maximum(squares / floor - 1.0, 0.0) * noise.rows / noise.memory
+    excess = np.maximum(squares / floor - 1.0, 0.0) * noise.rows / noise.autocorrelation_time
     total = float(excess.sum())
     if total <= 0.0:
         return (), ()

@@ -1,0 +1,74 @@
+"""Weighted least squares: normal equations of columns and residuals, and steps within bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.gap.estimation.likelihood import Noise
+from wlr_gym.gap.estimation.model import FittedModel, prior_tightness, room, scaled_nominal, scaled_numbers
+from wlr_gym.gap.problem import Problem
+
+Array = NDArray[np.float64]
+
+
+def normal_equations(columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise) -> tuple[Array, Array]:
+    """Return ``C W C^T`` (numbers, numbers) and ``C W r`` (numbers) over all runs."""
+    size = len(columns[0])
+    matrix, vector = np.zeros((size, size)), np.zeros(size)
+    root = np.sqrt(noise.weight)
+    for column, residual in zip(columns, residuals, strict=True):
+        weights = np.broadcast_to(root, residual.shape).ravel()
+        weighted = column * weights
+        matrix += weighted @ weighted.T
+        vector += weighted @ (np.nan_to_num(residual).ravel() * weights)
+    return matrix, vector
+
+
+def cross_products(columns: Sequence[NDArray[np.float32]], others: Sequence[Array], noise: Noise) -> Array:
+    """Return ``C W D^T`` of known columns with a few others (D: per run (k, rows, channels)), over all runs."""
+    total = 0.0
+    for column, other in zip(columns, others, strict=True):
+        weighted = (np.nan_to_num(other) * noise.weight).reshape(len(other), -1).astype(np.float32)
+        total = total + column @ weighted.T
+    return np.asarray(total, np.float64)
+
+
+def gauss_newton_step(
+    problem: Problem, model: FittedModel, columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise
+) -> Array:
+    """Step (numbers), scaled; numbers that would leave their bounds stay on them and the rest is solved anew."""
+    return constrained_step(problem, model, *normal_equations(columns, residuals, noise))
+
+
+def constrained_step(problem: Problem, model: FittedModel, matrix: Array, vector: Array) -> Array:
+    """Return the step that solves these normal equations, tolerances added, within bounds; see :func:`gauss_newton_step`."""
+    tight = prior_tightness(problem, model)
+    nominal = scaled_nominal(problem, model)
+    here = scaled_numbers(problem, model)
+    gradient = vector + tight * (here - nominal)
+    return bounded_minimum(matrix + np.diag(tight), gradient, *room(problem, model))
+
+
+def bounded_minimum(matrix: Array, gradient: Array, low: Array, high: Array) -> Array:
+    """Return the x within bounds that minimises ``x matrix x / 2 + gradient x``: what leaves them is held there, one by one."""
+    free = np.ones(len(gradient), bool)
+    x = np.zeros(len(gradient))
+    for _ in range(8):
+        held = gradient + matrix @ np.where(free, 0.0, x)
+        x[free] = -np.linalg.solve(matrix[np.ix_(free, free)], held[free])
+        out = free & ((x < low - 1e-12) | (x > high + 1e-12))
+        if not out.any():
+            break
+        x[out] = np.clip(x, low, high)[out]
+        free &= ~out
+    return np.clip(x, low, high)
+
+
+def corrected(columns: NDArray[np.float32], taken: Array, before: Array, after: Array) -> NDArray[np.float32]:
+    """Return one run's columns with the least change that predicts what the step ``taken`` (scaled) really did."""
+    change = taken.astype(np.float32)
+    missed = np.nan_to_num(after - before).ravel() - change @ columns
+    return (columns + np.outer(change / (change @ change), missed.astype(np.float32))).astype(np.float32, copy=False)

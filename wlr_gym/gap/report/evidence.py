@@ -1,0 +1,97 @@
+"""The section of the report on what is missing: the effects, what is equivalent to them, and every candidate compared."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+
+from wlr_gym.gap.analysis import REJECTED, SELECTED, Analysis, Evidence, FoundEffect
+from wlr_gym.gap.problem import Range
+from wlr_gym.gap.report.html import heading, section, table
+from wlr_gym.gap.report.text import estimate, listed, number, percent, places, plain, unit_of
+from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT
+
+
+def evidence_section(analysis: Analysis, picture: str) -> str:
+    """Return what was found, what the data cannot distinguish it from, and every candidate; ``picture`` is HTML."""
+    parts = [_effect(effect) for effect in analysis.effects]
+    if analysis.equivalent:
+        rows = [(listed([plain(name) for name in group.names], "or"), group.separating_run) for group in analysis.equivalent]
+        parts += [heading("Effects not distinguishable in these data"), table(("one of", "discriminating experiment"), rows)]
+    if analysis.evidence:
+        rounds = sorted({one.round for one in analysis.evidence})
+        parts += [heading("Candidates compared"), _COMPARED, picture]
+        parts += [_evidence([one for one in analysis.evidence if one.round == turn], turn) for turn in rounds]
+    return section("What", *parts)
+
+
+_COMPARED = """<p>Every candidate was scored by its <i>predicted</i> improvement of the calibrated model (score test, a linear
+estimate). The best were added and refitted together with all calibrated parameters: their <i>gain</i> is the fall of minus two
+log posterior, of which chance alone gives about 1 for each fitted number. One effect is selected per round, then the search
+starts again.</p>"""
+
+
+def _effect(effect: FoundEffect) -> str:
+    known = EFFECTS.get(effect.name)
+    if effect.name == UNKNOWN_EFFECT:
+        meaning = "Nothing in the library explains it."
+    else:
+        meaning = f"What is missing: {known.doc}." if known else "An effect of the test rig's own model."
+    law = effect.formula or (known.equation if known else "")
+    unlawful = "<p>No formula was found that holds.</p>" if effect.name == UNKNOWN_EFFECT else ""
+    rows = [(name, estimate(found)) for name, found in effect.parameters.items()]
+    return "\n".join(
+        [
+            heading(f"{plain(effect.name).capitalize()}: {places(effect.where)}"),
+            f"<p>{escape(meaning)} In files: <code>{escape(effect.name)}</code>, where <code>{escape(', '.join(effect.where))}"
+            f"</code>. Selection frequency {percent(effect.confidence)}.</p>",
+            f"<p>Law: <code>{escape(law)}</code></p>" if law else unlawful,
+            *([f"<p>Tried where {_tried(effect.validity)}; beyond, it is untested.</p>"] if effect.validity else []),
+            table(("parameter", "value (95 % interval)"), rows),
+        ]
+    )
+
+
+def _tried(validity: Mapping[str, Range]) -> str:
+    texts = [f"{plain(name)} is {number(one.low)} to {number(one.high)}{unit_of(one.unit)}" for name, one in validity.items()]
+    return escape(listed(texts, "and"))
+
+
+def _evidence(evidence: Sequence[Evidence], turn: int) -> str:
+    fitted = sorted((one for one in evidence if one.outcome != REJECTED), key=_rank)
+    rows = [
+        (plain(one.name), places(one.where), _values(one), number(one.gain), number(one.screened), one.outcome, one.reason)
+        for one in fitted
+    ]
+    rows += [_rejected(alike) for alike in _by_name([one for one in evidence if one.outcome == REJECTED])]
+    classes = ["selected" if one.outcome == SELECTED else "" for one in fitted] + [""] * (len(rows) - len(fitted))
+    headings = ("candidate", "where", "values", "gain", "predicted", "outcome", "reason")
+    return (
+        heading(f"Round {turn}: {len(evidence)} candidate{'s' if len(evidence) > 1 else ''} compared")
+        + "\n"
+        + table(headings, rows, {3, 4}, classes)
+    )
+
+
+def _rank(one: Evidence) -> tuple[bool, float]:
+    """Order of the fitted: the selected one, then by gain."""
+    return one.outcome != SELECTED, -one.gain if math.isfinite(one.gain) else math.inf
+
+
+def _by_name(evidence: Sequence[Evidence]) -> list[list[Evidence]]:
+    """Put the places of an effect together, the largest predicted improvement first."""
+    ordered = sorted(evidence, key=lambda one: -one.screened if math.isfinite(one.screened) else math.inf)
+    return [[one for one in ordered if one.name == name] for name in dict.fromkeys(one.name for one in ordered)]
+
+
+def _rejected(alike: Sequence[Evidence]) -> tuple[str, ...]:
+    best, others = alike[0], len(alike) - 1
+    more = f"; less at {others} other place{'s' if others > 1 else ''}" if others else ""
+    return plain(best.name), f"{places(best.where)}{more}", "", "-", number(best.screened), best.outcome, best.reason
+
+
+def _values(one: Evidence) -> str:
+    known = EFFECTS[one.name].parameters if one.name in EFFECTS else {}
+    units = {name: unit_of(known[name].unit) if name in known else "" for name in one.values}
+    return ", ".join(f"{name} {number(value)}{units[name]}" for name, value in one.values.items())
