@@ -17,7 +17,7 @@ from pydantic import Field
 from wlr_gym.base.files import replace_file
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.physics.plants.base import PlantState
-from wlr_gym.robot.parameters import ELEMENTS
+from wlr_gym.robot.parameter_table import ELEMENTS
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,8 @@ from wlr_gym.hardware.link import Link, serial_link
 from wlr_gym.hardware.loop import ControlLoop
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, RobotOptions, Sensors, Truth
 from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
-from wlr_gym.robot.parameters import ELEMENTS, Parameters
+from wlr_gym.robot.parameter_table import ELEMENTS
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 

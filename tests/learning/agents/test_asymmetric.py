@@ -1,6 +1,7 @@
 """A critic that sees more than the actor: what each sees, and that training with it is as reproducible as without."""
 
 import shutil
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,14 +43,16 @@ def test_actor_sees_the_policy_group_only_and_the_critic_both(core):
     network = AsymmetricPolicy(core.observation_space, core.action_space, lambda _: 1e-3, net_arch=[16])
     generator = torch.Generator().manual_seed(0)
     sizes = {group: space.shape[0] for group, space in core.observation_space.spaces.items()}
-    seen = {group: torch.rand(5, size, generator=generator) for group, size in sizes.items()}
+    seen: Any = {group: torch.rand(5, size, generator=generator) for group, size in sizes.items()}
     other = seen | {"privileged": seen["privileged"] + 1.0}
     assert torch.equal(network._predict(seen, deterministic=True), network._predict(other, deterministic=True))
     assert not torch.equal(network.predict_values(seen), network.predict_values(other))
     other = seen | {"policy": seen["policy"] + 1.0}
     assert not torch.equal(network._predict(seen, deterministic=True), network._predict(other, deterministic=True))
     assert not torch.equal(network.predict_values(seen), network.predict_values(other))
-    actions, values, chance = network.forward(seen, deterministic=True)
+    actions, values, chance = network.forward(
+        cast(torch.Tensor, seen), deterministic=True
+    )  # its annotation knows no Dict spaces
     again, same_chance, _ = network.evaluate_actions(seen, actions)
     torch.testing.assert_close(again, values)
     torch.testing.assert_close(same_chance, chance)

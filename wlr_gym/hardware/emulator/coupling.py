@@ -33,7 +33,8 @@ from wlr_gym.hardware.emulator.servo import EmulatedServo
 from wlr_gym.physics import servo as law
 from wlr_gym.physics.plants.base import Plant, PlantState
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, Robot
-from wlr_gym.robot.parameters import SPECS, Parameters
+from wlr_gym.robot.parameter_table import SPECS
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
