@@ -356,7 +356,7 @@ def test_an_effect_registered_in_one_place_is_all_that_it_takes(monkeypatch, cap
     probes, candidates = robot_candidates(NOMINAL, {}, [moved], [moved])
     found = [candidate for candidate in candidates if candidate.name == hot.name]
     assert tuple(candidate.where for candidate in found) == WHEEL_SETS
-    assert found[0].unknowns == (Unknown("scale", "-", 1.0, 0.6, 1.0, pytest.approx(0.02)),)
+    assert found[0].unknowns == (Unknown("scale", "-", 1.0, 0.6, 1.0, 0.05 * (1.0 - 0.6)),)
     assert [len(start.directions[0]) for candidate in (found[0], found[-1]) for start in candidate.starts] == [1, 4]
     assert [dict(probe.effects[0].parameters) for probe in probes if probe.effects[0].name == hot.name] == [{"scale": 0.9}] * 4
     (patched,) = apply_patch(load_patch([found[0].effect((0.8,)).content()]), NOMINAL)["servo.stall_torque[wheel_lf]"]

@@ -15,7 +15,7 @@ from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors
 from wlr_gym.physics.plants.forces import MEMORY, Force, compile_forces
 from wlr_gym.physics.plants.gibbs_appell import kernel, packing
-from wlr_gym.physics.plants.gibbs_appell.step import STORED
+from wlr_gym.physics.plants.gibbs_appell.lanes import STORED
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
