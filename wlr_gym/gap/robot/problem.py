@@ -32,8 +32,10 @@ from wlr_gym.robot.parameters import Parameters
 Array = NDArray[np.float64]
 
 
-#: Noise units beyond which a residual counts no more in the gap's numbers, and Gauss-Newton steps of a fit.
-CAP, STEPS = 50.0, 3
+#: Noise units beyond which a residual counts no more in the gap's numbers.
+CAP = 50.0
+#: Gauss-Newton steps of a fit.
+STEPS = 3
 #: Noise units that every residual of a simulation that broke down counts.
 LOST = 1e3
 #: See :class:`wlr_gym.gap.problem.Problem`: with 1, what two simulators of one robot do not share moves numbers by two to three

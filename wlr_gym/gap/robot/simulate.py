@@ -27,7 +27,7 @@ from wlr_gym.physics.plants.forces import Force
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.physics.plants.simulator import Simulator
 from wlr_gym.physics.servo import motor_constants
-from wlr_gym.robot import Robot
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -203,9 +203,9 @@ def _anchor(
     """Put one run's robots where they were measured at the start of a window."""
     anchors, state = clock.anchors, _standing_where_lost(plant, lanes)
     legs = anchors.legs[window] - lanes["joint.zero_offset"][mine]
-    state.joint_position[mine, :4] = legs
-    missing = np.nan_to_num(anchors.effort[window] - readings.joint_effort[mine, 4:])
-    state.reference_position[mine, 4:] += missing * _tension_per_effort(plant.robot, lanes, mine)
+    state.joint_position[mine, LEG_SLICE] = legs
+    missing = np.nan_to_num(anchors.effort[window] - readings.joint_effort[mine, WHEEL_SLICE])
+    state.reference_position[mine, WHEEL_SLICE] += missing * _tension_per_effort(plant.robot, lanes, mine)
     if np.isfinite(anchors.pose[window]).all():
         _place(state, clock, window, mine, lanes)
     kept = {name: readings[name][mine].copy() for name in ("joint_effort", "gyro", "accelerometer", "supply_voltage")}
@@ -232,8 +232,10 @@ def _tension_per_effort(robot: Robot, lanes: Parameters, mine: NDArray[np.bool_]
     """Change of a wheel's reference (rad) that changes its reported effort by 1 N m."""
     nominal = robot.servo.supply_voltage
     constant, _ = motor_constants(robot.servo.wheel.stall_torque, robot.servo.wheel.no_load_speed, nominal)
-    _, resistance = motor_constants(lanes["servo.stall_torque"][mine, 4:], lanes["servo.no_load_speed"][mine, 4:], nominal)
-    return resistance / constant / np.maximum(lanes["servo.kp"][mine, 4:], 1e-9)
+    _, resistance = motor_constants(
+        lanes["servo.stall_torque"][mine, WHEEL_SLICE], lanes["servo.no_load_speed"][mine, WHEEL_SLICE], nominal
+    )
+    return resistance / constant / np.maximum(lanes["servo.kp"][mine, WHEEL_SLICE], 1e-9)
 
 
 def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.bool_], lanes: Parameters) -> None:
@@ -260,15 +262,19 @@ def _start(run: Run, robot: Robot, parameters: Parameters, begin: float) -> Plan
     measured = start_state(run, robot, base)
     state = PlantState(**{name: np.repeat(value, count, axis=0) for name, value in vars(measured).items() if value is not None})
     legs = base["joint.zero_offset"] - parameters["joint.zero_offset"]
-    state.joint_position[:, :4] += legs
-    state.reference_position[:, :4] += legs
+    state.joint_position[:, LEG_SLICE] += legs
+    state.reference_position[:, LEG_SLICE] += legs
     background = standing_state(robot, parameters)
     height = background.position[:, 2] - background.position[:1, 2]
-    moved = rest_pose(parameters, state.joint_position[:, :4]) - rest_pose(parameters, background.joint_position[:, :4])
+    moved = rest_pose(parameters, state.joint_position[:, LEG_SLICE]) - rest_pose(
+        parameters, background.joint_position[:, LEG_SLICE]
+    )
     state.position[:, 2] = measured.position[0, 2] + height + (moved - moved[:1])[:, 0]
-    tension = state.reference_position[:, 4:] - state.joint_position[:, 4:]
-    kp = parameters["servo.kp"][:, 4:]
-    state.reference_position[:, 4:] = state.joint_position[:, 4:] + tension * base["servo.kp"][:, 4:] / np.maximum(kp, 1e-9)
+    tension = state.reference_position[:, WHEEL_SLICE] - state.joint_position[:, WHEEL_SLICE]
+    kp = parameters["servo.kp"][:, WHEEL_SLICE]
+    state.reference_position[:, WHEEL_SLICE] = state.joint_position[:, WHEEL_SLICE] + tension * base["servo.kp"][
+        :, WHEEL_SLICE
+    ] / np.maximum(kp, 1e-9)
     state.time = np.full(count, begin)
     return PlantState(**{name: value[1:] for name, value in vars(state).items() if value is not None})
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.robot import JOINTS, WHEELS, Robot
+from wlr_gym.robot import JOINTS, LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import XYZ, Parameters
 
 Array = NDArray[np.float64]
@@ -225,7 +225,7 @@ def standing_state(robot: Robot, parameters: Parameters, leg_angle: float | None
     )
     sag = mass * parameters["gravity"] / parameters["ground.normal_stiffness"].sum(axis=1)
     joints = np.zeros((count, 8))
-    joints[:, :4] = angle
+    joints[:, LEG_SLICE] = angle
     position = np.zeros((count, 3))
     position[:, 2] = height.mean(axis=1) - sag
     quaternion = np.zeros((count, 4))

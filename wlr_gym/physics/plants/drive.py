@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import ops
-from wlr_gym.robot import Robot
+from wlr_gym.robot import FIRST_WHEEL, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Value = Any
@@ -190,7 +190,7 @@ def command(
     for j, joint in enumerate(joints):
         goal = _goal(lanes, j, time, step)
         old = (lanes[f"reference_position{j}"], lanes[f"reference_velocity{j}"])
-        if j < 4:
+        if j < FIRST_WHEEL:
             new = servo.leg_profile_step(*old, goal, lanes[f"velocity_limit{j}"], lanes[f"acceleration_limit{j}"], step)
         else:
             new = servo.wheel_profile_step(

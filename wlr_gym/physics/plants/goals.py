@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.plants.base import PlantState
+from wlr_gym.robot import LEG_SLICE
 from wlr_gym.robot.parameters import SPECS, Parameters
 
 Array = NDArray[np.float64]
@@ -52,7 +53,7 @@ class GoalHistory:
         Goals are in terms of the reading, references in terms of the true angle.
         """
         hold = state.reference_velocity[rows].copy()
-        hold[:, :4] = state.reference_position[rows, :4] + parameters["joint.zero_offset"][rows]
+        hold[:, LEG_SLICE] = state.reference_position[rows, LEG_SLICE] + parameters["joint.zero_offset"][rows]
         self._ring[:, rows] = hold
         self.set_delays(rows, parameters)
 

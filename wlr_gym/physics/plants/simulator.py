@@ -21,7 +21,7 @@ from wlr_gym.physics.plants.base import (
 )
 from wlr_gym.physics.plants.goals import GoalHistory, Goals
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
-from wlr_gym.robot import Robot
+from wlr_gym.robot import LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -157,7 +157,7 @@ class Simulator(ABC):
     def _present_goals(self) -> Array:
         """Goals that keep every joint as it is: leg angles as the servo reads them, wheels at rest."""
         present = np.zeros((self._count, 8))
-        present[:, :4] = self._truth.joint_position[:, :4] + self.parameters["joint.zero_offset"]
+        present[:, LEG_SLICE] = self._truth.joint_position[:, LEG_SLICE] + self.parameters["joint.zero_offset"]
         return present
 
     def truth(self) -> Truth:

@@ -17,7 +17,7 @@ from wlr_gym.physics.plants.forces import MEMORY, Force, compile_forces
 from wlr_gym.physics.plants.gibbs_appell import kernel, packing
 from wlr_gym.physics.plants.gibbs_appell.lanes import STORED
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
-from wlr_gym.robot import Robot
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -131,10 +131,10 @@ class GibbsAppellPlant(Simulator):
         values = np.zeros((rows.size, len(STORED)))
         quaternion = state.quaternion[rows] / np.linalg.norm(state.quaternion[rows], axis=1, keepdims=True)
         w = state.angular_velocity_in_body[rows]
-        leg_rate = state.joint_velocity[rows, :4] + w[:, 1:2]
-        wheel_rate = state.joint_velocity[rows, 4:] + leg_rate
+        leg_rate = state.joint_velocity[rows, LEG_SLICE] + w[:, 1:2]
+        wheel_rate = state.joint_velocity[rows, WHEEL_SLICE] + leg_rate
         zero_offset = np.zeros((rows.size, 8))
-        zero_offset[:, :4] = self.parameters["joint.zero_offset"][rows]
+        zero_offset[:, LEG_SLICE] = self.parameters["joint.zero_offset"][rows]
         reference = state.reference_position[rows] + zero_offset
         groups = {
             "p{}": (state.position[rows], "xyz"),
@@ -143,8 +143,8 @@ class GibbsAppellPlant(Simulator):
             "w{}": (w, "xyz"),
             "last_w{}": (w, "xyz"),
             "gyro_{}": (w, "xyz"),
-            "leg_angle{}": (state.joint_position[rows, :4], range(4)),
-            "wheel_angle{}": (state.joint_position[rows, 4:], range(4)),
+            "leg_angle{}": (state.joint_position[rows, LEG_SLICE], range(4)),
+            "wheel_angle{}": (state.joint_position[rows, WHEEL_SLICE], range(4)),
             "leg_rate{}": (leg_rate, range(4)),
             "last_leg_rate{}": (leg_rate, range(4)),
             "wheel_rate{}": (wheel_rate, range(4)),
@@ -178,7 +178,7 @@ class GibbsAppellPlant(Simulator):
             return np.stack([values[:, _LANE[pattern.format(label)]] for label in labels], axis=1)  # type: ignore[union-attr]
 
         reference = columns("reference_position{}", range(8))
-        reference[:, :4] -= self.parameters["joint.zero_offset"]
+        reference[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
         has_play = self.parameters["servo.backlash"] > 0.0
         return PlantState(
             position=columns("p{}", "xyz"),

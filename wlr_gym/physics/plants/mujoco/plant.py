@@ -16,7 +16,7 @@ from wlr_gym.physics.plants.mujoco.batch import RobotBatch
 from wlr_gym.physics.plants.mujoco.kernel import addresses, load_kernel
 from wlr_gym.physics.plants.mujoco.step import STATE, TICK_SUMS
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
-from wlr_gym.robot import Robot
+from wlr_gym.robot import LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -101,7 +101,7 @@ class MujocoPlant(Simulator):
         velocity = np.einsum("nij,nj->ni", rotation, state.linear_velocity_in_body[rows])
         w, rates = state.angular_velocity_in_body[rows], state.joint_velocity[rows]
         reference = state.reference_position[rows].copy()
-        reference[:, :4] += self.parameters["joint.zero_offset"][rows]
+        reference[:, LEG_SLICE] += self.parameters["joint.zero_offset"][rows]
         still = -np.einsum("nji,nj->ni", rotation, gravity_in_floor(self.parameters)[rows])
         values = np.zeros((rows.size, len(STATE)))
         groups = {
@@ -134,7 +134,7 @@ class MujocoPlant(Simulator):
 
         truth = self._truth
         reference = columns("reference_position")
-        reference[:, :4] -= self.parameters["joint.zero_offset"]
+        reference[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
         has_play = self.parameters["servo.backlash"] > 0.0
         return PlantState(
             position=truth.position.copy(),
