@@ -232,10 +232,11 @@ def _tension_per_effort(robot: Robot, lanes: Parameters, mine: NDArray[np.bool_]
     """Change of a wheel's reference (rad) that changes its reported effort by 1 N m."""
     nominal = robot.servo.supply_voltage
     constant, _ = motor_constants(robot.servo.wheel.stall_torque, robot.servo.wheel.no_load_speed, nominal)
-    _, resistance = motor_constants(
-        lanes["servo.stall_torque"][mine, WHEEL_SLICE], lanes["servo.no_load_speed"][mine, WHEEL_SLICE], nominal
+    kp, stall_torque, no_load_speed = (
+        lanes[f"servo.{name}"][mine, WHEEL_SLICE] for name in ("kp", "stall_torque", "no_load_speed")
     )
-    return resistance / constant / np.maximum(lanes["servo.kp"][mine, WHEEL_SLICE], 1e-9)
+    _, resistance = motor_constants(stall_torque, no_load_speed, nominal)
+    return resistance / constant / np.maximum(kp, 1e-9)
 
 
 def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.bool_], lanes: Parameters) -> None:
@@ -266,15 +267,12 @@ def _start(run: Run, robot: Robot, parameters: Parameters, begin: float) -> Plan
     state.reference_position[:, LEG_SLICE] += legs
     background = standing_state(robot, parameters)
     height = background.position[:, 2] - background.position[:1, 2]
-    moved = rest_pose(parameters, state.joint_position[:, LEG_SLICE]) - rest_pose(
-        parameters, background.joint_position[:, LEG_SLICE]
-    )
+    bent, level = state.joint_position[:, LEG_SLICE], background.joint_position[:, LEG_SLICE]
+    moved = rest_pose(parameters, bent) - rest_pose(parameters, level)
     state.position[:, 2] = measured.position[0, 2] + height + (moved - moved[:1])[:, 0]
-    tension = state.reference_position[:, WHEEL_SLICE] - state.joint_position[:, WHEEL_SLICE]
-    kp = parameters["servo.kp"][:, WHEEL_SLICE]
-    state.reference_position[:, WHEEL_SLICE] = state.joint_position[:, WHEEL_SLICE] + tension * base["servo.kp"][
-        :, WHEEL_SLICE
-    ] / np.maximum(kp, 1e-9)
+    wheels, reference = state.joint_position[:, WHEEL_SLICE], state.reference_position[:, WHEEL_SLICE]
+    kp, own_kp = base["servo.kp"][:, WHEEL_SLICE], parameters["servo.kp"][:, WHEEL_SLICE]
+    reference[...] = wheels + (reference - wheels) * kp / np.maximum(own_kp, 1e-9)
     state.time = np.full(count, begin)
     return PlantState(**{name: value[1:] for name, value in vars(state).items() if value is not None})
 
