@@ -11,7 +11,8 @@ from wlr_gym.hardware.config import Hardware, load_hardware, with_ports
 from wlr_gym.hardware.link import Link, emulated_robot, serial_link
 from wlr_gym.hardware.log import sensors_of
 from wlr_gym.hardware.loop import ControlLoop
-from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, RobotOptions, Sensors, Truth
+from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors, Truth
+from wlr_gym.physics.plants.robot_options import RobotOptions
 from wlr_gym.robot import JOINTS, Robot
 from wlr_gym.robot.parameters import Parameters
 

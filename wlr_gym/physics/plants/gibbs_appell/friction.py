@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
 from wlr_gym.physics.plants import ground
 from wlr_gym.physics.plants.gibbs_appell.kinematics import dot
-from wlr_gym.physics.plants.gibbs_appell.lanes import Lanes, Out, Value, Vector
 from wlr_gym.robot import FIRST_WHEEL
 
 

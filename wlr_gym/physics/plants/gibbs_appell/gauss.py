@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
 from wlr_gym.physics.model.equations import assembly_terms, platform_terms
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.gibbs_appell.kinematics import (
@@ -24,7 +25,7 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     vector,
     wheel_points,
 )
-from wlr_gym.physics.plants.gibbs_appell.lanes import ASSEMBLY, AXES, CORNERS, PLATFORM, Lanes, Out, Value, Vector
+from wlr_gym.physics.plants.gibbs_appell.lanes import ASSEMBLY, AXES, CORNERS, PLATFORM
 from wlr_gym.robot import FIRST_WHEEL, JOINTS
 
 

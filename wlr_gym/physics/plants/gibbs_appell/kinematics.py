@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.codegen.ops import Lanes, Value, Vector
 from wlr_gym.physics.plants import drive
-from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, Lanes, Value, Vector
+from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS
 
 
 def cross(a: Sequence[Value], b: Sequence[Value]) -> Vector:

@@ -5,17 +5,9 @@ Every function of the step maps lanes (state, parameters, inputs; each a scalar)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from wlr_gym.physics.plants import drive
 from wlr_gym.physics.plants.forces import COORDINATES
 from wlr_gym.physics.plants.forces import INPUTS as INPUTS_OF_FORMULAS
-
-Value = Any
-Lanes = Mapping[str, Value]
-Out = dict[str, Value]
-Vector = list[Value]
 
 CORNERS = range(4)
 AXES = "xyz"

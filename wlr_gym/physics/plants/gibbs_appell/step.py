@@ -24,6 +24,7 @@ in ``friction.py``; ``kinematics.py`` has the geometry, ``lanes.py`` the names.
 from __future__ import annotations
 
 from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.codegen.ops import Lanes, Out, Value
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     contact_place,
@@ -37,7 +38,7 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     vector,
     wheel_points,
 )
-from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, INPUTS_OF_FORMULAS, Lanes, Out, Value
+from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, INPUTS_OF_FORMULAS
 from wlr_gym.robot import FIRST_WHEEL
 
 

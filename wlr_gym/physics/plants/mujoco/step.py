@@ -25,6 +25,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.forces import COORDINATES
 from wlr_gym.physics.plants.gibbs_appell import step as engine
@@ -38,7 +39,7 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     vector,
     wheel_points,
 )
-from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, INPUTS_OF_FORMULAS, Lanes, Out, Value, Vector
+from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, INPUTS_OF_FORMULAS
 from wlr_gym.robot import FIRST_WHEEL
 
 #: Families of effects: always all, so that no robot's bits can depend on what its neighbours have.
