@@ -105,7 +105,7 @@ def test_what_a_robot_cannot_do_is_refused():
     for ask in (plant.truth, plant.get_state):
         with pytest.raises(InputError, match="real robot"):
             ask()
-    with pytest.raises(InputError, match=r"goals have shape \(8,\)"):
+    with pytest.raises(InputError, match=r"setpoints have shape \(8,\)"):
         plant.step(np.zeros(8))
     other = Parameters.nominal(ROBOT)
     other["ground.mu_x"] = 0.3

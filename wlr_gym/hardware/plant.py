@@ -109,20 +109,20 @@ class RobotPlant:
             self._wheel_zero, self._started = view.position[4:].copy(), view.time
         return self._readings()
 
-    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
-        """Send goals through the safety gate, wait for the deadline, read; see :meth:`wlr_gym.physics.plants.base.Plant.step`.
+    def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+        """Send setpoints through the safety gate, wait for the deadline, read: :meth:`wlr_gym.physics.plants.base.Plant.step`.
 
-        Goals that are no numbers are the gate's business: they stop the robot.
+        Setpoints that are no numbers are the gate's business: they stop the robot.
 
         Raises:
             StoppedError: the robot has stopped, and torque is off.
         """
         if self.loop.view is None:
             self.reset()
-        shape = np.shape(goals)
+        shape = np.shape(setpoints)
         if shape != (1, len(JOINTS)) or (torque_on is not None and np.shape(torque_on) != shape):
-            raise InputError(f"goals have shape {shape}, expected (1, {len(JOINTS)}), and torque_on the same")
-        self.loop.tick(np.asarray(goals)[0], None if torque_on is None else np.asarray(torque_on)[0])
+            raise InputError(f"setpoints have shape {shape}, expected (1, {len(JOINTS)}), and torque_on the same")
+        self.loop.tick(np.asarray(setpoints)[0], None if torque_on is None else np.asarray(torque_on)[0])
         return self._readings()
 
     def _readings(self) -> Sensors:

@@ -42,8 +42,8 @@ MOST_ROBOTS = 1024
 KERNELS = ("without effects", "tyres that creep", "all effects")
 
 
-class WrittenGoals:
-    """Goals that arrive at their measured times, each joint's late by its own ``command.delay``."""
+class WrittenSetpoints:
+    """Setpoints that arrive at their measured times, each joint's late by its own ``command.delay``."""
 
     given = True
 
@@ -58,13 +58,13 @@ class WrittenGoals:
         self._tick = 0
 
     def reset(self, rows: NDArray[np.intp], state: PlantState, parameters: Parameters) -> None:
-        """Nothing: the goals are given."""
+        """Nothing: the setpoints are given."""
 
     def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
         """Nothing: the delays are given."""
 
-    def push(self, goals: Array) -> tuple[Array, Array, Array]:
-        """Return the newer goals, the older goals and the time between (s) of the present tick; see GoalHistory.
+    def push(self, setpoints: Array) -> tuple[Array, Array, Array]:
+        """Return the newer setpoints, the older setpoints and the time between (s) of the present tick; see SetpointHistory.
 
         The next call overwrites them.
         """
@@ -75,17 +75,17 @@ class WrittenGoals:
 
 
 @njit(cache=True, nogil=True)
-def _arrive(now: Any, times: Any, goals: Any, delay: Any, rows: Any, newer: Any, older: Any, wait: Any) -> None:
-    """Fill the goals of a tick and move ``rows`` on to those that have arrived."""
+def _arrive(now: Any, times: Any, setpoints: Any, delay: Any, rows: Any, newer: Any, older: Any, wait: Any) -> None:
+    """Fill the setpoints of a tick and move ``rows`` on to those that have arrived."""
     for i in range(len(rows)):
         for j in range(8):
-            older[i, j] = goals[rows[i, j], j]
+            older[i, j] = setpoints[rows[i, j], j]
             due = times[rows[i, j] + 1] + delay[i, j] - now
             wait[i, j] = 0.0
             if due < CLOCK:
                 rows[i, j] += 1
                 wait[i, j] = max(due, 0.0)
-            newer[i, j] = goals[rows[i, j], j]
+            newer[i, j] = setpoints[rows[i, j], j]
 
 
 def replay_batch(
@@ -166,7 +166,7 @@ def _replay_chunk(
         plant.set_force_values(np.tile(constants, (runs, 1)))
     delay = lanes["command.delay"].copy()
     lanes["command.delay"] = 0.0
-    plant.use_goals(WrittenGoals(clocks, run_of, delay))
+    plant.use_setpoints(WrittenSetpoints(clocks, run_of, delay))
     first = _join([_start(clock.run, robot, parameters, clock.begin - clock.t[0]) for clock in clocks])
     try:
         recorder = Recorder(clocks, settings, first, delay, with_truth)

@@ -277,39 +277,41 @@ class PlantOptions:
         return round(self.control_period / self.physics_step)
 
 
-def check_goals(goals: Array, count: int) -> Array:
-    """Return goals as a float64 (count, 8) matrix.
+def check_setpoints(setpoints: Array, count: int) -> Array:
+    """Return setpoints as a float64 (count, 8) matrix.
 
     Raises:
-        InputError: wrong shape, or a non-finite goal; names robot and joint.
+        InputError: wrong shape, or a non-finite setpoint; names robot and joint.
     """
-    goals = np.ascontiguousarray(goals, dtype=np.float64)
-    if goals.shape != (count, len(JOINTS)):
-        raise InputError(f"goals have shape {goals.shape}, expected ({count}, {len(JOINTS)})")
-    if not math.isfinite(goals.sum()) and (bad := ~np.isfinite(goals)).any():
+    setpoints = np.ascontiguousarray(setpoints, dtype=np.float64)
+    if setpoints.shape != (count, len(JOINTS)):
+        raise InputError(f"setpoints have shape {setpoints.shape}, expected ({count}, {len(JOINTS)})")
+    if not math.isfinite(setpoints.sum()) and (bad := ~np.isfinite(setpoints)).any():
         row, joint = np.argwhere(bad)[0]
-        raise InputError(f"goal of {JOINTS[joint]} (robot {row} of the batch) is {goals[row, joint]}, expected a finite number")
-    return goals
+        raise InputError(
+            f"setpoint of {JOINTS[joint]} (robot {row} of the batch) is {setpoints[row, joint]}, expected a finite number"
+        )
+    return setpoints
 
 
-def hold_where_off(goals: Array, torque_on: NDArray[np.bool_], present: Array) -> Array:
-    """Return goals in which a motor that is off is told to stay as it is.
+def hold_where_off(setpoints: Array, torque_on: NDArray[np.bool_], present: Array) -> Array:
+    """Return setpoints in which a motor that is off is told to stay as it is.
 
-    As on the servo, whose goal returns to the present position (speed 0) when torque is switched on: what was asked of a
+    As on the servo, whose setpoint returns to the present position (speed 0) when torque is switched on: what was asked of a
     motor while it was off, NaN included, never acts later.
 
     Args:
-        goals: (N, 8).
+        setpoints: (N, 8).
         torque_on: (N, 8).
-        present: (N, 8) goals that keep each joint as it is: leg readings (rad), zero wheel speeds.
+        present: (N, 8) setpoints that keep each joint as it is: leg readings (rad), zero wheel speeds.
 
     Raises:
         InputError: wrong shape.
     """
-    for name, value in (("goals", goals), ("torque_on", torque_on)):
+    for name, value in (("setpoints", setpoints), ("torque_on", torque_on)):
         if np.shape(value) != present.shape:
             raise InputError(f"{name} has shape {np.shape(value)}, expected {present.shape}")
-    return np.where(np.asarray(torque_on, dtype=bool), goals, present)
+    return np.where(np.asarray(torque_on, dtype=bool), setpoints, present)
 
 
 class Plant(Protocol):
@@ -342,8 +344,8 @@ class Plant(Protocol):
         """
         ...
 
-    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
-        """Write goals (N, 8: leg angles rad, wheel speeds rad/s) and advance one control tick.
+    def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+        """Write setpoints (N, 8: leg angles rad, wheel speeds rad/s) and advance one control tick.
 
         ``torque_on`` (N, 8) False leaves a motor open-circuit (free-spinning); None = all on. The returned matrix is
         overwritten by the next step; copy what must be kept.

@@ -215,13 +215,18 @@ class GibbsAppellPlant(Simulator):
         going = -(-count // self._width)
         self._chunks = [(0, going)] if self._pool is None else self._shared_out(going)
 
-    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+    def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick; see :meth:`wlr_gym.physics.plants.base.Plant.step`.
 
         Raises:
-            InputError: wrong shape or a non-finite goal of a motor that is on.
+            InputError: wrong shape or a non-finite setpoint of a motor that is on.
         """
-        inputs = (*self._take_goals(goals, torque_on, self._torque_on), self._torque_on, self._formula_values, self._memory)
+        inputs = (
+            *self._take_setpoints(setpoints, torque_on, self._torque_on),
+            self._torque_on,
+            self._formula_values,
+            self._memory,
+        )
         if self._formulas:  # in full precision: single precision would lose it step by step
             _scatter(self._memory, self._width, self._all, self._time[:, None], slice(0, 1))
         arguments = (self._lanes, self._constants, *inputs, self._truth.values, self._raw)

@@ -158,13 +158,13 @@ class MujocoPlant(Simulator):
         """Take the constants of the formula forces per robot; see :class:`wlr_gym.physics.plants.simulator.Simulator`."""
         self._force_values = np.ascontiguousarray(values.T)
 
-    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+    def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick; see :meth:`wlr_gym.physics.plants.base.Plant.step`.
 
         Raises:
-            InputError: wrong shape or a non-finite goal of a motor that is on.
+            InputError: wrong shape or a non-finite setpoint of a motor that is on.
         """
-        for target, values in zip(self._inputs, self._take_goals(goals, torque_on, self._inputs[3]), strict=False):
+        for target, values in zip(self._inputs, self._take_setpoints(setpoints, torque_on, self._inputs[3]), strict=False):
             target[...] = values
         self._tick()
         self._sensors.measure(self._raw, self._readings.values)
