@@ -15,7 +15,7 @@ from wlr_gym.physics.plants.base import (
     PlantOptions,
     Sensors,
     Truth,
-    check_goals,
+    check_setpoints,
     standing_state,
 )
 from wlr_gym.robot import load_robot
@@ -61,16 +61,16 @@ class FakePlant:
         chosen.validate()
         self.parameters.values[rows] = chosen.values
 
-    def step(self, goals, torque_on=None):
-        goals = check_goals(goals if torque_on is None else np.where(torque_on, goals, 0.0), self.count)
-        self.goals_seen.append(goals.copy())
-        on = np.ones_like(goals) if torque_on is None else np.asarray(torque_on, float)
+    def step(self, setpoints, torque_on=None):
+        setpoints = check_setpoints(setpoints if torque_on is None else np.where(torque_on, setpoints, 0.0), self.count)
+        self.goals_seen.append(setpoints.copy())
+        on = np.ones_like(setpoints) if torque_on is None else np.asarray(torque_on, float)
         period, truth = self.options.control_period, self._truth
         self._ticks += 1
-        speed = goals[:, 4:] * on[:, 4:]
+        speed = setpoints[:, 4:] * on[:, 4:]
         ground = speed * self.parameters["wheel.radius"]
         truth["joint_velocity"][:, 4:] = speed
-        truth["joint_position"][:, :4] = goals[:, :4]
+        truth["joint_position"][:, :4] = setpoints[:, :4]
         truth["joint_position"][:, 4:] += speed * period
         truth["linear_velocity_in_body"][:, 0] = ground.mean(axis=1)
         truth["angular_velocity_in_body"][:, 2] = (ground[:, 1] + ground[:, 3] - ground[:, 0] - ground[:, 2]) / 0.64

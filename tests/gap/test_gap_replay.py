@@ -12,7 +12,7 @@ from wlr_gym.data.noise import channel_noise
 from wlr_gym.gap.robot import simulate
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
 from wlr_gym.gap.robot.recorder import TRUTH
-from wlr_gym.gap.robot.simulate import WrittenGoals, replay_batch
+from wlr_gym.gap.robot.simulate import WrittenSetpoints, replay_batch
 from wlr_gym.gap.robot.windows import anchored_residuals
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
 from wlr_gym.robot import JOINTS
@@ -240,7 +240,7 @@ def test_written_goals_arrive_at_their_times(run):
     delay = np.zeros((2, 8))
     delay[1] = 2.55 * CLOCK
     clock.goals[1] += 1.0
-    goals = WrittenGoals([clock], np.array([0, 0]), delay)
+    goals = WrittenSetpoints([clock], np.array([0, 0]), delay)
     arrived = np.full(2, np.nan)
     for tick in range(round((clock.t[1] - clock.begin) / CLOCK) + 5):
         newer, older, wait = goals.push(np.zeros((2, 8)))

@@ -11,6 +11,7 @@ from engine_runs import META, ROBOT, posture_and_turns, record, spaced
 from gap_examples import EFFECT_FOUND
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.cli import main
 from wlr_gym.data import Run, read_run
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.format import CHANNELS
@@ -19,11 +20,13 @@ from wlr_gym.data.replay import replay
 from wlr_gym.data.write import write_run
 from wlr_gym.gap.analysis import ParameterEstimate
 from wlr_gym.gap.estimation.model import FittedModel, nominal_model
-from wlr_gym.gap.problem import Setting
+from wlr_gym.gap.problem import Setting, Unknown
+from wlr_gym.gap.report.relations import relation_of
 from wlr_gym.gap.report.result import write_result
-from wlr_gym.gap.robot.candidates import ripple_order, robot_candidates
+from wlr_gym.gap.robot.candidates import robot_candidates, shown_by
 from wlr_gym.gap.robot.clock import RunClock
 from wlr_gym.gap.robot.formulas import formula_candidates, wave_frequency
+from wlr_gym.gap.robot.observed import wave_order
 from wlr_gym.gap.robot.open import LEAST_RUNS, open_robot
 from wlr_gym.gap.robot.problem import LOST, WORTH_APART, RobotProblem
 from wlr_gym.gap.robot.quantities import knobs, write
@@ -31,7 +34,19 @@ from wlr_gym.gap.robot.simulate import PHYSICS_STEP
 from wlr_gym.gap.selection.hypothesis import within_tolerance
 from wlr_gym.gap.validation.held_out import level, mean_squares, noise_floor
 from wlr_gym.gap.workflow import found_effect
-from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Patch, PatchEffect, apply_patch, load_patch
+from wlr_gym.physics.effects import (
+    EFFECTS,
+    UNKNOWN_EFFECT,
+    Effect,
+    EffectParameter,
+    Patch,
+    PatchEffect,
+    apply_patch,
+    load_patch,
+)
+from wlr_gym.physics.effects.document import effect_table
+from wlr_gym.physics.effects.effect import multiply
+from wlr_gym.physics.effects.search import WHEEL_SETS, Search, steps
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, load_robot
 from wlr_gym.robot.parameter_table import SPECS
 from wlr_gym.robot.parameters import Parameters
@@ -290,14 +305,14 @@ def test_ripple_is_looked_for_at_its_own_order():
     measured[:, CHANNELS.index("pos_wheel_lf")] = angle
     residual[:, CHANNELS.index("eff_wheel_lf")] = np.sin(12 * angle + 0.7) + 0.5 * rng.standard_normal(800)
     residual[rng.random(800) < 0.2] = np.nan
-    assert ripple_order("wheel_lf", [measured], [residual]) == 12.0
+    assert wave_order("wheel_lf", [measured], [residual]) == 12.0
     swing, bend = np.zeros((2, 800, len(CHANNELS)))
     swing[:, CHANNELS.index("pos_leg_lf")] = 1.0 + 0.4 * np.sin(angle)
     bend[:, CHANNELS.index("eff_leg_lf")] = np.sin(swing[:, CHANNELS.index("pos_leg_lf")])  # one period per turn: any bend
-    order = ripple_order("leg_lf", [swing], [bend])
+    order = wave_order("leg_lf", [swing], [bend])
     assert order is not None
     assert order >= 1.5 * 2 * np.pi / 0.8
-    assert ripple_order("leg_rf", [swing], [bend]) is None  # it stood still
+    assert wave_order("leg_rf", [swing], [bend]) is None  # it stood still
 
 
 def test_patch_of_floor_needs_a_floor_that_was_driven():
@@ -307,6 +322,35 @@ def test_patch_of_floor_needs_a_floor_that_was_driven():
     assert "friction_patch" not in {candidate.name for candidate in candidates}
     blind = np.full_like(still, np.nan)
     robot_candidates(NOMINAL, sigmas, [blind], [blind])
+
+
+def test_an_effect_registered_in_one_place_is_all_that_it_takes(monkeypatch, capsys):
+    """It acts, is documented, and is looked for with its places, tolerance-free probes, relation and motion."""
+    hot = Effect(
+        "hot_winding",
+        "a hot motor: its winding's resistance is higher",
+        "stall torque = scale x nominal",
+        JOINTS,
+        {"scale": EffectParameter("-", "cold over hot resistance", 0.2, 1.0, 1.0, (0.6, 1.0), 0.7)},
+        multiply("servo.stall_torque", "scale"),
+        "scale",
+        Search("winding of the {}", "rear_legs", WHEEL_SETS, steps("scale", -0.1, neutral=1.0)),
+    )
+    monkeypatch.setitem(EFFECTS, hot.name, hot)
+    moved = np.zeros((100, len(CHANNELS)))
+    probes, candidates = robot_candidates(NOMINAL, {}, [moved], [moved])
+    found = [candidate for candidate in candidates if candidate.name == hot.name]
+    assert tuple(candidate.where for candidate in found) == WHEEL_SETS
+    assert found[0].unknowns == (Unknown("scale", "-", 1.0, 0.6, 1.0, 0.05 * (1.0 - 0.6)),)
+    assert [len(start.directions[0]) for candidate in (found[0], found[-1]) for start in candidate.starts] == [1, 4]
+    assert [dict(probe.effects[0].parameters) for probe in probes if probe.effects[0].name == hot.name] == [{"scale": 0.9}] * 4
+    (patched,) = apply_patch(load_patch([found[0].effect((0.8,)).content()]), NOMINAL)["servo.stall_torque[wheel_lf]"]
+    assert patched == pytest.approx(0.8 * NOMINAL["servo.stall_torque[wheel_lf]"][0])
+    assert relation_of(found[0]) == "winding of the left front wheel"
+    assert shown_by()[hot.name] == "rear_legs"
+    assert main(["effects"]) == main(["effects", hot.name]) == 0
+    assert capsys.readouterr().out.count(hot.name) == 2
+    assert any(f"`{hot.name}`" in row for row in effect_table())
 
 
 # ---- formulas --------------------------------------------------------------------------------------------------------

@@ -3,7 +3,11 @@
 import pytest
 
 from wlr_gym.data.excitations import EXCITATIONS
-from wlr_gym.gap.report.recommendation import SHOWN_BY, record_commands, separating_run, separation
+from wlr_gym.gap.report.recommendation import record_commands, separating_run, separation
+from wlr_gym.gap.robot.candidates import shown_by
+from wlr_gym.physics.effects import EFFECTS
+
+SHOWN_BY = shown_by()
 
 
 @pytest.mark.parametrize(
@@ -36,4 +40,5 @@ def test_motions_of_other_servo_profiles_are_recorded_apart():
 
 
 def test_every_motion_exists():
+    assert set(SHOWN_BY) == set(EFFECTS)
     assert set(SHOWN_BY.values()) <= set(EXCITATIONS)

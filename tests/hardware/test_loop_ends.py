@@ -23,7 +23,8 @@ from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.operator import Keys, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.evaluation import make_core
-from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
+from wlr_gym.physics.plants.base import PlantOptions
+from wlr_gym.physics.plants.robot_options import RobotOptions
 from wlr_gym.policy import make_policy
 from wlr_gym.studies.paper.experiments import PROFILE
 

@@ -19,7 +19,8 @@ from wlr_gym.envs.settings import Settings
 from wlr_gym.learning.evaluation import make_core, roll_out
 from wlr_gym.physics.effects import Patch
 from wlr_gym.physics.plants import REAL, SIMULATORS, make_plant
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, RobotOptions, Sensors, read_robot_options
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, Sensors
+from wlr_gym.physics.plants.robot_options import RobotOptions, read_robot_options
 from wlr_gym.robot.parameters import Parameters
 
 QUIET = PlantOptions(sensor_noise=False)
@@ -104,7 +105,7 @@ def test_what_a_robot_cannot_do_is_refused():
     for ask in (plant.truth, plant.get_state):
         with pytest.raises(InputError, match="real robot"):
             ask()
-    with pytest.raises(InputError, match=r"goals have shape \(8,\)"):
+    with pytest.raises(InputError, match=r"setpoints have shape \(8,\)"):
         plant.step(np.zeros(8))
     other = Parameters.nominal(ROBOT)
     other["ground.mu_x"] = 0.3

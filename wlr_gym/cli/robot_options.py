@@ -68,7 +68,8 @@ class HardwareOption:
     def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
         """Return the robot as a plant, torque off; every start is logged in a new run of ``log``."""
         from wlr_gym.hardware.plant import RobotPlant
-        from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
+        from wlr_gym.physics.plants.base import PlantOptions
+        from wlr_gym.physics.plants.robot_options import RobotOptions
 
         hardware = self.load_hardware()
         options = RobotOptions(hardware=self.hardware, ports=port_pairs(self.port), log=log)

@@ -264,7 +264,7 @@ def _simulate(
 def _goals(run: Run, parameters: Parameters, begin: Array, ticks: int, clock: float) -> tuple[Array, NDArray[np.bool_]]:
     """Goals (ticks, robots, 8) and torque switches on the plant's clock: each row's goal holds until the next row's.
 
-    Goals are delayed, switching the torque is not: as in :class:`wlr_gym.physics.plants.goals.GoalHistory`.
+    Goals are delayed, switching the torque is not: as in :class:`wlr_gym.physics.plants.setpoints.SetpointHistory`.
     """
     commands = np.stack([run[name] for name in COMMANDS], axis=1)
     written = held_goals(run)

@@ -10,7 +10,8 @@ from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.config import Hardware, load_hardware, with_ports
 from wlr_gym.hardware.link import Link, serial_link
 from wlr_gym.hardware.loop import ControlLoop
-from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, RobotOptions, Sensors, Truth
+from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors, Truth
+from wlr_gym.physics.plants.robot_options import RobotOptions
 from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
 from wlr_gym.robot.parameter_table import ELEMENTS
 from wlr_gym.robot.parameters import Parameters
@@ -105,21 +106,21 @@ class RobotPlant:
             self.loop.start(None if state is None else state.joint_position[0, LEG_SLICE])
         return self.loop.sensors()
 
-    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
-        """Send goals through the command limiter, wait for the deadline, read; see
+    def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+        """Send setpoints through the command limiter, wait for the deadline, read; see
         :meth:`wlr_gym.physics.plants.base.Plant.step`.
 
-        Goals that are no numbers stop the robot.
+        Setpoints that are no numbers stop the robot.
 
         Raises:
             StoppedError: the robot has stopped, and torque is off.
         """
         if self.loop.status is None:
             self.reset()
-        shape = np.shape(goals)
+        shape = np.shape(setpoints)
         if shape != (1, len(JOINTS)) or (torque_on is not None and np.shape(torque_on) != shape):
-            raise InputError(f"goals have shape {shape}, expected (1, {len(JOINTS)}), and torque_on the same")
-        self.loop.tick(np.asarray(goals)[0], None if torque_on is None else np.asarray(torque_on)[0])
+            raise InputError(f"setpoints have shape {shape}, expected (1, {len(JOINTS)}), and torque_on the same")
+        self.loop.tick(np.asarray(setpoints)[0], None if torque_on is None else np.asarray(torque_on)[0])
         return self.loop.sensors()
 
     def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:

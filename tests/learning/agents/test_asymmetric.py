@@ -50,9 +50,7 @@ def test_actor_sees_the_policy_group_only_and_the_critic_both(core):
     other = seen | {"policy": seen["policy"] + 1.0}
     assert not torch.equal(network._predict(seen, deterministic=True), network._predict(other, deterministic=True))
     assert not torch.equal(network.predict_values(seen), network.predict_values(other))
-    actions, values, chance = network.forward(
-        cast(torch.Tensor, seen), deterministic=True
-    )  # its annotation knows no Dict spaces
+    actions, values, chance = network.forward(seen, deterministic=True)
     again, same_chance, _ = network.evaluate_actions(seen, actions)
     torch.testing.assert_close(again, values)
     torch.testing.assert_close(same_chance, chance)

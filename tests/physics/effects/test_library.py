@@ -15,6 +15,7 @@ from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 
 ROBOT = load_robot()
+NOMINAL = Parameters.nominal(ROBOT)
 VOCABULARY = Path(__file__).parents[4] / "shared" / "effects.md"
 EACH = pytest.mark.parametrize("effect", EFFECTS.values(), ids=list(EFFECTS))
 
@@ -60,14 +61,14 @@ def test_the_library_is_the_vocabulary():
 
 @EACH
 def test_neutral_values_change_nothing(effect):
-    neutral = {name: parameter.neutral_for(ROBOT) for name, parameter in effect.parameters.items()}
+    neutral = {name: parameter.neutral_in(NOMINAL) for name, parameter in effect.parameters.items()}
     assert changed(effect, effect.where, neutral) == set()
 
 
 @EACH
 def test_what_may_be_left_out_is_then_neutral(effect):
     values = {name: value for name, value in severe(effect).items() if not effect.parameters[name].optional}
-    optional = {name: effect.parameters[name].neutral_for(ROBOT) for name in effect.parameters if name not in values}
+    optional = {name: effect.parameters[name].neutral_in(NOMINAL) for name in effect.parameters if name not in values}
     short, full = (patched(effect, effect.where, given) for given in (values, values | optional))
     np.testing.assert_array_equal(short.values, full.values)
 
@@ -86,7 +87,7 @@ def test_numbers_of_an_effect_fit_together(effect):
     for name, parameter in effect.parameters.items():
         low, high = parameter.prior
         assert parameter.low <= low < high <= parameter.high, name
-        assert parameter.low <= parameter.neutral_for(ROBOT) <= parameter.high, name
+        assert parameter.low <= parameter.neutral_in(NOMINAL) <= parameter.high, name
         assert parameter.low <= parameter.severity <= parameter.high, name
         assert low <= parameter.severity <= high or effect.name == "friction_patch", name
         assert re.search(rf"\b{name}\b", effect.equation) or name in "xyz" or name in {"angle", "roll", "pitch", "yaw"}, name

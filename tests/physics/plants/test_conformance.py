@@ -329,7 +329,7 @@ def test_callers_parameters_are_not_kept_by_reference(simulator):
 
 @pytest.mark.parametrize("shape", [(8,), (2, 8), (3, 7), (3, 8, 1)])
 def test_goals_of_a_wrong_shape_are_refused(simulator, shape):
-    with pytest.raises(InputError, match=r"goals have shape .*expected \(3, 8\)"):
+    with pytest.raises(InputError, match=r"setpoints have shape .*expected \(3, 8\)"):
         make(simulator, 3).step(np.zeros(shape))
 
 

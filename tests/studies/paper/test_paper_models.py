@@ -153,8 +153,8 @@ class Blind:
         readings.camera_is_new[:] = 0.0
         return readings
 
-    def step(self, goals, torque_on=None):
-        readings = self._plant.step(goals, torque_on)
+    def step(self, setpoints, torque_on=None):
+        readings = self._plant.step(setpoints, torque_on)
         if not self.has_camera:
             readings.camera_is_new[:] = 0.0
         return readings

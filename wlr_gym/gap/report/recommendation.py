@@ -10,37 +10,6 @@ from wlr_gym.gap.analysis import EFFECT_FOUND, Recommendation
 from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
 from wlr_gym.gap.selection.search import Round
 
-#: Motion of :data:`wlr_gym.data.excitations.EXCITATIONS` that shows an effect best.
-SHOWN_BY: Mapping[str, str] = {
-    "coulomb_friction": "random",
-    "viscous_friction": "straight",
-    "stribeck_friction": "stop_and_go",
-    "load_dependent_friction": "rear_legs",
-    "backlash": "stop_and_go",
-    "torque_ripple": "straight",
-    "weak_motor": "rear_legs",
-    "supply_sag": "steps",
-    "command_delay": "chirp",
-    "joint_zero_offset": "all_legs",
-    "friction_level": "turns",
-    "friction_asymmetry": "turns",
-    "friction_anisotropy": "turns",
-    "friction_patch": "straight",
-    "slip_weakening": "turns",
-    "tyre_creep": "straight",
-    "rolling_resistance": "straight",
-    "wheel_radius_error": "straight",
-    "payload": "all_legs",
-    "com_offset": "all_legs",
-    "floor_slope": "turns",
-    "external_force": "turns",
-    "tether": "straight",
-    "gyro_bias": "random",
-    "imu_misalignment": "random",
-    "camera_misalignment": "s_curve",
-    "camera_delay": "chirp",
-}
-
 _FRICTION = frozenset({"coulomb_friction", "viscous_friction", "stribeck_friction", "load_dependent_friction"})
 _PULL = frozenset({"floor_slope", "external_force", "tether"})
 #: One of the first and one of the second -> excitation that separates them, and why it does.

@@ -13,44 +13,24 @@ from wlr_gym.gap.analysis import Relation
 from wlr_gym.gap.problem import Candidate
 from wlr_gym.gap.report.text import places
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score
+from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.robot import JOINTS
 
-#: Effect -> what it changes; ``{}`` is its place. A formula is a force on its place; all others are torques in a joint.
-_CHANGES = {
-    "friction_asymmetry": "contact of the {}",
-    "tyre_creep": "contact of the {}",
-    "rolling_resistance": "contact of the {}",
-    "wheel_radius_error": "radius of the {}",
-    "joint_zero_offset": "zero of the {}",
-    "command_delay": "timing of the {}",
-    "friction_level": "friction of the floor",
-    "friction_anisotropy": "friction of the floor",
-    "friction_patch": "friction of the floor",
-    "slip_weakening": "friction of the floor",
-    "floor_slope": "force on the body",
-    "external_force": "force on the body",
-    "tether": "force on the body",
-    "payload": "mass of the body",
-    "com_offset": "mass of the body",
-    "supply_sag": "supply",
-    "gyro_bias": "reading of the gyroscope",
-    "imu_misalignment": "mounting of the IMU",
-    "camera_misalignment": "mounting of the camera",
-    "camera_delay": "timing of the camera",
-}
+#: What effects outside the library change.
 _TORQUE = "torque in the {}"
 
 
 def relation_of(candidate: Candidate) -> str | None:
     """Return the relation that a candidate changes, in words; None where it changes several places at once."""
-    if candidate.where == JOINTS and candidate.name == "command_delay":
-        return "timing of the commands"
+    effect = EFFECTS.get(candidate.name)
+    search = None if effect is None else effect.search
     if len(candidate.where) != 1:
-        return None
+        at_all_places = effect is not None and candidate.where == effect.where
+        return (search.relation_of_all or None) if search is not None and at_all_places else None
     where = places(candidate.where)
     if candidate.formula and candidate.where[0] not in JOINTS:
         return where
-    return _CHANGES.get(candidate.name, _TORQUE).format(where)
+    return (_TORQUE if search is None else search.relation).format(where)
 
 
 def relations(scores: Sequence[Score]) -> tuple[Relation, ...]:

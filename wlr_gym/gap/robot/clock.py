@@ -12,7 +12,7 @@ from wlr_gym.data.read import Run
 from wlr_gym.data.replay import held_goals
 from wlr_gym.data.run_states import CAMERA_WINDOW, JOINT_WINDOW, frame_near, has_camera, local_fit, starts_at_rest, unwrapped
 from wlr_gym.gap.robot.windows import WINDOW, window_rows
-from wlr_gym.robot import LEGS, WHEELS
+from wlr_gym.robot import LEGS, WHEEL_SLICE, WHEELS
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class RunClock:
         for k, wheel in enumerate(WHEELS):
             if np.isfinite(run[f"eff_{wheel}"]).sum() > 2 if f"eff_{wheel}" in run else False:
                 effort[k] = local_fit(self.t, run[f"eff_{wheel}"], times, JOINT_WINDOW)[0]
-        effort[~self.torque_on[rows, 4:].T] = np.nan
+        effort[~self.torque_on[rows, WHEEL_SLICE].T] = np.nan
         pose = np.full((2, 3, len(rows)), np.nan)
         if has_camera(run):
             fits = [local_fit(self.t, unwrapped(run[f"cam_{name}"]), times, CAMERA_WINDOW) for name in ("x", "y", "yaw")]

@@ -110,8 +110,10 @@ _WAVES = (
     _wave("floor_force_y", "N", 0.5, 20.0),
     _wave("body_torque_yaw", "N m", 0.05, 2.0),
 )
-#: Hz; where a wave is looked for: spacing, and the neighbourhood it must stand out of.
-WAVE_FREQUENCIES, NEIGHBOURHOOD = np.arange(0.2, 5.0, 0.01), 0.5
+#: Hz; where a wave is looked for.
+WAVE_FREQUENCIES = np.arange(0.2, 5.0, 0.01)
+#: Hz; the neighbourhood it must stand out of.
+NEIGHBOURHOOD = 0.5
 #: Channels that a push or a twist of the body moves.
 _SHAKEN = [
     CHANNELS.index(name)

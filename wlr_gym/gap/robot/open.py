@@ -20,14 +20,22 @@ from wlr_gym.robot import JOINTS, LEGS
 LEAST_RUNS = 3
 #: s; shorter runs hold no window to compare.
 LEAST_SECONDS = 3.0
-#: Rows of all runs from which on the memory that an analysis needs is said; GB per row (eight runs of 20 s: 1.4 GB).
-MANY_ROWS, MEMORY_PER_ROW = 20_000, 1.8e-4
-#: rad, rad/s; a joint asked to move more than this and showing nothing is dead.
-ASKED, SHOWN = 0.2, 0.02
+#: Rows of all runs from which on the memory that an analysis needs is said.
+MANY_ROWS = 20_000
+#: GB; eight runs of 20 s need 1.4 GB.
+MEMORY_PER_ROW = 1.8e-4
+#: rad; a joint that is asked to move more than this ...
+ASKED = 0.2
+#: ... and moves less than this share of it is dead.
+SHOWN = 0.02
 #: Ratio of measured to commanded wheel motion that means a turned sign.
 MIRRORED = -0.5
-#: Correlation of a rate with its angle's turning that means it; rad in half a second by which both must turn, 1 sigma; rows.
-OPPOSITE, TURNED, LEAST_ROWS = -0.8, 0.02, 100
+#: Correlation of a rate with its angle's turning that means a turned sign.
+OPPOSITE = -0.8
+#: rad in half a second by which both must turn, one sigma.
+TURNED = 0.02
+#: Rows that a correlation needs.
+LEAST_ROWS = 100
 #: Mean product of a leg's effort and its lag behind the goal, over the product of their rms, that means a turned sign of the
 #: effort. A servo pushes towards its goal: with the right sign 0.99 in the median, and 0.10 with 0.35 N m of dry friction.
 PUSHES_AWAY = -0.5

@@ -16,15 +16,14 @@ from wlr_gym.data.noise import channel_noise, noise_parts
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters, robot_of
 from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, since_reversal
-from wlr_gym.gap.report.recommendation import SHOWN_BY
-from wlr_gym.gap.robot.candidates import robot_candidates
+from wlr_gym.gap.robot.candidates import robot_candidates, shown_by
 from wlr_gym.gap.robot.clock import RunClock
 from wlr_gym.gap.robot.formulas import formula_candidates, tried_effects
 from wlr_gym.gap.robot.quantities import Knob, knobs, write
 from wlr_gym.gap.robot.recorder import TRUTH, Replays
 from wlr_gym.gap.robot.simulate import KERNELS, PHYSICS_STEP, kernel_of, replay_batch
 from wlr_gym.gap.robot.windows import WINDOW, anchored_residuals
-from wlr_gym.physics.effects import Patch, PatchEffect, Source, apply_patch, load_patch
+from wlr_gym.physics.effects import EFFECTS, Patch, PatchEffect, Source, apply_patch, load_patch
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.forces import MEMORY, Force, features_read
 from wlr_gym.robot import JOINTS, WHEELS, Robot
@@ -33,8 +32,10 @@ from wlr_gym.robot.parameters import Parameters
 Array = NDArray[np.float64]
 
 
-#: Noise units beyond which a residual counts no more in the gap's numbers, and Gauss-Newton steps of a fit.
-CAP, STEPS = 50.0, 3
+#: Noise units beyond which a residual counts no more in the gap's numbers.
+CAP = 50.0
+#: Gauss-Newton steps of a fit.
+STEPS = 3
 #: Noise units that every residual of a simulation that broke down counts.
 LOST = 1e3
 #: See :class:`wlr_gym.gap.problem.Problem`: with 1, what two simulators of one robot do not share moves numbers by two to three
@@ -79,7 +80,7 @@ class RobotProblem:
             raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
         self.cap, self.steps, self.tempering = CAP, STEPS, TEMPERING
         self.disagreement = DISAGREEMENT
-        self.thorough, self.held_out, self.motions = False, (), SHOWN_BY
+        self.thorough, self.held_out, self.motions = False, (), shown_by()
         self.turning: Mapping[str, tuple[str, tuple[str, ...]]] = {
             wheel: (f"joint_position[{wheel}]", tuple(f"{kind}_{wheel}" for kind in ("pos", "vel", "eff"))) for wheel in WHEELS
         }
@@ -222,9 +223,9 @@ class RobotProblem:
     def _possible(self, setting: Setting, probe: Probe) -> bool:
         """Whether a robot can have a probe's effects beside those it has.
 
-        A joint has one Stribeck speed: beside another such effect a probe's may be the same, but no fit could move it.
+        Of some effects a place holds one: beside another such effect a probe's may be the same, but no fit could move it.
         """
-        if _stribeck_joints((*self.known.effects, *setting.effects)) & _stribeck_joints(probe.effects):
+        if _taken((*self.known.effects, *setting.effects)) & _taken(probe.effects):
             return False
         try:
             self.parameters([replace(setting, effects=(*setting.effects, *probe.effects))])
@@ -276,8 +277,10 @@ def _by_slot(forces: Sequence[Force]) -> dict[_Slot, Force]:
     return slots
 
 
-def _stribeck_joints(effects: Iterable[PatchEffect]) -> set[str]:
-    return {joint for effect in effects if effect.name == "stribeck_friction" for joint in effect.where}
+def _taken(effects: Iterable[PatchEffect]) -> set[tuple[str, str]]:
+    """Effects of which a place holds one, and their places."""
+    searches = ((effect, EFFECTS[effect.name].search) for effect in effects if effect.name in EFFECTS)
+    return {(effect.name, place) for effect, search in searches if search and search.one_per_place for place in effect.where}
 
 
 def _with_starts(candidate: Candidate, keys: set[str]) -> Candidate | None:

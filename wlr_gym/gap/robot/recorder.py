@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, Sensors, Truth
+from wlr_gym.robot import FIRST_WHEEL, WHEEL_SLICE
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -32,8 +33,10 @@ TRUTH = (
     "angular_velocity_in_body",
 )
 #: Channels begin as the sensors do: joint positions and speeds, then what only motors and IMU know; the camera follows.
-_MOVED, _READ = SENSOR_LAYOUT.slices["joint_velocity"].stop, SENSOR_LAYOUT.slices["accelerometer"].stop
-_SENSED_VOLT, _VOLT = SENSOR_LAYOUT.slices["supply_voltage"].start, CHANNELS.index("volt")
+_MOVED = SENSOR_LAYOUT.slices["joint_velocity"].stop
+_READ = SENSOR_LAYOUT.slices["accelerometer"].stop
+_SENSED_VOLT = SENSOR_LAYOUT.slices["supply_voltage"].start
+_VOLT = CHANNELS.index("volt")
 _CAMERA = slice(CHANNELS.index("cam_x"), CHANNELS.index("cam_pitch") + 1)
 #: The leading columns of the truth layout: position and quaternion.
 _POSE = TRUTH_LAYOUT.slices["quaternion"].stop
@@ -60,7 +63,7 @@ class Recorder:
         self.clocks, self.settings, self.with_truth = clocks, settings, with_truth
         count = settings * len(clocks)
         self.idle_goals = np.zeros((count, 8))
-        self._wheels = first.joint_position[:, 4:]
+        self._wheels = first.joint_position[:, WHEEL_SLICE]
         self._values = [np.zeros((settings, len(clock.t), len(CHANNELS))) for clock in clocks]
         width = sum(len(TRUTH_LAYOUT.channels[name].elements) for name in TRUTH) if with_truth else 0
         self._truths = [np.zeros((settings, len(clock.t), width)) for clock in clocks]
@@ -75,12 +78,12 @@ class Recorder:
 
     def start(self, readings: Sensors) -> None:
         """Count the wheel angles from where the robots stand."""
-        self._shift = self._wheels - readings.joint_position[:, 4:]
+        self._shift = self._wheels - readings.joint_position[:, WHEEL_SLICE]
 
     def start_anew(self, r: int, tick: int, readings: Sensors, truth: Truth) -> None:
         """Count the wheel angles of one run on after an anchor; what was read before it says nothing about what follows."""
         mine = self._mine(r)
-        self._shift[mine] = truth.joint_position[mine, 4:] - readings.joint_position[mine, 4:]
+        self._shift[mine] = truth.joint_position[mine, WHEEL_SLICE] - readings.joint_position[mine, WHEEL_SLICE]
         self._anchored[r] = tick
 
     def _mine(self, r: int) -> slice:
@@ -150,7 +153,7 @@ def _store(readings: Any, shift: Any, out: Any) -> None:
         for c in range(_READ):
             out[i, c] = readings[i, c]
         for k in range(4):
-            out[i, 4 + k] += shift[i, k]
+            out[i, FIRST_WHEEL + k] += shift[i, k]
         out[i, _VOLT] = readings[i, _SENSED_VOLT]
 
 

@@ -28,7 +28,7 @@ from wlr_gym.physics.plants.forces import Force
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.physics.plants.simulator import Simulator
 from wlr_gym.physics.servo import motor_constants
-from wlr_gym.robot import Robot
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -43,8 +43,8 @@ MOST_ROBOTS = 1024
 KERNELS = ("without effects", "tyres that creep", "all effects")
 
 
-class WrittenGoals:
-    """Goals that arrive at their measured times, each joint's late by its own ``command.delay``."""
+class WrittenSetpoints:
+    """Setpoints that arrive at their measured times, each joint's late by its own ``command.delay``."""
 
     given = True
 
@@ -59,13 +59,13 @@ class WrittenGoals:
         self._tick = 0
 
     def reset(self, rows: NDArray[np.intp], state: PlantState, parameters: Parameters) -> None:
-        """Nothing: the goals are given."""
+        """Nothing: the setpoints are given."""
 
     def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
         """Nothing: the delays are given."""
 
-    def push(self, goals: Array) -> tuple[Array, Array, Array]:
-        """Return the newer goals, the older goals and the time between (s) of the present tick; see GoalHistory.
+    def push(self, setpoints: Array) -> tuple[Array, Array, Array]:
+        """Return the newer setpoints, the older setpoints and the time between (s) of the present tick; see SetpointHistory.
 
         The next call overwrites them.
         """
@@ -76,17 +76,17 @@ class WrittenGoals:
 
 
 @njit(cache=True, nogil=True)
-def _arrive(now: Any, times: Any, goals: Any, delay: Any, rows: Any, newer: Any, older: Any, wait: Any) -> None:
-    """Fill the goals of a tick and move ``rows`` on to those that have arrived."""
+def _arrive(now: Any, times: Any, setpoints: Any, delay: Any, rows: Any, newer: Any, older: Any, wait: Any) -> None:
+    """Fill the setpoints of a tick and move ``rows`` on to those that have arrived."""
     for i in range(len(rows)):
         for j in range(8):
-            older[i, j] = goals[rows[i, j], j]
+            older[i, j] = setpoints[rows[i, j], j]
             due = times[rows[i, j] + 1] + delay[i, j] - now
             wait[i, j] = 0.0
             if due < CLOCK:
                 rows[i, j] += 1
                 wait[i, j] = max(due, 0.0)
-            newer[i, j] = goals[rows[i, j], j]
+            newer[i, j] = setpoints[rows[i, j], j]
 
 
 def replay_batch(
@@ -167,7 +167,7 @@ def _replay_chunk(
         plant.set_force_values(np.tile(constants, (runs, 1)))
     delay = lanes["command.delay"].copy()
     lanes["command.delay"] = 0.0
-    plant.use_goals(WrittenGoals(clocks, run_of, delay))
+    plant.use_setpoints(WrittenSetpoints(clocks, run_of, delay))
     first = _join([_start(clock.run, robot, parameters, clock.begin - clock.t[0]) for clock in clocks])
     try:
         recorder = Recorder(clocks, settings, first, delay, with_truth)
@@ -204,9 +204,9 @@ def _anchor(
     """Put one run's robots where they were measured at the start of a window."""
     anchors, state = clock.anchors, _standing_where_lost(plant, lanes)
     legs = anchors.legs[window] - lanes["joint.zero_offset"][mine]
-    state.joint_position[mine, :4] = legs
-    missing = np.nan_to_num(anchors.effort[window] - readings.joint_effort[mine, 4:])
-    state.reference_position[mine, 4:] += missing * _tension_per_effort(plant.robot, lanes, mine)
+    state.joint_position[mine, LEG_SLICE] = legs
+    missing = np.nan_to_num(anchors.effort[window] - readings.joint_effort[mine, WHEEL_SLICE])
+    state.reference_position[mine, WHEEL_SLICE] += missing * _tension_per_effort(plant.robot, lanes, mine)
     if np.isfinite(anchors.pose[window]).all():
         _place(state, clock, window, mine, lanes)
     kept = {name: readings[name][mine].copy() for name in ("joint_effort", "gyro", "accelerometer", "supply_voltage")}
@@ -233,8 +233,11 @@ def _tension_per_effort(robot: Robot, lanes: Parameters, mine: NDArray[np.bool_]
     """Change of a wheel's reference (rad) that changes its reported effort by 1 N m."""
     nominal = robot.servo.supply_voltage
     constant, _ = motor_constants(robot.servo.wheel.stall_torque, robot.servo.wheel.no_load_speed, nominal)
-    _, resistance = motor_constants(lanes["servo.stall_torque"][mine, 4:], lanes["servo.no_load_speed"][mine, 4:], nominal)
-    return resistance / constant / np.maximum(lanes["servo.kp"][mine, 4:], 1e-9)
+    kp, stall_torque, no_load_speed = (
+        lanes[f"servo.{name}"][mine, WHEEL_SLICE] for name in ("kp", "stall_torque", "no_load_speed")
+    )
+    _, resistance = motor_constants(stall_torque, no_load_speed, nominal)
+    return resistance / constant / np.maximum(kp, 1e-9)
 
 
 def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.bool_], lanes: Parameters) -> None:
@@ -261,15 +264,16 @@ def _start(run: Run, robot: Robot, parameters: Parameters, begin: float) -> Plan
     measured = start_state(run, robot, base)
     state = PlantState(**{name: np.repeat(value, count, axis=0) for name, value in vars(measured).items() if value is not None})
     legs = base["joint.zero_offset"] - parameters["joint.zero_offset"]
-    state.joint_position[:, :4] += legs
-    state.reference_position[:, :4] += legs
+    state.joint_position[:, LEG_SLICE] += legs
+    state.reference_position[:, LEG_SLICE] += legs
     background = standing_state(robot, parameters)
     height = background.position[:, 2] - background.position[:1, 2]
-    moved = rest_pose(parameters, state.joint_position[:, :4]) - rest_pose(parameters, background.joint_position[:, :4])
+    bent, level = state.joint_position[:, LEG_SLICE], background.joint_position[:, LEG_SLICE]
+    moved = rest_pose(parameters, bent) - rest_pose(parameters, level)
     state.position[:, 2] = measured.position[0, 2] + height + (moved - moved[:1])[:, 0]
-    tension = state.reference_position[:, 4:] - state.joint_position[:, 4:]
-    kp = parameters["servo.kp"][:, 4:]
-    state.reference_position[:, 4:] = state.joint_position[:, 4:] + tension * base["servo.kp"][:, 4:] / np.maximum(kp, 1e-9)
+    wheels, reference = state.joint_position[:, WHEEL_SLICE], state.reference_position[:, WHEEL_SLICE]
+    kp, own_kp = base["servo.kp"][:, WHEEL_SLICE], parameters["servo.kp"][:, WHEEL_SLICE]
+    reference[...] = wheels + (reference - wheels) * kp / np.maximum(own_kp, 1e-9)
     state.time = np.full(count, begin)
     return PlantState(**{name: value[1:] for name, value in vars(state).items() if value is not None})
 

@@ -13,18 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.format import CHANNELS
-from wlr_gym.robot import JOINTS
+from wlr_gym.robot import WHEELS
 
 Array = NDArray[np.float64]
 
-#: s; length of a window, and of its beginning in which the camera's frames are not compared.
-WINDOW, BLIND = 2.0, 0.05
+#: s; length of a window.
+WINDOW = 2.0
+#: s; beginning of a window in which the camera's frames are not compared.
+BLIND = 0.05
 _X, _Y, _YAW, _PITCH = (CHANNELS.index(f"cam_{name}") for name in ("x", "y", "yaw", "pitch"))
 #: Rows (0.14 s at 50 Hz) over which bouncing is averaged, and the channels that show it.
 BOUNCE = 7
 _BOUNCING = [CHANNELS.index(name) for name in ("gyro_x", "gyro_y", "acc_z")]
 _CAMERA = [CHANNELS.index(name) for name in CHANNELS if name.startswith("cam_")]
-_WHEELS = [CHANNELS.index(f"pos_{joint}") for joint in JOINTS[4:]]
+_WHEELS = [CHANNELS.index(f"pos_{joint}") for joint in WHEELS]
 
 
 def window_rows(t: Array, length: float = WINDOW) -> list[slice]:

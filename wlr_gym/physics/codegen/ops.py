@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from math import factorial
 from typing import Any
 
@@ -11,6 +11,9 @@ import numpy as np
 from wlr_gym.physics.codegen.graph import Node
 
 Value = Any  # float | numpy array | Node
+Lanes = Mapping[str, Value]
+Out = dict[str, Value]
+Vector = list[Value]
 
 
 def _apply(op: str, reference: Callable[..., Any], *operands: Value) -> Value:

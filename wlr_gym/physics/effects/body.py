@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from wlr_gym.physics.effects.effect import Effect, EffectParameter, Values, add_vector, xyz
+from wlr_gym.physics.effects.search import Change, Coordinate, Coordinates, Guess, Known, Observed, Places, Search, along
 from wlr_gym.physics.model.dynamics import point_inertia
 from wlr_gym.robot.parameters import Parameters
 
@@ -34,6 +35,73 @@ def _add_tether(parameters: Parameters, where: Sequence[str], values: Values) ->
     parameters["tether.stiffness"] = old + values["stiffness"]
 
 
+BODY = (("body",),)
+#: Relations that several effects change.
+BODY_MASS = "mass of the body"
+BODY_FORCE = "force on the body"
+#: kg and m: the load, in the middle and off it along each axis, from which a search starts.
+LOAD = 0.15
+ARM = 0.1
+#: N; the force from which a search starts.
+PULL = 0.5
+#: m; a load is carried no farther from the middle of the body.
+FARTHEST_LOAD = 0.2
+
+
+def _payload_guesses(where: Places, observed: Observed) -> list[Guess]:
+    middle = {"mass": LOAD, "x": 0.0, "y": 0.0, "z": 0.0}
+    loads = (middle, *({**middle, axis: ARM} for axis in "xyz"))
+    moment = ARM * LOAD
+    return [
+        Guess(
+            tuple((Change(load),) for load in loads),
+            lambda a: (max(LOAD * float(a.sum()), 0.0), *(float(v) for v in moment * a[1:])),
+        )
+    ]
+
+
+def _payload_coordinates(where: Places, observed: Observed) -> Coordinates:
+    """Mass and moments, in place of mass and place."""
+    moments = {f"moment_{axis}": Coordinate("kg m", 0.0, -0.2, 0.2, 0.01) for axis in "xyz"}
+    return Coordinates({"mass": Coordinate("kg", 0.0, 0.0, 2.0, 0.1), **moments}, _load, within=_carried)
+
+
+def _carried(values: Sequence[float]) -> tuple[float, ...]:
+    """Mass and moments of a load that is carried no farther out than plausible."""
+    mass = float(values[0])
+    return mass, *(float(np.clip(moment, -mass * FARTHEST_LOAD, mass * FARTHEST_LOAD)) for moment in values[1:])
+
+
+def _load(values: Sequence[float]) -> dict[str, float]:
+    """Mass and place of a load from its mass and moments; none is carried farther out than plausible."""
+    mass = max(float(values[0]), 1e-6)
+    moments = zip("xyz", values[1:], strict=True)
+    return {"mass": mass, **{axis: float(np.clip(moment / mass, -FARTHEST_LOAD, FARTHEST_LOAD)) for axis, moment in moments}}
+
+
+def _pulls() -> tuple[dict[str, float], ...]:
+    return {"fx": PULL, "fy": 0.0}, {"fx": 0.0, "fy": PULL}
+
+
+def _tether_guesses(where: Places, observed: Observed) -> list[Guess]:
+    spring = Change({"stiffness": 1.0, "x": 0.0, "y": 0.0})
+    pulls = ((Change(pull, "external_force"),) for pull in _pulls())
+    return [Guess(((spring,), *pulls), lambda a: (max(float(a[0]), 0.0), *(float(v) for v in PULL * a[1:])))]
+
+
+def _tether_coordinates(where: Places, observed: Observed) -> Coordinates:
+    """Stiffness and the pull at the floor's origin, in place of stiffness and anchor."""
+    pulls = {f"pull_{axis}": Coordinate("N", 0.0, -20.0, 20.0, 0.2) for axis in "xy"}
+    return Coordinates({"stiffness": Coordinate("N/m", 0.0, 0.0, 20.0, 0.5), **pulls}, _anchored)
+
+
+def _anchored(values: Sequence[float]) -> dict[str, float]:
+    """Stiffness and anchor from stiffness and the pull at the floor's origin."""
+    stiffness = max(float(values[0]), 1e-6)
+    pulls = zip("xy", values[1:], strict=True)
+    return {"stiffness": stiffness, **{axis: float(np.clip(pull / stiffness, -1e3, 1e3)) for axis, pull in pulls}}
+
+
 EFFECTS: tuple[Effect, ...] = (
     Effect(
         "payload",
@@ -42,9 +110,23 @@ EFFECTS: tuple[Effect, ...] = (
         ("body",),
         {
             "mass": EffectParameter("kg", "extra mass", 0, 20, 0.0, (0, 2), 0.5),
-            **xyz("m", 0.5, 0.2, (0.08, 0.04, 0.05), "{axis} in the body frame", is_size=False),
+            **xyz("m", 0.5, FARTHEST_LOAD, (0.08, 0.04, 0.05), "{axis} in the body frame", is_size=False),
         },
         _add_payload,
+        search=Search(
+            BODY_MASS,
+            "all_legs",
+            BODY,
+            _payload_guesses,
+            {"mass": Known("body.mass", any_size=True)}
+            | {
+                f"moment_{axis}": Known(
+                    f"body.com_offset[{axis}]", scale=lambda observed: observed.mean("body.mass"), any_size=True
+                )
+                for axis in "xyz"
+            },
+            _payload_coordinates,
+        ),
     ),
     Effect(
         "com_offset",
@@ -53,6 +135,9 @@ EFFECTS: tuple[Effect, ...] = (
         ("body",),
         xyz("m", 0.2, 0.05, (0.02, -0.01, 0.0), "shift along body {axis}"),
         add_vector("body.com_offset", "xyz"),
+        search=Search(
+            BODY_MASS, "all_legs", BODY, known={axis: Known(f"body.com_offset[{axis}]", step=0.005) for axis in "xyz"}
+        ),
     ),
     Effect(
         "external_force",
@@ -64,6 +149,7 @@ EFFECTS: tuple[Effect, ...] = (
             "fy": EffectParameter("N", "along floor y", -1e3, 1e3, 0.0, (-5, 5), 1.0, optional=True),
         },
         add_vector("external_force", ("fx", "fy")),
+        search=Search(BODY_FORCE, "turns", BODY, lambda where, observed: [along(PULL, *_pulls())]),
     ),
     Effect(
         "tether",
@@ -76,5 +162,6 @@ EFFECTS: tuple[Effect, ...] = (
             "y": EffectParameter("m", "anchor, floor frame", -1e3, 1e3, 0.0, (-5, 5), 0.3, optional=True, is_size=False),
         },
         _add_tether,
+        search=Search(BODY_FORCE, "straight", BODY, _tether_guesses, coordinates=_tether_coordinates),
     ),
 )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.robot import Robot
+from wlr_gym.physics.effects.search import Search
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -46,11 +46,9 @@ class EffectParameter:
     optional: bool = False
     is_size: bool = True
 
-    def neutral_for(self, robot: Robot) -> float:
-        """Return the value that changes nothing about ``robot``."""
-        if isinstance(self.neutral, str):
-            return float(Parameters.nominal(robot)[self.neutral].flat[0])
-        return self.neutral
+    def neutral_in(self, parameters: Parameters) -> float:
+        """Return the value that changes nothing about a model with these parameters."""
+        return float(parameters[self.neutral].mean()) if isinstance(self.neutral, str) else float(self.neutral)
 
 
 @dataclass(frozen=True)
@@ -65,6 +63,7 @@ class Effect:
         parameters: its numbers by name.
         apply: writes it into a batch of parameters, in place.
         stage: its place in the order of application, of :data:`STAGES`.
+        search: how measured runs are searched for it; None = they are not.
     """
 
     name: str
@@ -74,6 +73,7 @@ class Effect:
     parameters: Mapping[str, EffectParameter]
     apply: Apply
     stage: str = "addition"
+    search: Search | None = None
 
 
 @dataclass(frozen=True)

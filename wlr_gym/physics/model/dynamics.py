@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.model.equations import assembly_terms, platform_terms
-from wlr_gym.robot import CORNER_SIGNS
+from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, WHEEL_SLICE
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -51,8 +51,8 @@ def inertial_constants(parameters: Parameters) -> dict[str, Array]:
         "leg_izz": leg_inertia[:, :, 2],
         "wheel_transverse": parameters["wheel.transverse_inertia"],
         "wheel_spin": parameters["wheel.spin_inertia"],
-        "armature_leg": armature[:, :4],
-        "armature_wheel": armature[:, 4:],
+        "armature_leg": armature[:, LEG_SLICE],
+        "armature_wheel": armature[:, WHEEL_SLICE],
     }
 
 
@@ -117,8 +117,8 @@ def _add(mass_matrix: Array, bias: Array, entries: dict, rows: dict) -> None:
 
 def absolute_rates(w: Array, joint_velocity: Array) -> tuple[Array, Array]:
     """Return absolute pitch rates of legs and wheels, (N, 4) each, from rates relative to the parent link (N, 8)."""
-    leg_rate = w[:, 1:2] + joint_velocity[:, :4]
-    return leg_rate, leg_rate + joint_velocity[:, 4:]
+    leg_rate = w[:, 1:2] + joint_velocity[:, LEG_SLICE]
+    return leg_rate, leg_rate + joint_velocity[:, WHEEL_SLICE]
 
 
 def absolute_forces(force: Array) -> Array:
@@ -176,7 +176,7 @@ def potential_energy(parameters: Parameters, position: Array, quaternion: Array,
 
 def _first_moment(constants: dict[str, Array], joint_position: Array) -> Array:
     """First moment of the whole robot about the body origin (N, 3), body frame, kg m."""
-    mass, moment, angle = constants["assembly_mass"], constants["first_moment"], joint_position[:, :4]
+    mass, moment, angle = constants["assembly_mass"], constants["first_moment"], joint_position[:, LEG_SLICE]
     x = mass * constants["hip_x"] + moment * np.cos(angle)
     z = mass * constants["hip_z"] - moment * np.sin(angle)
     assemblies = np.stack([x, mass * constants["hip_y"], z], axis=2).sum(axis=1)

@@ -32,7 +32,8 @@ from wlr_gym.physics.model.derivation import (
 
 TARGET = Path(__file__).with_name("equations.py")
 BASE = range(6)
-LEG, WHEEL = 6, 7
+LEG = 6
+WHEEL = 7
 RESULT_KINDS = {"base_mass": "Entries", "base_bias": "Rows", "leg_coupling": "Rows"}
 
 HEADER = '''"""Mass matrix and bias of the robot's equations of motion.

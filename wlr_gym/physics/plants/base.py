@@ -7,17 +7,15 @@ world frame is the floor frame (x, y in the floor, z its normal); on a slope gra
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass
 from numbers import Integral, Real
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.robot import JOINTS, WHEELS, Robot
+from wlr_gym.robot import JOINTS, LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameter_table import XYZ
 from wlr_gym.robot.parameters import Parameters
 
@@ -226,7 +224,7 @@ def standing_state(robot: Robot, parameters: Parameters, leg_angle: float | None
     )
     sag = mass * parameters["gravity"] / parameters["ground.normal_stiffness"].sum(axis=1)
     joints = np.zeros((count, 8))
-    joints[:, :4] = angle
+    joints[:, LEG_SLICE] = angle
     position = np.zeros((count, 3))
     position[:, 2] = height.mean(axis=1) - sag
     quaternion = np.zeros((count, 4))
@@ -280,92 +278,41 @@ class PlantOptions:
         return round(self.control_period / self.physics_step)
 
 
-@dataclass(frozen=True)
-class RobotOptions:
-    """Which real robot, and how it is connected (``backend="dynamixel"``).
-
-    Attributes:
-        hardware: name in ``configs/hardware/`` or path of a YAML file: wiring, mounting, safety limits.
-        ports: bus name or ``imu`` -> device, where it differs from the file's.
-        emulated: an emulated robot in this process and in emulated time, instead of ports.
-        dry_run: do everything but write to the servos: nothing moves.
-        log: folder for the logs of runs; None = none.
-        guard: start the watchdog process, which switches torque off when this one is killed.
-        deadman: s the operator may be silent; None = the hardware file's.
-        effects: what the emulated robot has that its file does not say, as ``effects=`` of a simulator; no environment,
-            policy or log is told of it.
+def check_setpoints(setpoints: Array, count: int) -> Array:
+    """Return setpoints as a float64 (count, 8) matrix.
 
     Raises:
-        InputError: effects for a robot that is not emulated.
+        InputError: wrong shape, or a non-finite setpoint; names robot and joint.
     """
-
-    hardware: str | Path = "nominal"
-    ports: Mapping[str, str] = field(default_factory=dict)
-    emulated: bool = False
-    dry_run: bool = False
-    log: Path | None = None
-    guard: bool = True
-    deadman: float | None = None
-    effects: Any = None
-
-    def __post_init__(self) -> None:
-        if self.effects and not self.emulated:
-            raise InputError("effects: a real robot has its own; they are for simulators and the emulated robot")
-
-
-def read_robot_options(given: object) -> RobotOptions:
-    """Return options from options, the name or path of a hardware file, a mapping of fields, or None.
-
-    Raises:
-        InputError: something else, or an unknown field.
-    """
-    if given is None or isinstance(given, RobotOptions):
-        return given or RobotOptions()
-    if isinstance(given, str | Path):
-        return RobotOptions(hardware=given)
-    if not isinstance(given, Mapping):
-        raise InputError(f"hardware = {given!r}: expected a name, a path or a mapping")
-    valid = [item.name for item in fields(RobotOptions)]
-    for name in given:
-        if name not in valid:
-            raise unknown_name("field", str(name), valid, "hardware")
-    options = RobotOptions(**given)
-    return options if options.log is None else replace(options, log=Path(options.log))
-
-
-def check_goals(goals: Array, count: int) -> Array:
-    """Return goals as a float64 (count, 8) matrix.
-
-    Raises:
-        InputError: wrong shape, or a non-finite goal; names robot and joint.
-    """
-    goals = np.ascontiguousarray(goals, dtype=np.float64)
-    if goals.shape != (count, len(JOINTS)):
-        raise InputError(f"goals have shape {goals.shape}, expected ({count}, {len(JOINTS)})")
-    if not math.isfinite(goals.sum()) and (bad := ~np.isfinite(goals)).any():
+    setpoints = np.ascontiguousarray(setpoints, dtype=np.float64)
+    if setpoints.shape != (count, len(JOINTS)):
+        raise InputError(f"setpoints have shape {setpoints.shape}, expected ({count}, {len(JOINTS)})")
+    if not math.isfinite(setpoints.sum()) and (bad := ~np.isfinite(setpoints)).any():
         row, joint = np.argwhere(bad)[0]
-        raise InputError(f"goal of {JOINTS[joint]} (robot {row} of the batch) is {goals[row, joint]}, expected a finite number")
-    return goals
+        raise InputError(
+            f"setpoint of {JOINTS[joint]} (robot {row} of the batch) is {setpoints[row, joint]}, expected a finite number"
+        )
+    return setpoints
 
 
-def hold_where_off(goals: Array, torque_on: NDArray[np.bool_], present: Array) -> Array:
-    """Return goals in which a motor that is off is told to stay as it is.
+def hold_where_off(setpoints: Array, torque_on: NDArray[np.bool_], present: Array) -> Array:
+    """Return setpoints in which a motor that is off is told to stay as it is.
 
-    As on the servo, whose goal returns to the present position (speed 0) when torque is switched on: what was asked of a
+    As on the servo, whose setpoint returns to the present position (speed 0) when torque is switched on: what was asked of a
     motor while it was off, NaN included, never acts later.
 
     Args:
-        goals: (N, 8).
+        setpoints: (N, 8).
         torque_on: (N, 8).
-        present: (N, 8) goals that keep each joint as it is: leg readings (rad), zero wheel speeds.
+        present: (N, 8) setpoints that keep each joint as it is: leg readings (rad), zero wheel speeds.
 
     Raises:
         InputError: wrong shape.
     """
-    for name, value in (("goals", goals), ("torque_on", torque_on)):
+    for name, value in (("setpoints", setpoints), ("torque_on", torque_on)):
         if np.shape(value) != present.shape:
             raise InputError(f"{name} has shape {np.shape(value)}, expected {present.shape}")
-    return np.where(np.asarray(torque_on, dtype=bool), goals, present)
+    return np.where(np.asarray(torque_on, dtype=bool), setpoints, present)
 
 
 class Plant(Protocol):
@@ -398,8 +345,8 @@ class Plant(Protocol):
         """
         ...
 
-    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
-        """Write goals (N, 8: leg angles rad, wheel speeds rad/s) and advance one control tick.
+    def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+        """Write setpoints (N, 8: leg angles rad, wheel speeds rad/s) and advance one control tick.
 
         ``torque_on`` (N, 8) False leaves a motor open-circuit (free-spinning); None = all on. The returned matrix is
         overwritten by the next step; copy what must be kept.

@@ -17,21 +17,18 @@ supply sag) and ``backlash``. A joint whose own parameters are neutral gets the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import ops
-from wlr_gym.robot import Robot
+from wlr_gym.physics.codegen.ops import Lanes, Out, Value
+from wlr_gym.robot import FIRST_WHEEL, Robot
 from wlr_gym.robot.parameters import Parameters
 
-Value = Any
-Lanes = Mapping[str, Value]
-Out = dict[str, Value]
 Array = NDArray[np.float64]
 
 JOINTS = range(8)
@@ -43,11 +40,7 @@ JOINT_LANES = (
     "half_play", "rotor_inertia", "teeth_stiffness", "teeth_damping",
 )  # fmt: skip
 #: Parameter lanes of the drive.
-DRIVE_LANES: tuple[str, ...] = (
-    "supply",
-    "supply_resistance",
-    *(f"{name}{j}" for name in JOINT_LANES for j in JOINTS),
-)
+DRIVE_LANES: tuple[str, ...] = ("supply", "supply_resistance", *(f"{name}{j}" for name in JOINT_LANES for j in JOINTS))
 #: What a simulator keeps from substep to substep. ``rotor_lead`` is the rotor's angle beyond its joint's (rad, 0 in the
 #: middle of the play), ``rotor_rate`` its rate relative to the parent link (rad/s, at the output shaft).
 STATE: tuple[str, ...] = (
@@ -190,7 +183,7 @@ def command(
     for j, joint in enumerate(joints):
         goal = _goal(lanes, j, time, step)
         old = (lanes[f"reference_position{j}"], lanes[f"reference_velocity{j}"])
-        if j < 4:
+        if j < FIRST_WHEEL:
             new = servo.leg_profile_step(*old, goal, lanes[f"velocity_limit{j}"], lanes[f"acceleration_limit{j}"], step)
         else:
             new = servo.wheel_profile_step(
@@ -337,14 +330,7 @@ def _teeth(lanes: Lanes, j: int, joint: Joint, impulse: Value, damping: Value, b
     rotor_gain = 1.0 / (own + grip)
     share = grip * rotor_gain
     free = momentum - step * spring
-    return Push(
-        impulse=step * spring + share * free,
-        damping=share * own,
-        bound=bound,
-        share=share,
-        rotor_free=free * rotor_gain,
-        rotor_gain=rotor_gain,
-    )
+    return Push(step * spring + share * free, share * own, bound, share, rotor_free=free * rotor_gain, rotor_gain=rotor_gain)
 
 
 def friction_on_rotor(pushed: Push, rate: Value) -> tuple[Value, Value]:

@@ -28,12 +28,11 @@ from wlr_gym.physics.codegen.expression import (
     symbols,
     unit_of,
 )
+from wlr_gym.physics.codegen.ops import Lanes, Value
 from wlr_gym.robot import CORNERS, JOINTS
 from wlr_gym.robot.parameter_table import XYZ
 
 Array = NDArray[np.float64]
-Value = Any  # float | numpy array | Node
-Lanes = Mapping[str, Value]
 
 #: Where a formula may act -> unit of its value. Joints: like the motor's torque, on the child link, its opposite on the parent.
 #: ``body_force``: on the body origin, along the body's axes; ``floor_force``: on the body origin, along the floor's axes;

@@ -7,19 +7,16 @@ fills the parameter lanes from the table. Families of effects that change what i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.codegen.ops import Lanes, Value
 from wlr_gym.robot.parameter_table import PATCHES
 from wlr_gym.robot.parameters import Parameters
 
-Value = Any
-Lanes = Mapping[str, Value]
 Array = NDArray[np.float64]
 
 WHEEL_LANES = (

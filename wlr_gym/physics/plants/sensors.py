@@ -21,7 +21,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import normals4, stream_number, words4
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Channel, Layout, PlantOptions
 from wlr_gym.physics.servo import REGISTER_UNITS, effort_counts
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import FIRST_WHEEL, JOINTS, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameter_table import SPECS, XYZ
 from wlr_gym.robot.parameters import Parameters
 
@@ -48,13 +48,33 @@ _CALIBRATION = (
     "camera.scale",
     "camera.delay",
 )
-_ZERO_OFFSET, _GYRO_BIAS, _ACCEL_BIAS, _MOUNT_YAW, _SCALE, _DELAY, _IMU_TO_BODY = 0, 4, 7, 10, 11, 12, 13
-_WHEEL_ZERO, _START_POSE, _SHOWN_POSE, _PHASE, _POSES = 22, 26, 29, 32, 33
+_ZERO_OFFSET = 0
+_GYRO_BIAS = 4
+_ACCEL_BIAS = 7
+_MOUNT_YAW = 10
+_SCALE = 11
+_DELAY = 12
+_IMU_TO_BODY = 13
+_WHEEL_ZERO = 22
+_START_POSE = 26
+_SHOWN_POSE = 29
+_PHASE = 32
+_POSES = 33
 
 # Entries of the settings vector.
-_PERIOD, _CAMERA_RATE, _NOISY = 0, 1, 2
-_POSITION_COUNT, _VELOCITY_COUNT, _VOLT_COUNT, _EFFORT_COUNTS = 3, 4, 5, 6
-_VOLT_NOISE, _GYRO_NOISE, _ACCEL_NOISE, _CAMERA_NOISE, _YAW_NOISE, _EFFORT_NOISE = 14, 15, 16, 17, 18, 19
+_PERIOD = 0
+_CAMERA_RATE = 1
+_NOISY = 2
+_POSITION_COUNT = 3
+_VELOCITY_COUNT = 4
+_VOLT_COUNT = 5
+_EFFORT_COUNTS = 6
+_VOLT_NOISE = 14
+_GYRO_NOISE = 15
+_ACCEL_NOISE = 16
+_CAMERA_NOISE = 17
+_YAW_NOISE = 18
+_EFFORT_NOISE = 19
 
 # First columns of the signals, as plain numbers for the kernel.
 _RAW_VELOCITY, _RAW_EFFORT, _RAW_GYRO, _RAW_ACCEL, _RAW_VOLT, _RAW_POSE = (
@@ -165,7 +185,7 @@ def _measure(raw: Any, seeds: Any, ticks: Any, settings: Any, states: Any, outs:
         row, state, out = raw[i], states[i], outs[i]
         for k in range(4):
             out[k] = row[k] + state[_ZERO_OFFSET + k]
-            out[4 + k] = row[4 + k] - state[_WHEEL_ZERO + k]
+            out[FIRST_WHEEL + k] = row[FIRST_WHEEL + k] - state[_WHEEL_ZERO + k]
         for k in range(3):
             out[_OUT_GYRO + k] = _in_imu_frame(state, row, _RAW_GYRO, k) + state[_GYRO_BIAS + k]
             out[_OUT_ACCEL + k] = _in_imu_frame(state, row, _RAW_ACCEL, k) + state[_ACCEL_BIAS + k]
@@ -238,7 +258,7 @@ class SensorModel:
         if parameters is not None:
             self.set_errors(rows, parameters)
         self._ticks[rows] = 0
-        self._states[rows, _WHEEL_ZERO:_START_POSE] = raw[rows, 4:8]
+        self._states[rows, _WHEEL_ZERO:_START_POSE] = raw[rows, WHEEL_SLICE]
         self._states[rows, _START_POSE:_SHOWN_POSE] = raw[rows, _RAW_POSE:]
         self._states[rows, _PHASE] = [_camera_phase(seed) for seed in self._seeds[rows]]
         for i in rows:

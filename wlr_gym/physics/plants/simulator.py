@@ -1,4 +1,4 @@
-"""What every simulator does alike: buffers, taking and checking parameters, resets, goals of motors that are off."""
+"""What every simulator does alike: buffers, taking and checking parameters, resets, setpoints of motors that are off."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from wlr_gym.physics.plants.base import (
     PlantState,
     Sensors,
     Truth,
-    check_goals,
+    check_setpoints,
     hold_where_off,
     standing_state,
 )
-from wlr_gym.physics.plants.goals import GoalHistory, Goals
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
-from wlr_gym.robot import Robot
+from wlr_gym.physics.plants.setpoints import SetpointHistory, Setpoints
+from wlr_gym.robot import LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ class Simulator(ABC):
         self._raw = np.zeros((count, RAW_LAYOUT.width))
         self._readings = Sensors(np.zeros((count, SENSOR_LAYOUT.width)))
         self._time: Array = np.zeros(count)
-        self._goals: Goals = GoalHistory(count, self.options.control_period)
+        self._setpoints: Setpoints = SetpointHistory(count, self.options.control_period)
         self._sensors = SensorModel(robot, self.options, count)
 
     def _start(self) -> None:
@@ -103,7 +103,7 @@ class Simulator(ABC):
         start = standing_state(self.robot, self.parameters) if state is None else state
         self._write_state(start, rows)
         self._time[rows] = 0.0 if start.time is None else start.time[rows]
-        self._goals.reset(rows, start, self.parameters)
+        self._setpoints.reset(rows, start, self.parameters)
         self._look(rows)
         self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)
         return self._readings
@@ -112,30 +112,30 @@ class Simulator(ABC):
         """Change parameters in mid-run (interval randomisation, drifting friction); the state stays."""
         rows = self._rows(mask)
         self._take_parameters(parameters, rows)
-        self._goals.set_delays(rows, self.parameters)
+        self._setpoints.set_delays(rows, self.parameters)
         self._sensors.set_errors(rows, self.parameters)
 
-    def use_goals(self, goals: Goals) -> None:
-        """Take the goals from a schedule of one's own instead of the history of those written."""
-        self._goals = goals
+    def use_setpoints(self, setpoints: Setpoints) -> None:
+        """Take the setpoints from a schedule of one's own instead of the history of those written."""
+        self._setpoints = setpoints
 
     def keep_going(self, count: int) -> None:  # noqa: B027 (a simulator may have no use for it)
         """From now on nobody looks at any but the first ``count`` robots: a simulator need not move the others."""
 
-    def _take_goals(self, goals: Array, torque_on: NDArray[np.bool_] | None, on: Array) -> tuple[Array, Array, Array]:
-        """Write into ``on`` (N, 8) which motors are on; return newer goals, older goals and switch time of this tick.
+    def _take_setpoints(self, setpoints: Array, torque_on: NDArray[np.bool_] | None, on: Array) -> tuple[Array, Array, Array]:
+        """Write into ``on`` (N, 8) which motors are on; return newer setpoints, older setpoints and switch time of this tick.
 
         Raises:
-            InputError: wrong shape or a non-finite goal of a motor that is on.
+            InputError: wrong shape or a non-finite setpoint of a motor that is on.
         """
         if torque_on is None:
             on.fill(1.0)
-        elif self._goals.given:
+        elif self._setpoints.given:
             on[...] = torque_on
         else:
-            goals = hold_where_off(goals, torque_on, self._present_goals())
+            setpoints = hold_where_off(setpoints, torque_on, self._present_setpoints())
             on[...] = np.asarray(torque_on, dtype=bool)
-        return self._goals.push(goals if self._goals.given else check_goals(goals, self._count))
+        return self._setpoints.push(setpoints if self._setpoints.given else check_setpoints(setpoints, self._count))
 
     def _rows(self, mask: NDArray[np.bool_] | None) -> Rows:
         if mask is None:
@@ -154,10 +154,10 @@ class Simulator(ABC):
         self.parameters.values[rows] = chosen.values
         self._use_parameters(rows, chosen)
 
-    def _present_goals(self) -> Array:
-        """Goals that keep every joint as it is: leg angles as the servo reads them, wheels at rest."""
+    def _present_setpoints(self) -> Array:
+        """Setpoints that keep every joint as it is: leg angles as the servo reads them, wheels at rest."""
         present = np.zeros((self._count, 8))
-        present[:, :4] = self._truth.joint_position[:, :4] + self.parameters["joint.zero_offset"]
+        present[:, LEG_SLICE] = self._truth.joint_position[:, LEG_SLICE] + self.parameters["joint.zero_offset"]
         return present
 
     def truth(self) -> Truth:

@@ -23,7 +23,7 @@ from wlr_gym.physics.plants.base import (
     PlantState,
     Sensors,
     Truth,
-    check_goals,
+    check_setpoints,
     standing_state,
 )
 from wlr_gym.physics.plants.mujoco.mjcf import build_model
@@ -179,9 +179,9 @@ class MujocoLoopPlant:
             truth.angular_velocity_in_body.copy(), truth.joint_position.copy(), truth.joint_velocity.copy(), reference, speed,
         )  # fmt: skip
 
-    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+    def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick with the servos as actuators."""
-        row = check_goals(goals, 1)[0]
+        row = check_setpoints(setpoints, 1)[0]
         self._data.ctrl[:8] = row
         self._data.ctrl[8:] = row[WHEEL_SLICE]
         mujoco.mj_step(self._model, self._data, nstep=self.options.substeps)

@@ -21,8 +21,9 @@ from wlr_gym.data.format import Profile, RunMeta
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.run_states import standing_at
 from wlr_gym.physics.plants import REAL, SIMULATORS, check_backend, make_plant
-from wlr_gym.physics.plants.base import Plant, PlantOptions, RobotOptions, Sensors
+from wlr_gym.physics.plants.base import Plant, PlantOptions, Sensors
 from wlr_gym.physics.plants.forces import Force
+from wlr_gym.physics.plants.robot_options import RobotOptions
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.physics.servo import from_register
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot

@@ -18,10 +18,10 @@ from wlr_gym.physics.codegen import Graph, Node, emit, graph, hoist, live_nodes,
 from wlr_gym.physics.model import equations
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
-from wlr_gym.physics.plants.gibbs_appell import packing
+from wlr_gym.physics.plants.gibbs_appell import friction, gauss, kinematics, lanes, packing
 from wlr_gym.physics.plants.gibbs_appell import step as source
+from wlr_gym.physics.plants.gibbs_appell.lanes import FORMULA_INPUTS, FORMULA_OUTPUTS, INPUTS, STORED, TICK_SUMS
 from wlr_gym.physics.plants.gibbs_appell.packing import PARAMETER_LANES
-from wlr_gym.physics.plants.gibbs_appell.step import FORMULA_INPUTS, FORMULA_OUTPUTS, INPUTS, STORED, TICK_SUMS
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT
 
 WIDTH = {"float64": 8, "float32": 16}
@@ -51,12 +51,12 @@ def trace(features: frozenset[str]) -> dict[str, dict[str, Any]]:
     owner = Graph()
     lanes = _Lanes(owner)
     step, time = owner.input("step"), owner.input("time")
-    setup = source.kick_setup(lanes, time, step, features)
+    setup = gauss.kick_setup(lanes, time, step, features)
     known = {name: value for name, value in setup.items() if _is_known(value) and name not in STORED}
     inner = _Lanes(owner, known)
     blocks = {
         "setup": {name: value for name, value in setup.items() if name not in known},
-        "sweep": source.kick_sweep(inner, features),
+        "sweep": friction.kick_sweep(inner, features),
         "finish": source.kick_finish(inner, step, features),
     }
     prepare: dict[str, Any] = {}
@@ -245,5 +245,8 @@ def load_kernel(features: frozenset[str], precision: str, width: int, formulas: 
 #: Read at import, so that the key always tells of the code that is loaded.
 _SOURCE_KEY = "\0".join(
     inspect.getsource(module)
-    for module in (source, equations, servo, drive, ground, packing, sys.modules[__name__], ops, graph)
+    for module in (
+        *(source, gauss, friction, kinematics, lanes, packing, sys.modules[__name__]),
+        *(equations, servo, drive, ground, ops, graph),
+    )
 )

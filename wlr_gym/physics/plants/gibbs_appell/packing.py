@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.physics.model.dynamics import gravity_in_floor, inertial_constants
 from wlr_gym.physics.plants import drive, ground
-from wlr_gym.physics.plants.gibbs_appell.step import ASSEMBLY, PLATFORM
-from wlr_gym.robot import Robot
+from wlr_gym.physics.plants.gibbs_appell.lanes import ASSEMBLY, PLATFORM
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ def pack(parameters: Parameters, robot: Robot, step: float) -> Array:
     moved += [inertia["armature_wheel"] + inertia["wheel_spin"]]
     lanes |= drive.pack(parameters, robot, step, np.hstack(moved)) | ground.pack(parameters)
     armature = drive.joint_armature(parameters)
-    inertia["armature_leg"], inertia["armature_wheel"] = armature[:, :4], armature[:, 4:]
+    inertia["armature_leg"], inertia["armature_wheel"] = armature[:, LEG_SLICE], armature[:, WHEEL_SLICE]
     lanes["platform_mass"] = inertia["platform_mass"]
     _spread(lanes, inertia["platform_first_moment"], [f"platform_moment_{a}" for a in "xyz"])
     _spread(lanes, inertia["platform_inertia"], [f"platform_inertia_{a}" for a in ("xx", "yy", "zz", "xy", "xz", "yz")])

@@ -15,9 +15,9 @@ from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors
 from wlr_gym.physics.plants.forces import MEMORY, Force, compile_forces
 from wlr_gym.physics.plants.gibbs_appell import kernel, packing
-from wlr_gym.physics.plants.gibbs_appell.step import STORED
+from wlr_gym.physics.plants.gibbs_appell.lanes import STORED
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
-from wlr_gym.robot import Robot
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -131,10 +131,10 @@ class GibbsAppellPlant(Simulator):
         values = np.zeros((rows.size, len(STORED)))
         quaternion = state.quaternion[rows] / np.linalg.norm(state.quaternion[rows], axis=1, keepdims=True)
         w = state.angular_velocity_in_body[rows]
-        leg_rate = state.joint_velocity[rows, :4] + w[:, 1:2]
-        wheel_rate = state.joint_velocity[rows, 4:] + leg_rate
+        leg_rate = state.joint_velocity[rows, LEG_SLICE] + w[:, 1:2]
+        wheel_rate = state.joint_velocity[rows, WHEEL_SLICE] + leg_rate
         zero_offset = np.zeros((rows.size, 8))
-        zero_offset[:, :4] = self.parameters["joint.zero_offset"][rows]
+        zero_offset[:, LEG_SLICE] = self.parameters["joint.zero_offset"][rows]
         reference = state.reference_position[rows] + zero_offset
         groups = {
             "p{}": (state.position[rows], "xyz"),
@@ -143,8 +143,8 @@ class GibbsAppellPlant(Simulator):
             "w{}": (w, "xyz"),
             "last_w{}": (w, "xyz"),
             "gyro_{}": (w, "xyz"),
-            "leg_angle{}": (state.joint_position[rows, :4], range(4)),
-            "wheel_angle{}": (state.joint_position[rows, 4:], range(4)),
+            "leg_angle{}": (state.joint_position[rows, LEG_SLICE], range(4)),
+            "wheel_angle{}": (state.joint_position[rows, WHEEL_SLICE], range(4)),
             "leg_rate{}": (leg_rate, range(4)),
             "last_leg_rate{}": (leg_rate, range(4)),
             "wheel_rate{}": (wheel_rate, range(4)),
@@ -178,7 +178,7 @@ class GibbsAppellPlant(Simulator):
             return np.stack([values[:, _LANE[pattern.format(label)]] for label in labels], axis=1)  # type: ignore[union-attr]
 
         reference = columns("reference_position{}", range(8))
-        reference[:, :4] -= self.parameters["joint.zero_offset"]
+        reference[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
         has_play = self.parameters["servo.backlash"] > 0.0
         return PlantState(
             position=columns("p{}", "xyz"),
@@ -215,13 +215,18 @@ class GibbsAppellPlant(Simulator):
         going = -(-count // self._width)
         self._chunks = [(0, going)] if self._pool is None else self._shared_out(going)
 
-    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+    def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick; see :meth:`wlr_gym.physics.plants.base.Plant.step`.
 
         Raises:
-            InputError: wrong shape or a non-finite goal of a motor that is on.
+            InputError: wrong shape or a non-finite setpoint of a motor that is on.
         """
-        inputs = (*self._take_goals(goals, torque_on, self._torque_on), self._torque_on, self._formula_values, self._memory)
+        inputs = (
+            *self._take_setpoints(setpoints, torque_on, self._torque_on),
+            self._torque_on,
+            self._formula_values,
+            self._memory,
+        )
         if self._formulas:  # in full precision: single precision would lose it step by step
             _scatter(self._memory, self._width, self._all, self._time[:, None], slice(0, 1))
         arguments = (self._lanes, self._constants, *inputs, self._truth.values, self._raw)

@@ -19,6 +19,7 @@ from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import Graph, emit, graph, live_nodes, load_module, ops
 from wlr_gym.physics.plants import drive, forces, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
+from wlr_gym.physics.plants.gibbs_appell import kinematics, lanes
 from wlr_gym.physics.plants.gibbs_appell import step as engine
 from wlr_gym.physics.plants.mujoco import step as source
 from wlr_gym.physics.plants.mujoco.packing import PARAMETER_LANES
@@ -161,5 +162,9 @@ def load_kernel() -> ModuleType:
 
 #: Read at import, so that the key always tells of the code that is loaded.
 _SOURCE_KEY = "\0".join(
-    inspect.getsource(module) for module in (source, engine, drive, ground, forces, servo, sys.modules[__name__], ops, graph)
+    inspect.getsource(module)
+    for module in (
+        *(source, engine, kinematics, lanes, sys.modules[__name__]),
+        *(drive, ground, forces, servo, ops, graph),
+    )
 ) + "\0".join(PARAMETER_LANES)

@@ -31,7 +31,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.robot import CORNER_SIGNS, JOINTS, LEGS, WHEELS, Robot, standing_height
+from wlr_gym.robot import CORNER_SIGNS, FIRST_WHEEL, JOINTS, LEGS, WHEELS, Robot, standing_height
 from wlr_gym.robot.parameters import Parameters
 
 WheelShape = Literal["sphere", "capsule"]
@@ -175,7 +175,7 @@ def _add_assembly(body: mujoco.MjsBody, robot: Robot, row: Parameters, corner: i
     transverse = row["wheel.transverse_inertia"][0, corner]
     inertia = np.array([transverse, row["wheel.spin_inertia"][0, corner], transverse])
     _set_inertia(wheel, row["wheel.mass"][0, corner], np.zeros(3), inertia)
-    _add_joint(wheel, row, 4 + corner, 0.0)
+    _add_joint(wheel, row, FIRST_WHEEL + corner, 0.0)
     _add_wheel_geoms(wheel, robot, radius, shape)
 
 

@@ -16,7 +16,7 @@ from wlr_gym.physics.plants.mujoco.batch import RobotBatch
 from wlr_gym.physics.plants.mujoco.kernel import addresses, load_kernel
 from wlr_gym.physics.plants.mujoco.step import STATE, TICK_SUMS
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
-from wlr_gym.robot import Robot
+from wlr_gym.robot import LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -101,7 +101,7 @@ class MujocoPlant(Simulator):
         velocity = np.einsum("nij,nj->ni", rotation, state.linear_velocity_in_body[rows])
         w, rates = state.angular_velocity_in_body[rows], state.joint_velocity[rows]
         reference = state.reference_position[rows].copy()
-        reference[:, :4] += self.parameters["joint.zero_offset"][rows]
+        reference[:, LEG_SLICE] += self.parameters["joint.zero_offset"][rows]
         still = -np.einsum("nji,nj->ni", rotation, gravity_in_floor(self.parameters)[rows])
         values = np.zeros((rows.size, len(STATE)))
         groups = {
@@ -134,7 +134,7 @@ class MujocoPlant(Simulator):
 
         truth = self._truth
         reference = columns("reference_position")
-        reference[:, :4] -= self.parameters["joint.zero_offset"]
+        reference[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
         has_play = self.parameters["servo.backlash"] > 0.0
         return PlantState(
             position=truth.position.copy(),
@@ -158,13 +158,13 @@ class MujocoPlant(Simulator):
         """Take the constants of the formula forces per robot; see :class:`wlr_gym.physics.plants.simulator.Simulator`."""
         self._force_values = np.ascontiguousarray(values.T)
 
-    def step(self, goals: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
+    def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick; see :meth:`wlr_gym.physics.plants.base.Plant.step`.
 
         Raises:
-            InputError: wrong shape or a non-finite goal of a motor that is on.
+            InputError: wrong shape or a non-finite setpoint of a motor that is on.
         """
-        for target, values in zip(self._inputs, self._take_goals(goals, torque_on, self._inputs[3]), strict=False):
+        for target, values in zip(self._inputs, self._take_setpoints(setpoints, torque_on, self._inputs[3]), strict=False):
             target[...] = values
         self._tick()
         self._sensors.measure(self._raw, self._readings.values)

@@ -25,26 +25,22 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.forces import COORDINATES
-from wlr_gym.physics.plants.forces import INPUTS as INPUTS_OF_FORMULAS
 from wlr_gym.physics.plants.gibbs_appell import step as engine
-from wlr_gym.physics.plants.gibbs_appell.step import (
-    AXES,
-    CORNERS,
+from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     cross,
     dot,
     floor_axes,
     rotation_rows,
+    slip_velocity,
     to_body,
     vector,
     wheel_points,
 )
-
-Value = Any
-Lanes = Mapping[str, Value]
-Out = dict[str, Value]
-Vector = list[Value]
+from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, INPUTS_OF_FORMULAS
+from wlr_gym.robot import FIRST_WHEEL
 
 #: Families of effects: always all, so that no robot's bits can depend on what its neighbours have.
 FEATURES = frozenset({"drive", "backlash", "ground", "creep"})
@@ -58,7 +54,7 @@ POSITION: tuple[str, ...] = (
 VELOCITY: tuple[str, ...] = (
     *(f"u{a}" for a in AXES),
     *(f"w{a}" for a in AXES),
-    *(f"joint_rate{j}" for i in CORNERS for j in (i, 4 + i)),
+    *(f"joint_rate{j}" for i in CORNERS for j in (i, FIRST_WHEEL + i)),
 )
 #: MuJoCo's results by lane: ``qfrc_constraint`` and the contact sensors (force on the wheel, floor frame).
 CONSTRAINT: tuple[str, ...] = tuple(f"constraint_{name}" for name in VELOCITY)
@@ -91,7 +87,8 @@ TICK_SUMS: tuple[str, ...] = STATE[-10:]
 CAPSULE_HALF_LENGTH = 0.01
 CAPSULE_LEAN = math.pi / 6
 #: Gains of the integral hold of rolling resistance on the spin and on its change, in wheel inertia over the step.
-HOLD_SPIN, HOLD_CHANGE = 0.2, 0.8
+HOLD_SPIN = 0.2
+HOLD_CHANGE = 0.8
 #: Above this many steps of braking by its bound, rolling resistance brakes fully.
 HOLD_REACH = 8.0
 #: MuJoCo's smallest friction coefficient.
@@ -123,7 +120,7 @@ def with_engine_rates(lanes: Lanes) -> Lanes:
     added: Out = {f"v{a}": value for a, value in zip(AXES, body, strict=True)}
     for i in CORNERS:
         added[f"leg_rate{i}"] = lanes["wy"] + lanes[f"joint_rate{i}"]
-        added[f"wheel_rate{i}"] = added[f"leg_rate{i}"] + lanes[f"joint_rate{4 + i}"]
+        added[f"wheel_rate{i}"] = added[f"leg_rate{i}"] + lanes[f"joint_rate{FIRST_WHEEL + i}"]
     return Overlay(lanes, added)
 
 
@@ -133,7 +130,7 @@ def drift(lanes: Lanes, duration: Value) -> Out:
     out: Out = {name: moved[name] for name in POSITION}
     out |= {f"p{a}": lanes[f"p{a}"] + duration * lanes[f"u{a}"] for a in AXES}
     for j in range(8):
-        name = f"{'leg' if j < 4 else 'wheel'}_angle{j % 4}"
+        name = f"{'leg' if j < FIRST_WHEEL else 'wheel'}_angle{j % FIRST_WHEEL}"
         out[name] = lanes[name] + duration * lanes[f"joint_rate{j}"]
     return out | _drift_of_rotors(lanes, duration)
 
@@ -166,8 +163,9 @@ def before(lanes: Lanes, time: Value, step: Value) -> Out:
 
 
 def _joint(lanes: Lanes, j: int) -> drive.Joint:
-    if j >= 4:
-        return drive.Joint(lanes[f"wheel_angle{j - 4}"], lanes[f"joint_rate{j}"], lanes[f"wheel_angle{j - 4}"])
+    if j >= FIRST_WHEEL:
+        angle = lanes[f"wheel_angle{j - FIRST_WHEEL}"]
+        return drive.Joint(angle, lanes[f"joint_rate{j}"], angle)
     return drive.Joint(lanes[f"leg_angle{j}"], lanes[f"joint_rate{j}"], lanes[f"leg_angle{j}"] + lanes[f"zero_offset{j}"])
 
 
@@ -228,8 +226,8 @@ def _push_wheel(
 
     push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * dot(n, velocity), 0.0)
     normal = ops.where_positive(-gap, push, 0.0)
-    spin_inertia = lanes[f"wheel_spin{i}"] + out[f"armature_joint_rate{4 + i}"]
-    rolling = _rolling_torque(lanes, i, normal, lanes[f"wheel_spin{i}"] + lanes[f"joint_armature{4 + i}"], step)
+    spin_inertia = lanes[f"wheel_spin{i}"] + out[f"armature_joint_rate{FIRST_WHEEL + i}"]
+    rolling = _rolling_torque(lanes, i, normal, lanes[f"wheel_spin{i}"] + lanes[f"joint_armature{FIRST_WHEEL + i}"], step)
     out[f"rolling_torque{i}"], out[f"old_spin{i}"] = rolling, lanes[f"wheel_rate{i}"]
     creep = _creep_force(lanes, i, mu, normal, slip, speed, spin_inertia, step)
     for k, a in enumerate("xy"):
@@ -243,13 +241,13 @@ def _push_wheel(
     swing = arm[2] * force[0] - arm[0] * force[2]
     applied[f"joint_rate{i}"] = applied[f"joint_rate{i}"] + (swing + rolling)
     spin = rim[2] * force[0] - rim[0] * force[2]
-    applied[f"joint_rate{4 + i}"] = applied[f"joint_rate{4 + i}"] + (spin + rolling)
+    applied[f"joint_rate{FIRST_WHEEL + i}"] = applied[f"joint_rate{FIRST_WHEEL + i}"] + (spin + rolling)
 
 
 def _point_velocity(lanes: Lanes, i: int, point: Vector, arm: Vector, rim: Vector) -> Vector:
     """Velocity of the contact point of wheel ``i``, body frame."""
     turned = cross(vector(lanes, "w"), point)
-    leg_rate, wheel_rate = lanes[f"joint_rate{i}"], lanes[f"joint_rate{4 + i}"]
+    leg_rate, wheel_rate = lanes[f"joint_rate{i}"], lanes[f"joint_rate{FIRST_WHEEL + i}"]
     swing = [leg_rate * arm[2] + wheel_rate * rim[2], 0.0, -(leg_rate * arm[0] + wheel_rate * rim[0])]
     return [lanes[f"v{a}"] + turned[k] + swing[k] for k, a in enumerate(AXES)]
 
@@ -361,7 +359,7 @@ def _read_wheel(lanes: Lanes, i: int, out: Out) -> None:
     along, across, normal = c * floor[0] + s * floor[1], c * floor[1] - s * floor[0], floor[2]
     moment = lanes[f"leg_arm_x{i}"] * along + lanes[f"leg_arm_y{i}"] * across + lanes[f"leg_arm_z{i}"] * normal
     out[f"gear_torque{i}"] = lanes[f"constraint_joint_rate{i}"] - moment
-    out[f"gear_torque{4 + i}"] = lanes[f"constraint_joint_rate{4 + i}"] + lanes[f"radius{i}"] * along
+    out[f"gear_torque{FIRST_WHEEL + i}"] = lanes[f"constraint_joint_rate{FIRST_WHEEL + i}"] + lanes[f"radius{i}"] * along
     out[f"force_x{i}"], out[f"force_y{i}"] = along + lanes[f"own_force_x{i}"], across + lanes[f"own_force_y{i}"]
     out[f"force_z{i}"] = normal
 
@@ -371,7 +369,7 @@ def _add_slip(lanes: Lanes, step: Value, out: Out) -> None:
     twist = [*vector(lanes, "v"), *vector(lanes, "w")]
     for i in CORNERS:
         points = wheel_points(lanes, i, *ops.sin_cos(lanes[f"leg_angle{i}"]), n, scale)
-        slip = engine.slip_velocity(lanes, i, points, heading, lateral, twist)
+        slip = slip_velocity(lanes, i, points, heading, lateral, twist)
         for a, speed in zip("xy", slip, strict=True):
             out[f"slip_displacement_{a}{i}"] = lanes[f"slip_displacement_{a}{i}"] + step * speed
 

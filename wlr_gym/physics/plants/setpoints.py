@@ -1,4 +1,4 @@
-"""Delayed goals: a command acts some time after it was written, per joint and robot."""
+"""Delayed setpoints: a command acts some time after it was written, per joint and robot."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.plants.base import PlantState
+from wlr_gym.robot import LEG_SLICE
 from wlr_gym.robot.parameter_table import SPECS
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
 
-class Goals(Protocol):
-    """Where a simulator gets the goals of a tick from; see :class:`GoalHistory`.
+class Setpoints(Protocol):
+    """Where a simulator gets the setpoints of a tick from; see :class:`SetpointHistory`.
 
     Attributes:
         given: they come from elsewhere; what is written to the simulator is ignored.
@@ -27,13 +28,13 @@ class Goals(Protocol):
 
     def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None: ...
 
-    def push(self, goals: Array) -> tuple[Array, Array, Array]: ...
+    def push(self, setpoints: Array) -> tuple[Array, Array, Array]: ...
 
 
-class GoalHistory:
-    """Ring of the last goals, from which each joint reads at its own ``command.delay``.
+class SetpointHistory:
+    """Ring of the last setpoints, from which each joint reads at its own ``command.delay``.
 
-    Within one control tick a joint follows the older of two neighbouring goals until ``switch_time``, then the newer one.
+    Within one control tick a joint follows the older of two neighbouring setpoints until ``switch_time``, then the newer one.
     """
 
     given = False
@@ -48,28 +49,28 @@ class GoalHistory:
         self._delayed = False
 
     def reset(self, rows: NDArray[np.intp], state: PlantState, parameters: Parameters) -> None:
-        """Forget old goals: legs are told to stay where their reference is, wheels to keep their reference speed.
+        """Forget old setpoints: legs are told to stay where their reference is, wheels to keep their reference speed.
 
-        Goals are in terms of the reading, references in terms of the true angle.
+        Setpoints are in terms of the reading, references in terms of the true angle.
         """
         hold = state.reference_velocity[rows].copy()
-        hold[:, :4] = state.reference_position[rows, :4] + parameters["joint.zero_offset"][rows]
+        hold[:, LEG_SLICE] = state.reference_position[rows, LEG_SLICE] + parameters["joint.zero_offset"][rows]
         self._ring[:, rows] = hold
         self.set_delays(rows, parameters)
 
     def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
-        """Take new delays; goals already written act at their new time."""
+        """Take new delays; setpoints already written act at their new time."""
         delay = parameters["command.delay"][rows]
         self._ticks[rows] = np.floor(delay / self._period + 1e-9)
         self._switch_time[rows] = np.maximum(delay - self._ticks[rows] * self._period, 0.0)
         self._delayed = bool(parameters["command.delay"].any())
 
-    def push(self, goals: Array) -> tuple[Array, Array, Array]:
-        """Take this tick's goals (N, 8); return the newer goals, the older goals and the switch time (s), each (N, 8)."""
+    def push(self, setpoints: Array) -> tuple[Array, Array, Array]:
+        """Take this tick's setpoints (N, 8); return the newer and the older ones and the switch time (s), each (N, 8)."""
         self._head = (self._head + 1) % len(self._ring)
-        self._ring[self._head] = goals
+        self._ring[self._head] = setpoints
         if not self._delayed:
-            return goals, goals, self._switch_time
+            return setpoints, setpoints, self._switch_time
         return self._at(self._ticks), self._at(self._ticks + 1), self._switch_time
 
     def _at(self, ticks: NDArray[np.intp]) -> Array:

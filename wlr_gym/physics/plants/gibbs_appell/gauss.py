@@ -1,0 +1,335 @@
+"""The kick's Gauss problem: mass matrix, free motion, friction rows and their bounds, at the middle position of a step.
+
+Legs and wheels are taken out of the system, so that a 6x6 base matrix is left; its Cholesky factor whitens the friction rows,
+which :mod:`wlr_gym.physics.plants.gibbs_appell.friction` then solves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
+from wlr_gym.physics.model.equations import assembly_terms, platform_terms
+from wlr_gym.physics.plants import drive, ground
+from wlr_gym.physics.plants.gibbs_appell.kinematics import (
+    contact_place,
+    contact_row,
+    dot,
+    floor_axes,
+    joints_of,
+    rotation_rows,
+    slip_velocity,
+    to_body,
+    vector,
+    wheel_points,
+)
+from wlr_gym.physics.plants.gibbs_appell.lanes import ASSEMBLY, AXES, CORNERS, PLATFORM
+from wlr_gym.robot import FIRST_WHEEL, JOINTS
+
+
+@dataclass
+class Corner:
+    """One leg with its wheel while the Gauss problem is being set up.
+
+    Attributes:
+        coupling: leg-rate column of the mass matrix against the six base rows.
+        leg_leg, leg_wheel, wheel_wheel: its own 2x2 block.
+        leg_bias, wheel_bias: velocity-dependent inertia terms.
+        hip, leg, rim: geometry in the body frame, see :func:`wheel_points`.
+        block, inverse: the 2x2 block with implicit damping as (11, 12, 22), and its inverse.
+        free: free motion of the pair for a resting base.
+    """
+
+    coupling: Vector
+    leg_leg: Value
+    leg_wheel: Value
+    wheel_wheel: Value
+    leg_bias: Value
+    wheel_bias: Value
+    trig: tuple[Value, Value]
+    hip: Vector = field(default_factory=list)
+    leg: Vector = field(default_factory=list)
+    rim: Vector = field(default_factory=list)
+    block: tuple[Value, Value, Value] = (0.0, 0.0, 0.0)
+    inverse: tuple[Value, Value, Value] = (0.0, 0.0, 0.0)
+    free: tuple[Value, Value] = (0.0, 0.0)
+
+
+def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str]) -> Out:
+    """Build the Gauss problem of one substep: reduced base matrix, free motion, friction rows, impulse bounds."""
+    rows = rotation_rows(lanes)
+    n, heading, lateral, scale = floor_axes(rows)
+    gravity = to_body(rows, vector(lanes, "gravity_"))
+    v, w = vector(lanes, "v"), vector(lanes, "w")
+    u_base = [*(v[k] + step * gravity[k] for k in range(3)), *w]  # uniform gravity accelerates every point alike
+    w_mid = [1.5 * w[k] - 0.5 * lanes[f"last_w{a}"] for k, a in enumerate(AXES)]
+    joints = joints_of(lanes)
+    out, voltages = drive.command(lanes, joints, time, step, features)
+    mass, bias, corners = _inertia(lanes, w_mid)
+
+    momentum: list[Value] = [dot(mass[r], u_base) - step * bias[r] for r in range(6)]
+    _push_of_surroundings(lanes, rows, step, features, momentum)
+    reduced = [row[:] for row in mass]
+    for i, corner in enumerate(corners):
+        leg_rate, wheel_rate = lanes[f"leg_rate{i}"], lanes[f"wheel_rate{i}"]
+        for r in range(6):
+            momentum[r] = momentum[r] + corner.coupling[r] * leg_rate
+        own = [
+            dot(corner.coupling, u_base) + corner.leg_leg * leg_rate + corner.leg_wheel * wheel_rate - step * corner.leg_bias,
+            corner.leg_wheel * leg_rate + corner.wheel_wheel * wheel_rate - step * corner.wheel_bias,
+        ]
+        corner.hip, corner.leg, corner.rim = wheel_points(lanes, i, *corner.trig, n, scale)
+        _push_of_floor(lanes, i, corner, n, [*v, *w], step, momentum, own, out)
+        damping = _push_of_motors(lanes, i, voltages, joints, step, features, momentum, own, out)
+        _friction_under_wheel(lanes, i, corner, (rows, heading, lateral), [*v, *w], features, out)
+        _eliminate(corner, damping, own, momentum, reduced)
+
+    lower, inverse_diagonal = _cholesky(reduced)
+
+    def whiten(b: Vector) -> Vector:
+        x: Vector = []
+        for r in range(6):
+            s = b[r]
+            for k in range(r):
+                s = s - lower[r][k] * x[k]
+            x.append(s * inverse_diagonal[r])
+        return x
+
+    base = whiten(momentum)
+    hinge = whiten([0.0, 0.0, 0.0, 0.0, -1.0, 0.0])
+    for i, corner in enumerate(corners):
+        white = whiten(corner.coupling)
+        for r in range(6):
+            out[f"coupling{i}_{r}"] = corner.coupling[r]
+        out[f"i11_{i}"], out[f"i12_{i}"] = corner.inverse[0], corner.inverse[1]
+        out[f"a11_{i}"], out[f"a12_{i}"], out[f"a22_{i}"] = corner.block
+        out[f"y_leg{i}"], out[f"y_wheel{i}"] = corner.free
+        _warm_start(lanes, i, step, features, out)
+        # friction rows: (base part, leg entry, wheel entry, impulse)
+        local = {
+            f"leg{i}": (hinge, 1.0, 0.0, out[f"share{i}"] * out[f"gear_friction{i}"]),
+            f"wheel{i}": ([0.0] * 6, -1.0, 1.0, out[f"share{FIRST_WHEEL + i}"] * out[f"gear_friction{FIRST_WHEEL + i}"]),
+        }
+        if "rolling_resistance" in features:
+            local[f"rolling{i}"] = ([0.0] * 6, 0.0, 1.0, out[f"rolling_friction{i}"])
+        for e, name, wheel_entry in ((heading, "x", -lanes[f"radius{i}"]), (lateral, "y", 0.0)):
+            base_row, leg_entry = contact_row(corner.hip, corner.leg, corner.rim, e)
+            local[f"{name}{i}"] = (whiten(base_row), leg_entry, wheel_entry, out[f"friction_{name}{i}"])
+            out[f"leg_entry_{name}{i}"] = leg_entry
+        _friction_rows(lanes, i, corner, white, local, base, out)
+    for r in range(6):
+        out[f"base{r}"] = base[r]
+        out[f"inverse_diagonal{r}"] = inverse_diagonal[r]
+        for c in range(r):
+            out[f"lower{r}{c}"] = lower[r][c]
+    return out
+
+
+def _inertia(lanes: Lanes, w_mid: Vector) -> tuple[list[list[Value]], list[Value], list[Corner]]:
+    """Mass matrix and bias of the base, and the four corners, from the generated Gibbs-Appell equations."""
+    mass: list[list[Value]] = [[0.0 for _ in range(6)] for _ in range(6)]
+    bias: list[Value] = [0.0] * 6
+    platform_mass, platform_bias = platform_terms(*(lanes[name] for name in PLATFORM), *w_mid)
+    _accumulate(mass, bias, platform_mass, platform_bias)
+    corners: list[Corner] = []
+    for i in CORNERS:
+        sine, cosine = ops.sin_cos(lanes[f"leg_angle{i}"])
+        mid_rates = [1.5 * lanes[f"{name}{i}"] - 0.5 * lanes[f"last_{name}{i}"] for name in ("leg_rate", "wheel_rate")]
+        arguments = [*(lanes[f"{name}{i}"] for name in ASSEMBLY), sine, cosine, *w_mid, *mid_rates]
+        base_mass, base_bias, coupling, *own = assembly_terms(*arguments)
+        _accumulate(mass, bias, base_mass, base_bias)
+        corners.append(Corner([coupling.get(r, 0.0) for r in range(6)], *own, trig=(sine, cosine)))
+    return mass, bias, corners
+
+
+def _push_of_floor(
+    lanes: Lanes, i: int, corner: Corner, n: Vector, twist: Vector, step: Value, momentum: Vector, own: Vector, out: Out
+) -> None:
+    """Add the normal impulse of wheel ``i``."""
+    base_row, leg_entry = contact_row(corner.hip, corner.leg, corner.rim, n)
+    normal, gap_rate = _normal_force(lanes, i, corner, n, dot(base_row, twist) + leg_entry * lanes[f"leg_rate{i}"])
+    out[f"normal{i}"], out[f"last_gap_rate{i}"] = normal, gap_rate
+    for r in range(6):
+        momentum[r] = momentum[r] + (step * normal) * base_row[r]
+    own[0] = own[0] + (step * normal) * leg_entry
+
+
+def _push_of_surroundings(
+    lanes: Lanes, rows: Sequence[Sequence[Value]], step: Value, features: frozenset[str], momentum: Vector
+) -> None:
+    """Add the impulses of external force, tether and formula forces on the body."""
+    pull = [lanes[f"external_{a}"] - lanes["tether_stiffness"] * (lanes[f"p{a}"] - lanes[f"anchor_{a}"]) for a in "xy"]
+    force = to_body(rows, [*pull, 0.0])
+    for k in range(3):
+        momentum[k] = momentum[k] + step * force[k]
+    if "forces" not in features:
+        return
+    on_floor = to_body(rows, [lanes[f"formula_floor_force_{a}"] for a in AXES])
+    for k, (a, turn) in enumerate(zip(AXES, ("roll", "pitch", "yaw"), strict=True)):
+        momentum[k] = momentum[k] + step * (lanes[f"formula_body_force_{a}"] + on_floor[k])
+        momentum[3 + k] = momentum[3 + k] + step * lanes[f"formula_body_torque_{turn}"]
+
+
+def _push_of_motors(
+    lanes: Lanes,
+    i: int,
+    voltages: Vector,
+    joints: Sequence[drive.Joint],
+    step: Value,
+    features: frozenset[str],
+    momentum: Vector,
+    own: Vector,
+    out: Out,
+) -> tuple[Value, Value]:
+    """Add the explicit impulses on both joints of leg ``i``; return their implicit damping (times the step)."""
+    pushes: list[drive.Push] = []
+    for j in (i, FIRST_WHEEL + i):
+        pushed = drive.push(lanes, j, voltages[j], joints[j], step, step, features)
+        pushes.append(pushed)
+        out[f"drive{j}"], out[f"friction_bound{j}"] = voltages[j], pushed.bound
+        out |= drive.kept_for_finish(pushed, j)
+    leg, wheel = pushes
+    momentum[4] = momentum[4] - leg.impulse
+    own[0] = own[0] + leg.impulse - wheel.impulse
+    own[1] = own[1] + wheel.impulse
+    if "forces" in features:
+        leg_torque, wheel_torque = (lanes[f"formula_{JOINTS[j]}"] for j in (i, FIRST_WHEEL + i))
+        momentum[4] = momentum[4] - step * leg_torque
+        own[0] = own[0] + step * (leg_torque - wheel_torque)
+        own[1] = own[1] + step * wheel_torque
+    return leg.damping, wheel.damping
+
+
+def _friction_under_wheel(
+    lanes: Lanes,
+    i: int,
+    corner: Corner,
+    axes: tuple[Sequence[Sequence[Value]], Vector, Vector],
+    twist: Vector,
+    features: frozenset[str],
+    out: Out,
+) -> None:
+    """Find the friction coefficients under wheel ``i``, at its place and slip at the start of the kick."""
+    place: list[Value] = [0.0, 0.0]
+    speed: Value = 0.0
+    if "ground" in features:
+        rows, heading, lateral = axes
+        points = (corner.hip, corner.leg, corner.rim)
+        place = contact_place(lanes, rows, points)
+        slip = slip_velocity(lanes, i, points, heading, lateral, twist)
+        speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
+    found = ground.friction(lanes, i, place[0], place[1], speed, features)
+    out[f"acting_mu_x{i}"], out[f"acting_mu_y{i}"] = found.mu_x, found.mu_y
+    out[f"acting_inverse_mu_x{i}"], out[f"acting_inverse_mu_y{i}"] = found.inverse_mu_x, found.inverse_mu_y
+
+
+def _eliminate(corner: Corner, damping: tuple[Value, Value], own: Vector, momentum: Vector, reduced: list[list[Value]]) -> None:
+    """Take leg and wheel out of the system: Schur complement onto the base."""
+    leg_damping, wheel_damping = damping
+    on_base = ops.rounded(leg_damping)  # a constant where the gear is rigid; rounded like one where it has play
+    reduced[4][4] = reduced[4][4] + on_base
+    corner.coupling = [*corner.coupling[:4], corner.coupling[4] - on_base, corner.coupling[5]]
+    a11 = corner.leg_leg + leg_damping + wheel_damping
+    a12 = corner.leg_wheel - wheel_damping
+    a22 = corner.wheel_wheel + wheel_damping
+    determinant = 1.0 / (a11 * a22 - a12 * a12)
+    i11, i12, i22 = a22 * determinant, -(a12 * determinant), a11 * determinant
+    corner.block, corner.inverse = (a11, a12, a22), (i11, i12, i22)
+    corner.free = (i11 * own[0] + i12 * own[1], i12 * own[0] + i22 * own[1])
+    scaled = [i11 * x for x in corner.coupling]
+    for r in range(6):
+        momentum[r] = momentum[r] - corner.coupling[r] * corner.free[0]
+        for c in range(r + 1):
+            reduced[r][c] = reduced[r][c] - scaled[r] * corner.coupling[c]
+
+
+def _friction_rows(
+    lanes: Lanes,
+    i: int,
+    corner: Corner,
+    white: Vector,
+    local: Mapping[str, tuple[Vector, Value, Value, Value]],
+    base: Vector,
+    out: Out,
+) -> None:
+    """Whitened rows of all friction at one leg, their gains, and the effect of the warm-started impulses."""
+    i11, i12, i22 = corner.inverse
+    for name, (white_base, leg_entry, wheel_entry, impulse) in local.items():
+        on_leg, on_wheel = i12 * wheel_entry, i22 * wheel_entry
+        if not isinstance(wheel_entry, float):  # a constant where both gears are rigid: not to be fused where one has play
+            on_leg, on_wheel = ops.rounded(on_leg), ops.rounded(on_wheel)
+        g_leg = i11 * leg_entry + on_leg
+        g_wheel = i12 * leg_entry + on_wheel
+        z = [white_base[r] - g_leg * white[r] for r in range(6)]
+        gain = dot(z, z) + leg_entry * ops.rounded(g_leg) + wheel_entry * ops.rounded(g_wheel)
+        out[f"g_leg_{name}"], out[f"g_wheel_{name}"] = g_leg, g_wheel
+        for r in range(6):
+            out[f"z_{name}_{r}"] = z[r]
+            base[r] = base[r] + z[r] * impulse
+        out[f"y_leg{i}"] = out[f"y_leg{i}"] + g_leg * impulse
+        out[f"y_wheel{i}"] = out[f"y_wheel{i}"] + g_wheel * impulse
+        out[f"gain_{name}"] = gain
+        if (joint := {"leg": i, "wheel": FIRST_WHEEL + i}.get(name[:-1])) is not None:
+            share = out[f"share{joint}"]
+            gain = share * share * gain + out[f"rotor_gain{joint}"]
+        if name[0] not in "xy":
+            out[f"inverse_gain_{name}"] = 1.0 / gain
+    cross_gain = dot([out[f"z_x{i}_{r}"] for r in range(6)], [out[f"z_y{i}_{r}"] for r in range(6)])
+    own_gain = cross_gain + out[f"leg_entry_x{i}"] * out[f"g_leg_y{i}"]
+    out[f"gain_xy{i}"] = own_gain - lanes[f"radius{i}"] * out[f"g_wheel_y{i}"]
+
+
+def _accumulate(
+    mass: list[list[Value]], bias: list[Value], more_mass: Mapping[tuple[int, int], Value], more_bias: Mapping[int, Value]
+) -> None:
+    for (r, c), value in more_mass.items():
+        mass[r][c] = mass[r][c] + value
+        if r != c:
+            mass[c][r] = mass[c][r] + value
+    for r, value in more_bias.items():
+        bias[r] = bias[r] + value
+
+
+def _normal_force(lanes: Lanes, i: int, corner: Corner, n: Vector, gap_rate: Value) -> tuple[Value, Value]:
+    """Spring and damper at the middle position, never pulling. Returns the force (N) and the present gap rate (m/s)."""
+    point = [corner.hip[k] + corner.leg[k] + corner.rim[k] for k in range(3)]
+    gap = lanes["pz"] + dot(n, point)
+    mid_rate = gap_rate + lanes[f"look_ahead{i}"] * (gap_rate - lanes[f"last_gap_rate{i}"])
+    push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * mid_rate, 0.0)
+    return ops.where_positive(-gap, push, 0.0), gap_rate
+
+
+def _warm_start(lanes: Lanes, i: int, step: Value, features: frozenset[str], out: Out) -> None:
+    """Start from the last step's impulses, shrunk into this step's bounds: descent must begin at an admissible point."""
+    for j in (i, FIRST_WHEEL + i):
+        bound = out[f"friction_bound{j}"]
+        out[f"gear_friction{j}"] = ops.clip(lanes[f"gear_friction{j}"], -bound, bound)
+    if "rolling_resistance" in features:
+        bound = (step * lanes[f"rolling{i}"]) * (lanes[f"radius{i}"] * out[f"normal{i}"])
+        out[f"bound_rolling{i}"] = bound
+        out[f"rolling_friction{i}"] = ops.clip(lanes[f"rolling_friction{i}"], -bound, bound)
+    out[f"bound{i}"] = step * out[f"normal{i}"]
+    x, y = (lanes[f"friction_{a}{i}"] * out[f"acting_inverse_mu_{a}{i}"] for a in "xy")
+    shrink = ops.minimum(out[f"bound{i}"] / ops.sqrt(x * x + y * y + 1e-30), 1.0)
+    for a in "xy":
+        limit = out[f"acting_mu_{a}{i}"] * out[f"bound{i}"]
+        out[f"friction_{a}{i}"] = ops.clip(lanes[f"friction_{a}{i}"] * shrink, -limit, limit)
+
+
+def _cholesky(matrix: list[list[Value]]) -> tuple[list[list[Value]], list[Value]]:
+    """Lower Cholesky factor without its diagonal, and the inverse of the diagonal."""
+    size = len(matrix)
+    lower: list[list[Value]] = [[0.0] * size for _ in range(size)]
+    inverse_diagonal: list[Value] = [0.0] * size
+    for r in range(size):
+        for c in range(r + 1):
+            s = matrix[r][c]
+            for k in range(c):
+                s = s - lower[r][k] * lower[c][k]
+            if r == c:
+                inverse_diagonal[r] = 1.0 / ops.sqrt(s)
+            else:
+                lower[r][c] = s * inverse_diagonal[c]
+    return lower, inverse_diagonal

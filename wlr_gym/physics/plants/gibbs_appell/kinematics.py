@@ -1,0 +1,105 @@
+"""Vectors, turns, and the geometry of the wheels on the floor, as generic scalar arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.codegen.ops import Lanes, Value, Vector
+from wlr_gym.physics.plants import drive
+from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS
+
+
+def cross(a: Sequence[Value], b: Sequence[Value]) -> Vector:
+    """Vector product."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def dot(a: Sequence[Value], b: Sequence[Value]) -> Value:
+    """Scalar product."""
+    total: Value = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+def vector(lanes: Lanes, prefix: str) -> Vector:
+    """Read the three lanes ``prefix + x|y|z``."""
+    return [lanes[prefix + a] for a in AXES]
+
+
+def rotation_rows(lanes: Lanes) -> list[Vector]:
+    """Rotation matrix body -> floor as rows, from the unit quaternion."""
+    w, x, y, z = (lanes[f"q{a}"] for a in "wxyz")
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+
+
+def to_body(rows: Sequence[Sequence[Value]], a: Sequence[Value]) -> Vector:
+    """Turn a floor-frame vector into the body frame."""
+    return [rows[0][k] * a[0] + rows[1][k] * a[1] + rows[2][k] * a[2] for k in range(3)]
+
+
+def floor_axes(rows: Sequence[Sequence[Value]]) -> tuple[Vector, Vector, Vector, Value]:
+    """Floor normal n, wheel heading t_x and lateral axis t_y in the body frame, and 1/|axle x n|.
+
+    All axles are parallel to body y. t_x = (axle x n)/|.|, t_y = n x t_x.
+    """
+    n = rows[2]
+    scale = 1.0 / ops.sqrt(n[0] * n[0] + n[2] * n[2] + 1e-12)
+    heading = [n[2] * scale, 0.0, -(n[0] * scale)]
+    return list(n), heading, cross(n, heading), scale
+
+
+def wheel_points(
+    lanes: Lanes, i: int, sine: Value, cosine: Value, n: Sequence[Value], scale: Value
+) -> tuple[Vector, Vector, Vector]:
+    """Hip, leg vector (hip -> axle) and rim vector (axle -> contact point of the thin disc) of wheel ``i``, body frame."""
+    hip = [lanes[f"hip_{a}{i}"] for a in AXES]
+    leg = [lanes[f"length{i}"] * cosine, 0.0, -(lanes[f"length{i}"] * sine)]
+    reach = lanes[f"radius{i}"] * scale
+    return hip, leg, [-(reach * n[0]), 0.0, -(reach * n[2])]
+
+
+def contact_row(hip: Vector, leg: Vector, rim: Vector, e: Sequence[Value]) -> tuple[Vector, Value]:
+    """Jacobian of the contact point's velocity along ``e``: six base entries and the leg-rate entry.
+
+    The wheel-rate entry is -radius along the heading and zero along the lateral axis and the normal.
+    """
+    point = [hip[0] + leg[0] + rim[0], hip[1], hip[2] + leg[2] + rim[2]]
+    arm = cross(point, e)
+    return [*e, arm[0], hip[2] * e[0] - hip[0] * e[2], arm[2]], leg[2] * e[0] - leg[0] * e[2]
+
+
+def contact_place(lanes: Lanes, rows: Sequence[Sequence[Value]], points: tuple[Vector, Vector, Vector]) -> Vector:
+    """Place (x, y) of a contact point on the floor, m."""
+    hip, leg, rim = points
+    point = [hip[k] + leg[k] + rim[k] for k in range(3)]
+    return [lanes[f"p{a}"] + dot(rows[k], point) for k, a in enumerate("xy")]
+
+
+def slip_velocity(
+    lanes: Lanes, i: int, points: tuple[Vector, Vector, Vector], heading: Vector, lateral: Vector, twist: Vector
+) -> Vector:
+    """Velocity of wheel ``i``'s contact point over the floor along heading and axle, at the present rates, m/s."""
+    slip: Vector = []
+    for e, wheel_entry in ((heading, -lanes[f"radius{i}"]), (lateral, 0.0)):
+        base_row, leg_entry = contact_row(*points, e)
+        speed = dot(base_row, twist) + leg_entry * lanes[f"leg_rate{i}"] + wheel_entry * lanes[f"wheel_rate{i}"]
+        slip.append(speed)
+    return slip
+
+
+def joints_of(lanes: Lanes) -> list[drive.Joint]:
+    """Return the eight joints as the drive sees them."""
+    joints: list[drive.Joint] = []
+    for i in CORNERS:
+        angle = lanes[f"leg_angle{i}"]
+        joints.append(drive.Joint(angle, lanes[f"leg_rate{i}"] - lanes["wy"], angle + lanes[f"zero_offset{i}"]))
+    for i in CORNERS:
+        angle = lanes[f"wheel_angle{i}"]
+        joints.append(drive.Joint(angle, lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"], angle))
+    return joints
