@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs.tasks.task import Task, signals_of
+from wlr_gym.envs.tasks.signals import signals_of
+from wlr_gym.envs.tasks.task import Task
 from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Sensors
 
