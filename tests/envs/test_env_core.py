@@ -11,8 +11,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.settings import Settings
 from wlr_gym.envs.tasks.compiled_terms import (
+    MATRICES,
     Scores,
-    SignalMatrices,
     compile_computed,
     compile_scores,
     computed_expressions,
@@ -288,6 +288,10 @@ def random_matrices(task, count=50):
     return matrices
 
 
+def signals_in_order(matrices):
+    return tuple(matrices[name] for name in MATRICES)
+
+
 def every_reward():
     return {
         "commands": {"terms": {name: [max(-1.0, term.least), 1.0] for name, term in COMMANDS.items()}},
@@ -313,7 +317,7 @@ def test_compiled_rewards_equal_the_same_terms_on_numpy():
     )
     terms, total, over, sums, measures = scores
     kernel = compile_scores(task)
-    assert kernel.run(np.ones(count, bool), SignalMatrices(**matrices), kernel.numbers, scores) == -1
+    assert kernel.run(np.ones(count, bool), signals_in_order(matrices), kernel.numbers, tuple(scores)) == -1
     for k, name in enumerate(task.rewards):
         np.testing.assert_allclose(
             terms[:, k], np.broadcast_to(expected[f"term.{name}"], count), rtol=1e-12, atol=1e-13, err_msg=name
@@ -333,7 +337,7 @@ def test_compiled_computed_observations_equal_the_same_terms_on_numpy():
     expected = computed_expressions(task, reader(task, matrices))
     kernel, computed = compile_computed(task), matrices["computed"]
     active = np.arange(50) % 2 == 0
-    kernel.run(active, SignalMatrices(**matrices), kernel.numbers)
+    kernel.run(active, signals_in_order(matrices), kernel.numbers)
     for k, name in enumerate(task.computed):
         wanted = np.broadcast_to(expected[name], 50)[active]
         np.testing.assert_allclose(computed[active, k], wanted, rtol=1e-12, atol=1e-12, err_msg=name)

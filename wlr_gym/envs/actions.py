@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -23,23 +23,16 @@ ACTION_LIMIT = 1.0 + 1e-6
 SCALING = np.dtype([(name, np.float64) for name in ("centre", "scale", "low", "high")])
 
 
-class ActionBuffers(NamedTuple):
-    """What the robots were asked to do last, (N, 8) each; setpoints in rad (legs) and rad/s (wheels)."""
-
-    action: Array
-    previous: Array
-    setpoints: Array
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _take(mask: Any, given: Any, limit: float, scaling: Any, buffers: Any) -> int:
     """Check actions (N, 8) and turn them into setpoints; nothing is written when one is bad.
 
-    Robots outside ``mask`` get the setpoints of action 0.
+    Robots outside ``mask`` get the setpoints of action 0. ``buffers``: action, previous action and setpoints, (N, 8) each.
 
     Returns:
         Flat index of the first action that is not finite or beyond the limit, or -1.
     """
+    action, previous, setpoints = buffers
     robots, width = given.shape
     for i in range(robots):
         if mask[i]:
@@ -49,10 +42,10 @@ def _take(mask: Any, given: Any, limit: float, scaling: Any, buffers: Any) -> in
     for i in range(robots):
         for j in range(width):
             value = min(max(float(given[i, j]), -1.0), 1.0) if mask[i] else 0.0
-            buffers.previous[i, j] = buffers.action[i, j]
-            buffers.action[i, j] = value
+            previous[i, j] = action[i, j]
+            action[i, j] = value
             row = scaling[j]
-            buffers.setpoints[i, j] = min(max(row.centre + row.scale * value, row.low), row.high)
+            setpoints[i, j] = min(max(row.centre + row.scale * value, row.low), row.high)
     return -1
 
 
@@ -72,8 +65,8 @@ class Actions:
 
     def __init__(self, columns: Sequence[ActionColumn], count: int, free_wheels: Sequence[str]) -> None:
         self._scaling = np.array([(c.centre, c.scale, c.low, c.high) for c in columns], SCALING)
-        self._buffers = ActionBuffers(*np.zeros((3, count, len(columns))))
-        self.action, self.previous, self.setpoints = self._buffers
+        self.action, self.previous, self.setpoints = np.zeros((3, count, len(columns)))
+        self._buffers = (self.action, self.previous, self.setpoints)
         self.torque_on: Mask | None = None
         if free_wheels:
             self.torque_on = np.ones((count, len(columns)), bool)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -31,34 +31,31 @@ RANGE = np.dtype([(name, np.float64) for name in ("low", "high", "change")])
 TIMING = np.dtype([(name, np.float64) for name in ("hold_low", "hold_high", "zero_probability", "share")])
 
 
-class CommandBuffers(NamedTuple):
-    """Present commands (N, C), where they go to (N, C), until which step (N,), and how often they were drawn (N,)."""
-
-    command: NDArray[np.float64]
-    target: NDArray[np.float64]
-    until: Counts
-    draws: Counts
+# The kernels' ``buffers``: present commands (N, C), where they go to (N, C), until which step (N,), how often they were drawn
+# (N,). A plain tuple: numba takes twice as long to receive a named one.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw(i: int, now: int, seed: Any, ranges: Any, timing: Any, buffers: Any) -> None:
     """Draw where robot i's commands go to and how long they stay there."""
+    _, target, until, draws = buffers
     width = len(ranges)
-    counter = buffers.draws[i] * (width + 2)
-    buffers.draws[i] += 1
+    counter = draws[i] * (width + 2)
+    draws[i] += 1
     hold = timing.hold_low + (timing.hold_high - timing.hold_low) * uniform(seed, _STREAM, counter)
-    buffers.until[i] = now + max(1, math.floor(hold + 0.5))
+    until[i] = now + max(1, math.floor(hold + 0.5))
     stop = uniform(seed, _STREAM, counter + 1) < timing.zero_probability
     for c in range(width):
         u = uniform(seed, _STREAM, counter + 2 + c)
         if timing.share != 1.0:
             u = 0.5 + timing.share * (u - 0.5)
-        buffers.target[i, c] = 0.0 if stop else ranges[c].low + (ranges[c].high - ranges[c].low) * u
+        target[i, c] = 0.0 if stop else ranges[c].low + (ranges[c].high - ranges[c].low) * u
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _follow(i: int, ranges: Any, command: Any, target: Any) -> None:
+def _follow(i: int, ranges: Any, buffers: Any) -> None:
     """Move robot i's commands towards their targets, no further than they may change in a step."""
+    command, target, _, _ = buffers
     for c in range(len(ranges)):
         change = target[i, c] - command[i, c]
         if abs(change) <= ranges[c].change:
@@ -70,23 +67,25 @@ def _follow(i: int, ranges: Any, command: Any, target: Any) -> None:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _begin(mask: Any, seeds: Any, ranges: Any, timing: Any, buffers: Any) -> None:
     """Draw the first commands of an episode. Those that ramp begin at zero."""
+    command, _, _, draws = buffers
     for i in range(len(mask)):
         if mask[i]:
-            buffers.draws[i] = 0
+            draws[i] = 0
             _draw(i, 0, seeds[i], ranges, timing[0], buffers)
             for c in range(len(ranges)):
-                buffers.command[i, c] = 0.0
-            _follow(i, ranges, buffers.command, buffers.target)
+                command[i, c] = 0.0
+            _follow(i, ranges, buffers)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _advance(mask: Any, seeds: Any, steps: Any, ranges: Any, timing: Any, buffers: Any) -> None:
     """Draw new commands where their time is up, and let commands ramp."""
+    _, _, until, _ = buffers
     for i in range(len(mask)):
         if mask[i]:
-            if steps[i] >= buffers.until[i]:
+            if steps[i] >= until[i]:
                 _draw(i, steps[i], seeds[i], ranges, timing[0], buffers)
-            _follow(i, ranges, buffers.command, buffers.target)
+            _follow(i, ranges, buffers)
 
 
 class Commands:
@@ -106,9 +105,9 @@ class Commands:
         self._ranges = np.array(ranges, RANGE)
         low, high = (time / period for time in config.commands.hold_time)
         self._timing = np.array([(low, high, config.commands.zero_probability, 1.0)], TIMING)
-        shape = (count, len(self.names))
-        self._buffers = CommandBuffers(np.zeros(shape), np.zeros(shape), np.zeros(count, np.int64), np.zeros(count, np.int64))
-        self.command, self.target = self._buffers.command, self._buffers.target
+        self.command, self.target = np.zeros((2, count, len(self.names)))
+        self._until, draws = np.zeros((2, count), np.int64)
+        self._buffers = (self.command, self.target, self._until, draws)
 
     def set_share(self, share: float) -> None:
         """Draw from this share of every range about its middle from now on."""
@@ -124,7 +123,7 @@ class Commands:
 
     def hold(self, rows: NDArray[np.intp], values: Mapping[int, float]) -> None:
         """Hold the commands of some robots until the episode ends, some {column: value} at a given value."""
-        self._buffers.until[rows] = FOREVER
+        self._until[rows] = FOREVER
         for column, value in values.items():
             self.command[rows, column] = self.target[rows, column] = value
 

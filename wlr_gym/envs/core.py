@@ -22,7 +22,7 @@ from wlr_gym.envs.measured import measurable, measured_truth
 from wlr_gym.envs.observation import ObservationPipeline
 from wlr_gym.envs.randomized_robots import RandomizedRobots
 from wlr_gym.envs.settings import Settings
-from wlr_gym.envs.tasks.compiled_terms import Scores, SignalMatrices, compile_computed, compile_scores
+from wlr_gym.envs.tasks.compiled_terms import Scores, compile_computed, compile_scores
 from wlr_gym.envs.tasks.describe import contract, describe
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.envs.tasks.signals import START
@@ -135,6 +135,7 @@ class Core:
             sums=np.zeros((count, len(task.rewards))),
             measures=np.zeros((count, len(task.measures))),
         )
+        self._score_buffers = tuple(self.scores)
         self._no_estimate = np.zeros((count, ESTIMATE_LAYOUT.width))
         self._start = np.zeros((count, len(START)))
         self._clock = np.zeros((count, 1))
@@ -251,30 +252,30 @@ class Core:
         self._observe(mask, signals, first=False)
         return any_done
 
-    def _signals(self) -> SignalMatrices:
-        """What terms and observations read; without a simulator what a real robot measures stands for the truth."""
-        return SignalMatrices(
-            sensors=self.sensors.values,
-            estimate=self._no_estimate if self.observer is None else self.observer.values,
-            truth=self.plant.truth().values if self.plant.capabilities.has_truth else measured_truth(self.sensors),
-            command=self.command,
-            action=self.action,
-            previous_action=self.actions.previous,
-            start=self._start,
-            clock=self._clock,
-            computed=self.computed,
+    def _signals(self) -> tuple[Array, ...]:
+        """What terms and observations read, in the order of ``MATRICES``; what a real robot measures stands for the truth."""
+        return (
+            self.sensors.values,
+            self._no_estimate if self.observer is None else self.observer.values,
+            self.plant.truth().values if self.plant.capabilities.has_truth else measured_truth(self.sensors),
+            self.command,
+            self.action,
+            self.actions.previous,
+            self._start,
+            self._clock,
+            self.computed,
         )
 
-    def _score(self, mask: Mask, signals: SignalMatrices) -> None:
+    def _score(self, mask: Mask, signals: tuple[Array, ...]) -> None:
         self._clock[:, 0] = (self.episodes.steps + 1) * self.task.config.control_period
-        bad = self._score_kernel.run(mask, signals, self._score_kernel.numbers, self.scores)
+        bad = self._score_kernel.run(mask, signals, self._score_kernel.numbers, self._score_buffers)
         if bad >= 0:
             hint = "; a formula among its effects may have left its domain" if self.patch.forces else ""
             raise FloatingPointError(
                 f"robot {bad} of the batch left the finite numbers (episode seed {self.episodes.seeds[bad]}){hint}"
             )
 
-    def _observe(self, mask: Mask, signals: SignalMatrices, *, first: bool) -> None:
+    def _observe(self, mask: Mask, signals: tuple[Array, ...], *, first: bool) -> None:
         if self._computed_kernel is not None:
             self._clock[:, 0] = self.time
             self._computed_kernel.run(mask, signals, self._computed_kernel.numbers)
@@ -283,7 +284,7 @@ class Core:
     @property
     def time(self) -> Array:
         """Time (N,) since the episodes began, s."""
-        return self.episodes.steps * self.task.config.control_period
+        return np.multiply(self.episodes.steps, self.task.config.control_period, dtype=np.float64)
 
     # ---- what the interfaces hand out: fresh objects every time ----
 

@@ -38,8 +38,8 @@ def measured_truth(sensors: Sensors) -> Array:
 def measurable(task: Task) -> tuple[Task, tuple[str, ...]]:
     """Return the task with the rewards, terminations and measures that a robot can measure, and the names of those it cannot.
 
-    A robot does not know its speed over the floor, its slip, or the height of its body. It is the safety gate that watches its
-    tilt. The slip observer runs on its sensors, without a camera.
+    A robot does not know its speed over the floor, its slip, or the height of its body. The safety rules watch its tilt.
+    The slip observer runs on its sensors, without a camera.
 
     Raises:
         InputError: an observation that needs the true state or the camera.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.random import normals4
 from wlr_gym.envs.episodes import Episodes
-from wlr_gym.envs.tasks.compiled_terms import SignalMatrices
+from wlr_gym.envs.tasks.compiled_terms import MATRICES
 from wlr_gym.envs.tasks.draws import stream_numbers, uniforms
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.task import ObservationColumn, Task
@@ -24,10 +24,17 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 
+# Where the matrices that observations show stand in :data:`MATRICES`.
+SENSORS = MATRICES.index("sensors")
+ESTIMATE = MATRICES.index("estimate")
+COMMAND = MATRICES.index("command")
+ACTION = MATRICES.index("action")
+COMPUTED = MATRICES.index("computed")
+
 #: A bias is cut off so many sigmas from zero.
 BIAS_CUT = 4.0
 
-#: One number that is read in every step: its place in :class:`SignalMatrices`, offset, noise (1 sigma) and the noise's stream.
+#: One number that is read in every step: its matrix of :data:`MATRICES`, column there, offset, noise (1 sigma), noise's stream.
 READING = np.dtype(
     [("matrix", np.int64), ("column", np.int64), ("offset", np.float64), ("noise", np.float64), ("stream", np.uint64)]
 )
@@ -43,77 +50,87 @@ SHOWN = np.dtype(
         ("scale", np.float64),
     ]
 )
-#: One number of the privileged observation: its place in :class:`SignalMatrices`, clipped and scaled.
+#: One number of the privileged observation: its matrix of :data:`MATRICES`, column there, clipped and scaled.
 PICKED = np.dtype([("matrix", np.int64), ("column", np.int64), ("limit", np.float64), ("scale", np.float64)])
 
 
-class ObservationTables(NamedTuple):
-    """What is read (W,) and what is shown of it (D,), made from the task."""
-
-    readings: NDArray[np.void]
-    shown: NDArray[np.void]
-
-
-class ObservationBuffers(NamedTuple):
-    """Of N robots: ``bias`` (N, W) of the readings, ``delays`` (N, devices + 1) of the devices in control steps, of which the
-    last is zero, ``ring`` (N, K, W) with the last K readings, and the policy observation ``policy`` (N, D)."""
-
-    bias: Array
-    delays: Array
-    ring: Array
-    policy: NDArray[np.float32]
+# Of the kernels' arguments, ``tables`` is what is read (W,) and what is shown of it (D,). ``buffers``: bias (N, W) of the
+# readings, delays (N, devices + 1) of the devices in control steps, of which the last is zero, ring (N, K, W) with the last K
+# readings, and the policy observation (N, D). Plain tuples: numba takes twice as long to receive named ones.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _observe(mask: Any, first: bool, signals: Any, seeds: Any, steps: Any, tables: Any, buffers: Any) -> None:
     """Take all readings, and show those of the right age. ``first``: the episode starts, older readings are as this one."""
-    depth = buffers.ring.shape[1]
+    readings, shown = tables
+    _read(mask, first, signals, seeds, steps, readings, buffers)
+    _show(mask, steps, shown, buffers)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _read(mask: Any, first: bool, signals: Any, seeds: Any, steps: Any, readings: Any, buffers: Any) -> None:
+    """Take the readings into the ring."""
+    sensors, estimate, truth, command, action, _, _, _, computed = signals
+    bias, _, ring, _ = buffers
+    depth = ring.shape[1]
     for i in range(len(mask)):
-        if mask[i]:
-            _read(i, first, signals, seeds[i], steps[i], tables.readings, buffers)
-            _show(i, steps[i] % depth, tables.shown, buffers)
+        if not mask[i]:
+            continue
+        now = steps[i] % depth
+        for w in range(len(readings)):
+            reading = readings[w]
+            matrix, column = reading.matrix, reading.column
+            if matrix == SENSORS:
+                value = sensors[i, column]
+            elif matrix == COMMAND:
+                value = command[i, column]
+            elif matrix == ACTION:
+                value = action[i, column]
+            elif matrix == ESTIMATE:
+                value = estimate[i, column]
+            elif matrix == COMPUTED:
+                value = computed[i, column]
+            else:
+                value = truth[i, column]
+            value = value - reading.offset + bias[i, w]
+            if reading.noise > 0.0:
+                value += reading.noise * normals4(seeds[i], reading.stream, steps[i], 0)[0]
+            ring[i, now, w] = value
+            if first:
+                for k in range(depth):
+                    ring[i, k, w] = value
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _read(i: int, first: bool, signals: Any, seed: Any, step: int, readings: Any, buffers: Any) -> None:
-    """Take robot i's readings into the ring."""
-    depth = buffers.ring.shape[1]
-    now = step % depth
-    for w in range(len(readings)):
-        reading = readings[w]
-        value = signals[reading.matrix][i, reading.column] - reading.offset + buffers.bias[i, w]
-        if reading.noise > 0.0:
-            value += reading.noise * normals4(seed, reading.stream, step, 0)[0]
-        buffers.ring[i, now, w] = value
-        if first:
-            for k in range(depth):
-                buffers.ring[i, k, w] = value
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _show(i: int, now: int, shown: Any, buffers: Any) -> None:
-    """Assemble robot i's observation; ``now`` is the newest reading's place in the ring."""
-    depth = buffers.ring.shape[1]
-    for d in range(len(shown)):
-        column = shown[d]
-        age = buffers.delays[i, column.device] + column.lag
-        whole = math.floor(age)
-        rest = age - whole
-        value = buffers.ring[i, (now - whole + depth) % depth, column.reading]
-        if rest > 0.0:
-            older = buffers.ring[i, (now - whole - 1 + depth) % depth, column.reading]
-            value = value + rest * (older - value) if column.interpolate == 1 else older
-        buffers.policy[i, d] = column.scale * min(max(value, -column.limit), column.limit)
+def _show(mask: Any, steps: Any, shown: Any, buffers: Any) -> None:
+    """Assemble the observation from readings of the right age."""
+    _, delays, ring, policy = buffers
+    depth = ring.shape[1]
+    for i in range(len(mask)):
+        if not mask[i]:
+            continue
+        now = steps[i] % depth
+        for d in range(len(shown)):
+            column = shown[d]
+            age = delays[i, column.device] + column.lag
+            whole = math.floor(age)
+            rest = age - whole
+            value = ring[i, (now - whole + depth) % depth, column.reading]
+            if rest > 0.0:
+                older = ring[i, (now - whole - 1 + depth) % depth, column.reading]
+                value = value + rest * (older - value) if column.interpolate == 1 else older
+            policy[i, d] = column.scale * min(max(value, -column.limit), column.limit)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _pick(mask: Any, signals: Any, picked: Any, out: Any) -> None:
-    """Copy chosen signals, clipped to a limit and scaled."""
+    """Copy columns of the truth and of what is computed, clipped to a limit and scaled."""
+    _, _, truth, _, _, _, _, _, computed = signals
     for i in range(len(mask)):
         if mask[i]:
             for d in range(len(picked)):
                 column = picked[d]
-                value = signals[column.matrix][i, column.column]
+                value = computed[i, column.column] if column.matrix == COMPUTED else truth[i, column.column]
                 out[i, d] = column.scale * min(max(value, -column.limit), column.limit)
 
 
@@ -140,7 +157,7 @@ class ObservationPipeline:
         noisy = float(randomization.sensor_noise)
         noise_streams = stream_numbers(*(f"noise/{c.term}/{c.element}" for c in read))
         readings = [(*_place(c, task), c.offset, c.noise * noisy, s) for c, s in zip(read, noise_streams, strict=True)]
-        self._tables = ObservationTables(np.array(readings, READING), _shown(task, read))
+        self._tables = (np.array(readings, READING), _shown(task, read))
         self._picked = np.array([(*_place(c, task), c.limit, c.scale) for c in task.privileged], PICKED)
         self._bias_sigma = np.array([c.bias * noisy for c in read])
         self._bias_stream = stream_numbers(*(f"bias/{c.term}/{c.element}" for c in read))
@@ -151,13 +168,10 @@ class ObservationPipeline:
         self._has_privileged = has_privileged
         longest_delay = float(self._latency.max()) if latency else 0.0
         depth = max(c.lag for c in task.policy) + math.ceil(longest_delay) + 1
-        self._buffers = ObservationBuffers(
-            bias=np.zeros((count, len(read))),
-            delays=np.zeros((count, len(latency) + 1)),
-            ring=np.zeros((count, depth, len(read))),
-            policy=np.zeros((count, len(task.policy)), np.float32),
-        )
-        self.bias, self.delays, self.policy = self._buffers.bias, self._buffers.delays, self._buffers.policy
+        self.bias = np.zeros((count, len(read)))
+        self.delays = np.zeros((count, len(latency) + 1))
+        self.policy = np.zeros((count, len(task.policy)), np.float32)
+        self._buffers = (self.bias, self.delays, np.zeros((count, depth, len(read))), self.policy)
         self.privileged = np.zeros((count, len(task.privileged)), np.float32)
 
     def begin(self, rows: Rows, seeds: NDArray[np.uint64]) -> None:
@@ -169,15 +183,15 @@ class ObservationPipeline:
             u = uniforms(seeds, self._bias_stream)
             self.bias[rows] = normal(u, np.zeros(1), self._bias_sigma, np.full(1, BIAS_CUT))
 
-    def observe(self, mask: Mask, signals: SignalMatrices, episodes: Episodes, *, first: bool) -> None:
-        """Observe the robots in ``mask``; ``first``: their episodes start."""
+    def observe(self, mask: Mask, signals: tuple[Array, ...], episodes: Episodes, *, first: bool) -> None:
+        """Observe the robots in ``mask``; ``signals`` are :data:`MATRICES`, ``first``: their episodes start."""
         _observe(mask, first, signals, episodes.seeds, episodes.steps, self._tables, self._buffers)
         if self._has_privileged:
             _pick(mask, signals, self._picked, self.privileged)
 
 
 def _place(column: ObservationColumn, task: Task) -> tuple[int, int]:
-    """Matrix of :class:`SignalMatrices` and column there."""
+    """Matrix of :data:`MATRICES` and column there."""
     elements = {
         "sensors": SENSOR_LAYOUT.elements,
         "command": task.commands,
@@ -186,7 +200,7 @@ def _place(column: ObservationColumn, task: Task) -> tuple[int, int]:
         "computed": task.computed,
         "truth": TRUTH_LAYOUT.elements,
     }
-    return SignalMatrices._fields.index(column.source), elements[column.source].index(column.element)
+    return MATRICES.index(column.source), elements[column.source].index(column.element)
 
 
 def _shown(task: Task, read: list[ObservationColumn]) -> NDArray[np.void]:

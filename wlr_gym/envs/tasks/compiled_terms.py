@@ -23,28 +23,15 @@ from wlr_gym.robot import JOINTS
 Array = NDArray[np.float64]
 
 
-class SignalMatrices(NamedTuple):
-    """The signals of a control step, one row per robot, float64 and C-contiguous.
-
-    ``clock`` has the one column ``time``. ``computed`` holds the computed observations, which rewards, terminations and
-    measures do not read.
-    """
-
-    sensors: Array
-    estimate: Array
-    truth: Array
-    command: Array
-    action: Array
-    previous_action: Array
-    start: Array
-    clock: Array
-    computed: Array
+#: The signals of a control step, a matrix each, float64 and C-contiguous, one row per robot. ``clock`` has the one column
+#: ``time``. ``computed`` holds the computed observations, which rewards, terminations and measures do not read.
+MATRICES = ("sensors", "estimate", "truth", "command", "action", "previous_action", "start", "clock", "computed")
 
 
 class Scores(NamedTuple):
     """What a control step is worth.
 
-    Weighted reward ``terms`` (N, T), their ``total`` (N,) and their ``sums`` (N, T) over the episode, termination terms ``over``
+    Weighted reward ``terms`` (N, T), their ``total`` (N,) and ``sums`` (N, T) over the episode, termination terms ``over``
     (N, K) and ``measures`` (N, M).
     """
 
@@ -60,9 +47,10 @@ class TermKernel:
     """Terms of a task, compiled.
 
     Attributes:
-        run: takes ``active`` (N,), whose rows to do, :class:`SignalMatrices` and ``numbers``. That of rewards, terminations and
-            measures also takes :class:`Scores`, writes them, and returns the first robot whose reward is not finite, or -1;
-            that of computed observations writes ``computed``.
+        run: takes ``active`` (N,), whose rows to do, a plain tuple of :data:`MATRICES`, and ``numbers``. That of rewards,
+            terminations and measures also takes a plain tuple of :class:`Scores`, writes them, and returns the first robot
+            whose reward is not finite, or -1; that of computed observations writes ``computed``. (numba takes twice as long to
+            receive a named tuple as a plain one.)
         numbers: (P,) weights, parameters and robot numbers in the order the kernel reads them.
     """
 
@@ -193,7 +181,7 @@ def _compile(
 
 
 _DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
-_UNPACK = f"    {', '.join(SignalMatrices._fields)} = signals"
+_UNPACK = f"    {', '.join(MATRICES)} = signals"
 _SCORES_HEAD = (
     "def run(active, signals, numbers, scores):",
     _UNPACK,

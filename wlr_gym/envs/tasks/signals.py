@@ -5,7 +5,7 @@ The same term runs on numpy arrays (one value per robot) and on trace nodes: onl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -86,7 +86,7 @@ class Signals:
         return self._read("task.control_period")
 
 
-def signals_of(function: Callable[..., Any], parameters: Mapping[str, float] | None = None) -> set[str]:
+def signals_of(function: Callable[..., Any]) -> set[str]:
     """Return the names of the signals that a term's function reads."""
     names: set[str] = set()
 
@@ -95,7 +95,7 @@ def signals_of(function: Callable[..., Any], parameters: Mapping[str, float] | N
         return np.float64(1.0)
 
     with np.errstate(all="ignore"):
-        function(Signals(read), **(parameters or {}))
+        function(Signals(read))
     return names
 
 

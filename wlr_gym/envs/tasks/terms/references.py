@@ -11,14 +11,16 @@ from dataclasses import dataclass
 from wlr_gym.envs.tasks.signals import Signals, Value
 from wlr_gym.envs.tasks.terms.geometry import PlanarPose, wrapped
 from wlr_gym.physics.codegen import ops
-from wlr_gym.robot import CORNER_SIGNS
+from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE
 
 #: m along the path from the robot to where its curvature is previewed.
 PREVIEW = (0.0, 0.1, 0.2)
 #: Newton steps to the nearest point of an S-curve.
 NEWTON_STEPS = 4
-#: s in which the legs go from home to the first posture; s at which the sweep to the second one begins.
-POSTURE_READY, SWEEP_BEGINS = 3.0, 4.0
+#: s in which the legs go from home to the first posture.
+POSTURE_READY = 3.0
+#: s at which the sweep to the second posture begins.
+SWEEP_BEGINS = 4.0
 #: m/s2 on a slope: less than what is left 1.5 degrees below the friction limit, g sin 1.5 = 0.26.
 CLIMB_RAMP = 0.1
 
@@ -116,7 +118,7 @@ def _leg_reference(signals: Signals, axle: str) -> tuple[Value, Value]:
 
 def leg_errors(signals: Signals) -> list[Value]:
     """Return the true leg angles minus those asked for, rad."""
-    angles = signals.truth("joint_position")[:4]
+    angles = signals.truth("joint_position")[LEG_SLICE]
     return [angle - asked for angle, (asked, _) in zip(angles, leg_references(signals), strict=True)]
 
 

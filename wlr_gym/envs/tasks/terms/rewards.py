@@ -12,7 +12,7 @@ from wlr_gym.envs.tasks.terms import references
 from wlr_gym.envs.tasks.terms.geometry import true_pose
 from wlr_gym.envs.tasks.terms.scalar import POSITIVE, ScalarTerm, registered
 from wlr_gym.physics.codegen import ops
-from wlr_gym.robot import CORNER_SIGNS
+from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, LEGS, WHEELS
 
 REWARDS: dict[str, ScalarTerm] = {}
 
@@ -99,7 +99,7 @@ def action_rate(signals: Signals) -> Value:
 def leg_posture(signals: Signals, *, scale: Value = 0.5) -> Value:
     """Mean squared leg angle from home over ``scale`` (rad)."""
     home = signals.robot("home.leg_angle")
-    offsets = [(angle - home) / scale for angle in signals.truth("joint_position")[:4]]
+    offsets = [(angle - home) / scale for angle in signals.truth("joint_position")[LEG_SLICE]]
     return mean([offset * offset for offset in offsets])
 
 
@@ -119,7 +119,7 @@ def skid_turn_slip(signals: Signals) -> list[tuple[Value, Value]]:
     yaw_rate = ops.absolute(signals.truth("angular_velocity_in_body")[2])
     hip, side, length = signals.robot("hip_position.x"), signals.robot("hip_position.y"), signals.robot("leg.length")
     needed = []
-    for (front, _), angle in zip(CORNER_SIGNS, signals.truth("joint_position")[:4], strict=True):
+    for (front, _), angle in zip(CORNER_SIGNS, signals.truth("joint_position")[LEG_SLICE], strict=True):
         reach = ops.absolute(hip * front + length * ops.cos(angle))
         needed.append((yaw_rate * reach * reach / side, yaw_rate * reach))
     return needed
@@ -148,7 +148,7 @@ def _beyond(value: Value, free: Value) -> Value:
 @registered(REWARDS, threshold=(-math.inf, 1.0))
 def torque_saturation(signals: Signals, *, threshold: Value = 0.8) -> Value:
     """Mean motor torque beyond ``threshold`` of its stall torque, over the rest up to stall."""
-    stall = [signals.robot("servo.leg.stall_torque")] * 4 + [signals.robot("servo.wheel.stall_torque")] * 4
+    stall = [signals.robot("servo.leg.stall_torque")] * len(LEGS) + [signals.robot("servo.wheel.stall_torque")] * len(WHEELS)
     used = [ops.absolute(torque) / limit for torque, limit in zip(signals.truth("motor_torque"), stall, strict=True)]
     return mean([ops.maximum(share - threshold, 0.0) for share in used]) / (1.0 - threshold)
 
