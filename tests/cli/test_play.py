@@ -180,5 +180,5 @@ def test_a_film_goes_on_after_the_end_of_an_episode(graphics):
     policy = make_policy("do_nothing", core.contract())
     pictures = list(film(core, policy, 0, 0.4, view=View(size=(64, 64), text=False)))
     assert len(pictures) == 10
-    assert core.episodes[0] >= 2
+    assert core.episodes.number[0] >= 2
     core.close()

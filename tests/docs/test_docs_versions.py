@@ -12,7 +12,7 @@ from blocks import ROOT
 
 import wlr_gym
 from wlr_gym.envs.registry import ENVIRONMENTS
-from wlr_gym.envs.tasks.task import read_task
+from wlr_gym.envs.tasks.task_config import read_task
 
 
 def _public_modules() -> dict[str, str]:

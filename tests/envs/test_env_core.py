@@ -10,10 +10,11 @@ import wlr_gym  # noqa: F401
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.settings import Settings
-from wlr_gym.envs.tasks.compiled import (
+from wlr_gym.envs.tasks.compiled_terms import (
     MATRICES,
-    compile_computation,
-    compile_evaluation,
+    Scores,
+    compile_computed,
+    compile_scores,
     computed_expressions,
     expressions,
     reader,
@@ -61,11 +62,11 @@ def test_bad_actions_name_robot_and_joint_and_never_reach_the_plant(fake, value,
     plant = fake["plants"][-1]
     actions = np.zeros((3, 8))
     actions[1, 5] = value
-    steps, ticks = len(plant.goals_seen), env.core.ticks.copy()
+    steps, ticks = len(plant.goals_seen), env.core.episodes.steps.copy()
     with pytest.raises(InputError, match=rf"wheel_rf of robot 1 of the batch is {text}.*finite number in \[-1, 1\]"):
         env.step(actions)
     assert len(plant.goals_seen) == steps
-    assert np.array_equal(env.core.ticks, ticks)
+    assert np.array_equal(env.core.episodes.steps, ticks)
 
 
 @pytest.mark.parametrize("action", [np.zeros(7), np.zeros((1, 8)), 0.5, np.zeros((2, 8)), "forward", None, [None] * 8])
@@ -85,7 +86,7 @@ def test_rounding_beyond_one_is_accepted(fake):
 
 def test_free_wheels_may_come_from_an_iterator(fake):
     env = make(free_wheels=iter(["wheel_lf", "wheel_rr"]))
-    assert env.core.torque_on[0, 4:].tolist() == [False, True, True, False]
+    assert env.core.actions.torque_on[0, 4:].tolist() == [False, True, True, False]
 
 
 def test_free_wheels_spin_free(fake):
@@ -158,7 +159,7 @@ def test_history_comes_newest_first_and_starts_filled(fake):
 def test_latency_differs_between_robots_within_its_range_and_is_shared_by_a_device(fake):
     env = make_vec(200, task={"latency": {"joints": {"delay": [0.01, 0.03]}}})
     env.reset(seed=0)
-    delays = env.core._delays * 0.02
+    delays = env.core.pipeline.delays * 0.02
     assert 0.01 <= delays[:, 0].min() < 0.011
     assert 0.029 < delays[:, 0].max() <= 0.03
     assert np.all(delays[:, -1] == 0.0)
@@ -281,9 +282,14 @@ def random_matrices(task, count=50):
         "start": 3,
         "clock": 1,
     }
-    matrices = {name: rng.normal(size=(count, widths[name])) for name in MATRICES}
+    matrices = {name: rng.normal(size=(count, width)) for name, width in widths.items()}
+    matrices["computed"] = np.full((count, len(task.computed)), np.nan)
     matrices["truth"][:, TRUTH_LAYOUT.slices["quaternion"]] /= 2.0
     return matrices
+
+
+def signals_in_order(matrices):
+    return tuple(matrices[name] for name in MATRICES)
 
 
 def every_reward():
@@ -302,11 +308,16 @@ def test_compiled_rewards_equal_the_same_terms_on_numpy():
     matrices = random_matrices(task)
     count = len(matrices["truth"])
     expected = expressions(task, reader(task, matrices))
-    terms, over = np.zeros((count, len(task.rewards))), np.zeros((count, len(task.terminations)))
-    total, sums, measures = np.zeros(count), np.ones((count, len(task.rewards))), np.zeros((count, len(task.measures)))
-    evaluation = compile_evaluation(task)
-    bad = evaluation.run(np.ones(count, bool), *matrices.values(), evaluation.numbers, terms, total, over, sums, measures)
-    assert bad == -1
+    scores = Scores(
+        terms=np.zeros((count, len(task.rewards))),
+        total=np.zeros(count),
+        over=np.zeros((count, len(task.terminations))),
+        sums=np.ones((count, len(task.rewards))),
+        measures=np.zeros((count, len(task.measures))),
+    )
+    terms, total, over, sums, measures = scores
+    kernel = compile_scores(task)
+    assert kernel.run(np.ones(count, bool), signals_in_order(matrices), kernel.numbers, tuple(scores)) == -1
     for k, name in enumerate(task.rewards):
         np.testing.assert_allclose(
             terms[:, k], np.broadcast_to(expected[f"term.{name}"], count), rtol=1e-12, atol=1e-13, err_msg=name
@@ -324,10 +335,9 @@ def test_compiled_computed_observations_equal_the_same_terms_on_numpy():
     task = make_task("velocity", Settings(task=every_reward()))
     matrices = random_matrices(task)
     expected = computed_expressions(task, reader(task, matrices))
-    computation = compile_computation(task)
-    computed = np.full((50, len(task.computed)), np.nan)
+    kernel, computed = compile_computed(task), matrices["computed"]
     active = np.arange(50) % 2 == 0
-    computation.run(active, *matrices.values(), computation.numbers, computed)
+    kernel.run(active, signals_in_order(matrices), kernel.numbers)
     for k, name in enumerate(task.computed):
         wanted = np.broadcast_to(expected[name], 50)[active]
         np.testing.assert_allclose(computed[active, k], wanted, rtol=1e-12, atol=1e-12, err_msg=name)
@@ -393,8 +403,8 @@ def test_action_rate_compares_with_the_tick_before(fake):
 
 
 def test_weights_and_parameters_compile_nothing_new():
-    base = compile_evaluation(make_task("velocity", Settings()))
-    changed = compile_evaluation(make_task("velocity", Settings(task={"rewards": {"slip": {"weight": -9.0, "speed": 0.3}}})))
+    base = compile_scores(make_task("velocity", Settings()))
+    changed = compile_scores(make_task("velocity", Settings(task={"rewards": {"slip": {"weight": -9.0, "speed": 0.3}}})))
     assert changed.run is base.run
     assert not np.array_equal(changed.numbers, base.numbers)
 
@@ -426,7 +436,7 @@ def test_robots_outside_the_mask_keep_time_flags_and_observation(fake):
     assert core.truncated.all()
     before = core.observation[0].copy()
     core.step(np.full((2, 8), [[np.nan], [0.5]]), np.array([False, True]))
-    assert core.ticks.tolist() == [5, 6]
+    assert core.episodes.steps.tolist() == [5, 6]
     assert core.truncated.all()
     assert core.reward[0] == 0.0
     assert np.array_equal(core.observation[0], before)

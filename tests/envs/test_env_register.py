@@ -8,7 +8,7 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs import register_task
 from wlr_gym.envs.registry import ENVIRONMENTS, title_of
-from wlr_gym.envs.tasks.task import read_task
+from wlr_gym.envs.tasks.task_config import read_task
 
 TASK = """
 name: {name}

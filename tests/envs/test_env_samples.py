@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from test_env_faces import same_where_masked
+from test_env_interfaces import same_where_masked
 
 import wlr_gym  # noqa: F401
 from wlr_gym.envs.tasks import load_randomization

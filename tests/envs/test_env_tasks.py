@@ -194,7 +194,7 @@ def drive(env_id, count, act, **keywords):
 
 
 def computed(core, element):
-    return core._computed[:, [core.task.computed.index(element)]]
+    return core.computed[:, [core.task.computed.index(element)]]
 
 
 def test_legs_that_follow_their_reference_have_no_leg_error():
@@ -259,7 +259,7 @@ def test_progress_narrows_what_is_drawn_and_says_nothing_of_the_past():
             env.unwrapped.set_progress(steps)
         env.reset(seed=7)
         core = env.unwrapped.core
-        return np.abs(core._command_target[:, 0]).max(), np.ptp(core.parameters["ground.mu_x"][:, 0])
+        return np.abs(core.commands.target[:, 0]).max(), np.ptp(core.parameters["ground.mu_x"][:, 0])
 
     whole = widths()
     assert whole[0] == pytest.approx(0.1, abs=0.003)
@@ -285,7 +285,7 @@ def test_progress_within_an_episode_leaves_its_robot_and_floor_as_they_were():
     pushes = 0
     for _ in range(160):
         core.step(np.zeros((4, 8), np.float32), core.everyone)
-        pushes += core.changed.sum()
+        pushes += core.robots.changed.sum()
     assert pushes > 4
     changed = (core.parameters.values != before).any(axis=0)
     assert set(np.flatnonzero(changed)) <= set(core.randomization.timed_columns)

@@ -178,7 +178,7 @@ def test_rewards_are_those_of_the_simulator_where_they_are_measured():
         core.begin_episodes(core.everyone, {"command": {"linear_velocity_x": 0.0, "yaw_rate": 0.0}})
         for tick in range(20):
             core.step(np.r_[0.1 * np.sin(0.3 * tick + np.arange(4)), [0.0] * 4][None], core.everyone)
-        rewards[backend] = dict(zip(core.task.rewards, core.sums[0], strict=True))
+        rewards[backend] = dict(zip(core.task.rewards, core.scores.sums[0], strict=True))
         core.close()
     ours, theirs = rewards.values()
     assert set(ours) < set(theirs)
@@ -189,8 +189,8 @@ def test_rewards_are_those_of_the_simulator_where_they_are_measured():
 def test_a_robot_adds_no_delay_and_no_noise_of_ours(env):
     env.reset(seed=0)
     core = env.unwrapped.core
-    assert not core._delays.any()
-    assert not core._bias.any()
+    assert not core.pipeline.delays.any()
+    assert not core.pipeline.bias.any()
     names = [column["name"] for column in core.contract()["observation"]]
     column = names.index("leg_position[leg_lf]")
     assert core.observation[0, column] == np.float32(core.plant.loop.status.position[0] - np.pi / 2)

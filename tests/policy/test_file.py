@@ -6,7 +6,7 @@ import json
 import pytest
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs.tasks.task import ObserverConfig
+from wlr_gym.envs.tasks.task_config import ObserverConfig
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import check_contract, load_policy, make_policy, read_contract, write_contract
 from wlr_gym.policy.file import DEFAULTS, with_defaults

@@ -221,9 +221,7 @@ def status_table(loop: ControlLoop, core: Core) -> Any:
     from wlr_gym.hardware.safety.rules import tilt_of
     from wlr_gym.robot import JOINTS
 
-    table = Table(
-        box=None, title=f"{loop.phase.value}  {core.ticks[0] * core.task.config.control_period:.1f} s", title_justify="left"
-    )
+    table = Table(box=None, title=f"{loop.phase.value}  {core.time[0]:.1f} s", title_justify="left")
     for name in ("joint", "angle rad", "setpoint", "speed rad/s", "effort N m", "degC", "V"):
         table.add_column(name, justify="left" if name == "joint" else "right")
     status = loop.status

@@ -14,7 +14,8 @@ from wlr_gym.base.files import make_output_folder
 from wlr_gym.cli import OK
 from wlr_gym.envs.registry import ENVIRONMENTS, task_name_of
 from wlr_gym.envs.tasks import Randomization, Task, describe, describe_randomization, load_randomization
-from wlr_gym.envs.tasks.task import build_task, read_task
+from wlr_gym.envs.tasks.task import build_task
+from wlr_gym.envs.tasks.task_config import read_task
 from wlr_gym.robot import load_robot
 
 PICTURES = (".png", ".svg", ".pdf")

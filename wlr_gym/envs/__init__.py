@@ -1,4 +1,4 @@
-"""Environments: one batched core (``core.Core``) with three thin faces. Faces load when asked for."""
+"""Environments: one batched core (``core.Core``) with three thin interfaces, loaded when they are asked for."""
 
 from __future__ import annotations
 

@@ -11,10 +11,10 @@ from wlr_gym.base.paths import find_config
 from wlr_gym.envs.document import class_document
 from wlr_gym.envs.registry import ENVIRONMENTS, enter, title_of
 from wlr_gym.envs.single import WlrEnv
-from wlr_gym.envs.tasks.task import read_task
+from wlr_gym.envs.tasks.task_config import read_task
 from wlr_gym.envs.vector import WlrVectorEnv
 
-_FACES = {"VectorEnv": WlrVectorEnv, "Env": WlrEnv}
+_BASES = {"VectorEnv": WlrVectorEnv, "Env": WlrEnv}
 
 
 def register_task(path: str | Path) -> str:
@@ -47,5 +47,5 @@ def __getattr__(name: str) -> Any:
 
 @cache
 def _make_class(name: str, task: str) -> type:
-    face = next(face for ending, face in _FACES.items() if name.endswith(ending))
-    return type(name, (face,), {"__module__": __name__, "__doc__": class_document(task), "task_name": task})
+    base = next(base for ending, base in _BASES.items() if name.endswith(ending))
+    return type(name, (base,), {"__module__": __name__, "__doc__": class_document(task), "task_name": task})

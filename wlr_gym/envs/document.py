@@ -6,7 +6,8 @@ import inspect
 
 from wlr_gym.envs.settings import Settings
 from wlr_gym.envs.tasks.describe import describe
-from wlr_gym.envs.tasks.task import build_task, read_task
+from wlr_gym.envs.tasks.task import build_task
+from wlr_gym.envs.tasks.task_config import read_task
 from wlr_gym.robot import load_robot
 
 _INFO = """**Info** ``reset``: ``randomization`` {parameter element: value}. ``step``: ``reward_terms`` {term: weighted value},

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs.tasks.task import Task, signals_of
+from wlr_gym.envs.tasks.signals import signals_of
+from wlr_gym.envs.tasks.task import Task
 from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Sensors
 
@@ -37,8 +38,8 @@ def measured_truth(sensors: Sensors) -> Array:
 def measurable(task: Task) -> tuple[Task, tuple[str, ...]]:
     """Return the task with the rewards, terminations and measures that a robot can measure, and the names of those it cannot.
 
-    A robot does not know its speed over the floor, its slip, or the height of its body. It is the safety rules that watch its
-    tilt. The slip observer runs on its sensors, without a camera.
+    A robot does not know its speed over the floor, its slip, or the height of its body. The safety rules watch its tilt.
+    The slip observer runs on its sensors, without a camera.
 
     Raises:
         InputError: an observation that needs the true state or the camera.

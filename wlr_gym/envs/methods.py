@@ -1,4 +1,4 @@
-"""What all faces of a batch offer beyond their libraries' own interfaces."""
+"""What all interfaces of a batch offer beyond their libraries' own interfaces."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Pictures:
         self._scene: Scene | None = None
         self._viewer: Viewer | None = None
 
-    def after_tick(self) -> None:
+    def after_step(self) -> None:
         """Show the present state where there is a window."""
         if self.render_mode == "human":
             self.show()
@@ -73,7 +73,7 @@ class Pictures:
         Raises:
             InputError: no OpenGL on this machine.
         """
-        self.core.require_begun("render()")
+        self.core.episodes.require_begun("render()")
         if self._scene is None:
             from wlr_gym.render import Scene
 
@@ -82,7 +82,7 @@ class Pictures:
 
     def show(self) -> None:
         """Show the first robot in a window, in real time. Once the user has closed it, nothing happens."""
-        self.core.require_begun("render()")
+        self.core.episodes.require_begun("render()")
         if self._viewer is None:
             from wlr_gym.render import Viewer
 
@@ -99,4 +99,4 @@ class Pictures:
     def _texts(self, row: int) -> dict[str, Any]:
         core = self.core
         command = dict(zip(core.task.commands, core.command[row].tolist(), strict=True))
-        return {"time": float(core.ticks[row] * core.task.config.control_period), "command": command}
+        return {"time": float(core.time[row]), "command": command}

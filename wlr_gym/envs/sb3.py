@@ -11,7 +11,8 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.envs.core import Core, Mask, read_seed
+from wlr_gym.envs.core import Core, Mask
+from wlr_gym.envs.episodes import read_seed
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
 from wlr_gym.envs.registry import task_name_of
@@ -76,7 +77,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         self._reset_seeds()
         self._reset_options()
         self._keep_reset_infos(self.core.everyone)
-        self.pictures.after_tick()
+        self.pictures.after_step()
         return self.core.observations()
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
@@ -84,7 +85,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, NDArray[np.float32], Mask, list[dict[str, Any]]]:
-        """Advance one control tick.
+        """Advance one control step.
 
         Raises:
             InputError: wrong shape, or an action that is not finite or out of [-1, 1].
@@ -94,12 +95,12 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         any_done = core.step(self._actions, core.everyone)
         reward = core.reward.astype(np.float32)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        if core.changed.any():
-            for row, info in self._samples(core.change_info(), core.changed):
+        if core.robots.changed.any():
+            for row, info in self._samples(core.change_info(), core.robots.changed):
                 infos[row] = info
         done = core.terminated | core.truncated
         if any_done:
-            sums = core.sums.copy()
+            sums = core.scores.sums.copy()
             for row in np.flatnonzero(done).tolist():
                 infos[row] = {
                     "terminal_observation": core.observation_of(row),
@@ -108,7 +109,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
                 }
             core.begin_episodes(done)
             self._keep_reset_infos(done)
-        self.pictures.after_tick()
+        self.pictures.after_step()
         return core.observations(), reward, done, infos
 
     def _keep_reset_infos(self, mask: Mask) -> None:

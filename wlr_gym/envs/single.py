@@ -8,7 +8,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import EzPickle
 
-from wlr_gym.envs.core import Core, read_actions, read_seed
+from wlr_gym.envs.actions import read_actions
+from wlr_gym.envs.core import Core
+from wlr_gym.envs.episodes import read_seed
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
 from wlr_gym.envs.settings import read_settings
@@ -45,14 +47,14 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
             InputError: a seed or an option that is none.
         """
         super().reset(seed=None if seed is None else read_seed(seed))
-        if seed is not None or not self.core.seeded[0]:
+        if seed is not None or not self.core.episodes.seeded[0]:
             self.core.seed(0, self.np_random_seed % 2**64 if seed is None else seed)  # -1 where the user set np_random
         self.core.begin_episodes(self._everyone, options)
-        self.pictures.after_tick()
+        self.pictures.after_step()
         return self.core.observation_of(0), _first_rows(self.core.reset_info())
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Advance one control tick.
+        """Advance one control step.
 
         Raises:
             InputError: wrong shape, or an action that is not finite or out of [-1, 1].
@@ -60,13 +62,13 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
         """
         core = self.core
         done = core.step(read_actions(action, self._shape)[None], self._everyone)
-        info: dict[str, Any] = {"reward_terms": dict(zip(self._rewards, core.terms[0].tolist(), strict=True))}
+        info: dict[str, Any] = {"reward_terms": dict(zip(self._rewards, core.scores.terms[0].tolist(), strict=True))}
         info |= {name: value[0] for name, value in core.contact_info().items()}
-        if core.changed[0]:
+        if core.robots.changed[0]:
             info |= _first_rows(core.change_info())
         if done:
             info |= _first_rows(core.episode_info())
-        self.pictures.after_tick()
+        self.pictures.after_step()
         return core.observation_of(0), float(core.reward[0]), bool(core.terminated[0]), bool(core.truncated[0]), info
 
     def render(self) -> np.ndarray | None:

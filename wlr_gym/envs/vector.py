@@ -13,7 +13,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, nearest
-from wlr_gym.envs.core import OPTIONS, Core, Mask, read_options, read_seed
+from wlr_gym.envs.core import OPTIONS, Core, Mask, read_options
+from wlr_gym.envs.episodes import read_seed
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
 from wlr_gym.envs.settings import read_settings
@@ -25,7 +26,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
     Args:
         num_envs: N.
         autoreset_mode: ``NextStep`` (default), ``SameStep`` or ``Disabled``, as text or ``gymnasium.vector.AutoresetMode``.
-        max_episode_steps: truncate after so many control ticks, if that is before the task's own limit.
+        max_episode_steps: truncate after so many control steps, if that is before the task's own limit.
         render_mode: ``rgb_array`` (``render()`` returns one picture per robot), ``human`` (a window with the first robot)
             or None.
         **keywords: those of :class:`wlr_gym.envs.settings.Settings`.
@@ -89,13 +90,13 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
         seed_robots(self.core, seeds, mask)
         self.core.begin_episodes(mask, given)
         self._over = self._over & ~mask
-        self.pictures.after_tick()
+        self.pictures.after_step()
         return self.core.observations(), _masked(self.core.reset_info(), mask)
 
     # ---- step ----
 
     def step(self, actions: Any) -> tuple[Any, NDArray[np.float64], Mask, Mask, dict[str, Any]]:
-        """Advance all robots one control tick; an ended episode is followed by the next as ``autoreset_mode`` says.
+        """Advance all robots one control step; an ended episode is followed by the next as ``autoreset_mode`` says.
 
         ``SameStep`` hands out the last observation and info of ended episodes as ``final_obs`` and ``final_info``.
 
@@ -122,7 +123,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
             core.begin_episodes(self._over)
             _merge(infos, _masked(core.reset_info(), self._over))
         self._over = over
-        self.pictures.after_tick()
+        self.pictures.after_step()
         return core.observations(), reward, terminated, truncated, infos
 
     def _restart_now(
@@ -139,12 +140,12 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
         core.begin_episodes(over)
         _merge(infos, _masked(core.reset_info(), over))
         _merge(infos, changes)
-        self.pictures.after_tick()
+        self.pictures.after_step()
         return core.observations(), reward, terminated, truncated, infos
 
     def _changes(self) -> dict[str, Any]:
         """Info of the robots whose parameters changed within their episode."""
-        return _masked(self.core.change_info(), self.core.changed) if self.core.changed.any() else {}
+        return _masked(self.core.change_info(), self.core.robots.changed) if self.core.robots.changed.any() else {}
 
     # ---- the rest ----
 
@@ -173,7 +174,7 @@ def seed_robots(core: Core, seeds: Sequence[int | None], mask: Mask) -> None:
         given = seeds[row]
         if given is not None:
             core.seed(row, given)
-        elif not core.seeded[row]:
+        elif not core.episodes.seeded[row]:
             core.seed(row, int(np.random.SeedSequence().generate_state(1, np.uint64)[0]))
 
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.settings import overlay
 from wlr_gym.envs.tasks import contract, describe, load_task
-from wlr_gym.envs.tasks.task import bounds, overlay
+from wlr_gym.envs.tasks.task import bounds
 from wlr_gym.envs.tasks.terms import TERMINATIONS
 from wlr_gym.robot import load_robot
 

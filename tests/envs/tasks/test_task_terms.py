@@ -13,7 +13,7 @@ from wlr_gym.envs.tasks import load_task
 from wlr_gym.envs.tasks.signals import Signals
 from wlr_gym.envs.tasks.success import succeeded
 from wlr_gym.envs.tasks.terms import MEASURES, REWARDS, references
-from wlr_gym.envs.tasks.terms.geometry import Motion, true_motion
+from wlr_gym.envs.tasks.terms.geometry import PlanarPose, true_pose
 from wlr_gym.robot import load_robot
 from wlr_gym.studies.paper.experiments import LEG_SPEED, TESTS
 
@@ -27,8 +27,8 @@ def signals(**values: Any) -> Signals:
 
 def error(shape, x, y, yaw: Any = 0.0, *, bend=1.0, wavelength=1.5, offset=0.0, turn=0.0) -> references.PathError:
     given = {"path_shape": shape, "path_curvature": bend, "path_wavelength": wavelength}
-    motion = Motion(np.asarray(x), np.asarray(y), np.asarray(yaw))
-    return references.path_error(signals(**given, path_offset=offset, path_heading=turn), motion)
+    pose = PlanarPose(np.asarray(x), np.asarray(y), np.asarray(yaw))
+    return references.path_error(signals(**given, path_offset=offset, path_heading=turn), pose)
 
 
 def test_line():
@@ -138,8 +138,8 @@ def test_motion_is_seen_from_the_start():
     values["truth.position[x]"] = 2.0 + 0.5 * math.cos(yaw0) - 0.1 * math.sin(yaw0)
     values["truth.position[y]"] = 1.0 + 0.5 * math.sin(yaw0) + 0.1 * math.cos(yaw0)
     values |= {"truth.quaternion[w]": math.cos(yaw / 2), "truth.quaternion[z]": math.sin(yaw / 2)}
-    motion = true_motion(Signals(lambda name: values.get(name, 0.0)))
-    assert (motion.x, motion.y, motion.yaw) == pytest.approx((0.5, 0.1, 1.5))
+    pose = true_pose(Signals(lambda name: values.get(name, 0.0)))
+    assert (pose.x, pose.y, pose.yaw) == pytest.approx((0.5, 0.1, 1.5))
 
 
 def test_success_is_staying_within_the_limits_to_the_end():

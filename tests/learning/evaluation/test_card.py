@@ -212,7 +212,7 @@ def test_slip_beyond_a_turn_is_what_the_reward_counts(core):
     spun = roll_out(core, Spin(), 0)
     slip = core.task.rewards.index("slip")
     rate = core.task.config.rewards["slip"]["weight"] * core.task.config.control_period / 0.05
-    np.testing.assert_allclose(spun.excess_slip[-1] * rate, core.terms[:, slip], rtol=1e-9)
+    np.testing.assert_allclose(spun.excess_slip[-1] * rate, core.scores.terms[:, slip], rtol=1e-9)
     assert 0.0 < spun.excess_slip.mean() < np.linalg.norm(spun.slip_velocity, axis=-1).mean()
 
 

@@ -2,7 +2,8 @@
 
 from wlr_gym.envs.tasks.describe import contract, describe, describe_randomization
 from wlr_gym.envs.tasks.randomization import Randomization, load_randomization
-from wlr_gym.envs.tasks.task import Task, TaskConfig, load_task
+from wlr_gym.envs.tasks.task import Task, load_task
+from wlr_gym.envs.tasks.task_config import TaskConfig
 
 __all__ = [
     "Randomization",

@@ -7,7 +7,8 @@ from typing import Any
 
 from wlr_gym.envs.tasks.entries import AreaConfig, EventConfig
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
-from wlr_gym.envs.tasks.task import ObservationColumn, Task, TaskConfig
+from wlr_gym.envs.tasks.task import ObservationColumn, Task
+from wlr_gym.envs.tasks.task_config import TaskConfig
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.robot import robot_hash, servo_hash
 
@@ -35,8 +36,8 @@ def describe(task: Task) -> str:
     period = config.control_period * 1000
     return "\n".join(
         [
-            f"**Action** ``Box(-1, 1, ({len(task.actions)},), float32)``: goal = clip(centre + scale * action, low, high)",
-            *table(("index", "joint", "goal", "unit", "centre", "scale", "low", "high"), _action_rows(task)),
+            f"**Action** ``Box(-1, 1, ({len(task.actions)},), float32)``: setpoint = clip(centre + scale * action, low, high)",
+            *table(("index", "joint", "setpoint", "unit", "centre", "scale", "low", "high"), _action_rows(task)),
             f"**Observation** ``Box(({len(task.policy)},), float32)``: value = scale * clip(reading - offset, +-limit)",
             *table(_OBSERVATION_HEADER, _observation_rows(task)),
             f'**Privileged observation** (``observation="dict"``): ``Box(({len(task.privileged)},), float32)``',
@@ -49,7 +50,7 @@ def describe(task: Task) -> str:
             *table(("term", "parameters", "meaning"), termination_rows),
             "**Measured**, in ``core.measures``; an episode is a success when nothing terminated it and all limits hold",
             *table(("measure", "unit", "limits", "meaning"), measure_rows),
-            f"**Truncated** after {config.episode_length:g} s ({task.episode_ticks} control ticks of {period:g} ms).",
+            f"**Truncated** after {config.episode_length:g} s ({task.episode_steps} control steps of {period:g} ms).",
         ]
     )
 
@@ -95,7 +96,7 @@ _OBSERVATION_HEADER = (
     "noise",
     "bias",
     "delay (ms)",
-    "lag (ticks)",
+    "lag (steps)",
 )
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from wlr_gym.base.errors import unknown_name
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.codegen import ops
@@ -21,7 +23,7 @@ START = ("x", "y", "yaw")
 
 
 class Signals:
-    """Access to one tick's signals.
+    """Access to one control step's signals.
 
     Args:
         read: returns the value of one scalar signal, such as ``truth.position[x]``, ``command.yaw_rate``,
@@ -30,7 +32,7 @@ class Signals:
 
     def __init__(self, read: Callable[[str], Value]) -> None:
         self._read = read
-        #: 1 where a termination term ended the episode in this tick, else 0.
+        #: 1 where a termination term ended the episode in this step, else 0.
         self.terminated: Value = 0.0
 
     def sensors(self, channel: str) -> list[Value]:
@@ -61,17 +63,17 @@ class Signals:
         return [self._read(f"{source}.{element}") for element in layout.channels[channel].elements]
 
     def command(self, name: str) -> Value:
-        """Commanded value the robot should have followed in this tick."""
+        """Commanded value the robot should have followed in this step."""
         return self._read(f"command.{name}")
 
     @property
     def action(self) -> list[Value]:
-        """This tick's action, 8 elements in [-1, 1]."""
+        """This step's action, 8 elements in [-1, 1]."""
         return [self._read(f"action[{joint}]") for joint in JOINTS]
 
     @property
     def previous_action(self) -> list[Value]:
-        """The action of the tick before (zeros in the first)."""
+        """The action of the step before (zeros in the first)."""
         return [self._read(f"previous_action[{joint}]") for joint in JOINTS]
 
     def robot(self, path: str) -> Value:
@@ -80,8 +82,21 @@ class Signals:
 
     @property
     def control_period(self) -> Value:
-        """Length of a control tick, s."""
+        """Length of a control step, s."""
         return self._read("task.control_period")
+
+
+def signals_of(function: Callable[..., Any]) -> set[str]:
+    """Return the names of the signals that a term's function reads."""
+    names: set[str] = set()
+
+    def read(name: str) -> np.float64:
+        names.add(name)
+        return np.float64(1.0)
+
+    with np.errstate(all="ignore"):
+        function(Signals(read))
+    return names
 
 
 def mean(values: list[Value]) -> Value:

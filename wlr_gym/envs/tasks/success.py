@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.envs.tasks.task import TaskConfig
+from wlr_gym.envs.tasks.task_config import TaskConfig
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
 def episode_rms(measure: Array, active: Flags) -> Array:
-    """Return the root mean square (N,) of a measure (T, N) over the ticks in which each episode was going on (T, N)."""
+    """Return the root mean square (N,) of a measure (T, N) over the steps in which each episode was going on (T, N)."""
     return np.sqrt((np.where(active, measure, 0.0) ** 2).sum(axis=0) / np.maximum(active.sum(axis=0), 1))
 
 
 def episode_max(measure: Array, active: Flags) -> Array:
-    """Return the largest magnitude (N,) of a measure (T, N) over the ticks in which each episode was going on (T, N)."""
+    """Return the largest magnitude (N,) of a measure (T, N) over the steps in which each episode was going on (T, N)."""
     return np.abs(np.where(active, measure, 0.0)).max(axis=0)
 
 
@@ -27,7 +27,7 @@ def succeeded(config: TaskConfig, measures: Array, active: Flags, fell: Flags) -
     Args:
         config: of the task.
         measures: (T, N, M) in the order of ``config.measures``.
-        active: (T, N) the episode was going on in this tick.
+        active: (T, N) the episode was going on in this step.
         fell: (N,) a termination term ended it.
     """
     well = ~fell

@@ -45,14 +45,14 @@ class EpisodeRecorder:
     """
 
     def __init__(self, core: Core, robot: int = 0) -> None:
-        if not core.begun[robot] or core.ticks[robot] != 0:
+        if not core.episodes.begun[robot] or core.episodes.steps[robot] != 0:
             raise InputError(f"robot {robot} of the batch: a recorder starts right after a reset")
         self.core, self.robot = core, robot
         self._parameters = core.parameters.values[robot].copy()
         nominal = Parameters.nominal(core.task.robot).values[0]
         self._at_first = departures(self._parameters, nominal)
         self._start = start_of(core.state, robot)
-        self._seed = int(core.episode_seeds[robot])
+        self._seed = int(core.episodes.seeds[robot])
         self._readings = [channels(core.sensors, robot)]
         self._goals: list[np.ndarray] = []
         self._changes: list[ParameterChange] = []
@@ -60,13 +60,13 @@ class EpisodeRecorder:
     def note(self) -> None:
         """Log the step just taken; once the episode is over nothing more is logged."""
         core, robot, row = self.core, self.robot, len(self._goals) + 1
-        if core.ticks[robot] != row or core.episode_seeds[robot] != self._seed:
+        if core.episodes.steps[robot] != row or core.episodes.seeds[robot] != self._seed:
             return
-        torque_on = True if core.torque_on is None else core.torque_on[robot]
-        self._goals.append(np.where(torque_on, core.goals[robot], np.nan))
+        torque_on = True if core.actions.torque_on is None else core.actions.torque_on[robot]
+        self._goals.append(np.where(torque_on, core.actions.setpoints[robot], np.nan))
         self._readings.append(channels(core.sensors, robot))
         parameters = core.parameters.values[robot]
-        if core.changed[robot]:
+        if core.robots.changed[robot]:
             self._changes.append(ParameterChange(row=row, parameters=departures(parameters, self._parameters)))
             self._parameters = parameters.copy()
 

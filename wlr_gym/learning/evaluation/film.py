@@ -69,7 +69,7 @@ def drive(core: Core, policy: Policy, seed: int, driver: Driver | None = None) -
         policy.reset(core.everyone)
         yield
         while not (driver.wants_reset() or core.terminated[0] or core.truncated[0]):
-            if commands := driver.command(float(core.ticks[0]) * period):
+            if commands := driver.command(float(core.episodes.steps[0]) * period):
                 core.set_command(dict(commands))
             core.step(policy.act(core.observation), core.everyone)
             yield
@@ -180,7 +180,7 @@ class Journey:
         """Note the present step."""
         truth, asked = core.plant.truth(), commands(core)
         place = truth.position[0, :2].copy()
-        if core.ticks[0] == 0 or not self._driven:
+        if core.episodes.steps[0] == 0 or not self._driven:
             self._driven, self._wanted, self._yaw = [], [place], float(yaw_of(*truth["quaternion"].T)[0])
         else:
             period = core.task.config.control_period
@@ -198,7 +198,7 @@ class Journey:
 
 def present_time(core: Core) -> float:
     """Return the time of the first robot since its episode began, s."""
-    return float(core.ticks[0]) * core.task.config.control_period
+    return float(core.episodes.steps[0]) * core.task.config.control_period
 
 
 def commands(core: Core) -> dict[str, float]:

@@ -218,7 +218,7 @@ def excess_slip_of(core: Core) -> Callable[[], Array]:
 
     It is what the reward term ``slip`` counts in the last step, whether the task has that term or not.
     """
-    from wlr_gym.envs.tasks.compiled import reader
+    from wlr_gym.envs.tasks.compiled_terms import reader
     from wlr_gym.envs.tasks.signals import Signals
     from wlr_gym.envs.tasks.terms import REWARDS
 

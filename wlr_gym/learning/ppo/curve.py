@@ -51,7 +51,7 @@ class Meter(BaseCallback):
         self._ticks += 1
         self._reward += float(rewards.mean(dtype=np.float64))
         self._robots += int(going_on.sum())
-        self._terms += self.core.terms[going_on].sum(axis=0)
+        self._terms += self.core.scores.terms[going_on].sum(axis=0)
         self._slip += float(np.sqrt((slip * slip).sum(axis=-1)).mean(axis=-1)[going_on].sum())
         for row in np.flatnonzero(dones):
             self._episodes += 1
@@ -64,7 +64,8 @@ class Meter(BaseCallback):
         arrays: dict[str, Any] = {}
         for name in sorted(names):
             arrays |= _arrays(name, self.locals[name])
-        arrays |= {"parameters": self.core.parameters.values, "robot_seeds": self.core.robot_seeds, "ticks": self.core.ticks}
+        episodes = self.core.episodes
+        arrays |= {"parameters": self.core.parameters.values, "robot_seeds": episodes.robot_seeds, "ticks": episodes.steps}
         replace_file(self.dump, lambda temporary: np.savez(temporary, **arrays))  # type: ignore[arg-type]
         raise TrainingError(f"{reason} after {self.num_timesteps} steps; state written to {self.dump}")
 

@@ -1,6 +1,6 @@
 """Computed observations: functions of named signals, traced into one compiled kernel per task.
 
-They are evaluated after the tick's new commands are drawn, so that they speak of what is asked from now on.
+They are evaluated after the step's new commands are drawn, so that they speak of what is asked from now on.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from wlr_gym.envs.tasks.signals import Signals, Value
 from wlr_gym.envs.tasks.terms import references
-from wlr_gym.envs.tasks.terms.geometry import Motion, estimated_motion, true_motion
+from wlr_gym.envs.tasks.terms.geometry import PlanarPose, estimated_pose, true_pose
 from wlr_gym.envs.tasks.terms.observations import POLICY_TERMS, PRIVILEGED_TERMS, ObservationTerm
 from wlr_gym.envs.tasks.terms.scalar import refuse_another
 from wlr_gym.robot import LEGS
@@ -70,27 +70,27 @@ def speed_command(signals: Signals) -> list[Value]:
 # ---- paths ----
 
 
-def _path_error(signals: Signals, motion: Motion) -> list[Value]:
-    error = references.path_error(signals, motion)
+def _path_error(signals: Signals, pose: PlanarPose) -> list[Value]:
+    error = references.path_error(signals, pose)
     return [error.lateral, error.heading]
 
 
 @computed("lateral", "heading", unit="m, rad", frame="path", limit=4.0, estimated=True)
 def path_error(signals: Signals) -> list[Value]:
     """Estimated distance from the path and heading against it, positive to the left."""
-    return _path_error(signals, estimated_motion(signals))
+    return _path_error(signals, estimated_pose(signals))
 
 
 @computed("lateral", "heading", unit="m, rad", frame="path", limit=4.0)
 def true_path_error(signals: Signals) -> list[Value]:
     """True distance from the path and heading against it, positive to the left."""
-    return _path_error(signals, true_motion(signals))
+    return _path_error(signals, true_pose(signals))
 
 
 @computed(*(f"{distance:g} m" for distance in references.PREVIEW), unit="1/m", frame="path", limit=10.0, estimated=True)
 def path_curvature(signals: Signals) -> list[Value]:
     """Curvature of the path at distances ahead, positive to the left."""
-    return list(references.path_error(signals, estimated_motion(signals)).curvature)
+    return list(references.path_error(signals, estimated_pose(signals)).curvature)
 
 
 # ---- a straight course ----
@@ -99,15 +99,15 @@ def path_curvature(signals: Signals) -> list[Value]:
 @computed("lateral", "heading", unit="m, rad", frame="start", limit=4.0, estimated=True)
 def course_error(signals: Signals) -> list[Value]:
     """Estimated distance from the line straight ahead of the start and heading against it, positive to the left."""
-    motion = estimated_motion(signals)
-    return [motion.y, motion.yaw]
+    pose = estimated_pose(signals)
+    return [pose.y, pose.yaw]
 
 
 @computed("lateral", "heading", unit="m, rad", frame="start", limit=4.0)
 def true_course_error(signals: Signals) -> list[Value]:
     """True distance from the line straight ahead of the start and heading against it, positive to the left."""
-    motion = true_motion(signals)
-    return [motion.y, motion.yaw]
+    pose = true_pose(signals)
+    return [pose.y, pose.yaw]
 
 
 # ---- leg angles ----

@@ -9,7 +9,7 @@ from wlr_gym.physics.codegen import ops
 
 
 @dataclass(frozen=True)
-class Motion:
+class PlanarPose:
     """Pose of the body origin. Frame: that of the episode's start (x ahead of the robot as it stood there).
 
     Attributes:
@@ -22,23 +22,23 @@ class Motion:
     yaw: Value
 
 
-def true_motion(signals: Signals) -> Motion:
+def true_pose(signals: Signals) -> PlanarPose:
     """What the simulator knows."""
     x, y, _ = signals.truth("position")
     x0, y0, yaw0 = signals.start
     cos, sin = ops.cos(yaw0), ops.sin(yaw0)
-    return Motion(
+    return PlanarPose(
         x=cos * (x - x0) + sin * (y - y0),
         y=cos * (y - y0) - sin * (x - x0),
         yaw=wrapped(yaw_of(*signals.truth("quaternion")) - yaw0),
     )
 
 
-def estimated_motion(signals: Signals) -> Motion:
+def estimated_pose(signals: Signals) -> PlanarPose:
     """What the slip observer makes of the sensors."""
     x, y = signals.estimate("position")
     (yaw,) = signals.estimate("yaw")
-    return Motion(x, y, yaw)
+    return PlanarPose(x, y, yaw)
 
 
 def yaw_of(w: Value, x: Value, y: Value, z: Value) -> Value:

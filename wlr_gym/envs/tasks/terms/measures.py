@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from wlr_gym.envs.tasks.signals import Signals, Value, mean, norm
 from wlr_gym.envs.tasks.terms import references
-from wlr_gym.envs.tasks.terms.geometry import true_motion
+from wlr_gym.envs.tasks.terms.geometry import true_pose
 from wlr_gym.envs.tasks.terms.scalar import ScalarTerm, registered
 from wlr_gym.physics.codegen import ops
 
@@ -29,25 +29,25 @@ def yaw_rate_error(signals: Signals) -> Value:
 @registered(MEASURES, unit="m")
 def path_lateral_error(signals: Signals) -> Value:
     """Distance of the body origin from the commanded path, positive to its left."""
-    return references.path_error(signals, true_motion(signals)).lateral
+    return references.path_error(signals, true_pose(signals)).lateral
 
 
 @registered(MEASURES, unit="rad")
 def path_heading_error(signals: Signals) -> Value:
     """Heading of the body against the path's direction at its nearest point, positive to the left."""
-    return references.path_error(signals, true_motion(signals)).heading
+    return references.path_error(signals, true_pose(signals)).heading
 
 
 @registered(MEASURES, unit="m")
 def lateral_error(signals: Signals) -> Value:
     """Distance of the body origin from the line straight ahead of the start, positive to the left."""
-    return true_motion(signals).y
+    return true_pose(signals).y
 
 
 @registered(MEASURES, unit="rad")
 def heading_error(signals: Signals) -> Value:
     """Heading of the body against that at the start, positive to the left."""
-    return true_motion(signals).yaw
+    return true_pose(signals).yaw
 
 
 @registered(MEASURES, unit="rad")
@@ -64,6 +64,6 @@ def climb_speed_error(signals: Signals) -> Value:
 
 @registered(MEASURES, unit="m/s")
 def slip_speed(signals: Signals) -> Value:
-    """Mean over the wheels of the slip speed, averaged over the tick."""
+    """Mean over the wheels of the slip speed, averaged over the step."""
     slip, period = signals.truth("slip_displacement"), signals.control_period
     return mean([norm(x, y) for x, y in zip(slip[0::2], slip[1::2], strict=True)]) / period

@@ -69,7 +69,7 @@ _SENSED = {
     term.name: term
     for term in (
         ObservationTerm("command", "command", (), "", "body", 2.0, "what the robot is asked to follow"),
-        ObservationTerm("last_action", "action", (), "-", "-", 1.0, "the action given one control tick before"),
+        ObservationTerm("last_action", "action", (), "-", "-", 1.0, "the action given one control step before"),
         _sensor(
             "leg_position", "joint_position", "joint", 2.0, "joints", lambda r: r.sensors.encoder.position,
             labels=LEGS, offset=lambda r: r.home.leg_angle, doc="leg encoder, from the home angle",

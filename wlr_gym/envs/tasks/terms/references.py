@@ -1,6 +1,6 @@
 """What a task asks for beyond constant speeds: paths on the floor, leg angles that change with time, climbing and holding.
 
-Everything is a closed function of the held commands, the time and the pose, so nothing is stored from tick to tick.
+Everything is a closed function of the held commands, the time and the pose, so nothing is stored from step to step.
 """
 
 from __future__ import annotations
@@ -9,16 +9,18 @@ import math
 from dataclasses import dataclass
 
 from wlr_gym.envs.tasks.signals import Signals, Value
-from wlr_gym.envs.tasks.terms.geometry import Motion, wrapped
+from wlr_gym.envs.tasks.terms.geometry import PlanarPose, wrapped
 from wlr_gym.physics.codegen import ops
-from wlr_gym.robot import CORNER_SIGNS
+from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE
 
 #: m along the path from the robot to where its curvature is previewed.
 PREVIEW = (0.0, 0.1, 0.2)
 #: Newton steps to the nearest point of an S-curve.
 NEWTON_STEPS = 4
-#: s in which the legs go from home to the first posture; s at which the sweep to the second one begins.
-POSTURE_READY, SWEEP_BEGINS = 3.0, 4.0
+#: s in which the legs go from home to the first posture.
+POSTURE_READY = 3.0
+#: s at which the sweep to the second posture begins.
+SWEEP_BEGINS = 4.0
 #: m/s2 on a slope: less than what is left 1.5 degrees below the friction limit, g sin 1.5 = 0.26.
 CLIMB_RAMP = 0.1
 
@@ -38,7 +40,7 @@ class PathError:
     curvature: tuple[Value, ...]
 
 
-def path_error(signals: Signals, motion: Motion) -> PathError:
+def path_error(signals: Signals, pose: PlanarPose) -> PathError:
     """Return the error from the commanded path: a line, an S-curve or a circle.
 
     The path begins ``path_offset`` to the left of where the robot stood at the start, turned left by ``path_heading``.
@@ -48,8 +50,8 @@ def path_error(signals: Signals, motion: Motion) -> PathError:
     shape, bend = signals.command("path_shape"), signals.command("path_curvature")
     turn = signals.command("path_heading")
     cos, sin = ops.cos(turn), ops.sin(turn)
-    away = motion.y - signals.command("path_offset")
-    x, y = cos * motion.x + sin * away, cos * away - sin * motion.x
+    away = pose.y - signals.command("path_offset")
+    x, y = cos * pose.x + sin * away, cos * away - sin * pose.x
     is_circle, is_curve = shape - 2.0, shape - 1.0
     circle = _circle(x, y, ops.where_positive(is_circle, bend, 0.0))  # a line is a circle without curvature
     curve = _s_curve(x, y, bend, 2.0 * math.pi / signals.command("path_wavelength"))
@@ -59,7 +61,7 @@ def path_error(signals: Signals, motion: Motion) -> PathError:
 
     lateral, direction = (chosen(a, b) for a, b in zip(circle[:2], curve[:2], strict=True))
     curvature = tuple(chosen(a, b) for a, b in zip(circle[2], curve[2], strict=True))
-    return PathError(lateral, wrapped(motion.yaw - turn - direction), curvature)
+    return PathError(lateral, wrapped(pose.yaw - turn - direction), curvature)
 
 
 def _circle(x: Value, y: Value, bend: Value) -> tuple[Value, Value, list[Value]]:
@@ -116,7 +118,7 @@ def _leg_reference(signals: Signals, axle: str) -> tuple[Value, Value]:
 
 def leg_errors(signals: Signals) -> list[Value]:
     """Return the true leg angles minus those asked for, rad."""
-    angles = signals.truth("joint_position")[:4]
+    angles = signals.truth("joint_position")[LEG_SLICE]
     return [angle - asked for angle, (asked, _) in zip(angles, leg_references(signals), strict=True)]
 
 

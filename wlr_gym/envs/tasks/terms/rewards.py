@@ -9,10 +9,10 @@ import math
 
 from wlr_gym.envs.tasks.signals import Signals, Value, mean, norm
 from wlr_gym.envs.tasks.terms import references
-from wlr_gym.envs.tasks.terms.geometry import true_motion
+from wlr_gym.envs.tasks.terms.geometry import true_pose
 from wlr_gym.envs.tasks.terms.scalar import POSITIVE, ScalarTerm, registered
 from wlr_gym.physics.codegen import ops
-from wlr_gym.robot import CORNER_SIGNS
+from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, LEGS, WHEELS
 
 REWARDS: dict[str, ScalarTerm] = {}
 
@@ -51,15 +51,15 @@ def velocity_error(signals: Signals, *, linear: Value = 0.02, angular: Value = 0
 @registered(REWARDS, lateral=POSITIVE, heading=POSITIVE)
 def path_error(signals: Signals, *, lateral: Value = 0.015, heading: Value = 0.2) -> Value:
     """Distance from the path over ``lateral`` (m), heading error over ``heading`` (rad), each r as |r| / (1 + |r| / 8)."""
-    error = references.path_error(signals, true_motion(signals))
+    error = references.path_error(signals, true_pose(signals))
     return _levelling(error.lateral / lateral) + _levelling(error.heading / heading)
 
 
 @registered(REWARDS, lateral=POSITIVE, heading=POSITIVE)
 def course_error(signals: Signals, *, lateral: Value = 0.01, heading: Value = 0.025) -> Value:
     """Distance from the start's line over ``lateral`` (m), heading over ``heading`` (rad), each r as |r| / (1 + |r| / 8)."""
-    motion = true_motion(signals)
-    return _levelling(motion.y / lateral) + _levelling(motion.yaw / heading)
+    pose = true_pose(signals)
+    return _levelling(pose.y / lateral) + _levelling(pose.yaw / heading)
 
 
 @registered(REWARDS, scale=POSITIVE)
@@ -90,7 +90,7 @@ def other_motion(signals: Signals, *, linear: Value = 0.1, angular: Value = 0.5)
 
 @registered(REWARDS)
 def action_rate(signals: Signals) -> Value:
-    """Mean squared change of the action since the tick before."""
+    """Mean squared change of the action since the step before."""
     changes = [now - before for now, before in zip(signals.action, signals.previous_action, strict=True)]
     return mean([change * change for change in changes])
 
@@ -99,7 +99,7 @@ def action_rate(signals: Signals) -> Value:
 def leg_posture(signals: Signals, *, scale: Value = 0.5) -> Value:
     """Mean squared leg angle from home over ``scale`` (rad)."""
     home = signals.robot("home.leg_angle")
-    offsets = [(angle - home) / scale for angle in signals.truth("joint_position")[:4]]
+    offsets = [(angle - home) / scale for angle in signals.truth("joint_position")[LEG_SLICE]]
     return mean([offset * offset for offset in offsets])
 
 
@@ -119,7 +119,7 @@ def skid_turn_slip(signals: Signals) -> list[tuple[Value, Value]]:
     yaw_rate = ops.absolute(signals.truth("angular_velocity_in_body")[2])
     hip, side, length = signals.robot("hip_position.x"), signals.robot("hip_position.y"), signals.robot("leg.length")
     needed = []
-    for (front, _), angle in zip(CORNER_SIGNS, signals.truth("joint_position")[:4], strict=True):
+    for (front, _), angle in zip(CORNER_SIGNS, signals.truth("joint_position")[LEG_SLICE], strict=True):
         reach = ops.absolute(hip * front + length * ops.cos(angle))
         needed.append((yaw_rate * reach * reach / side, yaw_rate * reach))
     return needed
@@ -127,9 +127,9 @@ def skid_turn_slip(signals: Signals) -> list[tuple[Value, Value]]:
 
 @registered(REWARDS, speed=POSITIVE)
 def slip(signals: Signals, *, speed: Value = 0.05) -> Value:
-    """Mean wheel slip speed beyond what turning on skids needs, over ``speed`` (m/s); rolling costs nothing.
+    """Mean wheel slip speed beyond what skid steering needs, over ``speed`` (m/s); rolling costs nothing.
 
-    Slip is the mean over the tick (slip displacement over the control period); what a turn needs: :func:`skid_turn_slip`.
+    Slip is the mean over the step (slip displacement over the control period); what a turn needs: :func:`skid_turn_slip`.
     """
     displacement, period = signals.truth("slip_displacement"), signals.control_period
     excess = [
@@ -148,7 +148,7 @@ def _beyond(value: Value, free: Value) -> Value:
 @registered(REWARDS, threshold=(-math.inf, 1.0))
 def torque_saturation(signals: Signals, *, threshold: Value = 0.8) -> Value:
     """Mean motor torque beyond ``threshold`` of its stall torque, over the rest up to stall."""
-    stall = [signals.robot("servo.leg.stall_torque")] * 4 + [signals.robot("servo.wheel.stall_torque")] * 4
+    stall = [signals.robot("servo.leg.stall_torque")] * len(LEGS) + [signals.robot("servo.wheel.stall_torque")] * len(WHEELS)
     used = [ops.absolute(torque) / limit for torque, limit in zip(signals.truth("motor_torque"), stall, strict=True)]
     return mean([ops.maximum(share - threshold, 0.0) for share in used]) / (1.0 - threshold)
 
@@ -161,5 +161,5 @@ def alive(signals: Signals) -> Value:
 
 @registered(REWARDS)
 def termination(signals: Signals) -> Value:
-    """1 in the tick in which a termination term ends the episode, else 0."""
+    """1 in the step in which a termination term ends the episode, else 0."""
     return signals.terminated

@@ -1,4 +1,4 @@
-"""Termination terms: the episode ends (``terminated``) in the tick in which a term is greater than zero."""
+"""Termination terms: the episode ends (``terminated``) in the step in which a term is greater than zero."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,35 +23,38 @@ from wlr_gym.robot import JOINTS
 Array = NDArray[np.float64]
 
 
-#: Matrices that terms read, one row per robot, in the order kernels take them; ``clock`` has the one column ``time``.
-MATRICES = ("sensors", "estimate", "truth", "command", "action", "previous_action", "start", "clock")
+#: The signals of a control step, a matrix each, float64 and C-contiguous, one row per robot. ``clock`` has the one column
+#: ``time``. ``computed`` holds the computed observations, which rewards, terminations and measures do not read.
+MATRICES = ("sensors", "estimate", "truth", "command", "action", "previous_action", "start", "clock", "computed")
+
+
+class Scores(NamedTuple):
+    """What a control step is worth.
+
+    Weighted reward ``terms`` (N, T), their ``total`` (N,) and ``sums`` (N, T) over the episode, termination terms ``over``
+    (N, K) and ``measures`` (N, M).
+    """
+
+    terms: Array
+    total: Array
+    over: Array
+    sums: Array
+    measures: Array
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """Compiled rewards, terminations and measures.
+class TermKernel:
+    """Terms of a task, compiled.
 
     Attributes:
-        run: ``run(active, *MATRICES, numbers, terms, total, over, sums, measures)``; ``active`` (N,) tells whose rows to do.
-            Writes the weighted reward terms (N, T), their total (N,), the termination terms (N, K) and the measures (N, M),
-            and adds the terms to ``sums`` (N, T). Returns the first robot whose reward is not finite, or -1.
+        run: takes ``active`` (N,), whose rows to do, a plain tuple of :data:`MATRICES`, and ``numbers``. That of rewards,
+            terminations and measures also takes a plain tuple of :class:`Scores`, writes them, and returns the first robot
+            whose reward is not finite, or -1; that of computed observations writes ``computed``. (numba takes twice as long to
+            receive a named tuple as a plain one.)
         numbers: (P,) weights, parameters and robot numbers in the order the kernel reads them.
     """
 
-    run: Callable[..., int]
-    numbers: Array
-
-
-@dataclass(frozen=True)
-class Computation:
-    """Compiled computed observations.
-
-    Attributes:
-        run: ``run(active, *MATRICES, numbers, computed)`` writes (N, ``task.computed``).
-        numbers: (P,) robot numbers in the order the kernel reads them.
-    """
-
-    run: Callable[..., None]
+    run: Callable[..., Any]
     numbers: Array
 
 
@@ -110,7 +113,7 @@ def number(task: Task, name: str) -> float:
 
 
 def matrix_columns(task: Task) -> dict[str, tuple[str, int]]:
-    """Return signal name -> (matrix, column) for everything that differs from robot to robot and tick to tick."""
+    """Return signal name -> (matrix, column) for everything that differs from robot to robot and step to step."""
     groups = {
         "sensors": ("sensors.{}", SENSOR_LAYOUT.elements),
         "estimate": ("estimate.{}", ESTIMATE_LAYOUT.elements),
@@ -141,26 +144,26 @@ def reader(task: Task, matrices: Mapping[str, Array]) -> Callable[[str], Value]:
     return read
 
 
-def compile_evaluation(task: Task) -> Evaluation:
+def compile_scores(task: Task) -> TermKernel:
     """Trace and compile the rewards, terminations and measures of a task."""
     stores = {"total": "total[i]"}
     stores |= {f"over.{name}": f"over[i, {k}]" for k, name in enumerate(task.terminations)}
     stores |= {f"term.{name}": f"terms[i, {k}]" for k, name in enumerate(task.rewards)}
     stores |= {f"measure.{name}": f"measures[i, {k}]" for k, name in enumerate(task.measures)}
     outputs = expressions(task, Graph().input)
-    return Evaluation(*_compile(task, "evaluation", outputs, stores, _EVALUATION_HEAD, _EVALUATION_TAIL))
+    return _compile(task, "evaluation", outputs, stores, _SCORES_HEAD, _SCORES_TAIL)
 
 
-def compile_computation(task: Task) -> Computation:
+def compile_computed(task: Task) -> TermKernel:
     """Trace and compile the computed observations of a task."""
     outputs = computed_expressions(task, Graph().input)
     stores = {element: f"computed[i, {k}]" for k, element in enumerate(task.computed)}
-    return Computation(*_compile(task, "computation", outputs, stores, _COMPUTATION_HEAD, ()))
+    return _compile(task, "computation", outputs, stores, _COMPUTED_HEAD, ())
 
 
 def _compile(
     task: Task, kind: str, outputs: Mapping[str, Value], stores: Mapping[str, str], head: Sequence[str], tail: Sequence[str]
-) -> tuple[Callable[..., Any], Array]:
+) -> TermKernel:
     columns = matrix_columns(task)
     numbers: dict[str, int] = {}
 
@@ -174,13 +177,15 @@ def _compile(
     source = "\n".join([_DECORATOR, *head, *lines, *tail, ""])
     name = task.config.name
     module = load_module(f"{kind}_{name}", source, f"wlr_gym: compiling the {kind} of task '{name}' (once)")
-    return module.run, np.array([number(task, name) for name in numbers], dtype=np.float64)
+    return TermKernel(module.run, np.array([number(task, name) for name in numbers], dtype=np.float64))
 
 
 _DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
-_ARGUMENTS = f"active, {', '.join(MATRICES)}, numbers"
-_EVALUATION_HEAD = (
-    f"def run({_ARGUMENTS}, terms, total, over, sums, measures):",
+_UNPACK = f"    {', '.join(MATRICES)} = signals"
+_SCORES_HEAD = (
+    "def run(active, signals, numbers, scores):",
+    _UNPACK,
+    f"    {', '.join(Scores._fields)} = scores",
     "    bad = -1",
     "    for i in range(total.shape[0]):",
     "        if not active[i]:",
@@ -190,15 +195,16 @@ _EVALUATION_HEAD = (
     "            measures[i, :] = 0.0",
     "            continue",
 )
-_EVALUATION_TAIL = (
+_SCORES_TAIL = (
     "        for k in range(terms.shape[1]):",
     "            sums[i, k] += terms[i, k]",
     "        if bad < 0 and not math.isfinite(total[i]):",
     "            bad = i",
     "    return bad",
 )
-_COMPUTATION_HEAD = (
-    f"def run({_ARGUMENTS}, computed):",
+_COMPUTED_HEAD = (
+    "def run(active, signals, numbers):",
+    _UNPACK,
     "    for i in range(computed.shape[0]):",
     "        if not active[i]:",
     "            continue",

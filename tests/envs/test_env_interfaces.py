@@ -307,7 +307,7 @@ def test_next_step_resets_on_the_following_step_and_ignores_the_action(fake):
     assert not truncated.any()
     assert infos["_randomization"].all()
     assert not np.array_equal(following, observation)
-    assert env.core.ticks.tolist() == [0, 0]
+    assert env.core.episodes.steps.tolist() == [0, 0]
 
 
 def test_same_step_hands_out_the_final_observation_and_info(fake):

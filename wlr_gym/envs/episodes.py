@@ -1,0 +1,100 @@
+"""Episodes: their seeds, how many steps they have lasted, and how they end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from numba import njit
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.envs.tasks.draws import episode_seeds
+
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.intp]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_step(mask: Any, limit: int, over: Any, steps: Any, terminated: Any, truncated: Any) -> bool:
+    """Count a step and set the end flags. Returns whether any episode ended."""
+    any_done = False
+    for i in range(len(mask)):
+        if not mask[i]:
+            continue
+        terminated[i] = False
+        steps[i] += 1
+        for k in range(over.shape[1]):
+            if over[i, k] > 0.0:
+                terminated[i] = True
+        truncated[i] = steps[i] >= limit
+        any_done = any_done or terminated[i] or truncated[i]
+    return any_done
+
+
+class Episodes:
+    """The episodes of N robots, all (N,).
+
+    Attributes:
+        robot_seeds: the robots' own seeds. number: which episode of the robot this is, from 0. seeds: of the episodes.
+        seeded: whether the robot has a seed. begun: whether its first episode has begun.
+        steps: control steps since the episode began.
+        terminated, truncated: flags of the last step.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.robot_seeds = np.zeros(count, np.uint64)
+        self.number = np.zeros(count, np.int64)
+        self.seeds = np.zeros(count, np.uint64)
+        self.seeded = np.zeros(count, bool)
+        self.begun = np.zeros(count, bool)
+        self.steps = np.zeros(count, np.int64)
+        self.terminated = np.zeros(count, bool)
+        self.truncated = np.zeros(count, bool)
+
+    def seed(self, row: int, seed: int) -> None:
+        """Give a robot its seed; its next episode is its first.
+
+        Raises:
+            InputError: see :func:`read_seed`.
+        """
+        self.robot_seeds[row] = read_seed(seed) % 2**64
+        self.number[row] = -1
+        self.seeded[row] = True
+
+    def next_seeds(self, rows: Rows) -> NDArray[np.uint64]:
+        """Return the seeds of the next episodes of some robots."""
+        return episode_seeds(self.robot_seeds[rows], self.number[rows] + 1)
+
+    def begin(self, rows: Rows, seeds: NDArray[np.uint64]) -> None:
+        """Begin the next episodes of some robots, which have these seeds."""
+        self.number[rows] += 1
+        self.seeds[rows] = seeds
+        self.steps[rows] = 0
+        self.terminated[rows] = self.truncated[rows] = False
+
+    def count_step(self, mask: Mask, limit: int, over: NDArray[np.float64]) -> bool:
+        """Count a step of the robots in ``mask``: any of their termination terms ``over`` (N, K) above 0 ends the episode, as
+        does step ``limit``. Returns whether any episode ended."""
+        return _count_step(mask, limit, over, self.steps, self.terminated, self.truncated)
+
+    def require_begun(self, what: str) -> None:
+        """Refuse what needs the episodes of all robots to have begun.
+
+        Raises:
+            gymnasium.error.ResetNeeded: one has not.
+        """
+        if not self.begun.all():
+            raise ResetNeeded(f"call reset() before {what}: no episode of robot {int(np.argmin(self.begun))} has begun")
+
+
+def read_seed(seed: Any) -> int:
+    """Return a seed.
+
+    Raises:
+        InputError: no whole number of 0 or more.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError(f"seed = {seed!r}: expected a whole number of 0 or more")
+    return int(seed)

@@ -1,0 +1,215 @@
+"""The observation: readings with noise and bias, kept for a while, and shown as old as their devices make them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from wlr_gym.base.random import normals4
+from wlr_gym.envs.episodes import Episodes
+from wlr_gym.envs.tasks.compiled_terms import MATRICES
+from wlr_gym.envs.tasks.draws import stream_numbers, uniforms
+from wlr_gym.envs.tasks.randomization import RandomizationConfig
+from wlr_gym.envs.tasks.task import ObservationColumn, Task
+from wlr_gym.envs.tasks.terms.events import normal
+from wlr_gym.perception.observer import ESTIMATE_LAYOUT
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
+from wlr_gym.robot import JOINTS
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.intp]
+
+# Where the matrices that observations show stand in :data:`MATRICES`.
+SENSORS = MATRICES.index("sensors")
+ESTIMATE = MATRICES.index("estimate")
+COMMAND = MATRICES.index("command")
+ACTION = MATRICES.index("action")
+COMPUTED = MATRICES.index("computed")
+
+#: A bias is cut off so many sigmas from zero.
+BIAS_CUT = 4.0
+
+#: One number that is read in every step: its matrix of :data:`MATRICES`, column there, offset, noise (1 sigma), noise's stream.
+READING = np.dtype(
+    [("matrix", np.int64), ("column", np.int64), ("offset", np.float64), ("noise", np.float64), ("stream", np.uint64)]
+)
+#: One number of the policy observation: which reading, how old (control steps, on top of its device's latency), clipped and
+#: scaled. ``interpolate``: between the two readings around that age; else the newest that is at least that old.
+SHOWN = np.dtype(
+    [
+        ("reading", np.int64),
+        ("lag", np.int64),
+        ("device", np.int64),
+        ("interpolate", np.int64),
+        ("limit", np.float64),
+        ("scale", np.float64),
+    ]
+)
+#: One number of the privileged observation: its matrix of :data:`MATRICES`, column there, clipped and scaled.
+PICKED = np.dtype([("matrix", np.int64), ("column", np.int64), ("limit", np.float64), ("scale", np.float64)])
+
+
+# Of the kernels' arguments, ``tables`` is what is read (W,) and what is shown of it (D,). ``buffers``: bias (N, W) of the
+# readings, delays (N, devices + 1) of the devices in control steps, of which the last is zero, ring (N, K, W) with the last K
+# readings, and the policy observation (N, D). Plain tuples: numba takes twice as long to receive named ones.
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _observe(mask: Any, first: bool, signals: Any, seeds: Any, steps: Any, tables: Any, buffers: Any) -> None:
+    """Take all readings, and show those of the right age. ``first``: the episode starts, older readings are as this one."""
+    readings, shown = tables
+    _read(mask, first, signals, seeds, steps, readings, buffers)
+    _show(mask, steps, shown, buffers)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _read(mask: Any, first: bool, signals: Any, seeds: Any, steps: Any, readings: Any, buffers: Any) -> None:
+    """Take the readings into the ring."""
+    sensors, estimate, truth, command, action, _, _, _, computed = signals
+    bias, _, ring, _ = buffers
+    depth = ring.shape[1]
+    for i in range(len(mask)):
+        if not mask[i]:
+            continue
+        now = steps[i] % depth
+        for w in range(len(readings)):
+            reading = readings[w]
+            matrix, column = reading.matrix, reading.column
+            if matrix == SENSORS:
+                value = sensors[i, column]
+            elif matrix == COMMAND:
+                value = command[i, column]
+            elif matrix == ACTION:
+                value = action[i, column]
+            elif matrix == ESTIMATE:
+                value = estimate[i, column]
+            elif matrix == COMPUTED:
+                value = computed[i, column]
+            else:
+                value = truth[i, column]
+            value = value - reading.offset + bias[i, w]
+            if reading.noise > 0.0:
+                value += reading.noise * normals4(seeds[i], reading.stream, steps[i], 0)[0]
+            ring[i, now, w] = value
+            if first:
+                for k in range(depth):
+                    ring[i, k, w] = value
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _show(mask: Any, steps: Any, shown: Any, buffers: Any) -> None:
+    """Assemble the observation from readings of the right age."""
+    _, delays, ring, policy = buffers
+    depth = ring.shape[1]
+    for i in range(len(mask)):
+        if not mask[i]:
+            continue
+        now = steps[i] % depth
+        for d in range(len(shown)):
+            column = shown[d]
+            age = delays[i, column.device] + column.lag
+            whole = math.floor(age)
+            rest = age - whole
+            value = ring[i, (now - whole + depth) % depth, column.reading]
+            if rest > 0.0:
+                older = ring[i, (now - whole - 1 + depth) % depth, column.reading]
+                value = value + rest * (older - value) if column.interpolate == 1 else older
+            policy[i, d] = column.scale * min(max(value, -column.limit), column.limit)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pick(mask: Any, signals: Any, picked: Any, out: Any) -> None:
+    """Copy columns of the truth and of what is computed, clipped to a limit and scaled."""
+    _, _, truth, _, _, _, _, _, computed = signals
+    for i in range(len(mask)):
+        if mask[i]:
+            for d in range(len(picked)):
+                column = picked[d]
+                value = computed[i, column.column] if column.matrix == COMPUTED else truth[i, column.column]
+                out[i, d] = column.scale * min(max(value, -column.limit), column.limit)
+
+
+class ObservationPipeline:
+    """Makes the observations of N robots.
+
+    Args:
+        task: what is observed.
+        randomization: whether sensors are noisy, and whether latency is drawn.
+        count: N.
+        has_latency: False for a real robot, whose readings are late by themselves.
+        has_privileged: whether privileged observations are made.
+
+    Attributes:
+        policy: (N, D) float32 policy observations. privileged: (N, P) float32 privileged ones.
+        bias: (N, W) of the readings, in their units. delays: (N, devices + 1) of the devices, control steps.
+    """
+
+    def __init__(
+        self, task: Task, randomization: RandomizationConfig, count: int, *, has_latency: bool, has_privileged: bool
+    ) -> None:
+        latency, period = task.config.latency, task.config.control_period
+        read = list({(c.term, c.element): c for c in task.policy}.values())
+        noisy = float(randomization.sensor_noise)
+        noise_streams = stream_numbers(*(f"noise/{c.term}/{c.element}" for c in read))
+        readings = [(*_place(c, task), c.offset, c.noise * noisy, s) for c, s in zip(read, noise_streams, strict=True)]
+        self._tables = (np.array(readings, READING), _shown(task, read))
+        self._picked = np.array([(*_place(c, task), c.limit, c.scale) for c in task.privileged], PICKED)
+        self._bias_sigma = np.array([c.bias * noisy for c in read])
+        self._bias_stream = stream_numbers(*(f"bias/{c.term}/{c.element}" for c in read))
+        self._latency = np.array([device.delay for device in latency.values()]).reshape(-1, 2) / period
+        self._latency_stream = stream_numbers(*(f"latency/{device}" for device in latency))
+        self._draws_latency = randomization.latency
+        self._has_latency = has_latency
+        self._has_privileged = has_privileged
+        longest_delay = float(self._latency.max()) if latency else 0.0
+        depth = max(c.lag for c in task.policy) + math.ceil(longest_delay) + 1
+        self.bias = np.zeros((count, len(read)))
+        self.delays = np.zeros((count, len(latency) + 1))
+        self.policy = np.zeros((count, len(task.policy)), np.float32)
+        self._buffers = (self.bias, self.delays, np.zeros((count, depth, len(read))), self.policy)
+        self.privileged = np.zeros((count, len(task.privileged)), np.float32)
+
+    def begin(self, rows: Rows, seeds: NDArray[np.uint64]) -> None:
+        """Draw latency and bias of some robots' episodes, which have these seeds (M,)."""
+        low, high = self._latency[:, 0], self._latency[:, 1]
+        share = uniforms(seeds, self._latency_stream) if self._draws_latency else 0.5
+        self.delays[rows, :-1] = low + (high - low) * share if self._has_latency else 0.0
+        if self._bias_sigma.any():
+            u = uniforms(seeds, self._bias_stream)
+            self.bias[rows] = normal(u, np.zeros(1), self._bias_sigma, np.full(1, BIAS_CUT))
+
+    def observe(self, mask: Mask, signals: tuple[Array, ...], episodes: Episodes, *, first: bool) -> None:
+        """Observe the robots in ``mask``; ``signals`` are :data:`MATRICES`, ``first``: their episodes start."""
+        _observe(mask, first, signals, episodes.seeds, episodes.steps, self._tables, self._buffers)
+        if self._has_privileged:
+            _pick(mask, signals, self._picked, self.privileged)
+
+
+def _place(column: ObservationColumn, task: Task) -> tuple[int, int]:
+    """Matrix of :data:`MATRICES` and column there."""
+    elements = {
+        "sensors": SENSOR_LAYOUT.elements,
+        "command": task.commands,
+        "action": JOINTS,
+        "estimate": ESTIMATE_LAYOUT.elements,
+        "computed": task.computed,
+        "truth": TRUTH_LAYOUT.elements,
+    }
+    return MATRICES.index(column.source), elements[column.source].index(column.element)
+
+
+def _shown(task: Task, read: list[ObservationColumn]) -> NDArray[np.void]:
+    places = {(c.term, c.element): index for index, c in enumerate(read)}
+    devices: list[str] = list(task.config.latency)
+    modes = [latency.mode for latency in task.config.latency.values()]
+    rows = []
+    for c in task.policy:
+        device = devices.index(c.device) if c.device in devices else len(devices)
+        interpolate = c.device in devices and modes[device] == "interpolate"
+        rows.append((places[c.term, c.element], c.lag, device, interpolate, c.limit, c.scale))
+    return np.array(rows, SHOWN)

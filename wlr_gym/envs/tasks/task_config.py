@@ -1,0 +1,249 @@
+"""What a task's file says: a YAML file that lists terms with weights, parameters, scales, noise, latency and history."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_config
+from wlr_gym.envs.tasks.signals import signals_of
+from wlr_gym.envs.tasks.terms import (
+    COMMANDS,
+    COMPUTED,
+    MEASURES,
+    POLICY_TERMS,
+    PRIVILEGED_TERMS,
+    REWARDS,
+    TERMINATIONS,
+    ScalarTerm,
+)
+
+#: Group of a task's data -> what its terms are called, and those there are.
+_TERMS: dict[str, tuple[str, Mapping[str, Any]]] = {
+    "observations": ("observation term", POLICY_TERMS),
+    "privileged": ("privileged term", PRIVILEGED_TERMS),
+    "rewards": ("reward term", REWARDS),
+    "terminations": ("termination term", TERMINATIONS),
+    "measures": ("measure", MEASURES),
+}
+
+
+class ActionConfig(SettingsModel):
+    """Setpoint = centre + scale * action: rad about the home angle (legs), rad/s about zero (wheels)."""
+
+    leg_scale: float = Field(gt=0)
+    wheel_scale: float = Field(gt=0)
+
+
+class CommandsConfig(SettingsModel):
+    """Commands drawn uniformly in [low, high], held for a time drawn in ``hold_time`` (s); all zero now and then.
+
+    ``ramp``: largest rate of change (unit/s) of a command, from 0 at the start; those not named jump. A command that is given
+    (reset option, ``set_command``) holds at once.
+    """
+
+    hold_time: tuple[float, float]
+    zero_probability: float = Field(default=0.0, ge=0, le=1)
+    ramp: dict[str, Annotated[float, Field(gt=0)]] = Field(default={})
+    terms: dict[str, tuple[float, float]]
+
+
+class LatencyConfig(SettingsModel):
+    """Age of a device's readings: drawn per episode and robot in ``delay`` (s).
+
+    ``interpolate`` mixes the two readings around that age; ``hold`` gives the newest reading at least that old.
+    """
+
+    delay: tuple[float, float]
+    mode: Literal["interpolate", "hold"] = "interpolate"
+
+
+class ObservationConfig(SettingsModel):
+    """How a term enters the observation: ``scale * clip(reading - offset + bias + noise, +-limit)``.
+
+    ``noise`` (per reading) and ``bias`` (per episode) are 1 sigma in the term's unit; ``history`` readings, newest first.
+    """
+
+    scale: float = Field(default=1.0, gt=0)
+    noise: float = Field(default=0.0, ge=0)
+    bias: float = Field(default=0.0, ge=0)
+    limit: float | None = Field(default=None, gt=0)
+    history: int = Field(default=1, ge=1, le=64)
+
+
+class PrivilegedConfig(SettingsModel):
+    """How a true quantity enters the privileged observation: ``scale * clip(value, +-limit)``."""
+
+    scale: float = Field(default=1.0, gt=0)
+    limit: float | None = Field(default=None, gt=0)
+
+
+class ObserverConfig(SettingsModel):
+    """The slip observer (:mod:`wlr_gym.perception.observer`); it runs where a term needs its estimate.
+
+    ``camera``: it uses the camera's poses as they come; False = as if there were no camera.
+    """
+
+    camera: bool = True
+
+
+class RampConfig(SettingsModel):
+    """Share of a spread: ``start`` in the beginning, rising evenly to 1 after ``steps`` environment steps of all robots."""
+
+    start: float = Field(gt=0, le=1)
+    steps: float = Field(gt=0)
+
+
+class CurriculumConfig(SettingsModel):
+    """What a training begins with less of. Every draw is moved towards the middle of its distribution.
+
+    It only acts on who says how far training is (``Core.set_progress``): all else meets the whole task.
+    """
+
+    commands: RampConfig | None = None
+    randomization: RampConfig | None = None
+
+
+class SuccessConfig(SettingsModel):
+    """Largest root mean square and largest magnitude of a measure over an episode, in its unit."""
+
+    rms: float | None = Field(default=None, gt=0)
+    max: float | None = Field(default=None, gt=0)
+
+
+class TaskConfig(SettingsModel):
+    """Contents of ``configs/task/*.yaml``.
+
+    An episode is a success when no termination term ended it and every measure named in ``success`` stays within its limits.
+    ``summary`` opens the environment's documentation, ``history`` closes it: version of the id -> what changed. The last
+    version is the present one.
+    """
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    summary: str = ""
+    history: dict[Annotated[str, Field(pattern=r"^v\d+$")], str] = Field(default={"v0": "first version"}, min_length=1)
+    robot: str = "nominal"
+    randomization: str = "nominal"
+    control_period: float = Field(gt=0, le=0.5)
+    episode_length: float = Field(gt=0)
+    action: ActionConfig
+    commands: CommandsConfig
+    latency: dict[Literal["joints", "imu", "camera"], LatencyConfig] = Field(default={})
+    observer: ObserverConfig = ObserverConfig()
+    observations: dict[str, ObservationConfig]
+    privileged: dict[str, PrivilegedConfig] = Field(default={})
+    rewards: dict[str, dict[str, float]]
+    terminations: dict[str, dict[str, float]] = Field(default={})
+    measures: dict[str, dict[str, float]] = Field(default={})
+    success: dict[str, SuccessConfig] = Field(default={})
+    curriculum: CurriculumConfig = CurriculumConfig()
+
+
+def read_task(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> TaskConfig:
+    """Read a task and check every name and number in it.
+
+    Args:
+        source: name in ``configs/task/``, path of a YAML file, or a mapping with the same keys.
+        overrides: nested mapping laid over it; a term set to None is removed, if it is there.
+
+    Raises:
+        InputError: unknown or wrong key, term, parameter or value, with the nearest valid name.
+    """
+    data, where = _task_data(source)
+    if overrides:
+        where = f"{where} with overrides"
+        _check_names(overrides, where)
+        data = overlay(data, overrides)
+    config = parse_config(TaskConfig, data, where)
+    _check_ranges(config, where)
+    _check_names(vars(config), where)
+    _check_scalars("reward term", config.rewards, REWARDS, {"weight"}, where)
+    _check_scalars("termination term", config.terminations, TERMINATIONS, set(), where)
+    _check_scalars("measure", config.measures, MEASURES, set(), where)
+    for name in config.success:
+        if name not in config.measures:
+            raise unknown_name("measure", name, config.measures, f"{where}: success")
+    _check_commands(config, where)
+    return config
+
+
+def _task_data(source: Any) -> tuple[Any, str]:
+    if isinstance(source, Mapping):
+        return dict(source), "task"
+    if not isinstance(source, (str, Path)):
+        raise InputError(f"task = {source!r}: expected a name, a path or a mapping")
+    return read_config("task", source)
+
+
+def _check_names(data: Mapping[str, Any], where: str) -> None:
+    """Refuse a term that does not exist, in changes also one that is to be removed."""
+    for group, (kind, registry) in _TERMS.items():
+        names = data.get(group)
+        for name in names if isinstance(names, Mapping) else ():
+            if name not in registry:
+                raise unknown_name(kind, str(name), registry, where)
+
+
+def _check_ranges(config: TaskConfig, where: str) -> None:
+    ranges = {"commands.hold_time": config.commands.hold_time}
+    for name, limits in config.commands.terms.items():
+        if name not in COMMANDS:
+            raise unknown_name("command", name, COMMANDS, where)
+        ranges[f"commands.terms.{name}"] = limits
+        term = COMMANDS[name]
+        if limits[0] < term.least:
+            raise InputError(f"{where}: commands.terms.{name} = {list(limits)}: expected {term.least:g} {term.unit} or more")
+    for name in config.commands.ramp:
+        if name not in config.commands.terms:
+            raise unknown_name("command", name, config.commands.terms, f"{where}: commands.ramp")
+    for device, latency in config.latency.items():
+        ranges[f"latency.{device}.delay"] = latency.delay
+        if latency.delay[0] < 0:
+            raise InputError(f"{where}: latency.{device}.delay = {list(latency.delay)}: a reading cannot be younger than 0 s")
+    for field, (low, high) in ranges.items():
+        if low > high:
+            raise InputError(f"{where}: {field} = [{low:g}, {high:g}]: expected [low, high] with low <= high")
+    if config.commands.hold_time[0] <= 0:
+        raise InputError(f"{where}: commands.hold_time = {list(config.commands.hold_time)}: expected times above 0 s")
+    for group in ("observations", "rewards"):
+        if not getattr(config, group):
+            raise InputError(f"{where}: {group} is empty: a task needs at least one term there")
+    steps = config.episode_length / config.control_period
+    if not math.isclose(steps, round(steps), abs_tol=1e-6) or round(steps) < 1:
+        length, period = config.episode_length, config.control_period
+        raise InputError(f"{where}: episode_length = {length:g} s is not a whole number of control periods of {period:g} s")
+
+
+def _check_scalars(
+    kind: str, chosen: Mapping[str, Mapping[str, float]], registry: Mapping[str, ScalarTerm], required: set[str], where: str
+) -> None:
+    for name, values in chosen.items():
+        valid = required | set(registry[name].parameters)
+        for key in values:
+            if key not in valid:
+                raise unknown_name(f"parameter of {kind} '{name}'", key, valid, where)
+        for key in required - set(values):
+            raise InputError(f"{where}: {kind} '{name}' lacks '{key}'")
+        for key, (low, high) in registry[name].ranges.items():
+            if key in values and not low < values[key] < high:
+                raise InputError(
+                    f"{where}: {kind} '{name}': {key} = {values[key]:g}: expected a number above {low:g} and below {high:g}"
+                )
+
+
+def _check_commands(config: TaskConfig, where: str) -> None:
+    """Refuse a term that reads a command which the task does not give."""
+    functions = {f"reward term '{name}'": REWARDS[name].function for name in config.rewards}
+    functions |= {f"termination term '{name}'": TERMINATIONS[name].function for name in config.terminations}
+    functions |= {f"measure '{name}'": MEASURES[name].function for name in config.measures}
+    used = [name for name in (*config.observations, *config.privileged) if name in COMPUTED]
+    functions |= {f"observation term '{name}'": COMPUTED[name].function for name in used}
+    for term, function in functions.items():
+        for command in sorted(name.removeprefix("command.") for name in signals_of(function) if name.startswith("command.")):
+            if command not in config.commands.terms:
+                raise InputError(f"{where}: {term} needs the command '{command}', which commands.terms does not give")
