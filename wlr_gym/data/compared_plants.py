@@ -98,7 +98,7 @@ class Traces:
 
     @cached_property
     def signals(self) -> dict[str, Array]:
-        """Every signal of :func:`resolutions`, each (ticks + 1, motions, elements)."""
+        """Every signal of :func:`wlr_gym.data.compared_signals.resolutions`, each (ticks + 1, motions, elements)."""
         shape = self.sensors.shape[:2]
         sensors = Sensors(self.sensors.reshape(-1, self.sensors.shape[2]))
         truth = Truth(self.truth.reshape(-1, self.truth.shape[2]))

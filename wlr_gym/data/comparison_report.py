@@ -72,7 +72,7 @@ def tables(comparison: Comparison) -> list[ReportTable]:
 
 
 def agreement_table(title: str, cases: Sequence[tuple[str, MotionComparison]]) -> ReportTable:
-    """Return the figures that :data:`~wlr_gym.data.comparison.BOUNDS` bounds, one row per case; ``!`` marks a broken bound."""
+    """Return the figures that :data:`wlr_gym.data.comparison.BOUNDS` bounds, one row per case; ``!`` marks a broken bound."""
     headings = (
         "motion", "travel m", f"apart after {HORIZON:g} s mm", "% of travel", "yaw deg", "leg torque %", "wheel torque %",
         "diverges first in", "at s",

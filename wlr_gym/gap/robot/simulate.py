@@ -108,7 +108,7 @@ def replay_batch(
         backend: the simulator.
         forces: formula forces.
         constants: (settings, constants of all forces one after the other); None = the forces' own.
-        with_truth: keep the columns of :data:`TRUTH` too.
+        with_truth: keep the columns of :data:`wlr_gym.gap.robot.recorder.TRUTH` too.
         threads: worker threads; the result does not depend on it.
     """
     settings = len(parameters)

@@ -1,7 +1,7 @@
 """Search for missing effects: screen all candidates, refit the best of them, select the one that improves the fit most, repeat.
 
 A candidate is accepted if it lowers minus two log posterior by more than chance and an imperfect simulator can
-(:data:`LEAST_GAIN`, more for every further unknown, and :data:`LEAST_SHARE` of what is left), if the runs agree on it, and if
+(:data:`LEAST_GAIN`, more for every further unknown, and ``LEAST_SHARE`` of what is left), if the runs agree on it, and if
 its value lies inside its plausible range. Effects that become redundant beside others are removed.
 """
 

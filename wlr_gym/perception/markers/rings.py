@@ -239,7 +239,7 @@ def fit_marker(
 
     Args:
         image: (H, W) grey.
-        camera: (9,) of :attr:`Camera.values`.
+        camera: (9,) of :attr:`wlr_gym.perception.markers.camera.Camera.values`.
         ellipse: (6,) guess of the outer circle's image, px; refined in place.
         radii: (3,) of the marker's circles over the outer radius.
         centres: (3, 2) output: centre of each circle's ellipse, undistorted coordinates; NaN for circles not used.

@@ -119,7 +119,7 @@ def assembly_terms(
         wx, wy, wz, leg_rate, wheel_rate: angular velocity; absolute pitch rate of leg and wheel, rad/s.
 
     Returns:
-        base_mass, base_bias: as :func:`platform_terms`. leg_coupling: column leg_rate' of M, rows 0..5 (column wheel_rate' has
+        base_mass, base_bias: as ``platform_terms``. leg_coupling: column leg_rate' of M, rows 0..5 (column wheel_rate' has
         none). leg_leg, leg_wheel, wheel_wheel: entries of M. leg_bias, wheel_bias.
     """
     mx = hx * mass

@@ -81,7 +81,7 @@ ASSEMBLY_DOC = '''"""Return the share of one leg with its wheel in M and in the 
         wx, wy, wz, leg_rate, wheel_rate: angular velocity; absolute pitch rate of leg and wheel, rad/s.
 
     Returns:
-        base_mass, base_bias: as :func:`platform_terms`. leg_coupling: column leg_rate' of M, rows 0..5 (column wheel_rate' has
+        base_mass, base_bias: as ``platform_terms``. leg_coupling: column leg_rate' of M, rows 0..5 (column wheel_rate' has
         none). leg_leg, leg_wheel, wheel_wheel: entries of M. leg_bias, wheel_bias.
     """'''
 
@@ -280,7 +280,7 @@ def base_results(program: Program, printer: Printer) -> dict[str, str]:
 
 
 def assembly_results(program: Program, printer: Printer) -> dict[str, str]:
-    """Source text of everything :func:`assembly_terms` returns."""
+    """Source text of everything ``assembly_terms`` returns."""
     matrix, bias = program.mass_matrix, program.bias
     coupling = {row: value for (row, column), value in matrix.items() if column == LEG and row in BASE}
     return base_results(program, printer) | {
