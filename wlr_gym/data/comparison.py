@@ -157,7 +157,8 @@ def compare(
     """Drive the same motions on two plants and compare all they show.
 
     Args:
-        motions: what to drive (:func:`wlr_gym.data.excitations.excite`, :func:`wlr_gym.data.record.motion_of`), all of one period.
+        motions: what to drive (:func:`wlr_gym.data.excitations.excite`, :func:`wlr_gym.data.record.motion_of`), all of one
+            period.
         plants: the two.
         robot: None = nominal.
         parameters: (1) physical parameters; None = the robot's nominal ones.

@@ -140,7 +140,7 @@ def _latency(delay: Callable[[], float], count: int) -> list[float]:
 
 @contextlib.contextmanager
 def _our_cycle(robot: Robot, hardware: Hardware) -> Iterator[tuple[Cycle, Callable[[], float]]]:
-    """A cycle of :class:`wlr_gym.hardware.servos.Servos`, and one that returns the s from its readings to its setpoints on their way."""
+    """A cycle of :class:`wlr_gym.hardware.servos.Servos`, and one that returns the s between readings and setpoints."""
     from wlr_gym.hardware.servos import Servos
 
     setpoints = np.where(np.arange(len(JOINTS)) < len(LEGS), np.pi / 2, 1.0)
