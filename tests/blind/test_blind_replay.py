@@ -76,7 +76,7 @@ _SHOWS = dict.fromkeys(NAMED, 7) | {"friction_patch": 2, "friction_level": 2, "s
 
 
 def excess(found, floor):
-    """Errors beyond those that a robot without the effect leaves: wheel angles have some, as goals arrive on a 2 ms clock."""
+    """Errors beyond those that a robot without the effect leaves: wheel angles have some: setpoints come on a 2 ms clock."""
     return {prefix: np.sqrt(max(found[prefix] ** 2 - floor[prefix] ** 2, 0.0)) for prefix in found}
 
 

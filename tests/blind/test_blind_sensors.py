@@ -29,8 +29,8 @@ def moving(seconds: float = 20.0, yaw_rate: float = 0.2) -> np.ndarray:
 def log(records, effects=(), seed=0, **copy_numbers) -> pd.DataFrame:
     copy, rng = nominal(ROBOT).moved(**copy_numbers), np.random.default_rng(seed)
     times = sensors.ticks((len(records) - 1) / 1000 - 0.1, 50.0, rng)
-    goals = np.zeros((len(times), 8))
-    return sensors.log(records, times, goals, copy, hide(effects, copy), ROBOT, rng)
+    setpoints = np.zeros((len(times), 8))
+    return sensors.log(records, times, setpoints, copy, hide(effects, copy), ROBOT, rng)
 
 
 def effect(name, **parameters):

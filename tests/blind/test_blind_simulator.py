@@ -26,16 +26,16 @@ def effect(name, where, **parameters):
     return {"name": name, "where": where, "parameters": parameters}
 
 
-def simulate(goals, duration, effects=(), copy: Copy | None = None, start=DOWN, profile=SHARP):
-    """Drive with wheel goals (4,) or goals (n, 8), one per 20 ms."""
+def simulate(setpoints, duration, effects=(), copy: Copy | None = None, start=DOWN, profile=SHARP):
+    """Drive with wheel setpoints (4,) or setpoints (n, 8), one per 20 ms."""
     copy = nominal(ROBOT) if copy is None else copy
-    goals = np.asarray(goals, dtype=float)
+    setpoints = np.asarray(setpoints, dtype=float)
     times = np.arange(0.0, duration, 0.02)
-    if goals.ndim == 1:
-        goals = np.tile(np.concatenate([start, goals]), (len(times), 1))
+    if setpoints.ndim == 1:
+        setpoints = np.tile(np.concatenate([start, setpoints]), (len(times), 1))
     hidden = hide(effects, copy)
     return simulation.simulate(
-        build(copy, hidden), copy, hidden, profile, times, goals, np.asarray(start, dtype=float), duration
+        build(copy, hidden), copy, hidden, profile, times, setpoints, np.asarray(start, dtype=float), duration
     )
 
 
@@ -146,9 +146,9 @@ def lifted() -> Copy:
 def test_free_wheel_answers_a_step_as_a_dc_motor():
     constant, stall = 12.0 / 6.388, 1.5
     resistance, inertia, dry = constant * 12.0 / stall, 2.684e-4 + 1.156e-5, 0.03
-    goals = np.tile(np.concatenate([DOWN, np.zeros(4)]), (50, 1))
-    goals[10:, 4] = 3.0
-    records = simulate(goals, 0.6, copy=lifted())
+    setpoints = np.tile(np.concatenate([DOWN, np.zeros(4)]), (50, 1))
+    setpoints[10:, 4] = 3.0
+    records = simulate(setpoints, 0.6, copy=lifted())
     assert records[:, 38].max() == 0.0, "the wheel is in the air"
     # state: reference angle ahead, rate, 1; from the step on
     gain = constant / resistance
@@ -162,10 +162,10 @@ def test_free_wheel_answers_a_step_as_a_dc_motor():
 
 
 def test_free_wheel_coasts_against_dry_and_viscous_friction():
-    goals = np.tile(np.concatenate([DOWN, np.zeros(4)]), (100, 1))
-    goals[:50, 4], goals[50:, 4] = 3.0, np.nan
+    setpoints = np.tile(np.concatenate([DOWN, np.zeros(4)]), (100, 1))
+    setpoints[:50, 4], setpoints[50:, 4] = 3.0, np.nan
     viscous = 1e-4
-    records = simulate(goals, 1.2, [effect("viscous_friction", ["wheel_lf"], coefficient=viscous)], copy=lifted())
+    records = simulate(setpoints, 1.2, [effect("viscous_friction", ["wheel_lf"], coefficient=viscous)], copy=lifted())
     inertia, dry, first = 2.684e-4 + 1.156e-5, 0.03, records[1000, 19]
     assert records[1020:, 27].max() == 0.0, "no current with the torque off"
     time = 1e-3 * np.arange(20)
@@ -206,9 +206,9 @@ def test_play_lets_the_robot_roll_by_its_width():
 
 
 def test_command_delay_shifts_in_time():
-    goals = np.tile(np.concatenate([DOWN, np.zeros(4)]), (50, 1))
-    goals[10:, 4:] = 3.0
-    on_time, late = simulate(goals, 0.8), simulate(goals, 0.8, [effect("command_delay", WHEELS, delay=0.05)])
+    setpoints = np.tile(np.concatenate([DOWN, np.zeros(4)]), (50, 1))
+    setpoints[10:, 4:] = 3.0
+    on_time, late = simulate(setpoints, 0.8), simulate(setpoints, 0.8, [effect("command_delay", WHEELS, delay=0.05)])
     assert late[250:700, 19] == pytest.approx(on_time[200:650, 19], abs=1e-3)
 
 
@@ -226,8 +226,8 @@ def test_every_law_changes_the_motion(name, kind):
     time = np.arange(100)[:, None] * 0.02
     legs = DOWN + 0.2 * np.sin(4 * time + np.array([0, 0, 1, 1]))
     wheels = 4 * np.sin(3 * time) * np.array([1, -1, 1, -1]) + 3 * np.sin(2 * time)
-    goals = np.concatenate([legs, wheels], axis=1)
-    plain, changed = simulate(goals, 2.0), simulate(goals, 2.0, [hidden])
+    setpoints = np.concatenate([legs, wheels], axis=1)
+    plain, changed = simulate(setpoints, 2.0), simulate(setpoints, 2.0, [hidden])
     currents, place, supply = (np.abs(changed[:, part] - plain[:, part]).max() for part in (slice(23, 31), slice(0, 2), 37))
     assert currents > 1e-2 or place > 1e-3 or supply > 0.05
 

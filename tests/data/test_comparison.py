@@ -146,21 +146,21 @@ def test_every_motion_is_driven_by_its_own_goals_and_profile():
     """A batch shows what each motion alone shows."""
     other = excite("straight", 0, ROBOT, seconds=2.0)
     together, alone = drive(ENGINE, [MOTION, other], ROBOT), drive(ENGINE, [other], ROBOT)
-    assert np.array_equal(together.truth[: len(other.goals) + 1, 1], alone.truth[:, 0])
+    assert np.array_equal(together.truth[: len(other.setpoints) + 1, 1], alone.truth[:, 0])
 
 
-def test_whose_zeros_are_off_begins_at_its_goals():
+def test_whose_zeros_are_off_begins_at_its_setpoints():
     """References are true angles: a servo that stands where its reading says has no way to go."""
     parameters = Parameters.nominal(ROBOT)
     parameters["joint.zero_offset"] = 0.1
-    goals = np.array([[*[1.5] * 4, *[0.0] * 4]])
-    state = standing_at(goals, ROBOT, parameters)
+    setpoints = np.array([[*[1.5] * 4, *[0.0] * 4]])
+    state = standing_at(setpoints, ROBOT, parameters)
     np.testing.assert_allclose(state.reference_position[:, :4], 1.4)
     np.testing.assert_array_equal(state.reference_position, state.joint_position)
     for compared in (ENGINE, ComparedPlant("mujoco")):
         plant = make_plant(compared.backend, ROBOT, 1, PlantOptions(sensor_noise=False))
         plant.reset(np.zeros(1, np.uint64), parameters, state=state)
-        plant.step(goals)
+        plant.step(setpoints)
         moved = plant.get_state().reference_position[:, :4]
         plant.close()
         np.testing.assert_allclose(moved, 1.4, atol=1e-9)
@@ -184,7 +184,7 @@ def test_motion_of_a_run_holds_its_commands_until_the_next_row():
     motion = motion_of(run)
     assert motion.name == "run_07"
     assert motion.profile.leg_velocity == 1.0
-    np.testing.assert_array_equal(motion.goals[:, 4], [0.0, 1.0, 1.0, 2.0, np.nan, 3.0])
+    np.testing.assert_array_equal(motion.setpoints[:, 4], [0.0, 1.0, 1.0, 2.0, np.nan, 3.0])
 
 
 @pytest.mark.parametrize("name", EFFECTS)

@@ -20,10 +20,10 @@ def test_motion_rests_first_and_last_and_stays_within_its_limits(name):
     low, high = ROBOT.leg_limits
     for seed in range(8):
         motion = excite(name, seed, ROBOT)
-        legs, wheels = motion.goals[:, :4], np.nan_to_num(motion.goals[:, 4:])
+        legs, wheels = motion.setpoints[:, :4], np.nan_to_num(motion.setpoints[:, 4:])
         rest = round(REST / motion.period)
         assert 13.0 < motion.duration < 25.0
-        assert np.isfinite(motion.goals[:, :6]).all()
+        assert np.isfinite(motion.setpoints[:, :6]).all()
         for ends in (slice(0, rest), slice(-rest + 1, None)):
             assert not wheels[ends].any()
             assert (np.ptp(legs[ends], axis=0) == 0.0).all()
@@ -35,22 +35,22 @@ def test_motion_rests_first_and_last_and_stays_within_its_limits(name):
 @pytest.mark.parametrize("name", EXCITATIONS)
 def test_seed_decides_the_motion(name):
     one, again, other = excite(name, 3), excite(name, 3), excite(name, 4)
-    assert np.array_equal(one.goals, again.goals, equal_nan=True)
-    assert one.goals.shape != other.goals.shape or not np.array_equal(one.goals, other.goals, equal_nan=True)
+    assert np.array_equal(one.setpoints, again.setpoints, equal_nan=True)
+    assert one.setpoints.shape != other.setpoints.shape or not np.array_equal(one.setpoints, other.setpoints, equal_nan=True)
 
 
 @pytest.mark.parametrize("name", EXCITATIONS)
 def test_period_samples_the_same_motion(name):
     coarse, fine = excite(name, 1, period=0.02), excite(name, 1, period=0.01)
-    ticks = min(len(coarse.goals), len(fine.goals[::2]))
-    assert np.array_equal(coarse.goals[:ticks], fine.goals[::2][:ticks], equal_nan=True)
-    assert len(excite(name, 1, seconds=3.0).goals) == 150
+    ticks = min(len(coarse.setpoints), len(fine.setpoints[::2]))
+    assert np.array_equal(coarse.setpoints[:ticks], fine.setpoints[::2][:ticks], equal_nan=True)
+    assert len(excite(name, 1, seconds=3.0).setpoints) == 150
 
 
 def test_posture_sweep_rolls_the_treads():
-    """While legs swing, wheel goals are such that all four hubs would move at one speed without slip."""
+    """While legs swing, wheel setpoints are such that all four hubs would move at one speed without slip."""
     motion = excite("posture", 2, period=1e-3)
-    legs, wheels = motion.goals[:, :4], motion.goals[:, 4:]
+    legs, wheels = motion.setpoints[:, :4], motion.setpoints[:, 4:]
     rates = np.gradient(legs, motion.period, axis=0)
     hub = ROBOT.wheel.radius * (wheels + rates) + ROBOT.leg.length * np.sin(legs) * rates
     speed = np.median(hub, axis=1)
@@ -62,7 +62,7 @@ def test_posture_sweep_rolls_the_treads():
 def test_torque_switches():
     """Rear wheels run free while the legs turn over; nowhere else is a motor off."""
     for name in EXCITATIONS:
-        off = np.isnan(excite(name).goals)
+        off = np.isnan(excite(name).setpoints)
         assert off[:, 6:].all() == off.any() == (name in {"rear_legs", "all_legs"})
         assert not off[:, :6].any()
 
@@ -90,14 +90,14 @@ def test_kinds_are_those_of_the_measured_data():
             commands = [column for column in run.table.columns if column.startswith("cmd_")]
             measured[name].append(_traits(run.table[commands].to_numpy()))
     for name in MEASURED:
-        ours = np.array([_traits(excite(name, seed, ROBOT).goals) for seed in range(30)])
+        ours = np.array([_traits(excite(name, seed, ROBOT).setpoints) for seed in range(30)])
         slack = 0.35 * (np.ptp(ours, axis=0) + np.array([0.0, 0.1, 0.5, 0.5]))
         for traits in measured[name]:
             assert (traits >= ours.min(axis=0) - slack).all(), (name, traits, ours.min(axis=0))
             assert (traits <= ours.max(axis=0) + slack).all(), (name, traits, ours.max(axis=0))
 
 
-def _traits(goals: np.ndarray) -> np.ndarray:
-    wheels = np.nan_to_num(goals[:, 4:])
-    swing = np.ptp(goals[:, :4], axis=0).max()
-    return np.array([np.isnan(goals).mean(), swing, np.abs(wheels).max(), np.abs(wheels[:, 0] - wheels[:, 1]).max()])
+def _traits(setpoints: np.ndarray) -> np.ndarray:
+    wheels = np.nan_to_num(setpoints[:, 4:])
+    swing = np.ptp(setpoints[:, :4], axis=0).max()
+    return np.array([np.isnan(setpoints).mean(), swing, np.abs(wheels).max(), np.abs(wheels[:, 0] - wheels[:, 1]).max()])

@@ -17,7 +17,7 @@ from wlr_gym.data import Profile, Run, RunMeta, read_dataset, read_run
 from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.noise import channel_noise
-from wlr_gym.data.replay import ReplayResult, held_goals, profile_parameters, replay, robot_entry, robot_of
+from wlr_gym.data.replay import ReplayResult, held_setpoints, profile_parameters, replay, robot_entry, robot_of
 from wlr_gym.data.run_states import local_fit
 from wlr_gym.physics.effects import apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant
@@ -50,13 +50,13 @@ PAYLOAD = {"name": "payload", "parameters": {"mass": 0.5, "x": 0.08, "z": 0.05}}
 
 def commands(t: float) -> np.ndarray:
     """Drive, turn and change posture; rear wheels free for a while."""
-    goals = np.zeros(8)
+    setpoints = np.zeros(8)
     moving = max(t - 0.6, 0.0)
-    goals[:4] = 1.4 + 0.3 * np.sin(1.3 * moving) * np.array([1.0, 1.0, -1.0, -1.0])
-    goals[4:] = 3.0 * np.sin(1.1 * moving) + np.array([-0.6, 0.6, -0.6, 0.6]) * np.sin(0.7 * moving)
+    setpoints[:4] = 1.4 + 0.3 * np.sin(1.3 * moving) * np.array([1.0, 1.0, -1.0, -1.0])
+    setpoints[4:] = 3.0 * np.sin(1.1 * moving) + np.array([-0.6, 0.6, -0.6, 0.6]) * np.sin(0.7 * moving)
     if 3.3 < t < 4.6:
-        goals[6:] = np.nan
-    return goals
+        setpoints[6:] = np.nan
+    return setpoints
 
 
 def simulated_run(effects: Sequence[dict], steps: Sequence[int], meta: RunMeta = META, seconds: float = 5.0) -> Run:
@@ -258,7 +258,7 @@ def test_legs_that_were_off_do_not_jump_when_torque_is_back():
     run = simulated_run([DELAY], [10], seconds=3.0)
     off = (run["t"] > 1.0) & (run["t"] < 1.3)
     run.table.loc[off, [f"cmd_{joint}" for joint in JOINTS[:4]]] = np.nan
-    held = held_goals(run)
+    held = held_setpoints(run)
     assert np.isfinite(held).all()
     assert (held[off, :4] > 1.0).all()  # not 0
     result = replay(run, effects=[DELAY])
@@ -271,7 +271,7 @@ def test_a_joint_without_goals_stays():
     run = simulated_run([], [10], seconds=1.0)
     run.table.loc[:, ["cmd_leg_lf", "cmd_wheel_lf"]] = np.nan
     run.table.loc[:5, "cmd_leg_rf"] = np.nan
-    held = held_goals(run)
+    held = held_setpoints(run)
     assert (held[:, JOINTS.index("leg_lf")] == run["pos_leg_lf"][0]).all()
     assert (held[:, JOINTS.index("wheel_lf")] == 0.0).all()
     assert (held[:6, JOINTS.index("leg_rf")] == run["cmd_leg_rf"][6]).all()

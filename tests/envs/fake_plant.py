@@ -32,7 +32,7 @@ class FakePlant:
         self.options = options or PlantOptions()
         self.count = count
         self.fall_at = fall_at
-        self.goals_seen = []
+        self.setpoints_seen = []
         self.parameters = Parameters.nominal(self.robot, count)
         self._seeds = np.zeros(count, np.uint64)
         self._ticks = np.zeros(count, np.int64)
@@ -63,7 +63,7 @@ class FakePlant:
 
     def step(self, setpoints, torque_on=None):
         setpoints = check_setpoints(setpoints if torque_on is None else np.where(torque_on, setpoints, 0.0), self.count)
-        self.goals_seen.append(setpoints.copy())
+        self.setpoints_seen.append(setpoints.copy())
         on = np.ones_like(setpoints) if torque_on is None else np.asarray(torque_on, float)
         period, truth = self.options.control_period, self._truth
         self._ticks += 1

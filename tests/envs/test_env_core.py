@@ -49,7 +49,7 @@ def test_action_is_scaled_about_home_and_clipped_to_the_limits(fake):
     robot = env.core.task.robot
     home, (low, high), top = robot.home.leg_angle, robot.leg_limits, robot.servo.wheel.no_load_speed
     expected = [home + 0.2, home - 0.2, high, low, 1.0, -1.0, top, -top]
-    assert fake["plants"][-1].goals_seen[-1][0] == pytest.approx(expected, rel=1e-6)
+    assert fake["plants"][-1].setpoints_seen[-1][0] == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -62,10 +62,10 @@ def test_bad_actions_name_robot_and_joint_and_never_reach_the_plant(fake, value,
     plant = fake["plants"][-1]
     actions = np.zeros((3, 8))
     actions[1, 5] = value
-    steps, ticks = len(plant.goals_seen), env.core.episodes.steps.copy()
+    steps, ticks = len(plant.setpoints_seen), env.core.episodes.steps.copy()
     with pytest.raises(InputError, match=rf"wheel_rf of robot 1 of the batch is {text}.*finite number in \[-1, 1\]"):
         env.step(actions)
-    assert len(plant.goals_seen) == steps
+    assert len(plant.setpoints_seen) == steps
     assert np.array_equal(env.core.episodes.steps, ticks)
 
 
@@ -440,7 +440,7 @@ def test_robots_outside_the_mask_keep_time_flags_and_observation(fake):
     assert core.truncated.all()
     assert core.reward[0] == 0.0
     assert np.array_equal(core.observation[0], before)
-    assert fake["plants"][-1].goals_seen[-1][0, 4:].tolist() == [0.0] * 4
+    assert fake["plants"][-1].setpoints_seen[-1][0, 4:].tolist() == [0.0] * 4
 
 
 def test_a_plant_that_leaves_the_finite_numbers_is_reported(fake):

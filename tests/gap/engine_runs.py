@@ -26,25 +26,25 @@ LEG = 1.4
 def posture_and_turns(t):
     """Drive, turn and change posture."""
     moving = max(t - 0.4, 0.0)
-    goals = np.zeros(8)
-    goals[:4] = LEG + 0.25 * np.sin(1.9 * moving) * np.array([1.0, 1.0, -1.0, -1.0])
-    goals[4:] = 3.5 * np.sin(1.7 * moving) + np.array([-0.8, 0.8, -0.8, 0.8]) * np.sin(1.1 * moving)
-    return goals
+    setpoints = np.zeros(8)
+    setpoints[:4] = LEG + 0.25 * np.sin(1.9 * moving) * np.array([1.0, 1.0, -1.0, -1.0])
+    setpoints[4:] = 3.5 * np.sin(1.7 * moving) + np.array([-0.8, 0.8, -0.8, 0.8]) * np.sin(1.1 * moving)
+    return setpoints
 
 
 def free_rear_wheels(t):
     """The same, rear wheels off for a while."""
-    goals = posture_and_turns(t)
+    setpoints = posture_and_turns(t)
     if 1.5 < t < 2.5:
-        goals[6:] = np.nan
-    return goals
+        setpoints[6:] = np.nan
+    return setpoints
 
 
 def abrupt(t):
-    """Goals that jump."""
-    goals = np.full(8, LEG)
-    goals[4:] = 0.0 if t < 0.4 else 4.0 * np.sign(np.sin(5.0 * (t - 0.4)))
-    return goals
+    """Setpoints that jump."""
+    setpoints = np.full(8, LEG)
+    setpoints[4:] = 0.0 if t < 0.4 else 4.0 * np.sign(np.sin(5.0 * (t - 0.4)))
+    return setpoints
 
 
 def nominal(effects=(), meta=META):
@@ -68,10 +68,10 @@ def record(
     """Record a run.
 
     Args:
-        commands: goals (8) as a function of time.
+        commands: setpoints (8) as a function of time.
         rows: (T,) times of the rows, whole ticks.
         effects: in the robot.
-        tick: s between two steps of the plant; the goals of a row act from that very moment.
+        tick: s between two steps of the plant; the setpoints of a row act from that very moment.
         step: s, physics step; None = the replay's, or the tick where that is shorter.
         noise: seed of the sensors' noise; None = exact sensors.
         changes: parameters of the robot.
@@ -91,19 +91,19 @@ def record(
         readings = plant.step(first)
     wheels = readings.joint_position[0, 4:].copy()
     due = np.rint(np.asarray(rows) / tick).astype(int)
-    table, poses, goals = [], [], first[0]
+    table, poses, setpoints = [], [], first[0]
     try:
         for k in range(due[-1] + 1):
             truth = plant.truth()
             yaw, pitch, _ = euler_angles(truth.quaternion)
             poses.append([*truth.position[0, :2], yaw[0], truth.position[0, 2], pitch[0]])
             if k in due:
-                goals = commands(rows[len(table)])
+                setpoints = commands(rows[len(table)])
                 joints = [readings.joint_position[0] - np.append(np.zeros(4), wheels), readings.joint_velocity[0]]
                 imu = [readings.joint_effort[0], readings.gyro[0], readings.accelerometer[0], readings.supply_voltage]
-                table.append(np.concatenate([goals, *joints, *imu]))
-            on = np.isfinite(goals)[None]
-            readings = plant.step(np.nan_to_num(goals)[None], None if on.all() else on)
+                table.append(np.concatenate([setpoints, *joints, *imu]))
+            on = np.isfinite(setpoints)[None]
+            readings = plant.step(np.nan_to_num(setpoints)[None], None if on.all() else on)
     finally:
         plant.close()
     direct = [c for c in CHANNELS if not c.startswith("cam")]

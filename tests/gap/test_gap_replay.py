@@ -150,7 +150,7 @@ def test_goals_off_the_grid_act_at_their_own_time(offset):
 
 
 def test_goal_of_a_row_does_not_show_in_its_own_reading():
-    """Sensors are read before goals are written, whenever that falls between two ticks."""
+    """Sensors are read before setpoints are written, whenever that falls between two ticks."""
     step = RunMeta()
     jumping = record(abrupt, spaced(0.9, offset=0.001), tick=0.00025, meta=step)
     found = replayed(jumping, nominal(meta=step)).values[0]
@@ -239,13 +239,13 @@ def test_written_goals_arrive_at_their_times(run):
     clock = RunClock(run)
     delay = np.zeros((2, 8))
     delay[1] = 2.55 * CLOCK
-    clock.goals[1] += 1.0
-    goals = WrittenSetpoints([clock], np.array([0, 0]), delay)
+    clock.setpoints[1] += 1.0
+    setpoints = WrittenSetpoints([clock], np.array([0, 0]), delay)
     arrived = np.full(2, np.nan)
     for tick in range(round((clock.t[1] - clock.begin) / CLOCK) + 5):
-        newer, older, wait = goals.push(np.zeros((2, 8)))
+        newer, older, wait = setpoints.push(np.zeros((2, 8)))
         for k in np.flatnonzero((newer != older).any(axis=1) & np.isnan(arrived)):
-            assert newer[k] == pytest.approx(clock.goals[1])
-            assert older[k] == pytest.approx(clock.goals[0])
+            assert newer[k] == pytest.approx(clock.setpoints[1])
+            assert older[k] == pytest.approx(clock.setpoints[0])
             arrived[k] = tick * CLOCK + wait[k, 0]
     assert arrived == pytest.approx(clock.t[1] - clock.begin + delay[:, 0], abs=1e-9)

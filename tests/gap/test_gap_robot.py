@@ -719,8 +719,8 @@ def test_rolling_resistance_is_found_in_four_runs(tmp_path):
         motion = excite(kind, k, seconds=6.0)
         meta = META.model_copy(update={"profile": motion.profile})
 
-        def commands(t, goals=motion.goals):
-            return goals[min(round(t / 0.02), len(goals) - 1)]
+        def commands(t, setpoints=motion.setpoints):
+            return setpoints[min(round(t / 0.02), len(setpoints) - 1)]
 
         run = record(commands, spaced(5.9), [RESISTANCE], meta=meta, noise=k)
         write_run(tmp_path / f"run_{k + 1:02d}.csv", run.table, meta)

@@ -33,12 +33,12 @@ def run(seconds, angle=0.0, rate=0.0, goal: ArrayLike = 0.0, supply=7.4, on=1.0,
     moved = parameters["rotor_inertia"] if parameters["half_play"] else parameters["inertia"]
     damping = parameters["back_emf_damping"] * parameters["torque_scale"] + parameters["viscous"]
     parameters["weight"] = float(fitted_weight(np.array(step * damping / moved)))
-    goals = np.broadcast_to(np.asarray(goal, float), (count,)).copy()
+    setpoints = np.broadcast_to(np.asarray(goal, float), (count,)).copy()
     inputs = np.stack([np.broadcast_to(np.asarray(v, float), (count,)) for v in (supply, on, warmth)], axis=1)
     starts = np.full(count, -1)
     starts[0] = 0
     row = np.array([[parameters[name] for name in law.PARAMETERS]])
-    return kernel.simulate(row, np.array([lag]), goals, inputs, starts, np.array([[angle, rate]]), step)[0]
+    return kernel.simulate(row, np.array([lag]), setpoints, inputs, starts, np.array([[angle, rate]]), step)[0]
 
 
 # --- pendulum

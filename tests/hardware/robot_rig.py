@@ -98,16 +98,16 @@ class Rig:
         self.link = emulated_link(self.machine)
         self.loop = ControlLoop(ROBOT, hardware, self.link, PERIOD, log=log, dry_run=dry_run)
 
-    def drive(self, seconds, goals=DRIVE):
+    def drive(self, seconds, setpoints=DRIVE):
         for _ in range(round(seconds / PERIOD)):
-            self.loop.tick(goals)
+            self.loop.tick(setpoints)
 
     def torque(self):
         """(8,) which motors are on."""
         return np.array([bool(servo["torque_enable"]) and not servo.dead for servo in self.machine.servos.values()])
 
     def goal_counts(self):
-        """(8,) goals the servos hold."""
+        """(8,) setpoints the servos hold."""
         return np.array(
             [self.machine.servos[joint]["goal_position" if k < 4 else "goal_velocity"] for k, joint in enumerate(JOINTS)]
         )

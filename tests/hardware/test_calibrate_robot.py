@@ -145,14 +145,14 @@ def test_the_other_joint_is_noticed_and_asked_for_again(monkeypatch, tmp_path, c
 def test_no_motor_is_driven_and_none_is_let_go_without_asking(monkeypatch, tmp_path):
     machine = make_machine(TRUE, monkeypatch)
     machine.servos["leg_lf"].set("torque_enable", 1)
-    goals = {joint: (servo["goal_position"], servo["goal_velocity"]) for joint, servo in machine.servos.items()}
+    setpoints = {joint: (servo["goal_position"], servo["goal_velocity"]) for joint, servo in machine.servos.items()}
     operator = Operator(machine, {"Switch them off?": "n"})
     assert calibrate_joints(JointsOptions(out=tmp_path / "a.yaml"), operator) == 1
     assert operator.questions[0].startswith("Motors are on: leg_lf. Off, the robot drops")
     assert machine.servos["leg_lf"]["torque_enable"] == 1
     assert calibrate_joints(JointsOptions(out=tmp_path / "a.yaml"), Operator(machine)) == 0
     assert not any(servo["torque_enable"] for servo in machine.servos.values())
-    assert {joint: (servo["goal_position"], servo["goal_velocity"]) for joint, servo in machine.servos.items()} == goals
+    assert {joint: (servo["goal_position"], servo["goal_velocity"]) for joint, servo in machine.servos.items()} == setpoints
 
 
 @pytest.mark.parametrize("answers", [{"leg_rf (right front): hold it still": "q"}, {"Write": "n"}])
@@ -210,7 +210,7 @@ class Turner:
         self.rng = np.random.default_rng(0)
         machine.plant.step = self._read
 
-    def _read(self, goals, torque):
+    def _read(self, setpoints, torque):
         sensors = self.machine.coupling.sensors
         sensors.accelerometer[0] = 9.80665 * self.up + 0.03 * self.rng.standard_normal(3)
         sensors.gyro[0] = 0.001 * self.rng.standard_normal(3)

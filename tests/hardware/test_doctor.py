@@ -90,7 +90,7 @@ def test_a_tilted_robot_and_a_lossy_imu(machine, capsys):
     assert "0 faults, 1 warning in" in text
     machine.clear()
     machine.coupling.sensors.accelerometer[0] = [3.0, 0.0, 9.3]
-    machine.plant.step = lambda goals, torque: machine.coupling.sensors
+    machine.plant.step = lambda setpoints, torque: machine.coupling.sensors
     code, text = look(capsys)
     assert (code, "First: imu, level: 17" in text) == (1, True)
     assert "wlr calibrate imu --mounting" in text

@@ -97,8 +97,8 @@ def test_reg_write_and_action_by_broadcast_move_all_at_once():
 
 def test_sync_and_bulk_writes_are_silent_even_when_refused():
     machine = make()
-    goals = {2: (2100).to_bytes(4, "little"), 3: (9999).to_bytes(4, "little")}
-    assert ask(machine, protocol.sync_write(116, goals)) == []
+    setpoints = {2: (2100).to_bytes(4, "little"), 3: (9999).to_bytes(4, "little")}
+    assert ask(machine, protocol.sync_write(116, setpoints)) == []
     assert machine.servos["leg_lf"]["goal_position"] == 2100
     assert machine.servos["leg_rf"]["goal_position"] != 9999
     bulk = b"\1" + word(65) + word(1) + b"\1" + b"\4" + word(112) + word(4) + (9).to_bytes(4, "little")
@@ -244,7 +244,7 @@ def test_answers_to_two_instructions_do_not_overlap():
 
 
 def test_native_modes_are_the_simulator_bit_for_bit():
-    """The same goals written to the registers and to a plant of its own: equal readings, to the bit."""
+    """The same setpoints written to the registers and to a plant of its own: equal readings, to the bit."""
     machine = make()
     plant = make_plant("gibbs_appell", ROBOT, 1, PlantOptions(control_period=0.001, sensor_noise=False))
     parameters = Parameters.nominal(ROBOT, 1)
@@ -268,10 +268,10 @@ def test_native_modes_are_the_simulator_bit_for_bit():
     unit = table.per_count("goal_position")
     legs = [s * (c * unit - z * ROBOT.sensors.encoder.position) for s, c, z in zip(signs, counts, zeros, strict=False)]
     wheels = [s * c * wheel.per_count("goal_velocity") for s, c in zip(signs[4:], (50, -50, 40, -40), strict=True)]
-    goals = np.array([[*legs, *wheels]])
+    setpoints = np.array([[*legs, *wheels]])
     for _ in range(300):
         machine.step()
-        plant.step(goals)
+        plant.step(setpoints)
     np.testing.assert_array_equal(machine.plant.truth().values, plant.truth().values)
     expected = [z + s * round(p / POSITION) for s, z, p in zip(signs, zeros, plant.truth().joint_position[0], strict=True)]
     for servo, count in zip(machine.servos.values(), expected, strict=True):

@@ -65,7 +65,7 @@ class Watch:
     def __init__(self, rig):
         self.rig, self.jump = rig, 0.0
         self.off_at: float | None = None
-        self.goals, self.driven = rig.goal_counts(), np.zeros(8, bool)
+        self.setpoints, self.driven = rig.goal_counts(), np.zeros(8, bool)
         step = rig.machine.step
 
         def watched():
@@ -76,12 +76,12 @@ class Watch:
 
     def look(self):
         rig = self.rig
-        goals = rig.goal_counts()
-        # goals of a servo that is off mean nothing, and its watchdog sets its own
+        setpoints = rig.goal_counts()
+        # setpoints of a servo that is off mean nothing, and its watchdog sets its own
         driven = rig.torque() & [servo["bus_watchdog"] >= 0 for servo in rig.machine.servos.values()]
         both = driven & self.driven
-        self.jump = max(self.jump, float((np.abs(goals - self.goals) / LARGEST_STEP)[both].max(initial=0.0)))
-        self.goals, self.driven = goals, driven
+        self.jump = max(self.jump, float((np.abs(setpoints - self.setpoints) / LARGEST_STEP)[both].max(initial=0.0)))
+        self.setpoints, self.driven = setpoints, driven
         if rig.torque().any():
             self.off_at = None
         elif self.off_at is None:
@@ -151,7 +151,7 @@ def test_matrix(tmp_path, name, phase):
 
 
 def stands_from_now(rig, struck):
-    """The motors that could not be told stand, and refuse goals, ``STAND_BOUND`` after they heard the last packet."""
+    """The motors that could not be told stand, and refuse setpoints, ``STAND_BOUND`` after they heard the last packet."""
     assert rig.machine.time > struck + STAND_BOUND
     for joint, servo in rig.machine.servos.items():
         if servo["torque_enable"]:
@@ -220,12 +220,12 @@ def test_wheels_stop_before_torque_goes_off():
     rig.loop.start()
     rig.drive(0.5)
     rig.inject("drop legs wheels")
-    lost, goals = rig.machine.time, {}
-    rig.loop.operator.spare = lambda: goals.__setitem__(round(rig.machine.time - lost, 3), rig.loop.setpoints[4])
+    lost, setpoints = rig.machine.time, {}
+    rig.loop.operator.spare = lambda: setpoints.__setitem__(round(rig.machine.time - lost, 3), rig.loop.setpoints[4])
     with pytest.raises(StoppedError):
         rig.drive(2.0)
-    assert all(goal == 3.0 for time, goal in goals.items() if time < 0.06)
-    assert all(goal == 0.0 for time, goal in goals.items() if time > 0.16)
+    assert all(goal == 3.0 for time, goal in setpoints.items() if time < 0.06)
+    assert all(goal == 0.0 for time, goal in setpoints.items() if time > 0.16)
     rig.loop.close()
 
 

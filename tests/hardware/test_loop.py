@@ -57,7 +57,7 @@ def test_a_run_from_start_to_end(rig):
 
 
 def test_torque_comes_on_without_a_jerk(rig):
-    """Whatever goals the registers held before, the robot stays as it stands."""
+    """Whatever setpoints the registers held before, the robot stays as it stands."""
     for joint in JOINTS[:4]:
         rig.machine.servos[joint].set("goal_position", 1500)
     start = rig.machine.plant.truth().joint_position[0, :4].copy()
@@ -82,7 +82,7 @@ def test_the_ramp_is_slow_and_smooth(tmp_path):
     ramp = read_run(tmp_path / "ramp_01.csv")
     steps = np.diff([ramp[f"cmd_{joint}"] for joint in JOINTS[:4]], axis=1)
     assert np.abs(steps).max() < 2.0 * PERIOD  # peak of a minimum-jerk path is 1.9 times its mean speed of 1 rad/s
-    assert np.abs(np.diff(steps, axis=1)).max() < 0.004 + 2.0 * ANGLE_COUNT  # goals are whole counts
+    assert np.abs(np.diff(steps, axis=1)).max() < 0.004 + 2.0 * ANGLE_COUNT  # setpoints are whole counts
 
 
 def test_start_again_after_an_end(rig):
@@ -107,7 +107,7 @@ def test_a_dry_run_writes_nothing(tmp_path):
     rig.drive(0.3)
     rig.loop.close()
     for joint, servo in rig.machine.servos.items():
-        assert servo.registers.memory[64:120] == before[joint][64:120], joint  # all goals, gains, torque and the watchdog
+        assert servo.registers.memory[64:120] == before[joint][64:120], joint  # all setpoints, gains, torque and the watchdog
     assert rig.loop.reason == "end"
     assert read_run(tmp_path / "run_01.csv")["cmd_wheel_lf"][-1] == 0.0
 
@@ -362,9 +362,9 @@ def test_single_motors_off_and_on_again(rig):
     rig.loop.start()
     free = np.ones(8, bool)
     free[4:] = False
-    goals = np.r_[DRIVE[:4], [np.nan] * 4]
+    setpoints = np.r_[DRIVE[:4], [np.nan] * 4]
     for _ in range(10):
-        rig.loop.tick(goals, free)
+        rig.loop.tick(setpoints, free)
     np.testing.assert_array_equal(rig.torque(), free)
     rig.drive(1.0)
     assert rig.torque().all()

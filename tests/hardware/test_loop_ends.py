@@ -183,15 +183,15 @@ def test_a_stop_asked_for_at_the_very_end_ends_the_command(tmp_path, when):
     elif when == "stopping":
         in_phase(plant.loop, Phase.STOPPING, interrupt)
     else:
-        ticks = iter(range(len(motion.goals)))
+        ticks = iter(range(len(motion.setpoints)))
         plant.loop.operator.spare = lambda: (
-            interrupt() if plant.loop.phase is Phase.RUNNING and next(ticks) == len(motion.goals) - 1 else None
+            interrupt() if plant.loop.phase is Phase.RUNNING and next(ticks) == len(motion.setpoints) - 1 else None
         )
     drive = drive_robot(plant, motion)
     plant.close()
     assert drive.reason == "the motion is over; SIGINT"
     assert drive.well
-    assert drive.ticks == len(motion.goals)
+    assert drive.ticks == len(motion.setpoints)
 
 
 def test_a_stop_in_the_last_motion_tick_starts_no_other(tmp_path, monkeypatch):

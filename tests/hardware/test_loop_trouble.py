@@ -171,7 +171,7 @@ def test_motors_that_are_off_stay_off_in_a_stop(rig):
 
 
 def test_servos_that_stopped_themselves_are_noticed_when_they_are_back(rig):
-    """Silence shorter than the ladder's last step, but longer than the watchdog's time: goals are refused from then on."""
+    """Silence shorter than the ladder's last step, but longer than the watchdog's time: setpoints are refused from then on."""
     rig.loop.start()
     rig.drive(0.3)
     rig.inject("deaf wheels duration=0.3")
@@ -218,10 +218,10 @@ def test_a_leg_outside_its_limits_comes_back_slowly(rig, angle):
     low, high = ROBOT.leg_limits
     rig.loop.start()
     ramp = read_run(rig.loop.recorder.log.folder / "partial_ramp_01.csv")
-    goals = np.r_[ramp["pos_leg_lf"][0], ramp["cmd_leg_lf"]]
-    assert not low <= goals[0] <= high
-    count = 2.0 * np.pi / 4096  # goals are whole counts of the register
-    assert np.abs(np.diff(goals)).max() <= CALM_SPEED * HARDWARE.safety.start_speed * PERIOD + count
+    setpoints = np.r_[ramp["pos_leg_lf"][0], ramp["cmd_leg_lf"]]
+    assert not low <= setpoints[0] <= high
+    count = 2.0 * np.pi / 4096  # setpoints are whole counts of the register
+    assert np.abs(np.diff(setpoints)).max() <= CALM_SPEED * HARDWARE.safety.start_speed * PERIOD + count
     np.testing.assert_allclose(rig.loop.status.position[0], ROBOT.home.leg_angle, atol=0.05)
 
 
@@ -260,7 +260,7 @@ def test_mending_leaves_servos_alone_that_are_on(rig):
     rig.link.close()
 
 
-def test_latency_is_from_the_readings_to_their_goals(rig):
+def test_latency_is_from_the_readings_to_their_setpoints(rig):
     """Thinking is slow in every second tick; the ramp, in which nobody thinks, must not mix in."""
     rig.loop.start()
     for tick in range(20):

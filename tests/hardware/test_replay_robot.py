@@ -40,7 +40,7 @@ def again(run, out, **options):
 
 
 def test_the_same_robot_does_the_same(run, tmp_path, capsys):
-    """In emulated time the same robot, driven by the same goals from the same pose, gives the same bits."""
+    """In emulated time the same robot, driven by the same setpoints from the same pose, gives the same bits."""
     code, errors = again(run, tmp_path)
     assert code == 0
     assert max(error["full_run_in_noise_units"] for error in errors.values()) < 1.0  # it starts half a count beside the run

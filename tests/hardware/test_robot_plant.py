@@ -32,7 +32,7 @@ def robot_plant(options: PlantOptions = QUIET, **changes: Any) -> Any:
     return make_plant("dynamixel", ROBOT, 1, options, hardware=RobotOptions(emulated=True, **changes))
 
 
-def goals_at(tick):
+def setpoints_at(tick):
     return np.r_[np.pi / 2 + 0.05 * np.sin(0.1 * tick + np.arange(4)), 1.5 * np.sin(0.05 * tick) * np.ones(4)][None]
 
 
@@ -45,14 +45,14 @@ def test_it_reads_what_the_simulator_behind_it_reads():
     robot.reset()
     simulator.reset()
     for _ in range(25):  # the robot's ramp
-        simulator.step(goals_at(0) * [[0] * 4 + [1] * 4] + [[np.pi / 2] * 4 + [0] * 4])
+        simulator.step(setpoints_at(0) * [[0] * 4 + [1] * 4] + [[np.pi / 2] * 4 + [0] * 4])
     theirs, ours = [], []
     for tick in range(100):
-        goals = goals_at(tick)
-        goals[0, :4] = np.pi / 2 + np.rint((goals[0, :4] - np.pi / 2) / 0.0015339807878856412) * 0.0015339807878856412
-        goals[0, 4:] = np.rint(goals[0, 4:] / 0.02398082392240917) * 0.02398082392240917
-        ours.append(robot.step(goals).values[0].copy())
-        theirs.append(simulator.step(goals).values[0].copy())
+        setpoints = setpoints_at(tick)
+        setpoints[0, :4] = np.pi / 2 + np.rint((setpoints[0, :4] - np.pi / 2) / 0.0015339807878856412) * 0.0015339807878856412
+        setpoints[0, 4:] = np.rint(setpoints[0, 4:] / 0.02398082392240917) * 0.02398082392240917
+        ours.append(robot.step(setpoints).values[0].copy())
+        theirs.append(simulator.step(setpoints).values[0].copy())
     ours, theirs = Sensors(np.array(ours)), Sensors(np.array(theirs))
     np.testing.assert_allclose(ours.joint_position[:, :4], theirs.joint_position[:, :4], atol=0.002)
     np.testing.assert_allclose(ours.joint_position[:, 4:], theirs.joint_position[:, 4:], atol=0.01)
@@ -67,7 +67,7 @@ def test_the_same_run_gives_the_same_bits():
     def rollout():
         plant = robot_plant(PlantOptions())
         plant.reset()
-        rows = np.array([plant.step(goals_at(tick)).values[0].copy() for tick in range(40)])
+        rows = np.array([plant.step(setpoints_at(tick)).values[0].copy() for tick in range(40)])
         plant.close()
         return rows
 
@@ -83,7 +83,7 @@ def test_reset_goes_to_the_state_and_zeroes_the_wheels():
         np.testing.assert_allclose(sensors.joint_position[0, :4], [1.3, 1.4, 1.7, 1.8], atol=0.05)
         np.testing.assert_array_equal(sensors.joint_position[0, 4:], 0.0)
         for tick in range(20):
-            sensors = plant.step(goals_at(tick + 20))
+            sensors = plant.step(setpoints_at(tick + 20))
         assert np.abs(sensors.joint_position[0, 4:]).min() > 0.1
     assert sensors is not None
     assert sensors.camera_is_new[0] == 0.0

@@ -41,7 +41,7 @@ def test_the_emulated_robot_is_driven_and_logged(tmp_path, capsys):
     for run, name in zip(data.runs, ("straight", "rear_legs"), strict=True):
         motion = excite(name, 3, ROBOT, seconds=2.0)
         logged = np.stack([run[name] for name in COMMANDS], axis=1)
-        near = motion.goals[: len(logged)]
+        near = motion.setpoints[: len(logged)]
         assert len(near) == 100
         np.testing.assert_array_equal(np.isnan(logged[:100]), np.isnan(near))
         half_count = np.pi / 4096  # the command limiter leaves them as they are; the registers round them
@@ -107,8 +107,8 @@ def test_a_simulated_run_repeats_bit_for_bit(tmp_path, backend, effects):
     again = simulate_again(run, ROBOT)
     for name in SENSED:
         np.testing.assert_array_equal(again[name], run[name], err_msg=name)
-    for joint, goals in zip(JOINTS, motion.goals.T, strict=True):
-        np.testing.assert_array_equal(run[f"cmd_{joint}"], goals)
+    for joint, setpoints in zip(JOINTS, motion.setpoints.T, strict=True):
+        np.testing.assert_array_equal(run[f"cmd_{joint}"], setpoints)
     assert run.meta.profile == GENTLE
     assert np.ptp(run["pos_leg_lr"]) > 0.05
     assert all(np.abs(run[f"vel_{joint}"][0]) < 0.05 for joint in JOINTS)  # it starts settled
@@ -129,11 +129,13 @@ def test_commands_go_through_a_file(tmp_path, capsys):
     assert recorded(tmp_path, excitation=("rear_legs", "turns"), commands_only=True, seconds=None) == 0
     for name in ("rear_legs", "turns"):
         motion, read = excite(name, 0, ROBOT), read_commands(tmp_path / f"{name}.csv")
-        np.testing.assert_array_equal(read.goals, motion.goals)
+        np.testing.assert_array_equal(read.setpoints, motion.setpoints)
         assert (read.period, read.profile, read.name) == (motion.period, GENTLE, name)
     driven = tmp_path / "driven"
     assert recorded(driven, commands=(tmp_path / "turns.csv",), backend="gibbs_appell", emulated=False, seconds=2.0) == 0
-    np.testing.assert_array_equal(motion_of(read_run(driven / "run_01.parquet")).goals, excite("turns", 0, ROBOT).goals[:100])
+    np.testing.assert_array_equal(
+        motion_of(read_run(driven / "run_01.parquet")).setpoints, excite("turns", 0, ROBOT).setpoints[:100]
+    )
     assert "written:" in capsys.readouterr().out
 
 
@@ -141,7 +143,7 @@ def test_a_whole_run_is_a_motion_too(tmp_path):
     motion = excite("steps", 1, ROBOT, seconds=2.0)
     run = record_simulation(tmp_path / "run_01.parquet", motion, ROBOT, "gibbs_appell")
     read = read_commands(run)
-    np.testing.assert_array_equal(read.goals, motion.goals)
+    np.testing.assert_array_equal(read.setpoints, motion.setpoints)
     assert read.profile == Profile()
 
 
@@ -247,10 +249,10 @@ def test_every_repeated_run_of_a_real_robot_is_asked_for(tmp_path, monkeypatch, 
 
 
 def test_travel_is_what_the_wheels_roll():
-    goals = np.full((100, 8), np.pi / 2)
-    goals[:, 4:] = 2.0
-    goals[50:, 4:] = [-6.0, np.nan, np.nan, -2.0]
-    goals[99, 4:] = np.nan
-    travel = Motion("to and fro", goals, 0.02).travel(0.1)
+    setpoints = np.full((100, 8), np.pi / 2)
+    setpoints[:, 4:] = 2.0
+    setpoints[50:, 4:] = [-6.0, np.nan, np.nan, -2.0]
+    setpoints[99, 4:] = np.nan
+    travel = Motion("to and fro", setpoints, 0.02).travel(0.1)
     assert travel.max() == pytest.approx(0.2)
     assert travel[-1] == pytest.approx(0.2 - 49 * 0.02 * 4.0 * 0.1)

@@ -36,9 +36,9 @@ plant = make_plant("dynamixel", load_robot(), 1, PlantOptions(), hardware=option
 try:
     with stop_on_signals(plant.loop.operator):
         plant.reset()
-        goals = np.array([[1.5, 1.6, 1.5, 1.6, 2.0, 2.0, 2.0, 2.0]])
+        setpoints = np.array([[1.5, 1.6, 1.5, 1.6, 2.0, 2.0, 2.0, 2.0]])
         for tick in range(100000):
-            plant.step(goals)
+            plant.step(setpoints)
             if tick == 10:
                 print("driving", plant.loop._watchdog.process.pid, flush=True)
 except StoppedError as stop:

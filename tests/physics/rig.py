@@ -56,11 +56,11 @@ def make_plant(
     return plant
 
 
-def drive(plant: GibbsAppellPlant, seconds: float, goals=HOME, torque_on=None) -> Truth:
-    """Hold ``goals`` (8,) or (N, 8) for ``seconds``; return a copy of the truth at the end."""
-    goals = np.array(np.broadcast_to(goals, (plant.count, 8)))
+def drive(plant: GibbsAppellPlant, seconds: float, setpoints=HOME, torque_on=None) -> Truth:
+    """Hold ``setpoints`` (8,) or (N, 8) for ``seconds``; return a copy of the truth at the end."""
+    setpoints = np.array(np.broadcast_to(setpoints, (plant.count, 8)))
     for _ in range(round(seconds / plant.options.control_period)):
-        plant.step(goals, torque_on)
+        plant.step(setpoints, torque_on)
     return Truth(plant.truth().values.copy())
 
 
@@ -103,12 +103,12 @@ def lift(state: PlantState) -> None:
     state.position[:, 2] = 1.0
 
 
-def record(plant: GibbsAppellPlant, seconds: float, goals=HOME, torque_on=None) -> np.ndarray:
-    """Hold ``goals`` for ``seconds``; return the truth matrices after every control tick, (ticks, N, columns)."""
-    goals = np.array(np.broadcast_to(goals, (plant.count, 8)))
+def record(plant: GibbsAppellPlant, seconds: float, setpoints=HOME, torque_on=None) -> np.ndarray:
+    """Hold ``setpoints`` for ``seconds``; return the truth matrices after every control tick, (ticks, N, columns)."""
+    setpoints = np.array(np.broadcast_to(setpoints, (plant.count, 8)))
     history = []
     for _ in range(round(seconds / plant.options.control_period)):
-        plant.step(goals, torque_on)
+        plant.step(setpoints, torque_on)
         history.append(plant.truth().values.copy())
     return np.array(history)
 

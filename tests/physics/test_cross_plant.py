@@ -1,4 +1,4 @@
-"""Both simulators, same goals and parameters: where the robots are after ten seconds, and what their motors did.
+"""Both simulators, same setpoints and parameters: where the robots are after ten seconds, and what their motors did.
 
 Excitations as in the measured data, without and with every named effect at its default severity. Bounds are those of the
 project: base pose within 2 % of the travel and 2 degrees of yaw, motor torques within 5 % rms; docs/cross_plant.md has the
@@ -56,11 +56,11 @@ def rollout(backend: str, cases: list[Case], step: float, seconds: float) -> tup
     motions = [excite(case.motion, seed=1, robot=ROBOT, seconds=seconds) for case in cases]
     parameters = parameters_of(cases, motions)
     plant = make_plant(backend, ROBOT, len(cases), PlantOptions(physics_step=step, sensor_noise=False))
-    goals = np.stack([motion.goals for motion in motions], axis=1)
+    setpoints = np.stack([motion.setpoints for motion in motions], axis=1)
     state = standing_state(ROBOT, parameters)
     plant.reset(parameters=parameters, state=state)
     poses, torques = [], []
-    for tick in goals:
+    for tick in setpoints:
         plant.step(np.nan_to_num(tick), np.isfinite(tick))
         truth = plant.truth()
         w, x, y, z = truth.quaternion.T

@@ -50,11 +50,11 @@ def test_rotor_spins_up_alone_until_the_teeth_meet():
         parameters["servo.kd"][:, 4:] = 50.0
 
     plant = make_plant(2, edit, lift, step=1e-4, period=1e-3)
-    goals = np.concatenate([LEGS_DOWN, np.full(4, 1000.0)])
+    setpoints = np.concatenate([LEGS_DOWN, np.full(4, 1000.0)])
     decay = K * K / R / WHEEL.armature
     angle = 0.0
     for tick in range(1, 6):
-        truth = drive(plant, 1e-3, goals)
+        truth = drive(plant, 1e-3, setpoints)
         rate = WHEEL.no_load_speed * (1.0 - np.exp(-decay * tick * 1e-3))
         lead, rotor_rate = gears(plant)
         np.testing.assert_allclose(rotor_rate[:, 4:], rate, rtol=1e-9)
@@ -64,7 +64,7 @@ def test_rotor_spins_up_alone_until_the_teeth_meet():
         if angle + rate * 1e-3 > 0.5 * PLAY:
             break
     assert angle > 0.1 * PLAY
-    assert np.abs(drive(plant, 5e-3, goals).joint_velocity[:, 4:]).min() > 0.5
+    assert np.abs(drive(plant, 5e-3, setpoints).joint_velocity[:, 4:]).min() > 0.5
 
 
 def mechanical_energy(plant):
@@ -163,22 +163,22 @@ def test_a_resting_robot_with_play_stays_at_rest():
 
 def test_play_may_come_and_go_in_mid_run():
     plant = make_plant(2)
-    goals = np.concatenate([LEGS_DOWN, np.full(4, 3.0)])
-    drive(plant, 0.5, goals)
+    setpoints = np.concatenate([LEGS_DOWN, np.full(4, 3.0)])
+    drive(plant, 0.5, setpoints)
     for play in (0.02, 0.01, 0.03, 0.0):
         energy = mechanical_energy(plant)
         parameters = plant.parameters.copy()
         parameters["servo.backlash"] = play
         plant.set_parameters(parameters)
         assert np.all(mechanical_energy(plant) < energy * (1.0 + 1e-9) + 1e-9)
-        truth = drive(plant, 0.1, goals)
+        truth = drive(plant, 0.1, setpoints)
         assert np.abs(truth.joint_velocity[:, 4:] - 3.0).max() < 1.0
 
 
 def test_state_with_play_round_trips():
     plant = make_plant(2, lambda p: p.__setitem__("servo.backlash", 0.02))
-    goals = np.concatenate([LEGS_DOWN + 0.1, np.full(4, 3.0)])
-    drive(plant, 0.3, goals)
+    setpoints = np.concatenate([LEGS_DOWN + 0.1, np.full(4, 3.0)])
+    drive(plant, 0.3, setpoints)
     state = plant.get_state()
     assert np.abs(gears(plant)[0]).max() > 0.005
     plant.reset(state=state)

@@ -29,7 +29,7 @@ def different_robots(count):
     return parameters
 
 
-def goals(count):
+def setpoints(count):
     rows = [np.random.default_rng([8, row]) for row in range(count)]
     low, high = np.repeat([1.2, -5.0], 4), np.repeat([1.9, 5.0], 4)
     return np.stack([rng.uniform(low, high, (TICKS, 8)) for rng in rows], axis=1)
@@ -53,7 +53,7 @@ def with_effects(parameters, families, robots=slice(None)):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_neutral_robot_keeps_its_bits(family):
     count = 9
-    parameters, commands = different_robots(count), goals(count)
+    parameters, commands = different_robots(count), setpoints(count)
     plain = rollout(GibbsAppellPlant(ROBOT, count), parameters, commands)
     plant = GibbsAppellPlant(ROBOT, count)
     changed = rollout(plant, with_effects(parameters, [family]), commands)
@@ -69,7 +69,7 @@ def test_neutral_robot_keeps_its_bits(family):
 @pytest.mark.parametrize(("count", "precision"), [(1, "float64"), (9, "float64"), (17, "float32")])
 def test_all_families_at_once(count, precision):
     """Neutral robots as in the plain kernel, robots with one family as in that family's, at every tile width."""
-    parameters, commands = different_robots(count), goals(count)
+    parameters, commands = different_robots(count), setpoints(count)
     options = PlantOptions(precision=precision)
     plant = GibbsAppellPlant(ROBOT, count, options)
     rollout(plant, with_effects(parameters, FAMILIES), commands[:2])

@@ -26,8 +26,8 @@ def bench(count, edit, **options):
     return make_plant(count, change, lift, **options)
 
 
-def goals_for(volts):
-    """Goals that put ``volts`` (N,) on resting wheels."""
+def setpoints_for(volts):
+    """Setpoints that put ``volts`` (N,) on resting wheels."""
     return np.concatenate([np.tile(DOWN, (len(volts), 1)), np.repeat(np.asarray(volts)[:, None], 4, axis=1)], axis=1)
 
 
@@ -40,7 +40,7 @@ def test_stribeck_breakaway_and_sliding_torque():
         parameters["servo.stribeck_speed"][:, 4:] = speed
 
     volts = np.array([0.99, 1.01, 2.0, 4.0]) * (coulomb + extra) * R / K
-    truth = drive(bench(4, edit), 3.0, goals_for(volts))
+    truth = drive(bench(4, edit), 3.0, setpoints_for(volts))
     rate, friction = np.abs(truth.joint_velocity[:, 4:]), np.abs(truth.friction_torque[:, 4:])
     assert rate[0].max() < 1e-12
     np.testing.assert_allclose(friction[0], 0.99 * (coulomb + extra), rtol=1e-6)
@@ -57,7 +57,7 @@ def test_load_dependent_friction_grows_with_the_motors_torque():
         parameters["servo.load_friction"][:, 4:] = ratio
 
     breakaway = coulomb / (1.0 - ratio) * R / K
-    truth = drive(bench(3, edit), 4.0, goals_for(np.array([0.99, 1.05, 2.0]) * breakaway))
+    truth = drive(bench(3, edit), 4.0, setpoints_for(np.array([0.99, 1.05, 2.0]) * breakaway))
     assert np.abs(truth.joint_velocity[0]).max() < 1e-12
     np.testing.assert_allclose(truth.motor_torque[1:, 4:], coulomb / (1.0 - ratio), rtol=1e-6)
     np.testing.assert_allclose(truth.friction_torque[1:, 4:], -coulomb / (1.0 - ratio), rtol=1e-6)
@@ -108,7 +108,7 @@ def test_weak_motor_stalls_weaker_and_reports_the_same_effort():
         parameters["servo.torque_scale"][:, 4:] = scale[:, None]
 
     plant = bench(3, edit)
-    sensors = plant.step(goals_for(np.full(3, 100.0)))
+    sensors = plant.step(setpoints_for(np.full(3, 100.0)))
     torque = plant.truth().motor_torque[:, 4:]
     np.testing.assert_allclose(torque, np.repeat(scale[:, None], 4, axis=1) * WHEEL.stall_torque, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(sensors.joint_effort[:, 4:], WHEEL.stall_torque, rtol=1e-9)
@@ -123,7 +123,7 @@ def test_weak_motor_runs_up_as_slowly_as_its_torque_says():
         parameters["servo.torque_scale"][:, 4:] = scale[:, None]
         parameters["body.inertia"], parameters["body.mass"] = 10.0, 100.0
 
-    truth = drive(bench(2, edit, period=1e-3), 2e-3, goals_for(np.full(2, 1000.0)))
+    truth = drive(bench(2, edit, period=1e-3), 2e-3, setpoints_for(np.full(2, 1000.0)))
     inertia = WHEEL.armature + ROBOT.wheel.spin_inertia
     expected = WHEEL.no_load_speed * (1.0 - np.exp(-2e-3 * scale * K * K / R / inertia))
     np.testing.assert_allclose(truth.joint_velocity[:, 4], expected, rtol=1e-3)
@@ -138,12 +138,12 @@ def test_supply_sags_under_stall(resistance):
         parameters["servo.supply_resistance"] = resistance
 
     plant = bench(2, edit)
-    drive(plant, 0.08, goals_for(np.full(2, 1000.0)))
-    sensors = plant.step(goals_for(np.full(2, 1000.0)))
+    drive(plant, 0.08, setpoints_for(np.full(2, 1000.0)))
+    sensors = plant.step(setpoints_for(np.full(2, 1000.0)))
     expected = V0 / (1.0 + resistance * 4.0 / R)
     np.testing.assert_allclose(sensors.supply_voltage, expected, rtol=1e-9)
     np.testing.assert_allclose(plant.truth().motor_torque[:, 4:], K / R * expected, rtol=1e-9)
-    sensors = plant.step(goals_for(np.zeros(2)))
+    sensors = plant.step(setpoints_for(np.zeros(2)))
     np.testing.assert_allclose(sensors.supply_voltage, V0, atol=0.1)  # recovers
 
 
@@ -157,6 +157,6 @@ def test_sagging_supply_settles_where_motors_run_partly_loaded():
 
     plant = bench(2, edit)
     for _ in range(149):
-        plant.step(goals_for(np.full(2, 6.0)))
-    sensors = plant.step(goals_for(np.full(2, 6.0)))
+        plant.step(setpoints_for(np.full(2, 6.0)))
+    sensors = plant.step(setpoints_for(np.full(2, 6.0)))
     np.testing.assert_allclose(sensors.supply_voltage, V0 - resistance * 4.0 * coulomb / K, rtol=1e-6)

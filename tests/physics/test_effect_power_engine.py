@@ -72,11 +72,11 @@ def test_power_balance_closes(family):
     parameters, count = plant.parameters, plant.count
     start, done, work, friction_work = stored(plant), np.zeros(count), np.zeros(count), np.zeros((2000, count))
     old, old_rate = Truth(plant.truth().values.copy()), gears(plant)[1]
-    goals = np.zeros((count, 8))
+    setpoints = np.zeros((count, 8))
     for tick in range(2000):
         if tick % 400 == 0:
-            goals = np.hstack([rng.uniform(1.3, 1.8, (count, 4)), rng.uniform(-4.0, 4.0, (count, 4))])
-        plant.step(goals)
+            setpoints = np.hstack([rng.uniform(1.3, 1.8, (count, 4)), rng.uniform(-4.0, 4.0, (count, 4))])
+        plant.step(setpoints)
         truth, rate = Truth(plant.truth().values.copy()), gears(plant)[1]
         turned = 0.5 * STEP * (rate + old_rate)
         slid = 0.5 * STEP * (truth.slip_velocity + old.slip_velocity)
@@ -101,17 +101,17 @@ def test_power_balance_closes(family):
 
 
 def test_neutral_formula_changes_no_bit():
-    goals = np.concatenate([LEGS_DOWN + 0.2, np.full(4, 3.0)])
-    plain = drive(make_plant(3), 0.3, goals)
+    setpoints = np.concatenate([LEGS_DOWN + 0.2, np.full(4, 3.0)])
+    plain = drive(make_plant(3), 0.3, setpoints)
     neutral = [make_force(["leg_lf", "floor_force_x", "body_torque_yaw"][:1], "0 * motor_torque", {}, {})]
-    np.testing.assert_array_equal(drive(make_plant(3, forces=neutral), 0.3, goals).values, plain.values)
+    np.testing.assert_array_equal(drive(make_plant(3, forces=neutral), 0.3, setpoints).values, plain.values)
 
 
 def test_formula_force_on_the_floor_is_the_external_force():
-    goals = np.concatenate([LEGS_DOWN, np.full(4, 2.0)])
+    setpoints = np.concatenate([LEGS_DOWN, np.full(4, 2.0)])
     pull = [make_force(["floor_force_y"], "f", {"f": 3.0}, {"f": "N"})]
-    pushed = drive(make_plant(2, lambda p: p.__setitem__("external_force", (0.0, 3.0))), 0.5, goals)
-    formula = drive(make_plant(2, forces=pull), 0.5, goals)
+    pushed = drive(make_plant(2, lambda p: p.__setitem__("external_force", (0.0, 3.0))), 0.5, setpoints)
+    formula = drive(make_plant(2, forces=pull), 0.5, setpoints)
     np.testing.assert_allclose(formula.values, pushed.values, rtol=1e-9, atol=1e-10)
 
 

@@ -18,17 +18,17 @@ def smooth(parameters):
     parameters["servo.profile_acceleration"] = np.repeat([15.0, 10.0], 4)
 
 
-def random_goals(rng):
+def random_setpoints(rng):
     return np.hstack([np.pi / 2 + rng.uniform(-0.3, 0.3, (COUNT, 4)), rng.uniform(-6, 6, (COUNT, 4))])
 
 
 def drive_smoothly(step, sweeps=4):
-    """Position after 1 s of trapezoidal profiles between two random goals."""
+    """Position after 1 s of trapezoidal profiles between two random setpoints."""
     rng = np.random.default_rng(5)
-    goals = random_goals(rng), random_goals(rng)
+    setpoints = random_setpoints(rng), random_setpoints(rng)
     plant = make_plant(COUNT, smooth, step=step, sweeps=sweeps)
     for tick in range(50):
-        plant.step(goals[tick // 15 % 2])
+        plant.step(setpoints[tick // 15 % 2])
     return plant.truth().position.copy()
 
 
@@ -53,7 +53,7 @@ def test_four_sweeps_are_enough():
 
 @pytest.mark.parametrize("step", [2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3])
 def test_stable_after_a_drop_and_under_random_commands(step):
-    """Dropped from 5 cm, then new random goals every tick for 4 s: no growth of speed, height or tilt."""
+    """Dropped from 5 cm, then new random setpoints every tick for 4 s: no growth of speed, height or tilt."""
 
     def place(state):
         state.position[:, 2] += 0.05
@@ -61,7 +61,7 @@ def test_stable_after_a_drop_and_under_random_commands(step):
     rng = np.random.default_rng(7)
     plant = make_plant(COUNT, edit, place, step=step)
     for _ in range(200):
-        plant.step(random_goals(rng))
+        plant.step(random_setpoints(rng))
         truth = plant.truth()
         assert np.isfinite(truth.values).all()
         assert np.abs(truth.linear_velocity_in_body).max() < 2.0

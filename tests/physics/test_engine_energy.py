@@ -57,11 +57,11 @@ def audit():
     start = energy(parameters, plant.truth())
     old = Truth(plant.truth().values.copy())
     old_gap, old_rates = wheel_gaps(parameters, old), rates(old)
-    goals = np.zeros((COUNT, 8))
+    setpoints = np.zeros((COUNT, 8))
     for tick in range(10_000):
         if tick % 500 == 0:
-            goals = np.hstack([rng.uniform(1.0, 2.1, (COUNT, 4)), rng.uniform(-5.0, 5.0, (COUNT, 4))])
-        plant.step(goals)
+            setpoints = np.hstack([rng.uniform(1.0, 2.1, (COUNT, 4)), rng.uniform(-5.0, 5.0, (COUNT, 4))])
+        plant.step(setpoints)
         truth = plant.truth()
         gap, new_rates = wheel_gaps(parameters, truth), rates(truth)
         joint, slip, spin = np.split(0.5 * STEP * (new_rates + old_rates), [8, 16], axis=1)
@@ -105,8 +105,8 @@ def test_stalled_motors_turn_electrical_energy_into_heat():
         parameters["servo.coulomb_friction"] = 50.0
 
     plant = make_plant(2, hold)
-    goals = np.tile(np.concatenate([np.full(4, np.pi / 2), np.full(4, 100.0)]), (2, 1))
-    plant.step(goals)
+    setpoints = np.tile(np.concatenate([np.full(4, np.pi / 2), np.full(4, 100.0)]), (2, 1))
+    plant.step(setpoints)
     truth = plant.truth()
     motor = plant.robot.servo.wheel
     current = motor.stall_torque / (12.0 / motor.no_load_speed)

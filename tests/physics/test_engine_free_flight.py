@@ -50,8 +50,8 @@ def test_engine_accelerations_equal_the_equations():
     state = random_state(rng, COUNT)
     sign = rng.choice([-1.0, 1.0], (COUNT, 8))
     state.reference_velocity[:, 4:] = 1000.0 * sign[:, 4:]
-    goals = np.where(np.arange(8) < 4, state.joint_position + 50.0 * sign, 1000.0 * sign)
-    state.reference_position[:] = np.where(np.arange(8) < 4, goals, state.joint_position)
+    setpoints = np.where(np.arange(8) < 4, state.joint_position + 50.0 * sign, 1000.0 * sign)
+    state.reference_position[:] = np.where(np.arange(8) < 4, setpoints, state.joint_position)
 
     table = []
     for level in range(6):
@@ -59,7 +59,7 @@ def test_engine_accelerations_equal_the_equations():
         plant = make_plant(
             COUNT, lambda p: p.values.__setitem__(..., parameters.values), lambda s: assign(s, state), step=step, period=step
         )
-        plant.step(goals)
+        plant.step(setpoints)
         table.append((velocity(plant.get_state()) - velocity(state)) / step)
     for power in range(1, 6):
         table = [(2**power * fine - coarse) / (2**power - 1) for coarse, fine in itertools.pairwise(table)]

@@ -139,9 +139,9 @@ def test_wheels_driven_above_their_grip_spin(step):
 
     plant = make_plant(2, edit, step=step)
     sign = np.array([1.0, -1.0])
-    goals = np.concatenate([np.tile(HOME[:4], (2, 1)), np.repeat(100.0 * sign[:, None], 4, axis=1)], axis=1)
-    early = drive(plant, 0.1, goals)
-    late = drive(plant, 0.2, goals)
+    setpoints = np.concatenate([np.tile(HOME[:4], (2, 1)), np.repeat(100.0 * sign[:, None], 4, axis=1)], axis=1)
+    early = drive(plant, 0.1, setpoints)
+    late = drive(plant, 0.2, setpoints)
 
     wheel = ROBOT.servo.wheel
     constant, resistance = servo.motor_constants(wheel.stall_torque, wheel.no_load_speed, 12.0)
@@ -198,8 +198,8 @@ def direction_case(mode, mu, step):
         state.reference_velocity[:, 4:] = rolling / RADIUS
 
     plant = make_plant(12, edit, place, step=step, period=step)
-    goals = np.concatenate([HOME[:4], np.full(4, 100.0)])
-    truth = drive(plant, max(step, 0.005), goals, torque_on=None if mode == "driven" else wheels_off(12))
+    setpoints = np.concatenate([HOME[:4], np.full(4, 100.0)])
+    truth = drive(plant, max(step, 0.005), setpoints, torque_on=None if mode == "driven" else wheels_off(12))
     return truth.slip_velocity.reshape(12, 4, 2), contact_force(truth)
 
 
@@ -217,7 +217,7 @@ def test_friction_points_where_it_dissipates_most(step, mode, mu):
     np.testing.assert_allclose(np.hypot(*(force[..., :2] / mu).transpose(2, 0, 1)), force[..., 2], rtol=1e-6)
 
 
-def random_goals(rng, count):
+def random_setpoints(rng, count):
     return np.concatenate([np.pi / 2 + rng.uniform(-0.4, 0.4, (count, 4)), rng.uniform(-6, 6, (count, 4))], axis=1)
 
 
@@ -232,7 +232,7 @@ def test_friction_never_leaves_its_ellipse():
     plant = make_plant(200, edit)
     worst, sliding = 0.0, 0
     for _ in range(100):
-        plant.step(random_goals(rng, 200))
+        plant.step(random_setpoints(rng, 200))
         force = contact_force(plant.truth())
         used = np.hypot(force[..., 0] / mu[..., 0], force[..., 1] / mu[..., 1])
         worst = max(worst, (used - force[..., 2]).max())
@@ -249,9 +249,9 @@ def test_anisotropic_friction_is_the_same_at_any_heading():
     rng = np.random.default_rng(5)
     plant = make_plant(8, lambda p: anisotropic(p, slice(None)), lambda s: turn(s, yaw))
     for _ in range(10):
-        goals = np.repeat(random_goals(rng, 1), 8, axis=0)
+        setpoints = np.repeat(random_setpoints(rng, 1), 8, axis=0)
         for _ in range(10):
-            plant.step(goals)
+            plant.step(setpoints)
     truth = plant.truth()
     x, y = truth.position[:, 0], truth.position[:, 1]
     path = np.column_stack([np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x, truth.position[:, 2]])

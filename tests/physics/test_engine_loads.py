@@ -125,8 +125,8 @@ def test_hip_torque_at_rest_is_the_papers_static_torque():
         state.reference_position[:] = state.joint_position
 
     plant = make_plant(2, edit, place, step=2.5e-4)
-    goals = np.column_stack([front, front, rear, rear, np.zeros((2, 4))])
-    truth = drive(plant, 2.0, goals)
+    setpoints = np.column_stack([front, front, rear, rear, np.zeros((2, 4))])
+    truth = drive(plant, 2.0, setpoints)
     force = contact_force(truth)
     angle = truth.joint_position[:, :4]
     arm = LENGTH * np.cos(angle)

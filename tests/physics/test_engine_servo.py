@@ -55,11 +55,11 @@ def test_wheel_at_full_voltage_follows_the_dc_motor(step):
         parameters["servo.armature"][1, 4:] *= 30.0
 
     sign = np.array([1.0, -1.0, 1.0, -1.0])
-    goals = np.concatenate([HOME[:4], 100.0 * sign])
+    setpoints = np.concatenate([HOME[:4], 100.0 * sign])
     plant = make_plant(2, edit, lift, step=step, period=4e-3)
     inertia = ROBOT.wheel.spin_inertia + WHEEL.armature * np.array([1.0, 30.0])
     for tick in range(1, 11):
-        truth = drive(plant, 4e-3, goals)
+        truth = drive(plant, 4e-3, setpoints)
         expected = WHEEL.no_load_speed * (1 - np.exp(-4e-3 * tick * damping(WHEEL) / inertia))
         np.testing.assert_allclose(sign * truth.joint_velocity[:, 4:], np.tile(expected[:, None], (1, 4)), rtol=1e-3)
 
@@ -69,9 +69,9 @@ def test_leg_at_full_voltage_follows_the_dc_motor(step):
     """A step of 2.5 rad: the voltage stays at its limit, so that the speed rises as a first-order lag."""
     plant = make_plant(2, in_the_air, lift, step=step, period=4e-3)
     sign = np.array([1.0, -1.0, 1.0, -1.0])
-    goals = np.concatenate([HOME[:4] + 2.5 * sign, np.zeros(4)])
+    setpoints = np.concatenate([HOME[:4] + 2.5 * sign, np.zeros(4)])
     for tick in range(1, 11):
-        truth = drive(plant, 4e-3, goals, wheels_off(2))
+        truth = drive(plant, 4e-3, setpoints, wheels_off(2))
         expected = LEG.no_load_speed * (1 - np.exp(-4e-3 * tick * damping(LEG) / LEG_INERTIA))
         np.testing.assert_allclose(truth.joint_velocity[:, :4], np.tile(expected * sign, (2, 1)), rtol=2e-3)
 
@@ -110,10 +110,10 @@ def test_gear_friction_holds_a_leg_against_less_torque():
 
     constant, resistance = servo.motor_constants(LEG.stall_torque, LEG.no_load_speed, 12.0)
     reach = 0.1 / (LEG.kp * constant / resistance)
-    goals = np.tile(HOME, (2, 1))
-    goals[:, :4] += np.array([[0.98], [1.1]]) * reach
+    setpoints = np.tile(HOME, (2, 1))
+    setpoints[:, :4] += np.array([[0.98], [1.1]]) * reach
     plant = make_plant(2, edit, lift)
-    moved = drive(plant, 0.5, goals).joint_position[:, :4] - np.pi / 2
+    moved = drive(plant, 0.5, setpoints).joint_position[:, :4] - np.pi / 2
     assert np.abs(moved[0]).max() < 1e-12
     assert moved[1].min() > 0.01 * reach
 
@@ -126,9 +126,9 @@ def test_zero_offset_is_reading_minus_truth_and_the_servo_regulates_the_reading(
         parameters["joint.zero_offset"] = offset
 
     plant = make_plant(2, edit, lift)
-    goals = np.concatenate([np.full(4, 1.2), np.zeros(4)])
-    truth = drive(plant, 1.0, goals)
-    reading = plant.step(np.tile(goals, (2, 1)))
+    setpoints = np.concatenate([np.full(4, 1.2), np.zeros(4)])
+    truth = drive(plant, 1.0, setpoints)
+    reading = plant.step(np.tile(setpoints, (2, 1)))
     np.testing.assert_allclose(truth.joint_position[:, :4], np.tile(1.2 - offset, (2, 1)), atol=1e-6)
     np.testing.assert_allclose(reading.joint_position[:, :4], 1.2, atol=1e-6)
 

@@ -7,9 +7,9 @@ LEFT, RIGHT = [4, 6], [5, 7]
 
 
 def skid(left, right):
-    goals = HOME.copy()
-    goals[LEFT], goals[RIGHT] = left, right
-    return goals
+    setpoints = HOME.copy()
+    setpoints[LEFT], setpoints[RIGHT] = left, right
+    return setpoints
 
 
 def heading(truth):
@@ -19,8 +19,8 @@ def heading(truth):
 
 def test_skid_turns_turn_towards_the_slower_side():
     """Left back and right forth is a left turn; forwards it bends to the slower side; straight stays straight."""
-    goals = np.array([skid(-4, 4), skid(4, -4), skid(2, 5), skid(5, 2), skid(4, 4), skid(-4, -4)], dtype=float)
-    truth = drive(make_plant(6), 3.0, goals)
+    setpoints = np.array([skid(-4, 4), skid(4, -4), skid(2, 5), skid(5, 2), skid(4, 4), skid(-4, -4)], dtype=float)
+    truth = drive(make_plant(6), 3.0, setpoints)
     rate, speed = truth.angular_velocity_in_body[:, 2], truth.linear_velocity_in_body[:, 0]
     assert (np.sign(rate[:4]) == [1, -1, 1, -1]).all()
     np.testing.assert_allclose(rate[[1, 3]], -rate[[0, 2]], rtol=1e-8)
@@ -38,8 +38,8 @@ def test_mirrored_commands_give_mirrored_motion():
     rng = np.random.default_rng(0)
     plant = make_plant(16)
     for _ in range(10):
-        goals = np.hstack([rng.uniform(1.0, 2.0, (8, 4)), rng.uniform(-5.0, 5.0, (8, 4))])
-        drive(plant, 0.5, np.vstack([goals, goals[:, MIRROR]]))
+        setpoints = np.hstack([rng.uniform(1.0, 2.0, (8, 4)), rng.uniform(-5.0, 5.0, (8, 4))])
+        drive(plant, 0.5, np.vstack([setpoints, setpoints[:, MIRROR]]))
     truth = plant.truth()
     assert np.linalg.norm(truth.position[:, :2], axis=1).min() > 1e-3
     position, joints = truth.position, truth.joint_position

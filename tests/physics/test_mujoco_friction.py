@@ -77,8 +77,8 @@ def test_anisotropic_friction_is_the_same_at_any_heading():
 
     plant = make("mujoco", 6, edit, lambda state: turn(state, yaw))
     for _ in range(8):
-        goals = np.concatenate([np.pi / 2 + rng.uniform(-0.4, 0.4, 4), rng.uniform(-6, 6, 4)])
-        drive(plant, 0.2, goals)
+        setpoints = np.concatenate([np.pi / 2 + rng.uniform(-0.4, 0.4, 4), rng.uniform(-6, 6, 4)])
+        drive(plant, 0.2, setpoints)
     truth = plant.truth()
     x, y = truth.position[:, 0], truth.position[:, 1]
     path = np.column_stack([np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x, truth.position[:, 2]])
@@ -186,8 +186,8 @@ def test_tyre_creep_under_a_steady_pull(step):
 def test_contact_geometry_is_the_thin_discs():
     """A robot rolled and pitched on unequal legs: MuJoCo's normal forces are those of the disc's own spring."""
     plant = make("mujoco", 1, period=1e-3)
-    goals = np.concatenate([[1.2, 1.5, 1.7, 2.0], np.zeros(4)])
-    drive(plant, 1.0, goals)
+    setpoints = np.concatenate([[1.2, 1.5, 1.7, 2.0], np.zeros(4)])
+    drive(plant, 1.0, setpoints)
     truth, p = plant.truth(), plant.parameters
     w, x, y, z = truth.quaternion[0]
     n = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])

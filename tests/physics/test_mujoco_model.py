@@ -103,11 +103,11 @@ def audit():
     start = stored(parameters, plant.truth())
     old = Truth(plant.truth().values.copy())
     old_gap = wheel_gaps(parameters, old)
-    goals = np.zeros((count, 8))
+    setpoints = np.zeros((count, 8))
     for tick in range(3000):
         if tick % 250 == 0:
-            goals = np.tile(np.hstack([rng.uniform(1.1, 2.0, 4), rng.uniform(-5.0, 5.0, 4)]), (count, 1))
-        plant.step(goals)
+            setpoints = np.tile(np.hstack([rng.uniform(1.1, 2.0, 4), rng.uniform(-5.0, 5.0, 4)]), (count, 1))
+        plant.step(setpoints)
         truth = plant.truth()
         gap = wheel_gaps(parameters, truth)
         rate = 0.5 * STEP * (truth.joint_velocity + old.joint_velocity)

@@ -145,22 +145,22 @@ def test_trapezoid_is_on_time_within_limits_and_never_overshoots(start, goal, li
 
 @settings(max_examples=15, deadline=None)
 @given(
-    goals=st.lists(st.floats(0.35, 2.79), min_size=2, max_size=6),
+    setpoints=st.lists(st.floats(0.35, 2.79), min_size=2, max_size=6),
     acceleration=st.sampled_from([0.3745, 7.49, 15.0, servo.NO_LIMIT]),
     dtype=st.sampled_from([np.float64, np.float32]),
 )
-def test_goals_that_change_on_the_way_are_reached_without_chatter(goals, acceleration, dtype):
-    position, velocity = dtype(goals[0]), dtype(0)
+def test_goals_that_change_on_the_way_are_reached_without_chatter(setpoints, acceleration, dtype):
+    position, velocity = dtype(setpoints[0]), dtype(0)
     args = (dtype(1.0), dtype(acceleration), dtype(2e-3))
-    for goal in goals:
+    for goal in setpoints:
         for _ in range(150):
             position, velocity, *_ = (dtype(x) for x in servo.leg_profile_step(position, velocity, dtype(goal), *args))
     for _ in range(4000):
-        position, velocity, *_ = (dtype(x) for x in servo.leg_profile_step(position, velocity, dtype(goals[-1]), *args))
+        position, velocity, *_ = (dtype(x) for x in servo.leg_profile_step(position, velocity, dtype(setpoints[-1]), *args))
     for _ in range(5):
-        assert position == dtype(goals[-1])
+        assert position == dtype(setpoints[-1])
         assert velocity == 0
-        position, velocity, *_ = (dtype(x) for x in servo.leg_profile_step(position, velocity, dtype(goals[-1]), *args))
+        position, velocity, *_ = (dtype(x) for x in servo.leg_profile_step(position, velocity, dtype(setpoints[-1]), *args))
 
 
 def float32_kernel():
@@ -176,9 +176,9 @@ def float32_kernel():
     )
     head = """
 @njit(cache=True, error_model="numpy")
-def run(start, goals, limits, accelerations, step, count, out):
+def run(start, setpoints, limits, accelerations, step, count, out):
     for i in range(start.shape[0]):
-        q, w, goal, limit, acceleration = start[i], np.float32(0.0), goals[i], limits[i], accelerations[i]
+        q, w, goal, limit, acceleration = start[i], np.float32(0.0), setpoints[i], limits[i], accelerations[i]
         ahead = np.float32(1.0) if goal > q else np.float32(-1.0)
         beyond = np.float32(0.0)
         for _ in range(count):

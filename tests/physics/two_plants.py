@@ -36,11 +36,11 @@ def make(
     return plant
 
 
-def drive(plant: Plant, seconds: float, goals=HOME, torque_on=None) -> np.ndarray:
-    """Hold ``goals`` (8,) or (N, 8) for ``seconds``; return a copy of the linear velocities in the body (N, 3)."""
-    goals = np.array(np.broadcast_to(goals, (plant.count, 8)))
+def drive(plant: Plant, seconds: float, setpoints=HOME, torque_on=None) -> np.ndarray:
+    """Hold ``setpoints`` (8,) or (N, 8) for ``seconds``; return a copy of the linear velocities in the body (N, 3)."""
+    setpoints = np.array(np.broadcast_to(setpoints, (plant.count, 8)))
     for _ in range(round(seconds / plant.options.control_period)):
-        plant.step(goals, torque_on)
+        plant.step(setpoints, torque_on)
     return plant.truth().linear_velocity_in_body.copy()
 
 

@@ -22,7 +22,7 @@ from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-#: s at the first goals before time 0, not compared: until the bounce of being set down has died out.
+#: s at the first setpoints before time 0, not compared: until the bounce of being set down has died out.
 SETTLE = 0.5
 
 
@@ -144,7 +144,7 @@ def drive(
     patch: Patch | None = None,
     threads: int = 1,
 ) -> Traces:
-    """Drive all motions on one plant, one robot of a batch each; a shorter motion stays at its last goals.
+    """Drive all motions on one plant, one robot of a batch each; a shorter motion stays at its last setpoints.
 
     Args:
         plant: the plant.
@@ -156,19 +156,21 @@ def drive(
     """
     patch = patch or Patch()
     batch = _parameters(motions, robot, parameters, patch)
-    goals, torque_on = _goals(motions)
+    setpoints, torque_on = _goals(motions)
     options = PlantOptions(motions[0].period, plant.physics_step, plant.precision, threads, sensor_noise=False)
     simulator = make_plant(plant.backend, robot, len(motions), options, patch.forces)
     sensors, truth = [], []
     try:
-        readings = simulator.reset(np.arange(len(motions), dtype=np.uint64), batch, state=standing_at(goals[0], robot, batch))
+        readings = simulator.reset(
+            np.arange(len(motions), dtype=np.uint64), batch, state=standing_at(setpoints[0], robot, batch)
+        )
         for _ in range(round(SETTLE / motions[0].period)):
-            readings = simulator.step(goals[0], torque_on[0])
-        for tick in range(len(goals) + 1):
+            readings = simulator.step(setpoints[0], torque_on[0])
+        for tick in range(len(setpoints) + 1):
             sensors.append(readings.values.copy())
             truth.append(simulator.truth().values.copy())
-            if tick < len(goals):
-                readings = simulator.step(goals[tick], torque_on[tick])
+            if tick < len(setpoints):
+                readings = simulator.step(setpoints[tick], torque_on[tick])
     finally:
         simulator.close()
     return Traces(plant, robot, np.array(sensors), np.array(truth))
@@ -181,11 +183,11 @@ def _parameters(motions: Sequence[Motion], robot: Robot, parameters: Parameters 
 
 
 def _goals(motions: Sequence[Motion]) -> tuple[Array, NDArray[np.bool_]]:
-    """Goals (ticks, motions, 8) and torque switches; a motor that is off keeps its last goal."""
-    ticks = max(len(motion.goals) for motion in motions)
-    goals = np.stack([np.pad(m.goals, ((0, ticks - len(m.goals)), (0, 0)), mode="edge") for m in motions], axis=1)
-    torque_on = np.isfinite(goals)
+    """Setpoints (ticks, motions, 8) and torque switches; a motor that is off keeps its last goal."""
+    ticks = max(len(motion.setpoints) for motion in motions)
+    setpoints = np.stack([np.pad(m.setpoints, ((0, ticks - len(m.setpoints)), (0, 0)), mode="edge") for m in motions], axis=1)
+    torque_on = np.isfinite(setpoints)
     for tick in range(1, ticks):
-        goals[tick] = np.where(torque_on[tick], goals[tick], goals[tick - 1])
-    goals[..., LEG_SLICE] = np.where(np.isnan(goals[..., LEG_SLICE]), np.pi / 2, goals[..., LEG_SLICE])
-    return np.nan_to_num(goals), torque_on
+        setpoints[tick] = np.where(torque_on[tick], setpoints[tick], setpoints[tick - 1])
+    setpoints[..., LEG_SLICE] = np.where(np.isnan(setpoints[..., LEG_SLICE]), np.pi / 2, setpoints[..., LEG_SLICE])
+    return np.nan_to_num(setpoints), torque_on

@@ -1,4 +1,4 @@
-"""Compare two plants: same goals, same parameters, same start; where and when do they diverge, and by how much?
+"""Compare two plants: same setpoints, same parameters, same start; where and when do they diverge, and by how much?
 
 Differences are given in units of what the robot's own sensors resolve (:func:`resolutions`), so that a difference below one
 could not be measured on the robot at all. With ``halve`` everything is repeated at half the physics step: a difference that
@@ -113,7 +113,7 @@ class Comparison:
 
     Attributes:
         effects: what was added. threshold: in units of resolution, for ``parted``.
-        motions, first, second: goals and traces. cases: one per motion. signals: what was compared.
+        motions, first, second: setpoints and traces. cases: one per motion. signals: what was compared.
         half: cases at half of both steps. own: each plant against itself at half its step. None without ``halve``.
     """
 
@@ -196,7 +196,7 @@ def compare(
 
 def difference(first: Traces, second: Traces, name: str, signal: ComparedSignal, motion: Motion, index: int) -> Array:
     """Return second minus first of one signal over one motion, (ticks + 1, elements)."""
-    a, b = (traces.signals[name][: len(motion.goals) + 1, index] for traces in (first, second))
+    a, b = (traces.signals[name][: len(motion.setpoints) + 1, index] for traces in (first, second))
     return np.angle(np.exp(1j * (b - a))) if signal.turns else b - a
 
 
@@ -217,7 +217,7 @@ def _case(
 
 
 def _agreement(motion: Motion, k: int, a: Traces, b: Traces, signals: Mapping[str, ComparedSignal], robot: Robot) -> Agreement:
-    rows = len(motion.goals) + 1
+    rows = len(motion.setpoints) + 1
     horizon = min(round(HORIZON / motion.period), rows - 1)
     path = a.signals["true_xy"][: horizon + 1, k]
     travel = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())

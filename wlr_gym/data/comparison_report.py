@@ -184,7 +184,7 @@ def _motion_figure(comparison: Comparison, index: int, title: str) -> Figure:
 
 def _draw_panel(comparison: Comparison, index: int, names: Sequence[str], above: Axes, below: Axes) -> None:
     motion = comparison.motions[index]
-    t = motion.period * np.arange(len(motion.goals) + 1)
+    t = motion.period * np.arange(len(motion.setpoints) + 1)
     for traces, colour, style in ((comparison.first, _FIRST, "-"), (comparison.second, _SECOND, "--")):
         for name in names:
             values = traces.signals[name][: len(t), index]

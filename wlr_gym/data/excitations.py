@@ -1,4 +1,4 @@
-"""Goals that bring out what a robot is made of: motions to drive on the real robot, and on simulators to compare them.
+"""Setpoints that bring out what a robot is made of: motions to drive on the real robot, and on simulators to compare them.
 
 Every excitation is a function of a seed, starts and ends at rest, keeps the legs within their limits and the wheels below
 their no-load speed, and needs up to 2 m of floor in front of the robot or behind it. :data:`EXCITATIONS` says what each is
@@ -20,7 +20,7 @@ from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot, load_robot
 
 Array = NDArray[np.float64]
 
-#: s between the goals of a motion.
+#: s between the setpoints of a motion.
 CONTROL_PERIOD = 0.02
 #: s of rest before and after every motion.
 REST = 1.0
@@ -28,44 +28,44 @@ REST = 1.0
 GENTLE = Profile(wheel_acceleration=11.2, leg_velocity=1.44, leg_acceleration=15.0)
 #: rad/s; fastest wheel goal, 14 % below the no-load speed.
 TOP_SPEED = 5.5
-#: rad; leg goals stay this far off the leg limits.
+#: rad; leg setpoints stay this far off the leg limits.
 LEG_MARGIN = 0.1
 _DOWN = np.pi / 2
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Goals over time.
+    """Setpoints over time.
 
     Attributes:
         name: of the excitation, or of the run it was taken from.
-        goals: (ticks, 8) leg angles, rad, and wheel speeds, rad/s, held for one control period each; NaN = torque off.
+        setpoints: (ticks, 8) leg angles, rad, and wheel speeds, rad/s, held for one control period each; NaN = torque off.
         period: s per tick.
         profile: the servos' profile registers.
     """
 
     name: str
-    goals: Array
+    setpoints: Array
     period: float
     profile: Profile = GENTLE
 
     @property
     def duration(self) -> float:
         """Length in s."""
-        return len(self.goals) * self.period
+        return len(self.setpoints) * self.period
 
     def travel(self, wheel_radius: float) -> Array:
         """Return the way rolled after each tick (ticks,), m, forward positive: without slip, motors that are off left out."""
-        wheels = self.goals[:, WHEEL_SLICE]
+        wheels = self.setpoints[:, WHEEL_SLICE]
         driven = np.isfinite(wheels).sum(axis=1)
         return wheel_radius * self.period * np.cumsum(np.nansum(wheels, axis=1) / np.maximum(driven, 1))
 
     def cut(self, seconds: float | None) -> Motion:
         """Return its first ``seconds``; None = all of it."""
-        return self if seconds is None else replace(self, goals=self.goals[: max(1, round(seconds / self.period))])
+        return self if seconds is None else replace(self, setpoints=self.setpoints[: max(1, round(seconds / self.period))])
 
 
-#: Goals at any times (T,) -> (T, 8), and their length in s without the rests.
+#: Setpoints at any times (T,) -> (T, 8), and their length in s without the rests.
 Course = tuple[Callable[[Array], NDArray[np.floating]], float]
 
 
@@ -111,26 +111,26 @@ def excite(
     course, length = excitation.draw(generator(seed, "excitation", name), robot)
     t: Array = period * np.arange(round((length + 2 * REST) / period), dtype=np.float64)
     own: Array = np.clip(t - REST, 0.0, length)
-    goals = np.asarray(course(own), dtype=np.float64)
-    goals[(t < REST) | (t > REST + length), WHEEL_SLICE] *= 0.0  # NaN stays NaN
+    setpoints = np.asarray(course(own), dtype=np.float64)
+    setpoints[(t < REST) | (t > REST + length), WHEEL_SLICE] *= 0.0  # NaN stays NaN
     low, high = robot.leg_limits
-    goals[:, LEG_SLICE] = np.clip(goals[:, LEG_SLICE], low + LEG_MARGIN, high - LEG_MARGIN)
-    goals[:, WHEEL_SLICE] = np.clip(goals[:, WHEEL_SLICE], -TOP_SPEED, TOP_SPEED)
-    return Motion(name, goals, period, excitation.profile).cut(seconds)
+    setpoints[:, LEG_SLICE] = np.clip(setpoints[:, LEG_SLICE], low + LEG_MARGIN, high - LEG_MARGIN)
+    setpoints[:, WHEEL_SLICE] = np.clip(setpoints[:, WHEEL_SLICE], -TOP_SPEED, TOP_SPEED)
+    return Motion(name, setpoints, period, excitation.profile).cut(seconds)
 
 
 # ---- building blocks -------------------------------------------------------------------------------------------------
 
 
 def _holds(pieces: Iterable[tuple[float, Sequence[float] | Array]]) -> Course:
-    """Rows of eight goals, each held for its seconds."""
+    """Rows of eight setpoints, each held for its seconds."""
     seconds, rows = zip(*pieces, strict=True)
     ends, table = np.cumsum(seconds), np.array(rows)
     return lambda t: table[np.minimum(np.searchsorted(ends, t, side="right"), len(table) - 1)], float(ends[-1])
 
 
 def _ramps(points: Iterable[tuple[float, Sequence[float] | Array]]) -> Course:
-    """Rows of eight goals at given times, straight lines between them; a NaN makes all of its column NaN."""
+    """Rows of eight setpoints at given times, straight lines between them; a NaN makes all of its column NaN."""
     times, rows = (np.array(column) for column in zip(*points, strict=True))
     return lambda t: np.stack([np.interp(t, times, column) for column in rows.T], axis=1), float(times[-1])
 
@@ -290,14 +290,14 @@ def _chirp(rng: np.random.Generator, robot: Robot) -> Course:
     amplitudes = (rng.uniform(2.5, 3.5), rng.uniform(2.5, 3.5), rng.uniform(0.05, 0.08))
 
     def course(t: Array) -> Array:
-        goals = np.tile(_posture(front, rear), (len(t), 1))
+        setpoints = np.tile(_posture(front, rear), (len(t), 1))
         for part, (sign, amplitude) in enumerate(zip(signs, amplitudes, strict=True)):
             own = np.clip(t - part * length, 0.0, length)
             phase = 2 * np.pi * low * length / np.log(high / low) * ((high / low) ** (own / length) - 1.0)
             wave = amplitude * np.sin(phase) * _fade(own, length, 0.3)
             columns = LEG_SLICE if part == 2 else WHEEL_SLICE
-            goals[:, columns] += np.multiply.outer(wave, sign)
-        return goals
+            setpoints[:, columns] += np.multiply.outer(wave, sign)
+        return setpoints
 
     return course, len(signs) * length
 
@@ -330,7 +330,7 @@ EXCITATIONS: dict[str, Excitation] = {
     "all_legs": Excitation(
         "all legs turn slowly to the other side, rear wheels free", "load on the legs, zero offsets, geometry", _all_legs
     ),
-    "random": Excitation("band-limited random goals of both axles and sides", "everything at once", _random),
+    "random": Excitation("band-limited random setpoints of both axles and sides", "everything at once", _random),
     "chirp": Excitation(
         "sines from 0.3 to 5 Hz: wheels together, left against right, front legs against rear legs",
         "bandwidth of servos and body, delays, tyre stiffness",

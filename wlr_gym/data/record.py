@@ -16,7 +16,7 @@ from wlr_gym.data.compared_plants import SETTLE
 from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
 from wlr_gym.data.read import Run, read_meta
-from wlr_gym.data.replay import held_goals, profile_parameters
+from wlr_gym.data.replay import held_setpoints, profile_parameters
 from wlr_gym.data.run_states import standing_at
 from wlr_gym.data.sensor_columns import SENSED, channels
 from wlr_gym.data.simulation_record import Simulation, departures, start_of
@@ -29,7 +29,7 @@ from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-#: rad, rad/s: goals beyond are in another unit.
+#: rad, rad/s: setpoints beyond are in another unit.
 _LARGEST = np.repeat([2.0 * np.pi, 30.0], 4)
 
 
@@ -37,7 +37,7 @@ _LARGEST = np.repeat([2.0 * np.pi, 30.0], 4)
 
 
 def write_commands(folder: Path, motion: Motion) -> Path:
-    """Write the goals of a motion as ``folder/<name>.csv`` (``t`` and ``cmd_*``; empty = torque off), profile in ``meta.yaml``.
+    """Write a motion's setpoints as ``folder/<name>.csv`` (``t``, ``cmd_*``; empty = torque off), profile in ``meta.yaml``.
 
     Raises:
         InputError: the folder cannot be written to, or its ``meta.yaml`` says something else.
@@ -45,22 +45,24 @@ def write_commands(folder: Path, motion: Motion) -> Path:
     make_output_folder(folder)
     write_meta(folder, RunMeta(profile=motion.profile))
     lines = [",".join(["t", *COMMANDS])]
-    for tick, goals in enumerate(motion.goals.tolist()):
-        lines.append(",".join([repr(round(tick * motion.period, 9)), *("" if goal != goal else repr(goal) for goal in goals)]))
+    for tick, setpoints in enumerate(motion.setpoints.tolist()):
+        lines.append(
+            ",".join([repr(round(tick * motion.period, 9)), *("" if goal != goal else repr(goal) for goal in setpoints)])
+        )
     path = folder / f"{motion.name}.csv"
     replace_file(path, lambda temporary: temporary.write_text("\n".join(lines) + "\n", encoding="utf-8"))
     return path
 
 
 def read_commands(path: Path, period: float = CONTROL_PERIOD) -> Motion:
-    """Read a motion from the goals in a command file or a whole run; its profile from the ``meta.yaml`` beside it.
+    """Read a motion from the setpoints in a command file or a whole run; its profile from the ``meta.yaml`` beside it.
 
     Args:
-        path: file with the columns ``t`` and ``cmd_*``; others are not looked at. Each row's goals hold until the next row.
+        path: file with the columns ``t`` and ``cmd_*``; others are not looked at. Each row's setpoints hold until the next row.
         period: s per control step.
 
     Raises:
-        InputError: no such file, a column that is missing, times that do not increase, goals that are not rad and rad/s.
+        InputError: no such file, a column that is missing, times that do not increase, setpoints that are not rad and rad/s.
     """
     import pandas
 
@@ -77,15 +79,15 @@ def read_commands(path: Path, period: float = CONTROL_PERIOD) -> Motion:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: cannot be read: {error}") from None
-    t, goals = columns[:, 0], columns[:, 1:]
+    t, setpoints = columns[:, 0], columns[:, 1:]
     if len(t) < 2 or not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
         raise InputError(f"{path}: column 't': expected two rows or more, finite and increasing")
-    if (beyond := np.abs(np.nan_to_num(goals)) > _LARGEST).any() or np.isinf(goals).any():
-        row, joint = np.argwhere(beyond | np.isinf(goals))[0]
-        raise InputError(f"{path}: row {row}, column 'cmd_{JOINTS[joint]}': {goals[row, joint]:g}: expected rad and rad/s")
+    if (beyond := np.abs(np.nan_to_num(setpoints)) > _LARGEST).any() or np.isinf(setpoints).any():
+        row, joint = np.argwhere(beyond | np.isinf(setpoints))[0]
+        raise InputError(f"{path}: row {row}, column 'cmd_{JOINTS[joint]}': {setpoints[row, joint]:g}: expected rad and rad/s")
     ticks = round((t[-1] - t[0]) / period) + 1
     rows = np.searchsorted(t - t[0], period * (np.arange(ticks) + 0.5), side="right") - 1
-    return Motion(path.stem, goals[rows], period, read_meta(path.parent).profile)
+    return Motion(path.stem, setpoints[rows], period, read_meta(path.parent).profile)
 
 
 def motion_of(run: Run) -> Motion:
@@ -94,8 +96,8 @@ def motion_of(run: Run) -> Motion:
     ticks = round(t[-1] / CONTROL_PERIOD) + 1
     rows = np.searchsorted(t, CONTROL_PERIOD * (np.arange(ticks) + 0.5), side="right") - 1
     commanded = np.stack([np.isfinite(run[f"cmd_{joint}"]) for joint in JOINTS], axis=1)
-    goals = np.where(commanded, held_goals(run), np.nan)[rows]
-    return Motion(run.name, goals, CONTROL_PERIOD, run.meta.profile)
+    setpoints = np.where(commanded, held_setpoints(run), np.nan)[rows]
+    return Motion(run.name, setpoints, CONTROL_PERIOD, run.meta.profile)
 
 
 # ---- runs ------------------------------------------------------------------------------------------------------------
@@ -118,11 +120,11 @@ def record_simulation(
 ) -> Path:
     """Drive a simulator through a motion and write the run, its ``meta.yaml`` and the record that repeats it bit for bit.
 
-    The robot stands at the first goals until it has settled; a leg without a goal stands at home.
+    The robot stands at the first setpoints until it has settled; a leg without a goal stands at home.
 
     Args:
         path: of the run.
-        motion: goals; NaN = torque off.
+        motion: setpoints; NaN = torque off.
         robot: what is driven.
         backend: one of :data:`wlr_gym.physics.plants.SIMULATORS`.
         seed: of the sensors' noise.
@@ -137,19 +139,19 @@ def record_simulation(
     patch = patch or load_patch(None)
     parameters = apply_patch(patch, profile_parameters(Parameters.nominal(robot), motion.profile))
     options, seeds = PlantOptions(control_period=motion.period), np.array([seed], np.uint64)
-    torque_on = np.isfinite(motion.goals)
+    torque_on = np.isfinite(motion.setpoints)
     plant = make_plant(backend, robot, 1, options, patch.forces)
-    rows = np.empty((len(motion.goals), len(SENSED)))
+    rows = np.empty((len(motion.setpoints), len(SENSED)))
     try:
-        plant.reset(seeds, parameters, state=standing_at(start_goals(motion, robot)[None], robot, parameters))
+        plant.reset(seeds, parameters, state=standing_at(start_setpoints(motion, robot)[None], robot, parameters))
         for _ in range(round(SETTLE / motion.period)):
-            plant.step(start_goals(motion, robot)[None], torque_on[:1])
+            plant.step(start_setpoints(motion, robot)[None], torque_on[:1])
         start = replace(plant.get_state(), time=np.zeros(1))  # the run begins here
         sensors = plant.reset(seeds, parameters, state=start)
-        for tick, goals in enumerate(motion.goals):
+        for tick, setpoints in enumerate(motion.setpoints):
             rows[tick] = channels(sensors, 0)
             on = torque_on[tick : tick + 1]
-            sensors = plant.step(np.nan_to_num(goals)[None], None if on.all() else on)
+            sensors = plant.step(np.nan_to_num(setpoints)[None], None if on.all() else on)
     finally:
         plant.close()
     record = Simulation(
@@ -163,16 +165,16 @@ def record_simulation(
         formulas=[effect.content() for effect in patch.effects if effect.name not in EFFECTS],
         start=start_of(start, 0),
     )
-    table = {"t": motion.period * np.arange(len(rows)), **dict(zip(COMMANDS, motion.goals.T, strict=True))}
+    table = {"t": motion.period * np.arange(len(rows)), **dict(zip(COMMANDS, motion.setpoints.T, strict=True))}
     table |= dict(zip(SENSED, rows.T, strict=True))
     return write_run(path, table, meta_of(motion, robot, meta), record)
 
 
-def start_goals(motion: Motion, robot: Robot) -> Array:
-    """Return the goals (8,) a motion starts from: a leg without one at home, wheels at rest."""
-    goals = motion.goals[0].copy()
-    goals[WHEEL_SLICE] = 0.0
-    return np.where(np.isnan(goals), robot.home.leg_angle, goals)
+def start_setpoints(motion: Motion, robot: Robot) -> Array:
+    """Return the setpoints (8,) a motion starts from: a leg without one at home, wheels at rest."""
+    setpoints = motion.setpoints[0].copy()
+    setpoints[WHEEL_SLICE] = 0.0
+    return np.where(np.isnan(setpoints), robot.home.leg_angle, setpoints)
 
 
 def meta_of(motion: Motion, robot: Robot, meta: RunMeta | None = None) -> RunMeta:

@@ -24,7 +24,7 @@ def compare_repeat(measured: Run, repeated: Run, robot: Robot | str | Path | Non
     shows 1.4 noise units. Rows beyond the end of the repetition are not compared.
 
     Args:
-        measured: the run whose goals were driven again.
+        measured: the run whose setpoints were driven again.
         repeated: what was logged then.
         robot: whose sensors' noise; None = the one the run's meta data name.
         segment: s.

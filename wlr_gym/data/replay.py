@@ -6,7 +6,7 @@ drift does not swamp what is missing in the model. All segments of a run are one
 
 The plant ticks on its own clock (2 ms by default). A goal acts from the row it was written in until the next row's, at the
 measured times, so jitter and lost control steps are replayed as they happened; simulated channels are interpolated to the rows'
-times. Command delays shift the measured times of the goals, so that a segment starts with the goals that were under way.
+times. Command delays shift the measured times of the setpoints, so a segment starts with the setpoints that were under way.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-#: s; the plant's tick in a replay: the goals' times are kept to half of it.
+#: s; the plant's tick in a replay: the setpoints' times are kept to half of it.
 CLOCK = 0.002
 #: s; a segment, and a run that starts at rest, is simulated this long before it is compared: until the bounce of being set
 #: down has died out.
@@ -232,16 +232,16 @@ def _simulate(
     duration: float,
     passing: Array | None = None,
 ) -> tuple[_Traces, PlantState]:
-    """Run the batch from ``state`` for ``duration``, robot i with the goals from time ``begin[i]`` on.
+    """Run the batch from ``state`` for ``duration``, robot i with the setpoints from time ``begin[i]`` on.
 
     Returns:
         The traces, and the states (of robot 0, one per time) at the times ``passing``.
     """
     clock = plant.options.control_period
     ticks = int(np.ceil(duration / clock))
-    goals, torque_on = _goals(run, parameters, begin, ticks, clock)
+    setpoints, torque_on = _goals(run, parameters, begin, ticks, clock)
     parameters = parameters.copy()
-    parameters["command.delay"] = 0.0  # the goals come delayed
+    parameters["command.delay"] = 0.0  # the setpoints come delayed
     snapshots = np.array([] if passing is None else np.rint((passing - begin[0]) / clock), dtype=int).tolist()
     states: list[PlantState] = []
     wheels = state.joint_position[:, WHEEL_SLICE]
@@ -254,7 +254,7 @@ def _simulate(
             states += [plant.get_state() for _ in range(snapshots.count(tick))]
             values[tick] = _readings(sensors, plant.truth(), wheels - first_reading, offset)
             if tick < ticks:
-                sensors = plant.step(goals[tick], torque_on[tick])
+                sensors = plant.step(setpoints[tick], torque_on[tick])
     finally:
         plant.close()
     _to_camera_frame(values, parameters)
@@ -262,24 +262,24 @@ def _simulate(
 
 
 def _goals(run: Run, parameters: Parameters, begin: Array, ticks: int, clock: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Goals (ticks, robots, 8) and torque switches on the plant's clock: each row's goal holds until the next row's.
+    """Setpoints (ticks, robots, 8) and torque switches on the plant's clock: each row's goal holds until the next row's.
 
-    Goals are delayed, switching the torque is not: as in :class:`wlr_gym.physics.plants.setpoints.SetpointHistory`.
+    Setpoints are delayed, switching the torque is not: as in :class:`wlr_gym.physics.plants.setpoints.SetpointHistory`.
     """
     commands = np.stack([run[name] for name in COMMANDS], axis=1)
-    written = held_goals(run)
+    written = held_setpoints(run)
     now = begin + clock * (np.arange(ticks)[:, None] + 0.5)  # nearest tick, on average neither early nor late
 
     def row(time: Array) -> NDArray[np.intp]:
         return np.maximum(np.searchsorted(run["t"], time, side="right") - 1, 0)
 
     torque_on = np.isfinite(commands[row(now)])
-    goals = np.stack([written[row(now - parameters["command.delay"][:, j]), j] for j in range(8)], axis=2)
-    return goals, torque_on
+    setpoints = np.stack([written[row(now - parameters["command.delay"][:, j]), j] for j in range(8)], axis=2)
+    return setpoints, torque_on
 
 
-def held_goals(run: Run) -> Array:
-    """Goals (rows, 8) that the servos hold: a motor that is off gets no new goal, so it keeps the one before.
+def held_setpoints(run: Run) -> Array:
+    """Setpoints (rows, 8) that the servos hold: a motor that is off gets no new goal, so it keeps the one before.
 
     Before its first goal a joint has the first one; a joint without any stays: a leg at its first measured angle, a wheel at
     speed 0.

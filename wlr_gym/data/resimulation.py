@@ -34,7 +34,7 @@ def simulated_parameters(run: Run, robot: Robot) -> Parameters:
 
 
 def simulate_again(run: Run, robot: Robot, backend: str | None = None) -> dict[str, Array]:
-    """Simulate a run as it was: same plant, start, noise, parameters and goals; same bits on the same kind of machine.
+    """Simulate a run as it was: same plant, start, noise, parameters and setpoints; same bits on the same kind of machine.
 
     Args:
         run: a run with its record.
@@ -50,15 +50,15 @@ def simulate_again(run: Run, robot: Robot, backend: str | None = None) -> dict[s
     record = _record_of(run)
     names = ("control_period", "physics_step", "precision", "sensor_noise")
     options = PlantOptions(**{name: getattr(record, name) for name in names})
-    goals = np.stack([run[name] for name in COMMANDS], axis=1)
+    setpoints = np.stack([run[name] for name in COMMANDS], axis=1)
     parameters = simulated_parameters(run, robot)
     changes = {change.row: change.parameters for change in record.changes}
-    rows = np.empty((len(goals), len(SENSED)))
+    rows = np.empty((len(setpoints), len(SENSED)))
     forces = load_patch(record.formulas).forces
     plant = make_plant(record.backend if backend is None else backend, robot, 1, options, forces)
     try:
         sensors = plant.reset(np.array([record.seed], np.uint64), parameters, state=_state(record, run))
-        for row, goal in enumerate(goals):
+        for row, goal in enumerate(setpoints):
             rows[row] = channels(sensors, 0)
             if row in changes:
                 _set(parameters, changes[row])

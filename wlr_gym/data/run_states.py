@@ -53,7 +53,7 @@ def starts_at_rest(run: Run) -> bool:
 
 
 def start_state(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
-    """Return the state (1 robot) at the run's first row: measured joints, legs on the floor, references at the goals.
+    """Return the state (1 robot) at the run's first row: measured joints, legs on the floor, references at the setpoints.
 
     The integral of a wheel's speed controller, which holds a standing robot under tension, is read off its measured effort.
     """
@@ -116,11 +116,11 @@ def measured_state(run: Run, times: Array, background: PlantState, parameters: P
     return state
 
 
-def standing_at(goals: Array, robot: Robot, parameters: Parameters) -> PlantState:
-    """Return every robot standing on the floor at its first leg goals, level where its parameters let it."""
+def standing_at(setpoints: Array, robot: Robot, parameters: Parameters) -> PlantState:
+    """Return every robot standing on the floor at its first leg setpoints, level where its parameters let it."""
     state = standing_state(robot, parameters)
     level = rest_pose(parameters, state.joint_position[:, LEG_SLICE])
-    state.joint_position[:, LEG_SLICE] = goals[:, LEG_SLICE] - parameters["joint.zero_offset"]  # goals are readings
+    state.joint_position[:, LEG_SLICE] = setpoints[:, LEG_SLICE] - parameters["joint.zero_offset"]  # setpoints are readings
     state.reference_position[:, LEG_SLICE] = state.joint_position[:, LEG_SLICE]  # true angles, both
     pose = rest_pose(parameters, state.joint_position[:, LEG_SLICE])
     state.position[:, 2] += pose[:, 0] - level[:, 0]

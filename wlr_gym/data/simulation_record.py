@@ -25,7 +25,7 @@ SUFFIX = ".simulation.yaml"
 
 
 class ParameterChange(SettingsModel):
-    """Parameters that changed after the sensors of ``row`` were read: they act from that row's goals on."""
+    """Parameters that changed after the sensors of ``row`` were read: they act from that row's setpoints on."""
 
     row: int = Field(ge=0)
     parameters: dict[str, float]

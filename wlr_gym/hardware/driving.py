@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from wlr_gym.data.excitations import Motion
-from wlr_gym.data.record import start_goals
+from wlr_gym.data.record import start_setpoints
 from wlr_gym.hardware.loop import StoppedError
 from wlr_gym.hardware.operator import stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
@@ -46,10 +46,10 @@ def drive_robot(plant: RobotPlant, motion: Motion) -> DriveResult:
     """
     loop, robot = plant.loop, plant.robot
     state = standing_state(robot, Parameters.nominal(robot))
-    state.joint_position[0, LEG_SLICE] = start_goals(motion, robot)[LEG_SLICE]
+    state.joint_position[0, LEG_SLICE] = start_setpoints(motion, robot)[LEG_SLICE]
     reason, ticks = "", 0
-    torque_on = np.isfinite(motion.goals)
-    setpoints = np.nan_to_num(motion.goals)
+    torque_on = np.isfinite(motion.setpoints)
+    setpoints = np.nan_to_num(motion.setpoints)
     with stop_on_signals(loop.operator):
         try:
             plant.reset(state=state)

@@ -113,9 +113,9 @@ class Chassis:
         return (rolling_speed - leg * np.sin(leg_angle) * leg_rate) / wheel - leg_rate
 
     def actions(self, leg_angle: Array, wheel_rate: Array) -> NDArray[np.float32]:
-        """Return the actions (N, 8) for goals (N, 4) in rad and (N, 4) in rad/s, clipped to [-1, 1]."""
-        goals = np.concatenate([leg_angle, wheel_rate], axis=1)
-        return np.clip((goals - self._centre) / self._scale, -1.0, 1.0).astype(np.float32)
+        """Return the actions (N, 8) for setpoints (N, 4) in rad and (N, 4) in rad/s, clipped to [-1, 1]."""
+        setpoints = np.concatenate([leg_angle, wheel_rate], axis=1)
+        return np.clip((setpoints - self._centre) / self._scale, -1.0, 1.0).astype(np.float32)
 
 
 class SearchConfig(SettingsModel):
@@ -242,7 +242,7 @@ class Pid:
         return self.turn(observations) + steer + self.config.uphill * self.leftward_force(observations)
 
     def legs(self, observations: NDArray[np.floating]) -> Array:
-        """Return the leg goals (N, 4), rad."""
+        """Return the leg setpoints (N, 4), rad."""
         home = self.chassis.robot.home.leg_angle + self.config.legs_inward * self.chassis.front
         return home + self.leg_offset(observations)
 

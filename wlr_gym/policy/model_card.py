@@ -85,7 +85,7 @@ def _facts(policy: Path, content: Mapping[str, Any]) -> dict[str, str]:
         "SHA-256": f"`{file_hash(policy)}`",
         "robot": f"{environment['robot']['name']}, at {1.0 / environment['control_period']:g} Hz",
         "observation": f"{len(environment['observation'])} numbers: {_terms(environment['observation'])}",
-        "action": f"{len(environment['action'])} goals of joints",
+        "action": f"{len(environment['action'])} setpoints of joints",
         "randomisation": environment.get("randomization", {}).get("name") or "as in the contract",
     }
     if "command" in training:

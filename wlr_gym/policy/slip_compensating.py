@@ -60,7 +60,7 @@ class SlipCompensating(Pid):
         return np.clip(wanted, travel - allowed[:, None], travel + allowed[:, None])
 
     def legs(self, observations: NDArray[np.floating]) -> Array:
-        """Return the leg goals (N, 4), rad: leaning so that the load is on the axle that slips less."""
+        """Return the leg setpoints (N, 4), rad: leaning so that the load is on the axle that slips less."""
         home = super().legs(observations)
         slip = np.abs(np.stack([read(observations) for read in self._slip], axis=1))
         difference = (slip * self.chassis.front).sum(axis=1) / 2

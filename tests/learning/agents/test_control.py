@@ -39,7 +39,7 @@ def observation(contract, readings):
     return row
 
 
-def goals(contract, action):
+def setpoints(contract, action):
     """Leg angles (rad) and wheel rates (rad/s) of an action (8,)."""
     return np.array(
         [column["centre"] + column["scale"] * value for column, value in zip(contract["action"], action, strict=True)]
@@ -47,9 +47,9 @@ def goals(contract, action):
 
 
 def act(contract, agent, settings, readings):
-    """Goals (8,) of a new controller for one observation."""
+    """Setpoints (8,) of a new controller for one observation."""
     policy = load_agent(agent).make_policy(contract, settings)
-    return goals(contract, policy.act(observation(contract, readings))[0])
+    return setpoints(contract, policy.act(observation(contract, readings))[0])
 
 
 def test_straight_ahead_the_wheels_roll_at_the_commanded_speed(contracts):
@@ -82,11 +82,15 @@ def test_too_slow_a_turn_is_pushed_in_proportion_and_by_the_integral(contracts):
     np.testing.assert_allclose(spread[0.1] - spread[0.3], 2.0 * 0.2, rtol=1e-4)
     policy = load_agent("pid").make_policy(contract, {"yaw_rate_i": 5.0, "integral_limit": 0.1})
     row = observation(contract, wanted | {"gyro[z]": 0.1})
-    series = np.array([goals(contract, policy.act(row)[0])[5] for _ in range(10)]) * ROBOT.wheel.radius / ROBOT.hip_position.y
+    series = (
+        np.array([setpoints(contract, policy.act(row)[0])[5] for _ in range(10)]) * ROBOT.wheel.radius / ROBOT.hip_position.y
+    )
     np.testing.assert_allclose(np.diff(series)[:4], 5.0 * 0.2 * 0.02, rtol=1e-3)
     np.testing.assert_allclose(series[-1], 0.3 + 0.1, rtol=1e-4)
     policy.reset(np.ones(1, bool))
-    np.testing.assert_allclose(goals(contract, policy.act(row)[0])[5] * ROBOT.wheel.radius / ROBOT.hip_position.y, series[0])
+    np.testing.assert_allclose(
+        setpoints(contract, policy.act(row)[0])[5] * ROBOT.wheel.radius / ROBOT.hip_position.y, series[0]
+    )
 
 
 def test_a_reset_forgets_the_robots_it_names_only(contracts):
@@ -154,7 +158,7 @@ def test_the_difference_of_the_axles_slip_is_smoothed_with_its_time_constant(con
     contract, time, period = contracts["Velocity"], 0.5, 0.02
     policy = load_agent("slip_compensating").make_policy(contract, {"load_shift": 1.0, "load_shift_time": time})
     row = observation(contract, {"estimated_slip_velocity[wheel_lf,x]": 0.1, "estimated_slip_velocity[wheel_rf,x]": 0.1})
-    lean = np.array([goals(contract, policy.act(row)[0])[0] for _ in range(25)]) - ROBOT.home.leg_angle
+    lean = np.array([setpoints(contract, policy.act(row)[0])[0] for _ in range(25)]) - ROBOT.home.leg_angle
     shift = np.sin(lean) * ROBOT.leg.length / (2 * ROBOT.hip_position.x)
     expected = -0.1 * (1.0 - (1.0 - period / time) ** np.arange(1, 26))
     np.testing.assert_allclose(shift, expected, atol=1e-5)

@@ -52,7 +52,7 @@ def held(draw, rng: np.random.Generator, ticks: int, count: int, shortest: float
     return out
 
 
-def commanded_goals(robot: Robot, ticks: int, count: int, rng: np.random.Generator) -> Array:
+def commanded_setpoints(robot: Robot, ticks: int, count: int, rng: np.random.Generator) -> Array:
     """Drive as a task asks: forward +-0.1 m/s and a skid turn of +-0.3 rad/s, held 2 to 5 s, at times standing."""
 
     def draw(n: int) -> Array:
@@ -60,31 +60,31 @@ def commanded_goals(robot: Robot, ticks: int, count: int, rng: np.random.Generat
 
     command = held(draw, rng, ticks, count, 2.0, 5.0)
     left = robot.hip_position.y * np.array([y for _, y in CORNER_SIGNS])
-    goals = np.full((ticks, count, 8), robot.home.leg_angle)
-    goals[..., 4:] = (command[..., :1] - 1.8 * command[..., 1:] * left) / robot.wheel.radius
-    return goals
+    setpoints = np.full((ticks, count, 8), robot.home.leg_angle)
+    setpoints[..., 4:] = (command[..., :1] - 1.8 * command[..., 1:] * left) / robot.wheel.radius
+    return setpoints
 
 
-def excited_goals(robot: Robot, ticks: int, count: int, rng: np.random.Generator) -> Array:
+def excited_setpoints(robot: Robot, ticks: int, count: int, rng: np.random.Generator) -> Array:
     """Shake every joint on its own: legs swing by up to 0.4 rad, wheels jump between +-5 rad/s."""
-    goals = np.empty((ticks, count, 8))
+    setpoints = np.empty((ticks, count, 8))
     time = PERIOD * np.arange(ticks)[:, None, None]
     size, rate, phase = rng.uniform(0, 0.4, (count, 4)), rng.uniform(0.2, 3.0, (count, 4)), rng.uniform(0, 6.3, (count, 4))
-    goals[..., :4] = robot.home.leg_angle + size * (np.sin(rate * time + phase))
-    goals[..., 4:] = held(lambda n: rng.uniform(-5.0, 5.0, (n, 4)), rng, ticks, count, 0.3, 1.5)
-    return goals
+    setpoints[..., :4] = robot.home.leg_angle + size * (np.sin(rate * time + phase))
+    setpoints[..., 4:] = held(lambda n: rng.uniform(-5.0, 5.0, (n, 4)), rng, ticks, count, 0.3, 1.5)
+    return setpoints
 
 
-def climbing_goals(robot: Robot, ticks: int, count: int, rng: np.random.Generator) -> Array:
+def climbing_setpoints(robot: Robot, ticks: int, count: int, rng: np.random.Generator) -> Array:
     """Drive straight ahead at 0.03 to 0.1 m/s, reached within half a second, for two thirds of the time; then hold."""
     time = PERIOD * np.arange(ticks)[:, None, None]
     speed = rng.uniform(0.03, 0.1, (count, 1)) * np.minimum(time / 0.5, 1.0) * (time < time[-1] * 2.0 / 3.0)
-    goals = np.full((ticks, count, 8), robot.home.leg_angle)
-    goals[..., 4:] = speed / robot.wheel.radius
-    return goals
+    setpoints = np.full((ticks, count, 8), robot.home.leg_angle)
+    setpoints[..., 4:] = speed / robot.wheel.radius
+    return setpoints
 
 
-DRIVES = {"climb": climbing_goals, "commands": commanded_goals, "excitation": excited_goals}
+DRIVES = {"climb": climbing_setpoints, "commands": commanded_setpoints, "excitation": excited_setpoints}
 
 
 def simulate(backend: str, floor: str, drive: str, count: int, seconds: float, seed: int = 0, **parameters: float) -> Runs:
@@ -95,7 +95,7 @@ def simulate(backend: str, floor: str, drive: str, count: int, seconds: float, s
     ticks, seeds = round(seconds / PERIOD), spawn_seeds(seed, count, "observed")
     occurrences = np.zeros((count, len(randomization.intervals)), np.int64)
     strike = randomization.next_strike(seeds, occurrences, PERIOD)
-    goals = DRIVES[drive](robot, ticks, count, generator(seed, "goals", drive))
+    setpoints = DRIVES[drive](robot, ticks, count, generator(seed, "goals", drive))
 
     def draw(tick: int):
         drawn = randomization.parameters(seeds, seeds, occurrences, np.full(count, tick * PERIOD))
@@ -107,7 +107,7 @@ def simulate(backend: str, floor: str, drive: str, count: int, seconds: float, s
     sensors = [plant.reset(seeds, drawn, state=randomization.state(drawn, seeds)).values.copy()]
     truth = [plant.truth().values.copy()]
     for tick in range(ticks):
-        sensors.append(plant.step(goals[tick]).values.copy())
+        sensors.append(plant.step(setpoints[tick]).values.copy())
         truth.append(plant.truth().values.copy())
         due = strike <= tick + 1
         occurrences[due] += 1

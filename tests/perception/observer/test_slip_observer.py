@@ -202,10 +202,10 @@ def test_normal_forces_are_the_engines_at_rest(legs):
     state.position[:, 2] = ROBOT.leg.length * np.sin(legs).mean() + RADIUS
     observer, everyone = SlipObserver(ROBOT, PERIOD, 1, False), np.ones(1, bool)
     observer.reset(everyone, plant.reset(parameters=parameters, state=state).values)
-    goals = np.zeros((1, 8))
-    goals[:, :4] = legs
+    setpoints = np.zeros((1, 8))
+    setpoints[:, :4] = legs
     for _ in range(300):
-        observer.update(everyone, plant.step(goals).values)
+        observer.update(everyone, plant.step(setpoints).values)
     true = plant.truth().contact_force[0, 2::3]
     assert ESTIMATE_LAYOUT.view(observer.values, "normal_force")[0] == pytest.approx(true, abs=0.1)
     assert true.sum() == pytest.approx(ROBOT.total_mass * GRAVITY, rel=1e-3)

@@ -71,28 +71,28 @@ def make(
     return plant
 
 
-def goals_for(tick: int, count: int = COUNT) -> np.ndarray:
-    """Random goals that depend on the tick alone, so that a run can be taken up anywhere."""
+def setpoints_for(tick: int, count: int = COUNT) -> np.ndarray:
+    """Random setpoints that depend on the tick alone, so that a run can be taken up anywhere."""
     rng = np.random.default_rng(100 + tick)
     return np.hstack([rng.uniform(1.1, 2.0, (count, 4)), rng.uniform(-5, 5, (count, 4))])
 
 
 def run(plant: Plant, first: int, last: int) -> np.ndarray:
-    """Step through :func:`goals_for`; return a copy of the last truth matrix."""
+    """Step through :func:`setpoints_for`; return a copy of the last truth matrix."""
     for tick in range(first, last):
-        plant.step(goals_for(tick, plant.count))
+        plant.step(setpoints_for(tick, plant.count))
     return plant.truth().values.copy()
 
 
-def hold(plant: Plant, goals: np.ndarray, ticks: int, torque_on: np.ndarray | None = None) -> Sensors:
-    """Step with the same goals; return the last readings."""
+def hold(plant: Plant, setpoints: np.ndarray, ticks: int, torque_on: np.ndarray | None = None) -> Sensors:
+    """Step with the same setpoints; return the last readings."""
     for _ in range(ticks - 1):
-        plant.step(goals, torque_on)
-    return plant.step(goals, torque_on)
+        plant.step(setpoints, torque_on)
+    return plant.step(setpoints, torque_on)
 
 
 def home(count: int) -> np.ndarray:
-    """Goals that keep the robot standing with its legs straight down."""
+    """Setpoints that keep the robot standing with its legs straight down."""
     return np.tile(np.concatenate([np.full(4, np.pi / 2), np.zeros(4)]), (count, 1))
 
 
@@ -114,21 +114,21 @@ def random_parameters(count: int, seed: int = 3) -> Parameters:
     return parameters
 
 
-def random_goals(count: int, ticks: int, seed: int = 4) -> np.ndarray:
-    """Goals (ticks, count, 8); column i depends on i alone."""
+def random_setpoints(count: int, ticks: int, seed: int = 4) -> np.ndarray:
+    """Setpoints (ticks, count, 8); column i depends on i alone."""
     rows = [np.random.default_rng([seed, row]) for row in range(count)]
     low, high = np.repeat([1.2, -5.0], 4), np.repeat([1.9, 5.0], 4)
     return np.stack([rng.uniform(low, high, (ticks, 8)) for rng in rows], axis=1)
 
 
 def rollout(
-    name: str, parameters: Parameters, goals: np.ndarray, seeds: np.ndarray, threads: int = 1
+    name: str, parameters: Parameters, setpoints: np.ndarray, seeds: np.ndarray, threads: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
     """Truth and sensor matrices (ticks, N, columns), with sensor noise."""
     plant = PLANTS[name].make(len(parameters), PlantOptions(threads=threads))
     plant.reset(seeds=seeds, parameters=parameters)
     truth, sensors = [], []
-    for tick in goals:
+    for tick in setpoints:
         sensors.append(plant.step(tick).values.copy())
         truth.append(plant.truth().values.copy())
     plant.close()

@@ -12,15 +12,15 @@ from simulators import (
     QUIET,
     ROBOT,
     SIMULATORS,
-    goals_for,
     hold,
     home,
     make,
     parameters_for,
-    random_goals,
     random_parameters,
+    random_setpoints,
     rollout,
     run,
+    setpoints_for,
 )
 
 from wlr_gym.base.errors import InputError
@@ -81,10 +81,10 @@ def test_standing_robots_read_what_they_should(plant_name):
     plant.close()
 
 
-def test_wheels_and_legs_follow_their_goals(plant_name):
+def test_wheels_and_legs_follow_their_setpoints(plant_name):
     plant = PLANTS[plant_name].make(1, QUIET)
-    goals = np.array([[1.3, 1.3, 1.3, 1.3, 2.0, 2.0, 2.0, 2.0]])
-    sensors = hold(plant, goals, ticks=100)
+    setpoints = np.array([[1.3, 1.3, 1.3, 1.3, 2.0, 2.0, 2.0, 2.0]])
+    sensors = hold(plant, setpoints, ticks=100)
     np.testing.assert_allclose(sensors.joint_position[:, :4], 1.3, atol=0.05)
     np.testing.assert_allclose(sensors.joint_velocity[:, 4:], 2.0, atol=0.1)
     plant.close()
@@ -94,9 +94,9 @@ def test_a_motor_that_is_off_gives_no_effort(plant_name):
     plant = PLANTS[plant_name].make(1, QUIET)
     torque_on = np.ones((1, 8), bool)
     torque_on[0, 4:] = False
-    goals = home(1)
-    goals[0, 4:] = np.nan
-    sensors = hold(plant, goals, 10, torque_on)
+    setpoints = home(1)
+    setpoints[0, 4:] = np.nan
+    sensors = hold(plant, setpoints, 10, torque_on)
     np.testing.assert_array_equal(sensors.joint_effort[:, 4:], 0.0)
     plant.close()
 
@@ -134,9 +134,9 @@ def test_slip_displacement_is_the_slip_velocity_integrated_over_the_tick(simulat
     total, travelled = np.zeros((COUNT, 8)), np.zeros((COUNT, 8))
     for tick in range(10):
         for _ in range(20):
-            fine.step(goals_for(tick))
+            fine.step(setpoints_for(tick))
             total += 1e-3 * fine.truth().slip_velocity
-        coarse.step(goals_for(tick))
+        coarse.step(setpoints_for(tick))
         travelled += coarse.truth().slip_displacement
     assert np.abs(travelled).max() > 1e-3
     np.testing.assert_allclose(travelled, total, atol=1e-4)
@@ -145,7 +145,7 @@ def test_slip_displacement_is_the_slip_velocity_integrated_over_the_tick(simulat
 def test_sensors_show_the_truth_where_nothing_disturbs_them(simulator):
     plant = make(simulator)
     run(plant, 0, 10)
-    sensors, truth = plant.step(goals_for(10)), plant.truth()
+    sensors, truth = plant.step(setpoints_for(10)), plant.truth()
     np.testing.assert_array_equal(sensors.joint_position, truth.joint_position)
     np.testing.assert_array_equal(sensors.joint_velocity, truth.joint_velocity)
     np.testing.assert_array_equal(sensors.joint_effort, truth.motor_torque)
@@ -290,7 +290,7 @@ def test_parameters_can_change_in_mid_run(simulator):
 
 
 def test_delay_and_sensor_errors_change_in_mid_run_too(simulator):
-    """A robot whose delay is switched on goes on with the goals it was given before; readings take the new zero at once."""
+    """A robot whose delay is switched on goes on with the setpoints it was given before; readings take the new zero at once."""
 
     def change(plant, mask):
         changed = plant.parameters.copy()
@@ -298,19 +298,19 @@ def test_delay_and_sensor_errors_change_in_mid_run_too(simulator):
         plant.set_parameters(changed, mask)
 
     plant = make(simulator, 2)
-    goals = np.tile(np.concatenate([np.full(4, 1.3), np.zeros(4)]), (2, 1))
+    setpoints = np.tile(np.concatenate([np.full(4, 1.3), np.zeros(4)]), (2, 1))
     for _ in range(100):
-        plant.step(goals)
+        plant.step(setpoints)
     change(plant, np.array([True, False]))
-    sensors = plant.step(goals)
+    sensors = plant.step(setpoints)
     reading = sensors.joint_position[:, :4] - plant.truth().joint_position[:, :4]
     np.testing.assert_allclose(reading, [[0.1] * 4, [0.0] * 4], atol=1e-12)
     for _ in range(100):
-        plant.step(goals)
+        plant.step(setpoints)
     np.testing.assert_allclose(plant.truth().joint_position[0, :4], 1.2, atol=0.02)
-    goals[:, :4] = 1.8
+    setpoints[:, :4] = 1.8
     for tick in range(4):
-        plant.step(goals)
+        plant.step(setpoints)
         moving = np.abs(plant.truth().joint_velocity[:, :4]).max(axis=1) > 0.1
         assert moving[0] == (tick == 3)
         assert moving[1] or tick > 0
@@ -336,15 +336,15 @@ def test_goals_of_a_wrong_shape_are_refused(simulator, shape):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_goals_that_are_no_numbers_never_reach_the_physics(simulator, bad):
     plant = make(simulator, 3)
-    goals = goals_for(0, 3)
-    goals[2, 5] = bad
+    setpoints = setpoints_for(0, 3)
+    setpoints[2, 5] = bad
     before = plant.truth().values.copy()
     with pytest.raises(InputError, match=r"wheel_rf \(robot 2 of the batch\)"):
-        plant.step(goals)
+        plant.step(setpoints)
     np.testing.assert_array_equal(plant.truth().values, before)
     torque_on = np.ones((3, 8), bool)
     torque_on[2, 5] = False
-    plant.step(goals, torque_on)
+    plant.step(setpoints, torque_on)
     assert np.isfinite(plant.truth().values).all()
 
 
@@ -373,16 +373,16 @@ def test_goals_of_a_motor_that_is_off_never_act_later(simulator):
         parameters["command.delay"] = 0.03
 
     plant = make(simulator, 2, delayed)
-    goals = np.tile(np.r_[[np.pi / 2] * 4, [0.0] * 4], (2, 1))
+    setpoints = np.tile(np.r_[[np.pi / 2] * 4, [0.0] * 4], (2, 1))
     off = np.ones((2, 8), bool)
     off[:, :4] = False
     for _ in range(10):
-        plant.step(goals)
+        plant.step(setpoints)
     for _ in range(5):
-        plant.step(np.where(off, goals, np.nan), off)
+        plant.step(np.where(off, setpoints, np.nan), off)
     lowest = before = plant.truth().joint_position[:, :4].copy()
     for _ in range(10):
-        plant.step(goals)
+        plant.step(setpoints)
         lowest = np.minimum(lowest, plant.truth().joint_position[:, :4])
     assert (lowest > before - 0.02).all()
 
@@ -419,26 +419,26 @@ def test_count_must_be_a_positive_whole_number(simulator, count):
 
 def test_alone_or_in_a_batch(simulator):
     count = 13
-    parameters, goals, seeds = random_parameters(count), random_goals(count, 20), np.arange(count, dtype=np.uint64)
-    truth, sensors = rollout(simulator, parameters, goals, seeds)
+    parameters, setpoints, seeds = random_parameters(count), random_setpoints(count, 20), np.arange(count, dtype=np.uint64)
+    truth, sensors = rollout(simulator, parameters, setpoints, seeds)
     assert np.abs(truth[-1, :, :2]).max() > 1e-3
     for row in (0, 5, 12):
         one = [row]
-        alone = rollout(simulator, Parameters(parameters.values[one]), goals[:, one], seeds[one])
+        alone = rollout(simulator, Parameters(parameters.values[one]), setpoints[:, one], seeds[one])
         np.testing.assert_array_equal(alone[0][:, 0], truth[:, row])
         np.testing.assert_array_equal(alone[1][:, 0], sensors[:, row])
     shuffled = np.random.default_rng(0).permutation(count)
-    again = rollout(simulator, Parameters(parameters.values[shuffled]), goals[:, shuffled], seeds[shuffled])
+    again = rollout(simulator, Parameters(parameters.values[shuffled]), setpoints[:, shuffled], seeds[shuffled])
     np.testing.assert_array_equal(again[0], truth[:, shuffled])
     np.testing.assert_array_equal(again[1], sensors[:, shuffled])
 
 
 def test_on_two_threads_and_again(simulator):
     count = 64
-    parameters, goals, seeds = random_parameters(count), random_goals(count, 5), np.arange(count, dtype=np.uint64)
-    once = rollout(simulator, parameters, goals, seeds)
-    again = rollout(simulator, parameters, goals, seeds)
-    threaded = rollout(simulator, parameters, goals, seeds, threads=2)
+    parameters, setpoints, seeds = random_parameters(count), random_setpoints(count, 5), np.arange(count, dtype=np.uint64)
+    once = rollout(simulator, parameters, setpoints, seeds)
+    again = rollout(simulator, parameters, setpoints, seeds)
+    threaded = rollout(simulator, parameters, setpoints, seeds, threads=2)
     for a, b, c in zip(once, again, threaded, strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a, c)
@@ -446,17 +446,17 @@ def test_on_two_threads_and_again(simulator):
 
 def test_a_neighbours_effects_and_ones_own_past_do_not_change_a_bit(simulator):
     """A robot without effects, beside one that has them, and after it had them itself."""
-    parameters, goals, seeds = random_parameters(2), random_goals(2, 10), np.arange(2, dtype=np.uint64)
-    expected = rollout(simulator, parameters, goals, seeds)
+    parameters, setpoints, seeds = random_parameters(2), random_setpoints(2, 10), np.arange(2, dtype=np.uint64)
+    expected = rollout(simulator, parameters, setpoints, seeds)
     both = parameters.copy()
     for name, value in EFFECTS.items():
         both[name] = value
     plant = PLANTS[simulator].make(2, PlantOptions())
     plant.reset(seeds=seeds, parameters=both)
-    plant.step(goals[0])
+    plant.step(setpoints[0])
     both.values[0] = parameters.values[0]
     plant.reset(seeds=seeds, parameters=both)
-    for tick, goal in enumerate(goals):
+    for tick, goal in enumerate(setpoints):
         sensors = plant.step(goal)
         np.testing.assert_array_equal(plant.truth().values[0], expected[0][tick, 0])
         np.testing.assert_array_equal(sensors.values[0], expected[1][tick, 0])
@@ -469,9 +469,9 @@ def test_a_neighbours_effects_and_ones_own_past_do_not_change_a_bit(simulator):
 def test_stalled_motors_turn_electrical_energy_into_heat(simulator):
     """A stalled motor draws V I with I = V/R and does no work."""
     plant = make(simulator, 2, lambda p: p["servo.coulomb_friction"].__setitem__(..., 50.0))
-    goals = home(2)
-    goals[:, 4:] = 100.0
-    plant.step(goals)
+    setpoints = home(2)
+    setpoints[:, 4:] = 100.0
+    plant.step(setpoints)
     motor = ROBOT.servo.wheel
     current = motor.stall_torque / (12.0 / motor.no_load_speed)
     electrical = 4 * 12.0 * current * 0.02
@@ -543,8 +543,8 @@ def test_a_formula_of_time_is_asked_at_every_step_and_time_goes_on_with_the_stat
 
 def test_wind_up_is_state_of_the_joint_whose_formula_asks_for_it(simulator):
     law = make_force(["leg_lf"], "-f * wind_up", {"f": 0.3}, {"f": "N m"})
-    goals, found, expected = home(2), [], np.zeros(2)
-    goals[:, :4] += 0.3
+    setpoints, found, expected = home(2), [], np.zeros(2)
+    setpoints[:, :4] += 0.3
     for ticks, step in ((10, 0.02), (200, 0.001)):
         plant = make_plant(simulator, ROBOT, 2, PlantOptions(step, 0.001, sensor_noise=False), (law,))
         for tick in range(ticks):
@@ -553,7 +553,7 @@ def test_wind_up_is_state_of_the_joint_whose_formula_asks_for_it(simulator):
                 expected += way - np.abs(way) * expected
             if tick == ticks // 2:
                 plant.reset(state=plant.get_state(), mask=np.array([True, False]))
-            hold(plant, goals, 1)
+            hold(plant, setpoints, 1)
         wound = plant.get_state().wind_up
         assert wound is not None
         assert not wound[:, 1:].any()

@@ -28,20 +28,20 @@ def random_parameters(count, seed=3):
     return parameters
 
 
-def random_goals(count, ticks, seed=4):
-    """Goals (ticks, count, 8); column i depends on i alone."""
+def random_setpoints(count, ticks, seed=4):
+    """Setpoints (ticks, count, 8); column i depends on i alone."""
     rows = [np.random.default_rng([seed, row]) for row in range(count)]
     low, high = np.repeat([1.2, -5.0], 4), np.repeat([1.9, 5.0], 4)
     return np.stack([rng.uniform(low, high, (ticks, 8)) for rng in rows], axis=1)
 
 
-def rollout(parameters, goals, seeds, precision="float64", threads=1):
+def rollout(parameters, setpoints, seeds, precision="float64", threads=1):
     """Truth and sensor matrices (ticks, N, columns)."""
     count = len(parameters)
     plant = GibbsAppellPlant(ROBOT, count, PlantOptions(precision=precision, threads=threads))
     plant.reset(seeds=seeds, parameters=parameters)
     truth, sensors = [], []
-    for tick in goals:
+    for tick in setpoints:
         sensors.append(plant.step(tick).values.copy())
         truth.append(plant.truth().values.copy())
     plant.close()
@@ -51,16 +51,16 @@ def rollout(parameters, goals, seeds, precision="float64", threads=1):
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_alone_or_in_a_batch(precision):
     count = 37
-    parameters, goals, seeds = random_parameters(count), random_goals(count, 20), np.arange(count, dtype=np.uint64)
-    truth, sensors = rollout(parameters, goals, seeds, precision)
+    parameters, setpoints, seeds = random_parameters(count), random_setpoints(count, 20), np.arange(count, dtype=np.uint64)
+    truth, sensors = rollout(parameters, setpoints, seeds, precision)
     assert np.abs(truth[-1, :, :2]).max() > 1e-3
     for row in (0, 5, 15, 16, 31, 36):
         one = [row]
-        alone = rollout(Parameters(parameters.values[one]), goals[:, one], seeds[one], precision)
+        alone = rollout(Parameters(parameters.values[one]), setpoints[:, one], seeds[one], precision)
         np.testing.assert_array_equal(alone[0][:, 0], truth[:, row])
         np.testing.assert_array_equal(alone[1][:, 0], sensors[:, row])
     shuffled = np.random.default_rng(0).permutation(count)
-    again = rollout(Parameters(parameters.values[shuffled]), goals[:, shuffled], seeds[shuffled], precision)
+    again = rollout(Parameters(parameters.values[shuffled]), setpoints[:, shuffled], seeds[shuffled], precision)
     np.testing.assert_array_equal(again[0], truth[:, shuffled])
     np.testing.assert_array_equal(again[1], sensors[:, shuffled])
 
@@ -68,10 +68,10 @@ def test_alone_or_in_a_batch(precision):
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_on_two_threads_and_again(precision):
     count = 16 * TILES_PER_THREAD * 3 + 5
-    parameters, goals, seeds = random_parameters(count), random_goals(count, 5), np.arange(count, dtype=np.uint64)
-    once = rollout(parameters, goals, seeds, precision)
-    again = rollout(parameters, goals, seeds, precision)
-    threaded = rollout(parameters, goals, seeds, precision, threads=2)
+    parameters, setpoints, seeds = random_parameters(count), random_setpoints(count, 5), np.arange(count, dtype=np.uint64)
+    once = rollout(parameters, setpoints, seeds, precision)
+    again = rollout(parameters, setpoints, seeds, precision)
+    threaded = rollout(parameters, setpoints, seeds, precision, threads=2)
     for a, b, c in zip(once, again, threaded, strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a, c)
@@ -89,9 +89,9 @@ def test_two_threads_are_really_used():
 def test_neutral_rolling_resistance_does_not_change_a_bit():
     """The kernel with the feature, fed zeros, equals the kernel without it."""
     count = 9
-    parameters, goals = random_parameters(count), random_goals(count, 20)
+    parameters, setpoints = random_parameters(count), random_setpoints(count, 20)
     seeds = np.arange(count, dtype=np.uint64)
-    base = rollout(parameters, goals, seeds)
+    base = rollout(parameters, setpoints, seeds)
     plant = GibbsAppellPlant(ROBOT, count)
     rolling = parameters.copy()
     rolling["ground.rolling_resistance"] = 0.01
@@ -99,15 +99,15 @@ def test_neutral_rolling_resistance_does_not_change_a_bit():
     assert plant._features == {"rolling_resistance"}
     plant.reset(seeds=seeds, parameters=parameters)
     assert plant._features == {"rolling_resistance"}
-    for tick, goal in enumerate(goals):
+    for tick, goal in enumerate(setpoints):
         sensors = plant.step(goal)
         np.testing.assert_array_equal(plant.truth().values, base[0][tick])
         np.testing.assert_array_equal(sensors.values, base[1][tick])
 
 
 def test_float32_follows_float64():
-    parameters, goals, seeds = random_parameters(16), random_goals(16, 25), np.arange(16, dtype=np.uint64)
-    double, single = (rollout(parameters, goals, seeds, precision)[0][-1] for precision in ("float64", "float32"))
+    parameters, setpoints, seeds = random_parameters(16), random_setpoints(16, 25), np.arange(16, dtype=np.uint64)
+    double, single = (rollout(parameters, setpoints, seeds, precision)[0][-1] for precision in ("float64", "float32"))
     error = np.abs(double[:, :3] - single[:, :3]).max()
     assert error < 1e-5
     assert not np.array_equal(double, single)
@@ -119,7 +119,7 @@ def test_golden_rollout():
     Compared to 1e-8 m, not bit by bit: the kernel is strict IEEE arithmetic, but numpy's exp and sin, which prepare its
     constants, differ by a rounding from one kind of processor to the next.
     """
-    truth, _ = rollout(random_parameters(8), random_goals(8, 100), np.arange(8, dtype=np.uint64))
+    truth, _ = rollout(random_parameters(8), random_setpoints(8, 100), np.arange(8, dtype=np.uint64))
     golden = json.loads(GOLDEN.read_text())
     expected = np.array([[float.fromhex(number) for number in row] for row in golden["position_and_quaternion"]])
     np.testing.assert_allclose(truth[-1, :, :7], expected, atol=1e-8, rtol=0)

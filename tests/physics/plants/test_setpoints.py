@@ -1,4 +1,4 @@
-"""Delayed goals."""
+"""Delayed setpoints."""
 
 import numpy as np
 
@@ -14,14 +14,14 @@ def test_nothing_moves_after_a_reset_with_a_delay_and_a_zero_offset():
     for parameters in (delayed, prompt):
         parameters["joint.zero_offset"] = [0.05, -0.05, 0.05, -0.05]
     delayed["command.delay"] = 0.07
-    goals = np.zeros((2, 8))
-    goals[:, :4] = robot.home.leg_angle + prompt["joint.zero_offset"]
+    setpoints = np.zeros((2, 8))
+    setpoints[:, :4] = robot.home.leg_angle + prompt["joint.zero_offset"]
     angles = []
     for parameters in (delayed, prompt):
         plant = make_plant("gibbs_appell", robot, 2, PlantOptions(sensor_noise=False))
         plant.reset(parameters=parameters)
         for _ in range(10):
-            plant.step(goals)
+            plant.step(setpoints)
             angles.append(plant.truth().joint_position.copy())
         plant.close()
     assert np.array_equal(angles[:10], angles[10:])

@@ -111,12 +111,12 @@ def test_peer_is_the_same_robot_under_the_same_servo_law():
     """The comparison is fair only if both do the same work: same motion, here within the contact models' difference."""
     robot = load_robot()
     plants = MujocoLoopPlant(robot), GibbsAppellPlant(robot)
-    goals = np.array([[*[robot.home.leg_angle] * 4, *[3.0] * 4]])
-    goals[0, :4] += 0.1
+    setpoints = np.array([[*[robot.home.leg_angle] * 4, *[3.0] * 4]])
+    setpoints[0, :4] += 0.1
     for plant in plants:
         plant.reset()
         for _ in range(50):
-            plant.step(goals)
+            plant.step(setpoints)
     peer, ours = (plant.truth() for plant in plants)
     assert np.abs(ours.position[0, 0]) > 0.05
     np.testing.assert_allclose(peer.position[0], ours.position[0], atol=2e-3)

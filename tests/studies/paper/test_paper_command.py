@@ -28,7 +28,7 @@ def test_report_is_written(tmp_path, capsys):
     assert "does not hold" in capsys.readouterr().out
     for name, test in TESTS.items():
         motion = read_commands(out / "commands" / f"{name}.csv")
-        np.testing.assert_array_equal(motion.goals, test.motion().goals)
+        np.testing.assert_array_equal(motion.setpoints, test.motion().setpoints)
         assert motion.profile == PROFILE
 
 

@@ -29,14 +29,14 @@ def test_commands_are_whole_register_counts():
 
 def test_goals_are_what_the_paper_commands():
     for name, test in TESTS.items():
-        goals = paper_test(name).motion().goals
-        assert np.isnan(goals[:, 6:]).all()
+        setpoints = paper_test(name).motion().setpoints
+        assert np.isnan(setpoints[:, 6:]).all()
         rest = int(1.0 / 0.02)
-        np.testing.assert_allclose(np.degrees(goals[rest - 1, :4]), np.degrees(np.repeat(test.start, 2)))
-        np.testing.assert_allclose(np.degrees(goals[rest, :4]), np.degrees(np.repeat(test.end, 2)))
-        driving = goals[:, 4] > 0.0
+        np.testing.assert_allclose(np.degrees(setpoints[rest - 1, :4]), np.degrees(np.repeat(test.start, 2)))
+        np.testing.assert_allclose(np.degrees(setpoints[rest, :4]), np.degrees(np.repeat(test.end, 2)))
+        driving = setpoints[:, 4] > 0.0
         assert driving.sum() * 0.02 == pytest.approx(stop_time(), abs=0.01)
-        assert set(goals[driving, 4]) == {WHEEL_SPEED}
+        assert set(setpoints[driving, 4]) == {WHEEL_SPEED}
 
 
 def test_travel_and_turns():

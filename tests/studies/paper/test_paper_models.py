@@ -181,6 +181,6 @@ def test_bad_input_is_named():
 
 
 def test_rear_wheels_can_be_driven_for_comparison():
-    goals = replace(paper_test("test_1"), rear_driven=True).motion().goals
-    assert np.isfinite(goals).all()
-    np.testing.assert_array_equal(goals[:, 4:6], goals[:, 6:])
+    setpoints = replace(paper_test("test_1"), rear_driven=True).motion().setpoints
+    assert np.isfinite(setpoints).all()
+    np.testing.assert_array_equal(setpoints[:, 4:6], setpoints[:, 6:])

@@ -21,9 +21,9 @@ OUTPUTS = ("angle", "rate", "voltage", "motor_torque", "friction_torque")
 
 _DRIVER = '''
 @njit(cache=True, nogil=True, error_model="numpy")
-def simulate(P, V, lag, goals, inputs, starts, begun, step, out):
+def simulate(P, V, lag, setpoints, inputs, starts, begun, step, out):
     """See the function of this name below. P: parameters; V: constants of the formulas; inputs: supply, switch, warmth."""
-    count = goals.shape[0]
+    count = setpoints.shape[0]
     for m in range(P.shape[0]):
         {read_parameters}
         {read_values}
@@ -33,7 +33,7 @@ def simulate(P, V, lag, goals, inputs, starts, begun, step, out):
         for i in range(count):
             new = min(max(i - whole, 0), count - 1)
             old = min(max(i - whole - 1, 0), count - 1)
-            goal = (1.0 - part) * goals[new] + part * goals[old]
+            goal = (1.0 - part) * setpoints[new] + part * setpoints[old]
             supply, on, warmth = inputs[i, 0], inputs[i, 1], inputs[i, 2]
             if starts[i] >= 0:
                 angle, rate = begun[starts[i], 0] - zero, begun[starts[i], 1]
@@ -92,7 +92,7 @@ def _compiled(with_play: bool, forces: Sequence[Force]) -> ModuleType:
 def simulate(
     parameters: Array,
     lag: Array,
-    goals: Array,
+    setpoints: Array,
     inputs: Array,
     starts: NDArray[np.int64],
     begun: Array,
@@ -104,8 +104,8 @@ def simulate(
 
     Args:
         parameters: (models, parameters) in the order of :data:`law.PARAMETERS`.
-        lag: (models,) how much later goals act than they were written, in substeps; fractions mix neighbours.
-        goals: (n,) mean goal of every substep as written, rad.
+        lag: (models,) how much later setpoints act than they were written, in substeps; fractions mix neighbours.
+        setpoints: (n,) mean goal of every substep as written, rad.
         inputs: (n, 3) supply (V), torque on (0 or 1), warmth (K).
         starts: (n,) row of ``begun`` to restart from before the substep, or -1; the first must not be -1.
         begun: (k, 2) encoder reading (rad) and rate (rad/s) where windows begin.
@@ -119,12 +119,12 @@ def simulate(
     """
     if values is None:
         values = np.repeat(force_values(forces)[None], len(parameters), axis=0)
-    out = np.empty((len(parameters), len(goals), len(OUTPUTS)))
+    out = np.empty((len(parameters), len(setpoints), len(OUTPUTS)))
     with_play = parameters[:, law.PARAMETERS.index("half_play")] > 0.0
     for chosen, is_with_play in ((np.flatnonzero(~with_play), False), (np.flatnonzero(with_play), True)):
         if len(chosen):
             part = np.empty((len(chosen), *out.shape[1:]))
             kernel = _compiled(is_with_play, forces).simulate
-            kernel(parameters[chosen], values[chosen], lag[chosen], goals, inputs, starts, begun, step, part)
+            kernel(parameters[chosen], values[chosen], lag[chosen], setpoints, inputs, starts, begun, step, part)
             out[chosen] = part
     return out

@@ -1,4 +1,4 @@
-"""A recording as input of the simulation: goals, supply and switch on a fixed grid, and states to start from."""
+"""A recording as input of the simulation: setpoints, supply and switch on a fixed grid, and states to start from."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Replay:
         time = recording.time
         count = max(2, int((time[-1] - time[0]) / STEP) + 1)
         self._grid = time[0] + STEP * np.arange(count + 1)
-        self._goals = _mean_goals(recording, self._grid)
+        self._goals = _mean_setpoints(recording, self._grid)
         middle = self._grid[:-1] + 0.5 * STEP
         row = np.clip(np.searchsorted(time - GOAL_LEAD, middle, side="right") - 1, 0, len(time) - 1)
         self._inputs = np.stack(
@@ -80,7 +80,7 @@ def _alike(models: Sequence[RigModel]) -> list[list[int]]:
     return list(groups.values())
 
 
-def _mean_goals(recording: Recording, grid: Array) -> Array:
+def _mean_setpoints(recording: Recording, grid: Array) -> Array:
     """Mean goal within every substep: each row's goal holds until the next is written."""
     written = recording.time - GOAL_LEAD
     edges = np.concatenate([[grid[0] - 1.0], written[1:], [grid[-1] + 1.0]])

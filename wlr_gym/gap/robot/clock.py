@@ -1,4 +1,4 @@
-"""Where a run's rows, goals and windows lie on the replaying plant's clock, and what was measured where windows begin."""
+"""Where a run's rows, setpoints and windows lie on the replaying plant's clock, and what was measured where windows begin."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.data.format import COMMANDS
 from wlr_gym.data.read import Run
-from wlr_gym.data.replay import held_goals
+from wlr_gym.data.replay import held_setpoints
 from wlr_gym.data.run_states import CAMERA_WINDOW, JOINT_WINDOW, frame_near, has_camera, local_fit, starts_at_rest, unwrapped
 from wlr_gym.gap.robot.windows import WINDOW, window_rows
 from wlr_gym.robot import LEGS, WHEEL_SLICE, WHEELS
@@ -41,14 +41,14 @@ class Anchors:
 
 
 class RunClock:
-    """When the goals of one run arrive at the servos, where its rows lie on the plant's clock, and its windows."""
+    """When the setpoints of one run arrive at the servos, where its rows lie on the plant's clock, and its windows."""
 
     def __init__(self, run: Run, window: float = WINDOW) -> None:
         self.run = run
         self.windows = window_rows(run["t"], window)
         self.t = run["t"]
         commands = np.stack([run[name] for name in COMMANDS], axis=1)
-        self.goals = held_goals(run)
+        self.setpoints = held_setpoints(run)
         self.torque_on = np.isfinite(commands)
         self.begin = self.t[0] - (LEAD if starts_at_rest(run) else 0.0)
         self.ticks = int(np.ceil((self.t[-1] - self.begin) / CLOCK)) + 1

@@ -62,7 +62,7 @@ class Recorder:
         self._soonest = delay.min(axis=1)
         self.clocks, self.settings, self.with_truth = clocks, settings, with_truth
         count = settings * len(clocks)
-        self.idle_goals = np.zeros((count, 8))
+        self.idle_setpoints = np.zeros((count, 8))
         self._wheels = first.joint_position[:, WHEEL_SLICE]
         self._values = [np.zeros((settings, len(clock.t), len(CHANNELS))) for clock in clocks]
         width = sum(len(TRUTH_LAYOUT.channels[name].elements) for name in TRUTH) if with_truth else 0

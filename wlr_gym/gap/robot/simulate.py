@@ -52,7 +52,7 @@ class WrittenSetpoints:
         rows = [len(clock.t) for clock in clocks]
         start = np.concatenate([[0], np.cumsum([n + 1 for n in rows])])[:-1]
         self._times = np.concatenate([np.append(clock.t - clock.begin, np.inf) for clock in clocks])
-        self._goals = np.concatenate([np.vstack([clock.goals, clock.goals[-1:]]) for clock in clocks])
+        self._goals = np.concatenate([np.vstack([clock.setpoints, clock.setpoints[-1:]]) for clock in clocks])
         self._row = np.repeat(start[run_of][:, None], 8, axis=1)
         self._delay = delay
         self._newer, self._older, self._wait = (np.zeros(delay.shape) for _ in range(3))
@@ -182,7 +182,7 @@ def _replay_chunk(
                 readings = _anchor(plant, clocks[r], window, run_of == r, lanes, readings)
                 recorder.start_anew(r, tick, readings, plant.truth())
             recorder.see(tick, readings, plant.truth())
-            readings = plant.step(recorder.idle_goals, recorder.torque_on(tick))
+            readings = plant.step(recorder.idle_setpoints, recorder.torque_on(tick))
         recorder.see(ticks, readings, plant.truth())
     finally:
         plant.close()

@@ -30,7 +30,7 @@ class MachineOptions:
 
     Attributes:
         backend: simulator behind it.
-        tick: s of emulated time per step; goals written in between act at the next one.
+        tick: s of emulated time per step; setpoints written in between act at the next one.
         seed: of sensor noise and fault choices.
         sensor_noise: the plant's.
         firmware: version the servos report; fast reads need 45.

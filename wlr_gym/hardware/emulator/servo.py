@@ -249,7 +249,7 @@ class EmulatedServo:
         self._drive = None
 
     def _go_to_present(self) -> None:
-        """Goals that ask for no motion."""
+        """Setpoints that ask for no motion."""
         self.set("goal_position", self._frame.count(self.shaft.position))
         self.set("goal_velocity", 0)
         self._profile_start = self.shaft.reference()[0]

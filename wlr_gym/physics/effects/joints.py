@@ -111,7 +111,7 @@ EFFECTS: tuple[Effect, ...] = (
     ),
     Effect(
         "command_delay",
-        "goals act later than written, on top of the robot's own delay",
+        "setpoints act later than written, on top of the robot's own delay",
         "goal(t) = written(t - delay)",
         JOINTS,
         {"delay": EffectParameter("s", "extra time", 0, 0.2, 0.0, (0, 0.06), 0.025)},

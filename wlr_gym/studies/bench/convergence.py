@@ -21,7 +21,7 @@ CASES = {
     "legs": "as skid, with every leg stepped to its own angle",
     "profile": "two such poses in turn every 0.3 s, with servo profiles",
     "drop": "as legs, from 10 mm above the floor",
-    "random": "new random goals every tick",
+    "random": "new random setpoints every tick",
 }
 STEPS = (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3)
 SWEEP_COUNTS = (2, 3, 4, 6, 8)
@@ -60,10 +60,10 @@ def measure_convergence(size: Size) -> list[Deviation]:
 
 
 def _case(case: str, count: int, ticks: int, size: Size) -> list[Deviation]:
-    goals = _goals(case, ticks, count)
+    setpoints = _goals(case, ticks, count)
 
     def travel(step: float, sweeps: int, precision: str = "float64") -> Array:
-        return _travel(case, goals, step, sweeps, precision)
+        return _travel(case, setpoints, step, sweeps, precision)
 
     found: list[Deviation] = []
     reference = travel(REFERENCE_STEP if not size.quick else 1e-4, REFERENCE_SWEEPS)
@@ -99,9 +99,9 @@ def _pose(rng: np.random.Generator, count: int) -> Array:
     return np.c_[np.pi / 2 + rng.uniform(-0.3, 0.3, (count, 4)), rng.uniform(-6.0, 6.0, (count, 4))]
 
 
-def _travel(case: str, goals: list[Array], step: float, sweeps: int, precision: str) -> Array:
+def _travel(case: str, setpoints: list[Array], step: float, sweeps: int, precision: str) -> Array:
     """Return how far the body of every robot moved (N, 3)."""
-    robot, count = load_robot(), len(goals[0])
+    robot, count = load_robot(), len(setpoints[0])
     parameters = Parameters.nominal(robot, count)
     friction = np.random.default_rng(1).uniform(0.2, 0.9, (count, 4))
     parameters["ground.mu_x"], parameters["ground.mu_y"] = friction, friction
@@ -114,6 +114,6 @@ def _travel(case: str, goals: list[Array], step: float, sweeps: int, precision: 
     plant = GibbsAppellPlant(robot, count, PlantOptions(physics_step=step, precision=precision), sweeps=sweeps)
     plant.reset(parameters=parameters, state=state)
     start = plant.truth().position.copy()
-    for row in goals:
+    for row in setpoints:
         plant.step(row)
     return plant.truth().position - start

@@ -102,7 +102,7 @@ class MujocoLoopPlant:
     """One robot on ``mj_step(nstep)``; see :class:`wlr_gym.physics.plants.base.Plant` for the contract.
 
     Enough for tasks, not a reference: sums over a tick (energy, slip displacement) are the last substep's rate times the
-    control period, contact forces and friction torques are not filled in, all motors are always on, goals are not delayed.
+    control period, contact forces and friction torques are not filled in, all motors are always on, setpoints are not delayed.
     """
 
     capabilities = Capabilities(BACKEND, has_truth=True, can_set_state=True, real_time=False)

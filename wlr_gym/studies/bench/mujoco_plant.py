@@ -9,7 +9,7 @@ from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.mujoco.plant import MujocoPlant
 from wlr_gym.robot import load_robot
 from wlr_gym.studies.bench.measure import Contender, Measurement, Size, interleave, rate
-from wlr_gym.studies.bench.speed import SUBSTEPS, mujoco_batch, random_goals
+from wlr_gym.studies.bench.speed import SUBSTEPS, mujoco_batch, random_setpoints
 
 Array = NDArray[np.float64]
 
@@ -43,10 +43,10 @@ def measure_mujoco(size: Size) -> list[Measurement]:
 
 
 def _plant(backend: str, count: int, ticks: int) -> Contender:
-    plant, goals = make_plant(backend, load_robot(), count), random_goals(ticks, count)
+    plant, setpoints = make_plant(backend, load_robot(), count), random_setpoints(ticks, count)
 
     def drive() -> None:
-        for row in goals:
+        for row in setpoints:
             plant.step(row)
 
     def run() -> float:
@@ -58,10 +58,10 @@ def _plant(backend: str, count: int, ticks: int) -> Contender:
 
 def _steps_alone(count: int, ticks: int) -> Contender:
     """Bare ``Batch.step`` on the plant's own model: a tick starts from a state of the plant's drive and keeps its forces."""
-    plant, goals = MujocoPlant(load_robot(), count), random_goals(ticks, count)
+    plant, setpoints = MujocoPlant(load_robot(), count), random_setpoints(ticks, count)
     batch = plant._batch  # the peer is what the plant is made of
     states: list[list[Array]] = []
-    for row in goals:
+    for row in setpoints:
         plant.step(row)
         states.append([getattr(batch, name).copy() for name in (*_STATE, *_INPUTS)])
 

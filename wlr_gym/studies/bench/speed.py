@@ -32,8 +32,8 @@ START = (
 )
 
 
-def random_goals(ticks: int, count: int) -> Array:
-    """Return goals (ticks, count, 8) that keep legs and wheels busy: new ones every tenth tick."""
+def random_setpoints(ticks: int, count: int) -> Array:
+    """Return setpoints (ticks, count, 8) that keep legs and wheels busy: new ones every tenth tick."""
     rng = np.random.default_rng(0)
     draws = -(-ticks // 10)
     legs, wheels = np.pi / 2 + rng.uniform(-0.3, 0.3, (draws, count, 4)), rng.uniform(-6.0, 6.0, (draws, count, 4))
@@ -62,10 +62,10 @@ def measure_engine(size: Size) -> list[Measurement]:
 
 def _engine(count: int, ticks: int, precision: str, threads: int) -> Contender:
     plant = GibbsAppellPlant(load_robot(), count, PlantOptions(precision=precision, threads=threads))
-    goals = random_goals(ticks, count)
+    setpoints = random_setpoints(ticks, count)
 
     def drive() -> None:
-        for row in goals:
+        for row in setpoints:
             plant.step(row)
 
     def run() -> float:
@@ -81,11 +81,11 @@ def mujoco_batch(count: int, ticks: int, *, soft: bool) -> Contender:
     parameters = Parameters.nominal(robot)
     batch = mujoco.batch.Batch(build_servo_model(robot, parameters, soft=soft), count, 1)
     position, control, activation = batch.bind("qpos"), batch.bind("ctrl"), batch.bind("act")
-    goals = random_goals(ticks, count)
+    setpoints = random_setpoints(ticks, count)
     height = standing_state(robot, parameters).position[0, 2]
 
     def drive() -> None:
-        for row in goals:
+        for row in setpoints:
             control[:, :8] = row
             control[:, 8:] = row[:, WHEEL_SLICE]
             batch.step(nstep=SUBSTEPS)

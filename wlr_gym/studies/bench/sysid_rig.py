@@ -87,13 +87,13 @@ def make_rig(seconds: float, seed: int = 0) -> tuple[WholeRuns, Array]:
 
 def peer_of(problem: WholeRuns) -> PeerProblem:
     """Return the same problem for ``mujoco.sysid``."""
-    return PeerProblem(problem.quantities, [_peer_run(replay) for replay in problem._replays])  # the same goals and starts
+    return PeerProblem(problem.quantities, [_peer_run(replay) for replay in problem._replays])  # the same setpoints and starts
 
 
 def _peer_run(replay: Replay) -> PeerRun:
     recording, model = replay.recording, _pendulum()
     delay = round(_NOMINAL[[q.name for q in QUANTITIES].index("delay")] / STEP)
-    goals = replay._goals[np.maximum(np.arange(len(replay._goals)) - delay, 0)]
+    setpoints = replay._goals[np.maximum(np.arange(len(replay._goals)) - delay, 0)]
     at_rows = (np.arange(1, len(recording.time)) * ROW) - 1
 
     def build(values: Array) -> mujoco.MjModel:
@@ -103,8 +103,8 @@ def _peer_run(replay: Replay) -> PeerRun:
         return (recording.angle[1:] - state[at_rows, 1]) / ENCODER_NOISE
 
     start = np.array([0.0, replay.angle[0], replay.rate[0]])
-    times = recording.time[0] + STEP * np.arange(len(goals) + 1)
-    control = np.append(goals, goals[-1:])[:, None]
+    times = recording.time[0] + STEP * np.arange(len(setpoints) + 1)
+    control = np.append(setpoints, setpoints[-1:])[:, None]
     return PeerRun(model, build, times, control, start, residual)
 
 
@@ -171,14 +171,14 @@ def _recorded(run: int, seconds: float, truth: Array, rng: np.random.Generator) 
         f"run{run}", "sines", mass, length, None, gain, SUPPLY, time, zeros, zeros, zeros, zeros, SUPPLY * ones, 25.0 * ones,
         np.asarray(goal), ones > 0.0,
     )  # fmt: skip
-    goals = np.repeat(Replay(empty)._goals, FINE)
+    setpoints = np.repeat(Replay(empty)._goals, FINE)
     step = STEP / FINE
-    inputs = np.tile([SUPPLY, 1.0, 0.0], (len(goals), 1))
-    starts = np.full(len(goals), -1)
+    inputs = np.tile([SUPPLY, 1.0, 0.0], (len(setpoints), 1))
+    starts = np.full(len(setpoints), -1)
     starts[0] = 0
     model = model_of(Setting(all_numbers(truth)), QUANTITIES)
     lag = np.array([model.numbers["delay"]]) / step
-    found = kernel.simulate(pack([model], empty, step), lag, goals, inputs, starts, np.zeros((1, 2)), step)[0]
+    found = kernel.simulate(pack([model], empty, step), lag, setpoints, inputs, starts, np.zeros((1, 2)), step)[0]
     angle = found[:: FINE * ROW, 0][:rows] + model.numbers["zero"]
     noisy = angle + np.sqrt(1.0 - 1.0 / 12.0) * ENCODER_NOISE * rng.standard_normal(rows)
     counted = ENCODER_NOISE * np.round(noisy / ENCODER_NOISE)

@@ -86,26 +86,26 @@ def make_robot(seconds: float, seed: int = 0) -> tuple[FewNumbers, Array]:
 
 def _recorded(parameters: Parameters, seconds: float, run: int, rng: np.random.Generator) -> Run:
     robot, rows = load_robot(), round(seconds / PERIOD) + 1
-    goals = _goals(PERIOD * np.arange(rows, dtype=np.float64), robot.home.leg_angle, rng)
+    setpoints = _goals(PERIOD * np.arange(rows, dtype=np.float64), robot.home.leg_angle, rng)
     plant = make_plant("mujoco", robot, 1, PlantOptions(PERIOD, 0.5 * STEP))
     try:
         readings = plant.reset(np.array([run], np.uint64), parameters, state=standing_state(robot, parameters))
         for _ in range(round(REST / PERIOD)):
-            readings = plant.step(goals[:1])
+            readings = plant.step(setpoints[:1])
         table = np.empty((rows, len(SENSED)))
-        for row, goal in enumerate(goals):
+        for row, goal in enumerate(setpoints):
             table[row] = channels(readings, 0)
             readings = plant.step(goal[None])
     finally:
         plant.close()
     table[:, WHEEL_SLICE] -= table[0, WHEEL_SLICE]
-    frame = pandas.DataFrame(np.hstack([goals, table]), columns=[*COMMANDS, *SENSED])
+    frame = pandas.DataFrame(np.hstack([setpoints, table]), columns=[*COMMANDS, *SENSED])
     frame.insert(0, "t", PERIOD * np.arange(rows))
     return Run(frame, RunMeta(), Path(f"run_{run}.parquet"))
 
 
 def _goals(t: Array, home: float, rng: np.random.Generator) -> Array:
-    """Smooth goals (rows, 8) that begin at rest: legs one by one, both sides' wheels."""
+    """Smooth setpoints (rows, 8) that begin at rest: legs one by one, both sides' wheels."""
     begin = np.clip(t - 0.3, 0.0, 1.0)
     waves = [_wave(t, rng) for _ in range(6)]
     legs = [home + 0.25 * begin * wave for wave in waves[:4]]
@@ -143,7 +143,7 @@ def _peer_run(problem: FewNumbers, run: int, build: Callable[[Array], mujoco.MjM
     steps = lead + round(t[-1] / STEP)
     arrival = lead + np.rint((t + nominal["command.delay"][0].max()) / STEP)
     row = np.maximum(np.searchsorted(arrival, np.arange(steps + 1), side="right") - 1, 0)
-    goals = problem.clocks[run].goals[row]
+    setpoints = problem.clocks[run].setpoints[row]
     model = build(np.array([quantity.nominal for quantity in problem.quantities]))
     rows = lead - 1 + np.rint(t / STEP).astype(int)  # states are those after each step
     shown = rows - round(nominal["camera.delay"][0] / STEP)
@@ -153,7 +153,7 @@ def _peer_run(problem: FewNumbers, run: int, build: Callable[[Array], mujoco.MjM
         found = anchored_residuals(t, measured, _channels(state, rows, shown, model)[None], problem.noise, window)[0]
         return np.nan_to_num(found)
 
-    control = np.hstack([goals, goals[:, WHEEL_SLICE]])
+    control = np.hstack([setpoints, setpoints[:, WHEEL_SLICE]])
     return PeerRun(
         model, build, STEP * np.arange(steps + 1), control, _start(problem.clocks[run].run, problem, nominal, model), residual
     )

@@ -69,12 +69,12 @@ def paper_test(number: int, robot: Robot) -> FilmedDrive:
     ramp = PAPER_SPEED / PAPER_ACCELERATION
     stop = _REST + (8 * math.pi - PAPER_SPEED * ramp) / PAPER_SPEED + ramp
 
-    def goals(t: float) -> tuple[list[float], list[float]]:
+    def setpoints(t: float) -> tuple[list[float], list[float]]:
         moving = _REST <= t < stop
         return (end if t >= _REST else start), [PAPER_SPEED * moving] * 2 + [0.0, 0.0]
 
     free = np.array([True] * 6 + [False] * 2)
-    return _drive(f"paper test {number}", robot, parameters, start, goals, stop + ramp + 0.5, free, -0.55)
+    return _drive(f"paper test {number}", robot, parameters, start, setpoints, stop + ramp + 0.5, free, -0.55)
 
 
 def skid_turn(robot: Robot) -> FilmedDrive:
@@ -82,12 +82,12 @@ def skid_turn(robot: Robot) -> FilmedDrive:
     parameters = Parameters.nominal(robot)
     parameters["ground.mu_x"] = parameters["ground.mu_y"] = 0.4
 
-    def goals(t: float) -> tuple[list[float], list[float]]:
+    def setpoints(t: float) -> tuple[list[float], list[float]]:
         sweep = math.pi / 2 + 0.35 * math.sin(1.5 * max(0.0, t - _REST))
         left, right = (4.0, 4.0) if _REST <= t < 3.2 or 5.6 <= t < 7.8 else (-3.5, 3.5) if 3.2 <= t < 5.6 else (0.0, 0.0)
         return [sweep, sweep, sweep, sweep], [left, right, left, right]
 
-    return _drive("skid turn", robot, parameters, [math.pi / 2] * 4, goals, 8.5, np.ones(8, bool), -0.3)
+    return _drive("skid turn", robot, parameters, [math.pi / 2] * 4, setpoints, 8.5, np.ones(8, bool), -0.3)
 
 
 def _paper_parameters(robot: Robot) -> Parameters:
@@ -103,7 +103,7 @@ def _drive(
     robot: Robot,
     parameters: Parameters,
     legs: list[float],
-    goals: Callable[[float], tuple[list[float], list[float]]],
+    setpoints: Callable[[float], tuple[list[float], list[float]]],
     duration: float,
     torque_on: NDArray[np.bool_],
     x: float,
@@ -113,15 +113,15 @@ def _drive(
     plant = make_plant("gibbs_appell", robot, 1, PlantOptions(control_period=TICK, physics_step=0.001))
     sensors = plant.reset(np.array([7], np.uint64), parameters, state=_start(robot, parameters, legs, x))
     for _ in range(int(_SETTLING / TICK)):
-        leg_goals, wheel_goals = goals(0.0)
-        sensors = plant.step(np.array([[*leg_goals, *wheel_goals]]), torque_on[None])
+        leg_setpoints, wheel_setpoints = setpoints(0.0)
+        sensors = plant.step(np.array([[*leg_setpoints, *wheel_setpoints]]), torque_on[None])
     count = int(duration / TICK)
     rows: list[dict[str, float]] = []
     truths, slips = [], np.zeros((count + 1, 4, 2))
     for tick in range(count + 1):
         time = tick * TICK
-        leg_goals, wheel_goals = goals(time - time % (ROW * TICK) if tick % ROW else time)
-        goal = np.array([[*leg_goals, *wheel_goals]])
+        leg_setpoints, wheel_setpoints = setpoints(time - time % (ROW * TICK) if tick % ROW else time)
+        goal = np.array([[*leg_setpoints, *wheel_setpoints]])
         truth = plant.truth()
         truths.append(np.concatenate([truth.position[0], truth.quaternion[0], truth.joint_position[0, LEG_SLICE]]))
         if tick > 0:

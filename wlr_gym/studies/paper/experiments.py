@@ -77,14 +77,14 @@ class PaperTest:
     rear_driven: bool = False
 
     def motion(self) -> Motion:
-        """Return the goals as they are written, NaN = no torque; the servos' profiles make the ramps."""
+        """Return the setpoints as they are written, NaN = no torque; the servos' profiles make the ramps."""
         times = PERIOD * np.arange(round((SETTLE + duration() + AFTER) / PERIOD)) - SETTLE
         commanded = (times > -0.5 * PERIOD)[:, None]
-        goals = np.full((len(times), 8), np.nan)
-        goals[:, LEG_SLICE] = np.where(commanded, np.repeat(self.end, 2), np.repeat(self.start, 2))
+        setpoints = np.full((len(times), 8), np.nan)
+        setpoints[:, LEG_SLICE] = np.where(commanded, np.repeat(self.end, 2), np.repeat(self.start, 2))
         driven = slice(4, 8) if self.rear_driven else slice(4, 6)
-        goals[:, driven] = np.where(commanded[:, 0] & (times < stop_time() - 0.5 * PERIOD), WHEEL_SPEED, 0.0)[:, None]
-        return Motion(self.name, goals, PERIOD, PROFILE)
+        setpoints[:, driven] = np.where(commanded[:, 0] & (times < stop_time() - 0.5 * PERIOD), WHEEL_SPEED, 0.0)[:, None]
+        return Motion(self.name, setpoints, PERIOD, PROFILE)
 
 
 #: Leg angles.
@@ -110,7 +110,7 @@ def paper_test(name: str) -> PaperTest:
 
 
 def write_tests(folder: Path) -> list[Path]:
-    """Write the goals of both tests as command files, for ``wlr record --commands``; its runs can be replayed and compared.
+    """Write the setpoints of both tests as command files, for ``wlr record --commands``; its runs can be replayed and compared.
 
     Raises:
         InputError: the folder cannot be written to.
@@ -253,16 +253,16 @@ def drive_plant(plant: Plant, test: PaperTest, parameters: Parameters, every: in
 
     A robot shows what it can measure: effort for torque, the camera for the pose; its slip and floor forces are NaN.
     """
-    goals = test.motion().goals
-    torque_on = np.isfinite(goals)
+    setpoints = test.motion().setpoints
+    torque_on = np.isfinite(setpoints)
     count = plant.count
-    state = standing_at(np.tile(goals[0], (count, 1)), plant.robot, parameters)
+    state = standing_at(np.tile(setpoints[0], (count, 1)), plant.robot, parameters)
     seeds = np.arange(count, dtype=np.uint64)
     readings = plant.reset(seeds=seeds, parameters=parameters if plant.capabilities.can_set_state else None, state=state)
     look = _look_at_truth if plant.capabilities.has_truth else _look_at_sensors
     slip_path = np.zeros((count, 8))
     rows, seen = [look(plant, readings, slip_path)], readings.camera_is_new > 0.0
-    for tick, (goal, on) in enumerate(zip(goals, torque_on, strict=True)):
+    for tick, (goal, on) in enumerate(zip(setpoints, torque_on, strict=True)):
         asked = np.where(on, goal, np.where(np.arange(8) < 4, np.pi / 2, 0.0))
         readings = plant.step(np.tile(asked, (count, 1)), np.tile(on, (count, 1)))
         seen = seen | (readings.camera_is_new > 0.0)
@@ -331,11 +331,11 @@ def _drive_reduced(tests: list[PaperTest], robot: Robot, parameters: Parameters,
     """All tests side by side, one block of robots each: a batch costs hardly more than one robot."""
     count, blocks = len(parameters), len(tests)
     model = reduced.ReducedModel(robot, Parameters(np.tile(parameters.values, (blocks, 1))), step)
-    goals = np.concatenate([np.repeat(test.motion().goals[:, None, PAIRS], count, axis=1) for test in tests], axis=1)
+    setpoints = np.concatenate([np.repeat(test.motion().setpoints[:, None, PAIRS], count, axis=1) for test in tests], axis=1)
     starts = np.repeat([test.start for test in tests], count, axis=0)
     rows, path, last = [], np.zeros((count * blocks, 4, 2)), np.zeros((count * blocks, 4, 2))
     state = model.standing(*starts.T)
-    for tick, now in enumerate(reduced.run(model, state, np.nan_to_num(goals), np.isfinite(goals), PERIOD)):
+    for tick, now in enumerate(reduced.run(model, state, np.nan_to_num(setpoints), np.isfinite(setpoints), PERIOD)):
         slip = model.slip(now)
         path, last = path + 0.5 * PERIOD * (slip + last), slip
         if tick % every == 0:

@@ -309,8 +309,8 @@ class ReducedModel:
             zero[0], legs.copy(), zero[1], zero[2], reference, zero[3], zero[4], zero[5], zero[6], normal_forces(bias, j_n)
         )
 
-    def advance(self, state: ReducedState, goals: Array, torque_on: NDArray[np.bool_]) -> None:
-        """Advance by one step, in place. ``goals``, ``torque_on`` (N, 6): front legs, rear legs, wheels lf, rf, lr, rr."""
+    def advance(self, state: ReducedState, setpoints: Array, torque_on: NDArray[np.bool_]) -> None:
+        """Advance by one step, in place. ``setpoints``, ``torque_on`` (N, 6): front legs, rear legs, wheels lf, rf, lr, rr."""
         h, c = self.step, self.constants
         self._drift(state)
         p = posture(c, *state.legs.T)
@@ -320,7 +320,7 @@ class ReducedModel:
         lag = np.einsum("nij,nj->ni", b_dot, state.u)
         small = b.transpose(0, 2, 1) @ mass @ b
         free = np.einsum("nki,nk->ni", b, bias + np.einsum("nij,nj->ni", mass, lag))
-        drive, damping = self._motors(state, goals, torque_on)
+        drive, damping = self._motors(state, setpoints, torque_on)
         small_damped = small.copy()
         small_damped[:, range(3, 9), range(3, 9)] += h * damping
         pull = np.einsum("nij,nj->ni", small, state.u) - h * free
@@ -350,14 +350,14 @@ class ReducedModel:
         state.legs += half * state.u[:, _LEGS9]
         state.wheels += half * state.u[:, _WHEELS9]
 
-    def _motors(self, state: ReducedState, goals: Array, torque_on: NDArray[np.bool_]) -> tuple[Array, Array]:
+    def _motors(self, state: ReducedState, setpoints: Array, torque_on: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Torque at rest (N, 6) and implicit damping (N, 6) of both motors of a leg pair and of each wheel's."""
         h = self.step
         position = np.concatenate([state.legs, state.wheels], axis=1)
         old, rate = state.reference, state.reference_rate
-        legs = servo.leg_profile_step(old[:, :2], rate[:, :2], goals[:, :2], self._speed[:, :2], self._ramp[:, :2], h)
+        legs = servo.leg_profile_step(old[:, :2], rate[:, :2], setpoints[:, :2], self._speed[:, :2], self._ramp[:, :2], h)
         wheels = servo.wheel_profile_step(
-            old[:, 2:], rate[:, 2:], goals[:, 2:], self._ramp[:, 2:], h, position[:, 2:], self._kp[:, 2:], self._supply
+            old[:, 2:], rate[:, 2:], setpoints[:, 2:], self._ramp[:, 2:], h, position[:, 2:], self._kp[:, 2:], self._supply
         )
         place, speed, middle, mean = (np.concatenate(pair, axis=1) for pair in zip(legs, wheels, strict=True))
         state.reference = np.where(torque_on, place, position)
@@ -376,11 +376,11 @@ class ReducedModel:
 
 
 def run(
-    model: ReducedModel, state: ReducedState, goals: Array, torque_on: NDArray[np.bool_], period: float
+    model: ReducedModel, state: ReducedState, setpoints: Array, torque_on: NDArray[np.bool_], period: float
 ) -> Iterator[ReducedState]:
-    """Hold each row of ``goals`` (ticks, N, 6) for ``period`` s and yield the state before the first and after every tick."""
+    """Hold each row of ``setpoints`` (ticks, N, 6) for ``period`` s and yield the state before the first and after each tick."""
     yield state
-    for goal, on in zip(goals, torque_on, strict=True):
+    for goal, on in zip(setpoints, torque_on, strict=True):
         for _ in range(round(period / model.step)):
             model.advance(state, goal, on)
         yield state

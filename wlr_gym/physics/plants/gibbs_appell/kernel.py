@@ -178,7 +178,8 @@ def scatter(W, TRUTH, RAW, tile, count):
 
 {decorator}
 def tick(
-    X, P, goals, old_goals, switch_time, on, formula_values, memory, TRUTH, RAW, first, last, count, step, substeps, sweeps
+    X, P, setpoints, old_setpoints, switch_time, on, formula_values, memory, TRUTH, RAW, first, last, count, step,
+    substeps, sweeps
 ):
     whole_registers()
     W = np.zeros({scratch}, F)
@@ -190,8 +191,8 @@ def tick(
         for k in range({width}):
             row = min(tile * {width} + k, count - 1)
             for j in range(8):
-                W[{inputs} + j * {width} + k] = goals[row, j]
-                W[{inputs} + (8 + j) * {width} + k] = old_goals[row, j]
+                W[{inputs} + j * {width} + k] = setpoints[row, j]
+                W[{inputs} + (8 + j) * {width} + k] = old_setpoints[row, j]
                 W[{inputs} + (16 + j) * {width} + k] = switch_time[row, j]
                 W[{inputs} + (24 + j) * {width} + k] = on[row, j]
         prepare(W, step)

@@ -31,8 +31,8 @@ Array = NDArray[np.float64]
 #: Arrays the kernels work on, in this order, one row per robot (:func:`addresses`): MuJoCo's positions, velocities, constraint
 #: forces and contact sensors; own state; parameter lanes; the tick's inputs; formula forces; what a step reads.
 _FLAT = (
-    "qpos", "qvel", "constraint", "contact", "state", "parameters", "goals", "old_goals", "switch_time", "on", "generalised",
-    "applied", "armature", "gear_bound", "pair_margin",
+    "qpos", "qvel", "constraint", "contact", "state", "parameters", "setpoints", "old_setpoints", "switch_time", "on",
+    "generalised", "applied", "armature", "gear_bound", "pair_margin",
 )  # fmt: skip
 #: These have four rows per robot, one per wheel.
 _PER_WHEEL = ("pair_friction", "geom_size", "geom_pos", "geom_quat")
@@ -63,8 +63,8 @@ _PLACES: dict[str, str] = (
     | _columns("contact", source.CONTACT)
     | _columns("state", STATE)
     | _columns("parameters", PARAMETER_LANES)
-    | _columns("goals", [f"goal{j}" for j in range(8)])
-    | _columns("old_goals", [f"old_goal{j}" for j in range(8)])
+    | _columns("setpoints", [f"goal{j}" for j in range(8)])
+    | _columns("old_setpoints", [f"old_goal{j}" for j in range(8)])
     | _columns("switch_time", [f"switch_time{j}" for j in range(8)])
     | _columns("on", [f"on{j}" for j in range(8)])
     | {name: f"generalised[{k} * count]" for k, name in enumerate(source.FORMULA)}  # the formulas' kernel has robots in columns

@@ -31,15 +31,15 @@ NAMES = (
 
 @dataclass(frozen=True)
 class BlindScript:
-    """Goals over time.
+    """Setpoints over time.
 
     Attributes:
         duration: s.
-        goals: times (n,) -> goals (n, 8), rad for legs, rad/s for wheels, NaN = torque off.
+        setpoints: times (n,) -> setpoints (n, 8), rad for legs, rad/s for wheels, NaN = torque off.
     """
 
     duration: float
-    goals: Callable[[Array], Array]
+    setpoints: Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -146,14 +146,14 @@ def posture(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
     end = knots[-1] + 2.0
     turn_back = rng.uniform(0.4, 0.6) * end
 
-    def goals(t: Array) -> Array:
+    def setpoints(t: Array) -> Array:
         legs = np.stack([np.interp(t, table, rows[:, k]) for k in range(4)], axis=1)
         rates = (np.stack([np.interp(t + 1e-3, table, rows[:, k]) for k in range(4)], axis=1) - legs) / 1e-3
         drive = np.interp(t, [1.0, 1.5, turn_back, turn_back + 0.3, end - 1.5, end - 1.0], [0, speed, speed, -speed, -speed, 0])
         travel = -geometry.leg_length * np.sin(legs) * rates / geometry.radius
         return np.concatenate([legs, drive[:, None] + travel - rates], axis=1)
 
-    return BlindScript(end, goals)
+    return BlindScript(end, setpoints)
 
 
 def _turning(rng: np.random.Generator, both: bool) -> BlindScript:
@@ -163,7 +163,7 @@ def _turning(rng: np.random.Generator, both: bool) -> BlindScript:
     end = rng.uniform(17.5, 19.0)
     rear = (high, low) if both else (low, high)
 
-    def goals(t: Array) -> Array:
+    def setpoints(t: Array) -> Array:
         share = np.clip((t - 1) / turning, 0, 1)
         front_angle = low + (high - low) * share if both else np.full(len(t), low)
         rear_angle = rear[0] + (rear[1] - rear[0]) * share
@@ -171,7 +171,7 @@ def _turning(rng: np.random.Generator, both: bool) -> BlindScript:
         free = np.full(len(t), np.nan)
         return np.stack([front_angle, front_angle, rear_angle, rear_angle, drive, drive, free, free], axis=1)
 
-    return BlindScript(end, goals)
+    return BlindScript(end, setpoints)
 
 
 def rear_legs(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
@@ -190,14 +190,14 @@ def random_band(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
     wheel_waves = _waves(rng, 2, (0.1, 0.6), 2.4)
     leg_waves, own_waves = _waves(rng, 2, (0.08, 0.35), 0.17), _waves(rng, 4, (0.08, 0.35), 0.02)
 
-    def goals(t: Array) -> Array:
+    def setpoints(t: Array) -> Array:
         envelope = np.clip(np.minimum(t - 1, end - 1 - t), 0, 1)[:, None]
         axle = leg_waves(t)[:, [0, 0, 1, 1]]
         legs = np.clip(stance + envelope * (axle + own_waves(t)), DOWN - REACH, DOWN + REACH)
         wheels = np.clip(envelope * wheel_waves(t)[:, [0, 1, 0, 1]], -5.6, 5.6)
         return np.concatenate([legs, wheels], axis=1)
 
-    return BlindScript(end, goals)
+    return BlindScript(end, setpoints)
 
 
 def _waves(rng: np.random.Generator, count: int, band: tuple[float, float], rms: float) -> Callable[[Array], Array]:

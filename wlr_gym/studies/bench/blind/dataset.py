@@ -57,10 +57,10 @@ def simulate_runs(
         noise = np.random.default_rng([seed, 3, kind])
         script = scripts[kind]
         times = sensors.ticks(script.duration, float(robot["sensors"]["control_rate"]), noise)
-        goals = script.goals(times)
-        start = goals[0, :4] + 0.02 * noise.standard_normal(4)
-        records = simulate(build(copy, hidden), copy, hidden, profile, times, goals, start, times[-1] + 0.01)
-        tables.append(sensors.log(records, times, goals, copy, hidden, dict(robot), noise))
+        setpoints = script.setpoints(times)
+        start = setpoints[0, :4] + 0.02 * noise.standard_normal(4)
+        records = simulate(build(copy, hidden), copy, hidden, profile, times, setpoints, start, times[-1] + 0.01)
+        tables.append(sensors.log(records, times, setpoints, copy, hidden, dict(robot), noise))
     return tables, _meta(robot, profile, runs), copy
 
 

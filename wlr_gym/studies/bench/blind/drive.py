@@ -171,7 +171,7 @@ def _add_damper(matrix, row, columns, coefficient):
 
 
 @_jit
-def drive(model, data, qpos, qvel, addresses, tables, times, goals, records):
+def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records):
     position, rate, motor_rate, motor_position = addresses
     joints, corners, general = tables
     kp, kd, constant, resistance, coulomb, viscous = joints[0], joints[1], joints[2], joints[3], joints[4], joints[5]
@@ -192,7 +192,7 @@ def drive(model, data, qpos, qvel, addresses, tables, times, goals, records):
     size = qvel.shape[0]
     reference, reference_rate = np.zeros(8), np.zeros(8)
     current, torque, dahl, dry = np.zeros(8), np.zeros(8), np.zeros(4), np.zeros(8)
-    goal, next_row = goals[0].copy(), np.zeros(8, dtype=np.int64)
+    goal, next_row = setpoints[0].copy(), np.zeros(8, dtype=np.int64)
     gyro, accel, turn = np.zeros(3), np.zeros(3), np.zeros((3, 3))
     normal, slip, before = np.zeros(4), np.zeros(4), np.zeros(size)
     mass, fixed, matrix = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
@@ -227,7 +227,7 @@ def drive(model, data, qpos, qvel, addresses, tables, times, goals, records):
         supply = full_supply - supply_resistance * drawn
         for j in range(8):
             while next_row[j] < times.shape[0] and times[next_row[j]] + delay[j] <= now:
-                goal[j] = goals[next_row[j], j]
+                goal[j] = setpoints[next_row[j], j]
                 next_row[j] += 1
             joint, motor = rate[j], motor_rate[j]
             angle, speed, motor_speed = qpos[position[j]], qvel[joint], qvel[motor]

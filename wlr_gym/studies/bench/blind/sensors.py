@@ -32,19 +32,19 @@ def ticks(duration: float, rate: float, rng: np.random.Generator) -> Array:
 
 
 def log(
-    records: Array, times: Array, goals: Array, copy: Copy, hidden: Hidden, robot: dict[str, Any], rng: np.random.Generator
+    records: Array, times: Array, setpoints: Array, copy: Copy, hidden: Hidden, robot: dict[str, Any], rng: np.random.Generator
 ) -> pd.DataFrame:
     """Turn the records of a simulated run into the table of a measured one.
 
     Args:
         records: as of ``simulation.simulate``.
         times: (n,) host clock of the rows, s.
-        goals: (n, 8) written in these rows.
+        setpoints: (n, 8) written in these rows.
     """
     sensors = robot["sensors"]
     now = _at(records, times)
     table: dict[str, Array] = {"t": times}
-    table |= {f"cmd_{joint}": goals[:, j] for j, joint in enumerate(JOINTS)}
+    table |= {f"cmd_{joint}": setpoints[:, j] for j, joint in enumerate(JOINTS)}
     table |= _encoders(now, records[0], copy, hidden, sensors)
     table |= _efforts(now, copy, robot, rng)
     table |= _inertial(now, copy, hidden, sensors["imu"], rng)

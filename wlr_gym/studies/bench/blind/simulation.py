@@ -37,7 +37,7 @@ def simulate(
     hidden: Hidden,
     profile: BlindProfile,
     times: Array,
-    goals: Array,
+    setpoints: Array,
     start: Array,
     duration: float,
 ) -> Array:
@@ -45,8 +45,8 @@ def simulate(
 
     Args:
         world: compiled model.
-        times: (n,) s, when the goals are written.
-        goals: (n, 8) rad, rad/s, NaN = torque off.
+        times: (n,) s, when the setpoints are written.
+        setpoints: (n, 8) rad, rad/s, NaN = torque off.
         start: (4,) leg angles at which the robot is set down, rad, true.
         duration: s.
 
@@ -64,7 +64,7 @@ def simulate(
     records = np.zeros((round(duration / SAMPLE) + 1, WIDTH))
     addresses = (world.position, world.rate, world.motor_rate, world.motor_position)
     tables = (_joint_table(copy, hidden), _corner_table(copy, hidden), _general_table(copy, hidden, profile))
-    drive(model._address, data._address, data.qpos, data.qvel, addresses, tables, times, goals, records)
+    drive(model._address, data._address, data.qpos, data.qvel, addresses, tables, times, setpoints, records)
     if not np.isfinite(records).all():
         raise FloatingPointError("the simulated robot blew up")
     return records
