@@ -378,7 +378,7 @@ class ReducedModel:
 def run(
     model: ReducedModel, state: ReducedState, setpoints: Array, torque_on: NDArray[np.bool_], period: float
 ) -> Iterator[ReducedState]:
-    """Hold each row of ``setpoints`` (ticks, N, 6) for ``period`` s and yield the state before the first and after each tick."""
+    """Hold each row of ``setpoints`` (ticks, N, 6) for ``period`` s and yield the states before the first and after each."""
     yield state
     for goal, on in zip(setpoints, torque_on, strict=True):
         for _ in range(round(period / model.step)):
