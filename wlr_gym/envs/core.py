@@ -138,7 +138,8 @@ class Core:
         self._score_buffers = tuple(self.scores)
         self._no_estimate = np.zeros((count, ESTIMATE_LAYOUT.width))
         self._start = np.zeros((count, len(START)))
-        self._clock = np.zeros((count, 1))
+        self._time = np.zeros(count)
+        self._clock = self._time[:, None]
         self.computed = np.zeros((count, len(task.computed)))
         self.observation, self.privileged = self.pipeline.policy, self.pipeline.privileged
         self.reward, self.measures = self.scores.total, self.scores.measures
@@ -189,7 +190,7 @@ class Core:
         self._start[rows, :2] = self.state.position[rows, :2]
         self._start[rows, 2] = yaw_of(*self.state.quaternion[rows].T)
         self._begin_observing(mask, held)
-        self.episodes.begun |= mask
+        self.episodes.note_begun(mask)
 
     def _begin_observing(self, mask: Mask, held_commands: Mapping[int, float]) -> None:
         rows = np.flatnonzero(mask)
@@ -267,7 +268,7 @@ class Core:
         )
 
     def _score(self, mask: Mask, signals: tuple[Array, ...]) -> None:
-        self._clock[:, 0] = (self.episodes.steps + 1) * self.task.config.control_period
+        np.multiply(self.episodes.steps + 1, self.task.config.control_period, out=self._time)
         bad = self._score_kernel.run(mask, signals, self._score_kernel.numbers, self._score_buffers)
         if bad >= 0:
             hint = "; a formula among its effects may have left its domain" if self.patch.forces else ""
@@ -277,7 +278,7 @@ class Core:
 
     def _observe(self, mask: Mask, signals: tuple[Array, ...], *, first: bool) -> None:
         if self._computed_kernel is not None:
-            self._clock[:, 0] = self.time
+            self._time[:] = self.time
             self._computed_kernel.run(mask, signals, self._computed_kernel.numbers)
         self.pipeline.observe(mask, signals, self.episodes, first=first)
 

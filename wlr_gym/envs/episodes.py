@@ -49,6 +49,7 @@ class Episodes:
         self.seeds = np.zeros(count, np.uint64)
         self.seeded = np.zeros(count, bool)
         self.begun = np.zeros(count, bool)
+        self._all_begun = False
         self.steps = np.zeros(count, np.int64)
         self.terminated = np.zeros(count, bool)
         self.truncated = np.zeros(count, bool)
@@ -79,13 +80,18 @@ class Episodes:
         does step ``limit``. Returns whether any episode ended."""
         return _count_step(mask, limit, over, self.steps, self.terminated, self.truncated)
 
+    def note_begun(self, mask: Mask) -> None:
+        """Say that the episodes of the robots in ``mask`` can be stepped."""
+        self.begun |= mask
+        self._all_begun = bool(self.begun.all())
+
     def require_begun(self, what: str) -> None:
         """Refuse what needs the episodes of all robots to have begun.
 
         Raises:
             gymnasium.error.ResetNeeded: one has not.
         """
-        if not self.begun.all():
+        if not self._all_begun:
             raise ResetNeeded(f"call reset() before {what}: no episode of robot {int(np.argmin(self.begun))} has begun")
 
 

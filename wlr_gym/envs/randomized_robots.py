@@ -87,7 +87,7 @@ class RandomizedRobots:
         """
         steps = episodes.steps
         due = (self._strike_at <= steps[:, None]) & mask[:, None]
-        self.changed[:] = due.any(axis=1)
+        due.any(axis=1, out=self.changed)
         if self._drift_steps:
             self.changed |= mask & (steps % self._drift_steps == 0)
         if not self.changed.any():
