@@ -180,7 +180,7 @@ def _play(
         if not first:
             first.append(rollout)
 
-    ticks = make_task(task, read_settings(keywords)).episode_ticks
+    ticks = make_task(task, read_settings(keywords)).episode_steps
     with progress(work(conditions, subjects, ticks), options.progress) as tell:
         results = play(str(options.env), subjects, conditions, options.seed, tell, watch)
     identities = {subject.name: identity(subject) for subject in subjects}
