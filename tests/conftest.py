@@ -1,6 +1,37 @@
 import pytest
 
 
+@pytest.fixture(scope="session", autouse=True)
+def shared_kernels():
+    """Give robots with any effect the engine's kernel for all effects, so that the suite compiles a few kernels and not dozens.
+
+    A family that a robot does not use changes none of its bits: tests/physics/test_effect_bits_engine.py, on the product's own
+    choice (``own_kernels``).
+    """
+    from wlr_gym.physics.plants import drive, ground
+    from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
+
+    choose = GibbsAppellPlant._choose_kernel
+
+    def choose_shared(plant: GibbsAppellPlant) -> None:
+        if drive.families(plant.parameters) | ground.families(plant.parameters):
+            plant.expect_all_effects()
+        choose(plant)
+
+    patch = pytest.MonkeyPatch()
+    patch.setattr(GibbsAppellPlant, "_choose_kernel", choose_shared)
+    yield choose
+    patch.undo()
+
+
+@pytest.fixture
+def own_kernels(shared_kernels, monkeypatch):
+    """The kernel that the product chooses itself, for what a test's robots need."""
+    from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
+
+    monkeypatch.setattr(GibbsAppellPlant, "_choose_kernel", shared_kernels)
+
+
 @pytest.fixture(scope="session")
 def graphics():
     """Skip where there is no OpenGL at all."""

@@ -34,6 +34,7 @@ def analysed(folder, one):
     return gap.read_result(plan.result_file(one))
 
 
+@pytest.mark.slow
 def test_nothing_is_named_where_only_tolerances_are_off(tmp_path):
     one = case(1, first_seed=700)
     assert (one.kind, one.effects) == ("parameters", ())

@@ -19,6 +19,8 @@ NOT_RUN = {
     "docs/run_format.md": 1,  # shortened
     "docs/vision.md": 3,  # installation, pictures, a film
 }
+#: Pages whose blocks take most of a minute or more together; the slow suite runs them.
+LONG = {"README.md", "docs/quickstart.md", "docs/run_format.md", "docs/compare.md", "docs/pictures.md"}
 BLOCKS = [block for page in PAGES for block in blocks(page)]
 
 
@@ -37,7 +39,14 @@ def _run(page: Path, request: pytest.FixtureRequest, *, slow: bool) -> None:
     run_page(page, slow=slow)
 
 
-@pytest.mark.parametrize("page", [page for page in _pages("") if page.name != "extending.md"], ids=_name)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[pytest.mark.slow] if _name(page) in LONG else [], id=_name(page))
+        for page in _pages("")
+        if page.name != "extending.md"
+    ],
+)
 def test_page_runs(page, workplace, request):
     """docs/extending.md: test_docs_extending.py."""
     _run(page, request, slow=False)

@@ -8,6 +8,8 @@ from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.robot.parameters import Parameters
 
+pytestmark = pytest.mark.usefixtures("own_kernels")
+
 FAMILIES = {
     "rolling_resistance": ("ground.rolling_resistance", 0.01),
     "drive": ("servo.torque_scale", 0.8),

@@ -54,8 +54,11 @@ def test_every_key_of_an_event_is_explained():
         assert f"`{key}`" in section, key
 
 
-def test_the_examples_load():
-    late, whole = (yaml.safe_load(example) for example in re.findall("```yaml\n(.*?)```", TEXT, re.S))
+def test_the_examples_load(tmp_path):
+    late, whole, copy = re.findall("```yaml\n(.*?)```", TEXT, re.S)
+    (tmp_path / "mine.yaml").write_text(copy)
+    assert load_robot(tmp_path / "mine.yaml").tolerances["body.com_offset"].legs == 0.003
+    late, whole = yaml.safe_load(late), yaml.safe_load(whole)
     delay = load_randomization(late, load_robot()).config.events["command_delay"]
     assert (delay.low, delay.high) == (0.0, 0.03)
     events = load_randomization(whole, load_robot()).config.events

@@ -86,25 +86,6 @@ def test_two_threads_are_really_used():
     plant.step(np.zeros((count, 8)))  # goes on without threads
 
 
-def test_neutral_rolling_resistance_does_not_change_a_bit():
-    """The kernel with the feature, fed zeros, equals the kernel without it."""
-    count = 9
-    parameters, setpoints = random_parameters(count), random_setpoints(count, 20)
-    seeds = np.arange(count, dtype=np.uint64)
-    base = rollout(parameters, setpoints, seeds)
-    plant = GibbsAppellPlant(ROBOT, count)
-    rolling = parameters.copy()
-    rolling["ground.rolling_resistance"] = 0.01
-    plant.reset(parameters=rolling)  # the kernel with the feature stays loaded from here on
-    assert plant._features == {"rolling_resistance"}
-    plant.reset(seeds=seeds, parameters=parameters)
-    assert plant._features == {"rolling_resistance"}
-    for tick, goal in enumerate(setpoints):
-        sensors = plant.step(goal)
-        np.testing.assert_array_equal(plant.truth().values, base[0][tick])
-        np.testing.assert_array_equal(sensors.values, base[1][tick])
-
-
 def test_float32_follows_float64():
     parameters, setpoints, seeds = random_parameters(16), random_setpoints(16, 25), np.arange(16, dtype=np.uint64)
     double, single = (rollout(parameters, setpoints, seeds, precision)[0][-1] for precision in ("float64", "float32"))
