@@ -58,7 +58,7 @@ def test_a_card_says_what_the_file_is(policy):
     assert "wlr-nominal, at 50 Hz" in text
     assert "| observation | " in text
     assert "command 2, leg_position 4" in text
-    assert "ppo, 64 control ticks, 0.0 min with 1 thread(s), seed 0" in text
+    assert "ppo, 64 environment steps, 0.0 min with 1 thread(s), seed 0" in text
     assert "| randomisation |" in text
     below = text[text.index("## Score card: velocity_blind") :]
     assert below.splitlines()[2] == "| metric | velocity_blind |"

@@ -84,7 +84,7 @@ def test_another_robot_is_refused(old, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--reseal"], "expected policy files"),
+        (["--reseal"], "expected policies"),
         (["--reseal", "pid"], "'pid' is an agent"),
         (["--reseal", "velocity_blind", "--out", "x.onnx"], "neither --out nor --card"),
         (["velocity_blind", "--robot", "nominal"], "--robot goes with --reseal"),
@@ -96,7 +96,18 @@ def test_options_that_do_not_go_together(words, message, capsys):
     assert message in capsys.readouterr().err
 
 
-def test_a_policy_folder_is_not_resealed(tmp_path, capsys):
+def test_a_policy_folder_is_resealed_too(old, tmp_path, capsys):
+    """What an earlier ``wlr train`` left: the advice of the refusal holds for it."""
+    contract = tmp_path / "policy" / "contract.json"
+    contract.parent.mkdir()
+    contract.write_text(json.dumps(contract_of(old)))
+    assert main(["export", "--reseal", str(tmp_path)]) == 0
+    assert f"environment.robot.hash: '{FIRST_ROBOT}' -> '2-" in capsys.readouterr().out
+    reseal(old)
+    assert contract_of(tmp_path) == contract_of(old)
+
+
+def test_a_contract_without_a_robot_is_refused(tmp_path, capsys):
     (tmp_path / "contract.json").write_text(json.dumps({"format": 1, "agent": "ppo", "environment": {}, "config": {}}))
     assert main(["export", "--reseal", str(tmp_path)]) == 2
-    assert "is a policy folder" in capsys.readouterr().err
+    assert "robot.hash is None" in capsys.readouterr().err

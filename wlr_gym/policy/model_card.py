@@ -108,7 +108,7 @@ def _terms(columns: list[Mapping[str, Any]]) -> str:
 def _training(agent: str, training: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
     found = [agent]
     if "steps" in training:
-        found.append(f"{training['steps']:,} control ticks")
+        found.append(f"{training['steps']:,} environment steps")
     if "seconds" in training:
         found.append(f"{training['seconds'] / 60.0:.1f} min with {config.get('torch_threads', 1)} thread(s)")
     if "seed" in training:
