@@ -87,7 +87,7 @@ def _block(text: str) -> str:
 
 
 def api_page() -> str:
-    """What the rooms offer to programs, from their docstrings."""
+    """What the packages offer to programs, from their docstrings."""
     intro = "`import wlr_gym` registers the environments and loads nothing heavy. [Public](versions.md) is what stands here."
     parts = ["# Python interface", "", intro, ""]
     for title, module in API.items():

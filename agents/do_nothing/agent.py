@@ -1,4 +1,4 @@
-"""Zero action at every tick: legs at home, wheels held still. What any policy must beat."""
+"""Zero action at every step: legs at home, wheels held still. What any policy must beat."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def test_the_same_robot_does_the_same(run, tmp_path, capsys):
     pandas.testing.assert_frame_equal(twice.table.iloc[: len(repeated.table)], repeated.table, check_exact=True)
     text = capsys.readouterr().out
     assert "Measured minus repeated" in text
-    assert f"run_01: {len(run.table)} of {len(run.table)} ticks driven; command limiter: " in text
+    assert f"run_01: {len(run.table)} of {len(run.table)} steps driven; command limiter: " in text
 
 
 def test_another_robot_shows(run, tmp_path):

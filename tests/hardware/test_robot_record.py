@@ -53,7 +53,7 @@ def test_the_emulated_robot_is_driven_and_logged(tmp_path, capsys):
     assert np.ptp(straight["pos_wheel_lf"]) > 0.5
     assert straight["pos_wheel_lf"][0] == 0.0
     text = capsys.readouterr().out
-    assert "straight: 100 of 100 ticks driven; to its end" in text
+    assert "straight: 100 of 100 steps driven; to its end" in text
 
 
 def test_the_profile_reaches_the_servos(tmp_path, monkeypatch):
@@ -81,7 +81,7 @@ def test_a_robot_that_stops_leaves_its_log_and_code_1(tmp_path, monkeypatch, cap
     (run,) = read_dataset(tmp_path).runs
     assert 20 < len(run.table) < 300
     text = capsys.readouterr().out
-    assert "of 300 ticks driven" in text
+    assert "of 300 steps driven" in text
     assert "turns" not in text
     assert not any(servo["torque_enable"] for servo in machine.servos.values() if not servo.dead)
 

@@ -15,7 +15,7 @@ import onnx
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.learning.evaluation import make_core
-from wlr_gym.policy import check_model_card, contract_of, find_policy, make_policy, policy_environment, reseal
+from wlr_gym.policy import contract_of, find_policy, make_policy, policy_environment, reseal
 from wlr_gym.policy.model_card import file_hash
 from wlr_gym.policy.onnx_file import seal
 
@@ -58,7 +58,7 @@ def test_it_says_what_changed_and_changes_nothing_else(old, capsys):
     assert {column.pop("lag") for column in after["environment"]["observation"]} == {0}
     assert [key for key in before if after[key] != before[key]] == ["environment"]
     assert [key for key in before["environment"] if after["environment"][key] != before["environment"][key]] == ["robot"]
-    check_model_card(old)
+    assert f"`{file_hash(old)}`" in old.with_suffix(".md").read_text()
     core = make_core("WLR-Velocity-v0", 1, policy_environment(old))
     assert np.isfinite(make_policy(old, core.contract()).act(core.observation)).all()
     core.close()
@@ -84,7 +84,7 @@ def test_another_robot_is_refused(old, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--reseal"], "expected policy files"),
+        (["--reseal"], "expected policies"),
         (["--reseal", "pid"], "'pid' is an agent"),
         (["--reseal", "velocity_blind", "--out", "x.onnx"], "neither --out nor --card"),
         (["velocity_blind", "--robot", "nominal"], "--robot goes with --reseal"),
@@ -96,7 +96,18 @@ def test_options_that_do_not_go_together(words, message, capsys):
     assert message in capsys.readouterr().err
 
 
-def test_a_policy_folder_is_not_resealed(tmp_path, capsys):
+def test_a_policy_folder_is_resealed_too(old, tmp_path, capsys):
+    """What an earlier ``wlr train`` left: the advice of the refusal holds for it."""
+    contract = tmp_path / "policy" / "contract.json"
+    contract.parent.mkdir()
+    contract.write_text(json.dumps(contract_of(old)))
+    assert main(["export", "--reseal", str(tmp_path)]) == 0
+    assert f"environment.robot.hash: '{FIRST_ROBOT}' -> '2-" in capsys.readouterr().out
+    reseal(old)
+    assert contract_of(tmp_path) == contract_of(old)
+
+
+def test_a_contract_without_a_robot_is_refused(tmp_path, capsys):
     (tmp_path / "contract.json").write_text(json.dumps({"format": 1, "agent": "ppo", "environment": {}, "config": {}}))
     assert main(["export", "--reseal", str(tmp_path)]) == 2
-    assert "is a policy folder" in capsys.readouterr().err
+    assert "robot.hash is None" in capsys.readouterr().err

@@ -100,6 +100,7 @@ def test_text_of_a_tolerance_is_the_tolerance():
         ("body.mass", "[0.1]", r"tolerances\.body\.mass = \[0\.1\]: expected a relative number"),
         ("body.mass", "some", r"'some': expected a relative number \(0\.05 or '5 %'\), or one with its unit \(kg, g\)"),
         ("body.mass", "5 %%", "unknown unit '%%'"),
+        ("body.mass", "0.1 kg m0", "unknown unit 'm0'"),
         ("body.mass", "''", "expected a relative number"),
         ("command.delay", "5 msec", r"unknown unit 'msec' \(did you mean 'ms'\?\); expected .* \(s, ms\)"),
         ("command.delay", "5 mm", r"'mm' is not a unit of command\.delay; expected .* \(s, ms\)"),

@@ -79,7 +79,7 @@ class ServoOptions(RobotOption):
 
 
 class _StoppedError(Exception):
-    """The operator does not want to go on."""
+    """The operator does not want to continue."""
 
 
 class _NobodyThereError(InputError):

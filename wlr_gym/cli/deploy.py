@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.deployment import Deployment
     from wlr_gym.hardware.loop import ControlLoop
 
-#: Ticks between two looks of the live status.
+#: Steps between two looks of the live status.
 _STATUS_TICKS = 10
 
 
@@ -190,7 +190,7 @@ def _say_what_is_not_known(core: Core, console: Console) -> None:
 
 @contextlib.contextmanager
 def _status(loop: ControlLoop, core: Core, keys: Any, show: bool, console: Console) -> Iterator[None]:
-    """Serve the keys, and show the status, in the time that is left in each tick."""
+    """Serve the keys, and show the status, in the time that is left in each step."""
     from rich.live import Live
 
     from wlr_gym.hardware.operator import HELP
@@ -240,7 +240,7 @@ def status_table(loop: ControlLoop, core: Core) -> Any:
     command = "  ".join(f"{name} {value:+.2f}" for name, value in zip(core.task.commands, core.command[0], strict=True))
     limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
     table.caption = (
-        f"{command}\ntilt {tilt_of(status.up):.2f} rad  ticks missed {loop.pacer.missed}\ncommand limiter: {limited}"
+        f"{command}\ntilt {tilt_of(status.up):.2f} rad  steps missed {loop.pacer.missed}\ncommand limiter: {limited}"
     )
     table.caption_justify = "left"
     return table
@@ -253,7 +253,7 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
     colour = "green" if result.well else "red"
     console.print(Text.assemble(("ended: ", "bold"), (result.reason, colour)))
     statistics = result.statistics
-    table = Table(box=None, title=f"{statistics['ticks']} ticks, {statistics['missed']} missed; ms", title_justify="left")
+    table = Table(box=None, title=f"{statistics['ticks']} steps, {statistics['missed']} missed; ms", title_justify="left")
     for name in ("", "p50", "p95", "p99", "max"):
         table.add_column(name, justify="right")
     for name, values in statistics.items():

@@ -21,20 +21,20 @@ from wlr_gym.cli.options import environment_of
 #: Episodes whose observations are compared, and their length, s.
 ROBOTS = 16
 SECONDS = 4.0
-#: ExportOptions of ``wlr train`` that say where and how it ran, not what it did.
+#: Options of ``wlr train`` that say where and how it ran, not what it did.
 ELSEWHERE = ("--out", "--resume", "--max-minutes")
 
 
 @dataclass(frozen=True)
 class ExportOptions:
     policy: tyro.conf.Positional[tuple[str, ...]]
-    """Policy folder or run folder; with --card or --reseal: policy file, or name of a shipped policy."""
+    """Policy folder or run folder; with --card: policy file, or name of a shipped policy; with --reseal: any of these."""
     out: Path | None = None
     """The file; default: policy.onnx."""
     card: Path | None = None
     """Folder that wlr evaluate --out has written: instead, write the model card beside the policy file."""
     reseal: bool = False
-    """Instead, rewrite the contracts of policy files in the present form, where the robot is the same, and say what changed."""
+    """Instead, rewrite the contracts of policies in the present form, where the robot is the same, and say what changed."""
     robot: str | None = None
     """With --reseal: name or path of the robot that they were trained with; default: as their contract says."""
 
@@ -61,13 +61,11 @@ def _reseal(options: ExportOptions) -> None:
     from wlr_gym.policy import find_policy, reseal
 
     if options.out is not None or options.card is not None:
-        raise InputError("--reseal rewrites policy files where they are: neither --out nor --card goes with it")
+        raise InputError("--reseal rewrites policies where they are: neither --out nor --card goes with it")
     if not options.policy:
-        raise InputError("--reseal: expected policy files, or names of shipped policies")
+        raise InputError("--reseal: expected policies: files, folders or names of shipped ones")
     for source in options.policy:
         place = find_policy(source)
-        if not place.is_file():
-            raise InputError(f"{place}: is a policy folder; what can be resealed is a policy file")
         print("\n  ".join([f"{place}:", *(reseal(place, options.robot) or ["nothing changed"])]))
 
 

@@ -141,7 +141,7 @@ def _report(motion: Motion, drive: DriveResult, console: Console) -> None:
 
     ended = drive.reason or "to its end"
     console.print(
-        f"{motion.name}: {drive.ticks} of {len(motion.setpoints)} ticks driven; {ended}",
+        f"{motion.name}: {drive.ticks} of {len(motion.setpoints)} steps driven; {ended}",
         style="" if not drive.reason else "red",
     )
     changed = drive.statistics["interventions"]

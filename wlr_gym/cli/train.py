@@ -66,7 +66,7 @@ def _new(options: TrainOptions) -> tuple[str, Training]:
     settings = Path(options.config or options.agent).stem
     folder = options.out or Path("runs_out") / f"{options.env.rpartition(':')[2]}_{settings}_{config.get('seed', 0)}"
     if folder.is_dir() and any(folder.iterdir()):
-        raise InputError(f"{folder}: not empty; give another --out, or go on with what is there: wlr train --resume {folder}")
+        raise InputError(f"{folder}: not empty; give another --out, or resume what is there: wlr train --resume {folder}")
     return options.agent, _training(options, options.env, folder, config, resume=False)
 
 

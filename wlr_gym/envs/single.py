@@ -39,7 +39,7 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):
         """Start an episode.
 
         Args:
-            seed: whole number; starts a new, reproducible series of episodes. None goes on with the present series.
+            seed: whole number; starts a new, reproducible series of episodes. None continues the present series.
             options: ``command`` {name: value} held for the whole episode; ``parameters`` {name or element: value} set
                 after randomisation and effects.
 

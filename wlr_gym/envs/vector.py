@@ -76,7 +76,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
         """Start episodes.
 
         Args:
-            seed: one number s (robot i gets s + i), or one number or None per robot. None goes on with the present series.
+            seed: one number s (robot i gets s + i), or one number or None per robot. None continues the present series.
             options: as in the single environment, alike for all robots that begin, and ``reset_mask`` (N,) bool: only these.
 
         Raises:

@@ -3,7 +3,7 @@
 from wlr_gym.policy.agents import Agent, Policy, Training, agent_names, load_agent, load_agent_config
 from wlr_gym.policy.export import Parity, export_policy
 from wlr_gym.policy.file import check_contract, needs_camera, read_contract, write_contract
-from wlr_gym.policy.model_card import check_model_card, write_model_card
+from wlr_gym.policy.model_card import write_model_card
 from wlr_gym.policy.reseal import reseal
 from wlr_gym.policy.sources import (
     contract_of,
@@ -22,7 +22,6 @@ __all__ = [
     "Training",
     "agent_names",
     "check_contract",
-    "check_model_card",
     "contract_of",
     "export_policy",
     "find_policy",

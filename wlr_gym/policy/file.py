@@ -105,7 +105,7 @@ def _advice(name: str, mine: Any, policy: Contract, environment: Contract) -> st
     if name not in ("robot.hash", "robot.servo"):
         return ""
     if not str(mine).startswith(f"{HASH_FORM}-"):
-        return " (an older form: if the robot is the same, 'wlr export --reseal FILE' rewrites it)"
+        return " (another form: if the robot is the same, 'wlr export --reseal POLICY' rewrites it)"
     return f" (robot '{policy['robot'].get('name')}' in the policy, '{environment['robot'].get('name')}' in the environment)"
 
 

@@ -40,21 +40,6 @@ def write_model_card(policy: Path, evaluation: str) -> Path:
     return card
 
 
-def check_model_card(policy: Path) -> None:
-    """Refuse a policy file without a card, or with one that was written for another file.
-
-    Raises:
-        InputError: naming both fingerprints.
-    """
-    card, mine = policy.with_suffix(SUFFIX), file_hash(policy)
-    try:
-        named = re.search(r"SHA-256 \| `([0-9a-f]{64})`", card.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{card}: cannot be read: {error.strerror}") from None
-    if named is None or named[1] != mine:
-        raise InputError(f"{card}: is about another file: SHA-256 {named and named[1]}, that of {policy.name} is {mine}")
-
-
 def file_hash(path: Path) -> str:
     """Return the SHA-256 of a file, as ``sha256sum`` prints it."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
@@ -108,7 +93,7 @@ def _terms(columns: list[Mapping[str, Any]]) -> str:
 def _training(agent: str, training: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
     found = [agent]
     if "steps" in training:
-        found.append(f"{training['steps']:,} control ticks")
+        found.append(f"{training['steps']:,} environment steps")
     if "seconds" in training:
         found.append(f"{training['seconds'] / 60.0:.1f} min with {config.get('torch_threads', 1)} thread(s)")
     if "seed" in training:

@@ -1,4 +1,4 @@
-"""Rewrite the contract of a policy file where the code writes contracts in a newer form. What the policy computes stays."""
+"""Rewrite the contract of a policy where the code writes contracts in a newer form. What the policy computes stays."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.base.files import replace_file, write_text
+from wlr_gym.base.files import replace_file, write_json, write_text
 from wlr_gym.base.settings import overlay, read_layers
-from wlr_gym.policy.file import differences, with_defaults
+from wlr_gym.policy.file import CONTRACT_FILE, differences, with_defaults
 from wlr_gym.policy.model_card import SUFFIX as CARD_SUFFIX
 from wlr_gym.policy.model_card import file_hash
 from wlr_gym.policy.onnx_file import open_policy, seal
-from wlr_gym.robot import load_robot, robot_hash, servo_hash
+from wlr_gym.policy.sources import contract_of
+from wlr_gym.robot import Robot, load_robot, robot_hash, servo_hash
 
 
 def reseal(path: Path, robot: str | None = None) -> list[str]:
-    """Rewrite the contract and fingerprint of a policy file, and its SHA-256 in the model cards beside it.
+    """Rewrite the contract of a policy; of a policy file also its fingerprint, and its SHA-256 in the model cards beside it.
 
     The graph stays byte for byte.
 
     Args:
-        path: of the file.
+        path: of the policy file or folder.
         robot: name or path of the robot that it was trained with; default: what its contract says.
 
     Returns:
         What changed: ``key: before -> now``.
 
     Raises:
-        InputError: a broken file, or a robot whose numbers are not those of the training.
-        MissingPackageError: onnx is not installed.
+        InputError: a broken policy, or a robot whose numbers are not those of the training.
+        MissingPackageError: a policy file, and onnx is not installed.
     """
-    require_package("onnx", "export")
-    _, content = open_policy(path)
+    content = contract_of(path)
     before, resealed = content["environment"], copy.deepcopy(content)
     source = robot or (content["config"].get("environment") or {}).get("robot") or "nominal"
     trained = load_robot(source)
-    stated, fingerprint = before["robot"]["hash"], robot_hash(trained)
-    if stated not in (fingerprint, _first_form(source)):
+    stated, fingerprint = (before.get("robot") or {}).get("hash"), robot_hash(trained)
+    if stated not in (fingerprint, _first_form(source, trained)):
         raise InputError(
             f"{path}: robot.hash is {stated!r}, that of robot '{source}' is {fingerprint!r}: not the robot of its training"
         )
@@ -51,19 +51,23 @@ def reseal(path: Path, robot: str | None = None) -> list[str]:
     now["robot"] |= {"hash": fingerprint, "servo": servo_hash(trained)}
     resealed["environment"] = now
     changes = [f"environment.{name}: {_text(old)} -> {_text(new)}" for name, old, new in differences("", before, now)]
+    if path.is_dir():
+        write_json(path / CONTRACT_FILE, resealed)
+        return changes
+    require_package("onnx", "export")
     sha = file_hash(path)
     replace_file(path, lambda temporary: temporary.write_bytes(seal(path.read_bytes(), resealed)))
     open_policy(path)
     return [*changes, *_cards(path, sha)]
 
 
-def _first_form(source: str) -> str:
+def _first_form(source: str, robot: Robot) -> str:
     """Return the hash of a robot as contracts had it at first: of everything in its file, tolerances as they are written."""
     tolerances: Any = {}
     for data, _ in read_layers("robot", source):
         tolerances = overlay(tolerances, data.get("tolerances") or {})
     adapter = TypeAdapter(dict[str, float | str])
-    numbers = load_robot(source).model_dump_json(exclude={"tolerances"})
+    numbers = robot.model_dump_json(exclude={"tolerances"})
     text = f'{numbers[:-1]},"tolerances":{adapter.dump_json(adapter.validate_python(tolerances)).decode()}}}'
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -39,7 +39,7 @@ RELATIVE = {"": 1.0, "%": 100.0}
 #: Tolerances of a robot file, and the rows of the parameter table that each is about.
 KEYS = {spec.tolerance: [row for row in TABLE if row.tolerance == spec.tolerance] for spec in TABLE if spec.tolerance}
 _PART = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^(,]*?)\s*(?:\(\s*(\w*)\s*\))?\s*")
-_SYMBOL = re.compile(r"([A-Za-z]+)(\d?)")
+_SYMBOL = re.compile(r"([A-Za-z]+)([2-9]?)")
 
 
 @dataclass(frozen=True)

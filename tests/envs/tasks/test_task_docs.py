@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from task_markdown import randomization_table, task_tables
 
 from wlr_gym.envs.registry import ENVIRONMENTS
 from wlr_gym.envs.tasks import load_randomization, load_task
-from wlr_gym.envs.tasks.describe import randomization_table
 from wlr_gym.envs.tasks.entries import AreaConfig, EventConfig
-from wlr_gym.envs.tasks.markdown import task_tables
 from wlr_gym.robot import load_robot
 
 ROOT = Path(__file__).parents[3]

@@ -160,14 +160,6 @@ def randomization_rows(config: RandomizationConfig) -> list[tuple[str, ...]]:
     ]
 
 
-def randomization_table(config: RandomizationConfig, base: RandomizationConfig | None = None) -> list[str]:
-    """Return the events as the lines of a Markdown table, without those that ``base`` has just so."""
-    known = [] if base is None else randomization_rows(base)
-    rows = [row for row in randomization_rows(config) if row not in known]
-    code = [(f"`{name}`", ", ".join(f"`{item}`" for item in items.split(", ")), *rest) for name, items, *rest in rows]
-    return [f"| {' | '.join(cells)} |" for cells in [RANDOMIZATION_HEADER, ["---"] * len(RANDOMIZATION_HEADER), *code]]
-
-
 def _when(event: EventConfig) -> str:
     return event.when if event.interval is None else f"{event.when} {_span(event.interval)} s"
 

@@ -288,7 +288,7 @@ class Randomization:
         _make_inertias_physical(Parameters(values))
 
     def next_strike(self, episode_seeds: Seeds, occurrences: Counts, control_period: float) -> Counts:
-        """Return (M, len(intervals)) control ticks until each interval event strikes next."""
+        """Return (M, len(intervals)) control steps until each interval event strikes next."""
         low, high = self._interval_limits.T
         wait = low + (high - low) * uniforms(episode_seeds, self._interval_streams, occurrences)
         return np.maximum(1, np.rint(wait / control_period)).astype(np.int64)

@@ -54,7 +54,7 @@ class Condition:
 
     @property
     def cost(self) -> int:
-        """Relative cost of a environment step of all episodes of a block."""
+        """Relative cost of an environment step of all episodes of a block."""
         return self.episodes * TICK_COST.get(str(self.keywords.get("backend")), 1)
 
 

@@ -1,10 +1,11 @@
-"""A task as Markdown tables: what ``docs/environments.md`` shows, kept equal to the data by a test."""
+"""Tasks and randomisations as Markdown tables: what ``docs/environments.md`` and ``docs/randomization.md`` show."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from wlr_gym.envs.tasks.describe import limits_text, parameters_text
+from wlr_gym.envs.tasks.describe import RANDOMIZATION_HEADER, limits_text, parameters_text, randomization_rows
+from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.task import ObservationColumn, Task
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 
@@ -33,6 +34,14 @@ def task_tables(task: Task) -> list[str]:
         *_table(("termination", "parameters", "meaning"), terminations),
         *_table(("measure", "unit", "success", "meaning"), measures)[:-1],
     ]
+
+
+def randomization_table(config: RandomizationConfig, base: RandomizationConfig | None = None) -> list[str]:
+    """Return the events as the lines of a table, without those that ``base`` has just so."""
+    known = [] if base is None else randomization_rows(base)
+    rows = [row for row in randomization_rows(config) if row not in known]
+    code = [(f"`{name}`", ", ".join(f"`{item}`" for item in items.split(", ")), *rest) for name, items, *rest in rows]
+    return _table(RANDOMIZATION_HEADER, code)[:-1]
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
