@@ -159,7 +159,7 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
         finally:
             plant.close()
         interventions = drive.statistics["interventions"]
-        changed = ", ".join(f"{rule} in {count} ticks" for rule, count in interventions.items()) or "nothing changed"
+        changed = ", ".join(f"{rule} in {count} steps" for rule, count in interventions.items()) or "nothing changed"
         console.print(f"{measured.name}: {drive.ticks} of {len(motion.setpoints)} ticks driven; command limiter: {changed}")
         if drive.reason or drive.run is None:
             console.print(f"stopped: {drive.reason or 'nothing was logged'}", style="red")

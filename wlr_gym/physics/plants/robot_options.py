@@ -20,7 +20,7 @@ class RobotOptions:
         emulated: an emulated robot in this process and in emulated time, instead of ports.
         dry_run: do everything but write to the servos: nothing moves.
         log: folder for the logs of runs; None = none.
-        guard: start the guard process, which switches torque off when this one is killed.
+        guard: start the watchdog process, which switches torque off when this one is killed.
         deadman: s the operator may be silent; None = the hardware file's.
         effects: what the emulated robot has that its file does not say, as ``effects=`` of a simulator; no environment,
             policy or log is told of it.
