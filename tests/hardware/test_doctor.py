@@ -1,11 +1,12 @@
 """``wlr doctor`` on the emulated robot: a good one passes; each fault is named first, with its remedy and exit code."""
 
 import json
+import sys
 from functools import partial
 
 import pytest
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, MissingPackageError
 from wlr_gym.cli import doctor
 from wlr_gym.cli.robot_options import RobotOption
 from wlr_gym.hardware.config import load_hardware
@@ -168,3 +169,12 @@ def test_a_policy_that_fits_and_one_that_does_not(machine, capsys, tmp_path):
     assert "control_period is 0.01 in the policy, 0.02" in text
     code, text = look(capsys, policy=tmp_path / "nowhere")
     assert (code, "is no policy" in text) == (1, True)
+
+
+@pytest.mark.parametrize("emulated", [False, True])
+def test_an_absent_sdk_is_named_with_its_extra(monkeypatch, emulated):
+    monkeypatch.setitem(sys.modules, "dynamixel_sdk", None)
+    for name in ("dynamixel.port", "emulator.memory", "emulator.link"):
+        monkeypatch.delitem(sys.modules, f"wlr_gym.hardware.{name}", raising=False)
+    with pytest.raises(MissingPackageError, match=r"dynamixel_sdk.*wlr-gym\[robot\]"):
+        RobotOption(emulated=emulated).link()

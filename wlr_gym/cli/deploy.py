@@ -72,7 +72,7 @@ def run(options: DeployOptions) -> int:
         InputError: bad options, a policy that does not fit, ports that cannot be opened.
     """
     from wlr_gym.hardware.deployment import deploy, loop_of
-    from wlr_gym.hardware.operator import Keys
+    from wlr_gym.hardware.operator import Keys, stop_on_signals
     from wlr_gym.learning.evaluation import make_core
     from wlr_gym.policy import make_policy, policy_environment
 
@@ -105,7 +105,7 @@ def run(options: DeployOptions) -> int:
             for fault in options.fault:
                 _machine_of(loop).inject(fault)
         keys = stack.enter_context(Keys())
-        stack.enter_context(_signals(loop))
+        stack.enter_context(stop_on_signals(loop.operator))
         stack.enter_context(_status(loop, core, keys, options.status and console.is_terminal, console))
         result = deploy(core, policy, options.seed, command)
     _report(result, loop, console)
@@ -173,12 +173,6 @@ def _emulator(options: DeployOptions, console: Console) -> Iterator[dict[str, st
             process.communicate()
 
 
-def _signals(loop: ControlLoop) -> contextlib.AbstractContextManager[None]:
-    from wlr_gym.hardware.operator import stop_on_signals
-
-    return stop_on_signals(loop.operator)
-
-
 def _say_what_is_not_known(core: Core, console: Console) -> None:
     from wlr_gym.policy import needs_camera
 
@@ -221,7 +215,7 @@ def status_table(loop: ControlLoop, core: Core) -> Any:
     from wlr_gym.hardware.safety.rules import tilt_of
     from wlr_gym.robot import JOINTS
 
-    table = Table(box=None, title=f"{loop.phase.value}  {core.time[0]:.1f} s", title_justify="left")
+    table = Table(box=None, title=f"{loop.phase.name.lower().replace('_', ' ')}  {core.time[0]:.1f} s", title_justify="left")
     for name in ("joint", "angle rad", "setpoint", "speed rad/s", "effort N m", "degC", "V"):
         table.add_column(name, justify="left" if name == "joint" else "right")
     status = loop.status

@@ -52,18 +52,16 @@ class HardwareOption:
         Raises:
             InputError: a patch for a real robot.
         """
-        from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot
+        if self.emulated:
+            from wlr_gym.hardware.emulator import Machine
+            from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot
+
+            return emulated_link(Machine(robot, hardware)) if patch is None else emulated_robot(robot, hardware, patch)
         from wlr_gym.hardware.link import serial_link
 
-        if not self.emulated:
-            if patch is not None and patch.effects:
-                raise InputError("--effects: a real robot has its own; they are for simulators and the emulated robot")
-            return serial_link(robot, hardware)
-        if patch is not None:
-            return emulated_robot(robot, hardware, patch)
-        from wlr_gym.hardware.emulator import Machine
-
-        return emulated_link(Machine(robot, hardware))
+        if patch is not None and patch.effects:
+            raise InputError("--effects: a real robot has its own; they are for simulators and the emulated robot")
+        return serial_link(robot, hardware)
 
     def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
         """Return the robot as a plant, torque off; every start is logged in a new run of ``log``."""

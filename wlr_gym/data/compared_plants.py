@@ -156,7 +156,7 @@ def drive(
     """
     patch = patch or Patch()
     batch = _parameters(motions, robot, parameters, patch)
-    setpoints, torque_on = _goals(motions)
+    setpoints, torque_on = _setpoints(motions)
     options = PlantOptions(motions[0].period, plant.physics_step, plant.precision, threads, sensor_noise=False)
     simulator = make_plant(plant.backend, robot, len(motions), options, patch.forces)
     sensors, truth = [], []
@@ -182,8 +182,8 @@ def _parameters(motions: Sequence[Motion], robot: Robot, parameters: Parameters 
     return Parameters(np.concatenate(rows))
 
 
-def _goals(motions: Sequence[Motion]) -> tuple[Array, NDArray[np.bool_]]:
-    """Setpoints (ticks, motions, 8) and torque switches; a motor that is off keeps its last goal."""
+def _setpoints(motions: Sequence[Motion]) -> tuple[Array, NDArray[np.bool_]]:
+    """Setpoints (ticks, motions, 8) and torque switches; a motor that is off keeps its last setpoint."""
     ticks = max(len(motion.setpoints) for motion in motions)
     setpoints = np.stack([np.pad(m.setpoints, ((0, ticks - len(m.setpoints)), (0, 0)), mode="edge") for m in motions], axis=1)
     torque_on = np.isfinite(setpoints)

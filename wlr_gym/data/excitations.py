@@ -26,7 +26,7 @@ CONTROL_PERIOD = 0.02
 REST = 1.0
 #: What a careful operator writes into the servos' profile registers.
 GENTLE = Profile(wheel_acceleration=11.2, leg_velocity=1.44, leg_acceleration=15.0)
-#: rad/s; fastest wheel goal, 14 % below the no-load speed.
+#: rad/s; fastest wheel setpoint, 14 % below the no-load speed.
 TOP_SPEED = 5.5
 #: rad; leg setpoints stay this far off the leg limits.
 LEG_MARGIN = 0.1
@@ -337,7 +337,7 @@ EXCITATIONS: dict[str, Excitation] = {
         _chirp,
     ),
     "steps": Excitation(
-        "new random goal for every joint each half second, no profile: motors saturate",
+        "new random setpoint for every joint each half second, no profile: motors saturate",
         "torque limits, supply, impacts, unequal wheels",
         _steps,
         Profile(),

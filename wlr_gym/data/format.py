@@ -54,7 +54,7 @@ _TABLE: list[Column] = [
     *_joint_columns(
         "cmd",
         ("rad", "rad/s"),
-        "goal written to the servo in this control step, after the row's sensors were read; NaN = torque off (free-spinning)",
+        "setpoint sent to the servo in this control step, after the row's sensors were read; NaN = torque off (free-spinning)",
         required=True,
         may_be_nan=True,
     ),

@@ -47,7 +47,7 @@ def write_commands(folder: Path, motion: Motion) -> Path:
     lines = [",".join(["t", *COMMANDS])]
     for tick, setpoints in enumerate(motion.setpoints.tolist()):
         lines.append(
-            ",".join([repr(round(tick * motion.period, 9)), *("" if goal != goal else repr(goal) for goal in setpoints)])
+            ",".join([repr(round(tick * motion.period, 9)), *("" if value != value else repr(value) for value in setpoints)])
         )
     path = folder / f"{motion.name}.csv"
     replace_file(path, lambda temporary: temporary.write_text("\n".join(lines) + "\n", encoding="utf-8"))
@@ -120,7 +120,7 @@ def record_simulation(
 ) -> Path:
     """Drive a simulator through a motion and write the run, its ``meta.yaml`` and the record that repeats it bit for bit.
 
-    The robot stands at the first setpoints until it has settled; a leg without a goal stands at home.
+    The robot stands at the first setpoints until it has settled; a leg without one stands at home.
 
     Args:
         path: of the run.

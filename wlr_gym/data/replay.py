@@ -4,7 +4,7 @@ Two comparisons per run. *Full run*: from the measured start, open loop, to the 
 reckoning. *Segments*: the run is cut into pieces of about a second, each started anew from the measured state, so that
 drift does not swamp what is missing in the model. All segments of a run are one batch.
 
-The plant ticks on its own clock (2 ms by default). A goal acts from the row it was written in until the next row's, at the
+The plant ticks on its own clock (2 ms by default). A setpoint acts from the row it was written in until the next row's, at the
 measured times, so jitter and lost control steps are replayed as they happened; simulated channels are interpolated to the rows'
 times. Command delays shift the measured times of the setpoints, so a segment starts with the setpoints that were under way.
 """
@@ -239,7 +239,7 @@ def _simulate(
     """
     clock = plant.options.control_period
     ticks = int(np.ceil(duration / clock))
-    setpoints, torque_on = _goals(run, parameters, begin, ticks, clock)
+    setpoints, torque_on = _setpoints(run, parameters, begin, ticks, clock)
     parameters = parameters.copy()
     parameters["command.delay"] = 0.0  # the setpoints come delayed
     snapshots = np.array([] if passing is None else np.rint((passing - begin[0]) / clock), dtype=int).tolist()
@@ -261,8 +261,8 @@ def _simulate(
     return _Traces(begin, clock, values, float(parameters["camera.delay"][0])), _stacked(states)
 
 
-def _goals(run: Run, parameters: Parameters, begin: Array, ticks: int, clock: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Setpoints (ticks, robots, 8) and torque switches on the plant's clock: each row's goal holds until the next row's.
+def _setpoints(run: Run, parameters: Parameters, begin: Array, ticks: int, clock: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Setpoints (ticks, robots, 8) and torque switches on the plant's clock: each row's holds until the next row's.
 
     Setpoints are delayed, switching the torque is not: as in :class:`wlr_gym.physics.plants.setpoints.SetpointHistory`.
     """
@@ -279,9 +279,9 @@ def _goals(run: Run, parameters: Parameters, begin: Array, ticks: int, clock: fl
 
 
 def held_setpoints(run: Run) -> Array:
-    """Setpoints (rows, 8) that the servos hold: a motor that is off gets no new goal, so it keeps the one before.
+    """Setpoints (rows, 8) that the servos hold: a motor that is off gets no new one, so it keeps the one before.
 
-    Before its first goal a joint has the first one; a joint without any stays: a leg at its first measured angle, a wheel at
+    Before its first setpoint a joint has that one; a joint without any stays: a leg at its first measured angle, a wheel at
     speed 0.
     """
     import pandas

@@ -58,13 +58,13 @@ def simulate_again(run: Run, robot: Robot, backend: str | None = None) -> dict[s
     plant = make_plant(record.backend if backend is None else backend, robot, 1, options, forces)
     try:
         sensors = plant.reset(np.array([record.seed], np.uint64), parameters, state=_state(record, run))
-        for row, goal in enumerate(setpoints):
+        for row, wanted in enumerate(setpoints):
             rows[row] = channels(sensors, 0)
             if row in changes:
                 _set(parameters, changes[row])
                 plant.set_parameters(parameters)
-            torque_on = np.isfinite(goal)
-            sensors = plant.step(np.nan_to_num(goal)[None], None if torque_on.all() else torque_on[None])
+            torque_on = np.isfinite(wanted)
+            sensors = plant.step(np.nan_to_num(wanted)[None], None if torque_on.all() else torque_on[None])
     finally:
         plant.close()
     return dict(zip(SENSED, rows.T, strict=True))

@@ -62,8 +62,8 @@ def start_state(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
     legs = np.array([[run[f"cmd_{joint}"][0] for joint in LEGS]])
     degree = 0 if starts_at_rest(run) else 2
     measured = _joints(run, first, parameters, degree)[0]
-    goal = legs - parameters["joint.zero_offset"]
-    background.reference_position[:, LEG_SLICE] = np.where(np.isnan(goal), measured[:, LEG_SLICE], goal)
+    wanted = legs - parameters["joint.zero_offset"]
+    background.reference_position[:, LEG_SLICE] = np.where(np.isnan(wanted), measured[:, LEG_SLICE], wanted)
     background.reference_position[:, WHEEL_SLICE] += _wheel_tension(run, robot, parameters)
     state = measured_state(run, first, background, parameters, degree)
     state.reference_velocity[:, WHEEL_SLICE] = state.joint_velocity[:, WHEEL_SLICE]
@@ -181,7 +181,7 @@ def _wheel_tension(run: Run, robot: Robot, parameters: Parameters) -> Array:
 
 
 def _rows_before_motion(run: Run) -> NDArray[np.bool_]:
-    """Rows of the first tenths of a second that were read before any goal asked a wheel to turn; the first one at least."""
+    """Rows of the first tenths of a second that were read before any setpoint asked a wheel to turn; the first one at least."""
     asked = np.any([np.nan_to_num(run[f"cmd_{joint}"]) != 0.0 for joint in WHEELS], axis=0)
     before = np.concatenate([[False], np.logical_or.accumulate(asked)[:-1]])
     return (run["t"] <= run["t"][0] + CAMERA_WINDOW) & ~before

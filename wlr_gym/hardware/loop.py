@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.bus import NoAnswerError, RefusedError
+from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.log import RunRecorder, origin_of, sensors_of
 from wlr_gym.hardware.operator import Operator

@@ -153,6 +153,6 @@ class RobotPlant:
 def _link(robot: Robot, hardware: Hardware, chosen: RobotOptions, options: PlantOptions) -> Link:
     if not chosen.emulated:
         return serial_link(robot, hardware)
-    from wlr_gym.hardware.emulator.link import emulated_robot  # needs the optional dynamixel-sdk
+    from wlr_gym.hardware.emulator.link import emulated_robot  # with the simulators, which a real robot does not need
 
     return emulated_robot(robot, hardware, chosen.effects, sensor_noise=options.sensor_noise)

@@ -54,7 +54,7 @@ def test_every_key_of_an_event_is_explained():
 
 
 def test_the_examples_load(tmp_path):
-    late, whole, copy = re.findall("```yaml\n(.*?)```", TEXT, re.S)
+    late, copy, whole = re.findall("```yaml\n(.*?)```", TEXT, re.S)
     (tmp_path / "mine.yaml").write_text(copy)
     assert load_robot(tmp_path / "mine.yaml").tolerances["body.com_offset"].legs == 0.003
     late, whole = yaml.safe_load(late), yaml.safe_load(whole)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from wlr_gym.base.errors import require_package
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
-from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu, MemoryPort
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.physics.effects import apply_patch, load_patch
@@ -15,7 +15,14 @@ from wlr_gym.robot.parameters import Parameters
 
 
 def emulated_link(machine: Machine) -> Link:
-    """Return a link to an emulated robot in this process and in emulated time: the same bits each time."""
+    """Return a link to an emulated robot in this process and in emulated time: the same bits each time.
+
+    Raises:
+        MissingPackageError: dynamixel-sdk is not installed.
+    """
+    require_package("dynamixel_sdk", "robot")
+    from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu, MemoryPort
+
     world, hardware = EmulatedWorld(machine), machine.hardware
     names = {bus.port: name for name, bus in hardware.buses.items()}
     servos = Servos(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import Profile
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.bus import NoAnswerError, RefusedError
+from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 from wlr_gym.hardware.safety import preflight, rules
 from wlr_gym.hardware.safety.rules import Decision, Memory, RobotStatus
 from wlr_gym.hardware.servos import JointReadings, Servos
