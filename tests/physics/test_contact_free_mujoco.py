@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from energy import kinetic_energy, potential_energy
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.model import dynamics
@@ -152,12 +153,12 @@ def test_mass_matrix(cases):
 
 
 def test_kinetic_energy(cases):
-    ours = dynamics.kinetic_energy(cases.parameters, cases.v, cases.w, cases.joint_position, cases.joint_velocity)
+    ours = kinetic_energy(cases.parameters, cases.v, cases.w, cases.joint_position, cases.joint_velocity)
     np.testing.assert_allclose(ours, cases.kinetic, rtol=1e-12)
 
 
 def test_potential_energy(cases):
-    ours = dynamics.potential_energy(cases.parameters, cases.position, cases.quaternion, cases.joint_position)
+    ours = potential_energy(cases.parameters, cases.position, cases.quaternion, cases.joint_position)
     np.testing.assert_allclose(ours, cases.potential, rtol=1e-10, atol=1e-10)
 
 

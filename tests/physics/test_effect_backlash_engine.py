@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from energy import kinetic_energy
 from rig import LEGS_DOWN, RADIUS, ROBOT, drive, float_in_space, gears, lift, lock, make_plant, record, wheels_off
 
-from wlr_gym.physics.model import dynamics
 from wlr_gym.physics.servo import motor_constants
 
 WHEEL = ROBOT.servo.wheel
@@ -73,7 +73,7 @@ def mechanical_energy(plant):
     parameters = plant.parameters.copy()
     armature, play = parameters["servo.armature"].copy(), parameters["servo.backlash"]
     parameters["servo.armature"] = np.where(play > 0.0, 0.0, armature)
-    bodies = dynamics.kinetic_energy(
+    bodies = kinetic_energy(
         parameters,
         truth.linear_velocity_in_body,
         truth.angular_velocity_in_body,

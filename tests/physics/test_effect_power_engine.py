@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from energy import kinetic_energy, potential_energy
 from rig import LEGS_DOWN, ROBOT, drive, float_in_space, gears, lift, lock, make_plant
 
 from wlr_gym.physics.model import dynamics
@@ -46,8 +47,8 @@ def stored(plant):
     play, armature = parameters["servo.backlash"], parameters["servo.armature"].copy()
     parameters["servo.armature"] = np.where(play > 0.0, 0.0, armature)
     v, w = truth.linear_velocity_in_body, truth.angular_velocity_in_body
-    total = dynamics.kinetic_energy(parameters, v, w, truth.joint_position, truth.joint_velocity)
-    total += dynamics.potential_energy(parameters, truth.position, truth.quaternion, truth.joint_position)
+    total = kinetic_energy(parameters, v, w, truth.joint_position, truth.joint_velocity)
+    total += potential_energy(parameters, truth.position, truth.quaternion, truth.joint_position)
     pressed = np.maximum(np.abs(state.rotor_lead) - 0.5 * play, 0.0)
     rotor = armature * state.rotor_rate**2 + parameters["servo.gear_stiffness"] * pressed**2
     total += 0.5 * np.where(play > 0.0, rotor, 0.0).sum(axis=1)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from energy import kinetic_energy, potential_energy
 from rig import make_plant
 
 from wlr_gym.physics.model import dynamics
@@ -25,8 +26,8 @@ def edit(parameters):
 
 def energy(parameters, truth):
     v, w = truth.linear_velocity_in_body, truth.angular_velocity_in_body
-    kinetic = dynamics.kinetic_energy(parameters, v, w, truth.joint_position, truth.joint_velocity)
-    return kinetic + dynamics.potential_energy(parameters, truth.position, truth.quaternion, truth.joint_position)
+    kinetic = kinetic_energy(parameters, v, w, truth.joint_position, truth.joint_velocity)
+    return kinetic + potential_energy(parameters, truth.position, truth.quaternion, truth.joint_position)
 
 
 def wheel_gaps(parameters, truth):

@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+from energy import kinetic_energy, potential_energy
 from rig import ROBOT, make_plant
 from test_contact_free_mujoco import random_parameters
 
@@ -115,16 +116,14 @@ def fly(step):
 
 def energies(plant):
     state = plant.get_state()
-    kinetic = dynamics.kinetic_energy(
+    kinetic = kinetic_energy(
         plant.parameters,
         state.linear_velocity_in_body,
         state.angular_velocity_in_body,
         state.joint_position,
         state.joint_velocity,
     )
-    return kinetic, kinetic + dynamics.potential_energy(
-        plant.parameters, state.position, state.quaternion, state.joint_position
-    )
+    return kinetic, kinetic + potential_energy(plant.parameters, state.position, state.quaternion, state.joint_position)
 
 
 def test_free_flight_conserves_energy():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from energy import kinetic_energy, potential_energy
 from two_plants import ROBOT, make
 
 from wlr_gym.physics.model import dynamics
@@ -76,9 +77,9 @@ def edit(parameters):
 
 def stored(parameters, truth):
     v, w = truth.linear_velocity_in_body, truth.angular_velocity_in_body
-    kinetic = dynamics.kinetic_energy(parameters, v, w, truth.joint_position, truth.joint_velocity)
+    kinetic = kinetic_energy(parameters, v, w, truth.joint_position, truth.joint_velocity)
     tether = 0.5 * parameters["tether.stiffness"] * (truth.position[:, :2] ** 2).sum(axis=1)
-    return kinetic + tether + dynamics.potential_energy(parameters, truth.position, truth.quaternion, truth.joint_position)
+    return kinetic + tether + potential_energy(parameters, truth.position, truth.quaternion, truth.joint_position)
 
 
 def wheel_gaps(parameters, truth):

@@ -97,7 +97,7 @@ def analyse(
         backend: simulator.
         heldout: names of the runs to hold out; empty = chosen by how informative the other runs are.
         threads: worker threads; the result does not depend on it.
-        tell: told of progress.
+        tell: called with progress.
 
     Raises:
         InputError: data that cannot be read, a run, rig or backend that does not exist, a folder that the results cannot go
@@ -223,7 +223,7 @@ def _choose_runs(problem: Problem, heldout: Sequence[str]) -> tuple[list[int], l
 
 
 class _Clock:
-    """Times the stages and tells of them."""
+    """Times the stages and reports them."""
 
     def __init__(self, tell: Tell) -> None:
         self.seconds: dict[str, float] = {}

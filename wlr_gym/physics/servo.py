@@ -250,47 +250,25 @@ REGISTER_UNITS: Mapping[str, Mapping[str, Register]] = {
 }
 
 
-def _register(model: str, quantity: str) -> Register:
-    if model not in REGISTER_UNITS:
-        raise unknown_name("servo model", model, REGISTER_UNITS)
-    if quantity not in REGISTER_UNITS[model]:
-        raise unknown_name("register quantity", quantity, REGISTER_UNITS[model], model)
-    return REGISTER_UNITS[model][quantity]
-
-
-def _require_range(counts: Array, register: Register, model: str, quantity: str) -> None:
-    bad = ~((counts >= register.low) & (counts <= register.high))
-    if bad.any():
-        worst = np.ravel(counts)[np.ravel(bad)][0]
-        raise InputError(
-            f"{model} {quantity}: {worst * register.per_count:g} {register.unit} ({worst:g} counts) is outside "
-            f"[{register.low}, {register.high}] counts = "
-            f"[{register.low * register.per_count:g}, {register.high * register.per_count:g}] {register.unit}"
-        )
-
-
-def to_register(model: str, quantity: str, si_value: ArrayLike) -> Any:
-    """Return the register count(s) nearest to an SI value: int, or an integer array of the same shape.
-
-    Raises:
-        InputError: unknown model or quantity, non-finite value, or one beyond the register's range.
-    """
-    register = _register(model, quantity)
-    counts = np.rint(np.asarray(si_value, dtype=np.float64) / register.per_count)
-    _require_range(counts, register, model, quantity)
-    whole = counts.astype(np.int64)
-    return int(whole) if whole.ndim == 0 else whole
-
-
 def from_register(model: str, quantity: str, counts: ArrayLike) -> Any:
     """Return the SI value(s) of register counts: float, or an array of the same shape.
 
     Raises:
         InputError: unknown model or quantity, or counts beyond the register's range.
     """
-    register = _register(model, quantity)
-    values = np.asarray(counts, dtype=np.float64)
-    _require_range(values, register, model, quantity)
+    if model not in REGISTER_UNITS:
+        raise unknown_name("servo model", model, REGISTER_UNITS)
+    if quantity not in REGISTER_UNITS[model]:
+        raise unknown_name("register quantity", quantity, REGISTER_UNITS[model], model)
+    register, values = REGISTER_UNITS[model][quantity], np.asarray(counts, dtype=np.float64)
+    bad = ~((values >= register.low) & (values <= register.high))
+    if bad.any():
+        worst = np.ravel(values)[np.ravel(bad)][0]
+        raise InputError(
+            f"{model} {quantity}: {worst * register.per_count:g} {register.unit} ({worst:g} counts) is outside "
+            f"[{register.low}, {register.high}] counts = "
+            f"[{register.low * register.per_count:g}, {register.high * register.per_count:g}] {register.unit}"
+        )
     return float(values * register.per_count) if values.ndim == 0 else values * register.per_count
 
 

@@ -13,7 +13,7 @@ from wlr_gym.robot import load_robot
 
 
 def test_pose_in_mujocos_picture(graphics):
-    from wlr_gym.studies.bench.vision_mujoco import MujocoStudio
+    from mujoco_studio import MujocoStudio  # after a graphics backend is chosen
 
     camera = Camera(width=1280, height=720, focal=(800.0, 800.0), centre=(639.5, 359.5))
     floor = load_target("floor")

@@ -34,7 +34,8 @@ def test_masses_enter_only_through_their_three_moments():
         first: leg_mass * com + wheel_mass * length,
         second: leg_mass * com**2 + wheel_mass * length**2,
     }
-    by_body = d.translation_of_bodies(leg_mass, com, wheel_mass, length)
+    leg = d.translational_gibbs(leg_mass, d.acceleration_along_leg(com))
+    by_body = leg + d.translational_gibbs(wheel_mass, d.acceleration_along_leg(length))
     assert sp.expand(by_body - d.translation_by_moments().subs(moments)) == 0
 
 

@@ -76,5 +76,6 @@ def test_search_is_reproducible_covers_pairs_and_closes_in(tmp_path):
     assert miss[-12:].min() < miss[:3].min()
     text = "\n".join(report.question_lines(first, report.what_would_decide(ROBOT, first)))
     assert "radius + camera" in text
+    assert f"### Reading: {READINGS[0].doc}" in text
     entry = pair.as_dict()["readings"][READINGS[0].name]
     assert entry["closest"] == pytest.approx(miss.min())

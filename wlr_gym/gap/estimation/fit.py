@@ -165,7 +165,7 @@ def fit(
         near: a fit of the same numbers, or of all but the last of them, whose columns serve for idle ones.
         steps: at most this many Gauss-Newton steps.
         renew: simulate the columns, but idle ones, anew at every step; otherwise only once, where ``columns`` are missing.
-        tell: information of progress.
+        tell: called with progress.
     """
     if columns is not None:
         residuals = [r[0] for r in problem.residuals([model.setting], runs)]

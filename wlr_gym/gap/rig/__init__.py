@@ -5,8 +5,8 @@ them (:mod:`.intake`), a fast simulation (:mod:`.law`, :mod:`.kernel`, :mod:`.re
 :class:`wlr_gym.gap.problem.Problem` (:mod:`.model`, :mod:`.candidates`, :mod:`.problem`).
 """
 
+from wlr_gym.gap.rig.effects import RIG_EFFECTS
 from wlr_gym.gap.rig.intake import findings
-from wlr_gym.gap.rig.model import RIG_EFFECTS
 from wlr_gym.gap.rig.open import open_rig, rig_patch
 from wlr_gym.gap.rig.problem import RigProblem
 from wlr_gym.gap.rig.recording import Recording, read_recordings

@@ -1,4 +1,4 @@
-"""The rig's calibrated parameters, the effects that may act in it, and what the compiled law reads of both.
+"""The rig's calibrated parameters, and what the compiled law reads of them and of the effects.
 
 Servo: XL330-M288-T by its data sheet (ROBOTIS e-manual: stall torque 0.52 N m, no load 103 rev/min, both at 5 V). That its gear
 has dry and viscous friction is known; how much is fitted.
@@ -7,25 +7,25 @@ has dry and viscous friction is known; how much is fitted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.gap.problem import Quantity, Setting, Unknown
+from wlr_gym.gap.problem import Quantity, Setting
 from wlr_gym.gap.rig import law
+from wlr_gym.gap.rig.effects import NO_TORQUE_LIMIT, RIG_EFFECTS, Numbers
 from wlr_gym.gap.rig.formula import rig_force
 from wlr_gym.gap.rig.recording import FULL_DUTY, Recording
 from wlr_gym.physics import servo
-from wlr_gym.physics.effects.effect import EffectParameter, PatchEffect
-from wlr_gym.physics.effects.registry import EFFECTS, UNKNOWN_EFFECT
+from wlr_gym.physics.effects.effect import PatchEffect
+from wlr_gym.physics.effects.registry import UNKNOWN_EFFECT
 from wlr_gym.physics.plants import drive
 from wlr_gym.physics.plants.forces import Force
 
 Array = NDArray[np.float64]
-Numbers = dict[str, float]
 
 #: The rig's one joint, where its effects act.
 JOINT = "servo"
@@ -43,8 +43,6 @@ DUTY_PER_GAIN = 4096 / (2 * math.pi) / (256 * FULL_DUTY)
 REFERENCE_TEMPERATURE = 25.0
 #: Of the gear's teeth where it has play, N m/rad.
 TEETH_STIFFNESS = 50.0
-#: N m; a limit that no torque reaches.
-NO_TORQUE_LIMIT = 10.0
 
 #: What calibration may move. The motor is given as in its data sheet (:func:`wlr_gym.physics.servo.motor_constants` makes
 #: torque constant and resistance of it), which says nothing of friction, rotor and delay: wide tolerances about a small
@@ -62,94 +60,11 @@ QUANTITIES: tuple[Quantity, ...] = (
 )
 
 
-def _add(target: str, parameter: str) -> Callable[[Numbers, Mapping[str, float]], None]:
-    def apply(numbers: Numbers, values: Mapping[str, float]) -> None:
-        numbers[target] += values[parameter]
-
-    return apply
-
-
-def _multiply(target: str, parameter: str) -> Callable[[Numbers, Mapping[str, float]], None]:
-    def apply(numbers: Numbers, values: Mapping[str, float]) -> None:
-        numbers[target] *= values[parameter]
-
-    return apply
-
-
-def _put(**targets: str) -> Callable[[Numbers, Mapping[str, float]], None]:
-    def apply(numbers: Numbers, values: Mapping[str, float]) -> None:
-        numbers.update({target: values[parameter] for target, parameter in targets.items()})
-
-    return apply
-
-
-@dataclass(frozen=True)
-class RigEffect:
-    """An effect as the rig knows it.
-
-    Attributes:
-        doc: what is missing without it, and its law.
-        parameters: as in the effect library, ``prior`` being the plausible range.
-        apply: writes it into the numbers of a model.
-    """
-
-    doc: str
-    parameters: Mapping[str, EffectParameter]
-    apply: Callable[[Numbers, Mapping[str, float]], None]
-
-
-def _library(name: str, apply: Callable[[Numbers, Mapping[str, float]], None]) -> RigEffect:
-    return RigEffect(EFFECTS[name].doc, EFFECTS[name].parameters, apply)
-
-
-#: Effects by name. Those of the library have its law and parameters; the last four are the rig's own.
-RIG_EFFECTS: dict[str, RigEffect] = {
-    "coulomb_friction": _library("coulomb_friction", _add("coulomb_friction", "torque")),
-    "viscous_friction": _library("viscous_friction", _add("viscous_friction", "coefficient")),
-    "stribeck_friction": _library(
-        "stribeck_friction", _put(stribeck_torque="extra_static_torque", stribeck_speed="stribeck_speed")
-    ),
-    "load_dependent_friction": _library("load_dependent_friction", _add("load_friction", "ratio")),
-    "backlash": _library("backlash", _add("play", "angle")),
-    "torque_ripple": _library("torque_ripple", _put(ripple_amplitude="amplitude", ripple_order="order", ripple_phase="phase")),
-    "weak_motor": _library("weak_motor", _multiply("torque_scale", "scale")),
-    "command_delay": _library("command_delay", _add("delay", "delay")),
-    "torque_saturation": RigEffect(
-        "torque falls behind the current: K I / (1 + coefficient |I|)",
-        {"coefficient": EffectParameter("1/A", "loss per current", 0, 10, 0.0, (0, 2), 0.3)},
-        _add("saturation", "coefficient"),
-    ),
-    "torque_limit": RigEffect(
-        "motor torque stays below a limit: |motor torque| <= torque; the data sheet's stall torque is reached, within 15 %",
-        {"torque": EffectParameter("N m", "the limit", 0.01, NO_TORQUE_LIMIT, NO_TORQUE_LIMIT, (0.45, NO_TORQUE_LIMIT), 0.6)},
-        _put(torque_limit="torque"),
-    ),
-    "quadratic_load_friction": RigEffect(
-        "gear friction growing with the square of the motor torque: -coefficient torque^2 sign(rate)",
-        {"coefficient": EffectParameter("1/(N m)", "friction per torque squared", 0, 20, 0.0, (0, 2), 0.3)},
-        _add("quadratic_friction", "coefficient"),
-    ),
-    "warm_winding": RigEffect(
-        "resistance grows with the temperature the servo reports: R (1 + coefficient (T - 25 deg C)); copper: 0.0039/K",
-        {"coefficient": EffectParameter("1/K", "relative, per degree", -0.01, 1, 0.0, (0, 0.0045), 0.0039)},
-        _add("thermal", "coefficient"),
-    ),
-}
 _NEUTRAL: Numbers = {
     "coulomb_friction": 0.0, "viscous_friction": 0.0, "stribeck_torque": 0.0, "stribeck_speed": 0.1, "load_friction": 0.0,
     "play": 0.0, "ripple_amplitude": 0.0, "ripple_order": 1.0, "ripple_phase": 0.0, "torque_scale": 1.0,
     "saturation": 0.0, "torque_limit": NO_TORQUE_LIMIT, "quadratic_friction": 0.0, "thermal": 0.0,
 }  # fmt: skip
-
-
-def unknowns(name: str) -> tuple[Unknown, ...]:
-    """Return the parameters of an effect as unknowns; their plausible range is the effect's prior."""
-    found = []
-    for key, parameter in RIG_EFFECTS[name].parameters.items():
-        low, high = parameter.prior
-        assert isinstance(parameter.neutral, float | int)
-        found.append(Unknown(key, parameter.unit, float(parameter.neutral), low, high, 0.02 * (min(high, 2.0) - low)))
-    return tuple(found)
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.paths import find_config
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.gap.analysis import IntakeFinding
+from wlr_gym.gap.rig.effects import RIG_EFFECTS
 from wlr_gym.gap.rig.formula import rig_force
 from wlr_gym.gap.rig.intake import findings
-from wlr_gym.gap.rig.model import JOINT, RIG_EFFECTS
+from wlr_gym.gap.rig.model import JOINT
 from wlr_gym.gap.rig.problem import RigProblem
 from wlr_gym.gap.rig.recording import read_recordings
 from wlr_gym.physics.codegen.expression import finite_number

@@ -154,10 +154,6 @@ class RigProblem:
             )
         return found
 
-    def position_errors(self, setting: Setting, runs: Sequence[int]) -> Array:
-        """Return the mean absolute error of the angle (runs,) over whole runs, rad."""
-        return np.array([float(np.abs(r[0, :, 0]).mean()) * ENCODER_NOISE for r in self.residuals([setting], runs)])
-
 
 def spread_over_conditions(recordings: Sequence[Recording], share: float = HELD_OUT_SHARE) -> tuple[str, ...]:
     """Return the names of runs to hold out: in turn one of every gain, each of the trajectory that is held out least so far."""

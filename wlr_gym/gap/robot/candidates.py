@@ -50,7 +50,7 @@ def shown_by() -> Mapping[str, str]:
 
 
 def _searches() -> Iterator[tuple[Effect, Search, Places]]:
-    """Every effect at every set of places; effects that start from known numbers alike take turns at each place."""
+    """Every effect at every set of places; effects that start from calibrated parameters take turns at each place."""
     sought = ((effect, effect.search) for effect in EFFECTS.values() if effect.search is not None)
     for _, alike in itertools.groupby(sought, lambda one: one[1].places if one[1].guesses is None else one[0].name):
         group = list(alike)
@@ -96,7 +96,7 @@ class _Library:
         return tuple(found)
 
     def _known_start(self, effect: Effect, where: Places, known: Mapping[str, Known]) -> Start:
-        """Start from the responses to known numbers: one tolerance each, or a probe where the robot's file gives none."""
+        """Start from responses to calibrated parameters: a tolerance each, or a probe where the robot's file gives none."""
         neutral = {name: effect.parameters[name].neutral_in(self.observed.parameters) for name in known}
         directions, amounts = [], []
         for name, number in known.items():

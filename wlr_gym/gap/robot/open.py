@@ -16,7 +16,7 @@ from wlr_gym.gap.robot.problem import RobotProblem
 from wlr_gym.physics.effects import Source
 from wlr_gym.robot import JOINTS, LEGS
 
-#: Runs that an analysis needs: two to fit, one for the proof.
+#: Runs that an analysis needs: two to fit, one to hold out.
 LEAST_RUNS = 3
 #: s; shorter runs hold no window to compare.
 LEAST_SECONDS = 3.0
@@ -65,13 +65,13 @@ def open_robot(
     good = [run for run in runs if not any(f.fatal and f.run == run.name for f in findings)]
     if len(good) < LEAST_RUNS:
         text = (
-            f"{len(good)} usable runs of {len(runs)}: at least {LEAST_RUNS} are needed, two to fit and one for the proof. "
+            f"{len(good)} usable runs of {len(runs)}: at least {LEAST_RUNS} are needed, two to fit and one to hold out. "
             "Record more, of different kinds: wlr record --list"
         )
         return None, [*findings, IntakeFinding("", "", "few_runs", text, fatal=True)]
     rows = sum(len(run["t"]) for run in good)
     if rows > MANY_ROWS:
-        text = f"{rows} rows in all: needs about {rows * MEMORY_PER_ROW:.0f} GB of memory; eight runs of 20 s tell as much"
+        text = f"{rows} rows in all: needs about {rows * MEMORY_PER_ROW:.0f} GB of memory; eight runs of 20 s are enough"
         findings.append(IntakeFinding("", "", "long", text))
     return RobotProblem(good, robot_of(good[0], robot), known, backend, threads=threads), findings
 

@@ -68,7 +68,7 @@ def fit_finalists(
         current: the model so far.
         hypotheses: refitted, best first.
         bare: the best model without a further effect so far.
-        tell: told of progress.
+        tell: called with progress.
 
     Returns:
         The finalists, best first; the best model without a further effect, which may be one that a finalist has led to.

@@ -85,7 +85,7 @@ def search_effects(
         problem: the system.
         runs: those that are fitted; no other is used.
         start: the calibrated model.
-        tell: told of progress.
+        tell: called with progress.
         given: columns of ``start`` without its calibration, where they are known: one (numbers, rows x channels) array per run.
     """
     if given is None and not problem.thorough:

@@ -6,6 +6,6 @@ On nodes it builds an expression graph with shared sub-expressions, which :func:
 """
 
 from wlr_gym.physics.codegen.graph import Graph, Node, emit, hoist, live_nodes
-from wlr_gym.physics.codegen.module import load_module
+from wlr_gym.physics.codegen.module import load_module, source_of
 
-__all__ = ["Graph", "Node", "emit", "hoist", "live_nodes", "load_module"]
+__all__ = ["Graph", "Node", "emit", "hoist", "live_nodes", "load_module", "source_of"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import inspect
 import os
 import platform
 import sys
@@ -44,6 +45,14 @@ def fingerprint(*texts: str) -> str:
     return hashlib.sha256("\0".join([*versions, *texts]).encode()).hexdigest()[:16]
 
 
+def source_of(*modules: ModuleType) -> str:
+    """Return the source of modules that a kernel is traced from, for its ``key``.
+
+    Call it at import, so that the key is that of the code that is loaded.
+    """
+    return "\0".join(map(inspect.getsource, modules))
+
+
 def load_module(tag: str, source: str | Callable[[], str], message: str = "", key: str = "") -> ModuleType:
     """Import generated numba source from the cache, writing it there first if it is new.
 
@@ -56,7 +65,9 @@ def load_module(tag: str, source: str | Callable[[], str], message: str = "", ke
     Returns:
         The module. Its ``@njit(cache=True)`` functions compile at first call and are kept beside the source.
     """
-    identity = fingerprint(HEADER, tag, key if callable(source) else source)
+    from wlr_gym.physics.codegen import intrinsics
+
+    identity = fingerprint(HEADER, source_of(intrinsics), tag, key if callable(source) else source)
     name = f"{tag}_{identity}"
     if name in sys.modules:
         return sys.modules[name]

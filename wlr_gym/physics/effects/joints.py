@@ -178,8 +178,6 @@ EFFECTS: tuple[Effect, ...] = (
             {"order": "servo.ripple_order", "phase": "servo.ripple_phase"},
             "ripple",
         ),
-        search=Search(
-            TORQUE, "straight", tuple((joint,) for joint in JOINTS), _ripple_guesses, coordinates=_ripple_coordinates
-        ),
+        search=Search(TORQUE, "straight", EACH_JOINT, _ripple_guesses, coordinates=_ripple_coordinates),
     ),
 )

@@ -159,10 +159,11 @@ class Search:
 
 def steps(parameter: str, *sizes: float, neutral: float = 0.0) -> Callable[[Places, Observed], list[Guess]]:
     """Return guesses of an effect of one parameter, from changes of these sizes: several where its response is not linear."""
-    return lambda where, observed: [_step(parameter, size, neutral) for size in sizes]
+    return lambda where, observed: [one_step(parameter, size, neutral) for size in sizes]
 
 
-def _step(parameter: str, size: float, neutral: float) -> Guess:
+def one_step(parameter: str, size: float, neutral: float) -> Guess:
+    """Return a guess of an effect of one parameter, from a change of this size."""
     return Guess(((Change({parameter: neutral + size}),),), lambda a: (neutral + size * float(a[0]),))
 
 

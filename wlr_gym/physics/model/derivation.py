@@ -138,14 +138,6 @@ def translation_by_moments() -> Expression:
     return mass * constant + first_moment * linear + second_moment * quadratic
 
 
-def translation_of_bodies(
-    leg_mass: Expression, com_along_leg: Expression, wheel_mass: Expression, length: Expression
-) -> Expression:
-    """The same, body by body: leg at its centre of mass, wheel at the end of the leg. For the proof only."""
-    leg = translational_gibbs(leg_mass, acceleration_along_leg(com_along_leg))
-    return leg + translational_gibbs(wheel_mass, acceleration_along_leg(length))
-
-
 def rotation_of_assembly() -> Expression:
     """Rotational Gibbs function of leg, wheel and the two rotors.
 

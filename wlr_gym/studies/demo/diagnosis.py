@@ -48,7 +48,7 @@ def name(demo: Demo, tell: Tell) -> Section:
     html += f"<p><b>{escape(sentence(found))}</b></p>"
     plots = demo.gap / "plots"
     for kind, caption in (
-        ("evidence", "How much each explanation improves the fit; the selected one is dark."),
+        ("evidence", "By how much each candidate improves the fit; the selected one is dark."),
         ("overlays_1", "Measured channels, and the same runs replayed by the simulator as given, calibrated, and with what was "
          "found; below each the error that is left. Green: two standard deviations of sensor noise."),
     ):  # fmt: skip

@@ -168,7 +168,7 @@ def question_lines(findings: Sequence[SearchFinding], decisive: Mapping[str, Dec
         "",
     ]
     for reading in READINGS:
-        lines += [f"### PaperReading: {reading.doc}", "", *_closest(findings, reading), "", *_ranges(findings, reading)]
+        lines += [f"### Reading: {reading.doc}", "", *_closest(findings, reading), "", *_ranges(findings, reading)]
         found = decisive.get(reading.name, {})
         if len(found) > 1:
             lines += [*_decisive(found), ""]

@@ -7,18 +7,17 @@ robots beside it, or on the number of threads.
 
 from __future__ import annotations
 
-import inspect
 import sys
 from collections.abc import Iterator, Mapping
 from types import ModuleType
 from typing import Any
 
 from wlr_gym.physics import servo
-from wlr_gym.physics.codegen import Graph, Node, emit, graph, hoist, live_nodes, load_module, ops
+from wlr_gym.physics.codegen import Graph, Node, emit, graph, hoist, live_nodes, load_module, ops, source_of
 from wlr_gym.physics.model import equations
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
-from wlr_gym.physics.plants.gibbs_appell import friction, gauss, kinematics, lanes, packing
+from wlr_gym.physics.plants.gibbs_appell import friction, gauss, kinematics, lanes
 from wlr_gym.physics.plants.gibbs_appell import step as source
 from wlr_gym.physics.plants.gibbs_appell.lanes import FORMULA_INPUTS, FORMULA_OUTPUTS, INPUTS, STORED, TICK_SUMS
 from wlr_gym.physics.plants.gibbs_appell.packing import PARAMETER_LANES
@@ -243,11 +242,8 @@ def load_kernel(features: frozenset[str], precision: str, width: int, formulas: 
     )
 
 
-#: Read at import, so that the key always tells of the code that is loaded.
+#: What the kernels are traced from. numba itself notices only that the generated file has changed.
+TRACED = (source, gauss, friction, kinematics, lanes, equations, servo, drive, ground, ops, graph, sys.modules[__name__])
 _SOURCE_KEY = "\0".join(
-    inspect.getsource(module)
-    for module in (
-        *(source, gauss, friction, kinematics, lanes, packing, sys.modules[__name__]),
-        *(equations, servo, drive, ground, ops, graph),
-    )
+    [source_of(*TRACED), *PARAMETER_LANES, *FORMULA_INPUTS, *FORMULA_OUTPUTS, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"]
 )

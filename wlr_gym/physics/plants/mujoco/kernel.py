@@ -6,7 +6,6 @@ itself.
 
 from __future__ import annotations
 
-import inspect
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics import servo
-from wlr_gym.physics.codegen import Graph, emit, graph, live_nodes, load_module, ops
+from wlr_gym.physics.codegen import Graph, emit, graph, live_nodes, load_module, ops, source_of
 from wlr_gym.physics.plants import drive, forces, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import kinematics, lanes
@@ -160,11 +159,6 @@ def load_kernel() -> ModuleType:
     return load_module("mujoco_plant", kernel_source, message, _SOURCE_KEY)
 
 
-#: Read at import, so that the key always tells of the code that is loaded.
-_SOURCE_KEY = "\0".join(
-    inspect.getsource(module)
-    for module in (
-        *(source, engine, kinematics, lanes, sys.modules[__name__]),
-        *(drive, ground, forces, servo, ops, graph),
-    )
-) + "\0".join(PARAMETER_LANES)
+#: What the kernels are traced from. numba itself notices only that the generated file has changed.
+TRACED = (source, engine, kinematics, lanes, forces, servo, drive, ground, ops, graph, sys.modules[__name__])
+_SOURCE_KEY = "\0".join([source_of(*TRACED), *PARAMETER_LANES, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"])
