@@ -69,7 +69,9 @@ def test_neutral_robot_keeps_its_bits(family):
     np.testing.assert_array_equal(beside[:, 3:6], changed[:, 3:6])
 
 
-@pytest.mark.parametrize(("count", "precision"), [(1, "float64"), pytest.param(9, "float64", marks=pytest.mark.slow), (17, "float32")])
+@pytest.mark.parametrize(
+    ("count", "precision"), [(1, "float64"), pytest.param(9, "float64", marks=pytest.mark.slow), (17, "float32")]
+)
 def test_all_families_at_once(count, precision):
     """Neutral robots as in the plain kernel, robots with one family as in that family's, at every tile width."""
     parameters, commands = different_robots(count), setpoints(count)

@@ -17,7 +17,13 @@ from wlr_gym.studies.bench.measure import Measurement, Size, against_fastest, in
 from wlr_gym.studies.bench.mujoco_loop import MujocoLoopPlant
 
 
-@pytest.mark.parametrize("name", ["engine", "mujoco", "env_step", "ppo", "learning", "import", "start", "batch", "convergence"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("engine", "mujoco", "env_step", "ppo", "learning", "import", "batch", "convergence"),
+        pytest.param("start", marks=pytest.mark.slow),  # compiles in an empty cache
+    ],
+)
 def test_measurement_runs_and_reports(name, tmp_path, capsys):
     file = tmp_path / "bench.json"
     assert main(["bench", "--quick", "--rounds", "1", "--only", name, "--json", str(file)]) == 0
