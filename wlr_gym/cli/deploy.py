@@ -25,6 +25,7 @@ from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
     from wlr_gym.hardware.deployment import Deployment
+    from wlr_gym.hardware.emulator.machine import Machine
     from wlr_gym.hardware.loop import ControlLoop
 
 #: Steps between two looks of the live status.
@@ -137,8 +138,12 @@ def _check(options: DeployOptions) -> dict[str, float]:
     return numbers
 
 
-def _machine_of(loop: ControlLoop) -> Any:
-    return loop.clock.machine  # type: ignore[attr-defined]
+def _machine_of(loop: ControlLoop) -> Machine:
+    """Return the emulated robot that a loop drives."""
+    from wlr_gym.hardware.emulator.memory import EmulatedWorld
+
+    assert isinstance(loop.clock, EmulatedWorld)
+    return loop.clock.machine
 
 
 @contextlib.contextmanager
