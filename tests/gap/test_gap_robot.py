@@ -636,6 +636,7 @@ def test_known_effects_and_formulas_are_part_of_the_model(good):
     assert np.nanmax(np.abs(mixed[2] - mixed[0])) > 1.0
 
 
+@pytest.mark.slow  # compiles the engine with all effects and formulas
 def test_company_does_not_change_a_bit(good):
     """Alone, beside others like it, and beside effects for which another kernel is needed."""
     problem = RobotProblem([good])
@@ -781,6 +782,7 @@ def places_tried(candidates, name):
     return {candidate.where for candidate in candidates if candidate.name == name}
 
 
+@pytest.mark.slow  # compiles the engine with all effects and formulas
 def test_a_simulation_that_breaks_down_is_far_from_the_data_and_harms_no_other():
     """A force that blows the robot up (a drag that pushes, and grows with its cube) is a bad hypothesis, not an error."""
     run = record(posture_and_turns, spaced(5.0))
