@@ -44,7 +44,7 @@ def _run(page: Path, request: pytest.FixtureRequest, *, slow: bool) -> None:
     [
         pytest.param(page, marks=[pytest.mark.slow] if _name(page) in LONG else [], id=_name(page))
         for page in _pages("")
-        if page.name != "extending.md"
+        if page.name != "extending.md" and not (_name(page) in LONG and page in _pages("slow"))  # whole: below
     ],
 )
 def test_page_runs(page, workplace, request):
