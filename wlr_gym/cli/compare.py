@@ -69,7 +69,7 @@ def run(options: CompareOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder, replace_file, write_json
+    from wlr_gym.base.files import make_output_folder, write_json, write_text
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.cli import FAILED, OK
     from wlr_gym.data.compared_plants import parse_plant
@@ -90,7 +90,7 @@ def run(options: CompareOptions) -> int:
         _print(console, summary_table(comparisons))
     write_json(options.out / "compare.json", [comparison.as_dict() for comparison in comparisons])
     text = markdown(comparisons, f"{first.label} and {second.label}")
-    replace_file(options.out / "report.md", lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(options.out / "report.md", text)
     record_provenance(options.out, _resolved(options, motions, robot, patches[0]))
     console.print(f"report: {options.out / 'report.md'}", soft_wrap=True)
     return FAILED if options.strict and any(comparison.broken for comparison in comparisons) else OK

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, replace_file
+from wlr_gym.base.files import make_output_folder, write_text
 from wlr_gym.data.compared_plants import SETTLE
 from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
@@ -50,7 +50,7 @@ def write_commands(folder: Path, motion: Motion) -> Path:
             ",".join([repr(round(tick * motion.period, 9)), *("" if value != value else repr(value) for value in setpoints)])
         )
     path = folder / f"{motion.name}.csv"
-    replace_file(path, lambda temporary: temporary.write_text("\n".join(lines) + "\n", encoding="utf-8"))
+    write_text(path, "\n".join(lines) + "\n")
     return path
 
 

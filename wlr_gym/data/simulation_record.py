@@ -14,7 +14,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import Field
 
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import write_text
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.physics.plants.base import PlantState
 from wlr_gym.robot.parameter_table import ELEMENTS
@@ -77,7 +77,7 @@ def write_simulation(run: Path, simulation: Simulation | None) -> None:
         path.unlink(missing_ok=True)
         return
     text = yaml.safe_dump(simulation.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=120)
-    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(path, text)
 
 
 def departures(values: Array, reference: Array) -> dict[str, float]:

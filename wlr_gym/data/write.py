@@ -12,7 +12,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import replace_file, write_text
 from wlr_gym.data.check import check_table
 from wlr_gym.data.format import COLUMNS, META_FILE, SUFFIXES, RunMeta
 from wlr_gym.data.read import read_meta
@@ -64,7 +64,7 @@ def write_meta(folder: str | Path, meta: RunMeta) -> Path:
             raise InputError(f"{path}: says something else than the meta data of the new run; write it to another folder")
         return path
     text = yaml.safe_dump(meta.model_dump(mode="json", exclude_none=True), sort_keys=False, allow_unicode=True)
-    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(path, text)
     return path
 
 

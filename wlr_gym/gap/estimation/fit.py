@@ -200,11 +200,8 @@ def _descend(
     scatter: float,
 ) -> tuple[FittedModel, list[Array], float]:
     """Go downhill from ``model``, whose residuals are given, with the columns simulated there; return also how far it went."""
-    autocorrelation_time = (
-        estimate_noise(residuals, scatter=scatter).autocorrelation_time
-        if autocorrelation_time is None
-        else autocorrelation_time
-    )  # the same cost in all steps
+    if autocorrelation_time is None:  # the same cost in all steps
+        autocorrelation_time = estimate_noise(residuals, scatter=scatter).autocorrelation_time
     secant, cost = list(columns), total_cost(problem, model, residuals, autocorrelation_time)
     top = cost
     for _ in range(CHORDS):

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, replace_file
+from wlr_gym.base.files import make_output_folder, replace_file, write_text
 from wlr_gym.base.provenance import CONFIG_FILE, PROVENANCE_FILE
 from wlr_gym.gap.analysis import Analysis
 from wlr_gym.gap.report.page import CAPTIONS, report
@@ -73,5 +73,5 @@ def save_analysis(analysis: Analysis, folder: Path) -> Path:
             stale.unlink()
     for name, picture in pictures.items():
         replace_file(folder / PLOTS / f"{name}.png", lambda temporary, picture=picture: temporary.write_bytes(picture))
-    replace_file(folder / REPORT_FILE, lambda temporary: temporary.write_text(page, encoding="utf-8"))
+    write_text(folder / REPORT_FILE, page)
     return write_result(analysis, folder)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wlr_gym.base.files import replace_file, write_json
+from wlr_gym.base.files import replace_file, write_json, write_text
 from wlr_gym.learning.evaluation.card import BY_DIFFERENCE, MAIN, OTHER_PLANT, Card, Scores
 from wlr_gym.learning.evaluation.conditions import BLOCK
 from wlr_gym.learning.evaluation.metrics import Metric
@@ -184,7 +184,7 @@ def write_card(folder: Path, card: Card, pictures: Mapping[str, str] | None = No
     """Write ``card.md`` and ``card.json`` into ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     text = markdown(card, pictures)
-    replace_file(folder / "card.md", lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(folder / "card.md", text)
     write_json(folder / "card.json", content(card))
 
 

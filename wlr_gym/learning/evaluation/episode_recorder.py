@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import write_text
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
 from wlr_gym.data.sensor_columns import SENSED, channels
 from wlr_gym.data.simulation_record import ParameterChange, Simulation, departures, start_of
@@ -129,4 +129,4 @@ def write_samples(path: Path, rollout: Rollout) -> None:
     lines = [",".join(["seed", *(f'"{name}"' for name in rollout.sampled)])]
     rows = zip(rollout.seeds.tolist(), rollout.samples.tolist(), strict=True)
     lines += [",".join(map(repr, [seed, *values])) for seed, values in rows]
-    replace_file(path, lambda temporary: temporary.write_text("\n".join(lines) + "\n", encoding="utf-8"))
+    write_text(path, "\n".join(lines) + "\n")

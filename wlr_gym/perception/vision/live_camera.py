@@ -15,7 +15,7 @@ from queue import Full, Queue
 from typing import Any
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import write_text
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.vision.tracking import check_size
 from wlr_gym.perception.vision.video import Image, VideoFile, grey
@@ -71,7 +71,7 @@ def film(number: int, folder: Path, camera: Camera, seconds: float | None = None
     if not times:
         raise InputError(f"camera {number}: gave no frame")
     rows = "".join(f"{index},{moment:.6f}\n" for index, moment in enumerate(times))
-    replace_file(folder / "film.csv", lambda temporary: temporary.write_text("frame,t\n" + rows, encoding="utf-8"))
+    write_text(folder / "film.csv", "frame,t\n" + rows)
     if fault:
         raise InputError(f"camera {number}: {fault} after {times[-1]:.1f} s; {len(times)} frames are kept in {folder}")
     return folder / "film.avi", folder / "film.csv"

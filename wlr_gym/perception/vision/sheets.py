@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import replace_file, write_text
 from wlr_gym.perception.markers.calibration import Board
 from wlr_gym.perception.markers.targets import QUIET_ZONE, Marker, Target, ring_radii
 
@@ -96,7 +96,7 @@ def write_pages(folder: Path, name: str, pages: Sequence[Page]) -> list[Path]:
     replace_file(paths[0], lambda temporary: temporary.write_bytes(pdf(pages)))
     for page in pages:
         paths.append(folder / f"{page.name}.svg")
-        replace_file(paths[-1], lambda temporary, page=page: temporary.write_text(svg(page), encoding="utf-8"))
+        write_text(paths[-1], svg(page))
     return paths
 
 

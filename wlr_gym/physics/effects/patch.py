@@ -21,7 +21,7 @@ from typing import Any
 import yaml
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import write_text
 from wlr_gym.base.paths import find_config
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.physics.codegen.expression import finite_number
@@ -120,7 +120,7 @@ def save_patch(patch: Patch, path: str | Path) -> Path:
     text = yaml.dump(patch.content(), Dumper=_Dumper, sort_keys=False)  # in ASCII: PyYAML loses U+0085 and its kin otherwise
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(path, text)
     return path
 
 

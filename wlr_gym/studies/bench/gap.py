@@ -25,7 +25,7 @@ from typing import Any
 import yaml
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, replace_file, write_json
+from wlr_gym.base.files import make_output_folder, write_json, write_text
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED, BlindCase, case
@@ -127,7 +127,7 @@ def write_answers(out: Path) -> None:
     results = {file.stem: read_result(file) for file in sorted((out / "results").glob("*.json"))}
     short = {name: {key: result[key] for key in _ANSWER if key in result} for name, result in results.items()}
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(answer)}" for name, answer in short.items())
-    replace_file(out / "answers.json", lambda temporary: temporary.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8"))
+    write_text(out / "answers.json", f"{{\n{lines}\n}}\n")
 
 
 def read_answers(path: Path) -> dict[str, dict[str, Any]]:
@@ -182,7 +182,7 @@ def seal(plan: Plan, cases: Sequence[BlindCase]) -> str:
         _check_seal(file, truths)
     text = yaml.safe_dump(truths, sort_keys=True)
     file = folder / f"truths_{plan.first_seed}_{plan.sets}.yaml"
-    replace_file(file, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(file, text)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

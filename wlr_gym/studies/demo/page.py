@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 
 from wlr_gym import __version__
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import write_text
 from wlr_gym.gap.report.html import document, section
 from wlr_gym.studies.demo.settings import Demo
 from wlr_gym.studies.demo.stage import FAILED, NOT_SHOWN, SHOWN, SKIPPED, Section
@@ -21,7 +21,7 @@ _ORDER = (SHOWN, SKIPPED, NOT_SHOWN, FAILED)
 def write_page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> Path:
     """Write the page and return its path."""
     text = page(demo, sections, interrupted)
-    replace_file(demo.page, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(demo.page, text)
     return demo.page
 
 

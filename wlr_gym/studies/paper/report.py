@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.files import replace_file, write_json
+from wlr_gym.base.files import write_json, write_text
 from wlr_gym.physics.plants import SIMULATORS
 from wlr_gym.robot import Robot
 from wlr_gym.studies.paper import slip_search
@@ -122,7 +122,7 @@ def write_report(
         lines += ["## What could explain the paper's slip", "", *question_lines(findings, decisive), ""]
     lines += ["## Equations", "", *verdict_table()]
     text = "\n".join(lines) + "\n"
-    replace_file(folder / "report.md", lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(folder / "report.md", text)
 
 
 def _ends_table(robot: Robot, records: Records) -> list[str]:
