@@ -13,7 +13,12 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-NEEDED = ("wlr_gym/py.typed", "wlr_gym/configs/task/velocity.yaml", "wlr_gym/agents/shipped/velocity_slip_aware.onnx")
+NEEDED = (
+    "wlr_gym/py.typed",
+    "wlr_gym/__init__.pyi",
+    "wlr_gym/configs/task/velocity.yaml",
+    "wlr_gym/agents/shipped/velocity_slip_aware.onnx",
+)
 
 
 def sdist_files(path: Path) -> set[str]:

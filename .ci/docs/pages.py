@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 #: Modules of the API page, in order: title -> module. They are the public interface (docs/versions.md).
 API = {
     "Environments": "wlr_gym.envs",
+    "The robot as a machine": "wlr_gym.hardware",
     "Tasks": "wlr_gym.envs.tasks",
     "Terms of tasks": "wlr_gym.envs.tasks.terms",
     "Signals that terms are written with": "wlr_gym.envs.tasks.signals",
@@ -36,6 +37,25 @@ API = {
     "Gap workflow": "wlr_gym.gap",
     "Errors": "wlr_gym.base.errors",
 }
+
+
+#: How docstrings refer to names; rendered as links where the name is on a page.
+ROLE = re.compile(r":(?:class|func|meth|mod|data|attr|exc):<code>~?([\w.]+)</code>")
+INTRODUCTION = (
+    "`import wlr_gym` registers the environments and loads nothing heavy; the names below load when they are used. What most "
+    "programs need stands first, under the name that you import it by; then the packages. [Public](versions.md) is what stands "
+    "here, no more."
+)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Turn the roles of docstrings into links, which are resolved when all pages are known."""
+
+    def link(found: re.Match[str]) -> str:
+        name = found.group(1)
+        return f'<autoref identifier="{name}" optional><code>{name.removeprefix("wlr_gym.")}</code></autoref>'
+
+    return ROLE.sub(link, html)
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -88,8 +108,17 @@ def _block(text: str) -> str:
 
 def api_page() -> str:
     """What the packages offer to programs, from their docstrings."""
-    intro = "`import wlr_gym` registers the environments and loads nothing heavy. [Public](versions.md) is what stands here."
-    parts = ["# Python interface", "", intro, ""]
+    import wlr_gym
+
+    parts = ["# Python interface", "", INTRODUCTION, "", "## The names of wlr_gym", ""]
+    for name, home in wlr_gym.HOMES.items():
+        parts += [
+            f"::: {home}.{name}",
+            "    options:",
+            f"      heading: wlr_gym.{name}",
+            f"      toc_label: {name}",
+            "",
+        ]
     for title, module in API.items():
         parts += [f"## {title}", "", f"::: {module}", ""]
     return "\n".join(parts)

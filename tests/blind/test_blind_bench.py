@@ -55,6 +55,19 @@ def test_progress_tells_the_time_left_and_no_truth(finished):
     assert not any(truth in line for line in said)
 
 
+@pytest.mark.slow
+def test_sets_are_spread_on_ray(finished, tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
+    plan, alone, _ = finished
+    said: list[str] = []
+    plan = dataclasses.replace(plan, out=tmp_path)
+    report = gap.run_blind_test(plan, "test_blind_bench:answers_nothing", said.append, ray="local")
+    assert [line.partition(":")[0] for line in said if "to go" in line] == ["1/2  set_4000", "2/2  set_4001"]
+    timed = {"median_seconds", "seconds", "wall_seconds"}
+    assert {k: v for k, v in report.items() if k not in timed} == {k: v for k, v in alone.items() if k not in timed}
+
+
 def test_truths_are_sealed_away_from_the_data(finished):
     plan, _, said = finished
     sealed = list((plan.out / "sealed").iterdir())

@@ -54,6 +54,7 @@ def test_evaluate_on_mujoco_says_so(tmp_path):
     assert json.loads((tmp_path / "card.json").read_text())["conditions"]["backend"] == "mujoco"
 
 
+@pytest.mark.slow
 def test_train_on_mujoco_with_its_precision(tmp_path):
     pytest.importorskip("torch")
     small = ["total_steps=16", "num_envs=2", "steps_per_env=8", "batch_size=16", "epochs=1", "environment.precision=float64"]

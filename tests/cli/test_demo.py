@@ -93,7 +93,7 @@ def test_ctrl_c_leaves_what_was_made(tmp_path):
     while not curve.is_file() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.1)
     process.send_signal(signal.SIGINT)
-    said, trouble = process.communicate(timeout=60)
+    said, trouble = process.communicate(timeout=150)
     assert process.returncode == INTERRUPTED, trouble
     assert said.strip().splitlines()[-1] == str(out / "demo.html")
     page = (out / "demo.html").read_text()

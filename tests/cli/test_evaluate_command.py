@@ -48,13 +48,13 @@ def test_full_means_seeds_sweeps_and_both_simulators(tmp_path, monkeypatch, caps
 
 
 def test_what_is_left_open_is_decided_by_full():
-    quick, full = (evaluate._complete(evaluate.EvaluateOptions("pid", full=full)) for full in (False, True))
+    quick, full = (evaluate._complete(evaluate.EvaluateOptions(("pid",), full=full)) for full in (False, True))
     assert quick.baselines == ("do_nothing", "pid")
     assert (quick.episodes, quick.seeds, quick.sweep, quick.backend) == (64, 1, (), "gibbs_appell")
     assert set(full.baselines or ()) >= {"do_nothing", "constant_command", "pid", "slip_compensating"}
     assert (full.episodes, full.seeds, full.backend) == (256, 5, "both")
     assert set(full.sweep or ()) >= {"friction", "split", "floors", "latency", "payload"}
-    slope = evaluate._complete(evaluate.EvaluateOptions("pid", full=True, env="WLR-Slope-v0", seeds=2, sweep=("slope",)))
+    slope = evaluate._complete(evaluate.EvaluateOptions(("pid",), full=True, env="WLR-Slope-v0", seeds=2, sweep=("slope",)))
     assert (slope.seeds, slope.sweep) == (2, ("slope",))
 
 

@@ -161,7 +161,7 @@ def test_whose_zeros_are_off_begins_at_its_setpoints():
         plant = make_plant(compared.backend, ROBOT, 1, PlantOptions(sensor_noise=False))
         plant.reset(np.zeros(1, np.uint64), parameters, state=state)
         plant.step(setpoints)
-        moved = plant.get_state().reference_position[:, :4]
+        moved = plant.mechanical_state().reference_position[:, :4]
         plant.close()
         np.testing.assert_allclose(moved, 1.4, atol=1e-9)
 

@@ -27,10 +27,11 @@ _MARK = re.compile(r"(file|slow|checked by|not run|demo-command|test-command)(?:
 #: Words of a command -> options that make it small enough for a test, added to its own.
 SMALLER = {
     "train": "--max-minutes 0.02 --no-progress",
+    "sweep": "--seeds 1 --set total_steps=16_384",
     "evaluate": "--episodes 2 --seeds 1 --sweep-episodes 1 --other-episodes 1 --video-seconds 0.1 --no-progress",
     "evaluate --full": "--sweep friction",
     "play": "--seconds 0.2 --size 96 64",
-    "deploy": "--stepped --seconds 0.5 --yes --no-status",
+    "deploy": "--seconds 0.5 --yes --no-status",
     "compare": "--seconds 1 --no-plots",
     "bench": "--quick --rounds 1",
     "record": "--seconds 4",
@@ -73,8 +74,11 @@ def blocks(page: Path) -> list[Block]:
     return found
 
 
-def run_page(page: Path, *, slow: bool) -> dict[str, Any]:
-    """Run a page's blocks in order in the present folder; return the names its Python blocks leave."""
+def run_page(page: Path, *, slow: bool, smaller: bool = True) -> dict[str, Any]:
+    """Run a page's blocks in order in the present folder; return the names its Python blocks leave.
+
+    ``smaller`` adds options that shorten commands; without it they run as they are printed.
+    """
     names: dict[str, Any] = {"__name__": page.stem}
     found = blocks(page)
     for block in found:
@@ -82,23 +86,23 @@ def run_page(page: Path, *, slow: bool) -> dict[str, Any]:
             Path(block.words).write_text(block.text, encoding="utf-8")
     for block in found:
         if not block.mark or (slow and block.mark == "slow"):
-            run_block(block, names)
+            run_block(block, names, smaller=smaller)
     return names
 
 
-def run_block(block: Block, names: dict[str, Any]) -> None:
+def run_block(block: Block, names: dict[str, Any], *, smaller: bool = True) -> None:
     """Run one block: Python in ``names``, or commands, each of which must end well."""
     if block.language == "python":
         exec(compile("\n" * block.line + block.text, str(block.page), "exec"), names)
         return
     assert block.language == "bash", f"{block}: a block of '{block.language}' cannot be run"
     for command in block.commands:
-        assert run_command(command) == 0, f"{block}: {command}"
+        assert run_command(command, smaller=smaller) == 0, f"{block}: {command}"
 
 
-def run_command(command: str) -> int:
-    """Run ``wlr ...`` in this process, smaller; return its exit code."""
+def run_command(command: str, *, smaller: bool = True) -> int:
+    """Run ``wlr ...`` in this process; return its exit code."""
     program, *words = shlex.split(command)
     assert program == "wlr", f"{command}: only wlr is run here"
-    smaller = [option for key, options in SMALLER.items() if set(key.split()) <= set(words) for option in options.split()]
-    return main([*words, *smaller])
+    fitting = [options for key, options in SMALLER.items() if set(key.split()) <= set(words)]
+    return main([*words, *(" ".join(fitting).split() if smaller else [])])

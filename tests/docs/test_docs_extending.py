@@ -17,7 +17,7 @@ def _parameters(env: gym.Env, name: str) -> np.ndarray:
 
 @pytest.mark.slow
 def test_the_page_makes_what_it_says(workplace):
-    names = run_page(PAGE, slow=False)
+    names = run_page(PAGE, slow=False, smaller=False)
     assert names["leg_rate_reward"] < 0.0
     assert [names["described"].count(f"side_speed[{side}]") for side in ("left", "right")] == [3, 3]  # history: 3
     assert (names["env_id"], names["batch"].num_envs) == ("WLR-Spin-v0", 64)

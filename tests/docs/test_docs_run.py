@@ -13,14 +13,17 @@ NOT_RUN = {
     "docs/evaluation.md": 1,  # runs of one training with several seeds
     "docs/gap.md": 4,  # minutes each; the quickstart has one
     "docs/pictures.md": 1,  # a window
+    "docs/own_logs.md": 2,  # logs of somebody else's
+    "docs/policy_file.md": 1,  # an archive of somebody else's
     "docs/quickstart.md": 1,  # installation
     "docs/randomization.md": 1,  # the result of an analysis
     "docs/robot.md": 5,  # a robot, or until Ctrl-C
     "docs/run_format.md": 1,  # shortened
+    "docs/sweep.md": 3,  # a cluster
     "docs/vision.md": 3,  # installation, pictures, a film
 }
 #: Pages whose blocks take most of a minute or more together; the slow suite runs them.
-LONG = {"README.md", "docs/quickstart.md", "docs/run_format.md", "docs/compare.md", "docs/pictures.md"}
+LONG = {"README.md", "docs/quickstart.md", "docs/run_format.md", "docs/compare.md", "docs/pictures.md", "docs/sweep.md"}
 BLOCKS = [block for page in PAGES for block in blocks(page)]
 
 

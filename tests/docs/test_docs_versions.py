@@ -36,7 +36,7 @@ def test_the_table_is_that_of_the_task_files():
     text = (ROOT / "docs" / "versions.md").read_text(encoding="utf-8")
     block = text.split("<!-- environments: ")[1].split("<!-- end of environments -->")[0]
     rows = []
-    for env_id, (task, _, _) in ENVIRONMENTS.items():
+    for env_id, task in ENVIRONMENTS.items():
         title = env_id.rpartition("-")[0]
         rows += [f"| `{title}-{version}` | {change} |" for version, change in read_task(task).history.items()]
     assert block.splitlines()[3:] == rows

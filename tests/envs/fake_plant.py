@@ -100,7 +100,7 @@ class FakePlant:
     def truth(self):
         return self._truth
 
-    def get_state(self):
+    def mechanical_state(self):
         return standing_state(self.robot, self.parameters)
 
     def close(self):

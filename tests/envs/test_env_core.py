@@ -314,8 +314,10 @@ def test_compiled_rewards_equal_the_same_terms_on_numpy():
         over=np.zeros((count, len(task.terminations))),
         sums=np.ones((count, len(task.rewards))),
         measures=np.zeros((count, len(task.measures))),
+        squares=np.ones((count, len(task.measures))),
+        largest=np.zeros((count, len(task.measures))),
     )
-    terms, total, over, sums, measures = scores
+    terms, total, over, sums, measures, squares, largest = scores
     kernel = compile_scores(task)
     assert kernel.run(np.ones(count, bool), signals_in_order(matrices), kernel.numbers, tuple(scores)) == -1
     for k, name in enumerate(task.rewards):
@@ -328,6 +330,8 @@ def test_compiled_rewards_equal_the_same_terms_on_numpy():
         np.testing.assert_allclose(measures[:, k], expected[f"measure.{name}"], rtol=1e-12, atol=1e-12, err_msg=name)
     np.testing.assert_allclose(total, terms.sum(axis=1), rtol=1e-12)
     np.testing.assert_allclose(sums, 1.0 + terms)
+    np.testing.assert_array_equal(squares, 1.0 + measures**2)
+    np.testing.assert_array_equal(largest, np.abs(measures))
     assert (over > 0).any(axis=1).sum() > 0
 
 

@@ -1,10 +1,11 @@
 """Three faces, one robot: Gymnasium single and vector, calling conventions, autoreset, errors."""
 
+import inspect
 import pickle
 import subprocess
 import sys
 import warnings
-from typing import Any
+from typing import Any, get_type_hints
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +16,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import wlr_gym
 from wlr_gym.base.errors import InputError
+from wlr_gym.envs import classes
+from wlr_gym.envs.settings import EnvironmentOptions, Settings
+from wlr_gym.envs.tasks.task_config import read_task
 
 ID = "WLR-Velocity-v0"
 
@@ -82,14 +86,50 @@ def test_a_vector_environment_is_pickled_by_its_arguments(fake):
     assert np.array_equal(copy.reset(seed=4)[0], env.reset(seed=4)[0])
 
 
-def test_class_documentation_is_made_from_the_data(fake):
-    from wlr_gym.envs.classes import VelocityEnv, VelocityVectorEnv
+@pytest.mark.parametrize("name", ["velocity", "path", "posture", "slope"])
+def test_classes_say_what_the_task_files_say(name):
+    config = read_task(name)
+    single, vector = (getattr(classes, f"{name.capitalize()}{kind}") for kind in ("Env", "VectorEnv"))
+    document = " ".join(str(inspect.getdoc(single)).split())
+    assert " ".join(config.summary.split()) in document
+    for version, change in config.history.items():
+        assert f"- {version}: {change}" in document
+    assert single.task_name == vector.task_name == name
 
-    for cls in (VelocityEnv, VelocityVectorEnv):
-        for text in ("wheel_velocity[wheel_lf]", "track_yaw_rate", "free_wheels", "v0: first version", "leg_rr"):
-            assert text in str(cls.__doc__)
-    env = make()
-    assert env.describe() in str(VelocityEnv.__doc__)
+
+def test_options_have_one_list_of_names_and_types():
+    options = get_type_hints(EnvironmentOptions)
+    assert options.pop("plant") == options["backend"]
+    assert options == get_type_hints(Settings)
+    for name in EnvironmentOptions.__annotations__:
+        assert f"\n    {name}: " in str(inspect.getdoc(EnvironmentOptions)), name
+
+
+def test_the_second_word_for_the_backend(fake):
+    assert make(plant="mujoco").core.settings.backend == "mujoco"
+    assert make_vec(2, plant="mujoco", backend="mujoco").core.settings.backend == "mujoco"
+    with pytest.raises(InputError, match="plant = 'mujoco' and backend = 'gibbs_appell'"):
+        make(plant="mujoco", backend="gibbs_appell")
+
+
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+def test_an_unknown_keyword_is_what_python_raises_for_one(make):
+    with pytest.raises(TypeError, match="got an unexpected keyword argument 'frameskip'") as caught:
+        make(ID, frameskip=2)
+    assert isinstance(caught.value, InputError)
+
+
+def test_the_spec_knows_when_episodes_end(fake):
+    for env in (gym.make(ID, episode_length=1.0), gym.make_vec(ID, num_envs=2, episode_length=1.0)):
+        assert env.spec is not None
+        assert env.spec.max_episode_steps == 50
+    assert gym.spec(ID).max_episode_steps is None  # or gym.make would cut longer episodes short
+    env = gym.wrappers.TimeAwareObservation(gym.make(ID, episode_length=1.0))
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(8, np.float32))[3] for _ in range(50)]
+    assert ends == [False] * 49 + [True]
+    assert make(episode_length=60.0).spec.max_episode_steps == 3000
+    assert make_vec(2, max_episode_steps=7).spec.max_episode_steps == 7
 
 
 def test_contract_names_the_task_robot_and_randomization(fake):

@@ -1,12 +1,15 @@
 """Environments that are registered from a task file, and the versions of those that ship."""
 
 import pickle
+import subprocess
+import sys
 
 import gymnasium as gym
 import pytest
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs import register_task
+from wlr_gym.envs import Sb3VecEnv, WlrEnv, register_task
+from wlr_gym.envs.classes import VelocityEnv
 from wlr_gym.envs.registry import ENVIRONMENTS, title_of
 from wlr_gym.envs.tasks.task_config import read_task
 
@@ -44,13 +47,77 @@ def test_a_task_file_becomes_an_environment(registry, task):
     env = gym.make("WLR-TurnAbout-v1", robot="nominal")
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
-    kind = type(env.unwrapped)
-    assert kind.__name__ == "TurnAboutV1Env"
-    assert "Turn on the spot." in str(kind.__doc__)
-    assert "- v1: turns faster" in str(kind.__doc__)
     assert pickle.loads(pickle.dumps(env.unwrapped)).core.task.config.name == "turn_about"
     batch = gym.make_vec("WLR-TurnAbout-v1", num_envs=2)
     assert batch.reset(seed=0)[0].shape == (2, 4)
+
+
+def test_a_task_travels_in_its_spec(registry, task, tmp_path):
+    """A worker needs neither the id nor the file; Ray pickles, ``spawn`` starts a fresh Python."""
+    env_id = register_task(task)
+    spec = gym.make(env_id, task={"episode_length": 0.5}).spec
+    assert spec is not None
+    (tmp_path / "spec.json").write_text(spec.to_json())
+    (tmp_path / "spec.pickle").write_bytes(pickle.dumps([gym.spec(env_id), gym.make(env_id).unwrapped]))
+    task.unlink()
+    code = (
+        "import pathlib, pickle, gymnasium as gym;"
+        "spec = gym.envs.registration.EnvSpec.from_json(pathlib.Path('spec.json').read_text());"
+        "plain, env = pickle.loads(pathlib.Path('spec.pickle').read_bytes());"
+        "made = [gym.make(spec), gym.make(plain), env, gym.make_vec(plain, num_envs=2)];"
+        "print(*[each.unwrapped.core.limit for each in made], *[each.reset(seed=0)[0].sum() for each in made[1:3]])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    limits, sums = done.stdout.split()[:4], done.stdout.split()[4:]
+    assert limits == ["25", "50", "50", "50"]
+    assert sums[0] == sums[1]
+
+
+def test_workers_of_a_vector_environment_know_the_task(registry, task):
+    env_id = register_task(task)
+    env = gym.make_vec(env_id, num_envs=2, vectorization_mode="async", vector_kwargs={"context": "spawn"})
+    try:
+        observation = env.reset(seed=0)[0]
+    finally:
+        env.close()
+    assert (observation == gym.make_vec(env_id, num_envs=2).reset(seed=0)[0]).all()
+
+
+def test_the_interface_of_stable_baselines3_takes_a_spec(registry, task):
+    pytest.importorskip("stable_baselines3")
+    from wlr_gym.envs import Sb3VecEnv
+
+    spec = gym.spec(register_task(task))
+    assert Sb3VecEnv(spec, 2, episode_length=0.2).core.limit == 10
+    assert Sb3VecEnv(spec.id, 2).core.limit == 50
+
+
+def test_a_pickled_batch_of_stable_baselines3_knows_the_task_elsewhere(registry, task, tmp_path):
+    """So does the evaluation once the file is gone: the spec holds the whole task."""
+    from wlr_gym.learning.evaluation import make_core
+
+    env_id = register_task(task)
+    (tmp_path / "env.pkl").write_bytes(pickle.dumps(Sb3VecEnv(env_id, 2)))
+    task.unlink()
+    assert make_core(env_id, 1, {}).task.config.name == "turn_about"
+    code = "import pickle, sys; env = pickle.load(open(sys.argv[1], 'rb')); env.reset(); print(env.num_envs)"
+    ran = subprocess.run([sys.executable, "-c", code, str(tmp_path / "env.pkl")], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "2"
+
+
+def test_a_task_that_is_registered_again_is_what_it_says_now(registry, task):
+    env_id = register_task(task)
+    task.write_text(task.read_text().replace("weight: 1.0", "weight: 3.0"))
+    assert register_task(task) == env_id
+    env = Sb3VecEnv(env_id, 1)
+    assert env.core.task.config.rewards["track_yaw_rate"]["weight"] == 3.0
+
+
+def test_the_contents_of_a_task_are_for_classes_without_one():
+    for make in (lambda: WlrEnv(), lambda: VelocityEnv(definition={"name": "x"})):
+        with pytest.raises(InputError, match="definition"):
+            make()
 
 
 def test_an_id_is_not_taken_twice(registry, task, tmp_path):
@@ -100,7 +167,7 @@ def test_a_broken_file_is_refused(registry, tmp_path):
 
 
 def test_versions_of_ids_are_the_last_of_the_history():
-    for env_id, (name, _, _) in ENVIRONMENTS.items():
+    for env_id, name in ENVIRONMENTS.items():
         config = read_task(name)
         assert env_id == f"WLR-{title_of(name)}-{list(config.history)[-1]}"
         assert config.summary

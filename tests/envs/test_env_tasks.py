@@ -142,7 +142,7 @@ def test_path_error_that_is_estimated_is_the_true_one_wherever_the_robot_stood()
         return np.hstack([np.zeros((core.count, 4)), np.full((core.count, 4), 0.45)])
 
     core, _ = drive("WLR-Path-v0", 20, ahead, randomization="nominal", observation="dict", episode_length=4.0)
-    assert np.ptp(core._start[:, 2]) > 3.0
+    assert np.ptp(core.start[:, 2]) > 3.0
     for error, bound in (("lateral", 0.01), ("heading", 0.03)):
         estimated, true = computed(core, f"path_error[{error}]"), computed(core, f"true_path_error[{error}]")
         assert np.abs(estimated - true).max() < bound

@@ -341,7 +341,7 @@ def test_an_effect_registered_in_one_place_is_all_that_it_takes(monkeypatch, cap
     probes, candidates = robot_candidates(NOMINAL, {}, [moved], [moved])
     found = [candidate for candidate in candidates if candidate.name == hot.name]
     assert tuple(candidate.where for candidate in found) == WHEEL_SETS
-    assert found[0].unknowns == (Unknown("scale", "-", 1.0, 0.6, 1.0, 0.05 * (1.0 - 0.6)),)
+    assert found[0].unknowns == (Unknown("scale", "-", 1.0, 0.6, 1.0, 0.05 * (1.0 - 0.6), least=0.2, most=1.0),)  # its bounds
     assert [len(start.directions[0]) for candidate in (found[0], found[-1]) for start in candidate.starts] == [1, 4]
     assert [dict(probe.effects[0].parameters) for probe in probes if probe.effects[0].name == hot.name] == [{"scale": 0.9}] * 4
     (patched,) = apply_patch(load_patch([found[0].effect((0.8,)).content()]), NOMINAL)["servo.stall_torque[wheel_lf]"]
@@ -588,6 +588,7 @@ def test_runs_of_different_profiles_are_refused(good):
         RobotProblem([good, other])
 
 
+@pytest.mark.slow
 def test_sensors_that_say_nothing_leave_finite_residuals(good):
     table = good.table.copy()
     table[["gyro_x", "eff_wheel_lf", "volt"]] = np.nan

@@ -126,14 +126,14 @@ def test_bouncing_is_averaged_and_its_noise_keeps_its_size():
         assert np.abs(residuals(measured, tone)[0][inside, c]).max() < 0.02 / NOISE[c]
 
 
-def test_drift_within_a_window_stays():
+def test_drift_of_a_wheel_stays_within_half_a_second_and_beyond_does_not():
     measured, simulated = drive(), drive()[None]
     for column in WHEELS:
         simulated[:, :, column] *= 1.01
     found = residuals(measured, simulated)[0][:, WHEELS[0]]
-    for window in WINDOWS:
-        drift = -0.01 * drive()[window, WHEELS[0]]
-        assert found[window] == pytest.approx((drift - drift.mean()) / NOISE[WHEELS[0]], abs=1e-6)
+    for rows in np.split(np.arange(len(T)), 16):  # 8 s
+        drift = -0.01 * drive()[rows, WHEELS[0]]
+        assert found[rows] == pytest.approx((drift - drift.mean()) / NOISE[WHEELS[0]], abs=1e-6)
 
 
 def test_pose_is_fitted_best():

@@ -23,7 +23,7 @@ from wlr_gym.gap.selection.cross_validation import (
     without_each_run,
 )
 from wlr_gym.gap.selection.equivalence import EQUIVALENT, equivalents
-from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.hypothesis import INSISTENT, Hypothesis
 from wlr_gym.gap.selection.refit import refit
 from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
 from wlr_gym.gap.selection.search import MOST_EFFECTS, PER_NAME, SHORTLIST, remove_redundant, search_effects, shortlist
@@ -163,16 +163,16 @@ def test_identical_responses_are_equivalent():
     assert gains["twin body"] > EQUIVALENT * look.selected.gain
 
 
-def test_implausible_size_is_not_accepted():
-    problem = Toy({}, [sized("weak", 1.2)], rows=400)
-    found = named(problem)
-    assert labels(found) == []
-    assert found.rounds[0].selected is None
+@pytest.mark.parametrize(("rows", "insist"), [(60, False), (400, True)])
+def test_implausible_size_is_accepted_only_where_the_data_insist(rows, insist):
+    found = named(Toy({}, [sized("weak", 1.2)], rows=rows))
     first = found.rounds[0].hypotheses[0]
     assert first.candidate.name == "weak"
     assert first.at_bound
     assert first.values == (0.5,)
     assert first.gain > LEAST_GAIN
+    assert (first.gain > INSISTENT) == insist
+    assert labels(found) == (["weak body"] if insist else [])
 
 
 @pytest.mark.parametrize(("size", "is_effect"), [(2.2, False), (4.0, True)])

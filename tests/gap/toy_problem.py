@@ -4,6 +4,7 @@ Everything is in noise units and one tolerance of a quantity moves its shape by 
 and in most effects; ``play`` starts with its square, ``ripple`` has an amplitude and a phase.
 """
 
+import math
 from collections.abc import Mapping
 from functools import cache
 from types import MappingProxyType
@@ -64,6 +65,7 @@ class Toy:
 
     metric, cap, steps, thorough, tempering, disagreement = "RMS in noise units", 50.0, 4, False, 1.0, 0.0
     held_out: tuple[str, ...] = ()
+    misfit = math.inf
     turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})
     motions: Mapping[str, str] = MappingProxyType({})
 

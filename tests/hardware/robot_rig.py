@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware import loop as loop_module
 from wlr_gym.hardware.config import load_hardware, with_ports
 from wlr_gym.hardware.emulator import Machine, MachineOptions
@@ -22,7 +23,7 @@ from wlr_gym.robot import JOINTS, load_robot
 
 loop_module.TIMED_READS = 20  # in emulated time they all take the same
 
-ROBOT = load_robot()
+ROBOT = load_robot("emanual")
 HARDWARE = load_hardware()
 PERIOD = 0.02
 DRIVE = np.array([1.5, 1.6, 1.5, 1.6, 3.0, 3.0, 3.0, 3.0])
@@ -30,7 +31,7 @@ DRIVE = np.array([1.5, 1.6, 1.5, 1.6, 3.0, 3.0, 3.0, 3.0])
 #: Safety limits for real time: a busy computer must not fail a test that is about something else than deadlines.
 PATIENT = {
     "patience": 1.0, "read_time": 5.0, "late": 10000, "late_share": 1.0, "silence": 9.0, "coast": 8.0, "imu_silence": 9.0,
-    "watchdog": 2.5,
+    "watchdog": 2.5, "heartbeat": 30.0,
 }  # fmt: skip
 
 
@@ -92,11 +93,14 @@ class Rig:
         machine: the emulated robot. loop: drives it.
     """
 
-    def __init__(self, log: Path | None = None, options=None, machine=None, dry_run: bool = False, **safety: Any) -> None:
+    def __init__(
+        self, log: Path | None = None, options=None, machine=None, dry_run: bool = False, profile=None, **safety: Any
+    ) -> None:
         hardware = hardware_with(**safety)
         self.machine = machine or Machine(ROBOT, hardware, options or MachineOptions(timing=NO_TIME))
         self.link = emulated_link(self.machine)
-        self.loop = ControlLoop(ROBOT, hardware, self.link, PERIOD, log=log, dry_run=dry_run)
+        meta = None if profile is None else RunMeta(robot=ROBOT.name, profile=profile)
+        self.loop = ControlLoop(ROBOT, hardware, self.link, PERIOD, log=log, dry_run=dry_run, meta=meta)
 
     def drive(self, seconds, setpoints=DRIVE):
         for _ in range(round(seconds / PERIOD)):

@@ -39,7 +39,7 @@ PATIENCE = 0.15
 @pytest.fixture
 def server():
     """The emulator in stepped time: what a test sees depends on no clock but the time-outs."""
-    machine = Machine(load_robot(), load_hardware(), MachineOptions(sensor_noise=False, timing=NO_TIME))
+    machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions(sensor_noise=False, timing=NO_TIME))
     with Server(machine, real_time=False) as server:
         yield server
 
@@ -107,7 +107,7 @@ def test_scan(group):
 
 
 def test_reboot_waits_until_the_servo_is_back():
-    machine = Machine(load_robot(), load_hardware(), MachineOptions())
+    machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions())
     with Server(machine) as server, connect(server) as group:
         group.write(2, "led", 1)
         group.reboot(2)
@@ -115,7 +115,7 @@ def test_reboot_waits_until_the_servo_is_back():
 
 
 def test_fast_reads_fall_back_for_good_on_old_firmware():
-    machine = Machine(load_robot(), load_hardware(), MachineOptions(firmware=44, timing=NO_TIME))
+    machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions(firmware=44, timing=NO_TIME))
     with Server(machine, real_time=False) as server, connect(server) as group:
         for _ in range(4):
             assert set(read_all(group, FAST_BLOCK)) == set(LEGS)
@@ -302,7 +302,8 @@ def test_what_is_lost_is_reported_missing_and_never_wrong(server, fault):
     server.machine.inject(fault)
     with connect(server, 0.02) as group:
         group.fast = False
-        truth = {id: server.machine.servos[joint]["present_position"] for joint, id in load_robot().dynamixel_ids.items()}
+        ids = load_robot("emanual").dynamixel_ids
+        truth = {id: server.machine.servos[joint]["present_position"] for joint, id in ids.items()}
         seen = 0
         for _ in range(40):
             for id, reading in read_all(group, FAST_BLOCK).items():
@@ -358,7 +359,7 @@ def test_torque_off_goes_out_on_a_line_that_never_falls_quiet():
 def test_a_line_that_never_falls_quiet_does_not_keep_the_other_bus_from_torque_off():
     with jabbering_port() as (legs, to_legs), jabbering_port() as (wheels, to_wheels):
         hardware = with_ports(load_hardware(), {"legs": legs, "wheels": wheels})
-        servos = Servos(load_robot(), hardware, 0.2)
+        servos = Servos(load_robot("emanual"), hardware, 0.2)
         servos.open()
         assert not servos.read().answered.any()
         for sent in (to_legs, to_wheels):
@@ -368,7 +369,7 @@ def test_a_line_that_never_falls_quiet_does_not_keep_the_other_bus_from_torque_o
         assert time.monotonic() - start < 10.0
         for sent, ids in ((to_legs, LEGS), (to_wheels, (6, 7, 5, 8))):
             assert protocol.sync_write(64, dict.fromkeys(ids, b"\0")) in sent()
-        (check,) = preflight.check_servos(servos, load_robot(), hardware, ["leg_lf"])
+        (check,) = preflight.check_servos(servos, load_robot("emanual"), hardware, ["leg_lf"])
         servos.close()
     assert check.found == "none, the line is never quiet"
     assert "Are two ports swapped" in check.remedy

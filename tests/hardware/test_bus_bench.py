@@ -15,7 +15,7 @@ from wlr_gym.studies.bench import bus
 
 
 def test_both_read_the_same():
-    robot, hardware = load_robot(), load_hardware()
+    robot, hardware = load_robot("emanual"), load_hardware()
     with bus._answering(robot, hardware) as ports:
         wired = with_ports(hardware, ports)
         with Servos(robot, wired, 1.0, lambda: 0.0) as servos:

@@ -28,7 +28,7 @@ from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 
-ROBOT, NOMINAL = load_robot(), load_hardware()
+ROBOT, NOMINAL = load_robot("emanual"), load_hardware()
 #: How the robot at hand is really mounted: not as the file says.
 TRUE = find.with_mountings(
     NOMINAL,

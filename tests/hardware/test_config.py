@@ -43,6 +43,10 @@ def edited(tmp_path, edit):
             lambda d: d["buses"]["wheels"]["eeprom"].pop("operating_mode"),
             r"yaml: .*eeprom.operating_mode is 3, expected 1",
         ),
+        (
+            lambda d: d["buses"]["legs"]["eeprom"].update(drive_mode=1),
+            r"yaml: .*legs.eeprom.drive_mode is 1, expected 0: leg_lf",
+        ),
         (lambda d: d["buses"]["legs"].update(prot="x"), "did you mean 'port'"),
         (lambda d: d["imu"].update(gyro_range=300), "imu.gyro_range"),
     ],

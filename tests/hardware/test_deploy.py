@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
+from rich.console import Console
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
@@ -19,6 +20,8 @@ from robot_rig import HARDWARE, PERIOD, Phase, hardware_file, machine_of
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK, run_command
+from wlr_gym.cli.deploy import DeployOptions, busy_note
+from wlr_gym.cli.robot_status import RobotView
 from wlr_gym.data.read import read_run
 from wlr_gym.data.replay import replay
 from wlr_gym.hardware.deployment import REHEARSALS, act_again, loop_of, read_policy_log
@@ -223,6 +226,34 @@ def test_command_line_in_emulated_time(tmp_path, capsys):
     assert (log["command_linear_velocity_x"] == 0.05).all()
 
 
+def test_the_live_status_shows_what_supervision_sees(tmp_path):
+    hardware = {"emulated": True, "log": tmp_path, "deadman": 5.0}
+    core = make_core(ID, 1, {"backend": "dynamixel", "hardware": hardware, "episode_length": 2.0})
+    loop = loop_of(core)
+    view, seen = RobotView(loop, core), []
+
+    def look():
+        if loop.phase is Phase.RUNNING:
+            loop.operator.note_sign()
+            file = io.StringIO()
+            Console(file=file, width=400).print(view.table())
+            seen.append(file.getvalue())
+
+    loop.operator.spare = look
+    machine_of(core).inject("drop wheel_rf after=1.2 duration=0.1")
+    drive(core, make_policy("pid", core.contract()), command=COMMAND)
+    core.close()
+    status = loop.status
+    assert status is not None
+    for words in ("running  1.0 s", "linear_velocity_x +0.08", "wheel_rr", "limit 70%", "limit 68", "limit 10.2", "limit 0.7"):
+        assert any(words in text for text in seen), words
+    assert "operator silent 0.0 s (limit 5)" in seen[-1]
+    silent = [text for text in seen if "servos silent 0.00 s" not in text]
+    assert 1 <= len(silent) <= 5  # of 20 ms each
+    assert "acts on: silence" in silent[-1]
+    assert "acts on: nothing" in seen[-1]
+
+
 def test_command_line_says_why_it_stopped(tmp_path, capsys):
     assert run_command("deploy", words(tmp_path, "--fault", "overload wheel_rr after=0.8")) == FAILED
     assert "alert: wheel_rr has a hardware error" in capsys.readouterr().out
@@ -253,6 +284,15 @@ def test_command_line_dry_run(tmp_path):
 def test_command_line_bad_options(tmp_path, more, message):
     with pytest.raises(InputError, match=message):
         run_command("deploy", words(tmp_path, *more))
+
+
+@pytest.mark.parametrize("reason", ["deadlines: 5 ticks in a row late", "silence: no answer from leg_lf for 0.5 s"])
+def test_a_busy_computer_is_named_where_nothing_else_can_be_late(reason):
+    emulated = DeployOptions("pid", emulated=True)
+    assert "--stepped" in busy_note(emulated, reason)
+    assert busy_note(emulated, "tilt: 0.8 rad") == ""
+    for other in ({"emulated": False}, {"stepped": True}, {"fault": ("drop legs",)}):
+        assert busy_note(replace(emulated, **other), reason) == ""
 
 
 def test_faults_are_for_the_emulated_robot(tmp_path):

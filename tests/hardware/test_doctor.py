@@ -1,5 +1,6 @@
 """``wlr doctor`` on the emulated robot: a good one passes; each fault is named first, with its remedy and exit code."""
 
+import io
 import json
 import sys
 from functools import partial
@@ -22,7 +23,7 @@ from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.safety import preflight
 
-ROBOT, HARDWARE = load_robot(), load_hardware()
+ROBOT, HARDWARE = load_robot("emanual"), load_hardware()
 
 
 @pytest.fixture
@@ -39,12 +40,12 @@ def look(capsys, **options):
 
 def test_a_good_robot_passes(machine, capsys, tmp_path):
     code, text = look(capsys, json=tmp_path / "checks.json")
-    assert (code, text.splitlines()[-1]) == (0, "All 151 checks passed.")
+    assert (code, text.splitlines()[-1]) == (0, "All 211 checks passed.")
     assert "8 of 8     supply" in text
     assert "bus speed: median 3.00 ms" in text
     assert "All 8" not in text
     found = json.loads((tmp_path / "checks.json").read_text())
-    assert len(found) == 151
+    assert len(found) == 211
     assert {entry["where"] for entry in found} >= {"legs", "imu", "wheel_rr", "robot"}
 
 
@@ -55,7 +56,7 @@ def test_a_good_robot_passes(machine, capsys, tmp_path):
         ("unplug imu", "imu, port: not there", "--port imu=PATH"),
         ("dead leg_rr", "leg_rr, answer: none", "cable and adapter of bus legs"),
         ("overload leg_lf", "leg_lf, hardware error: overload", "reboot it"),
-        ("sag value=3", "leg_lf, supply: 9.0 V", "Charge the battery"),
+        ("sag value=3", "leg_lf, supply: 9.", "Charge the battery"),
         ("dead imu", "imu, readings: none", "baud rate"),
     ],
 )
@@ -97,19 +98,28 @@ def test_a_tilted_robot_and_a_lossy_imu(machine, capsys):
     assert "wlr calibrate imu --mounting" in text
 
 
-def test_mending_writes_registers_and_looks_again(machine, capsys):
+def test_mending_asks_writes_registers_and_looks_again(machine, capsys, monkeypatch):
     machine.servos["leg_lr"].set("return_delay_time", 250)
     machine.servos["wheel_rf"].set("drive_mode", 1)
     code, text = look(capsys)
     assert (code, "1 fault, 1 warning in" in text) == (1, True)
     assert "First: wheel_rf, drive_mode: 1, expected 0" in text
+    assert "2 registers can be written, after a question: wlr doctor --emulated --mend" in text
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    with pytest.raises(InputError, match="nobody there to write it"):
+        look(capsys, mend=True)
+    assert machine.servos["leg_lr"]["return_delay_time"] == 250
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
     code, text = look(capsys, mend=True)
-    assert (code, text.splitlines()[0]) == (0, "mended: 2, left: 0")
+    assert code == 0
+    assert "leg_lr: return_delay_time, now 250, will be 0\nwheel_rf: drive_mode, now 1, will be 0" in text
+    assert "Nothing moves. Write it? Enter to write it" in text
+    assert "mended: 2, left: 0" in text
     assert machine.servos["leg_lr"]["return_delay_time"] == 0
 
 
 def test_verbose_lists_every_joint(machine, capsys):
-    assert len(look(capsys, verbose=True)[1].splitlines()) == 152
+    assert len(look(capsys, verbose=True)[1].splitlines()) == 212
 
 
 def test_on_ports_with_a_scan(capsys, monkeypatch):

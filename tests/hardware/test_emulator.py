@@ -21,7 +21,7 @@ from wlr_gym.physics.servo import motor_constants
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.robot.parameters import Parameters
 
-ROBOT = load_robot()
+ROBOT = load_robot("emanual")
 HARDWARE = load_hardware()
 LEG_IDS = [ROBOT.dynamixel_ids[joint] for joint in JOINTS[:4]]
 VELOCITY = 0.229 * 2 * np.pi / 60

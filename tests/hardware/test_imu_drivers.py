@@ -18,7 +18,7 @@ from wlr_gym.hardware.imu.mpu6050 import Mpu6050, open_bus
 from wlr_gym.hardware.imu.reading import Conversion, ImuGoneError
 from wlr_gym.hardware.imu.stream import ImuStream, StreamClock
 from wlr_gym.hardware.ports import PortInUseError
-from wlr_gym.hardware.safety.preflight import open_ports
+from wlr_gym.hardware.safety.preflight import check_imu, open_ports
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import load_robot
@@ -236,6 +236,7 @@ class Memory:
     def read(self, size):
         if self.gone:
             raise OSError(5, "Input/output error")
+        size = min(size, 4096)  # as systems do
         data, self.data = self.data[:size], self.data[size:]
         return data
 
@@ -294,6 +295,88 @@ def test_age_is_told_from_the_microcontrollers_clock_over_its_turn(clock, memory
     assert stream.statistics.restarts == 1
 
 
+def frames(begin, end):
+    """Frames at 200 Hz, stamped 100 s ahead of the computer's clock."""
+    return b"".join(frame(100.0 + k / 200, k % 65536) for k in range(round(begin * 200), round(end * 200)))
+
+
+def test_a_backlog_is_read_to_its_end(clock, memory, stream):
+    memory.data, clock.now = frames(0.0, 0.02), 0.02
+    assert stream.read().age == 0.0
+    memory.data, clock.now = frames(0.02, 3.5), 3.5  # 16.7 kB
+    assert stream.read().age < 0.005
+    assert memory.data == b""
+    assert (stream.statistics.readings, stream.statistics.restarts, stream.statistics.lost) == (700, 0, 0)
+
+
+def test_a_backlog_that_was_cut_off_tells_its_age(clock, memory, stream):
+    """The system kept the oldest 0.85 s and threw the rest away."""
+    memory.data, clock.now = frames(0.0, 0.02), 0.02
+    stream.read()
+    for now in (3.5, 6.0):
+        memory.data, clock.now = frames(now - 2.5, now - 2.5 + 0.85), now
+        assert stream.read().age == pytest.approx(1.65, abs=0.13)
+    clock.now += 0.02
+    memory.data = frames(6.0, 6.02)
+    assert stream.read().age == 0.0
+    assert stream.statistics.restarts == 0
+
+
+def test_a_first_backlog_is_of_unknown_age(clock, memory, stream):
+    """Nobody has read since the port was opened: the newest may be as old as that."""
+    memory.data, clock.now = frames(0.0, 0.85), 3.5
+    assert stream.read() is None
+    memory.data, clock.now = frames(3.5, 3.52), 3.52
+    assert stream.read().age == 0.0
+    assert stream.statistics.restarts == 0
+
+
+class Feed:
+    """A clock with which frames come at 200 Hz into a port that keeps 16 kB of what nobody reads, and throws the rest away."""
+
+    def __init__(self, clock, memory):
+        self.clock, self.memory, self.sent = clock, memory, 0
+
+    def now(self):
+        return self.clock.now
+
+    def wait_until(self, moment):
+        while (self.sent + 1) / 200 <= moment + 1e-9:
+            self.sent += 1
+            if len(self.memory.data) < 16384:
+                still = (self.sent % 2, 0, 0)
+                self.memory.data += frame(100.0 + self.sent / 200, self.sent % 65536, still)
+        self.clock.now = max(self.clock.now, moment)
+
+
+@pytest.mark.parametrize("unread", [0.0, 1.0, 3.5, 9.0])
+def test_the_doctor_sees_the_true_rate_whatever_piled_up(clock, memory, stream, unread):
+    feed = Feed(clock, memory)
+    feed.wait_until(unread)
+    checks = {check.what: check for check in check_imu(stream, ImuPort(port="x", rate=200.0), feed)}
+    assert 196 <= float(checks["rate"].found.split()[0]) <= 204
+    assert checks["losses"].found.startswith("0 lost")
+    assert all(check.ok for check in checks.values()), list(map(str, checks.values()))
+
+
+def test_a_microcontroller_that_restarts_while_nobody_reads(clock, memory, stream):
+    memory.data, clock.now = frames(0.0, 0.02), 0.02
+    stream.read()
+    memory.data, clock.now = frames(0.02, 0.4) + frame(0.1, 0) + frame(0.105, 1), 2.0
+    assert stream.read() is None
+    memory.data, clock.now = frame(0.125, 5), 2.02
+    assert stream.read().age == 0.0
+    assert stream.statistics.restarts == 1
+
+
+def test_a_frame_that_comes_again_and_again_ages(clock, memory, stream):
+    for clock.now in (0.0, 0.02, 0.2):
+        memory.data = frame(1.0, 7)
+        reading = stream.read()
+    assert reading.age == pytest.approx(0.2, abs=0.01)
+    assert stream.statistics.lost == 0
+
+
 @pytest.mark.parametrize("error", [-0.01, 0.0, 0.01])
 def test_clocks_may_drift_and_arrival_may_jitter(error):
     rng = np.random.default_rng(3)
@@ -303,6 +386,7 @@ def test_clocks_may_drift_and_arrival_may_jitter(error):
         delay = 0.001 + 0.004 * rng.random()
         age, restarted = frames.age(round((now - delay) * (1 + error) * 1e6) % 2**32, now)
         assert not restarted
+        assert age is not None
         ages.append((age, delay))
     age, delay = np.array(ages[100:]).T
     assert np.abs(age - (delay - 0.001)).max() < 0.004
@@ -333,7 +417,7 @@ def test_a_stream_in_use_is_refused_and_the_doctor_says_what_to_do(tmp_path):
             other = ImuStream(hardware.imu)
             with pytest.raises(PortInUseError, match=r"IMU port .* is in use by another program"):
                 other.open()
-            servos = Servos(load_robot(), with_ports(hardware, {"wheels": str(tmp_path / "none")}))
+            servos = Servos(load_robot("emanual"), with_ports(hardware, {"wheels": str(tmp_path / "none")}))
             found = {check.where: check for check in open_ports(servos, other, hardware)}
         assert {where: "End that program first" in check.remedy for where, check in found.items()} == {
             "legs": True, "wheels": False, "imu": True,
@@ -371,18 +455,22 @@ def test_on_the_emulated_robots_port():
     from wlr_gym.hardware.emulator.line import NO_TIME
     from wlr_gym.robot import load_robot
 
-    machine = Machine(load_robot(), load_hardware(), MachineOptions(timing=NO_TIME, sensor_noise=False))
+    machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions(timing=NO_TIME, sensor_noise=False))
     with Server(machine, real_time=False) as server:
         port = with_ports(machine.hardware, server.ports).imu
         with make_imu(port, lambda: machine.time) as imu:
             server.advance(0.5)
-            reading, end = imu.read(), time.monotonic() + 5.0
+            end = time.monotonic() + 5.0
             while imu.statistics.readings < 100 and time.monotonic() < end:  # the system passes bytes on when it likes
-                reading = imu.read()
+                imu.read()
+            server.advance(0.02)
+            while (reading := imu.read()) is None and time.monotonic() < end:
+                pass
             assert reading is not None
+            assert reading.age < 0.025
             np.testing.assert_allclose(reading.accelerometer, [0.0, 0.0, 9.81], atol=0.02)
             np.testing.assert_allclose(reading.gyro, 0.0, atol=0.01)
-            assert imu.statistics.readings == 100
+            assert imu.statistics.readings >= 100
             server.command("unplug imu")
             server.advance(0.01)
             with pytest.raises(ImuGoneError):

@@ -10,7 +10,8 @@ import pytest
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
-from robot_rig import DRIVE, JOINTS, PERIOD, Phase, Rig, StoppedError
+import robot_rig
+from robot_rig import DRIVE, HARDWARE, JOINTS, PERIOD, Phase, Rig, StoppedError
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.read import read_dataset, read_run
@@ -215,10 +216,12 @@ def test_the_watchdog_of_a_servo_that_does_not_confirm_torque_off_stays_armed(tm
     assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS] == [10] + [0] * 7
 
 
-def test_servo_limits_are_kept(rig):
+def test_servo_limits_are_kept(monkeypatch):
     """A servo ignores setpoints beyond its registers; the command limiter reads the registers and stays inside."""
-    for joint in JOINTS[4:]:
-        rig.machine.servos[joint].set("velocity_limit", 100)  # 2.4 rad/s
+    wheels = HARDWARE.buses["wheels"]
+    slow = wheels.model_copy(update={"eeprom": {**wheels.eeprom, "velocity_limit": 100}})  # 2.4 rad/s
+    monkeypatch.setattr(robot_rig, "HARDWARE", HARDWARE.model_copy(update={"buses": {**HARDWARE.buses, "wheels": slow}}))
+    rig = Rig()
     rig.loop.start()
     rig.drive(1.0)
     assert np.abs(rig.goal_counts()[4:]).max() == 100

@@ -295,11 +295,15 @@ def test_a_fault_in_the_tick_of_a_request_is_no_good_end(rig):
 
 
 def hold(rig, joint):
-    """Keep a leg about where it is: its servo's own limits let it go no farther."""
+    """Keep a leg about where it is: after the preflight checks its servo's own limits let it go no farther."""
     servo = rig.machine.servos[joint]
     place = servo["present_position"]
-    servo.set("min_position_limit", place - 50)
-    servo.set("max_position_limit", place + 50)
+
+    def narrow():
+        servo.set("min_position_limit", place - 50)
+        servo.set("max_position_limit", place + 50)
+
+    rig.loop.operator.spare = narrow
 
 
 def test_a_leg_that_is_not_at_the_start_pose_stops_the_robot(rig):

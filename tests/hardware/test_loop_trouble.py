@@ -17,7 +17,7 @@ from wlr_gym.data.read import read_run
 from wlr_gym.hardware.log import CsvTable, read_events
 from wlr_gym.hardware.operator import STOP_SIGNALS, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
-from wlr_gym.hardware.safety import preflight
+from wlr_gym.hardware.safety import preflight, registers
 from wlr_gym.hardware.safety.limiter import CALM_SPEED
 from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.physics.plants.robot_options import RobotOptions
@@ -114,7 +114,7 @@ def test_a_terminal_that_is_gone_stops_the_robot_in_good_order(rig):
     rig.drive(0.5)
     speeds = wheel_speeds_at_off(rig)
     rig.loop.operator.spare = gone
-    with pytest.raises(StoppedError, match="computer: the operator's terminal is gone"):
+    with pytest.raises(StoppedError, match="computer: the operator's terminal or gamepad is gone"):
         rig.drive(0.5)
     assert not rig.torque().any()
     assert np.abs(speeds[-1]).max() < 0.4
@@ -209,9 +209,9 @@ def test_a_display_that_hangs_is_noticed(rig, when):
 # ---- where the robot stands --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("angle", [-1.6, 1.6])
-def test_a_leg_outside_its_limits_comes_back_slowly(rig, angle):
-    """A hand can follow it, wherever the ramp begins."""
+@pytest.mark.parametrize("angle", [-1.25, 1.25])
+def test_a_leg_at_its_stop_comes_back_slowly(rig, angle):
+    """A hand can follow it, also where it begins a little beyond the range."""
     rig.link.servos.open()
     rig.machine.turn("leg_lf", angle)
     rig.link.servos.close()
@@ -229,7 +229,17 @@ def test_a_leg_outside_its_servos_limits_does_not_start(rig):
     """Its goal would be clipped to them, and the leg jump there at full speed when torque comes on."""
     place = rig.machine.servos["leg_rf"]["present_position"]
     rig.machine.servos["leg_rf"].set("min_position_limit", place + 300)
-    with pytest.raises(StoppedError, match=f"leg_rf +position: {place}, expected {place + 300} to 4095"):
+    with pytest.raises(StoppedError, match=f"leg_rf +min_position_limit: {place + 300}, expected 0"):
+        rig.loop.start()
+    assert not rig.torque().any()
+
+
+@pytest.mark.parametrize(("degrees", "angle"), [(100, "3.32"), (-100, "-0.17"), (360, "7.85")])
+def test_a_leg_outside_its_range_is_not_driven_back(rig, degrees, angle):
+    """Through whatever it went past; a turn too far may be no more than its count, which torque on would take back."""
+    rig.machine.turn("leg_rf", np.deg2rad(degrees))
+    rig.machine.step()
+    with pytest.raises(StoppedError, match=rf"leg_rf +position: {angle} rad .*expected 0.35 to 2.79 rad"):
         rig.loop.start()
     assert not rig.torque().any()
 
@@ -248,13 +258,22 @@ class Lying:
         return (0, 8192, 0), (0, 0, 0)
 
 
+@pytest.mark.parametrize("joint", ["leg_lf", "wheel_rf"])
+def test_a_servo_that_dies_is_named_alone(rig, joint):
+    """Those named behind it in a read of all wait for its answer; they are heard all the same."""
+    rig.loop.start()
+    rig.inject(f"dead {joint}")
+    with pytest.raises(StoppedError, match=rf"^silence: no answer from {joint} for 0\.4"):
+        rig.drive(1.0)
+
+
 def test_mending_leaves_servos_alone_that_are_on(rig):
     rig.link.open()
     for joint in ("leg_lf", "wheel_rr"):
         rig.machine.servos[joint].set("bus_watchdog", -1)
     rig.machine.servos["wheel_rr"].set("torque_enable", 1)
     servos = rig.link.servos
-    left = preflight.mend(servos, preflight.check_servos(servos, ROBOT, HARDWARE))
+    left = registers.mend(servos, preflight.check_servos(servos, ROBOT, HARDWARE))
     assert {(check.where, check.what) for check in left} == {("wheel_rr", "watchdog"), ("wheel_rr", "torque")}
     assert [servos.get(joint, "bus_watchdog") for joint in ("leg_lf", "wheel_rr")] == [0, -1]
     rig.link.close()

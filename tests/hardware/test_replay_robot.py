@@ -23,7 +23,7 @@ from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 
-ROBOT = load_robot()
+ROBOT = load_robot("emanual")
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,10 @@ import re
 from dataclasses import fields
 from pathlib import Path
 
-from wlr_gym.cli import emulate
+import pytest
+
+from wlr_gym.cli import commission, emulate
+from wlr_gym.hardware.commissioning.registry import TESTS
 from wlr_gym.hardware.config import load_hardware
 from wlr_gym.hardware.emulator import FAULTS, health
 from wlr_gym.hardware.emulator.servo import BOOT_TIME, FIRMWARE
@@ -62,3 +65,33 @@ def test_chosen_numbers():
     assert f"above {health.LARGEST_LOAD:.0%} of stall for {health.OVERLOAD_TIME:g} s".replace("80%", "80 %") in PAGE
     heating = f"{health.AMBIENT:g} degC, {health.HEATING:g} degC above that in a lasting stall"
     assert f"{heating}, time constant {health.THERMAL_TIME:g} s" in PAGE
+
+
+def test_every_commissioning_test_and_option_is_listed():
+    named = [name for row in table_under("## Commissioning") for name in re.findall(r"`([\w-]+)", row[0])]
+    assert [name for name in named if not name.startswith("--")] == list(TESTS)
+    options = {name[2:] for name in named if name.startswith("--")}
+    assert options
+    assert options <= {field.name for field in fields(commission.CommissionOptions)}
+
+
+def test_what_the_software_sees_of_the_power_switch():
+    pytest.importorskip("dynamixel_sdk")
+    from robot_rig import Rig, StoppedError
+
+    for fault, words in (
+        ("dead legs wheels", "ended: {}; CUT THE POWER"),
+        ("brownout legs wheels", "only ends the run after 0.4 s: `{}`"),
+    ):
+        rig = Rig()
+        rig.loop.start()
+        rig.drive(0.5)
+        start = rig.machine.time
+        rig.inject(fault)
+        with pytest.raises(StoppedError) as stopped:
+            rig.drive(3.0)
+        reason, _, demand = str(stopped.value).partition("; ")
+        assert words.format(reason) in PAGE
+        assert demand.startswith("CUT THE POWER") == fault.startswith("dead")
+        assert rig.machine.time - start == pytest.approx(2.5 if demand else 0.4, abs=0.05)
+        rig.loop.close()

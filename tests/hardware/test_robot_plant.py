@@ -76,7 +76,7 @@ def test_the_same_run_gives_the_same_bits():
 
 def test_reset_goes_to_the_state_and_zeroes_the_wheels():
     plant, sensors = robot_plant(), None
-    state = make_plant("gibbs_appell", ROBOT, 1, QUIET).get_state()
+    state = make_plant("gibbs_appell", ROBOT, 1, QUIET).mechanical_state()
     state.joint_position[0, :4] = [1.3, 1.4, 1.7, 1.8]
     for _ in range(2):
         sensors = plant.reset(state=state)
@@ -102,7 +102,7 @@ def test_there_is_one_robot(count):
 
 def test_what_a_robot_cannot_do_is_refused():
     plant = robot_plant()
-    for ask in (plant.truth, plant.get_state):
+    for ask in (plant.truth, plant.mechanical_state):
         with pytest.raises(InputError, match="real robot"):
             ask()
     with pytest.raises(InputError, match=r"setpoints have shape \(8,\)"):

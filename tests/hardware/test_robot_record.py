@@ -26,7 +26,7 @@ from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.log import read_events
 
-ROBOT = load_robot()
+ROBOT = load_robot("emanual")
 
 
 def recorded(out, **options):

@@ -15,11 +15,12 @@ from hypothesis.extra.numpy import arrays
 
 from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.safety import limiter, rules
-from wlr_gym.hardware.safety.rules import Level, Memory, RobotStatus
+from wlr_gym.hardware.safety.rules import Memory
+from wlr_gym.hardware.safety.state import Level, RobotStatus
 from wlr_gym.robot import JOINTS, load_robot
 
 ROOT = Path(__file__).resolve().parents[2]
-ROBOT = load_robot()
+ROBOT = load_robot("emanual")
 LIMITS = SafetyLimits()
 RATINGS = rules.ratings_of(ROBOT, 0.02)
 HOME = np.r_[[np.pi / 2] * 4, [0.0] * 4]
@@ -50,11 +51,16 @@ def decide(wanted=HOME, previous=HOME, memory=None, torque_on=None, **changes):
     return rules.decide(LIMITS, RATINGS, status(**changes), memory or Memory(), previous, wanted, torque_on)
 
 
+def noisy(seen, tick):
+    """A status with the last bit of the IMU in motion, as a real one's is."""
+    return replace(seen, gyro=seen.gyro + 1e-4 * (tick % 2))
+
+
 def last_for(seconds, limits=LIMITS, **changes):
     """The decision after a status has lasted, and s until the level rose."""
     memory, seen, decision = Memory(), status(**changes), decide()
     for tick in range(round(seconds / 0.02)):
-        decision = rules.decide(limits, RATINGS, seen, memory, HOME, HOME)
+        decision = rules.decide(limits, RATINGS, noisy(seen, tick), memory, HOME, HOME)
         memory = decision.memory
         if decision.level > Level.DRIVE:
             return decision, tick * 0.02
@@ -217,7 +223,7 @@ def test_what_acts_at_once(changes, rule, level):
     [
         ({"effort": at(-0.75 * 7.3, 0)}, "load", Level.STOP, LIMITS.load_time),
         ({"effort": at(0.75 * 1.5, 6)}, "load", Level.STOP, LIMITS.load_time),
-        ({"effort": np.r_[[4.9] * 4, [1.0] * 4]}, "current", Level.STOP, LIMITS.current_time),
+        ({"effort": np.r_[[4.2] * 4, [0.2] * 4]}, "current", Level.STOP, LIMITS.current_time),
         ({"voltage": at(9.9, 3, 12.0)}, "voltage", Level.STOP, LIMITS.low_voltage_time),
         ({"up": np.array([np.sin(0.75), 0.0, np.cos(0.75)])}, "tilt", Level.OFF, LIMITS.tilt_time),
         ({"gyro": np.array([4.5, 0.0, 0.0])}, "tilt ahead", Level.STOP, LIMITS.tilt_time),
@@ -234,7 +240,7 @@ def test_what_must_last(changes, rule, level, after):
     "changes",
     [
         {"effort": at(0.65 * 7.3, 0)},
-        {"effort": np.r_[[4.0] * 4, [0.2] * 4]},
+        {"effort": np.r_[[3.7] * 4, [0.2] * 4]},  # 9.7 A
         {"voltage": np.full(8, 10.3)},
         {"voltage": np.full(8, np.nan), "temperature": np.full(8, np.nan)},
         {"up": np.array([np.sin(0.35), 0.0, np.cos(0.35)])},
@@ -254,7 +260,7 @@ def test_loads_that_come_and_go_are_forgiven():
     memory = Memory()
     for tick in range(500):
         high = tick % 100 < 40
-        decision = rules.decide(LIMITS, RATINGS, status(effort=at(6.0 * high, 0)), memory, HOME, HOME)
+        decision = rules.decide(LIMITS, RATINGS, noisy(status(effort=at(6.0 * high, 0)), tick), memory, HOME, HOME)
         memory = decision.memory
         assert decision.level == Level.DRIVE
 
@@ -301,10 +307,10 @@ def test_tilt_is_seen_before_it_is_there():
     """Falling over the side at 3 rad/s: stopped before the body has passed the limit."""
     memory, up, rate, tilt = Memory(), np.array([0.0, 0.0, 1.0]), np.array([3.0, 0.0, 0.0]), 0.0
     decision = decide()
-    for _ in range(40):
+    for tick in range(40):
         tilt += 0.06
         up = rules.next_up(up, rate, np.zeros(3), 0.02)
-        decision = rules.decide(LIMITS, RATINGS, status(up=up, gyro=rate), memory, HOME, HOME)
+        decision = rules.decide(LIMITS, RATINGS, noisy(status(up=up, gyro=rate), tick), memory, HOME, HOME)
         memory = decision.memory
         if decision.level >= Level.STOP:
             break
@@ -313,14 +319,6 @@ def test_tilt_is_seen_before_it_is_there():
 
 
 # ---- readings ----------------------------------------------------------------------------------------------------------
-
-
-def test_positions_no_joint_can_reach_are_none():
-    before = status()
-    moved = HOME + np.r_[[0.2, 0.3, np.nan, 0.0], [0.25, 0.3, -0.3, 40.0]]
-    good = rules.plausible(RATINGS, before, moved, 1.02)
-    assert good.tolist() == [True, False, False, True, True, False, False, False]
-    assert rules.plausible(RATINGS, replace(before, silence=np.full(8, 0.1)), moved, 1.02)[1]  # it had more time
 
 
 # ---- limits are data ---------------------------------------------------------------------------------------------------
@@ -379,6 +377,25 @@ def test_only_command_limiter_and_watchdog_process_write_setpoints_and_torque():
                 found.add(path.relative_to(ROOT / "wlr_gym").as_posix())
     assert "hardware/safety/limiter.py" in found
     assert found <= ALLOWED, found - ALLOWED
+
+
+#: Modules that write single items of servos. Preflight's registers are mended with torque off; commissioning has own limits.
+SINGLE_WRITERS = {
+    "hardware/safety/limiter.py",
+    "hardware/safety/registers.py",
+    "hardware/commissioning/stand.py",
+}
+
+
+def test_single_items_are_written_by_limiter_preflight_and_commissioning_only():
+    found = set()
+    for path in (ROOT / "wlr_gym/hardware").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "set"):
+                continue
+            if len(node.args) == 3 or any(isinstance(one, ast.Starred) for one in node.args):
+                found.add(path.relative_to(ROOT / "wlr_gym").as_posix())
+    assert found == SINGLE_WRITERS
 
 
 def test_the_command_limiter_does_not_hand_out_the_servos():

@@ -27,14 +27,14 @@ def patient(monkeypatch):
 
 @pytest.fixture
 def server():
-    machine = Machine(load_robot(), load_hardware(), MachineOptions(sensor_noise=False))
+    machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions(sensor_noise=False))
     with Server(machine) as server:
         yield server
 
 
 @pytest.fixture
 def stepped():
-    machine = Machine(load_robot(), load_hardware(), MachineOptions(sensor_noise=False, timing=NO_TIME))
+    machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions(sensor_noise=False, timing=NO_TIME))
     with Server(machine, real_time=False) as server:
         yield server
 
@@ -162,7 +162,7 @@ def test_unplugged_port_is_gone_and_comes_back(tmp_path):
 
     import serial
 
-    machine = Machine(load_robot(), load_hardware(), MachineOptions(timing=NO_TIME))
+    machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions(timing=NO_TIME))
     with Server(machine, real_time=False, links=tmp_path) as server:
         link = tmp_path / "legs"
         assert os.path.realpath(link) == server.ports["legs"]
@@ -201,7 +201,7 @@ def test_a_failure_of_the_simulator_is_told(stepped, monkeypatch):
 def test_control_socket(tmp_path):
     import socket
 
-    machine = Machine(load_robot(), load_hardware(), MachineOptions(timing=NO_TIME))
+    machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions(timing=NO_TIME))
     path = tmp_path / "control"
     with Server(machine, control=path), socket.socket(socket.AF_UNIX) as client:
         client.settimeout(5)

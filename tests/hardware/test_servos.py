@@ -16,7 +16,7 @@ pytest.importorskip("termios")
 
 from wlr_gym.hardware.servos import JointMap, Servos
 
-ROBOT = load_robot()
+ROBOT = load_robot("emanual")
 HARDWARE = load_hardware()
 SETPOINTS = np.array([1.3, 1.4, 1.7, 1.8, 2.0, -2.0, 1.5, 3.0])
 
@@ -77,7 +77,7 @@ def test_counts_and_si_values_are_inverse():
     np.testing.assert_allclose(joint_map.position(counts)[:4], SETPOINTS[:4], atol=0.5 * 2 * np.pi / 4096)
     np.testing.assert_allclose(joint_map.velocity(counts)[4:], SETPOINTS[4:], atol=0.5 * 0.023981)
     np.testing.assert_allclose(
-        joint_map.effort(np.ones(8)), [s * e for s, e in zip([1, -1] * 4, effort_counts(ROBOT), strict=True)]
+        joint_map.effort(np.ones(8), np.zeros(8)), [s * e for s, e in zip([1, -1] * 4, effort_counts(ROBOT), strict=True)]
     )
 
 

@@ -40,7 +40,7 @@ try:
         for tick in range(100000):
             plant.step(setpoints)
             if tick == 10:
-                print("driving", plant.loop._watchdog.process.pid, flush=True)
+                print("driving", plant.loop._guard.process.process.pid, flush=True)
 except StoppedError as stop:
     print("stopped:", stop)
 finally:
@@ -138,6 +138,24 @@ def test_the_watchdog_process_waits_for_an_adapter_that_is_gone(server):
     assert torque(server) == [True] * 4 + [False] * 4
     groups[0]._port.port_name = server.ports["legs"]
     assert switch_off(groups, 3.0) == {}
+    assert not any(torque(server))
+
+
+def test_a_driver_that_hangs_is_killed_and_torque_goes_off(tmp_path, server):
+    """SIGSTOP: no signal is handled any more, and the port stays locked."""
+    driver, watchdog = start_driver(tmp_path, server, heartbeat=0.8, watchdog=0.7)
+    driver.send_signal(signal.SIGSTOP)
+    assert wait_until(lambda: not any(torque(server)), 20.0) < 1.5
+    assert driver.wait(5.0) == -signal.SIGKILL
+    wait_until(lambda: not alive(watchdog), 10.0)
+    assert '"driver": "hangs"' in (tmp_path / "log" / "guard.jsonl").read_text()
+
+
+def test_a_driver_whose_watchdog_process_is_gone_stops(tmp_path, server):
+    driver, watchdog = start_driver(tmp_path, server)
+    os.kill(watchdog, signal.SIGKILL)
+    output, _ = driver.communicate(timeout=20)
+    assert "computer: the watchdog process is gone" in output
     assert not any(torque(server))
 
 

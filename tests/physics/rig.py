@@ -115,7 +115,7 @@ def record(plant: GibbsAppellPlant, seconds: float, setpoints=HOME, torque_on=No
 
 def gears(plant: GibbsAppellPlant) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return how far the rotors lead their joints (rad) and their rates (rad/s), each (N, 8)."""
-    state = plant.get_state()
+    state = plant.mechanical_state()
     assert state.rotor_lead is not None
     assert state.rotor_rate is not None
     return state.rotor_lead, state.rotor_rate

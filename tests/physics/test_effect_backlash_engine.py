@@ -69,7 +69,7 @@ def test_rotor_spins_up_alone_until_the_teeth_meet():
 
 def mechanical_energy(plant):
     """Bodies, rotors and pressed teeth (N,), J."""
-    state, truth = plant.get_state(), plant.truth()
+    state, truth = plant.mechanical_state(), plant.truth()
     parameters = plant.parameters.copy()
     armature, play = parameters["servo.armature"].copy(), parameters["servo.backlash"]
     parameters["servo.armature"] = np.where(play > 0.0, 0.0, armature)
@@ -90,7 +90,7 @@ def test_impacts_keep_momentum_and_lose_energy(step):
     """A rotor coasts into its teeth: momentum of rotor and wheel about the axle stays, energy only falls."""
     start = 5.0
     plant = make_plant(2, in_space, lift, step=step, period=step)
-    state = plant.get_state()
+    state = plant.mechanical_state()
     state.rotor_rate = np.zeros((2, 8))
     state.rotor_rate[:, 4:] = start * np.array([1.0, -1.0, 0.5, -0.5])
     plant.reset(state=state)
@@ -179,9 +179,9 @@ def test_state_with_play_round_trips():
     plant = make_plant(2, lambda p: p.__setitem__("servo.backlash", 0.02))
     setpoints = np.concatenate([LEGS_DOWN + 0.1, np.full(4, 3.0)])
     drive(plant, 0.3, setpoints)
-    state = plant.get_state()
+    state = plant.mechanical_state()
     assert np.abs(gears(plant)[0]).max() > 0.005
     plant.reset(state=state)
-    again = plant.get_state()
+    again = plant.mechanical_state()
     for name in ("rotor_lead", "rotor_rate", "supply_drop"):
         np.testing.assert_array_equal(getattr(again, name), getattr(state, name))

@@ -43,7 +43,7 @@ FAMILIES = {f.__name__: f for f in (drive_effects, ground_effects, creep, tether
 
 def stored(plant):
     """Energy of bodies, rotors, pressed teeth and tether (N,), J; the contact springs' is counted as work."""
-    truth, state, parameters = plant.truth(), plant.get_state(), plant.parameters.copy()
+    truth, state, parameters = plant.truth(), plant.mechanical_state(), plant.parameters.copy()
     play, armature = parameters["servo.backlash"], parameters["servo.armature"].copy()
     parameters["servo.armature"] = np.where(play > 0.0, 0.0, armature)
     v, w = truth.linear_velocity_in_body, truth.angular_velocity_in_body

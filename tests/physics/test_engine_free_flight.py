@@ -61,7 +61,7 @@ def test_engine_accelerations_equal_the_equations():
             COUNT, lambda p: p.values.__setitem__(..., parameters.values), lambda s: assign(s, state), step=step, period=step
         )
         plant.step(setpoints)
-        table.append((velocity(plant.get_state()) - velocity(state)) / step)
+        table.append((velocity(plant.mechanical_state()) - velocity(state)) / step)
     for power in range(1, 6):
         table = [(2**power * fine - coarse) / (2**power - 1) for coarse, fine in itertools.pairwise(table)]
 
@@ -115,7 +115,7 @@ def fly(step):
 
 
 def energies(plant):
-    state = plant.get_state()
+    state = plant.mechanical_state()
     kinetic = kinetic_energy(
         plant.parameters,
         state.linear_velocity_in_body,

@@ -168,9 +168,9 @@ def test_external_force_moves_the_locked_robot_only_above_its_grip():
 
     plant = make_plant(16, edit)
     drive(plant, 1.0)
-    start = plant.get_state()
+    start = plant.mechanical_state()
     drive(plant, 1.0)
-    end = plant.get_state()
+    end = plant.mechanical_state()
     travel = np.linalg.norm(end.position - start.position, axis=1)
     speed = np.linalg.norm(end.linear_velocity_in_body, axis=1) - np.linalg.norm(start.linear_velocity_in_body, axis=1)
     assert travel[:8].max() < 1e-5

@@ -10,6 +10,7 @@ from wlr_gym.envs.tasks.task_config import ObserverConfig
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import check_contract, load_policy, make_policy, read_contract, write_contract
 from wlr_gym.policy.file import DEFAULTS, with_defaults
+from wlr_gym.robot import Robot, load_robot
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +66,26 @@ def test_first_difference_is_named(contract, change, message):
 )
 def test_other_conditions_are_not_refused(contract, change):
     check_contract(contract, changed(contract, change), "policy")
+
+
+def contract_with(motor):
+    """Contract of an environment of a robot with the e-manual's currents and ``motor`` numbers of its legs."""
+    data = load_robot("emanual").model_dump()
+    data["servo"]["leg"].update(motor)
+    core = make_core("WLR-Velocity-v0", 1, {"robot": Robot.model_validate(data)})
+    core.close()
+    return core.contract()
+
+
+def test_currents_of_the_motors_are_not_refused(contract):
+    check_contract(contract, contract_with({}), "policy")
+    check_contract(contract, contract_with({"stall_current": 4.0, "no_load_current": 0.3}), "policy")
+
+
+@pytest.mark.parametrize("motor", [{"stall_torque": 7.0}, {"no_load_speed": 5.6}])
+def test_another_torque_speed_line_is_refused(contract, motor):
+    with pytest.raises(InputError, match=r"robot\.(hash|servo) is .* \(robot 'wlr-nominal' in the policy, 'wlr-emanual'"):
+        check_contract(contract, contract_with(motor), "policy")
 
 
 @pytest.mark.parametrize("absent", DEFAULTS)

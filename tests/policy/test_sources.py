@@ -2,6 +2,7 @@
 
 import shutil
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from wlr_gym.policy import (
     contract_of,
     find_policy,
     load_agent_config,
+    load_policy,
     make_policy,
     policy_environment,
     shipped_names,
@@ -87,6 +89,15 @@ def test_shipped_policies_go_by_their_names(exported, tmp_path, monkeypatch):
     np.testing.assert_array_equal(mine, make_policy(exported, environment).act(seen))
     with pytest.raises(InputError, match=r"did you mean 'velocity_slip_aware'.*shipped: velocity_slip_aware"):
         find_policy("velocty_slip_aware")
+
+
+def test_a_policy_is_loaded_for_an_environment_or_its_contract():
+    env = gymnasium.make("WLR-Velocity-v0", task={"observer": {"camera": False}})
+    by_env, by_contract = (load_policy("velocity_slip_aware_no_camera", it) for it in (env, env.unwrapped.contract()))  # type: ignore[attr-defined]
+    observation = np.zeros((1, *env.observation_space.shape), np.float32)  # type: ignore[misc]
+    np.testing.assert_array_equal(by_env.act(observation), by_contract.act(observation))
+    with pytest.raises(InputError, match="expected one that was made"):
+        load_policy("velocity_slip_aware_no_camera", "WLR-Velocity-v0")  # type: ignore[arg-type]
 
 
 def test_an_agent_is_not_taken_for_an_unknown_name():

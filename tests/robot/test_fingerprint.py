@@ -103,5 +103,17 @@ def test_every_number_of_a_simulator_does(changes):
     assert servo_hash(later(**changes)) == servo_hash(ROBOT)
 
 
+def test_currents_of_the_motors_do_not_matter():
+    """No motion depends on them: a policy from ``nominal`` drives a robot with ``emanual``."""
+    emanual = load_robot("emanual")
+    assert emanual.servo.leg.stall_current != ROBOT.servo.leg.stall_current
+    assert (robot_hash(emanual), servo_hash(emanual)) == (robot_hash(ROBOT), servo_hash(ROBOT))
+
+
+def test_the_cycle_of_the_wheels_integral_does():
+    assert robot_hash(later(servo__integral_cycle=2e-3)) != robot_hash(ROBOT)
+    assert servo_hash(later(servo__integral_cycle=1e-3)) == servo_hash(ROBOT)
+
+
 def test_whole_numbers_are_the_same_numbers():
     assert robot_hash(later(servo__supply_voltage=12)) == robot_hash(ROBOT)

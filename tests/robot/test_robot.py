@@ -167,7 +167,9 @@ def test_a_file_that_is_no_text_is_refused(tmp_path):
 def test_missing_files_and_names():
     with pytest.raises(InputError, match=r"no file 'nowhere/robot.yaml'"):
         load_robot("nowhere/robot.yaml")
-    with pytest.raises(InputError, match=r"unknown robot config 'nomnal' \(did you mean 'nominal'\?\); valid: nominal, paper"):
+    with pytest.raises(
+        InputError, match=r"unknown robot config 'nomnal' \(did you mean 'nominal'\?\); valid: emanual, nominal, paper"
+    ):
         load_robot("nomnal")
 
 

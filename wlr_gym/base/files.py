@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -60,3 +62,42 @@ def write_json(path: Path, content: Any) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a text file (UTF-8)."""
     replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+@contextmanager
+def locked(path: Path, patience: float) -> Iterator[None]:
+    """Hold a file as a lock, among all processes and machines that see it; the system frees that of a process that died.
+
+    Where there are no such locks (Windows, some shared file systems) nothing is held.
+
+    Args:
+        path: of the file, which is made and stays.
+        patience: how long to wait for another process to let go, s.
+
+    Raises:
+        InputError: another process still holds it, or it cannot be written.
+    """
+    try:
+        file = path.open("ab")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with file:
+        deadline = time.monotonic() + patience
+        while not _lock(file.fileno()):
+            if time.monotonic() > deadline:
+                raise InputError(f"{path}: held by another process for {patience:g} s: something else works on the same")
+            time.sleep(0.1)
+        yield
+
+
+def _lock(descriptor: int) -> bool:
+    """Lock an open file, until it is closed; return whether that is so."""
+    try:
+        import fcntl
+
+        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    except (ImportError, OSError):
+        return True
+    return True

@@ -6,6 +6,7 @@ The options of ``wlr train`` are ``train.TrainOptions``, and so on.
 from __future__ import annotations
 
 import importlib
+import keyword
 import os
 import sys
 from collections.abc import Sequence
@@ -28,18 +29,21 @@ COMMANDS = {
     "envs": "list the environments, or describe one: its actions, observations and rewards",
     "effects": "list the effects that can be added to the robot, explain one, or check patch files",
     "train": "train an agent on an environment; resumes after an interruption",
+    "sweep": "train settings x seeds, or search settings, on this machine or a Ray cluster; resumes trial by trial",
     "evaluate": "score a policy or agent over many episodes, against baselines, with confidence intervals",
-    "export": "write a trained policy as one file (ONNX with its contract) that runs without torch, or its model card",
+    "export": "write a policy as one file (ONNX) that runs without torch, or its model card; runs as MCAP or rosbag2",
     "play": "drive a robot in a window with keys or a gamepad, or into a video",
     "replay": "drive a simulator with the commands of measured runs and report where they diverge",
     "compare": "drive two plants with the same setpoints and report where they diverge, in noise units",
     "gap": "find what the model lacks: compare with measured runs, name the missing effect, validate it on held-out runs",
+    "import": "make measured runs of other programs' logs: MCAP, rosbags, CSV, Parquet, LeRobot; proposes what is what",
     "record": "drive a robot or simulator through an excitation and write the measured run",
     "paper": "run the paper's experiments in several models and check its claims",
     "vision": "measure pose and slip from a video of the robot with ring markers",
     "calibrate": "calibrate the robot's joints, its IMU or a camera, or write the marker sheets to print",
     "deploy": "drive the robot with a policy, through the command limiter",
     "doctor": "look at a robot before it drives: ports, servos, IMU, policy; names the first fault and its remedy",
+    "commission": "test a robot on a stand, compare each result with the emulator, write what was measured",
     "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults on command",
     "bench": "measure the speed of the engine, the environments and training on this machine",
     "demo": "the whole loop in about three minutes: learn, drive on ice, find the hidden fault of a robot; one page",
@@ -90,17 +94,21 @@ def _import_modules(words: list[str]) -> list[str]:
 
 def run_command(name: str, arguments: Sequence[str]) -> int:
     """Parse the arguments of one command and run it."""
-    module = importlib.import_module(f"wlr_gym.cli.{name}")
-    return module.run(parse(name, arguments))
+    return _module(name).run(parse(name, arguments))
 
 
 def parse(name: str, arguments: Sequence[str]) -> Any:
     """Return the options of one command; SystemExit after ``--help`` and arguments that do not parse."""
     import tyro
 
-    module = importlib.import_module(f"wlr_gym.cli.{name}")
+    module = _module(name)
     kind = getattr(module, f"{name.capitalize()}Options")
     return tyro.cli(kind, prog=f"wlr {name}", description=module.__doc__, args=list(arguments))
+
+
+def _module(name: str) -> Any:
+    """Import the module of a command; a word of Python cannot be a module's name, and gets an underscore."""
+    return importlib.import_module(f"wlr_gym.cli.{name}{'_' if keyword.iskeyword(name) else ''}")
 
 
 def usage() -> str:

@@ -15,6 +15,7 @@ from rich.table import Table
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import write_json
 from wlr_gym.cli import OK
+from wlr_gym.cli.options import ray_address
 from wlr_gym.studies.bench.measure import Measurement, Size, machine
 
 if TYPE_CHECKING:
@@ -64,6 +65,8 @@ class BenchOptions:
     """gap: data sets."""
     processes: int = 2
     """gap: data sets at a time."""
+    ray: tuple[str, ...] | None = None
+    """gap: run on Ray: alone, it is started on this machine; with an address (auto, 10.0.0.1:6379), that cluster is used."""
     answers: Path | None = None
     """gap: answers.json of another folder; its sets are not analysed again, but for those that failed."""
 
@@ -106,7 +109,10 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
         raise InputError(f"{BLIND_TEST} needs --out DIR: finished data sets are kept there, so that it can be interrupted")
     console = Console(soft_wrap=True)
     report = gap.run_blind_test(
-        gap.Plan(options.out, options.sets, options.processes), say=console.print, answers=options.answers
+        gap.Plan(options.out, options.sets, options.processes),
+        say=console.print,
+        answers=options.answers,
+        ray=ray_address(options.ray),
     )
     text = markdown(report)
     (options.out / "score.md").write_text(text, encoding="utf-8")

@@ -14,8 +14,8 @@ import tyro
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.robot_options import RobotOption
-from wlr_gym.robot import JOINTS, LEGS
+from wlr_gym.cli.robot_options import NobodyThereError, RobotOption, ask_terminal
+from wlr_gym.robot import JOINTS, LEGS, full_name
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 Ask = Callable[[str], str]
 Result = TypeVar("Result")
 
-_SIDES = ("left front", "right front", "left rear", "right rear")
 #: Which side of the sensor points up, in the order of the poses.
 _UP = ("z up (as it stands)", "z down", "x up", "x down", "y up", "y down")
 #: Reads averaged for one angle.
@@ -80,22 +79,6 @@ class ServoOptions(RobotOption):
 
 class _StoppedError(Exception):
     """The operator does not want to continue."""
-
-
-class _NobodyThereError(InputError):
-    """Questions cannot be answered."""
-
-
-def ask_terminal(text: str) -> str:
-    """Ask on the terminal.
-
-    Raises:
-        InputError: nobody there.
-    """
-    try:
-        return input(text + " ")
-    except EOFError:
-        raise _NobodyThereError("calibration is a dialogue: run it on a terminal, or pipe its answers in") from None
 
 
 def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
@@ -186,7 +169,7 @@ def _calibrate(joint: str, robot: Robot, hardware: Hardware, servos: Servos, ask
     from wlr_gym.hardware.calibration import find_sign, find_zero
     from wlr_gym.hardware.config import Mounting
 
-    name = f"{joint} ({_SIDES[JOINTS.index(joint) % 4]})"
+    name = full_name(joint)
     move = "swing its foot to the back by 30 deg" if joint in LEGS else "roll it forward by a quarter turn"
 
     def look() -> Mounting | None:
@@ -307,7 +290,7 @@ def _until_good(look: Callable[[], Result]) -> Result:
     while True:
         try:
             return look()
-        except _NobodyThereError:
+        except NobodyThereError:
             raise
         except InputError as error:
             print(f"{error}. Once more.")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,11 +23,18 @@ from wlr_gym.cli.options import PatchOption, environment_of, pairs
 from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 
 if TYPE_CHECKING:
+    from wlr_gym.data.logs.stream import McapStream
     from wlr_gym.envs.core import Core
     from wlr_gym.hardware.deployment import Deployment
     from wlr_gym.hardware.emulator.machine import Machine
+    from wlr_gym.hardware.gamepad import DrivingPad
     from wlr_gym.hardware.loop import ControlLoop
+    from wlr_gym.hardware.operator import Keys
 
+#: How a stop begins that an emulated robot in real time owes to a busy computer.
+_LATE = ("deadlines:", "silence:", "idle:", "watchdog:", "imu: no reading", "no answer from", "NoAnswerError:")
+#: s for which the dead-man button of a gamepad may be let go.
+_PAD_DEADMAN = 0.2
 #: Steps between two looks of the live status.
 _STATUS_TICKS = 10
 
@@ -57,9 +64,15 @@ class DeployOptions(PatchOption):
     seed: int = 0
     """Seed of the drawn commands."""
     deadman: float | None = None
-    """Stop the wheels when no key was pressed for so many seconds."""
+    """Stop the wheels when no key was pressed for so many seconds; with --gamepad, its dead-man button (default: 0.2)."""
+    gamepad: str | None = None
+    """Steer with a gamepad, such as /dev/input/js0, while its dead-man button is held; buttons: the hardware file's gamepad."""
+    realtime: int | None = None
+    """Run at this real-time priority (1 to 99, SCHED_FIFO) with all memory locked; Linux."""
     out: Path = Path("robot_runs")
     """Folder for the logs."""
+    mcap: Path | None = None
+    """Write the run into this new MCAP file, too, while it goes on, for Foxglove and PlotJuggler."""
     yes: bool = False
     """Do not ask before the robot moves."""
     status: bool = True
@@ -74,6 +87,7 @@ def run(options: DeployOptions) -> int:
     """
     from wlr_gym.hardware.deployment import deploy, loop_of
     from wlr_gym.hardware.operator import Keys, stop_on_signals
+    from wlr_gym.hardware.realtime import real_time
     from wlr_gym.learning.evaluation import make_core
     from wlr_gym.policy import make_policy, policy_environment
 
@@ -81,35 +95,33 @@ def run(options: DeployOptions) -> int:
     environment = environment_of(options.env, options.policy)
     fed = policy_environment(options.policy)
     console = Console()
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as last, contextlib.ExitStack() as stack:  # the stream ends when the motors are off
         ports = port_pairs(options.port)
         if options.emulated and not options.stepped:
             ports |= stack.enter_context(_emulator(options, console))
-        robot_options = {
-            "hardware": options.hardware,
-            "ports": ports,
-            "emulated": options.emulated and options.stepped,
-            "effects": options.patch() if options.stepped else None,
-            "dry_run": options.dry_run,
-            "log": options.out,
-            "deadman": options.deadman,
-        }
-        keywords = {"backend": "dynamixel", "hardware": robot_options, "episode_length": options.seconds} | fed
+        keywords = {"backend": "dynamixel", "hardware": _robot(options, ports), "episode_length": options.seconds} | fed
         core = make_core(environment, 1, keywords)
         stack.callback(core.close)
         policy = make_policy(options.policy, core.contract())
         _say_what_is_not_known(core, console)
+        loop = loop_of(core)
+        pads = [stack.enter_context(pad) for pad in _gamepads(options, core, loop, console)]
+        if options.realtime is not None:
+            stack.enter_context(real_time(options.realtime))
         if not (options.yes or options.emulated or options.dry_run):
             wait_for_enter(console, "The robot will move. Wheels off the ground? Hand on the switch?")
-        loop = loop_of(core)
         if options.stepped:
             for fault in options.fault:
                 _machine_of(loop).inject(fault)
+        stream = _stream(options.mcap, loop, last)
         keys = stack.enter_context(Keys())
         stack.enter_context(stop_on_signals(loop.operator))
-        stack.enter_context(_status(loop, core, keys, options.status and console.is_terminal, console))
-        result = deploy(core, policy, options.seed, command)
+        stack.enter_context(_serving(loop, core, [keys, *pads], options.status and console.is_terminal, console))
+        result = deploy(core, policy, options.seed, command, pads[0].command if pads else None)
     _report(result, loop, console)
+    if stream is not None:
+        _report_stream(stream, console)
+    console.print(busy_note(options, result.reason), style="yellow", end="")
     return OK if result.well else FAILED
 
 
@@ -123,6 +135,8 @@ def _check(options: DeployOptions) -> dict[str, float]:
         raise InputError(f"--deadman {options.deadman:g}: expected more than 0")
     if not options.emulated and (options.stepped or options.fault):
         raise InputError("--stepped and --fault are for the emulated robot: add --emulated")
+    if options.stepped and options.realtime is not None:
+        raise InputError("--realtime: emulated time is not real time; leave out --stepped")
     if options.effects and not options.emulated:
         raise InputError("--effects: a real robot has its own; add --emulated")
     options.patch()  # a bad one is refused before a robot is started for it
@@ -136,6 +150,64 @@ def _check(options: DeployOptions) -> dict[str, float]:
     if not all(map(math.isfinite, numbers.values())):
         raise InputError(f"--command {' '.join(options.command)}: expected name=number")
     return numbers
+
+
+def busy_note(options: DeployOptions, reason: str) -> str:
+    """Return what to do about a busy computer, where that is why a run ended; an emulated robot is never late by itself."""
+    from wlr_gym.hardware.safety.preflight import STEPPED
+
+    if not options.emulated or options.stepped or options.fault or not reason.startswith(_LATE):
+        return ""
+    return f"This computer is too busy, or too slow, for an emulated robot in real time: {STEPPED}.\n"
+
+
+def _robot(options: DeployOptions, ports: dict[str, str]) -> dict[str, Any]:
+    """Return which robot is driven, and how it is connected."""
+    return {
+        "hardware": options.hardware,
+        "ports": ports,
+        "emulated": options.emulated and options.stepped,
+        "effects": options.patch() if options.stepped else None,
+        "dry_run": options.dry_run,
+        "log": options.out,
+        "deadman": _PAD_DEADMAN if options.deadman is None and options.gamepad is not None else options.deadman,
+    }
+
+
+def _gamepads(options: DeployOptions, core: Core, loop: ControlLoop, console: Console) -> list[DrivingPad]:
+    """Return the gamepad that steers, or none.
+
+    Raises:
+        InputError: its sticks steer none of the task's commands.
+    """
+    from wlr_gym.hardware.gamepad import DrivingPad
+
+    if options.gamepad is None:
+        return []
+    terms, buttons = core.task.config.commands.terms, loop.hardware.gamepad
+    ranges = {name: (float(terms[name][0]), float(terms[name][1])) for name in core.task.commands}
+    text = f"gamepad: hold button {buttons.deadman} to drive; {buttons.stop}: stop; {buttons.motors_off}: motors off at once"
+    console.print(text, style="dim")
+    return [DrivingPad(options.gamepad, buttons, ranges)]
+
+
+def _stream(path: Path | None, loop: ControlLoop, stack: contextlib.ExitStack) -> McapStream | None:
+    """Return what writes the run into an MCAP file while it goes on, or None."""
+    from wlr_gym.data.logs.stream import McapStream
+    from wlr_gym.hardware.log import ROW
+
+    if path is None:
+        return None
+    loop.recorder.stream = stack.enter_context(McapStream(path, ROW[1:], loop.recorder.meta))
+    return loop.recorder.stream
+
+
+def _report_stream(stream: McapStream, console: Console) -> None:
+    if not (stream.path.is_file() or stream.trouble):
+        return
+    left_out = f"{stream.left_out} rows came too quickly and are left out" if stream.left_out else ""
+    problem = stream.trouble or left_out
+    console.print(f"written: {stream.path}{problem and '; '}{problem}", style="yellow" if problem else "", soft_wrap=True)
 
 
 def _machine_of(loop: ControlLoop) -> Machine:
@@ -188,22 +260,26 @@ def _say_what_is_not_known(core: Core, console: Console) -> None:
 
 
 @contextlib.contextmanager
-def _status(loop: ControlLoop, core: Core, keys: Any, show: bool, console: Console) -> Iterator[None]:
-    """Serve the keys, and show the status, in the time that is left in each step."""
+def _serving(
+    loop: ControlLoop, core: Core, helpers: Sequence[Keys | DrivingPad], show: bool, console: Console
+) -> Iterator[None]:
+    """Serve keys and gamepad, and show the status, in the time that is left in each step."""
     from rich.live import Live
 
+    from wlr_gym.cli.robot_status import RobotView
     from wlr_gym.hardware.operator import HELP
 
     console.print(HELP, style="dim")
     live = Live(console=console, auto_refresh=False, transient=True) if show else None
-    count = 0
+    view, count = RobotView(loop, core), 0
 
     def spare() -> None:
         nonlocal count
-        keys.serve(loop.operator)
+        for helper in helpers:
+            helper.serve(loop.operator)
         count += 1
         if live is not None and count % _STATUS_TICKS == 0:
-            live.update(status_table(loop, core), refresh=True)
+            live.update(view.table(), refresh=True)
 
     loop.operator.spare = spare
     with live or contextlib.nullcontext():
@@ -211,38 +287,6 @@ def _status(loop: ControlLoop, core: Core, keys: Any, show: bool, console: Conso
             yield
         finally:
             loop.operator.spare = None
-
-
-def status_table(loop: ControlLoop, core: Core) -> Any:
-    """Return what a driver wants to see now."""
-    from rich.table import Table
-
-    from wlr_gym.hardware.safety.rules import tilt_of
-    from wlr_gym.robot import JOINTS
-
-    table = Table(box=None, title=f"{loop.phase.name.lower().replace('_', ' ')}  {core.time[0]:.1f} s", title_justify="left")
-    for name in ("joint", "angle rad", "setpoint", "speed rad/s", "effort N m", "degC", "V"):
-        table.add_column(name, justify="left" if name == "joint" else "right")
-    status = loop.status
-    if status is None:
-        return table
-    for k, joint in enumerate(JOINTS):
-        numbers = (
-            status.position[k],
-            loop.setpoints[k],
-            status.velocity[k],
-            status.effort[k],
-            status.temperature[k],
-            status.voltage[k],
-        )
-        table.add_row(joint, *(f"{number:.2f}" for number in numbers), style="red" if status.silence[k] > 0 else "")
-    command = "  ".join(f"{name} {value:+.2f}" for name, value in zip(core.task.commands, core.command[0], strict=True))
-    limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
-    table.caption = (
-        f"{command}\ntilt {tilt_of(status.up):.2f} rad  steps missed {loop.pacer.missed}\ncommand limiter: {limited}"
-    )
-    table.caption_justify = "left"
-    return table
 
 
 def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:

@@ -5,6 +5,7 @@ Names the first thing that is wrong and what to do about it. Exit code 0: nothin
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +15,18 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.robot_options import RobotOption
+from wlr_gym.cli.robot_options import RobotOption, wait_for_enter
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from wlr_gym.hardware.config import Hardware
     from wlr_gym.hardware.link import Link
-    from wlr_gym.hardware.safety.preflight import Check
+    from wlr_gym.hardware.safety.check import Check
     from wlr_gym.robot import Robot
+
+#: Times that registers are written: of a servo that answered nothing before, more are seen afterwards.
+_MEND_PASSES = 2
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,7 @@ class DoctorOptions(RobotOption):
 
     Attributes:
         policy: policy file or folder, run folder or shipped policy that is to drive it: does it fit this robot?
-        mend: write the register values that mend what is wrong (servos' torque must be off).
+        mend: write the register values that mend what is wrong; says which, and asks first (servos' torque must be off).
         scan: search every bus at every baud rate for servos, whatever their ids.
         json: file for all checks.
         verbose: show every check of every joint.
@@ -66,8 +70,8 @@ def run(options: DoctorOptions) -> int:
     finally:
         link.close()
     if options.policy is not None:
-        checks += check_policy(options.policy, options.robot)
-    _print(checks, console, options.verbose)
+        checks += check_policy(options.policy, options.robot_name(options.robot))
+    _print(checks, console, options)
     if options.json is not None:
         write_json(options.json, [check._asdict() for check in checks])
     return FAILED if any(check.is_fatal and not check.ok for check in checks) else OK
@@ -88,24 +92,43 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
         if options.scan:
             _scan(link, hardware, buses, console)
         servos = preflight.check_servos(link.servos, robot, hardware, joints)
-        if options.mend:
-            left = preflight.mend(link.servos, servos)
-            console.print(f"mended: {sum(not check.ok for check in servos) - len(left)}, left: {len(left)}")
+        for _ in range(_MEND_PASSES if options.mend else 0):
+            if not _mend(link, servos, console):
+                break
             servos = preflight.check_servos(link.servos, robot, hardware, joints)
         found += servos
         if len(buses) == len(hardware.buses) and all(check.ok for check in servos if check.what == "answer"):
             link.servos.set_patience(hardware.safety.patience)  # as while driving
             found.append(preflight.check_bus_speed(link.servos, TIMED_READS, hardware.safety.read_time, link.clock.now))
-    except (BusGoneError, InputError) as error:  # the latter: gone when a scan opens it again
+    except BusGoneError as error:
         found.append(preflight.Check("robot", "bus", False, str(error), "a bus that stays", "Check plugs and supply."))
     if "imu" in open_here:
         found += preflight.check_imu(link.imu, hardware.imu, link.clock)
     return found
 
 
+def _mend(link: Link, checks: Sequence[Check], console: Console) -> bool:
+    """Say which registers will be written, ask, write; return whether there were any.
+
+    Raises:
+        InputError: nobody there to ask.
+    """
+    from wlr_gym.hardware.safety.registers import mend, mendable
+
+    registers = [(check.where, check.found, *check.fix) for check in mendable(checks) if check.fix]
+    if not registers:
+        return False
+    for joint, found, item, count in registers:
+        console.print(f"{joint}: {item}, now {found}, will be {count}")
+    wait_for_enter(console, "Nothing moves. Write it?", "write it", "")
+    left = mend(link.servos, checks)
+    console.print(f"mended: {sum(not check.ok for check in checks) - len(left)}, left: {len(left)}")
+    return True
+
+
 def check_policy(source: str, robot: str) -> list[Check]:
     """Return whether a policy was made for this robot, its observations and its control period, and does without a camera."""
-    from wlr_gym.hardware.safety.preflight import Check
+    from wlr_gym.hardware.safety.check import Check
     from wlr_gym.learning.evaluation.rollout import make_core
     from wlr_gym.policy import check_contract, contract_of, needs_camera, policy_environment
 
@@ -128,22 +151,33 @@ def check_policy(source: str, robot: str) -> list[Check]:
 
 
 def _scan(link: Link, hardware: Hardware, buses: Sequence[str], console: Console) -> None:
+    """Print who answers on the buses.
+
+    Raises:
+        BusGoneError: a port is gone.
+    """
+    from wlr_gym.hardware.dynamixel.errors import BusGoneError
     from wlr_gym.hardware.servo_setup import find_servos
 
     for name in buses:
         link.servos.groups[name].close()
-        for servo in find_servos(name, hardware.buses[name].port):
-            console.print(f"{name}: {servo}")
-        link.servos.groups[name].open()
+        try:
+            for servo in find_servos(name, hardware.buses[name].port):
+                console.print(f"{name}: {servo}")
+            link.servos.groups[name].open()
+        except InputError as error:
+            raise BusGoneError(str(error)) from None
 
 
 # ---- the report ------------------------------------------------------------------------------------------------------
 
 
-def _print(checks: Sequence[Check], console: Console, verbose: bool) -> None:
+def _print(checks: Sequence[Check], console: Console, options: DoctorOptions) -> None:
     from rich.text import Text
 
-    for line, style in _lines(checks, verbose):
+    from wlr_gym.hardware.safety.registers import mendable
+
+    for line, style in _lines(checks, options.verbose):
         console.print(Text(line, style))
     wrong = sorted((check for check in checks if not check.ok), key=lambda check: not check.is_fatal)
     if not wrong:
@@ -155,6 +189,19 @@ def _print(checks: Sequence[Check], console: Console, verbose: bool) -> None:
     first = wrong[0]
     summary = f"First: {first.where}, {first.what}: {first.found}, expected {first.expected}."
     console.print(Text(f"{summary}\n{first.remedy}", "bold"))
+    if registers := mendable(checks):
+        repair = f"{_plural(len(registers), 'register')} can be written, after a question: {_mend_command(options)}"
+        console.print(Text(repair, "bold"))
+
+
+def _mend_command(options: DoctorOptions) -> str:
+    """Return the command line that mends the robot that was looked at."""
+    words = ["wlr", "doctor"]
+    words += ["--robot", options.robot] if options.robot else []
+    words += ["--hardware", options.hardware] if options.hardware != "nominal" else []
+    words += ["--port", *options.port] if options.port else []
+    words += ["--emulated"] if options.emulated else []
+    return shlex.join([*words, "--mend"])
 
 
 def _plural(count: int, word: str) -> str:

@@ -41,7 +41,7 @@ class EmulateOptions(PatchOption):
     """
 
     backend: str = "gibbs_appell"
-    robot: str = "nominal"
+    robot: str | None = None
     hardware: str = "nominal"
     links: Path | None = None
     control: Path | None = None
@@ -83,9 +83,10 @@ def run(options: EmulateOptions) -> int:
         factory=options.factory,
         timing=timing,
     )
-    robot, patch = load_robot(options.robot), options.patch()
+    hardware, patch = load_hardware(options.hardware), options.patch()
+    robot = load_robot(options.robot or hardware.robot or "nominal")
     parameters = apply_patch(patch, Parameters.nominal(robot, 1))
-    machine = Machine(robot, load_hardware(options.hardware), machine_options, parameters=parameters, forces=patch.forces)
+    machine = Machine(robot, hardware, machine_options, parameters=parameters, forces=patch.forces)
     for fault in options.fault:
         machine.inject(fault)
     with Server(machine, real_time=not options.stepped, links=options.links, control=options.control) as server:

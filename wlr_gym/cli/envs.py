@@ -12,7 +12,7 @@ from rich.table import Table
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.cli import OK
-from wlr_gym.envs.registry import ENVIRONMENTS, task_name_of
+from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
 from wlr_gym.envs.tasks import Randomization, Task, describe, describe_randomization, load_randomization
 from wlr_gym.envs.tasks.task import build_task
 from wlr_gym.envs.tasks.task_config import read_task
@@ -65,5 +65,5 @@ def _draw(path: Path, randomization: Randomization) -> None:
 
 
 def _task(env_id: str) -> Task:
-    config = read_task(task_name_of(env_id))
+    config = read_task(task_source_of(env_id))
     return build_task(config, load_robot(config.robot))

@@ -20,9 +20,7 @@ from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import PatchOption, environment_of
-from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of
-from wlr_gym.envs.settings import read_settings
 from wlr_gym.learning.evaluation import (
     FIRST_SEED,
     MAIN,
@@ -31,44 +29,44 @@ from wlr_gym.learning.evaluation import (
     Condition,
     Rollout,
     Subject,
-    Sweep,
     comparison_rows,
-    identity,
     make_player,
-    play,
     read_subjects,
-    read_sweep,
     record_episodes,
     rows,
+    seed_rows,
     sweep_rows,
     sweeps_for,
     transfer_rows,
-    work,
     write_card,
     write_episodes,
     write_samples,
 )
+from wlr_gym.learning.evaluation.scoring import (
+    BACKENDS,
+    BASELINES,
+    OTHER_EPISODES,
+    SWEEP_EPISODES,
+    evaluate,
+    fitting_baselines,
+)
+from wlr_gym.physics.effects import Patch
 from wlr_gym.policy import shipped_names, trained_environment
 from wlr_gym.render.video import check_video
 
-BACKENDS = ("gibbs_appell", "mujoco")
-#: What is played where no option says otherwise: quickly, and with --full.
-BASELINES = ("do_nothing", "pid")
+#: With --full.
 FULL_BASELINES = ("do_nothing", "constant_command", "pid", "slip_compensating")
 EPISODES = 64
 FULL_EPISODES = 256
 SEEDS = 1
 FULL_SEEDS = 5
-#: Episodes of each value of a sweep, and of each other condition.
-SWEEP_EPISODES = 64
-OTHER_EPISODES = 64
 
 
 @dataclass(frozen=True)
 class EvaluateOptions(PatchOption):
-    policy: tyro.conf.Positional[str]
-    """Agent, policy file (.onnx), policy or run folder, or shipped policy. NAME=POLICY names it; NAME=POLICY,POLICY,... is one
-    agent trained with several seeds."""
+    policy: tyro.conf.Positional[tuple[str, ...]]
+    """Agent, policy file (.onnx), policy or run folder, or shipped policy; NAME=POLICY names it. Several, NAME=POLICY,POLICY, a
+    pattern ('out/trials/lr=1e-3-*') or a folder of run folders: trainings of one recipe with different seeds, as one column."""
     env: str | None = None
     """Environment id (see: wlr envs); default: the one the policy was trained in, else WLR-Velocity-v0."""
     baselines: tuple[str, ...] | None = None
@@ -117,42 +115,50 @@ def run(options: EvaluateOptions) -> int:
     patch = options.patch()
     if options.out is not None:
         make_output_folder(options.out)
-    main, *others = BACKENDS if options.backend == "both" else (str(options.backend),)
-    keywords: dict[str, Any] = {"randomization": options.randomization, "robot": options.robot, "effects": patch}
-    keywords |= {"backend": main, "threads": options.threads}
-    subjects = read_subjects([options.policy, *(options.baselines or ())])
-    card, samples = _play(options, subjects, keywords, others, patch.summary())
+    card, samples = _play(options, patch)
     print_card(card)
+    keywords = {
+        "randomization": options.randomization, "robot": options.robot, "effects": patch, "threads": options.threads,
+        "backend": BACKENDS[0] if options.backend == "both" else options.backend,
+    }  # fmt: skip
     if options.out is not None:
         settings = {key: _plain(value) for key, value in asdict(options).items()}
         record_provenance(options.out, settings | {"effects": patch.content()["effects"]}, options.seed)
         _write(options.out, card, samples, options.seed)
         if options.record:
-            _record(options, subjects[0], options.out / "runs", keywords)
+            _record(options, _shown(card, read_subjects([options.policy])[0]), options.out / "runs", keywords)
     if options.video is not None:
-        _film(options, subjects[:2], options.video, keywords)
+        subjects = read_subjects([options.policy, *(options.baselines or ())])
+        _film(options, [_shown(card, subject) for subject in subjects[:2]], options.video, keywords)
     return OK
+
+
+def _shown(card: Card, subject: Subject) -> Subject:
+    """Return whom to watch: of several training seeds the median one."""
+    if not subject.seeds:
+        return subject
+    return replace(subject, sources=(subject.sources[subject.seeds.index(card.seed_scores[subject.name].median_seed)],))
 
 
 def _complete(options: EvaluateOptions) -> EvaluateOptions:
     """Return the options with nothing left open that --full and the policy decide."""
     full = options.full
-    policy = read_subjects([options.policy])[0].sources[0]
-    environment = environment_of(options.env, policy)
-    task = task_name_of(environment)
+    environment = environment_of(options.env, read_subjects([options.policy])[0].sources[0])
+    shipped = [name for name in shipped_names() if trained_environment(name) == environment]
     chosen = {
         "env": environment,
         "episodes": FULL_EPISODES if full else EPISODES,
         "seeds": FULL_SEEDS if full else SEEDS,
         "backend": "both" if full else BACKENDS[0],
-        "sweep": sweeps_for(task) if full else (),
-        "baselines": _full_baselines(environment) if full else BASELINES,
+        "sweep": sweeps_for(task_name_of(environment)) if full else (),
     }
+    if options.baselines is None:
+        names = FULL_BASELINES if full else BASELINES
+        fitting = fitting_baselines(environment, names)
+        if len(fitting) < len(names):
+            print(f"no baseline here, made for other tasks: {', '.join(name for name in names if name not in fitting)}")
+        chosen["baselines"] = (*fitting, *(shipped if full else ()))
     return replace(options, **{name: value for name, value in chosen.items() if getattr(options, name) is None})
-
-
-def _full_baselines(environment: str) -> tuple[str, ...]:
-    return (*FULL_BASELINES, *(name for name in shipped_names() if trained_environment(name) == environment))
 
 
 def _check(options: EvaluateOptions) -> None:
@@ -172,58 +178,43 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
 
 
-def _play(
-    options: EvaluateOptions, subjects: Sequence[Subject], keywords: Mapping[str, Any], others: Sequence[str], effects: str
-) -> tuple[Card, Rollout]:
+def _play(options: EvaluateOptions, patch: Patch) -> tuple[Card, Rollout]:
     """Play everything; returns the card, and the first block of the first subject."""
-    task = task_name_of(str(options.env))
-    sweeps = tuple(read_sweep(name, task) for name in dict.fromkeys(options.sweep or ()))
-    conditions = _conditions(options, sweeps, keywords, others)
     first: list[Rollout] = []
 
     def watch(condition: Condition, subject: Subject, block: int, rollout: Rollout) -> None:
         if not first:
             first.append(rollout)
 
-    ticks = make_task(task, read_settings(keywords)).episode_steps
-    with progress(work(conditions, subjects, ticks), options.progress) as tell:
-        results = play(str(options.env), subjects, conditions, options.seed, tell, watch)
-    identities = {subject.name: identity(subject) for subject in subjects}
-    return Card(results, sweeps, _said(options, conditions, effects), identities), first[0]
-
-
-def _conditions(
-    options: EvaluateOptions, sweeps: Sequence[Sweep], keywords: Mapping[str, Any], others: Sequence[str]
-) -> list[Condition]:
-    """Return the main condition, those of the sweeps, and the main one in the other simulator."""
-    episodes = options.episodes or 0
-    conditions = [Condition(MAIN, keywords, episodes=episodes, blocks=options.seeds or 0)]
-    for sweep in sweeps:
-        conditions += sweep.conditions(keywords, options.sweep_episodes)
-    fewer = min(options.other_episodes, episodes)
-    return conditions + [Condition(OTHER_PLANT, {**keywords, "backend": other}, episodes=fewer) for other in others]
-
-
-def _said(options: EvaluateOptions, conditions: Sequence[Condition], effects: str) -> dict[str, Any]:
-    """Return what the card says about how it was played."""
-    main, last = conditions[0], conditions[-1]
-    said = {
-        "environment": options.env, "backend": main.keywords["backend"], "episodes": f"{main.episodes} x {main.blocks} seeds",
-        "first seed": options.seed, "randomization": options.randomization or "the task's",
-        "robot": options.robot or "the task's", "effects": effects,
-    }  # fmt: skip
-    if last.label == OTHER_PLANT:
-        said |= {"second simulator": f"{last.keywords['backend']}, {last.episodes} episodes"}
-    return said | ({"sweeps": f"{options.sweep_episodes} episodes per point"} if options.sweep else {})
+    with progress(options.progress) as tell:
+        card = evaluate(
+            options.policy,
+            options.env,
+            baselines=options.baselines,
+            episodes=options.episodes or 0,
+            seeds=options.seeds or 0,
+            seed=options.seed,
+            backend=str(options.backend),
+            other_episodes=options.other_episodes,
+            sweeps=options.sweep or (),
+            sweep_episodes=options.sweep_episodes,
+            randomization=options.randomization,
+            robot=options.robot,
+            effects=patch,
+            threads=options.threads,
+            tell=tell,
+            watch=watch,
+        )
+    return card, first[0]
 
 
 @contextmanager
-def progress(total: int, shown: bool) -> Iterator[Callable[[str, int], None]]:
-    """Show a bar with the time left; yields a function that is told what is going on and how much of ``total`` was done."""
+def progress(shown: bool) -> Iterator[Callable[[str, float], None]]:
+    """Show a bar with the time left; yields a function that is told what is going on and the share that was done since."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, transient=True, disable=not shown) as bar:
-        task = bar.add_task("evaluating", total=total)
-        yield lambda text, done: bar.update(task, description=f"evaluating {text}", advance=done)
+        task = bar.add_task("evaluating", total=1.0)
+        yield lambda text, share: bar.update(task, description=f"evaluating {text}", advance=share)
 
 
 def _write(folder: Path, card: Card, samples: Rollout, seed: int) -> None:
@@ -263,6 +254,8 @@ def _film(options: EvaluateOptions, subjects: Sequence[Subject], path: Path, key
 
 def print_card(card: Card) -> None:
     """Print the tables of a card, intervals as ± half of their width."""
+    for name, seeds in card.seed_scores.items():
+        _print(f"training seeds of {name}, median seed {seeds.median_seed}", seed_rows(card, name, short=True))
     _print("mean over episodes ± half of the 95 % confidence interval", rows(card.scores[MAIN], card.metrics, short=True))
     if len(card.names) > 1:
         _print(f"{card.names[0]} is better by, paired episode by episode", comparison_rows(card, short=True))

@@ -1,4 +1,7 @@
-"""Write a trained policy as one file: ONNX with its contract inside. It runs wherever a policy is named, without torch."""
+"""Write a trained policy as one file: ONNX with its contract inside. It runs wherever a policy is named, without torch.
+
+With --to, write measured runs as MCAP files or as rosbag2, which Foxglove, PlotJuggler and ROS open and wlr import reads back.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -28,11 +31,20 @@ ELSEWHERE = ("--out", "--resume", "--max-minutes")
 @dataclass(frozen=True)
 class ExportOptions:
     policy: tyro.conf.Positional[tuple[str, ...]]
-    """Policy folder or run folder; with --card: policy file, or name of a shipped policy; with --reseal: any of these."""
+    """Policy folder, run folder, or archive of Stable-Baselines3 (.zip, with --env); with --card: policy file, or name of a
+    shipped policy; with --reseal: any of these; with --to: runs, or folders of runs."""
     out: Path | None = None
-    """The file; default: policy.onnx."""
+    """The file; default: policy.onnx. With --to: the folder; default: where each run is."""
+    to: Literal["mcap", "rosbag2"] | None = None
+    """Instead, write runs in this format: run_01.mcap, or run_01 as a folder."""
     card: Path | None = None
     """Folder that wlr evaluate --out has written: instead, write the model card beside the policy file."""
+    env: str | None = None
+    """Of an archive: id of the environment that it was trained in."""
+    config: str | None = None
+    """Of an archive: settings in configs/agent/, or a path, whose environment has the observations of its training."""
+    normalizer: Path | None = None
+    """Of an archive: saved VecNormalize that its observations went through."""
     reseal: bool = False
     """Instead, rewrite the contracts of policies in the present form, where the robot is the same, and say what changed."""
     robot: str | None = None
@@ -41,6 +53,9 @@ class ExportOptions:
 
 def run(options: ExportOptions) -> int:
     """Export and compare, or write the card, or reseal; say what was written."""
+    if options.to is not None:
+        _export_runs(options, options.to)
+        return OK
     if options.reseal:
         _reseal(options)
         return OK
@@ -48,13 +63,46 @@ def run(options: ExportOptions) -> int:
         raise InputError("--robot goes with --reseal: what is exported carries the robot of its training")
     if len(options.policy) != 1:
         raise InputError(f"expected one policy, got {len(options.policy)}; several go with --reseal")
-    if options.card is None:
+    if options.policy[0].endswith(".zip"):
+        _import(options)
+    elif options.env or options.config or options.normalizer:
+        raise InputError("--env, --config and --normalizer: of archives (.zip) only; other policies say themselves")
+    elif options.card is None:
         _export(options.policy[0], options.out or Path("policy.onnx"))
     elif options.out is None:
         _write_card(options.policy[0], options.card)
     else:
         raise InputError("--card and --out: one or the other; a card is written beside its policy file")
     return OK
+
+
+def _export_runs(options: ExportOptions, form: str) -> None:
+    from wlr_gym.data.logs import export_run
+    from wlr_gym.data.logs.write import FORMATS
+    from wlr_gym.data.read import read_run, run_files
+
+    if any((options.card, options.env, options.config, options.normalizer, options.reseal, options.robot)):
+        raise InputError(f"--to {form} writes runs: the options of policies do not go with it")
+    paths = [run for name in map(Path, options.policy) for run in (run_files(name) if name.is_dir() else [name])]
+    if not paths:
+        raise InputError("--to: expected runs, or folders of runs")
+    targets = [(options.out or path.parent) / f"{path.stem}{FORMATS[form]}" for path in paths]
+    _check_targets(paths, targets)
+    if options.out is not None:
+        make_output_folder(options.out)
+    for path, target in zip(paths, targets, strict=True):
+        print(f"written: {export_run(read_run(path), target, form)}")
+
+
+def _check_targets(paths: Sequence[Path], targets: Sequence[Path]) -> None:
+    """Refuse runs that would go to one place, or over what is there."""
+    taken: dict[Path, Path] = {}
+    for path, target in zip(paths, targets, strict=True):
+        if target in taken:
+            raise InputError(f"{path} and {taken[target]}: both would be {target}: export them to folders of their own (--out)")
+        if target.exists():
+            raise InputError(f"{target}: is there already: move it away, or name another folder (--out)")
+        taken[target] = path
 
 
 def _reseal(options: ExportOptions) -> None:
@@ -82,6 +130,27 @@ def _export(source: str, out: Path) -> None:
     )
 
 
+def _import(options: ExportOptions) -> None:
+    import gymnasium
+
+    from wlr_gym.envs.registry import task_name_of
+    from wlr_gym.learning.foreign import import_policy
+    from wlr_gym.policy import fed_environment, load_agent_config
+
+    if options.env is None:
+        raise InputError(f"{options.policy[0]}: an archive does not say what it was trained in: give --env ID")
+    settings = load_agent_config(options.config, (), task_name_of(options.env)) if options.config else {}
+    out = options.out or Path("policy.onnx")
+    make_output_folder(out.parent)
+    env = gymnasium.make(options.env, **fed_environment(settings.get("environment") or {}))
+    parity = import_policy(options.policy[0], env, out, normalizer=options.normalizer)
+    print(
+        f"written: {out} ({out.stat().st_size / 1000:.0f} kB)\n"
+        f"answers as the archive does: actions differ by at most {parity.random:.1e} on random observations, "
+        f"{parity.real:.1e} on those of robots that it drives"
+    )
+
+
 def _write_card(source: str, evaluation: Path) -> None:
     from wlr_gym.policy import find_policy, write_model_card
 
@@ -94,22 +163,14 @@ def _write_card(source: str, evaluation: Path) -> None:
 
 def real_observations(source: Path) -> NDArray[np.float32]:
     """Return the observations (M, D) of a policy that drives robots in the environment it was trained in."""
-    from wlr_gym.learning.evaluation import make_core, start_episodes
+    from wlr_gym.learning.evaluation.rollout import make_core, seen_observations
     from wlr_gym.policy import make_policy, policy_environment
 
-    core = make_core(environment_of(None, source), ROBOTS, {"episode_length": SECONDS} | policy_environment(source))
-    seen = []
+    core = make_core(environment_of(None, source), ROBOTS, policy_environment(source))
     try:
-        policy = make_policy(source, core.contract())
-        start_episodes(core, policy, 0)
-        active = core.everyone.copy()
-        while active.any():
-            seen.append(core.observation[active])
-            core.step(policy.act(core.observation), active)
-            active &= ~(core.terminated | core.truncated)
+        return seen_observations(core, make_policy(source, core.contract()), SECONDS)
     finally:
         core.close()
-    return np.concatenate(seen)
 
 
 def training_facts(folder: Path) -> dict[str, Any]:

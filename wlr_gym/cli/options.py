@@ -55,3 +55,10 @@ def environment_of(env: str | None, policy: str | Path) -> str:
     from wlr_gym.policy import trained_environment
 
     return env or trained_environment(policy) or "WLR-Velocity-v0"
+
+
+def ray_address(words: tuple[str, ...] | None) -> str | None:
+    """Return what ``--ray`` means: None = no Ray, ``local`` = one that is started here, otherwise the address of a cluster."""
+    if words is not None and len(words) > 1:
+        raise InputError(f"--ray {' '.join(words)}: expected one address, or none")
+    return None if words is None else (words or ("local",))[0]

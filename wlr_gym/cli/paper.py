@@ -115,17 +115,19 @@ def _drive(model: str, robot: Robot, options: PaperOptions, console: Console) ->
     from wlr_gym.studies.paper.experiments import drive_both
 
     console.print(f"both tests: {model}")
-    return _drive_robot(robot, options, console) if model in REAL else drive_both(model, robot)
+    return _drive_robot(options, console) if model in REAL else drive_both(model, robot)
 
 
-def _drive_robot(robot: Robot, options: PaperOptions, console: Console) -> dict[str, Record]:
+def _drive_robot(options: PaperOptions, console: Console) -> dict[str, Record]:
     """Guarded and logged; between the tests the operator carries the robot back."""
     from wlr_gym.data.format import RunMeta
     from wlr_gym.hardware.operator import stop_on_signals
     from wlr_gym.physics.effects import load_patch
+    from wlr_gym.robot import load_robot
     from wlr_gym.robot.parameters import Parameters
     from wlr_gym.studies.paper.experiments import PROFILE, TESTS, drive_plant
 
+    robot = load_robot(options.robot_name(options.robot))
     meta, records = RunMeta(robot=robot.name, profile=PROFILE, notes="the paper's tests"), {}
     for name, test in TESTS.items():
         if not (options.emulated or options.yes):

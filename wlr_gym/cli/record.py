@@ -72,11 +72,12 @@ def run(options: RecordOptions) -> int:
     from wlr_gym.robot import load_robot
 
     console = Console(soft_wrap=True, highlight=False)
-    robot = load_robot(options.robot)
+    check_backend(options.backend)
+    chosen = options.robot_name(options.robot) if options.backend in REAL else options.robot or "nominal"
+    robot = load_robot(chosen)
     if options.list:
         _list(console, robot)
         return OK
-    check_backend(options.backend)
     if options.backend not in REAL and (options.emulated or options.port):
         raise InputError(f"--emulated and --port are about the robot: leave --backend {options.backend} out")
     if options.out is None:
@@ -87,7 +88,7 @@ def run(options: RecordOptions) -> int:
         for motion in motions:
             console.print(f"written: {write_commands(options.out, motion)}")
         return OK
-    named = robot_entry(options.robot, options.out)
+    named = robot_entry(chosen, options.out)
     meta = meta_of(motions[0], robot, RunMeta(robot=named, ground=options.ground, notes=options.notes))
     if options.backend in REAL:
         return _record_robot(options, motions, robot, meta, console)

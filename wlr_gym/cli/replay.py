@@ -39,7 +39,8 @@ class ReplayOptions(HardwareOption, PatchOption):
         runs: a run (CSV or Parquet) or a folder of runs.
         out: folder for errors.json, plots and provenance; made if it is not there.
         backend: simulator, or dynamixel for the robot.
-        robot: robot file or config name; left out, the one meta.yaml names, else the nominal one.
+        robot: robot file or config name; left out, the one meta.yaml names, else the nominal one; of a real robot the one
+            that its hardware file names.
         segment: s between the points at which a segment starts anew from the measured state.
         plots: write overlay plots.
         video: file (.webp, .gif, .png, .mp4) for a film of the run beside its simulation; with several runs, one film each,
@@ -147,12 +148,13 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
     from wlr_gym.hardware.driving import drive_robot
 
     motions = [motion_of(measured) for measured in runs]
+    chosen = options.robot or options.load_hardware().robot
     for measured, motion in zip(runs, motions, strict=True):
-        robot = robot_of(measured, options.robot)
+        robot = robot_of(measured, chosen)
         if not (options.emulated or options.yes):
             confirm(motion, robot, console)
         folder = options.out / "robot" / measured.name
-        named = robot_entry(options.robot or str(measured.path.parent / (measured.meta.robot or "")), folder)
+        named = robot_entry(chosen or str(measured.path.parent / (measured.meta.robot or "")), folder)
         plant = options.plant_of(robot, folder, meta_of(motion, robot, RunMeta(robot=named)), patch)
         try:
             drive = drive_robot(plant, motion)
@@ -164,7 +166,7 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
         if drive.reason or drive.run is None:
             console.print(f"stopped: {drive.reason or 'nothing was logged'}", style="red")
             return
-        yield compare_repeat(measured, read_run(drive.run), options.robot, options.segment)
+        yield compare_repeat(measured, read_run(drive.run), chosen, options.segment)
 
 
 def _resolved(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch) -> dict[str, object]:

@@ -46,6 +46,10 @@ class HardwareOption:
             raise InputError("--port and --emulated: one or the other; the emulated robot of this process has no ports")
         return with_ports(load_hardware(self.hardware), ports)
 
+    def robot_name(self, asked: str | Path | None) -> str:
+        """Return the robot file that is asked for, else the one that the hardware file names, else ``nominal``."""
+        return str(asked or self.load_hardware().robot or "nominal")
+
     def link_to(self, robot: Robot, hardware: Hardware, patch: Patch | None = None) -> Link:
         """Return connections to a robot, closed; ``patch`` is what an emulated one has that the nominal one lacks.
 
@@ -78,14 +82,14 @@ class HardwareOption:
 class RobotOption(HardwareOption):
     """Which robot, how it is wired, and whether it is a real one."""
 
-    robot: str = "nominal"
-    """Robot file or config name."""
+    robot: str | None = None
+    """Robot file or config name; default: the one that the hardware file names."""
 
     def load(self) -> tuple[Robot, Hardware]:
         """Return the robot and its hardware, with the ports of ``--port``; see :meth:`load_hardware`."""
         from wlr_gym.robot import load_robot
 
-        return load_robot(self.robot), self.load_hardware()
+        return load_robot(self.robot_name(self.robot)), self.load_hardware()
 
     def link(self, changed: Hardware | None = None) -> Link:
         """Return connections to a robot that does not move, closed; a slow computer is no dead servo then.
@@ -117,16 +121,38 @@ def confirm(motion: Motion, robot: Robot, console: Console) -> None:
     wait_for_enter(console, "Free floor? Hand on the switch?")
 
 
-def wait_for_enter(console: Console, question: str) -> None:
+def wait_for_enter(console: Console, question: str, action: str = "start the robot", otherwise: str = ", or say --yes") -> None:
     """Ask the operator, and wait for Enter.
+
+    Args:
+        console: to ask on.
+        question: what is asked.
+        action: what Enter does.
+        otherwise: what else can be done where nobody is there.
 
     Raises:
         InputError: nobody there.
     """
     try:
-        console.input(f"[bold]{question} Enter to start, Ctrl-C not to. ")
+        console.input(f"[bold]{question} Enter to {action}, Ctrl-C not to. ")
     except EOFError:
-        raise InputError("nobody there to start the robot: run it on a terminal, or say --yes") from None
+        raise InputError(f"nobody there to {action}: run it on a terminal{otherwise}") from None
+
+
+class NobodyThereError(InputError):
+    """Questions cannot be answered."""
+
+
+def ask_terminal(text: str, what: str = "calibration") -> str:
+    """Ask on the terminal; ``what`` is the dialogue that the question is of.
+
+    Raises:
+        NobodyThereError: the input is at its end.
+    """
+    try:
+        return input(text + " ")
+    except EOFError:
+        raise NobodyThereError(f"{what} is a dialogue: run it on a terminal, or pipe its answers in") from None
 
 
 def port_pairs(words: Sequence[str]) -> dict[str, str]:

@@ -12,10 +12,9 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption
-from wlr_gym.envs.registry import task_name_of
-from wlr_gym.policy import Training, load_agent_config
-from wlr_gym.policy.agents import agent_function
+from wlr_gym.cli.options import PatchOption, environment_of
+from wlr_gym.learning.training import resume_training, run_training, settings_of, unused
+from wlr_gym.policy import Training
 
 if TYPE_CHECKING:
     from wlr_gym.physics.effects import Patch
@@ -23,8 +22,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainOptions(PatchOption):
-    env: tyro.conf.Positional[str] = "WLR-Velocity-v0"
-    """Environment id; see: wlr envs."""
+    env: tyro.conf.Positional[str | None] = None
+    """Environment id (see: wlr envs); default: that of --init, else WLR-Velocity-v0."""
     agent: str = "ppo"
     """Agent to train: a folder of agents/."""
     config: str | None = None
@@ -37,8 +36,12 @@ class TrainOptions(PatchOption):
     """Seed of everything random; default: that of the settings."""
     out: Path | None = None
     """Run folder; default: runs_out/<env>_<config or agent>_<seed>."""
+    init: str | None = None
+    """Trained policy to start from: run or policy folder, policy file or shipped policy. Its settings hold without --config."""
     resume: Path | None = None
     """Run folder to resume; its own environment, agent and settings are used."""
+    total_steps: int | None = None
+    """With --resume: go on until so many environment steps, at the rate at which the run's schedule ended."""
     max_minutes: float | None = None
     """Stop in good order after this time."""
     progress: bool = True
@@ -49,25 +52,40 @@ def run(options: TrainOptions) -> int:
     """Train and print where the policy is."""
     if options.max_minutes is not None and not options.max_minutes > 0:
         raise InputError(f"--max-minutes {options.max_minutes:g}: expected more than 0")
-    agent, training = _resumed(options) if options.resume is not None else _new(options)
-    train = agent_function(agent, "train")
-    policy = train(training)
-    print(f"policy: {policy}\nscore it: wlr evaluate {policy} --env {training.environment}")
+    seconds = None if options.max_minutes is None else 60.0 * options.max_minutes
+    if options.resume is not None:
+        _require_own_settings(options)
+        policy = resume_training(
+            options.resume, total_steps=options.total_steps, max_seconds=seconds, progress=options.progress
+        )
+        environment = read_yaml(options.resume / CONFIG_FILE)["environment"]
+    else:
+        environment = options.env or "WLR-Velocity-v0" if options.init is None else environment_of(options.env, options.init)
+        config = _config(options, environment)
+        folder = unused(options.out or default_folder(options, environment, config))
+        training = Training(environment, folder, config, False, seconds, options.progress, options.init)
+        policy = run_training(options.agent, training)
+    print(f"policy: {policy}\nscore it: wlr evaluate {policy} --env {environment}")
+    best = policy.with_name("best")
+    if best.is_dir():
+        print(f"best on held-out episodes: {best}")
     return OK
 
 
-def _new(options: TrainOptions) -> tuple[str, Training]:
-    config = load_agent_config(options.config or options.agent, options.set, task_name_of(options.env))
+def default_folder(options: TrainOptions, environment: str, config: dict[str, Any]) -> Path:
+    """Return the run folder of a training without ``--out``: its environment, settings and seed."""
+    settings = Path(options.config or options.init or options.agent).stem
+    return Path("runs_out") / f"{environment.rpartition(':')[2]}_{settings}_{config.get('seed', 0)}"
+
+
+def _config(options: TrainOptions, environment: str) -> dict[str, Any]:
+    config = settings_of(environment, options.config, options.agent, options.init, options.set)
     if options.seed is not None:
         config["seed"] = options.seed
     if options.backend is not None:
         config["environment"] = (config.get("environment") or {}) | {"backend": options.backend}
     add_effects(config, options.patch())
-    settings = Path(options.config or options.agent).stem
-    folder = options.out or Path("runs_out") / f"{options.env.rpartition(':')[2]}_{settings}_{config.get('seed', 0)}"
-    if folder.is_dir() and any(folder.iterdir()):
-        raise InputError(f"{folder}: not empty; give another --out, or resume what is there: wlr train --resume {folder}")
-    return options.agent, _training(options, options.env, folder, config, resume=False)
+    return config
 
 
 def add_effects(config: dict[str, Any], patch: Patch) -> None:
@@ -76,24 +94,10 @@ def add_effects(config: dict[str, Any], patch: Patch) -> None:
         config["environment"] = (config.get("environment") or {}) | {"effects": patch.content()["effects"]}
 
 
-def _resumed(options: TrainOptions) -> tuple[str, Training]:
-    folder = options.resume
-    assert folder is not None
-    own = (options.out, options.config, options.seed, options.backend)
+def _require_own_settings(options: TrainOptions) -> None:
+    own = (options.env, options.out, options.config, options.seed, options.backend, options.init)
     if any(value is not None for value in own) or options.set or options.effects:
         raise InputError(
-            "--resume uses the settings of the run folder; leave out --out, --config, --set, --seed, --backend and --effects"
+            "--resume uses the settings of the run folder; leave out the environment, --out, --config, --set, --seed, "
+            "--backend, --init and --effects"
         )
-    path = folder / CONFIG_FILE
-    if not path.is_file():
-        raise InputError(f"{folder}: not a run folder: {CONFIG_FILE} is missing")
-    saved = read_yaml(path)
-    for key in ("environment", "agent", "settings"):
-        if not isinstance(saved, dict) or key not in saved:
-            raise InputError(f"{path}: '{key}' is missing")
-    return saved["agent"], _training(options, saved["environment"], folder, saved["settings"], resume=True)
-
-
-def _training(options: TrainOptions, environment: str, folder: Path, config: dict, *, resume: bool) -> Training:
-    seconds = None if options.max_minutes is None else 60.0 * options.max_minutes
-    return Training(environment, folder, config, resume=resume, max_seconds=seconds, progress=options.progress)

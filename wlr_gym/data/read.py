@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+#: Tables beside a run that are none: what a policy was asked and answered, all samples of a log that was imported.
+BESIDE = (".policy", ".samples")
+
 
 @dataclass(frozen=True, eq=False)
 class Run:
@@ -104,8 +107,8 @@ def read_dataset(folder: str | Path) -> DataSet:
 
 
 def run_files(folder: Path) -> list[Path]:
-    """Return the runs of a folder, ``run_2`` before ``run_10``; what a policy was asked and answered lies beside them."""
-    files = [path for path in folder.glob("run_*") if path.suffix.lower() in SUFFIXES and not path.stem.endswith(".policy")]
+    """Return the runs of a folder, ``run_2`` before ``run_10``; what else is known of a run lies beside it (:data:`BESIDE`)."""
+    files = [path for path in folder.glob("run_*") if path.suffix.lower() in SUFFIXES and not path.stem.endswith(BESIDE)]
     return sorted(files, key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)])
 
 

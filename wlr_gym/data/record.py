@@ -146,7 +146,7 @@ def record_simulation(
         plant.reset(seeds, parameters, state=standing_at(start_setpoints(motion, robot)[None], robot, parameters))
         for _ in range(round(SETTLE / motion.period)):
             plant.step(start_setpoints(motion, robot)[None], torque_on[:1])
-        start = replace(plant.get_state(), time=np.zeros(1))  # the run begins here
+        start = replace(plant.mechanical_state(), time=np.zeros(1))  # the run begins here
         sensors = plant.reset(seeds, parameters, state=start)
         for tick, setpoints in enumerate(motion.setpoints):
             rows[tick] = channels(sensors, 0)

@@ -251,7 +251,7 @@ def _simulate(
         sensors = plant.reset(parameters=parameters, state=replace(state, time=begin - run["t"][0]))
         first_reading = sensors.joint_position[:, WHEEL_SLICE].copy()
         for tick in range(ticks + 1):
-            states += [plant.get_state() for _ in range(snapshots.count(tick))]
+            states += [plant.mechanical_state() for _ in range(snapshots.count(tick))]
             values[tick] = _readings(sensors, plant.truth(), wheels - first_reading, offset)
             if tick < ticks:
                 sensors = plant.step(setpoints[tick], torque_on[tick])

@@ -12,7 +12,7 @@ from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.physics.plants.sensors import imu_to_body, rotation
-from wlr_gym.physics.servo import motor_constants
+from wlr_gym.physics.servo import motor_constants, position_gains
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -177,7 +177,7 @@ def _wheel_tension(run: Run, robot: Robot, parameters: Parameters) -> Array:
     constant, resistance = motor_constants(robot.servo.wheel.stall_torque, robot.servo.wheel.no_load_speed, nominal_voltage)
     still = _rows_before_motion(run)
     effort = [np.mean(run[f"eff_{joint}"][still]) if f"eff_{joint}" in run else 0.0 for joint in WHEELS]
-    return np.nan_to_num(effort) * resistance / constant / np.maximum(parameters["servo.kp"][:, WHEEL_SLICE], 1e-9)
+    return np.nan_to_num(effort) * resistance / constant / np.maximum(position_gains(parameters)[:, WHEEL_SLICE], 1e-9)
 
 
 def _rows_before_motion(run: Run) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.envs.tasks.task import ActionColumn
 from wlr_gym.robot import JOINTS
 
@@ -75,6 +76,10 @@ class Actions:
     def begin(self, rows: NDArray[np.intp]) -> None:
         """Forget the actions of some robots."""
         self.action[rows] = self.previous[rows] = 0.0
+
+    def stores(self) -> dict[str, RowStore]:
+        """Return what snapshots hold."""
+        return {"action": self.action, "previous_action": self.previous, "setpoints": self.setpoints}
 
     def take(self, actions: ArrayLike, mask: Mask) -> None:
         """Turn actions (N, 8) into setpoints; robots outside ``mask`` get those of action 0.

@@ -1,51 +1,100 @@
-"""Classes behind the ids, made from a task's data when they are asked for: ``VelocityEnv``, ``VelocityVectorEnv``, ..."""
+"""Environment classes of the shipped tasks. A task of one's own needs none: see ``register_task``.
 
+Each takes the keywords of :class:`wlr_gym.envs.settings.EnvironmentOptions`. What an environment observes, rewards and measures
+is data: ``describe()`` prints its tables, ``wlr envs ID`` and docs/environments.md show them.
+
+Vector classes name Gymnasium's class among their bases a second time: skrl recognises an environment by its direct bases.
+"""
+
+# pyright: reportIncompatibleVariableOverride=false
 from __future__ import annotations
 
-from functools import cache
-from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
-from wlr_gym.base.errors import InputError
-from wlr_gym.base.paths import find_config
-from wlr_gym.envs.document import class_document
-from wlr_gym.envs.registry import ENVIRONMENTS, enter, title_of
+from gymnasium.vector import VectorEnv
+
 from wlr_gym.envs.single import WlrEnv
-from wlr_gym.envs.tasks.task_config import read_task
 from wlr_gym.envs.vector import WlrVectorEnv
 
-_BASES = {"VectorEnv": WlrVectorEnv, "Env": WlrEnv}
 
+class VelocityEnv(WlrEnv):
+    """Follow commands of forward velocity and yaw rate that change a few times within an episode.
 
-def register_task(path: str | Path) -> str:
-    """Register the task of a YAML file as an environment of this process, and return its id.
+    The robot turns on skids, so it cannot turn without slip; what it can learn is to slip no more than the turn needs, on
+    floors from slippery to grippy, which it must tell apart from wheel speeds, motor currents and the IMU.
 
-    The id is made of the file's ``name`` and of the last version in its ``history``: ``name: hill_climb`` gives
-    ``WLR-HillClimb-v0``, and the classes ``HillClimbV0Env`` and ``HillClimbV0VectorEnv``. Gymnasium and every command that
-    takes an id know it from then on.
+    Version history of ``WLR-Velocity-v0``:
 
-    Raises:
-        InputError: no such file, a fault in it, or an id that belongs to another task.
+    - v0: first version
     """
-    source = str(find_config("task", path).resolve())
-    config = read_task(source)
-    title, version = title_of(config.name), list(config.history)[-1]
-    env_id = f"WLR-{title}-{version}"
-    present = ENVIRONMENTS.get(env_id, (source,))[0]
-    if present != source:
-        raise InputError(f"{source}: '{env_id}' is the task '{present}' already; give it another name")
-    enter(env_id, source, title + version.upper())  # each version has its own classes
-    return env_id
+
+    task_name: ClassVar[str | None] = "velocity"
 
 
-def __getattr__(name: str) -> Any:
-    for task, *entry_points in ENVIRONMENTS.values():
-        if f"{__name__}:{name}" in entry_points:
-            return _make_class(name, task)
-    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+class VelocityVectorEnv(WlrVectorEnv, VectorEnv):
+    """A batch of robots on the task of :class:`VelocityEnv`."""
+
+    task_name: ClassVar[str | None] = "velocity"
 
 
-@cache
-def _make_class(name: str, task: str) -> type:
-    base = next(base for ending, base in _BASES.items() if name.endswith(ending))
-    return type(name, (base,), {"__module__": __name__, "__doc__": class_document(task), "task_name": task})
+class PathEnv(WlrEnv):
+    """Follow a line, an S-curve or a circle on the floor at a commanded speed, with the least lateral error.
+
+    Where the robot is against its path it knows from its own estimate: odometry and gyroscope drift as wheels slip, which
+    turning on skids makes them do, and the camera holds the estimate where there is one. Reward and measures use the true pose.
+
+    Version history of ``WLR-Path-v0``:
+
+    - v0: first version
+    """
+
+    task_name: ClassVar[str | None] = "path"
+
+
+class PathVectorEnv(WlrVectorEnv, VectorEnv):
+    """A batch of robots on the task of :class:`PathEnv`."""
+
+    task_name: ClassVar[str | None] = "path"
+
+
+class PostureEnv(WlrEnv):
+    """Drive straight on while the legs sweep from one posture to another: the two tests of the paper as a task.
+
+    First the legs go from home to the first posture; from 4 s on they sweep to the second one, each axle its own way. Legs that
+    turn drag their wheels along and load them unevenly, and where the floor grips the wheels unevenly that turns the robot
+    aside. The paper's tests are front legs at 30 degrees while rear legs go from 30 to 150, and front legs from 30 to 150 while
+    rear legs go from 150 to 30.
+
+    Version history of ``WLR-Posture-v0``:
+
+    - v0: first version
+    """
+
+    task_name: ClassVar[str | None] = "posture"
+
+
+class PostureVectorEnv(WlrVectorEnv, VectorEnv):
+    """A batch of robots on the task of :class:`PostureEnv`."""
+
+    task_name: ClassVar[str | None] = "posture"
+
+
+class SlopeEnv(WlrEnv):
+    """Climb a slope at a commanded speed, straight on, then hold.
+
+    Friction and slope are drawn together: the slope is 1.5 to 12 degrees less than the steepest one that the floor's friction
+    could hold, atan(mu). The world frame is the floor's; it is gravity that leans. Near the limit every wheel must carry its
+    share: wheels that spin, or fight each other, use up what holds the robot.
+
+    Version history of ``WLR-Slope-v0``:
+
+    - v0: first version
+    """
+
+    task_name: ClassVar[str | None] = "slope"
+
+
+class SlopeVectorEnv(WlrVectorEnv, VectorEnv):
+    """A batch of robots on the task of :class:`SlopeEnv`."""
+
+    task_name: ClassVar[str | None] = "slope"

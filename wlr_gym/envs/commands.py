@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.random import stream_number
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.envs.tasks.draws import uniform
 from wlr_gym.envs.tasks.task_config import TaskConfig
 from wlr_gym.envs.tasks.terms import COMMANDS
@@ -98,7 +99,7 @@ class Commands:
     """
 
     def __init__(self, config: TaskConfig, count: int) -> None:
-        self.names = tuple(config.commands.terms)
+        self.names: tuple[str, ...] = tuple(config.commands.terms)
         period = config.control_period
         ramp = {name: rate * period for name, rate in config.commands.ramp.items()}
         ranges = [(low, high, ramp.get(name, np.inf)) for name, (low, high) in config.commands.terms.items()]
@@ -126,6 +127,10 @@ class Commands:
         self._until[rows] = FOREVER
         for column, value in values.items():
             self.command[rows, column] = self.target[rows, column] = value
+
+    def stores(self) -> dict[str, RowStore]:
+        """Return what snapshots hold."""
+        return dict(zip(("command", "command_target", "command_until", "command_draws"), self._buffers, strict=True))
 
     def read(self, given: Mapping[str, Any]) -> dict[int, float]:
         """Return commands {name: value} as {column: value}.

@@ -41,10 +41,10 @@ Mask = NDArray[np.bool_]
 OPTIONS = ("command", "parameters")
 
 
-def make_task(task_name: str, settings: Settings) -> Task:
-    """Load the task of an environment with the user's overrides."""
+def make_task(task_name: str | Mapping[str, Any], settings: Settings) -> Task:
+    """Load the task of an environment with the user's overrides; a real robot is the one that its hardware file names."""
     changes: dict[str, Any] = {}
-    source: str | Path = task_name
+    source: str | Path | Mapping[str, Any] = task_name
     if isinstance(settings.task, Mapping):
         changes = dict(settings.task)
     elif settings.task is not None:
@@ -52,7 +52,10 @@ def make_task(task_name: str, settings: Settings) -> Task:
     if settings.episode_length is not None:
         changes["episode_length"] = settings.episode_length
     config = read_task(source, changes)
-    return build_task(config, load_robot(config.robot if settings.robot is None else settings.robot))
+    robot = settings.robot
+    if robot is None and settings.robot_options is not None:
+        robot = plants.robot_file(settings.robot_options)
+    return build_task(config, load_robot(config.robot if robot is None else robot))
 
 
 class Core:
@@ -75,11 +78,11 @@ class Core:
         command: (N, C). action: (N, 8). parameters: of every robot. state: where the present episodes started.
     """
 
-    def __init__(self, task_name: str, settings: Settings, count: int) -> None:
-        if not isinstance(count, (int, np.integer)) or count < 1:
+    def __init__(self, task_name: str | Mapping[str, Any], settings: Settings, count: int) -> None:
+        if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
             raise InputError(f"num_envs = {count!r}: expected a whole number of 1 or more")
         self.settings = settings
-        self.count = int(count)
+        self.count: int = int(count)
         self.unmeasured: tuple[str, ...] = ()
         self.task = make_task(task_name, settings)
         if settings.is_real:
@@ -96,8 +99,8 @@ class Core:
             sensor_noise=settings.is_real or self.randomization.config.sensor_noise,
         )
         self.plant = plants.make_plant(settings.backend, robot, self.count, options, self.patch.forces, settings.robot_options)
-        self.limit = self.task.episode_steps
-        self.dictionary = settings.observation == "dict"
+        self.limit: int = self.task.episode_steps
+        self.dictionary: bool = settings.observation == "dict"
         self.observer: SlipObserver | None = None
         if self.task.needs_observer:
             self.observer = SlipObserver(robot, config.control_period, self.count, config.observer.camera)
@@ -134,12 +137,14 @@ class Core:
             over=np.zeros((count, len(task.terminations))),
             sums=np.zeros((count, len(task.rewards))),
             measures=np.zeros((count, len(task.measures))),
+            squares=np.zeros((count, len(task.measures))),
+            largest=np.zeros((count, len(task.measures))),
         )
         self._score_buffers = tuple(self.scores)
         self._no_estimate = np.zeros((count, ESTIMATE_LAYOUT.width))
-        self._start = np.zeros((count, len(START)))
-        self._time = np.zeros(count)
-        self._clock = self._time[:, None]
+        self.start = np.zeros((count, len(START)))
+        self.end_time = np.zeros(count)
+        self._clock = self.end_time[:, None]
         self.computed = np.zeros((count, len(task.computed)))
         self.observation, self.privileged = self.pipeline.policy, self.pipeline.privileged
         self.reward, self.measures = self.scores.total, self.scores.measures
@@ -185,10 +190,10 @@ class Core:
         self.episodes.begin(rows, seeds)
         self.sensors = self.plant.reset(seeds=self.episodes.seeds, parameters=self.parameters, mask=mask, state=self.state)
         self.actions.begin(rows)
-        for buffer in (self.scores.terms, self.scores.total, self.scores.sums, self.scores.measures):
-            buffer[rows] = 0.0
-        self._start[rows, :2] = self.state.position[rows, :2]
-        self._start[rows, 2] = yaw_of(*self.state.quaternion[rows].T)
+        for name in ("terms", "total", "sums", "measures", "squares", "largest"):
+            getattr(self.scores, name)[rows] = 0.0
+        self.start[rows, :2] = self.state.position[rows, :2]
+        self.start[rows, 2] = yaw_of(*self.state.quaternion[rows].T)
         self._begin_observing(mask, held)
         self.episodes.note_begun(mask)
 
@@ -262,13 +267,13 @@ class Core:
             self.command,
             self.action,
             self.actions.previous,
-            self._start,
+            self.start,
             self._clock,
             self.computed,
         )
 
     def _score(self, mask: Mask, signals: tuple[Array, ...]) -> None:
-        np.multiply(self.episodes.steps + 1, self.task.config.control_period, out=self._time)
+        np.multiply(self.episodes.steps + 1, self.task.config.control_period, out=self.end_time)
         bad = self._score_kernel.run(mask, signals, self._score_kernel.numbers, self._score_buffers)
         if bad >= 0:
             hint = "; a formula among its effects may have left its domain" if self.patch.forces else ""
@@ -278,7 +283,7 @@ class Core:
 
     def _observe(self, mask: Mask, signals: tuple[Array, ...], *, first: bool) -> None:
         if self._computed_kernel is not None:
-            self._time[:] = self.time
+            self.end_time[:] = self.time
             self._computed_kernel.run(mask, signals, self._computed_kernel.numbers)
         self.pipeline.observe(mask, signals, self.episodes, first=first)
 
@@ -300,34 +305,6 @@ class Core:
         if self.dictionary:
             return {"policy": self.observation[row].copy(), "privileged": self.privileged[row].copy()}
         return self.observation[row].copy()
-
-    def step_info(self) -> dict[str, Any]:
-        """Return the last step's ``reward_terms`` {name: (N,)}, ``slip_velocity`` (N, 4, 2) m/s along each wheel's heading
-        and axle, and ``effective_friction`` (N, 4, 2) along them. A real robot knows its measured reward terms only."""
-        return {"reward_terms": dict(zip(self.task.rewards, self.scores.terms.T.copy(), strict=True)), **self.contact_info()}
-
-    def contact_info(self) -> dict[str, Any]:
-        """Return ``slip_velocity`` and ``effective_friction`` (N, 4, 2); nothing on a real robot."""
-        if not self.plant.capabilities.has_truth:
-            return {}
-        truth, shape = self.plant.truth(), (self.count, 4, 2)
-        return {name: truth[name].reshape(shape).copy() for name in ("slip_velocity", "effective_friction")}
-
-    def episode_info(self) -> dict[str, Any]:
-        """Return ``episode_reward_terms`` {name: (N,)}: sums over the episode so far."""
-        return {"episode_reward_terms": dict(zip(self.task.rewards, self.scores.sums.T.copy(), strict=True))}
-
-    def reset_info(self) -> dict[str, Any]:
-        """Return ``randomization`` {element: (N,)}: the present values of all parameters that randomisation changes."""
-        return self._samples(self.randomization.elements, self.randomization.columns)
-
-    def change_info(self) -> dict[str, Any]:
-        """Return ``randomization`` {element: (N,)}: the present values of those that also change within an episode."""
-        return self._samples(self.randomization.timed_elements, self.randomization.timed_columns)
-
-    def _samples(self, elements: tuple[str, ...], columns: NDArray[np.int64]) -> dict[str, Any]:
-        values = self.parameters.values[:, columns].T.copy()
-        return {"randomization": dict(zip(elements, values, strict=True))}
 
     def describe(self) -> str:
         """Return the task's tables as text."""

@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.envs.tasks.draws import episode_seeds
 
 Mask = NDArray[np.bool_]
@@ -44,15 +45,15 @@ class Episodes:
     """
 
     def __init__(self, count: int) -> None:
-        self.robot_seeds = np.zeros(count, np.uint64)
-        self.number = np.zeros(count, np.int64)
-        self.seeds = np.zeros(count, np.uint64)
-        self.seeded = np.zeros(count, bool)
-        self.begun = np.zeros(count, bool)
+        self.robot_seeds: NDArray[np.uint64] = np.zeros(count, np.uint64)
+        self.number: NDArray[np.int64] = np.zeros(count, np.int64)
+        self.seeds: NDArray[np.uint64] = np.zeros(count, np.uint64)
+        self.seeded: Mask = np.zeros(count, bool)
+        self.begun: Mask = np.zeros(count, bool)
         self._all_begun = False
-        self.steps = np.zeros(count, np.int64)
-        self.terminated = np.zeros(count, bool)
-        self.truncated = np.zeros(count, bool)
+        self.steps: NDArray[np.int64] = np.zeros(count, np.int64)
+        self.terminated: Mask = np.zeros(count, bool)
+        self.truncated: Mask = np.zeros(count, bool)
 
     def seed(self, row: int, seed: int) -> None:
         """Give a robot its seed; its next episode is its first.
@@ -85,14 +86,23 @@ class Episodes:
         self.begun |= mask
         self._all_begun = bool(self.begun.all())
 
-    def require_begun(self, what: str) -> None:
-        """Refuse what needs the episodes of all robots to have begun.
+    def stores(self) -> dict[str, RowStore]:
+        """Return what snapshots hold."""
+        names = ("robot_seeds", "number", "seeds", "seeded", "begun", "steps", "terminated", "truncated")
+        return {name: getattr(self, name) for name in names}
+
+    def require_begun(self, what: str, rows: Rows | None = None) -> None:
+        """Refuse what needs the episodes of some robots, None = all, to have begun.
 
         Raises:
             gymnasium.error.ResetNeeded: one has not.
         """
-        if not self._all_begun:
-            raise ResetNeeded(f"call reset() before {what}: no episode of robot {int(np.argmin(self.begun))} has begun")
+        if self._all_begun:
+            return
+        asked = np.arange(len(self.begun)) if rows is None else rows
+        waiting = asked[~self.begun[asked]]
+        if waiting.size:
+            raise ResetNeeded(f"call reset() before {what}: no episode of robot {waiting[0]} has begun")
 
 
 def read_seed(seed: Any) -> int:

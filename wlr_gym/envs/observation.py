@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from wlr_gym.base.random import normals4
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.envs.episodes import Episodes
 from wlr_gym.envs.tasks.compiled_terms import MATRICES
 from wlr_gym.envs.tasks.draws import stream_numbers, uniforms
@@ -182,6 +183,11 @@ class ObservationPipeline:
         if self._bias_sigma.any():
             u = uniforms(seeds, self._bias_stream)
             self.bias[rows] = normal(u, np.zeros(1), self._bias_sigma, np.full(1, BIAS_CUT))
+
+    def stores(self) -> dict[str, RowStore]:
+        """Return what snapshots hold."""
+        names = ("observation_bias", "observation_delays", "observation_ring", "observation")
+        return {**dict(zip(names, self._buffers, strict=True)), "privileged": self.privileged}
 
     def observe(self, mask: Mask, signals: tuple[Array, ...], episodes: Episodes, *, first: bool) -> None:
         """Observe the robots in ``mask``; ``signals`` are :data:`MATRICES`, ``first``: their episodes start."""

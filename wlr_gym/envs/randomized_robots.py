@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.envs.episodes import Episodes
 from wlr_gym.envs.tasks.randomization import DRIFT_PERIOD, Randomization
 from wlr_gym.physics.effects import Patch, apply_patch
@@ -44,12 +45,12 @@ class RandomizedRobots:
         self._randomization = randomization
         self._patch = patch
         self._period = control_period
-        self.share = 1.0
+        self.share: float = 1.0
         self._shares = np.ones(count)  # that the present episodes were drawn with
-        self.parameters = apply_patch(patch, Parameters.nominal(robot, count))
+        self.parameters: Parameters = apply_patch(patch, Parameters.nominal(robot, count))
         self.state: PlantState = randomization.state(self.parameters, np.zeros(count, np.uint64))
         self.changed = np.zeros(count, bool)
-        self._overrides: dict[int, dict[str, Any]] = {}
+        self._overrides = np.full(count, None, dtype=object)  # {parameter: value} that users set for the present episodes
         intervals = len(randomization.intervals)
         self._occurrences = np.zeros((count, intervals), np.int64)
         self._strike_at = np.zeros((count, intervals), np.int64)
@@ -70,7 +71,7 @@ class RandomizedRobots:
         _override(robots, overrides)
         self._shares[rows] = self.share
         self.parameters.values[rows] = robots.values
-        self._overrides |= dict.fromkeys(rows.tolist(), overrides)
+        self._overrides[rows] = overrides
         for name, value in vars(self._randomization.state(robots, seeds, self.share)).items():
             if value is not None:
                 getattr(self.state, name)[rows] = value
@@ -101,10 +102,23 @@ class RandomizedRobots:
         time = np.asarray(steps[rows] * self._period, np.float64)
         robots = self._draw(episodes.robot_seeds[rows], seeds, self._shares[rows], self._occurrences[rows], time)
         for index, row in enumerate(rows.tolist()):
-            if self._overrides.get(row):
+            if self._overrides[row]:
                 _override(Parameters(robots.values[index : index + 1]), self._overrides[row])
         self.parameters.values[rows] = robots.values
         return True
+
+    def stores(self) -> dict[str, RowStore]:
+        """Return what snapshots hold."""
+        start = {f"start_{name}": value for name, value in vars(self.state).items() if value is not None}
+        return {
+            "parameters": self.parameters.values,
+            "parameters_changed": self.changed,
+            "randomization_share": self._shares,
+            "overrides": self._overrides,
+            "occurrences": self._occurrences,
+            "strike_at": self._strike_at,
+            **start,
+        }
 
     def read_overrides(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return parameters {name or element: value} that fit one robot: they are set again, robot by robot, whenever its
@@ -121,7 +135,7 @@ class RandomizedRobots:
                 raise InputError(
                     f"parameters: {name} of shape {np.shape(value)}: expected shape {one.shape[1:]}, the same for every robot"
                 ) from None
-        return dict(given)
+        return {name: np.array(value, np.float64) for name, value in given.items()}  # a copy: what the caller does later is his
 
     def _draw(
         self, robot_seeds: Seeds, seeds: Seeds, share: Array, occurrences: Counts | None = None, time: Array | None = None

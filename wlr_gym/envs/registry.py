@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from wlr_gym.base.errors import unknown_name
+from typing import Any
 
-#: id -> (task: name in ``configs/task/`` or path, class of the single and of the vector environment).
-ENVIRONMENTS: dict[str, tuple[str, str, str]] = {}
+from wlr_gym.base.errors import InputError, unknown_name
+
+#: id -> task: name in ``configs/task/`` or path.
+ENVIRONMENTS: dict[str, str] = {}
 
 
 def title_of(task_name: str) -> str:
@@ -14,24 +16,53 @@ def title_of(task_name: str) -> str:
 
 
 def task_name_of(env_id: str) -> str:
-    """Return the task behind an environment id: a name in ``configs/task/`` or the path of a task file."""
+    """Return the task behind an environment id: a name in ``configs/task/`` or the path of a task file.
+
+    Raises:
+        InputError: no such id in this process.
+    """
+    if not isinstance(env_id, str):
+        raise InputError(f"environment {env_id!r}: expected an id, such as {next(iter(ENVIRONMENTS))}")
     name = env_id.rpartition(":")[2]
     if name not in ENVIRONMENTS:
-        raise unknown_name("environment", env_id, ENVIRONMENTS)
-    return ENVIRONMENTS[name][0]
+        error = unknown_name("environment", env_id, ENVIRONMENTS)
+        raise InputError(f"{error}; a task of your own is known once this process registered it (wlr --import MODULE)")
+    return ENVIRONMENTS[name]
 
 
-def enter(env_id: str, task: str, title: str) -> None:
-    """Enter an id into Gymnasium's registry and :data:`ENVIRONMENTS`; no other id has classes of this ``title``."""
+def task_source_of(env_id: str) -> str | dict[str, Any]:
+    """Return the task behind an environment id: a name in ``configs/task/``, or the whole content of a registered task.
+
+    Raises:
+        InputError: no such id in this process.
+    """
     import gymnasium
 
-    single, vector = f"wlr_gym.envs.classes:{title}Env", f"wlr_gym.envs.classes:{title}VectorEnv"
-    if env_id not in gymnasium.registry:
-        gymnasium.register(env_id, entry_point=single, vector_entry_point=vector)
-    ENVIRONMENTS[env_id] = (task, single, vector)
+    task = task_name_of(env_id)
+    return gymnasium.registry[env_id.rpartition(":")[2]].kwargs.get("definition", task)
 
 
 def register_environments() -> None:
     """Register the shipped tasks; a test compares the versions with the history in their files."""
     for name in ("velocity", "path", "posture", "slope"):
-        enter(f"WLR-{title_of(name)}-v0", name, title_of(name))
+        title = title_of(name)
+        enter(f"WLR-{title}-v0", name, f"wlr_gym.envs.classes:{title}Env", f"wlr_gym.envs.classes:{title}VectorEnv")
+
+
+def register_definition(env_id: str, source: str, definition: dict[str, Any]) -> None:
+    """Register a task by its whole content, so that a spec of it works in processes that know neither id nor file.
+
+    A task that is registered again is what it says now.
+    """
+    enter(env_id, source, "wlr_gym.envs.single:WlrEnv", "wlr_gym.envs.vector:WlrVectorEnv", definition=definition)
+
+
+def enter(env_id: str, task: str, single: str, vector: str, **keywords: Any) -> None:
+    """Enter an id into Gymnasium's registry and :data:`ENVIRONMENTS`, with the classes' places and keywords."""
+    import gymnasium
+
+    if env_id in gymnasium.registry and gymnasium.registry[env_id].kwargs != keywords:
+        del gymnasium.registry[env_id]
+    if env_id not in gymnasium.registry:
+        gymnasium.register(env_id, entry_point=single, vector_entry_point=vector, kwargs=keywords)
+    ENVIRONMENTS[env_id] = task

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, Unpack
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.envs.core import Core, Mask
 from wlr_gym.envs.episodes import read_seed
+from wlr_gym.envs.infos import Infos, row_of
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
 from wlr_gym.envs.registry import task_name_of
-from wlr_gym.envs.settings import read_settings
+from wlr_gym.envs.settings import EnvironmentOptions, read_settings
 from wlr_gym.envs.vector import seed_robots
 
 require_package("stable_baselines3", "train")
@@ -35,25 +37,35 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
     all robots are in ``core``: ``reward``, ``terms``, ``plant.truth()``), but for ``randomization`` when it changed.
 
     Args:
-        env_id: id such as ``WLR-Velocity-v0``.
+        env_id: id such as ``WLR-Velocity-v0``, or the spec of an environment.
         num_envs: N.
         seed: robot i gets seed + i at the first reset; None = fresh entropy.
         render_mode: ``rgb_array`` (``render()`` returns the first robots as tiles of one picture), ``human`` (a window with the
             first robot) or None.
-        **keywords: those of :class:`wlr_gym.envs.settings.Settings`.
+        **options: those of :class:`wlr_gym.envs.settings.EnvironmentOptions`.
     """
 
     def __init__(
-        self, env_id: str, num_envs: int, *, seed: int | None = None, render_mode: str | None = None, **keywords: Any
+        self,
+        env_id: str | EnvSpec,
+        num_envs: int,
+        *,
+        seed: int | None = None,
+        render_mode: str | None = None,
+        **options: Unpack[EnvironmentOptions],
     ) -> None:
-        EzPickle.__init__(self, env_id, num_envs, seed=seed, render_mode=render_mode, **keywords)
+        spec = _spec_of(env_id)
+        EzPickle.__init__(self, spec, num_envs, seed=seed, render_mode=render_mode, **options)
         check_render_mode(render_mode)
         self.render_mode = render_mode
-        self.core = Core(task_name_of(env_id), read_settings(keywords), num_envs)
-        self.spec = gym.spec(env_id.rpartition(":")[2])  # gym.make takes an id with its module, gym.spec does not
+        given = dict(spec.kwargs)
+        definition = given.pop("definition", None)
+        self.core = Core(definition or task_name_of(spec.id), read_settings(given | options), num_envs)
+        self.spec = spec
         super().__init__(self.core.count, self.core.observation_space, self.core.action_space)
-        self.metadata = metadata(self.core.task.config.control_period)
-        self.pictures = Pictures(self.core, render_mode)
+        self.metadata: dict[str, Any] = metadata(self.core.task.config.control_period)
+        self.pictures: Pictures = Pictures(self.core, render_mode)
+        self._infos = Infos(self.core)
         self._actions: Any = None
         if seed is not None:
             self.seed(seed)
@@ -94,33 +106,30 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         core = self.core
         any_done = core.step(self._actions, core.everyone)
         reward = core.reward.astype(np.float32)
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos = self._rows(self._infos.truth(), core.everyone)
         if core.robots.changed.any():
-            for row, info in self._samples(core.change_info(), core.robots.changed):
-                infos[row] = info
+            for info, more in zip(infos, self._rows(self._infos.change(), core.robots.changed), strict=True):
+                info |= more
         done = core.terminated | core.truncated
         if any_done:
-            sums = core.scores.sums.copy()
-            for row in np.flatnonzero(done).tolist():
-                infos[row] = {
-                    "terminal_observation": core.observation_of(row),
-                    "TimeLimit.truncated": bool(core.truncated[row] and not core.terminated[row]),
-                    "episode_reward_terms": dict(zip(core.task.rewards, sums[row].tolist(), strict=True)),
-                }
+            for row, more in enumerate(self._rows(self._infos.episode(), done)):
+                if done[row]:
+                    limit = bool(core.truncated[row] and not core.terminated[row])
+                    infos[row] |= {"terminal_observation": core.observation_of(row), "TimeLimit.truncated": limit, **more}
             core.begin_episodes(done)
             self._keep_reset_infos(done)
         self.pictures.after_step()
         return core.observations(), reward, done, infos
 
     def _keep_reset_infos(self, mask: Mask) -> None:
-        for row, info in self._samples(self.core.reset_info(), mask):
-            self.reset_infos[row] = info
+        infos = self._rows(self._infos.reset(), mask)
+        for row in np.flatnonzero(mask).tolist():
+            self.reset_infos[row] = infos[row]
 
     @staticmethod
-    def _samples(info: dict[str, Any], mask: Mask) -> Iterator[tuple[int, dict[str, Any]]]:
-        values = info["randomization"]
-        for row in np.flatnonzero(mask).tolist():
-            yield row, {"randomization": {name: float(column[row]) for name, column in values.items()}}
+    def _rows(info: dict[str, Any], mask: Mask) -> list[dict[str, Any]]:
+        """Infos of all robots, empty for those outside the mask and where nothing is said."""
+        return [row_of(info, row) if info and said else {} for row, said in enumerate(mask.tolist())]
 
     def render(self, mode: str | None = None) -> NDArray[np.uint8] | None:
         """Return the first robots as tiles of one picture with ``rgb_array``; show the first robot with ``human``.
@@ -172,3 +181,17 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: int | Iterable[int] | None = None) -> list[bool]:
         """Return False for every robot: there are no single environments to wrap."""
         return [False] * len(list(self._get_indices(indices)))
+
+
+def _spec_of(environment: Any) -> EnvSpec:
+    """Return the spec of an id, which may begin with the module that registers it, or the spec itself.
+
+    Raises:
+        InputError: unknown id, or neither.
+    """
+    if isinstance(environment, EnvSpec):
+        return environment
+    if not isinstance(environment, str):
+        raise InputError(f"env_id = {environment!r}: expected an id, such as WLR-Velocity-v0, or the spec of an environment")
+    task_name_of(environment)
+    return gym.spec(environment.rpartition(":")[2])

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, nearest, unknown_name
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.physics.effects import Patch, Source
 from wlr_gym.physics.plants import REAL
@@ -31,18 +31,20 @@ _TYPES: dict[str, tuple[tuple[type, ...], str]] = {
     "physics_step": ((Real,), "a time above 0 s"),
     "precision": ((str,), "a name"),
     "threads": ((Integral,), "a whole number of 1 or more"),
+    "truth_info": ((bool,), "True or False"),
     "view": ((Mapping, View, type(None)), "a mapping"),
     "hardware": ((str, Path, Mapping, RobotOptions, type(None)), "a name, a path or a mapping"),
 }
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What ``gym.make("WLR-...", ...)`` accepts.
+class EnvironmentOptions(TypedDict, total=False):
+    """What ``gym.make("WLR-...", ...)``, ``gym.make_vec`` and the environment classes accept.
 
     Attributes:
         backend: which plant: ``gibbs_appell`` or ``mujoco``, or ``dynamixel``: the real robot, see ``docs/robot.md``.
-        robot: name in ``configs/robot/``, path of a YAML file, or a :class:`wlr_gym.robot.Robot`; None = the task's.
+        plant: the same as ``backend``, for callers whose own interface takes that word (TorchRL).
+        robot: name in ``configs/robot/``, path of a YAML file, or a :class:`wlr_gym.robot.Robot`; None = the task's,
+            of a real robot the one that its hardware file names.
         randomization: name in ``configs/randomization/`` (none, nominal, wide, slippery, asymmetric, ice, split, patches,
             slope), path of such a file or of a gap result (``.json``), or mapping; None = the task's.
         task: mapping laid over the task's file (``{"rewards": {"slip": {"weight": -2.0}}}``), or another task file.
@@ -55,11 +57,33 @@ class Settings:
         physics_step: s per physics substep.
         precision: ``float64`` or ``float32``.
         threads: worker threads of the plant for large batches; results do not depend on it.
+        truth_info: put true pose, velocities and the command into ``info["truth"]`` at every reset and step (simulators only).
         view: what pictures show (with ``render_mode``): mapping of ``size`` (width, height), ``camera`` (follow, chase, side,
             top), ``friction``, ``slip``, ``forces``, ``path``, ``text`` (True or False), see :class:`wlr_gym.render.View`.
         hardware: of the real robot: name in ``configs/hardware/``, path of such a file, or mapping of the fields of
             :class:`wlr_gym.physics.plants.robot_options.RobotOptions` (``{"emulated": True}``).
     """
+
+    backend: str
+    plant: str
+    robot: str | Path | Robot | None
+    randomization: str | Path | Mapping[str, Any] | None
+    task: str | Path | Mapping[str, Any] | None
+    effects: Source
+    episode_length: float | None
+    observation: str
+    free_wheels: Sequence[str]
+    physics_step: float
+    precision: str
+    threads: int
+    truth_info: bool
+    view: Mapping[str, Any] | View | None
+    hardware: str | Path | Mapping[str, Any] | RobotOptions | None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Checked :class:`EnvironmentOptions` with their defaults."""
 
     backend: str = "gibbs_appell"
     robot: str | Path | Robot | None = None
@@ -72,13 +96,14 @@ class Settings:
     physics_step: float = 0.001
     precision: str = "float64"
     threads: int = 1
+    truth_info: bool = False
     view: Mapping[str, Any] | View | None = None
     hardware: str | Path | Mapping[str, Any] | RobotOptions | None = None
 
     def __post_init__(self) -> None:
         for keyword, (types, expected) in _TYPES.items():
             value = getattr(self, keyword)
-            if isinstance(value, bool) or not isinstance(value, types):
+            if (isinstance(value, bool) and bool not in types) or not isinstance(value, types):
                 raise InputError(f"{keyword} = {value!r}: expected {expected}")
         if self.observation not in OBSERVATIONS:
             raise unknown_name("observation", str(self.observation), OBSERVATIONS, "environment")
@@ -101,7 +126,11 @@ class Settings:
         read_robot_options(self.hardware)
         if self.observation == "dict":
             raise InputError("observation = 'dict': a real robot has no privileged observation")
-        for keyword, harmful in (("randomization", self.randomization not in (None, "none")), ("effects", self.effects)):
+        for keyword, harmful in (
+            ("randomization", self.randomization not in (None, "none")),
+            ("effects", self.effects),
+            ("truth_info", self.truth_info),
+        ):
             if harmful:
                 raise InputError(
                     f"{keyword} = {getattr(self, keyword)!r}: a real robot is what it is; only a simulator takes that"
@@ -123,14 +152,38 @@ class Settings:
         return read_view(self.view)
 
 
-def read_settings(keywords: Mapping[str, Any]) -> Settings:
+class UnknownOptionError(InputError, TypeError):
+    """An option that does not exist. Also a TypeError, worded as Python words it: that is what other libraries probe for."""
+
+
+def read_settings(options: Mapping[str, Any]) -> Settings:
     """Return checked settings.
 
     Raises:
-        InputError: unknown keyword (with the nearest valid one) or a bad value.
+        InputError: unknown option (with the nearest valid one) or a bad value.
     """
-    valid = [field.name for field in fields(Settings)]
-    for keyword in keywords:
-        if keyword not in valid:
-            raise unknown_name("keyword", keyword, [*valid, "render_mode"], "environment")
-    return Settings(**keywords)
+    valid = [*EnvironmentOptions.__annotations__, "render_mode"]
+    for option in options:
+        if option not in valid:
+            raise UnknownOptionError(
+                f"environment: got an unexpected keyword argument '{option}'{nearest(option, valid)}; valid: {', '.join(valid)}"
+            )
+    given = dict(options)
+    if "plant" in given:
+        plant = given.pop("plant")
+        if given.setdefault("backend", plant) != plant:
+            raise InputError(f"plant = {plant!r} and backend = {given['backend']!r}: two words for one thing, give one")
+    return Settings(**given)
+
+
+def task_of(own: str | None, definition: Mapping[str, Any] | None) -> str | Mapping[str, Any]:
+    """Return the task of an environment class, or the one that it is given.
+
+    Raises:
+        InputError: neither, or both.
+    """
+    if (own is None) == (definition is None):
+        raise InputError("definition: expected the task's content where the class has no task of its own, and only there")
+    if definition is not None and not isinstance(definition, Mapping):
+        raise InputError(f"definition = {definition!r}: expected the task's content, a mapping with the keys of a task file")
+    return own or dict(definition or {})

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Unpack
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.envs.core import OPTIONS, Core, Mask, read_options
 from wlr_gym.envs.episodes import read_seed
+from wlr_gym.envs.infos import Infos
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
-from wlr_gym.envs.settings import read_settings
+from wlr_gym.envs.settings import EnvironmentOptions, read_settings, task_of
 
 
-class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
+# Gymnasium's ``spec`` is a plain attribute; this one completes what is written to it.
+class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright: ignore[reportIncompatibleVariableOverride]
     """N robots on a task, bit-identical to N single environments with seeds ``seed + i``.
 
     Args:
@@ -29,10 +31,11 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
         max_episode_steps: truncate after so many control steps, if that is before the task's own limit.
         render_mode: ``rgb_array`` (``render()`` returns one picture per robot), ``human`` (a window with the first robot)
             or None.
-        **keywords: those of :class:`wlr_gym.envs.settings.Settings`.
+        definition: as in :class:`wlr_gym.envs.single.WlrEnv`.
+        **options: those of :class:`wlr_gym.envs.settings.EnvironmentOptions`.
     """
 
-    task_name: ClassVar[str]
+    task_name: ClassVar[str | None] = None
 
     def __init__(
         self,
@@ -41,7 +44,8 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
-        **keywords: Any,
+        definition: Mapping[str, Any] | None = None,
+        **options: Unpack[EnvironmentOptions],
     ) -> None:
         EzPickle.__init__(
             self,
@@ -49,24 +53,25 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
             autoreset_mode=autoreset_mode,
             max_episode_steps=max_episode_steps,
             render_mode=render_mode,
-            **keywords,
+            definition=definition,
+            **options,
         )
         check_render_mode(render_mode)
         self.render_mode = render_mode
-        self.autoreset_mode = _read_mode(autoreset_mode)
-        self.core = Core(self.task_name, read_settings(keywords), num_envs)
+        self.autoreset_mode: AutoresetMode = _read_mode(autoreset_mode)
+        self.core = Core(task_of(self.task_name, definition), read_settings(options), num_envs)
         self.metadata = {**metadata(self.core.task.config.control_period), "autoreset_mode": self.autoreset_mode}
-        self.pictures = Pictures(self.core, render_mode)
+        self.pictures: Pictures = Pictures(self.core, render_mode)
+        self._infos = Infos(self.core)
         self.num_envs = self.core.count
-        if max_episode_steps is not None:
+        if max_episode_steps is not None and max_episode_steps != -1:  # -1: as in gym.make, none beside the environment's own
             if not isinstance(max_episode_steps, (int, np.integer)) or max_episode_steps < 1:
-                raise InputError(f"max_episode_steps = {max_episode_steps!r}: expected a whole number of 1 or more")
+                raise InputError(f"max_episode_steps = {max_episode_steps!r}: expected a whole number of 1 or more, or -1")
             self.core.limit = min(self.core.limit, int(max_episode_steps))
         self.single_observation_space = self.core.observation_space
         self.single_action_space = self.core.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._over: Mask = np.zeros(self.num_envs, bool)
 
     # ---- reset ----
 
@@ -89,9 +94,8 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
             super().reset(seed=int(seed))
         seed_robots(self.core, seeds, mask)
         self.core.begin_episodes(mask, given)
-        self._over = self._over & ~mask
         self.pictures.after_step()
-        return self.core.observations(), _masked(self.core.reset_info(), mask)
+        return self.core.observations(), _masked(self._infos.reset(), mask)
 
     # ---- step ----
 
@@ -105,24 +109,23 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
             gymnasium.error.ResetNeeded: before the first reset, or (``Disabled``) on an ended episode.
         """
         core = self.core
-        if self.autoreset_mode is AutoresetMode.DISABLED and self._over.any():
+        waiting = core.terminated | core.truncated
+        if self.autoreset_mode is AutoresetMode.DISABLED and waiting.any():
             raise ResetNeeded(
-                f"the episode of robot {int(np.argmax(self._over))} is over: reset it with options={{'reset_mask': ...}}"
+                f"the episode of robot {int(np.argmax(waiting))} is over: reset it with options={{'reset_mask': ...}}"
             )
-        waiting = self._over.any()
-        active = ~self._over if waiting else core.everyone
+        active = ~waiting
         any_done = core.step(actions, active)
         reward, terminated, truncated = core.reward.copy(), core.terminated & active, core.truncated & active
         over = terminated | truncated
         if any_done and self.autoreset_mode is AutoresetMode.SAME_STEP:
             return self._restart_now(reward, terminated, truncated, over)
-        infos = _masked(core.step_info(), active) | self._changes()
+        infos = _masked(self._infos.step(), active) | self._changes()
         if any_done:
-            infos |= _masked(core.episode_info(), over)
-        if waiting:
-            core.begin_episodes(self._over)
-            _merge(infos, _masked(core.reset_info(), self._over))
-        self._over = over
+            infos |= _masked(self._infos.episode(), over)
+        if waiting.any():
+            core.begin_episodes(waiting)
+            _merge(infos, _masked(self._infos.reset(), waiting))
         self.pictures.after_step()
         return core.observations(), reward, terminated, truncated, infos
 
@@ -133,19 +136,19 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):
         final = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(over).tolist():
             final[row] = core.observation_of(row)
-        infos = {} if over.all() else _masked(core.step_info(), ~over)
+        infos = {} if over.all() else _masked(self._infos.step(), ~over)
         infos["final_obs"], infos["_final_obs"] = final, over.copy()
-        infos["final_info"] = _masked(core.step_info() | core.episode_info(), over)
+        infos["final_info"] = _masked(self._infos.step() | self._infos.episode(), over)
         infos["_final_info"] = over.copy()
         core.begin_episodes(over)
-        _merge(infos, _masked(core.reset_info(), over))
+        _merge(infos, _masked(self._infos.reset(), over))
         _merge(infos, changes)
         self.pictures.after_step()
         return core.observations(), reward, terminated, truncated, infos
 
     def _changes(self) -> dict[str, Any]:
         """Info of the robots whose parameters changed within their episode."""
-        return _masked(self.core.change_info(), self.core.robots.changed) if self.core.robots.changed.any() else {}
+        return _masked(self._infos.change(), self.core.robots.changed) if self.core.robots.changed.any() else {}
 
     # ---- the rest ----
 
@@ -214,7 +217,7 @@ def _masked(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
     own = mask.copy()
     result: dict[str, Any] = {}
     for key, value in values.items():
-        result[key] = {**value, **{f"_{name}": own for name in value}} if isinstance(value, dict) else value
+        result[key] = _masked(value, own) if isinstance(value, dict) else value
         result[f"_{key}"] = own
     return result
 
@@ -229,4 +232,5 @@ def _merge(infos: dict[str, Any], others: dict[str, Any]) -> None:
         elif key.startswith("_"):
             infos[key] = infos[key] | value
         else:
-            infos[key] = np.where(others[f"_{key}"], value, infos[key])
+            mask = others[f"_{key}"]
+            infos[key] = np.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, infos[key])

@@ -48,9 +48,10 @@ class Unknown:
         name: as in the effect vocabulary, ``coefficient``.
         unit: SI unit.
         neutral: value at which the effect vanishes.
-        low, high: physically plausible range; a fit that leaves it rules the candidate out.
+        low, high: range that a system may plausibly have: a prior.
         step: for finite differences.
         is_size: whether it says how large the effect is (at neutral it vanishes), not where it is or over what it fades.
+        least, most: how far a fit may go; a prior is no wall. None = ``low``, ``high``.
     """
 
     name: str
@@ -60,6 +61,13 @@ class Unknown:
     high: float
     step: float
     is_size: bool = True
+    least: float | None = None
+    most: float | None = None
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """How far a fit may go."""
+        return self.low if self.least is None else self.least, self.high if self.most is None else self.most
 
 
 @dataclass(frozen=True)
@@ -142,7 +150,7 @@ class Candidate:
 
     def kept(self, values: Sequence[float]) -> tuple[float, ...]:
         """Return the values brought into the plausible range."""
-        ranged = tuple(float(np.clip(v, u.low, u.high)) for v, u in zip(values, self.unknowns, strict=True))
+        ranged = tuple(float(np.clip(v, *u.bounds)) for v, u in zip(values, self.unknowns, strict=True))
         return ranged if self.within is None else self.within(ranged)
 
     def probed(self, start: Start) -> tuple[float, ...]:
@@ -182,12 +190,14 @@ class MeasuredSignal:
         unit: SI unit.
         noise: one sigma of the sensor, quantisation included.
         group: channels of one kind share it, for tables and pictures.
+        place: joint, ``body`` or ``sensor`` that it tells of.
     """
 
     name: str
     unit: str
     noise: float
     group: str
+    place: str = "body"
 
 
 @dataclass(frozen=True)
@@ -215,6 +225,8 @@ class Problem(Protocol):
         disagreement: share by which a simulator and the system may differ on how large an effect is; widens intervals.
         thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
         motions: effect -> name of the motion that shows it best, for advice on what to record; may be empty.
+        misfit: error of the fitted runs, in noise floors, from which on something is missing even if no effect explains it;
+            infinite where no simulator's own errors are known.
         held_out: names of the runs to hold out, where the problem knows better than a general rule; else empty.
         turning: joints without end, whose angle alone changes nothing: name -> its feature, and the signals that would show it.
     """
@@ -225,6 +237,7 @@ class Problem(Protocol):
     tempering: float
     disagreement: float
     thorough: bool
+    misfit: float
     motions: Mapping[str, str]
     held_out: tuple[str, ...]
     turning: Mapping[str, tuple[str, tuple[str, ...]]]

@@ -33,6 +33,7 @@ from wlr_gym.gap.analysis import (
     FoundEffect,
     IntakeFinding,
     ParameterEstimate,
+    Place,
     Turning,
 )
 from wlr_gym.gap.estimation.fit import Fit, fit, widened
@@ -172,18 +173,19 @@ def analyse_problem(
     models = (nominal_model(problem), base.model, search.fit.model)
     floor = noise_floor(problem, search.fit.model.setting, held_out)
     gap, run_gaps, channel_gaps = compare_models(problem, fitted, held_out, models, floor)
+    nameless = not search.fit.model.effects and gap.fit_after > problem.misfit * gap.noise_floor
     features = problem.features(base.model.setting, fitted)
     places, maps = localise(
         problem,
         base.residuals,
-        mean_of_runs(mean_squares(search.fit.residuals, problem.cap)),
+        _expected(problem, search.fit, is_incomplete=nameless),
         search.fit.noise,
         features,
     )
     adequacy = adequacy_of(problem, fitted, search.fit)
     shown = detectable(search.rounds[-1].scores, search.fit.cost)
     turned = turning(problem, search.fit.residuals, features)
-    effects = _effects(problem, search, fitted) or _turned(turned)
+    effects = _effects(problem, search, fitted) or _turned(turned) or (_somewhere(problem, places) if nameless else ())
     kept = {candidate.label for candidate, _ in search.fit.model.effects}
     verdict, groups = _verdict(search, effects), _equivalent(problem, search)
     clock.stop()
@@ -282,6 +284,18 @@ def found_effect(candidate: Candidate, own: Mapping[str, ParameterEstimate], fre
 def _turned(turned: Turning | None) -> tuple[FoundEffect, ...]:
     """An effect without name or formula, where nothing that has one explains what goes with a joint's turning."""
     return () if turned is None else (FoundEffect(UNKNOWN, (turned.joint,), {}, turned.confidence, math.nan),)
+
+
+def _expected(problem: Problem, found: Fit, *, is_incomplete: bool) -> Array:
+    """Mean squares (signals) that a complete model leaves: the final one, or sensors alone where that cannot be complete."""
+    left = mean_of_runs(mean_squares(found.residuals, problem.cap))
+    return np.where(np.isfinite(left), 1.0, np.nan) if is_incomplete else left
+
+
+def _somewhere(problem: Problem, places: Sequence[Place]) -> tuple[FoundEffect, ...]:
+    """An effect without name or formula, at what the worst signal tells of."""
+    where = next(signal.place for signal in problem.signals if signal.name == places[0].name)
+    return (FoundEffect(UNKNOWN, (where,), {}, 1.0, math.nan),)
 
 
 def _equivalent(problem: Problem, search: SearchResult) -> tuple[Equivalent, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file
+from wlr_gym.base.paths import named_in
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.hardware.config import Hardware, ImuCalibration, Mounting
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
@@ -249,7 +251,7 @@ def save_hardware(path: Path, source: Path, hardware: Hardware, section: str, no
         path: file to write; may be the source.
         source: file the hardware was loaded from.
         hardware: what its section shall say.
-        section: ``joints`` or ``imu``: the only part that is changed.
+        section: ``joints``, ``imu`` or ``measured``: the only part that is changed.
         note: comment for the section.
 
     Raises:
@@ -258,6 +260,12 @@ def save_hardware(path: Path, source: Path, hardware: Hardware, section: str, no
     changed = hardware.model_dump(mode="json", exclude_unset=True)[section]
     content = {**read_yaml(source), section: changed}
     patched = _replace_section(source.read_text(encoding="utf-8"), section, f"# {note}\n" + _yaml({section: changed}))
+    robot = named_in(source, content.get("robot") or "nominal")
+    if robot.is_absolute() and path.parent.resolve() != source.parent.resolve():  # a robot file beside the source
+        content["robot"] = os.path.relpath(robot, path.parent.resolve())
+        patched = re.sub(
+            r"^robot:.*$", lambda _: _yaml({"robot": content["robot"]}).strip(), patched, count=1, flags=re.MULTILINE
+        )
 
     def write(temporary: Path) -> None:
         temporary.write_text(patched, encoding="utf-8")
@@ -279,7 +287,9 @@ def _yaml(content: dict[str, Any]) -> str:
 
 
 def _replace_section(text: str, section: str, new: str) -> str:
-    """Replace a top-level key of a YAML text with all that is indented under it, and the note of an earlier calibration."""
+    """Replace a top-level key of a YAML text, with all that is indented under it and the note before it; add a new one."""
     indented = r"(?:(?:[ \t]*\n)*[ \t]+\S.*\n)*"
-    pattern = rf"^(?:# .* by wlr calibrate .*\n)?{section}:.*\n{indented}"
-    return re.sub(pattern, lambda _: new, text if text.endswith("\n") else text + "\n", count=1, flags=re.MULTILINE)
+    pattern = rf"^(?:# .* by wlr (?:calibrate|commission)\b.*\n)?{section}:.*\n{indented}"
+    text = text if text.endswith("\n") else text + "\n"
+    patched, count = re.subn(pattern, lambda _: new, text, count=1, flags=re.MULTILINE)
+    return patched if count else f"{text}\n{new}"

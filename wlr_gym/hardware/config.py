@@ -7,16 +7,20 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.paths import named_in
 from wlr_gym.base.settings import SettingsModel, parse_config, read_config
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, load_table
 from wlr_gym.hardware.limits import SafetyLimits
+from wlr_gym.hardware.measured import Measured
 from wlr_gym.robot import JOINTS, LEGS, Vector3
 
 #: Operating mode of the legs. Setpoints are written for these modes; in another one they would be another quantity.
 POSITION_MODE = 3
 #: Operating mode of the wheels.
 VELOCITY_MODE = 1
+#: What the EEPROM of all servos must hold: directions and zeros stand in the hardware file, torque comes on when asked for.
+FIXED_REGISTERS = {"drive_mode": 0, "homing_offset": 0, "startup_configuration": 0}
 
 
 class Bus(SettingsModel):
@@ -93,14 +97,49 @@ class Mounting(SettingsModel):
     zero: int = Field(0, ge=0, le=4095)
 
 
+class PadButtons(SettingsModel):
+    """Buttons of the gamepad (``wlr deploy --gamepad``), counted as ``jstest`` does.
+
+    Attributes:
+        deadman: the robot drives while it is held.
+        stop: stops in good order.
+        motors_off: at once.
+    """
+
+    deadman: int = Field(default=4, ge=0)
+    stop: int = Field(default=0, ge=0)
+    motors_off: int = Field(default=1, ge=0)
+
+    @model_validator(mode="after")
+    def _are_three(self) -> PadButtons:
+        if len({self.deadman, self.stop, self.motors_off}) < 3:
+            raise ValueError(f"deadman {self.deadman}, stop {self.stop}, motors_off {self.motors_off}: expected three buttons")
+        return self
+
+
 class Hardware(SettingsModel):
-    """Wiring and mounting of a whole robot, as one ``configs/hardware/*.yaml`` describes it."""
+    """Wiring and mounting of a whole robot, as one ``configs/hardware/*.yaml`` describes it.
+
+    ``robot`` is the robot file that holds its numbers: name in ``configs/robot/``, or path, seen from this file first; None =
+    the one that is asked for.
+    """
 
     name: str
+    robot: str | None = None
     buses: dict[str, Bus]
     imu: ImuPort
     joints: dict[str, Mounting]
+    gamepad: PadButtons = PadButtons()
     safety: SafetyLimits = SafetyLimits()
+    measured: Measured = Measured()
+
+    @model_validator(mode="after")
+    def _what_was_measured_is_of_this_robot(self) -> Hardware:
+        for name in Measured.model_fields:
+            for place in getattr(self.measured, name):
+                if place not in (*JOINTS, *self.buses):
+                    raise unknown_name("joint or bus", place, (*JOINTS, *self.buses), f"measured.{name}")
+        return self
 
     @model_validator(mode="after")
     def _every_joint_is_wired_once(self) -> Hardware:
@@ -110,16 +149,20 @@ class Hardware(SettingsModel):
         return self
 
     @model_validator(mode="after")
-    def _modes_are_those_of_the_setpoints(self) -> Hardware:
+    def _registers_are_those_of_the_setpoints(self) -> Hardware:
         for name, bus in self.buses.items():
-            found = bus.eeprom.get("operating_mode", load_table(bus.model)["operating_mode"].default)
             for joint in bus.joints:
-                expected = POSITION_MODE if joint in LEGS else VELOCITY_MODE
-                if found != expected:
-                    raise ValueError(
-                        f"buses.{name}.eeprom.operating_mode is {found}, expected {expected}: {joint} is driven in that mode"
-                    )
+                _require_registers(name, bus, joint)
         return self
+
+
+def _require_registers(name: str, bus: Bus, joint: str) -> None:
+    """Raise :class:`ValueError` where a bus's EEPROM is not what a joint is driven with."""
+    mode = POSITION_MODE if joint in LEGS else VELOCITY_MODE
+    for item, expected in {"operating_mode": mode, **FIXED_REGISTERS}.items():
+        found = bus.eeprom.get(item, load_table(bus.model)[item].default)
+        if found != expected:
+            raise ValueError(f"buses.{name}.eeprom.{item} is {found}, expected {expected}: {joint} is driven with that")
 
 
 def load_hardware(source: str | Path | Hardware = "nominal") -> Hardware:
@@ -130,7 +173,11 @@ def load_hardware(source: str | Path | Hardware = "nominal") -> Hardware:
     """
     if isinstance(source, Hardware):
         return source
-    return parse_config(Hardware, *read_config("hardware", source))
+    data, where = read_config("hardware", source)
+    hardware = parse_config(Hardware, data, where)
+    if hardware.robot is None:
+        return hardware
+    return hardware.model_copy(update={"robot": str(named_in(where, hardware.robot))})
 
 
 def with_ports(hardware: Hardware, ports: dict[str, str]) -> Hardware:

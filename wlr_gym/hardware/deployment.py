@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import gc
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,7 +61,13 @@ def loop_of(core: Core) -> ControlLoop:
     return core.plant.loop
 
 
-def deploy(core: Core, policy: Policy, seed: int = 0, command: Mapping[str, float] | None = None) -> Deployment:
+def deploy(
+    core: Core,
+    policy: Policy,
+    seed: int = 0,
+    command: Mapping[str, float] | None = None,
+    steer: Callable[[], Mapping[str, float]] | None = None,
+) -> Deployment:
     """Bring the robot to its start pose and drive it until the episode is over or something stops it; torque is off then.
 
     Args:
@@ -69,6 +75,7 @@ def deploy(core: Core, policy: Policy, seed: int = 0, command: Mapping[str, floa
         policy: what drives it.
         seed: of the commands that are drawn.
         command: held instead of drawn ones.
+        steer: asked in every control step for commands to follow from then on (a gamepad).
     """
     loop = loop_of(core)
     core.seed(0, seed)
@@ -79,12 +86,15 @@ def deploy(core: Core, policy: Policy, seed: int = 0, command: Mapping[str, floa
     inference: list[float] = []
     with _no_garbage_collection():
         try:
-            core.begin_episodes(core.everyone, {"command": dict(command)} if command else None)
+            held = {**(command or {}), **(steer() if steer else {})}
+            core.begin_episodes(core.everyone, {"command": held} if held else None)
             while not (core.terminated[0] or core.truncated[0]):
                 start = time.perf_counter()
                 action = policy.act(core.observation)
                 inference.append(time.perf_counter() - start)
                 _log(core, loop, action)
+                if steer is not None:
+                    core.set_command(steer())
                 core.step(action, core.everyone)
             loop.stop("time is over")
         except StoppedError:

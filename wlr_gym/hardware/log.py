@@ -21,9 +21,10 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, RunMeta
+from wlr_gym.data.logs.stream import McapStream
 from wlr_gym.data.sensor_columns import SENSED, channels
 from wlr_gym.data.write import write_meta
-from wlr_gym.hardware.safety.rules import RobotStatus
+from wlr_gym.hardware.safety.state import RobotStatus
 from wlr_gym.hardware.step import StepRecord
 from wlr_gym.hardware.timing import Clock
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
@@ -32,8 +33,9 @@ from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS
 PARTIAL = "partial_"
 #: Phases of the control loop that begin a table, and its kind.
 _TABLES = {"ramp": "ramp", "running": "run"}
-_HEADER = [name for name in COLUMNS if name == "t" or name in COMMANDS or (name in SENSED and name not in CAMERA)]
-_ORDER = [("t", *COMMANDS, *SENSED).index(name) for name in _HEADER]
+#: Columns of a run on the robot, in their order.
+ROW = [name for name in COLUMNS if name == "t" or name in COMMANDS or (name in SENSED and name not in CAMERA)]
+_ORDER = [("t", *COMMANDS, *SENSED).index(name) for name in ROW]
 
 
 def _append(file: io.FileIO, line: str) -> None:
@@ -99,11 +101,11 @@ class RunLog:
         make_output_folder(folder)
         write_meta(folder, meta)
         self.folder = folder
-        self.number = 1 + max((_number(path) for path in folder.iterdir()), default=0)
+        self.number: int = 1 + max((_number(path) for path in folder.iterdir()), default=0)
         self._tables: dict[str, CsvTable] = {}
         self._current = ""
         self._last = -np.inf
-        self.events_path = folder / f"{PARTIAL}{self.name('run')}.events.jsonl"
+        self.events_path: Path = folder / f"{PARTIAL}{self.name('run')}.events.jsonl"
         self._events = self.events_path.open("xb", buffering=0)
 
     def name(self, kind: str) -> str:
@@ -119,14 +121,16 @@ class RunLog:
         """Write rows to ``ramp`` or ``run`` from here on."""
         self._current = kind
         if kind not in self._tables:
-            self._tables[kind] = CsvTable(self.folder / f"{self.name(kind)}.csv", _HEADER)
+            self._tables[kind] = CsvTable(self.folder / f"{self.name(kind)}.csv", ROW)
 
-    def row(self, time: float, sensors: Sensors, setpoints: np.ndarray) -> None:
-        """Write what was read at ``time`` (s) and what was then asked for; NaN = motor off."""
-        if self._current and time > self._last:  # the readings of an interrupted control step come twice
-            self._last = time
-            values = np.concatenate([[time], setpoints, channels(sensors, 0)])
-            self._tables[self._current].add(values[_ORDER])
+    def row(self, time: float, sensors: Sensors, setpoints: np.ndarray) -> np.ndarray | None:
+        """Write what was read at ``time`` (s) and what was then asked for (NaN = motor off); return a run's row, else None."""
+        if not self._current or time <= self._last:  # the readings of an interrupted control step come twice
+            return None
+        self._last = time
+        values = np.concatenate([[time], setpoints, channels(sensors, 0)])[_ORDER]
+        self._tables[self._current].add(values)
+        return values if self._current == "run" else None
 
     def policy(self, names: list[str], values: np.ndarray) -> None:
         """Write what the policy was commanded and answered for the row that comes next."""
@@ -174,13 +178,15 @@ class RunRecorder:
         log: of the present or last run.
         trouble: why the log cannot be written; empty = it can.
         origin: what wheel angles and the camera's age count from.
+        stream: where rows of the run go besides; it has the columns of :data:`ROW`.
     """
 
     def __init__(self, folder: Path | None, meta: RunMeta, clock: Clock) -> None:
         self.folder, self.meta = folder, meta
         self.log: RunLog | None = None
         self.trouble = ""
-        self.origin = RunOrigin(0.0, np.zeros(len(WHEELS)))
+        self.stream: McapStream | None = None
+        self.origin: RunOrigin = RunOrigin(0.0, np.zeros(len(WHEELS)))
         self._clock = clock
         self._checks: list[str] = []
         self._rules: frozenset[str] = frozenset()
@@ -216,7 +222,9 @@ class RunRecorder:
             return
         with self._noting_trouble():
             status, decision = record.status, record.decision
-            self.log.row(status.time, sensors_of(status, self.origin), record.setpoints)
+            row = self.log.row(status.time, sensors_of(status, self.origin), record.setpoints)
+            if self.stream is not None and row is not None:
+                self.stream.add(float(row[0]), row[1:].tolist())
             rules = {verdict.rule: {"level": verdict.level.name, "text": verdict.text} for verdict in decision.verdicts}
             rules |= {rule: {"joints": [JOINTS[k] for k in np.flatnonzero(mask)]} for rule, mask in decision.limited.items()}
             for rule in rules.keys() - self._rules:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import math
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -35,11 +36,12 @@ from wlr_gym.hardware.log import RunRecorder, origin_of, sensors_of
 from wlr_gym.hardware.operator import Operator
 from wlr_gym.hardware.ramp import legs_away, make_ramp, ramp_speed, start_pose
 from wlr_gym.hardware.safety.limiter import CommandLimiter
-from wlr_gym.hardware.safety.rules import REQUESTS, Level, RobotStatus, Verdict, resting
-from wlr_gym.hardware.safety.watchdog import WatchdogProcess
+from wlr_gym.hardware.safety.rules import resting
+from wlr_gym.hardware.safety.state import REQUESTS, Level, RobotStatus, Verdict
+from wlr_gym.hardware.safety.watchdog import Guard
 from wlr_gym.hardware.sensing import NotReadyError
 from wlr_gym.hardware.step import ControlStep
-from wlr_gym.hardware.timing import Pacer
+from wlr_gym.hardware.timing import Clock, Pacer
 from wlr_gym.physics.plants.base import Sensors
 from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
 
@@ -49,6 +51,8 @@ Array = NDArray[np.float64]
 TIMED_READS = 200
 #: s in all that the way to the start pose may be held, by the operator's absence for one.
 LONGEST_HOLD = 30.0
+#: s that arming the servos may take, or the last tries to switch them off, before this process counts as hung.
+ARM_TIME = 10.0
 #: What a servo, a bus or the IMU can raise while it is talked to.
 HARDWARE_TROUBLE = (NoAnswerError, RefusedError, ConnectionError)
 
@@ -100,21 +104,19 @@ class ControlLoop:
         watchdog: bool = True,
         meta: RunMeta | None = None,
     ) -> None:
+        _check_period(period, hardware.safety.watchdog)
         meta = meta or RunMeta(robot=robot.name, notes="dry run" if dry_run else None)
         self.robot, self.hardware, self.limits = robot, hardware, hardware.safety
-        self.phase = Phase.TORQUE_OFF
-        self.reason = ""
-        self.ended_well = True
-        self.clock = link.clock
-        self.operator = Operator(link.clock)
-        self.pacer = Pacer(link.clock, period)
-        self.recorder = RunRecorder(log, meta, link.clock)
-        self._link = link
-        self._is_open = False
+        self.phase: Phase = Phase.TORQUE_OFF
+        self.reason, self.ended_well = "", True
+        self.clock: Clock = link.clock
+        self.operator: Operator = Operator(link.clock)
+        self.pacer: Pacer = Pacer(link.clock, period)
+        self.recorder: RunRecorder = RunRecorder(log, meta, link.clock)
+        self._link, self._is_open = link, False
         self._limiter = CommandLimiter(link.servos, robot, hardware, link.clock, period, dry_run, meta.profile)
         self._step = ControlStep(self._limiter, link.imu, self.operator, self.pacer)
-        self._wants_watchdog = watchdog and link.is_serial and not dry_run
-        self._watchdog: WatchdogProcess | None = None
+        self._guard = Guard(robot, hardware, watchdog and link.is_serial and not dry_run)
 
     def __enter__(self) -> ControlLoop:
         return self
@@ -184,13 +186,15 @@ class ControlLoop:
         self.recorder.new_run([str(check) for check in found])
         if wrong := "\n".join(str(check) for check in found if check.is_fatal and not check.ok):
             self._fail(f"preflight: {wrong}")
-        if self._wants_watchdog and self._watchdog is None:
-            self._watchdog = WatchdogProcess(self.robot, self.hardware, self.recorder.folder)
+        self._guard.start(self.recorder.folder)
         self._step.first()
         self.operator.serve()
         if self.operator.asked:
             self._fail(self.operator.asked, is_fault=False)
+        self._limiter.prepare()
+        self._step.first()  # again, after what takes a second: torque comes on under a body that stands now
         atexit.register(self.close)
+        self._guard.expect(ARM_TIME)
         self._limiter.arm()
         self._step.begin()
 
@@ -207,8 +211,8 @@ class ControlLoop:
             held += 1  # held legs wait where they are, and so does their way
             if held * self.pacer.period > LONGEST_HOLD:
                 self._fail(f"held for {LONGEST_HOLD:g} s on the way to the start pose: {worst.rule}: {worst.text}")
-        away = legs_away(self._step.known.position[LEG_SLICE], target, self.limits.start_error)
-        if away and not self._limiter.dry_run:
+        known = self._step.known.position[LEG_SLICE]
+        if (away := legs_away(known, target, self.limits.start_error)) and not self._limiter.dry_run:
             self._fail(away)
 
     # ---- drive ----
@@ -238,7 +242,9 @@ class ControlLoop:
 
     def _take_step(self, wanted: object, torque_on: NDArray[np.bool_] | None = None) -> Verdict:
         """Send, log and receive; return the worst verdict, at once when torque must go off."""
-        record = self._step.send(wanted, torque_on, self.recorder.trouble, is_answer=self.phase is Phase.RUNNING)
+        self._guard.expect(self.limits.heartbeat)
+        trouble = self.recorder.trouble or self._guard.trouble
+        record = self._step.send(wanted, torque_on, trouble, is_answer=self.phase is Phase.RUNNING)
         worst = record.decision.worst
         if worst.level >= (Level.OFF if self.phase is Phase.STOPPING else Level.STOP):
             self._note_reason(f"{worst.rule}: {worst.text}")
@@ -295,7 +301,7 @@ class ControlLoop:
             if self._limiter.armed:  # a stop that was interrupted
                 self._switch_off(is_fault=True)
             if not self._limiter.armed and self.phase is not Phase.FAULT:
-                self._release_watchdog()
+                self._guard.release()
             if self._is_open:
                 self._is_open = False
                 self._link.close()
@@ -334,19 +340,23 @@ class ControlLoop:
         """Torque off, logs closed."""
         left: list[str] = list(JOINTS)
         self.operator.is_switching_off = True
+        self._guard.expect(self.limits.off_time + ARM_TIME)
         try:
             left = self._limiter.off()
+        except BaseException:  # interrupted: once more, before the interruption goes on
+            left = self._limiter.off()
+            raise
         finally:
             self._note_end(not (is_fault or left))
             if left:
-                text = f"CUT THE POWER: torque is not confirmed off at {', '.join(left)}"
-                self.reason = f"{self.reason}; {text}"
-                _print_error(text)  # who ended the run may not look at the reason
+                self.reason = f"{self.reason}; {_demand(left)}"
             self.operator.is_switching_off = False
             self._enter(Phase.FAULT if is_fault or left else Phase.TORQUE_OFF)
             self.recorder.end(self.reason, self.statistics())
-            if not left:
-                self._release_watchdog()
+            if left:
+                self._guard.expect(math.inf)  # it has been said: nothing more is done here
+            else:
+                self._guard.release()
 
     def _note_end(self, is_well: bool) -> None:
         """Remember how the run ended. What was asked for until now has happened, and does not stop the next run."""
@@ -357,17 +367,20 @@ class ControlLoop:
     def _note_reason(self, reason: str) -> None:
         self.reason = f"{reason} (while stopping: {self.reason})" if self.phase is Phase.STOPPING else reason
 
-    def _release_watchdog(self) -> None:
-        if self._watchdog is not None:
-            self._watchdog.release()
-            self._watchdog = None
-
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
         self._limiter.is_calm = phase is Phase.RAMP
         self.recorder.phase(phase.value, self.reason)
 
 
-def _print_error(text: str) -> None:
+def _check_period(period: float, longest: float) -> None:
+    if period >= longest:
+        raise InputError(f"control period {period:g} s: expected less than safety.watchdog, {longest:g} s: servos would stop")
+
+
+def _demand(left: list[str]) -> str:
+    """Print what has to be done about joints that are not confirmed off, and return it."""
+    text = f"CUT THE POWER: torque is not confirmed off at {', '.join(left)}"
     with contextlib.suppress(OSError, ValueError):  # the terminal may be gone
-        print(text, file=sys.stderr, flush=True)
+        print(text, file=sys.stderr, flush=True)  # who ended the run may not look at the reason
+    return text

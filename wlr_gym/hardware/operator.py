@@ -72,14 +72,14 @@ class Operator:
         return asked
 
     def serve(self) -> None:
-        """Call ``spare``; a terminal that is gone is noted, and not called again."""
+        """Call ``spare``; a terminal or gamepad that is gone is noted, and not called again."""
         if self.spare is None:
             return
         try:
             self.spare()
         except OSError as error:
             self.spare = None
-            self.trouble = f"the operator's terminal is gone: {error}"
+            self.trouble = f"the operator's terminal or gamepad is gone: {error}"
 
 
 class Keys:

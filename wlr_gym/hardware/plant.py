@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.config import Hardware, load_hardware, with_ports
 from wlr_gym.hardware.link import Link, serial_link
@@ -53,10 +57,10 @@ class RobotPlant:
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count != 1:
             raise InputError(f"number of robots is {count!r}, expected 1: there is one robot on the ports")
         self.robot = robot
-        self.options = options or PlantOptions()
-        self.parameters = Parameters.nominal(robot, 1)
+        self.options: PlantOptions = options or PlantOptions()
+        self.parameters: Parameters = Parameters.nominal(robot, 1)
         chosen = hardware or RobotOptions()
-        self.capabilities = Capabilities("dynamixel", has_truth=False, can_set_state=False, real_time=True)
+        self.capabilities: Capabilities = Capabilities("dynamixel", has_truth=False, can_set_state=False, real_time=True)
         description = with_ports(load_hardware(chosen.hardware), dict(chosen.ports))
         if chosen.deadman is not None:
             if not 0.0 < chosen.deadman < np.inf:
@@ -65,7 +69,7 @@ class RobotPlant:
             description = description.model_copy(update={"safety": safety})
         if link is None:
             link = _link(robot, description, chosen, self.options)
-        self.loop = ControlLoop(
+        self.loop: ControlLoop = ControlLoop(
             robot,
             description,
             link,
@@ -141,9 +145,17 @@ class RobotPlant:
         """Refuse: a robot knows its sensors only."""
         raise InputError("backend 'dynamixel': a real robot has no truth, only sensors")
 
-    def get_state(self) -> PlantState:
+    def mechanical_state(self) -> PlantState:
         """Refuse: a robot knows its sensors only."""
         raise InputError("backend 'dynamixel': the state of a real robot is not known")
+
+    def get_state(self, rows: int | Sequence[int] | NDArray[Any] | None = None) -> Snapshot:
+        """Refuse: a robot knows its sensors only."""
+        raise InputError("backend 'dynamixel': a real robot cannot be saved and set back; simulators can")
+
+    def set_state(self, snapshot: Snapshot, rows: int | Sequence[int] | NDArray[Any] | None = None) -> Sensors:
+        """Refuse: a robot is where it is."""
+        raise InputError("backend 'dynamixel': a real robot cannot be saved and set back; simulators can")
 
     def close(self) -> None:
         """Stop the robot, switch torque off, close the ports."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
@@ -63,6 +64,12 @@ def lock(descriptor: int, path: str, name: str = "port") -> None:
     except OSError as error:
         if error.errno in _TAKEN:
             raise _in_use(path, name) from None
+
+
+def is_pseudo_terminal(path: str) -> bool:
+    """Return whether a device is a terminal that a program serves, such as an emulated robot's (Linux, macOS)."""
+    device = str(Path(path).resolve())
+    return device.startswith(("/dev/pts/", "/dev/ttys0"))
 
 
 def _in_use(path: str, name: str) -> PortInUseError:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.bus import PATIENCE, Block, BlockReading, BusGroup, open_all
+from wlr_gym.hardware.dynamixel.blocks import Block, BlockReading, IndirectBlock
+from wlr_gym.hardware.dynamixel.bus import PATIENCE, BusGroup, open_all
 from wlr_gym.hardware.dynamixel.errors import BusGoneError, NoAnswerError
-from wlr_gym.hardware.dynamixel.tables import HARDWARE_ERRORS, ControlTable, load_table
-from wlr_gym.physics.servo import effort_counts
+from wlr_gym.hardware.dynamixel.tables import ControlTable, error_names, load_table
+from wlr_gym.physics.servo import effort_counts, idle_effort
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 
 if TYPE_CHECKING:
@@ -27,6 +28,10 @@ Array = NDArray[np.float64]
 _IS_LEG = np.arange(len(JOINTS)) < len(LEGS)
 #: First and last item of what is read every tick ...
 _MOTION = ("realtime_tick", "present_position")
+#: ... what is used of it, besides current or load ...
+_STATE = ("present_position", "present_velocity")
+#: ... what is read with that, through indirect addresses, while the robot is driven ...
+_REGISTERS = ("torque_enable", "hardware_error_status", "bus_watchdog", "goal_pwm", "present_pwm")
 #: ... and now and then.
 _HEALTH = ("present_input_voltage", "present_temperature")
 #: Times that a single item is asked for again.
@@ -37,7 +42,7 @@ class JointMap:
     """Counts of the eight servos to SI values of the eight joints, and back.
 
     Args:
-        robot: encoder and effort counts.
+        robot: encoder counts, and the torque that currents and loads mean.
         hardware: models, and how the servos are mounted.
     """
 
@@ -48,7 +53,16 @@ class JointMap:
         self._zero = np.array([hardware.joints[joint].zero for joint in JOINTS], np.float64)
         self._position = np.array([table.per_count("present_position") for table in tables])
         self._velocity = np.array([table.per_count("present_velocity") for table in tables])
-        self._effort = effort_counts(robot)
+        self._effort, self._idle = effort_counts(robot), idle_effort(robot)
+        self._full_pwm = np.array([table["pwm_limit"].default for table in tables], np.float64)
+
+    def pwm_share(self, counts: ArrayLike) -> Array:
+        """Return the parts of the supply (8,) that Goal PWM lets through; 0 to 1."""
+        return np.asarray(counts, np.float64) / self._full_pwm
+
+    def voltage_share(self, counts: ArrayLike) -> Array:
+        """Return the parts of the supply (8,) that are on the motors, from Present PWM; -1 to 1, joint directions."""
+        return self._sign * np.asarray(counts, np.float64) / self._full_pwm
 
     def position(self, counts: ArrayLike) -> Array:
         """Return joint angles (8,) in rad; wheels as many turns as the servos counted."""
@@ -58,9 +72,9 @@ class JointMap:
         """Return joint rates (8,) in rad/s."""
         return self._sign * np.asarray(counts, np.float64) * self._velocity
 
-    def effort(self, counts: ArrayLike) -> Array:
-        """Return motor torques (8,) in N m by the nominal torque constants, before gear friction."""
-        return self._sign * np.asarray(counts, np.float64) * self._effort
+    def effort(self, counts: ArrayLike, velocity_counts: ArrayLike) -> Array:
+        """Return motor torques (8,) in N m by the nominal currents or loads, before gear friction."""
+        return self._sign * np.asarray(counts, np.float64) * self._effort - self._idle * self.velocity(velocity_counts)
 
     def setpoint_counts(self, setpoints: ArrayLike) -> NDArray[np.int64]:
         """Return the counts (8,) of leg angles (rad) and wheel speeds (rad/s): Goal Position and Goal Velocity.
@@ -83,6 +97,25 @@ class JointMap:
         return np.where(_IS_LEG, self.position(counts), self.velocity(counts))
 
 
+class ServoRegisters(NamedTuple):
+    """What the servos' registers hold besides the motion, (8,) in joint order; NaN where not read.
+
+    Attributes:
+        torque, error, watchdog, goal_pwm: counts of Torque Enable, Hardware Error Status, Bus Watchdog, Goal PWM.
+        voltage_share: of the supply on the motor, -1 to 1, in the joint's direction.
+    """
+
+    torque: Array
+    error: Array
+    watchdog: Array
+    goal_pwm: Array
+    voltage_share: Array
+
+
+#: Registers that were not read.
+UNREAD = ServoRegisters(*(np.full(len(JOINTS), np.nan) for _ in range(5)))
+
+
 @dataclass(frozen=True)
 class JointReadings:
     """What the eight servos said, in joint order; NaN where one did not.
@@ -93,6 +126,7 @@ class JointReadings:
         answered: (8,) it answered, and not too late.
         alert: (8,) it has a hardware error.
         restarted: (8,) it was rebooted, or had no power, since the last reading.
+        registers: read since :meth:`Servos.supervise`.
     """
 
     position: Array
@@ -102,6 +136,7 @@ class JointReadings:
     answered: NDArray[np.bool_]
     alert: NDArray[np.bool_]
     restarted: NDArray[np.bool_]
+    registers: ServoRegisters = UNREAD
 
 
 class Servos:
@@ -116,7 +151,7 @@ class Servos:
         patience, clock, make_port: see :class:`wlr_gym.hardware.dynamixel.bus.BusGroup`.
 
     Attributes:
-        groups: bus name -> bus group.
+        groups: bus name -> bus group. ports: bus name -> device.
         joint_map: counts to SI units.
     """
 
@@ -128,17 +163,22 @@ class Servos:
         clock: Callable[[], float] = time.monotonic,
         make_port: Callable[[str, int, float], DynamixelPort] | None = None,
     ) -> None:
-        self.joint_map = JointMap(robot, hardware)
+        self.joint_map: JointMap = JointMap(robot, hardware)
         self._ids = [robot.dynamixel_ids[joint] for joint in JOINTS]
         self._bus_of = {joint: name for name, bus in hardware.buses.items() for joint in bus.joints}
         self.groups: dict[str, BusGroup] = {}
+        self.ports: dict[str, str] = {name: bus.port for name, bus in hardware.buses.items()}
         self._motion: dict[str, Block] = {}
+        self._supervised: dict[str, IndirectBlock] = {}
+        self._is_supervised = False
         self._health: dict[str, Block] = {}
         for name, bus in hardware.buses.items():
             table = load_table(bus.model)
             servos = {robot.dynamixel_ids[joint]: table for joint in bus.joints}
             self.groups[name] = BusGroup(name, bus.port, bus.baud_rate, servos, patience, clock, make_port)
+            effort = "present_current" if "present_current" in table.items else "present_load"
             self._motion[name] = Block(table, *_MOTION)
+            self._supervised[name] = IndirectBlock(table, ("realtime_tick", effort, *_STATE, *_REGISTERS))
             self._health[name] = Block(table, *_HEALTH)
 
     def open(self) -> None:
@@ -168,27 +208,43 @@ class Servos:
 
     # ---- reading ----
 
+    def supervise(self) -> None:
+        """Have the servos' registers read with every :meth:`read` from here on. Torque must be off.
+
+        Raises:
+            NoAnswerError, RefusedError: a servo did not take its indirect addresses.
+        """
+        for joint in JOINTS:
+            block = self._supervised[self._bus_of[joint]]
+            _persist(self._group(joint).point, self._id(joint), block)
+        self._is_supervised = True
+
+    def unsupervise(self) -> None:
+        """Read the motion alone: servos may have been rebooted since :meth:`supervise`."""
+        self._is_supervised = False
+
     def read(self) -> JointReadings:
         """Read all joints; the buses work at the same time.
 
         Raises:
             BusGoneError: a port is gone.
         """
-        readings = self._read(self._motion)
-        counts = np.full((3, len(JOINTS)), np.nan)
-        flags = np.zeros((3, len(JOINTS)), bool)
-        age = np.full(len(JOINTS), np.nan)
-        for k, id in enumerate(self._ids):
-            reading = readings.get(id)
-            if reading is not None:
-                values = reading.counts
-                effort = values["present_current"] if "present_current" in values else values["present_load"]
-                counts[:, k] = values["present_position"], values["present_velocity"], effort
-                flags[:, k] = True, reading.alert, reading.restarted
-                age[k] = reading.age
-        position, velocity, effort = counts
+        readings = self._read(self._supervised if self._is_supervised else self._motion)
+        items = (*_STATE, *_REGISTERS) if self._is_supervised else _STATE
+        rows = [_row(readings.get(id), items) for id in self._ids]
+        age, effort, position, velocity, *registers = np.array([numbers for numbers, _ in rows]).T
+        flags = np.array([flags for _, flags in rows]).T
         convert = self.joint_map
-        return JointReadings(convert.position(position), convert.velocity(velocity), convert.effort(effort), age, *flags)
+        motion = convert.position(position), convert.velocity(velocity), convert.effort(effort, velocity)
+        if not registers:
+            return JointReadings(*motion, age, *flags)
+        registers[-1] = convert.voltage_share(registers[-1])
+        return JointReadings(*motion, age, *flags, registers=ServoRegisters(*registers))
+
+    @property
+    def broken_packets(self) -> int:
+        """Packets with a wrong checksum since the ports were opened."""
+        return sum(group.statistics.crc_errors for group in self.groups.values())
 
     def read_health(self) -> tuple[Array, Array]:
         """Return supply voltages (8,) in V and temperatures (8,) in degC; NaN where a servo did not answer.
@@ -218,8 +274,7 @@ class Servos:
         Raises:
             NoAnswerError, RefusedError: see :class:`wlr_gym.hardware.dynamixel.bus.BusGroup`.
         """
-        bits = self.get(joint, "hardware_error_status")
-        return [name for bit, name in HARDWARE_ERRORS.items() if bits & bit]
+        return error_names(self.get(joint, "hardware_error_status"))
 
     # ---- single items, by joint ----
 
@@ -297,18 +352,32 @@ class Servos:
                     group.close()
                     group.open()
 
-    def torque_off(self, retries: int = 5) -> list[str]:
-        """Switch every motor off, whatever happened before; return the joints that did not confirm it.
+    def torque_off(self, retries: int = 5, joints: Iterable[str] = JOINTS) -> list[str]:
+        """Switch motors off, whatever happened before; return the joints that did not confirm it.
 
         A bus whose port is gone does not keep the others from being tried.
+
+        Args:
+            retries: times that each is asked.
+            joints: which; those that confirmed it before need not do so again.
         """
-        left: set[int] = set()
-        for group in self.groups.values():
+        left: list[str] = []
+        for name, group in self.groups.items():
+            here = {self._id(joint): joint for joint in joints if self._bus_of[joint] == name}
             try:
-                left |= group.torque_off(retries)
+                left += [here[id] for id in group.torque_off(retries, here)]
             except BusGoneError:
-                left |= set(group.servos)
-        return [joint for joint, id in zip(JOINTS, self._ids, strict=True) if id in left]
+                left += here.values()
+        return [joint for joint in JOINTS if joint in left]
+
+
+def _row(reading: BlockReading | None, items: tuple[str, ...]) -> tuple[list[float], tuple[bool, bool, bool]]:
+    """Return age, current or load, and the counts of ``items``; and whether a servo answered, is in alert, was restarted."""
+    if reading is None:
+        return [np.nan] * (2 + len(items)), (False, False, False)
+    counts = reading.counts
+    effort = counts["present_current"] if "present_current" in counts else counts["present_load"]
+    return [reading.age, effort, *[counts[item] for item in items]], (True, reading.alert, reading.restarted)
 
 
 def _persist(ask: Callable[..., Any], *arguments: Any) -> Any:

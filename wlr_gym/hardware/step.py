@@ -11,7 +11,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.imu.driver import Imu
 from wlr_gym.hardware.operator import Operator
 from wlr_gym.hardware.safety.limiter import CommandLimiter
-from wlr_gym.hardware.safety.rules import Decision, Level, RobotStatus
+from wlr_gym.hardware.safety.rules import Decision
+from wlr_gym.hardware.safety.state import Level, RobotStatus
 from wlr_gym.hardware.sensing import Sensing
 from wlr_gym.hardware.timing import Pacer
 

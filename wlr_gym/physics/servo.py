@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.physics.codegen import ops
-from wlr_gym.robot import JOINTS, LEGS, Robot
+from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, Robot
+from wlr_gym.robot.parameters import Parameters
 
 Value = Any  # float | numpy array | traced node
 Array = NDArray[np.float64]
@@ -46,6 +47,56 @@ def motor_constants(stall_torque: Value, no_load_speed: Value, nominal_voltage: 
     return torque_constant, torque_constant * nominal_voltage / stall_torque
 
 
+@dataclass(frozen=True)
+class CurrentLaw:
+    """How the nominal motors' currents and torques belong together: current = torque/torque_constant + idle rate.
+
+    Two constants of a motor with a gear: its torque constant, and the back-EMF constant of :func:`winding`. The shaft gets
+    the torque of the torque-speed line, whatever the currents are.
+
+    Attributes:
+        torque_constant: (8,) N m/A.
+        idle: (8,) A s/rad, current per rate of a motor that gives no torque.
+    """
+
+    torque_constant: Array
+    idle: Array
+
+    def current(self, torque: ArrayLike, rate: ArrayLike) -> Array:
+        """Return motor currents (..., 8) in A for torques (N m, before gear friction) and rates (rad/s)."""
+        return np.asarray(torque, np.float64) / self.torque_constant + self.idle * np.asarray(rate, np.float64)
+
+
+def line_constants(robot: Robot) -> tuple[Array, Array]:
+    """Return slope constants (8,) in V s/rad and ohm of the nominal torque-speed lines; see :func:`motor_constants`."""
+    motors = (robot.servo.leg, robot.servo.wheel)
+    stall, speed = (np.repeat([getattr(motor, name) for motor in motors], 4) for name in ("stall_torque", "no_load_speed"))
+    return motor_constants(stall, speed, robot.servo.supply_voltage)
+
+
+def current_law(robot: Robot) -> CurrentLaw:
+    """Return how currents and torques of a robot's nominal motors belong together.
+
+    The winding is an Ohmic resistor with a back-EMF, so its current is linear in voltage and rate. With the torque-speed line
+    T (v/V - w/w0) given, the currents at its two ends leave one such law: I = Is torque/T + I0 w/w0. A robot file without
+    currents has one constant for both: that of the line.
+    """
+    line, _ = line_constants(robot)
+    torque_constant, idle = line.copy(), np.zeros(len(JOINTS))
+    for motor, joints in ((robot.servo.leg, LEG_SLICE), (robot.servo.wheel, WHEEL_SLICE)):
+        if motor.stall_current is not None and motor.no_load_current is not None:
+            torque_constant[joints] = motor.stall_torque / motor.stall_current
+            idle[joints] = motor.no_load_current / motor.no_load_speed
+    return CurrentLaw(torque_constant, idle)
+
+
+def winding(robot: Robot) -> tuple[Array, Array]:
+    """Return back-EMF constants (8,) in V s/rad and resistances (8,) in ohm of the nominal motors: v = R I + K_e w."""
+    (line, slope), law = line_constants(robot), current_law(robot)
+    resistance = slope * (law.torque_constant / line)
+    return line - resistance * law.idle, resistance
+
+
 def motor_torque(torque_constant: Value, resistance: Value, voltage: Value, velocity: Value) -> Value:
     """Return the motor torque at the output shaft (N m), before gear friction."""
     return (torque_constant / resistance) * (voltage - torque_constant * velocity)
@@ -63,10 +114,18 @@ def controller_voltage(
     """Return the voltage (V) the servo puts on its motor: kp (q_ref - q) + kd (w_ref - w), limited to the supply.
 
     One law for both modes. Legs (position mode): ``kp`` is the Position P Gain, ``kd`` the D gain. Wheels (velocity mode):
-    ``kd`` is the Velocity P Gain and ``kp`` the Velocity I Gain, acting on q_ref - q = integral of the velocity error.
+    ``kd`` is the Velocity P Gain and ``kp`` the Velocity I Gain, acting on q_ref - q = integral of the velocity error (see
+    :func:`position_gains`).
     """
     wish = kp * (reference_position - position) + kd * (reference_velocity - velocity)
     return ops.clip(wish, -supply_voltage, supply_voltage)
+
+
+def position_gains(parameters: Parameters) -> Array:
+    """Return the gains (N, 8) in V/rad as they act: a wheel's error is summed once a cycle; ``servo.kp`` holds for 1 ms."""
+    gains = parameters["servo.kp"].copy()
+    gains[:, WHEEL_SLICE] *= _CYCLE / parameters["servo.integral_cycle"]
+    return gains
 
 
 # --- profile generator ------------------------------------------------------------------------------------------------
@@ -219,7 +278,8 @@ def _pwm(divisor: float) -> float:
 _TURN = 2 * math.pi
 _POSITION = _TURN / 4096
 _VELOCITY = 0.229 * _TURN / 60
-#: The servo's controller runs at 1 kHz; the integral gain counts velocity errors per cycle.
+#: s. The integral gain counts velocity errors per cycle of the servo's controller. No manual says how long it is: 1 kHz is
+#: assumed, and the parameter ``servo.integral_cycle`` is for what was measured.
 _CYCLE = 1e-3
 _COMMON = {
     "position": Register("rad", _POSITION, -1_048_575, 1_048_575),
@@ -272,17 +332,22 @@ def from_register(model: str, quantity: str, counts: ArrayLike) -> Any:
     return float(values * register.per_count) if values.ndim == 0 else values * register.per_count
 
 
-def effort_constants(robot: Robot) -> Array:
-    """Return the nominal torque constants (8,) in N m/A that turn motor current into the reported effort."""
-    motors = (robot.servo.leg, robot.servo.wheel)
-    return np.repeat([motor_constants(m.stall_torque, m.no_load_speed, robot.servo.supply_voltage)[0] for m in motors], 4)
-
-
 def effort_counts(robot: Robot) -> Array:
     """Return one count of reported effort per joint (8,), N m.
 
     Legs: XM540 Present Current, 2.69 mA times the nominal torque constant. Wheels: XL430 Present Load, 0.1 % of stall torque.
     """
-    leg = REGISTER_UNITS["XM540-W150-R"]["current"].per_count * effort_constants(robot)[0]
+    leg = REGISTER_UNITS["XM540-W150-R"]["current"].per_count * current_law(robot).torque_constant[0]
     wheel = REGISTER_UNITS["XL430-W250-T"]["load"].per_count * robot.servo.wheel.stall_torque
     return np.repeat([leg, wheel], 4)
+
+
+def idle_effort(robot: Robot) -> Array:
+    """Return what :func:`effort_counts` alone would read too much per rate (8,), N m s/rad: the legs' idle current.
+
+    The wheels' servos measure no current: their load is of torque, as the servo infers it.
+    """
+    law = current_law(robot)
+    effort = law.torque_constant * law.idle
+    effort[WHEEL_SLICE] = 0.0
+    return effort

@@ -1,13 +1,15 @@
 """Policies and agents: how they are called, loaded by name, saved with their contract, and refused where they do not fit."""
 
-from wlr_gym.policy.agents import Agent, Policy, Training, agent_names, load_agent, load_agent_config
+from wlr_gym.policy.agents import Agent, Policy, Training, TrainingProgress, agent_names, load_agent, load_agent_config
 from wlr_gym.policy.export import Parity, export_policy
 from wlr_gym.policy.file import check_contract, needs_camera, read_contract, write_contract
 from wlr_gym.policy.model_card import write_model_card
 from wlr_gym.policy.reseal import reseal
 from wlr_gym.policy.sources import (
     contract_of,
+    fed_environment,
     find_policy,
+    is_policy,
     load_policy,
     make_policy,
     policy_environment,
@@ -20,11 +22,14 @@ __all__ = [
     "Parity",
     "Policy",
     "Training",
+    "TrainingProgress",
     "agent_names",
     "check_contract",
     "contract_of",
     "export_policy",
+    "fed_environment",
     "find_policy",
+    "is_policy",
     "load_agent",
     "load_agent_config",
     "load_policy",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -34,6 +34,30 @@ class Policy(Protocol):
         ...
 
 
+@dataclass
+class TrainingProgress:
+    """What is known of a training after an update.
+
+    Attributes:
+        folder: run folder.
+        steps, total_steps: environment steps done, and to be done.
+        metrics: the update's row of ``learning_curve.csv``.
+        held_out: newest scores on the held-out episodes, a row of ``held_out.csv``; empty before the first.
+        stop_requested: the training ends in good order after this update.
+    """
+
+    folder: Path
+    steps: int
+    total_steps: int
+    metrics: Mapping[str, float]
+    held_out: Mapping[str, float]
+    stop_requested: bool = False
+
+    def stop(self) -> None:
+        """End the training in good order, with a checkpoint that it can be resumed from."""
+        self.stop_requested = True
+
+
 @dataclass(frozen=True)
 class Training:
     """One request to train.
@@ -45,6 +69,8 @@ class Training:
         resume: continue from the newest checkpoint in ``folder``.
         max_seconds: stop in good order after this wall time; None = no limit.
         progress: show a progress bar.
+        init: policy to start from: run or policy folder, policy file, or shipped policy; None = untrained.
+        on_update: called after every update. What it raises ends the training, with a checkpoint.
     """
 
     environment: str
@@ -53,6 +79,8 @@ class Training:
     resume: bool = False
     max_seconds: float | None = None
     progress: bool = True
+    init: str | Path | None = None
+    on_update: Callable[[TrainingProgress], object] | None = None
 
 
 class Agent(Protocol):
@@ -68,6 +96,14 @@ class Agent(Protocol):
 
     def train(self, training: Training) -> Path:
         """Train and return the folder of the final policy."""
+        ...
+
+    def check_settings(self, config: Config) -> None:
+        """Raise what a training with these settings would be refused with, without beginning it."""
+        ...
+
+    def settings_to_start_from(self, source: str | Path) -> dict[str, Any]:
+        """Return the settings of a training that starts from a trained policy (``init``)."""
         ...
 
     def export_network(self, folder: Path, contract: Contract) -> bytes:
@@ -125,9 +161,18 @@ def load_agent_config(name: str | Path, changes: tuple[str, ...] = (), task: str
         InputError: no such file, broken YAML, a base or a task that is none, or a change that is not ``key=value``.
     """
     config = _read_config(name, task)
+    apply_changes(config, changes)
+    return config
+
+
+def apply_changes(config: dict[str, Any], changes: Iterable[str]) -> None:
+    """Lay changes such as ``environment.precision=float64`` over settings, in place.
+
+    Raises:
+        InputError: a change that is not ``key=value``.
+    """
     for change in changes:
         _apply(config, change)
-    return config
 
 
 def _read_config(name: str | Path, task: str | None) -> dict[str, Any]:

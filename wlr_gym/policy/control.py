@@ -54,7 +54,9 @@ class Readings:
 
     def __init__(self, contract: Mapping[str, Any], agent: str) -> None:
         numbered = enumerate(contract["observation"])
-        self.columns = {column["name"]: (index, column) for index, column in numbered if column["lag"] == 0}
+        self.columns: dict[Any, tuple[int, Any]] = {
+            column["name"]: (index, column) for index, column in numbered if column["lag"] == 0
+        }
         self.agent = agent
 
     def __contains__(self, name: str) -> bool:
@@ -95,8 +97,8 @@ class Chassis:
     def __init__(self, contract: Mapping[str, Any], robot: Robot) -> None:
         self.robot = robot
         signs = np.array(CORNER_SIGNS, np.float64)
-        self.front = signs[:, 0]
-        self.left = robot.hip_position.y * signs[:, 1]
+        self.front: NDArray[np.float64] = signs[:, 0]
+        self.left: NDArray[np.float64] = robot.hip_position.y * signs[:, 1]
         self._centre = np.array([column["centre"] for column in contract["action"]])
         self._scale = np.array([column["scale"] for column in contract["action"]])
 
@@ -200,17 +202,17 @@ class Pid:
 
     def __init__(self, contract: Mapping[str, Any], config: PidConfig, agent: str = "pid") -> None:
         self.config = config
-        self.chassis = Chassis(contract, known_robot(contract, config.robot, agent))
-        self.readings = Readings(contract, agent)
+        self.chassis: Chassis = Chassis(contract, known_robot(contract, config.robot, agent))
+        self.readings: Readings = Readings(contract, agent)
         read = self.readings
-        self.forward = read.first(FORWARD)
-        self.turn = read.optional("command[yaw_rate]")
-        self.curvature = read.optional("path_curvature[0 m]")
-        self.lateral_error = read.optional("path_error[lateral]", "course_error[lateral]")
-        self.heading_error = read.optional("path_error[heading]", "course_error[heading]")
-        self.gyro = read.first(("gyro[z]",))
-        self.leftward_force = read.first(("accelerometer[y]",))
-        self.estimated_forward = read.first((ESTIMATED_FORWARD,)) if ESTIMATED_FORWARD in read else None
+        self.forward: Reader = read.first(FORWARD)
+        self.turn: Reader = read.optional("command[yaw_rate]")
+        self.curvature: Reader = read.optional("path_curvature[0 m]")
+        self.lateral_error: Reader = read.optional("path_error[lateral]", "course_error[lateral]")
+        self.heading_error: Reader = read.optional("path_error[heading]", "course_error[heading]")
+        self.gyro: Reader = read.first(("gyro[z]",))
+        self.leftward_force: Reader = read.first(("accelerometer[y]",))
+        self.estimated_forward: Reader | None = read.first((ESTIMATED_FORWARD,)) if ESTIMATED_FORWARD in read else None
         self.leg_offset, self.leg_rate = read.legs("leg_reference"), read.legs("leg_reference_rate")
         period = contract["control_period"]
         self._yaw_rate_integral = Integral(config.yaw_rate_i, period, config.integral_limit)

@@ -54,17 +54,36 @@ def export_policy(
             answers differently from the policy.
         MissingPackageError: a package is not installed.
     """
-    if path.suffix != SUFFIX:
-        raise InputError(f"{path}: expected a file name that ends in {SUFFIX}")
     folder = find_policy(source)
     if folder.is_file():
         raise InputError(f"{folder}: is a policy file already; what can be exported is a policy or run folder")
-    require_package("onnx", "export")
-    require_package("onnxruntime", "export")
     content = read_contract(folder)
     graph = agent_function(content["agent"], "export_network")(folder, content)
     policy = agent_function(content["agent"], "load_policy")(folder, content)
     content["training"] = {**content.get("training", {}), **(training or {})}
+    return write_policy_file(path, graph, content, policy, observations)
+
+
+def write_policy_file(
+    path: Path, graph: bytes, content: dict[str, Any], policy: Policy, observations: NDArray[np.float32]
+) -> Parity:
+    """Write a graph with its contract as a policy file, if it answers as the policy does that it was made from.
+
+    Args:
+        path: of the file, ending in ``.onnx``; one that is there already is replaced in one step, or not at all.
+        graph: ONNX model: ``observation`` (N, D) to ``action`` (N, 8).
+        content: contract, as ``policy_content`` returns; ``exported`` is added.
+        policy: what the graph was made from.
+        observations: (M, D) real ones, to compare with.
+
+    Raises:
+        InputError: a file that cannot be written, or a graph that answers differently.
+        MissingPackageError: a package is not installed.
+    """
+    if path.suffix != SUFFIX:
+        raise InputError(f"{path}: expected a file name that ends in {SUFFIX}")
+    require_package("onnx", "export")
+    require_package("onnxruntime", "export")
 
     def write(temporary: Path) -> None:
         temporary.write_bytes(seal(graph, content))

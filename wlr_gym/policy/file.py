@@ -44,7 +44,12 @@ def write_contract(folder: Path, agent: str, config: Config, environment: Contra
         environment: what ``env.contract()`` returned.
         training: how it came about (environment id, steps, seed).
     """
-    content = {
+    write_json(folder / CONTRACT_FILE, policy_content(agent, config, environment, training))
+
+
+def policy_content(agent: str, config: Config, environment: Contract, training: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what ``contract.json``, or the metadata of a policy file, says; arguments as for :func:`write_contract`."""
+    return {
         "format": FORMAT,
         "agent": agent,
         "environment": environment,
@@ -52,7 +57,6 @@ def write_contract(folder: Path, agent: str, config: Config, environment: Contra
         "config": config,
         "versions": versions(),
     }
-    write_json(folder / CONTRACT_FILE, content)
 
 
 def read_contract(folder: str | Path) -> dict[str, Any]:

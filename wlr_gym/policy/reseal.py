@@ -61,13 +61,21 @@ def reseal(path: Path, robot: str | None = None) -> list[str]:
     return [*changes, *_cards(path, sha)]
 
 
+#: Keys of ``servo`` that robot files got after the first form.
+LATER: Any = {
+    "integral_cycle": True,
+    "leg": {"stall_current", "no_load_current"},
+    "wheel": {"stall_current", "no_load_current"},
+}
+
+
 def _first_form(source: str, robot: Robot) -> str:
     """Return the hash of a robot as contracts had it at first: of everything in its file, tolerances as they are written."""
     tolerances: Any = {}
     for data, _ in read_layers("robot", source):
         tolerances = overlay(tolerances, data.get("tolerances") or {})
     adapter = TypeAdapter(dict[str, float | str])
-    numbers = robot.model_dump_json(exclude={"tolerances"})
+    numbers = robot.model_dump_json(exclude={"tolerances": True, "servo": LATER})
     text = f'{numbers[:-1]},"tolerances":{adapter.dump_json(adapter.validate_python(tolerances)).decode()}}}'
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.paths import data_directory
@@ -14,6 +14,15 @@ from wlr_gym.policy.onnx_file import SUFFIX, open_policy
 
 #: Of a task's settings, what decides which numbers a policy is fed and what its own mean. The others are conditions.
 FED = ("observations", "observer", "action", "control_period")
+
+
+@runtime_checkable
+class HasContract(Protocol):
+    """An environment of this library."""
+
+    def contract(self) -> dict[str, Any]:
+        """Return what a policy must be fed and what its output means."""
+        ...
 
 
 def shipped_directory() -> Path:
@@ -42,6 +51,11 @@ def _policy_place(source: str | Path) -> Path | None:
         if (folder / CONTRACT_FILE).is_file():
             return folder
     return shipped_directory() / f"{source}{SUFFIX}" if str(source) in shipped_names() else None
+
+
+def is_policy(source: str | Path) -> bool:
+    """Whether there is an agent or a trained policy of this name or at this path."""
+    return str(source) in agent_names() or _policy_place(source) is not None
 
 
 def find_policy(source: str | Path) -> Path:
@@ -76,24 +90,33 @@ def contract_of(source: str | Path) -> dict[str, Any]:
     return open_policy(place)[1] if place.is_file() else read_contract(place)
 
 
-def load_policy(source: str | Path, environment: Contract) -> Policy:
+def load_policy(source: str | Path, environment: Contract | HasContract) -> Policy:
     """Load a trained policy for an environment.
 
     Args:
         source: policy folder, run folder with a ``policy`` in it, policy file, or name of a shipped policy.
-        environment: what ``env.contract()`` returns.
+        environment: single, vector or Stable-Baselines3 environment, wrapped or not, or what its ``contract()`` returns.
 
     Raises:
         InputError: no policy there, broken, or a contract that does not fit, naming the first difference.
     """
-    place = find_policy(source)
+    place, wanted = find_policy(source), _environment_contract(environment)
     if place.is_file():
         policy, contract = open_policy(place)
-        check_contract(contract["environment"], environment, str(place))
+        check_contract(contract["environment"], wanted, str(place))
         return policy
     contract = read_contract(place)
-    check_contract(contract["environment"], environment, str(place))
+    check_contract(contract["environment"], wanted, str(place))
     return agent_function(contract["agent"], "load_policy")(place, contract)
+
+
+def _environment_contract(environment: object) -> Contract:
+    if isinstance(environment, Mapping):
+        return environment
+    bare = getattr(environment, "unwrapped", environment)
+    if not isinstance(bare, HasContract):
+        raise InputError(f"environment = {environment!r}: expected one that was made, or what its contract() returns")
+    return bare.contract()
 
 
 def make_policy(source: str | Path, environment: Contract) -> Policy:
@@ -123,7 +146,12 @@ def policy_environment(source: str | Path) -> dict[str, Any]:
         InputError: neither an agent nor a policy, or a broken one.
     """
     config = load_agent_config(source) if str(source) in agent_names() else contract_of(source)["config"]
-    task = (config.get("environment") or {}).get("task")
+    return fed_environment(config.get("environment") or {})
+
+
+def fed_environment(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of an environment's keywords that decide what a policy's inputs and outputs mean."""
+    task = environment.get("task")
     if isinstance(task, Mapping):
         task = {key: task[key] for key in FED if key in task}
     return {"task": task} if task else {}

@@ -38,7 +38,7 @@ class Scene:
 
     def __init__(self, robot: Robot, view: View | None = None) -> None:
         self.robot = robot
-        self.view = view or View()
+        self.view: View = view or View()
         self._stage: Stage | None = None
         self._canvas: Canvas | None = None
         self._scene: mujoco.MjvScene | None = None

@@ -46,10 +46,10 @@ class Stage:
         self.robot = robot
         self._extend = functools.partial(_dress, robot=robot, size=size)
         self._shape = self._shape_of(parameters, row)
-        self.model = self._build(parameters, row)
-        self.data = mujoco.MjData(self.model)
+        self.model: Any = self._build(parameters, row)
+        self.data: Any = mujoco.MjData(self.model)
         self._addresses = [int(self.model.joint(joint).qposadr[0]) for joint in JOINTS]
-        self.wheel_bodies = [int(self.model.body(wheel).id) for wheel in WHEELS]
+        self.wheel_bodies: list[int] = [int(self.model.body(wheel).id) for wheel in WHEELS]
 
     def pose(self, truth: Truth, parameters: Parameters, row: int = 0) -> None:
         """Put the robot where row ``row`` of a plant's truth is, in the shape that row of its parameters gives it."""

@@ -87,7 +87,7 @@ class Keyboard:
     """Commands by key; :meth:`press` may be called from the window's thread."""
 
     def __init__(self, ranges: Ranges) -> None:
-        self._ranges = _steered(ranges, KEYS, "the arrow keys")
+        self._ranges = steered(ranges, KEYS, "the arrow keys")
         self._lock = threading.Lock()
         self._values = dict.fromkeys(self._ranges, 0.0)
         self._reset = False
@@ -127,7 +127,7 @@ class Gamepad:
     """
 
     def __init__(self, ranges: Ranges, joystick: Any = None) -> None:
-        self._ranges = _steered(ranges, AXES, "a gamepad")
+        self._ranges = steered(ranges, AXES, "a gamepad")
         self._joystick = joystick or _glfw()
         if not self._joystick.joystick_present(0):
             raise InputError("no gamepad found: plug one in, or leave --gamepad out and use the keyboard")
@@ -135,16 +135,10 @@ class Gamepad:
 
     def command(self, time: float) -> Mapping[str, float]:
         """Return the commands of the stick's position: full deflection is the end of the range."""
-        sticks, buttons = self._axes(), self._buttons()
+        buttons = self._buttons()
         if buttons and buttons[0]:
             return dict.fromkeys(self._ranges, 0.0)
-        values = {}
-        for name, (low, high) in self._ranges.items():
-            axis, sign = AXES[name]
-            share = sign * sticks[axis] if axis < len(sticks) else 0.0
-            share = math.copysign(max(0.0, abs(share) - DEAD_ZONE) / (1.0 - DEAD_ZONE), share)
-            values[name] = min(max(share * high if share >= 0 else -share * low, low), high)
-        return values
+        return stick_commands(self._ranges, self._axes())
 
     def wants_reset(self) -> bool:
         """Return whether the second button went down since the last call."""
@@ -161,6 +155,22 @@ class Gamepad:
         return [int(pointer[index]) for index in range(count)]
 
 
+def stick_commands(ranges: Ranges, sticks: Sequence[float]) -> dict[str, float]:
+    """Return the commands of a gamepad's sticks.
+
+    Args:
+        ranges: name -> (low, high), of :func:`steered` commands.
+        sticks: position of each axis, -1 to 1; up and left are negative.
+    """
+    values = {}
+    for name, (low, high) in ranges.items():
+        axis, sign = AXES[name]
+        share = sign * sticks[axis] if axis < len(sticks) else 0.0
+        share = math.copysign(max(0.0, abs(share) - DEAD_ZONE) / (1.0 - DEAD_ZONE), share)
+        values[name] = min(max(share * high if share >= 0 else -share * low, low), high)
+    return values
+
+
 def _glfw() -> Any:
     import glfw
 
@@ -169,8 +179,12 @@ def _glfw() -> Any:
     return glfw
 
 
-def _steered(ranges: Ranges, known: Mapping[str, object], what: str) -> dict[str, tuple[float, float]]:
-    """Return the ranges that can be steered, each as far as standing still: who drives must be able to stop."""
+def steered(ranges: Ranges, known: Mapping[str, object], what: str) -> dict[str, tuple[float, float]]:
+    """Return the ranges that can be steered, each as far as standing still: who drives must be able to stop.
+
+    Raises:
+        InputError: none can; names ``what`` steers.
+    """
     steered = {name: (min(low, 0.0), max(high, 0.0)) for name, (low, high) in ranges.items() if name in known}
     if not steered:
         raise unknown_name("command", ", ".join(ranges), known, f"{what} steer others")

@@ -86,7 +86,7 @@ class Viewer:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.robot = robot
-        self.view = view or View()
+        self.view: View = view or View()
         self._on_key, self._open, self._clock, self._sleep = on_key, open, clock, sleep
         self._stage: Stage | None = None
         self._window: Window | None = None

@@ -2,10 +2,22 @@
 
 from wlr_gym.robot.description import Robot, Vector3, load_robot, physical_faults, standing_height
 from wlr_gym.robot.fingerprint import robot_hash, servo_hash
-from wlr_gym.robot.joints import CORNER_SIGNS, CORNERS, FIRST_WHEEL, JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS
+from wlr_gym.robot.joints import (
+    CORNER_NAMES,
+    CORNER_SIGNS,
+    CORNERS,
+    FIRST_WHEEL,
+    JOINTS,
+    LEG_SLICE,
+    LEGS,
+    WHEEL_SLICE,
+    WHEELS,
+    full_name,
+)
 
 __all__ = [
     "CORNERS",
+    "CORNER_NAMES",
     "CORNER_SIGNS",
     "FIRST_WHEEL",
     "JOINTS",
@@ -15,6 +27,7 @@ __all__ = [
     "WHEEL_SLICE",
     "Robot",
     "Vector3",
+    "full_name",
     "load_robot",
     "physical_faults",
     "robot_hash",

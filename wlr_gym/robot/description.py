@@ -59,10 +59,16 @@ class Wheel(SettingsModel):
 
 
 class Motor(SettingsModel):
-    """One servo at its output shaft; torque and speed at the nominal supply voltage (source: ROBOTIS e-manual)."""
+    """One servo at its output shaft; torque, speed and currents at the nominal supply voltage (source: ROBOTIS e-manual).
+
+    Torque and speed are the ends of the torque-speed line. Currents (A) at the same two ends say how current becomes torque;
+    without them the constant is that of the back-EMF (:func:`wlr_gym.physics.servo.current_law`).
+    """
 
     stall_torque: float = Field(gt=0)
     no_load_speed: float = Field(gt=0)
+    stall_current: float | None = Field(None, gt=0)
+    no_load_current: float | None = Field(None, ge=0)
     kp: float = Field(ge=0)
     kd: float = Field(ge=0)
     armature: float = Field(gt=0)
@@ -72,11 +78,43 @@ class Motor(SettingsModel):
 
 
 class Servo(SettingsModel):
-    """Supply voltage (V) and the two servo types."""
+    """Supply voltage (V), the two servo types, and the time (s) between two steps of the wheels' velocity-loop integral.
+
+    The wheels' ``kp`` holds for a cycle of 1 ms.
+    """
 
     supply_voltage: float = Field(gt=0)
     leg: Motor
     wheel: Motor
+    integral_cycle: float = Field(1e-3, gt=0)
+
+    @model_validator(mode="after")
+    def _currents_are_possible(self) -> Servo:
+        for name, motor in (("leg", self.leg), ("wheel", self.wheel)):
+            _check_currents(f"servo.{name}", motor, self.supply_voltage)
+        return self
+
+
+def _check_currents(where: str, motor: Motor, supply: float) -> None:
+    """Refuse one current without the other, and a motor that would give more power than it takes.
+
+    With torque T (1 - w/w0) and current Is (1 - w/w0) + I0 w/w0 at the full supply V, and both in proportion at others, the
+    shaft never gets more than the supply gives if  T w0 <= V (sqrt(Is) + sqrt(I0))^2.
+    """
+    stall, idle = motor.stall_current, motor.no_load_current
+    if stall is None and idle is None:
+        return
+    if stall is None or idle is None:
+        there, missing = ("no_load_current", "stall_current") if stall is None else ("stall_current", "no_load_current")
+        raise InputError(f"{where}.{there}: expected {missing} beside it: both or none")
+    if idle >= stall:
+        raise InputError(f"{where}.no_load_current = {idle:g} A: expected less than stall_current, {stall:g} A")
+    shaft, most = motor.stall_torque * motor.no_load_speed, supply * (math.sqrt(stall) + math.sqrt(idle)) ** 2
+    if shaft > most:
+        raise InputError(
+            f"{where}.stall_current = {stall:g} A: the motor would give more power than it takes; with no_load_current = "
+            f"{idle:g} A expected at least {max(math.sqrt(shaft / supply) - math.sqrt(idle), 0.0) ** 2:.3g} A"
+        )
 
 
 class Ground(SettingsModel):

@@ -122,6 +122,11 @@ TABLE: tuple[ParameterSpec, ...] = (
     motor("servo.no_load_speed", "rad/s", low=0.1, high=200, tolerance="servo.no_load_speed", doc="at the nominal voltage"),
     motor("servo.kp", "V/rad", low=0, high=2000, tolerance="servo.kp", doc="on angle error; wheels: integral of speed error"),
     motor("servo.kd", "V s/rad", low=0, high=50, doc="gain on the velocity error"),
+    # The wheels' kp holds for 1 ms.
+    stated(
+        "servo.integral_cycle", "s", WHEELS, low=1e-4, high=1e-2, tolerance="servo.integral_cycle",
+        doc="cycle in which a wheel's speed error is summed",
+    ),
     motor("servo.armature", "kg m2", low=1e-6, high=1, tolerance="servo.armature", doc="rotor inertia at the output shaft"),
     motor("servo.coulomb_friction", "N m", low=0, high=50, tolerance="servo.coulomb_friction", doc="dry gear friction"),
     motor("servo.viscous_friction", "N m s/rad", low=0, high=10, tolerance="servo.viscous_friction", doc="beyond back-EMF"),

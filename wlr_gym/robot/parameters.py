@@ -30,7 +30,7 @@ class Parameters:
     """
 
     def __init__(self, values: Array) -> None:
-        self.values = np.ascontiguousarray(values, dtype=np.float64)
+        self.values: NDArray[np.float64] = np.ascontiguousarray(values, dtype=np.float64)
         if self.values.ndim != 2 or self.values.shape[1] != len(ELEMENTS):
             raise InputError(f"parameter matrix has shape {self.values.shape}, expected (N, {len(ELEMENTS)})")
 

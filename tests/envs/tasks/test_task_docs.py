@@ -32,7 +32,7 @@ def test_tables_are_those_of_the_code(name, base):
     assert block.splitlines()[1:] == randomization_table(config(name), None if base is None else config(base))
 
 
-@pytest.mark.parametrize(("env_id", "name"), [(env_id, name) for env_id, (name, _, _) in ENVIRONMENTS.items()])
+@pytest.mark.parametrize(("env_id", "name"), [(env_id, name) for env_id, name in ENVIRONMENTS.items()])
 def test_tables_of_environments_are_those_of_the_code(env_id, name):
     text = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
     section = text.split(f"## {env_id}\n")[1]

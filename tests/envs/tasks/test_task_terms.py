@@ -11,9 +11,11 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks import load_task
 from wlr_gym.envs.tasks.signals import Signals
-from wlr_gym.envs.tasks.success import succeeded
+from wlr_gym.envs.tasks.success import limits_of, succeeded
 from wlr_gym.envs.tasks.terms import MEASURES, REWARDS, references
 from wlr_gym.envs.tasks.terms.geometry import PlanarPose, true_pose
+from wlr_gym.learning.evaluation.metrics import errors_of
+from wlr_gym.learning.evaluation.rollout import Measure
 from wlr_gym.robot import load_robot
 from wlr_gym.studies.paper.experiments import LEG_SPEED, TESTS
 
@@ -155,9 +157,12 @@ def test_success_is_staying_within_the_limits_to_the_end():
     measures[3, 4, :] = 9.0
     active[3, 4] = False  # over by then
     fell = np.zeros(5, bool)
-    assert succeeded(config, measures, active, fell).tolist() == [True, False, False, True, True]
+    kept = [Measure(name, "", "", max=0.0) for name in config.measures]  # all kinds are asked for
+    limits, errors = limits_of(config), errors_of(kept, measures, active)
+    assert list(limits) == [("velocity_error", "rms"), ("yaw_rate_error", "max")]
+    assert succeeded(limits, errors, fell).tolist() == [True, False, False, True, True]
     fell[0] = True
-    assert not succeeded(config, measures, active, fell)[0]
+    assert not succeeded(limits, errors, fell)[0]
 
 
 @pytest.mark.parametrize(

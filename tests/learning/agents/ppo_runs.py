@@ -15,6 +15,7 @@ SETTINGS: dict[str, Any] = {
     "epochs": 2,
     "checkpoint_every": 128,
     "keep_checkpoints": 10,
+    "evaluate_every": 0,
     "environment": {"episode_length": 0.2},
 }
 

@@ -10,11 +10,12 @@ import time
 import numpy as np
 import pytest
 import yaml
-from ppo_runs import ENVIRONMENT, SETTINGS, assert_same_weights, curve, train
+from ppo_runs import ENVIRONMENT, SETTINGS, assert_same_weights, curve, train, weights
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.ppo.training_log import TrainingLog
 from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
 
 torch = pytest.importorskip("torch")
@@ -37,7 +38,8 @@ def test_run_folder_is_complete(run):
     assert [row["steps"] for row in curve(run)] == [64.0 * k for k in range(1, 7)]
     assert any(row["episodes"] > 0 for row in curve(run))
     contract = read_contract(run / "policy")
-    assert contract["training"] == {"environment": ENVIRONMENT, "steps": 384, "updates": 12, "seed": 0}
+    noise = float(weights(run / "policy")["log_std"].mean())
+    assert contract["training"] == {"environment": ENVIRONMENT, "steps": 384, "updates": 12, "seed": 0, "log_std": noise}
 
 
 def test_same_seed_gives_the_same_run_bit_for_bit(run, tmp_path):
@@ -65,6 +67,7 @@ def test_plain_stable_baselines_loads_the_model(run):
     subprocess.run([sys.executable, "-c", code, str(run / "policy" / "model.zip")], check=True)
 
 
+@pytest.mark.slow
 def test_killed_run_resumes_exactly(run, tmp_path):
     """kill -9 at an arbitrary moment after the first checkpoint; the resumed run ends as the uninterrupted one."""
     folder = tmp_path / "killed"
@@ -103,14 +106,21 @@ def test_resuming_from_any_checkpoint_ends_the_same(run, tmp_path):
     assert_same_weights(resumed, run / "policy")
 
 
-def test_every_stretch_between_checkpoints_has_new_episodes(tmp_path, monkeypatch):
-    from wlr_gym.envs import Sb3VecEnv
+def test_a_run_stopped_anywhere_goes_on_as_if_it_were_not(run, tmp_path):
+    """Between two checkpoints, in mid-episode: robots, learner and files go on bit for bit."""
 
-    seeds = []
-    seed = Sb3VecEnv.seed
-    monkeypatch.setattr(Sb3VecEnv, "seed", lambda env, value: (seeds.append(value), seed(env, value))[1])
-    train(tmp_path / "run")
-    assert len(set(seeds)) == len(seeds) >= 4
+    def stop(progress):
+        if progress.steps == 192:
+            progress.stop()
+
+    folder = tmp_path / "stopped"
+    load_agent("ppo").train(Training(ENVIRONMENT, folder, SETTINGS, progress=False, on_update=stop))
+    assert read_contract(folder / "policy")["training"]["steps"] == 192
+    resumed = train(folder, resume=True)
+    assert curve(folder) == curve(run)
+    assert_same_weights(resumed, run / "policy")
+    lines = [line.split(",")[0] for line in (folder / "learning_curve.csv").read_text().splitlines()]
+    assert lines == ["steps", "64", "128", "192", "256", "320", "384"]  # whole numbers stay whole numbers
 
 
 def test_the_environment_is_told_how_far_training_is(run, tmp_path, monkeypatch):
@@ -120,11 +130,11 @@ def test_the_environment_is_told_how_far_training_is(run, tmp_path, monkeypatch)
     told = []
     monkeypatch.setattr(Sb3VecEnv, "set_progress", lambda env, steps: told.append(steps))
     train(tmp_path / "run")
-    assert told == [0, 0, 64, 128, 128, 192, 256, 256, 320, 384]
+    assert told == [0, 0, 64, 128, 192, 256, 320]
     shutil.rmtree(tmp_path / "run" / "checkpoints" / "step_000000000384")
     told.clear()
     train(tmp_path / "run", resume=True)
-    assert told == [256, 256, 320, 384]
+    assert told == [256, 320]
 
 
 def test_a_run_with_a_curriculum_resumes_exactly(tmp_path):
@@ -140,25 +150,42 @@ def test_a_run_with_a_curriculum_resumes_exactly(tmp_path):
     assert_same_weights(resumed, whole)
 
 
-def test_ctrl_c_saves_a_checkpoint_and_says_how_to_go_on(tmp_path, monkeypatch):
-    folder, handler = tmp_path / "interrupted", signal.getsignal(signal.SIGINT)
-    load_agent("ppo")
-    training = importlib.import_module("wlr_gym.learning.ppo.training")
-    update = training.update
-
-    def interrupting(*arguments):
-        signal.raise_signal(signal.SIGINT)
-        return update(*arguments)
-
-    monkeypatch.setattr(training, "update", interrupting)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_a_checkpoint_and_says_how_to_go_on(run, tmp_path, number):
+    folder, handler = tmp_path / "interrupted", signal.getsignal(number)
+    request = Training(ENVIRONMENT, folder, SETTINGS, progress=False, on_update=lambda progress: signal.raise_signal(number))
     with pytest.raises(KeyboardInterrupt, match=r"wlr train --resume"):
-        train(folder)
+        load_agent("ppo").train(request)
     (saved,) = folder.glob("checkpoints/step_*")
     assert read_contract(saved)["training"]["steps"] == 64
-    monkeypatch.setattr(training, "update", update)
-    train(folder, resume=True)
-    assert read_contract(folder / "policy")["training"]["steps"] == 384
-    assert signal.getsignal(signal.SIGINT) is handler
+    assert signal.getsignal(number) is handler
+    assert_same_weights(train(folder, resume=True), run / "policy")
+
+
+def test_a_signal_before_the_first_update_leaves_a_checkpoint_too(run, tmp_path, monkeypatch):
+    class Slow(TrainingLog):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            assert (tmp_path / "early" / "learning_curve.csv").is_file()
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(importlib.import_module("wlr_gym.learning.ppo.training"), "TrainingLog", Slow)
+    with pytest.raises(KeyboardInterrupt, match=r"wlr train --resume"):
+        train(tmp_path / "early")
+    monkeypatch.undo()
+    assert_same_weights(train(tmp_path / "early", resume=True), run / "policy")
+
+
+def test_what_a_callback_raises_ends_the_run_with_a_checkpoint(run, tmp_path):
+    class PrunedError(Exception):
+        pass
+
+    def prune(progress):
+        raise PrunedError
+
+    with pytest.raises(PrunedError):
+        load_agent("ppo").train(Training(ENVIRONMENT, tmp_path / "a", SETTINGS, progress=False, on_update=prune))
+    assert_same_weights(train(tmp_path / "a", resume=True), run / "policy")
 
 
 def test_weights_that_are_not_finite_stop_the_run_with_a_dump(tmp_path):
@@ -202,12 +229,11 @@ def test_bad_input_exits_with_2(arguments, message, capsys, tmp_path, monkeypatc
     assert not list(tmp_path.iterdir())  # nothing is left that would be in the way of the next try
 
 
-def test_runs_of_different_settings_have_different_folders(tmp_path, monkeypatch):
+def test_runs_of_different_settings_have_different_folders():
     from wlr_gym.cli import train as command
 
-    monkeypatch.chdir(tmp_path)
     for config, folder in ((None, "WLR-Velocity-v0_ppo_0"), ("ppo_blind", "WLR-Velocity-v0_ppo_blind_0")):
-        assert command._new(command.TrainOptions(config=config))[1].folder.name == folder
+        assert command.default_folder(command.TrainOptions(config=config), ENVIRONMENT, {"seed": 0}).name == folder
 
 
 def test_a_full_folder_is_not_overwritten(run, capsys):

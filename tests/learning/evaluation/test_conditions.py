@@ -34,7 +34,7 @@ def test_every_subject_plays_every_condition_with_the_same_episodes(monkeypatch)
     assert {label: list(names) for label, names in results.items()} == {
         key: ["idle", "constant_command"] for key in ("main", "icy")
     }
-    assert results["main"]["idle"].pairs["reward"].shape == (2, 3, 2)
+    assert results["main"]["idle"].pairs["reward"].shape == (1, 2, 3, 2)
     for (label, _, block), rollout in seen.items():
         other = seen[label, "idle", block]
         assert rollout.seeds.tolist() == [100 + BLOCK * block + i for i in range(3)]
@@ -95,16 +95,25 @@ def test_a_policy_that_does_not_fit_is_refused_before_anything_is_played(monkeyp
     assert told == []
 
 
-def test_several_sources_take_turns_block_by_block():
+def test_all_policies_of_a_subject_play_all_blocks():
     both = Subject("both", ("constant_command", "do_nothing"))
-    moved = []
+    moved, told = [], []
     condition = Condition("main", {"episode_length": 1.0}, episodes=4, blocks=3)
-    play(ID, [both], [condition], watch=lambda *given: moved.append(np.abs(given[-1].action).max() > 0.0))
-    assert moved == [True, False, True]
+
+    def watch(condition, subject, block, rollout):
+        moved.append((block, int(rollout.seeds[0]), np.abs(rollout.action).max() > 0.0))
+
+    results = play(ID, [both], [condition], 100, lambda text, cost: told.append(cost), watch)
+    assert moved == [(block, 100 + BLOCK * block, moves) for moves in (True, False) for block in range(3)]
+    assert sum(told) == work([condition], [both], 50)
+    rewards = results["main"]["both"].pairs["reward"][..., 0]
+    alone = play(ID, [Subject("second", ("do_nothing",))], [condition], 100)["main"]["second"].pairs["reward"][..., 0]
+    assert np.array_equal(rewards[1], alone[0])
+    assert not np.array_equal(rewards[0], rewards[1])
 
 
 def test_subjects_are_read():
-    assert read_subjects(["pid", "pid", "mine=out/a,out/b"]) == (Subject("pid", ("pid",)), Subject("mine", ("out/a", "out/b")))
+    assert read_subjects(["pid", "pid", "mine=out/a"]) == (Subject("pid", ("pid",)), Subject("mine", ("out/a",)))
     for wrong, message in (
         (["a=x", "a=y"], "two policies are called 'a'"),
         (["a="], "expected NAME=POLICY"),

@@ -112,5 +112,5 @@ def test_an_action_at_its_limit_counts():
 
 def test_blocks_are_stacked():
     kept = summarise([rollout(), rollout(measured=measured(0.02))])
-    assert kept.pairs["velocity_error"].shape == (2, EPISODES, 2)
-    np.testing.assert_allclose(kept.pairs["velocity_error"][:, :, 0].mean(axis=1), [0.0, 0.02])
+    assert kept.pairs["velocity_error"].shape == (1, 2, EPISODES, 2)
+    np.testing.assert_allclose(kept.pairs["velocity_error"][0, :, :, 0].mean(axis=1), [0.0, 0.02])

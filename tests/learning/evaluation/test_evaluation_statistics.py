@@ -40,7 +40,7 @@ def test_reduction_and_share():
     resampling = Bootstrap(1, 10)
     ones = np.ones((1, 10))
     assert resampling.reduction(pairs(3 * ones), pairs(4 * ones)).mean == pytest.approx(25.0)
-    share = resampling.share(pairs(8 * ones), pairs(12 * ones), pairs(2 * ones), pairs(4 * ones))
+    share = resampling.share(pairs(8 * ones), pairs(12 * ones), pairs(2 * ones), pairs(4 * ones), subjects=(0, 1, 2, 2))
     assert share.mean == pytest.approx(75.0)
 
 

@@ -108,7 +108,7 @@ def test_truth_agrees_with_independent_values(simulator):
     """Slip, clearance and effective friction computed from the state without the engine's code."""
     plant = make(simulator)
     run(plant, 0, 25)
-    truth, state = plant.truth(), plant.get_state()
+    truth, state = plant.truth(), plant.mechanical_state()
     expected = slip.contact_slip_velocity(
         plant.parameters,
         state.quaternion,
@@ -154,7 +154,7 @@ def test_sensors_show_the_truth_where_nothing_disturbs_them(simulator):
 
 def test_accelerometer_shows_gravity_at_rest_and_nothing_in_free_fall(simulator):
     plant = make(simulator, 2)
-    state = plant.get_state()
+    state = plant.mechanical_state()
     state.position[1, 2] = 50.0
     plant.reset(state=state)
     home = np.tile(np.concatenate([np.full(4, np.pi / 2), np.zeros(4)]), (2, 1))
@@ -191,6 +191,7 @@ def test_gyroscope_lags_by_its_whole_time_constant(simulator):
     assert (np.abs(lead) < 4e-5).all(), lead  # s; a trapezoid per step is itself step^2/(12 time constants) = 23 us off
 
 
+@pytest.mark.slow
 def test_constants_of_formulas_are_per_robot(simulator):
     force = make_force(("floor_force_x",), "push", {"push": 0.0}, {"push": "N"})
     plant = make_plant(simulator, ROBOT, 3, QUIET, (force,))
@@ -221,10 +222,10 @@ def test_expecting_all_effects_does_not_change_a_bit(simulator):
 def test_state_survives_a_round_trip(simulator):
     plant = make(simulator, edit=lambda p: p["joint.zero_offset"].__setitem__(..., (0.02, -0.01, 0.0, 0.03)))
     run(plant, 0, 10)
-    state = plant.get_state()
+    state = plant.mechanical_state()
     other = make(simulator, edit=lambda p: p.values.__setitem__(..., plant.parameters.values))
     other.reset(state=state)
-    for name, value in vars(other.get_state()).items():
+    for name, value in vars(other.mechanical_state()).items():
         np.testing.assert_allclose(value, getattr(state, name), atol=1e-14, err_msg=name)
     # what is not state, the extrapolated rates and the warm start, is forgotten: the motion goes on almost alike
     np.testing.assert_allclose(run(other, 10, 15)[:, :3], run(plant, 10, 15)[:, :3], atol=1e-4)
@@ -234,7 +235,7 @@ def test_returned_state_is_a_copy(simulator):
     plant = make(simulator)
     run(plant, 0, 3)
     before = run(make(simulator), 0, 5)
-    for value in vars(plant.get_state()).values():
+    for value in vars(plant.mechanical_state()).values():
         value[:] = 0.0
     np.testing.assert_array_equal(run(plant, 3, 5), before)
 
@@ -251,7 +252,7 @@ def test_reset_with_a_mask_leaves_the_others_alone(simulator):
     np.testing.assert_array_equal(plant.parameters["ground.mu_x"][mask], 0.123)
     np.testing.assert_array_equal(plant.parameters.values[~mask], undisturbed.parameters.values[~mask])
     standing = standing_state(ROBOT, plant.parameters)
-    np.testing.assert_array_equal(plant.get_state().position[mask], standing.position[mask])
+    np.testing.assert_array_equal(plant.mechanical_state().position[mask], standing.position[mask])
     ours, theirs = run(plant, 10, 20), run(undisturbed, 10, 20)
     np.testing.assert_array_equal(ours[~mask], theirs[~mask])
     assert (ours[mask] != theirs[mask]).any(axis=1).all()
@@ -276,11 +277,11 @@ def test_parameters_can_change_in_mid_run(simulator):
     home = np.tile(np.concatenate([np.full(4, np.pi / 2), np.zeros(4)]), (3, 1))
     for _ in range(50):
         plant.step(home)
-    before = plant.get_state()
+    before = plant.mechanical_state()
     slippery = plant.parameters.copy()
     slippery["ground.mu_x"] = slippery["ground.mu_y"] = 0.1
     plant.set_parameters(slippery, np.array([True, False, True]))
-    np.testing.assert_array_equal(plant.get_state().position, before.position)
+    np.testing.assert_array_equal(plant.mechanical_state().position, before.position)
     for _ in range(25):
         plant.step(home)
     gained = plant.truth().linear_velocity_in_body[:, 0]
@@ -402,7 +403,7 @@ def test_bad_resets_are_refused(simulator):
     plant = make(simulator, 2)
     with pytest.raises(InputError, match="mask has shape"):
         plant.reset(mask=np.ones(3, bool))
-    state = plant.get_state()
+    state = plant.mechanical_state()
     state.position[0, 0] = np.nan
     with pytest.raises(InputError, match="not finite"):
         plant.reset(state=state)
@@ -513,14 +514,14 @@ def test_a_neutral_formula_does_not_change_a_bit(simulator):
 def test_a_formula_of_time_is_asked_at_every_step_and_time_goes_on_with_the_state(simulator):
     """Against an external force set anew before each step, from 2 s on; halfway through, robots are put where they are."""
     rise = make_force(["floor_force_x"], "f * time", {"f": 2.0}, {"f": "N/s"})
-    start = make(simulator, 2).get_state()
+    start = make(simulator, 2).mechanical_state()
     start.time = np.array([2.0, 0.0])
     found = []
     for ticks, step in ((20, 0.01), (200, 0.001)):
         plant = make_plant(simulator, ROBOT, 2, PlantOptions(step, 0.001, sensor_noise=False), (rise,))
         plant.reset(state=start)
         hold(plant, home(2), ticks // 2)
-        plant.reset(state=plant.get_state(), mask=np.array([True, False]))
+        plant.reset(state=plant.mechanical_state(), mask=np.array([True, False]))
         hold(plant, home(2), ticks // 2)
         found.append(plant.truth().position.copy())
         plant.close()
@@ -532,7 +533,7 @@ def test_a_formula_of_time_is_asked_at_every_step_and_time_goes_on_with_the_stat
             pushed.reset(parameters=parameters, state=start)
         pushed.set_parameters(parameters)
         if tick == 100:
-            pushed.reset(state=pushed.get_state(), mask=np.array([True, False]))
+            pushed.reset(state=pushed.mechanical_state(), mask=np.array([True, False]))
         hold(pushed, home(2), 1)
     expected = pushed.truth().position.copy()
     pushed.close()
@@ -552,14 +553,14 @@ def test_wind_up_is_state_of_the_joint_whose_formula_asks_for_it(simulator):
                 way = plant.truth().joint_velocity[:, 0] * step / WIND_UP
                 expected += way - np.abs(way) * expected
             if tick == ticks // 2:
-                plant.reset(state=plant.get_state(), mask=np.array([True, False]))
+                plant.reset(state=plant.mechanical_state(), mask=np.array([True, False]))
             hold(plant, setpoints, 1)
-        wound = plant.get_state().wind_up
+        wound = plant.mechanical_state().wind_up
         assert wound is not None
         assert not wound[:, 1:].any()
         found.append(wound[:, 0].copy())
         plant.reset()
-        cleared = plant.get_state().wind_up
+        cleared = plant.mechanical_state().wind_up
         assert cleared is not None
         assert not cleared.any()
         plant.close()

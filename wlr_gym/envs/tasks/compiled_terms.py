@@ -32,7 +32,7 @@ class Scores(NamedTuple):
     """What a control step is worth.
 
     Weighted reward ``terms`` (N, T), their ``total`` (N,) and ``sums`` (N, T) over the episode, termination terms ``over``
-    (N, K) and ``measures`` (N, M).
+    (N, K), ``measures`` (N, M), and of these over the episode the sum of ``squares`` and the ``largest`` magnitude (N, M).
     """
 
     terms: Array
@@ -40,6 +40,8 @@ class Scores(NamedTuple):
     over: Array
     sums: Array
     measures: Array
+    squares: Array
+    largest: Array
 
 
 @dataclass(frozen=True)
@@ -198,6 +200,9 @@ _SCORES_HEAD = (
 _SCORES_TAIL = (
     "        for k in range(terms.shape[1]):",
     "            sums[i, k] += terms[i, k]",
+    "        for k in range(measures.shape[1]):",
+    "            squares[i, k] += measures[i, k] ** 2",
+    "            largest[i, k] = max(largest[i, k], abs(measures[i, k]))",
     "        if bad < 0 and not math.isfinite(total[i]):",
     "            bad = i",
     "    return bad",

@@ -1,6 +1,8 @@
-"""Whether an episode was a success: one definition, for evaluations, cards and training."""
+"""How well an episode went: its tracking error, and whether it was a success. One definition, for environments and cards."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,33 +11,38 @@ from wlr_gym.envs.tasks.task_config import TaskConfig
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+#: A measure of the task and what of it counts over an episode: ``rms`` or ``max`` (largest magnitude).
+Which = tuple[str, str]
+
+#: What a fall adds to the tracking error of its episode, which otherwise knows the time before it only.
+FALL = 10.0
 
 
-def episode_rms(measure: Array, active: Flags) -> Array:
-    """Return the root mean square (N,) of a measure (T, N) over the steps in which each episode was going on (T, N)."""
-    return np.sqrt((np.where(active, measure, 0.0) ** 2).sum(axis=0) / np.maximum(active.sum(axis=0), 1))
+def limits_of(config: TaskConfig) -> dict[Which, float]:
+    """Return the limits of success of a task, in the order of its measures, SI units."""
+    limits: dict[Which, float] = {}
+    for name in config.measures:
+        chosen = config.success.get(name)
+        given = {} if chosen is None else {"rms": chosen.rms, "max": chosen.max}
+        limits |= {(name, kind): limit for kind, limit in given.items() if limit is not None}
+    return limits
 
 
-def episode_max(measure: Array, active: Flags) -> Array:
-    """Return the largest magnitude (N,) of a measure (T, N) over the steps in which each episode was going on (T, N)."""
-    return np.abs(np.where(active, measure, 0.0)).max(axis=0)
-
-
-def succeeded(config: TaskConfig, measures: Array, active: Flags, fell: Flags) -> Flags:
-    """Return which episodes (N,) were a success: not fallen, and every measure within the limits of ``config.success``.
+def tracking_error(limits: Mapping[Which, float], errors: Mapping[Which, Array], fell: Flags) -> Array:
+    """Return the tracking error of each episode (N,): rms of what is reached of every limit; a fall adds :data:`FALL`.
 
     Args:
-        config: of the task.
-        measures: (T, N, M) in the order of ``config.measures``.
-        active: (T, N) the episode was going on in this step.
-        fell: (N,) a termination term ended it.
+        limits: of the task; without any the rms is 0.
+        errors: measure and kind -> (N,), SI units; of all that is limited.
+        fell: (N,) a termination term ended the episode.
     """
+    shares = np.array([errors[which] / limit for which, limit in limits.items()]).reshape(len(limits), len(fell))
+    return np.sqrt((shares**2).sum(axis=0) / max(1, len(limits))) + FALL * fell
+
+
+def succeeded(limits: Mapping[Which, float], errors: Mapping[Which, Array], fell: Flags) -> Flags:
+    """Return which episodes (N,) were a success: not fallen, and within every limit. Arguments as for the tracking error."""
     well = ~fell
-    names = list(config.measures)
-    for name, limits in config.success.items():
-        measure = measures[:, :, names.index(name)]
-        if limits.rms is not None:
-            well &= episode_rms(measure, active) <= limits.rms
-        if limits.max is not None:
-            well &= episode_max(measure, active) <= limits.max
+    for which, limit in limits.items():
+        well &= errors[which] <= limit
     return well

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear
 
 from wlr_gym.gap.estimation.likelihood import Noise
 from wlr_gym.gap.estimation.model import FittedModel, prior_tightness, room, scaled_nominal, scaled_numbers
@@ -25,6 +27,15 @@ def normal_equations(columns: Sequence[NDArray[np.float32]], residuals: Sequence
         matrix += weighted @ weighted.T
         vector += weighted @ (np.nan_to_num(residual).ravel() * weights)
     return matrix, vector
+
+
+def channel_products(columns: Sequence[NDArray[np.float32]], channels: int) -> Array:
+    """Return ``C C^T`` of each channel alone (channels, numbers, numbers), over all runs: weights come later."""
+    total: Array = np.zeros((channels, len(columns[0]), len(columns[0])))
+    for column in columns:
+        own = np.ascontiguousarray(column.reshape(len(column), -1, channels).transpose(2, 0, 1))
+        total += own @ own.transpose(0, 2, 1)
+    return total
 
 
 def cross_products(columns: Sequence[NDArray[np.float32]], others: Sequence[Array], noise: Noise) -> Array:
@@ -53,10 +64,14 @@ def constrained_step(problem: Problem, model: FittedModel, matrix: Array, vector
 
 
 def bounded_minimum(matrix: Array, gradient: Array, low: Array, high: Array) -> Array:
-    """Return the x within bounds that minimises ``x matrix x / 2 + gradient x``: what leaves them is held there, one by one."""
+    """Return the x within bounds that minimises ``x matrix x / 2 + gradient x``.
+
+    What leaves its bounds is held there and the rest is solved anew. Where something held would rather return, which is rare,
+    scipy's bounded least squares solves the whole.
+    """
     free = np.ones(len(gradient), bool)
     x = np.zeros(len(gradient))
-    for _ in range(8):
+    while True:
         held = gradient + matrix @ np.where(free, 0.0, x)
         x[free] = -np.linalg.solve(matrix[np.ix_(free, free)], held[free])
         out = free & ((x < low - 1e-12) | (x > high + 1e-12))
@@ -64,7 +79,22 @@ def bounded_minimum(matrix: Array, gradient: Array, low: Array, high: Array) -> 
             break
         x[out] = np.clip(x, low, high)[out]
         free &= ~out
-    return np.clip(x, low, high)
+    slope = matrix @ x + gradient
+    returns = ~free & np.where(x <= low, slope < 0.0, slope > 0.0) & (low < high)
+    return _bounded_least_squares(matrix, gradient, low, high) if returns.any() else np.clip(x, low, high)
+
+
+def _bounded_least_squares(matrix: Array, gradient: Array, low: Array, high: Array) -> Array:
+    """The same as least squares of the matrix's Cholesky factor, every number scaled by its own curvature."""
+    movable = low < high
+    x = np.where(movable, 0.0, low)
+    scale = 1.0 / np.sqrt(np.diag(matrix)[movable])
+    inner = matrix[np.ix_(movable, movable)] * np.outer(scale, scale)
+    root = np.linalg.cholesky(inner).T
+    target = -solve_triangular(root.T, (gradient + matrix @ x)[movable] * scale, lower=True)
+    found = lsq_linear(root, target, (low[movable] / scale, high[movable] / scale), method="bvls").x
+    x[movable] = np.clip(found * scale, low[movable], high[movable])
+    return x
 
 
 def corrected(columns: NDArray[np.float32], taken: Array, before: Array, after: Array) -> NDArray[np.float32]:

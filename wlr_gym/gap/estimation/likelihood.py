@@ -14,14 +14,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
 #: Rows: the longest lag of an autocorrelation.
 LONGEST = 100
+#: Rows: runs that measured a channel no more often say nothing about its autocorrelation.
+LEAST_SERIES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +67,7 @@ def estimate_noise(residuals: Sequence[Array], autocorrelation_time: Array | Non
     rows = np.sum([np.isfinite(r).sum(axis=0) for r in residuals], axis=0)
     return Noise(
         total / np.maximum(rows, 1),
-        scatter * _autocorrelation_time(residuals) if autocorrelation_time is None else autocorrelation_time,
+        scatter * autocorrelation_times(residuals) if autocorrelation_time is None else autocorrelation_time,
         rows,
         scatter,
     )
@@ -72,7 +76,12 @@ def estimate_noise(residuals: Sequence[Array], autocorrelation_time: Array | Non
 def minus_two_log_likelihood(residuals: Sequence[Array], autocorrelation_time: Array) -> float:
     """Return ``sum n/tau log s^2`` over the channels of all runs together; below the sensor's own noise s^2 itself counts."""
     noise = estimate_noise(residuals, autocorrelation_time)
-    return float(np.sum(noise.rows / autocorrelation_time * (np.log(noise.level**2) + np.minimum(noise.square, 1.0) - 1.0)))
+    return float(np.sum(noise.rows / autocorrelation_time * channel_costs(noise.square)))
+
+
+def channel_costs(square: Array) -> Array:
+    """Return minus two log likelihood per independent row (channels) of mean squares in units of sensor noise."""
+    return np.log(np.maximum(square, 1.0)) + np.minimum(square, 1.0) - 1.0
 
 
 def run_scatter(matrices: Array, vectors: Array) -> float | None:
@@ -96,19 +105,45 @@ def run_scatter(matrices: Array, vectors: Array) -> float | None:
     return float(ratio.mean())
 
 
-def _autocorrelation_time(residuals: Sequence[Array]) -> Array:
+def autocorrelation_times(residuals: Sequence[Array]) -> Array:
     """Integrated autocorrelation (channels) in rows: summed until it first falls below 0.05, over measured rows only."""
-    channels = residuals[0].shape[1]
-    autocorrelation_time = np.ones(channels)
+    packed = [np.ascontiguousarray(residual.T, np.float64) for residual in residuals]
+    edges = np.cumsum([0, *(part.shape[1] for part in packed)])
+    return _integrated(np.concatenate(packed, axis=1), edges, LONGEST)
+
+
+@njit(cache=True, nogil=True)
+def _integrated(series: Any, edges: Any, longest: Any) -> Any:
+    """Integrated autocorrelation (channels) of series (channels, rows) of several runs that begin at ``edges``."""
+    channels = len(series)
+    found = np.ones(channels)
+    values = np.zeros(series.shape[1])
+    ends = np.zeros(len(edges), np.int64)
     for c in range(channels):
-        series = [r[np.isfinite(r[:, c]), c] for r in residuals]
-        series = [s for s in series if len(s) > 8]
-        power = sum(float(s @ s) for s in series)
+        count, runs = 0, 0
+        for r in range(len(edges) - 1):
+            first = count
+            for row in range(edges[r], edges[r + 1]):
+                if np.isfinite(series[c, row]):
+                    values[count] = series[c, row]
+                    count += 1
+            if count - first > LEAST_SERIES:
+                runs += 1
+                ends[runs] = count
+            else:
+                count = first
+        power = 0.0
+        for k in range(count):
+            power += values[k] * values[k]
         if power <= 0.0:
             continue
-        for lag in range(1, LONGEST):
-            rho = sum(float(s[lag:] @ s[:-lag]) for s in series if len(s) > lag) / power
+        for lag in range(1, longest):
+            product = 0.0
+            for r in range(runs):
+                for k in range(ends[r] + lag, ends[r + 1]):
+                    product += values[k] * values[k - lag]
+            rho = product / power
             if rho < 0.05:
                 break
-            autocorrelation_time[c] += 2.0 * rho
-    return autocorrelation_time
+            found[c] += 2.0 * rho
+    return found

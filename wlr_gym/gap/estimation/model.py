@@ -110,8 +110,8 @@ def on_bounds(problem: Problem, model: FittedModel) -> NDArray[np.bool_]:
 def _bounds(problem: Problem, model: FittedModel) -> tuple[Array, Array]:
     unknowns = [u for candidate, _ in model.effects for u in candidate.unknowns]
     scale = scales(problem, model)
-    low = np.array([*(q.low for q in problem.quantities), *(u.low for u in unknowns)]) / scale
-    high = np.array([*(q.high for q in problem.quantities), *(u.high for u in unknowns)]) / scale
+    low = np.array([*(q.low for q in problem.quantities), *(u.bounds[0] for u in unknowns)]) / scale
+    high = np.array([*(q.high for q in problem.quantities), *(u.bounds[1] for u in unknowns)]) / scale
     return low, high
 
 

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
@@ -42,7 +42,7 @@ Interval = tuple[Number, Number]
 
 
 class _Entry(SettingsModel):
-    model_config = ConfigDict(extra="allow", allow_inf_nan=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="allow", allow_inf_nan=True)
 
 
 class ParameterEntry(_Entry):

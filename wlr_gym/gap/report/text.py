@@ -23,7 +23,7 @@ from wlr_gym.gap.analysis import (
 from wlr_gym.gap.selection.screening import LEAST_GAIN
 from wlr_gym.physics.effects import UNKNOWN_EFFECT
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
-from wlr_gym.robot import CORNERS, LEGS, WHEELS
+from wlr_gym.robot import CORNER_NAMES, CORNERS, LEGS, WHEELS
 
 #: Verdict -> title of the report.
 TITLES = {
@@ -35,7 +35,6 @@ TITLES = {
 }
 #: Title where nothing was named, and yet something is left.
 NOTHING_CLEAR = "Nothing clear enough to be named"
-_CORNERS: dict[str, str] = dict(zip(CORNERS, ("left front", "right front", "left rear", "right rear"), strict=True))
 _SIDES = {
     frozenset(CORNERS): "all four",
     frozenset(("lf", "rf")): "both front",
@@ -81,7 +80,7 @@ def places(where: Sequence[str]) -> str:
         if where and all(place in members for place in where):
             corners = [place.removeprefix(f"{kind}_") for place in where]
             group = _SIDES.get(frozenset(corners))
-            return f"{group} {kind}s" if group else listed([f"{_CORNERS[corner]} {kind}" for corner in corners])
+            return f"{group} {kind}s" if group else listed([f"{CORNER_NAMES[corner]} {kind}" for corner in corners])
     if set(where) == {*LEGS, *WHEELS}:
         return "all legs and wheels"
     return listed([_place(name) for name in where])
@@ -89,14 +88,14 @@ def places(where: Sequence[str]) -> str:
 
 def _place(name: str) -> str:
     kind, _, corner = name.rpartition("_")
-    return f"{_CORNERS[corner]} {kind}" if corner in _CORNERS else _PLACES.get(name, name.replace("_", " "))
+    return f"{CORNER_NAMES[corner]} {kind}" if corner in CORNER_NAMES else _PLACES.get(name, name.replace("_", " "))
 
 
 def channel(name: str) -> str:
     """Return a measured channel in words: ``motor torque, left front leg``."""
     kind, _, corner = name.rpartition("_")
-    if kind in _MEASURED and corner in _CORNERS:
-        return f"{_MEASURED[kind]}, {_CORNERS[corner]} {kind.partition('_')[2]}"
+    if kind in _MEASURED and corner in CORNER_NAMES:
+        return f"{_MEASURED[kind]}, {CORNER_NAMES[corner]} {kind.partition('_')[2]}"
     return _CHANNELS.get(name, name.replace("_", " "))
 
 
@@ -280,7 +279,20 @@ def _unknown(analysis: Analysis) -> str:
     lacks = f"The model lacks something{acts} that no effect of the library explains"
     if any(effect.formula for effect in analysis.effects):
         return f"{lacks}; a formula describes it{_improvement(analysis)}."
-    return f"{lacks}; no formula describes it either{f': {turned(analysis.turning)}' if analysis.turning else ''}."
+    shown = turned(analysis.turning) if analysis.turning else _misfit(analysis)
+    return f"{lacks}; no formula describes it either{f': {shown}' if shown else ''}."
+
+
+def _misfit(analysis: Analysis) -> str:
+    """What is left where nothing that has a name explains it."""
+    gap = analysis.gap
+    if gap is None or not analysis.localisation:
+        return ""
+    most = analysis.localisation[0]
+    return (
+        f"the fitted runs are replayed to within {error(gap.fit_after)} times the sensor noise, where a complete model reaches "
+        f"{error(gap.noise_floor)}; {percent(most.share)} of what is left is in {channel(most.name)}"
+    )
 
 
 def turned(turning: Turning) -> str:

@@ -56,7 +56,7 @@ def substep(lanes: Lanes, step: Value, features: frozenset[str], force: Value = 
     joint = drive.Joint(angle, rate, angle + lanes["zero"])
     voltage = lanes["supply"] * ops.clip(lanes["gain"] * (lanes["goal"] - joint.reading), -1.0, 1.0)
 
-    gear = _Gear(lanes, {"rotor_lead0": lead, "rotor_rate0": rotor_rate, "on0": lanes["on"]})
+    gear = _Gear(lanes, {"rotor_lead0": lead, "rotor_rate0": rotor_rate, "on0": lanes["on"], "idle_current0": 0.0})
     motor_rate = drive.motor_rate(gear, 0, joint, features)
     strength, load_friction = _strength_and_load_friction(lanes, voltage, motor_rate)
     gear = gear.also(torque_scale0=strength, load_friction0=load_friction, gear_bound0=step * lanes["coulomb"])

@@ -50,7 +50,7 @@ class RigProblem:
     cap = LOST
     steps = 20
     #: A replay costs milliseconds, and a joint that sticks answers far from linearly: every hypothesis is worth a whole fit.
-    thorough, tempering, disagreement = True, 1.0, 0.0
+    thorough, tempering, disagreement, misfit = True, 1.0, 0.0, math.inf
     turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})
     motions: Mapping[str, str] = MappingProxyType({})
 
@@ -59,14 +59,16 @@ class RigProblem:
     ) -> None:
         if not recordings:
             raise InputError("no recordings to analyse")
-        self.recordings = tuple(recordings)
-        self.known = tuple(known)
-        self.runs = tuple(recording.name for recording in recordings)
-        self.signals = tuple(MeasuredSignal(name, "rad", ENCODER_NOISE, "position") for name in HORIZONS)
+        self.recordings: tuple[Recording, ...] = tuple(recordings)
+        self.known: tuple[PatchEffect, ...] = tuple(known)
+        self.runs: tuple[str, ...] = tuple(recording.name for recording in recordings)
+        self.signals: tuple[MeasuredSignal, ...] = tuple(
+            MeasuredSignal(name, "rad", ENCODER_NOISE, "position") for name in HORIZONS
+        )
         self.quantities: tuple[Quantity, ...] = tuple(
             quantity for quantity in QUANTITIES if friction_is_known or not quantity.name.endswith("friction")
         )
-        self.held_out = spread_over_conditions(self.recordings)
+        self.held_out: tuple[str, ...] = spread_over_conditions(self.recordings)
         self._replays = [Replay(recording) for recording in recordings]
 
     def times(self, run: int) -> Array:

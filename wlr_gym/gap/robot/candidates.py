@@ -22,6 +22,12 @@ from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
+#: A prior is no wall: a size is sought so far beyond it too, in its width, where the simulator accepts it.
+BEYOND = 3.0
+#: A probe so many times larger than a tolerance is simulated on its own: the response to the tolerance would be lost in
+#: rounding, and in what sticks and slips otherwise.
+LARGER = 8.0
+
 
 def robot_candidates(
     parameters: Parameters,
@@ -86,13 +92,16 @@ class _Library:
         return replace(candidate, fixed=own.fixed, convert=own.parameters, within=own.within)
 
     def _unknowns(self, effect: Effect, search: Search) -> tuple[Unknown, ...]:
-        """The parameters of an effect; their plausible range is its prior."""
+        """The parameters of an effect; a fit may go :data:`BEYOND` their prior."""
         found = []
         for name, parameter in effect.parameters.items():
             low, high = parameter.prior
             low = max(low, search.least.get(name, low))
-            neutral = parameter.neutral_in(self.observed.parameters)
-            found.append(Unknown(name, parameter.unit, neutral, low, high, 0.05 * (high - low), parameter.is_size))
+            neutral, room = parameter.neutral_in(self.observed.parameters), BEYOND * (high - low) * parameter.is_size
+            least = low if low == neutral else max(low - room, parameter.low, search.least.get(name, parameter.low))
+            most = high if high == neutral else min(high + room, parameter.high)
+            step = 0.05 * (high - low)
+            found.append(Unknown(name, parameter.unit, neutral, low, high, step, parameter.is_size, least, most))
         return tuple(found)
 
     def _known_start(self, effect: Effect, where: Places, known: Mapping[str, Known]) -> Start:
@@ -101,12 +110,15 @@ class _Library:
         directions, amounts = [], []
         for name, number in known.items():
             quantities = _quantities(number, where)
-            if all(quantity in self.tolerances for quantity in quantities):
+            step = max((number.step_at(place) for place in where), key=abs)
+            if all(
+                abs(step) < LARGER * number.scale(self.observed) * self.tolerances.get(quantity, 0.0) for quantity in quantities
+            ):
                 directions.append(quantities)
                 amounts.append(number.scale(self.observed) * self.tolerances[quantities[0]])
             else:
-                step = number.step_at(where[0])
-                directions.append((self._probe(PatchEffect(effect.name, where, {**neutral, name: neutral[name] + step})),))
+                changed = {**neutral, name: neutral[name] + step}
+                directions.append(tuple(self._probe(PatchEffect(effect.name, (place,), changed)) for place in where))
                 amounts.append(step)
         middle = tuple(neutral.values())
         return Start(

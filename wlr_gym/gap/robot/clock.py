@@ -46,13 +46,13 @@ class RunClock:
     def __init__(self, run: Run, window: float = WINDOW) -> None:
         self.run = run
         self.windows = window_rows(run["t"], window)
-        self.t = run["t"]
+        self.t: Array = run["t"]
         commands = np.stack([run[name] for name in COMMANDS], axis=1)
-        self.setpoints = held_setpoints(run)
+        self.setpoints: Array = held_setpoints(run)
         self.torque_on = np.isfinite(commands)
         self.begin = self.t[0] - (LEAD if starts_at_rest(run) else 0.0)
-        self.ticks = int(np.ceil((self.t[-1] - self.begin) / CLOCK)) + 1
-        self.anchors = self._anchors([window.start for window in self.windows[1:]])
+        self.ticks: int = int(np.ceil((self.t[-1] - self.begin) / CLOCK)) + 1
+        self.anchors: Anchors = self._anchors([window.start for window in self.windows[1:]])
 
     def _anchors(self, rows: list[int]) -> Anchors:
         run, times = self.run, self.t[rows]

@@ -16,6 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters
@@ -27,7 +29,7 @@ from wlr_gym.physics.plants.base import PlantOptions, PlantState, Sensors, stand
 from wlr_gym.physics.plants.forces import Force
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.physics.plants.simulator import Simulator
-from wlr_gym.physics.servo import motor_constants
+from wlr_gym.physics.servo import motor_constants, position_gains
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -63,6 +65,10 @@ class WrittenSetpoints:
 
     def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
         """Nothing: the delays are given."""
+
+    def stores(self) -> dict[str, RowStore]:
+        """Refuse: the setpoints are those of a recorded run."""
+        raise InputError("a plant that follows recorded setpoints cannot be saved and set back")
 
     def push(self, setpoints: Array) -> tuple[Array, Array, Array]:
         """Return the newer setpoints, the older setpoints and the time between (s) of the present tick; see SetpointHistory.
@@ -218,7 +224,7 @@ def _anchor(
 
 def _standing_where_lost(plant: Simulator, lanes: Parameters) -> PlantState:
     """The state of all robots; those whose simulation broke down stand still, and what was recorded of them is not finite."""
-    state = plant.get_state()
+    state = plant.mechanical_state()
     parts = {name: value for name, value in vars(state).items() if value is not None}
     lost = ~np.all([np.isfinite(value).reshape(len(lanes), -1).all(axis=1) for value in parts.values()], axis=0)
     if lost.any():
@@ -233,9 +239,8 @@ def _tension_per_effort(robot: Robot, lanes: Parameters, mine: NDArray[np.bool_]
     """Change of a wheel's reference (rad) that changes its reported effort by 1 N m."""
     nominal = robot.servo.supply_voltage
     constant, _ = motor_constants(robot.servo.wheel.stall_torque, robot.servo.wheel.no_load_speed, nominal)
-    kp, stall_torque, no_load_speed = (
-        lanes[f"servo.{name}"][mine, WHEEL_SLICE] for name in ("kp", "stall_torque", "no_load_speed")
-    )
+    kp = position_gains(lanes)[mine, WHEEL_SLICE]
+    stall_torque, no_load_speed = (lanes[f"servo.{name}"][mine, WHEEL_SLICE] for name in ("stall_torque", "no_load_speed"))
     _, resistance = motor_constants(stall_torque, no_load_speed, nominal)
     return resistance / constant / np.maximum(kp, 1e-9)
 
@@ -272,7 +277,7 @@ def _start(run: Run, robot: Robot, parameters: Parameters, begin: float) -> Plan
     moved = rest_pose(parameters, bent) - rest_pose(parameters, level)
     state.position[:, 2] = measured.position[0, 2] + height + (moved - moved[:1])[:, 0]
     wheels, reference = state.joint_position[:, WHEEL_SLICE], state.reference_position[:, WHEEL_SLICE]
-    kp, own_kp = base["servo.kp"][:, WHEEL_SLICE], parameters["servo.kp"][:, WHEEL_SLICE]
+    kp, own_kp = (position_gains(each)[:, WHEEL_SLICE] for each in (base, parameters))
     reference[...] = wheels + (reference - wheels) * kp / np.maximum(own_kp, 1e-9)
     state.time = np.full(count, begin)
     return PlantState(**{name: value[1:] for name, value in vars(state).items() if value is not None})

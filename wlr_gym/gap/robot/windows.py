@@ -1,8 +1,8 @@
 """Residuals that do not depend on where a window starts.
 
 Pose and wheel angles are integrals: an error, once made, stays in them. The residuals of a run are therefore taken window by
-window, and each window's own pose (x, y, heading) and wheel angles are fitted and removed. What is left says what went wrong
-within the window.
+window, and each window's own pose (x, y, heading) is fitted and removed, and so are the wheel angles of each of its parts. What
+is left says what went wrong within the window.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 
 #: s; length of a window.
 WINDOW = 2.0
+#: s; length over which wheel angles are compared: what wheels that work against each other on one floor slip depends on forces
+#: between them that nothing measures well, and beyond this such errors would outweigh all else.
+WHEEL_WINDOW = 0.5
 #: s; beginning of a window in which the camera's frames are not compared.
 BLIND = 0.05
 _X, _Y, _YAW, _PITCH = (CHANNELS.index(f"cam_{name}") for name in ("x", "y", "yaw", "pitch"))
@@ -54,12 +57,18 @@ def anchored_residuals(t: Array, measured: Array, simulated: Array, noise: Array
     residual = measured - simulated
     residual[:, :, _PITCH] = _wrapped(residual[:, :, _PITCH])
     for window in windows:
-        wheels = np.ascontiguousarray(residual[:, window, _WHEELS[0] : _WHEELS[-1] + 1])
-        residual[:, window, _WHEELS[0] : _WHEELS[-1] + 1] = wheels - np.nanmean(wheels, axis=1, keepdims=True)
+        for part in _parts(t, window):
+            wheels = np.ascontiguousarray(residual[:, part, _WHEELS[0] : _WHEELS[-1] + 1])
+            residual[:, part, _WHEELS[0] : _WHEELS[-1] + 1] = wheels - np.nanmean(wheels, axis=1, keepdims=True)
         _calm(residual[:, window])
         _take_out_pose(measured[window], simulated[:, window], residual[:, window], noise)
     residual /= noise
     return residual
+
+
+def _parts(t: Array, window: slice) -> list[slice]:
+    """Cut a window into parts over which wheel angles are compared."""
+    return [slice(window.start + p.start, window.start + p.stop) for p in window_rows(t[window], WHEEL_WINDOW)]
 
 
 def _calm(residual: Array) -> None:

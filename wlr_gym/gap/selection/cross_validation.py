@@ -5,6 +5,7 @@ Nothing here uses the held-out runs.
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -41,6 +42,8 @@ FORGIVING = 5
 CONVERGENCE_STEPS = 8
 #: Grid on which a better place is searched, in steps of every unknown that says where an effect is or over what it fades.
 GRID = (-8.0, -4.0, 0.0, 4.0, 8.0)
+#: An improvement beyond this is not due to how tolerances are counted.
+TOLERANCES_CANNOT = 80.0
 #: A named effect is preferred to a formula if it improves the fit by at least this share of what the formula does.
 NAMED_FIRST = 0.9
 
@@ -82,7 +85,7 @@ def fit_finalists(
         wholes.append(cheapest(problem, both, current.noise.autocorrelation_time))
     if not wholes:
         return [], bare
-    autocorrelation_time = cheapest(problem, wholes, current.noise.autocorrelation_time).noise.autocorrelation_time
+    autocorrelation_time = max(wholes, key=lambda whole: _own_gain(problem, whole, bare)).noise.autocorrelation_time
     if bare.columns is current.columns and _far_apart(problem, bare.model, current.model):  # they are of another minimum
         bare = _plain(problem, runs, bare, bare.model, None, autocorrelation_time)
     if not problem.thorough:
@@ -94,6 +97,11 @@ def fit_finalists(
         )
     found = [_evaluated(problem, runs, h, whole, bare, autocorrelation_time) for h, whole in zip(chosen, wholes, strict=True)]
     return sorted(found, key=lambda final: -final.hypothesis.gain), bare
+
+
+def _own_gain(problem: Problem, whole: Fit, bare: Fit) -> float:
+    """Improvement of the fit under the noise that a model itself leaves."""
+    return total_cost(problem, bare.model, bare.residuals, whole.noise.autocorrelation_time) - whole.cost
 
 
 def _far_apart(problem: Problem, one: FittedModel, other: FittedModel) -> bool:
@@ -223,10 +231,35 @@ def accept(
     seen = list(finals)
     for final in good:
         converged, bare = (final, bare) if problem.thorough else converge(problem, runs, final, bare, tell)
+        if _is_good(current.cost, converged.hypothesis) and _tolerances_do(problem, runs, current.cost, converged, bare):
+            converged = replace(converged, hypothesis=replace(converged.hypothesis, tolerable=True))
         seen = [converged if other is final else other for other in seen]
         if _is_good(current.cost, converged.hypothesis):
             return converged, seen, bare
     return None, seen, bare
+
+
+def _tolerances_do(problem: Problem, runs: Sequence[int], cost: float, final: Finalist, bare: Fit) -> bool:
+    """Whether tolerances that count once explain nearly as much: one number for all wheels costs less than four tolerances do,
+    the more so where they are tempered."""
+    if problem.tempering == 1.0 or final.hypothesis.gain > TOLERANCES_CANNOT:
+        return False
+    once = copy.copy(problem)
+    once.tempering = 1.0
+    noise = final.fit.noise
+    costs = [
+        fit(
+            once,
+            runs,
+            found.model,
+            autocorrelation_time=noise.autocorrelation_time,
+            scatter=noise.scatter,
+            columns=found.columns,
+            steps=1,
+        ).cost
+        for found in (bare, final.fit)
+    ]
+    return costs[0] - costs[1] < least_gain(len(final.hypothesis.values), cost)
 
 
 def shown_by_some_runs_only(hypothesis: Hypothesis, cost: float) -> bool:

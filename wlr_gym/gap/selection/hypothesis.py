@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from wlr_gym.gap.estimation.likelihood import Noise
 from wlr_gym.gap.estimation.model import FittedModel
-from wlr_gym.gap.problem import Candidate, Problem
+from wlr_gym.gap.problem import Candidate, Problem, Unknown
 
 Array = NDArray[np.float64]
 
 #: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
 MOST_HARM = 0.2
+#: Fall of minus two log posterior that outweighs what is known beforehand of the size of an effect.
+INSISTENT = 160.0
 #: Of an unknown that meets no calibrated parameter, what counts as an effect, in its steps.
 NOTICED = 0.25
 
@@ -55,22 +57,28 @@ class Hypothesis:
     @property
     def at_bound(self) -> bool:
         """Whether an unknown ended at the edge of its plausible range (other than its neutral value)."""
-        return any(
-            (value >= u.high - 1e-9 * abs(u.high) and u.high != u.neutral)
-            or (value <= u.low + 1e-9 * abs(u.low) and u.low != u.neutral)
-            for u, value in zip(self.candidate.unknowns, self.values, strict=True)
-        )
+        return any(_is_at_bound(unknown, value) for unknown, value in zip(self.candidate.unknowns, self.values, strict=True))
 
     @property
     def plausible(self) -> bool:
-        """Whether its size is one that a robot may have, and more than tolerances allow, and the runs agree."""
-        return not self.at_bound and not self.tolerable and self.consistent and self.cross_validated
+        """Whether its size is one that a robot may have, and more than tolerances allow, and the runs agree.
+
+        At the edge of what a robot may have it is, too, where the data insist.
+        """
+        inside = not self.at_bound or self.gain > INSISTENT
+        return inside and not self.tolerable and self.consistent and self.cross_validated
 
     @property
     def consistent(self) -> bool:
         """Whether the runs agree that it is there."""
         help_, harm = self.by_run.clip(min=0.0).sum(), -self.by_run.clip(max=0.0).sum()
         return bool(harm <= MOST_HARM * help_)
+
+
+def _is_at_bound(unknown: Unknown, value: float) -> bool:
+    low, high = unknown.bounds
+    too_much = value >= high - 1e-9 * abs(high) and high != unknown.neutral
+    return too_much or (value <= low + 1e-9 * abs(low) and low != unknown.neutral)
 
 
 def within_tolerance(problem: Problem, model: FittedModel) -> bool:

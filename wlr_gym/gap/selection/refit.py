@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.estimation.fit import CONVERGED, Fit, fit
-from wlr_gym.gap.estimation.least_squares import constrained_step, cross_products, normal_equations
-from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.estimation.least_squares import channel_products, constrained_step, cross_products
+from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise
 from wlr_gym.gap.estimation.model import FittedModel, moved, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem, Setting
 from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
@@ -88,18 +88,15 @@ def refit(
 
 def _descended(problem: Problem, runs: Sequence[int], current: Fit, trials: list[_Trial], rounds: int) -> list[_Trial]:
     """The trials after so many steps; those that are far behind are removed or no longer improved."""
+    products = {id(t.known): channel_products(t.known, len(problem.signals)) for t in trials}
     for done in range(rounds):
         autocorrelation_time = _best_autocorrelation_time(problem, current, trials)
         if done >= PATIENCE:
             trials = _given_up(problem, trials, autocorrelation_time)
-        noise = estimate_noise(
-            min((t.residuals for t in trials), key=lambda r: minus_two_log_likelihood(r, autocorrelation_time)),
-            autocorrelation_time,
-        )
         going = [trial for trial in trials if not trial.converged]
         if not going:
             break
-        moved_on = _improved(problem, runs, current, going, noise)
+        moved_on = _improved(problem, runs, current, going, products)
         trials = _hopeful(problem, [*(trial for trial in trials if trial.converged), *moved_on], autocorrelation_time)
     return trials
 
@@ -118,21 +115,29 @@ def _without_effect(problem: Problem, current: Fit, trials: Sequence[_Trial]) ->
     return [t if t.known is t.whole else replace(t, known=t.whole, corrections=()) for t in free]
 
 
-def _improved(problem: Problem, runs: Sequence[int], current: Fit, trials: Sequence[_Trial], noise: Noise) -> list[_Trial]:
-    """The trials one Gauss-Newton step on."""
-    bases = {id(trial.known): trial.known for trial in trials}
-    matrices = {key: normal_equations(known, current.residuals, noise)[0] for key, known in bases.items()}
+def _improved(
+    problem: Problem, runs: Sequence[int], current: Fit, trials: Sequence[_Trial], products: Mapping[int, Array]
+) -> list[_Trial]:
+    """The trials one Gauss-Newton step on, each under the noise of its own residuals.
+
+    Under that of a model without its effect, an effect that lasts would count as few readings and stay where it began.
+
+    ``products``: of the known columns of trials, channel by channel, by the columns' id.
+    """
     tries, owns = [], _own_columns(problem, trials, runs)
-    for trial, own in zip(trials, owns, strict=True):
-        equations = _equations(matrices[id(trial.known)], trial, own, noise)
+    noises = [estimate_noise(trial.residuals, scatter=current.noise.scatter) for trial in trials]
+    for trial, own, noise in zip(trials, owns, noises, strict=True):
+        equations = _equations(np.tensordot(noise.weight, products[id(trial.known)], 1), trial, own, noise)
         change = constrained_step(problem, trial.model, *equations)
         tries += [replace(trial, model=moved(problem, trial.model, share * change)) for share in TRIED]
     tries = _simulated(problem, tries, runs)
-    costs = [total_cost(problem, t.model, t.residuals, noise.autocorrelation_time) for t in tries]
     improved = []
-    for k, (trial, own) in enumerate(zip(trials, owns, strict=True)):
-        best = min(range(len(TRIED) * k, len(TRIED) * (k + 1)), key=lambda i: costs[i])
-        gained = total_cost(problem, trial.model, trial.residuals, noise.autocorrelation_time) - costs[best]
+    for k, (trial, own, noise) in enumerate(zip(trials, owns, noises, strict=True)):
+        tau = noise.autocorrelation_time
+        own_tries = range(len(TRIED) * k, len(TRIED) * (k + 1))
+        costs = {i: total_cost(problem, tries[i].model, tries[i].residuals, tau) for i in own_tries}
+        best = min(costs, key=lambda i: costs[i])
+        gained = total_cost(problem, trial.model, trial.residuals, tau) - costs[best]
         better = _corrected(problem, trial, own, tries[best]) if gained > 0.0 else trial
         improved.append(replace(better, converged=gained < CONVERGED))
     return improved
@@ -197,7 +202,8 @@ def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequ
     for k, score in enumerate(scores):
         candidate = score.candidate
         near, anew = (_without_replaced(problem, candidate, known) for known in (current.columns, given))
-        trials.append(_Trial(k, near, current.columns, current.model.with_effect(candidate, score.values)))
+        beside = current.model if score.step is None else moved(problem, current.model, score.step)
+        trials.append(_Trial(k, near, current.columns, beside.with_effect(candidate, score.values)))
         probed = as_given.with_effect(candidate, candidate.probed(candidate.starts[0]))
         trials.append(_Trial(k, anew, given, probed))
     return trials
@@ -289,12 +295,21 @@ def _ranked(
 
 
 def _best_autocorrelation_time(problem: Problem, current: Fit, trials: Sequence[_Trial]) -> Array:
-    """Autocorrelation time of the residuals of the best model so far: the same for all that are compared."""
-    autocorrelation_time = current.noise.autocorrelation_time
-    best = min(trials, key=lambda t: total_cost(problem, t.model, t.residuals, autocorrelation_time))
-    if total_cost(problem, best.model, best.residuals, autocorrelation_time) >= current.cost:
-        return autocorrelation_time
-    return estimate_noise(best.residuals, scatter=current.noise.scatter).autocorrelation_time
+    """Autocorrelation time of what the best trial leaves: the same for all that are compared.
+
+    The best is the one that improves the fit most under its own autocorrelation time: under that of a model without it, an
+    effect that lasts counts as few readings.
+    """
+    scatter = current.noise.scatter
+    bare = [(t.model, t.residuals) for t in trials if t.of < 0] or [(current.model, current.residuals)]
+    best, most = current.noise.autocorrelation_time, 0.0
+    for trial in trials:
+        own = estimate_noise(trial.residuals, scatter=scatter).autocorrelation_time
+        before = min(total_cost(problem, model, residuals, own) for model, residuals in bare)
+        gain = before - total_cost(problem, trial.model, trial.residuals, own)
+        if gain > most:
+            best, most = own, gain
+    return best
 
 
 def _own_columns(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) -> list[list[Array]]:
@@ -310,7 +325,7 @@ def _own_columns(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]
             continue
         candidate, values = trial.model.effects[-1]
         for k, unknown in enumerate(candidate.unknowns):
-            step = unknown.step if values[k] + unknown.step <= unknown.high else -unknown.step
+            step = unknown.step if values[k] + unknown.step <= unknown.bounds[1] else -unknown.step
             changed = tuple(v + step * (i == k) for i, v in enumerate(values))
             settings.append(replace(trial.model, effects=(*trial.model.effects[:-1], (candidate, changed))).setting)
             taken[-1].append(step / unknown.step)

@@ -6,8 +6,8 @@ is confounded with calibrated parameters within their tolerances scores nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ PER_UNKNOWN = 3.0
 LEAST_SHARE = 0.02
 #: A response of which calibrated parameters reproduce all but this share is not distinguishable from them.
 LEAST_OWN = 1e-4
+#: Shares of an amplitude that are tried where the whole lies beyond where a fit may go.
+SHARES = (1.0, 0.7, 0.5, 0.3, 0.1, 0.0)
 
 
 def least_gain(unknowns: int, cost: float = 0.0) -> float:
@@ -53,6 +55,7 @@ class Score:
         information: of the amplitudes of its best start (k, k), calibrated parameters projected out; 1 = the probe.
         start: that best start.
         visible: whether the data would show it somewhere in its plausible range.
+        step: (fitted numbers) scaled, how they move with it; None = they stay.
     """
 
     candidate: Candidate
@@ -62,6 +65,7 @@ class Score:
     information: Array
     start: Start
     visible: bool
+    step: Array | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +78,7 @@ class Responses:
         tight, away: (fitted numbers) weight of their tolerance, and how far they are from nominal.
         information: ``response`` with the fitted numbers projected out.
         low, high: (fitted numbers) how far they may still move.
+        columns: of all, one (numbers and probes, rows x channels) array per run.
     """
 
     keys: dict[str, int]
@@ -84,6 +89,7 @@ class Responses:
     information: Array
     low: Array
     high: Array
+    columns: Sequence[NDArray[np.float32]] = field(repr=False)
 
 
 def responses(problem: Problem, fit: Fit, runs: Sequence[int], probes: Sequence[Probe]) -> Responses:
@@ -107,7 +113,7 @@ def project(problem: Problem, fit: Fit, columns: Sequence[NDArray[np.float32]], 
     information = response - response[:known].T @ imitation
     names = [*(quantity.name for quantity in problem.quantities)]
     places = {name: k for k, name in enumerate(names)} | {key: known + k for k, key in enumerate(keys)}
-    return Responses(places, response, push, tight, away, information, *room(problem, fit.model))
+    return Responses(places, response, push, tight, away, information, *room(problem, fit.model), columns)
 
 
 def screen(candidates: Sequence[Candidate], found: Responses, cost: float = 0.0) -> list[Score]:
@@ -120,14 +126,12 @@ def screen(candidates: Sequence[Candidate], found: Responses, cost: float = 0.0)
 def _score(candidate: Candidate, found: Responses, nothing: float, cost: float) -> Score | None:
     best: Score | None = None
     for start in candidate.starts:
-        mix = np.zeros((len(start.directions), len(found.push)))
-        for row, names in zip(mix, start.directions, strict=True):
-            row[[found.keys[name] for name in names]] = 1.0
+        mix = directions(start, found)
         information = mix @ found.information @ mix.T
         raw = np.diag(mix @ found.response @ mix.T)
         own = float(np.max(np.diag(information) / np.maximum(raw, 1e-12)))
         fall, amplitude = _fall(found, mix)
-        values, share = _plausible(candidate, start.values, amplitude)
+        values, share = shortened(candidate, start, amplitude, SHARES)
         gain = (fall - nothing) * (2.0 * share - share**2)  # along the way to the minimum of a parabola
         if best is None or gain > best.gain:
             best = Score(candidate, values, gain, own, information, start, _visible(candidate, start, information, cost))
@@ -138,12 +142,7 @@ def _fall(found: Responses, mix: Array) -> tuple[float, Array]:
     """Fall of the cost if the calibrated parameters, within bounds, and the directions ``mix`` move together; amplitudes."""
     known = len(found.low)
     rows = np.vstack([np.eye(known, len(found.push)), mix])
-    matrix, gradient = rows @ found.response @ rows.T, rows @ found.push
-    # tolerances hold the quantities, not a direction that is the same response without its tolerance
-    matrix[np.arange(known), np.arange(known)] += found.tight
-    gradient[:known] += found.tight * found.away
-    own = np.arange(known, len(rows))
-    matrix[own, own] += LEAST_OWN * matrix[own, own] + 1e-9  # a probe that does nothing gets nothing
+    matrix, gradient = with_tolerances(rows @ found.response @ rows.T, rows @ found.push, found)
     free = np.full(len(mix), np.inf)
     x = bounded_minimum(matrix, gradient, np.concatenate([found.low, -free]), np.concatenate([found.high, free]))
     return -float(2.0 * gradient @ x + x @ matrix @ x), x[known:]
@@ -162,12 +161,32 @@ def _visible(candidate: Candidate, start: Start, information: Array, cost: float
     return False
 
 
-def _plausible(
-    candidate: Candidate, values_of: Callable[[Array], tuple[float, ...]], amplitude: Array
-) -> tuple[tuple[float, ...], float]:
-    """Shorten a first guess until it lies in the plausible range; return its values and the share that is left of it."""
-    for share in (1.0, 0.7, 0.5, 0.3, 0.1, 0.0):
-        values = values_of(share * amplitude)
-        if all(u.low - 1e-12 <= v <= u.high + 1e-12 for u, v in zip(candidate.unknowns, values, strict=True)):
+def directions(start: Start, found: Responses) -> Array:
+    """Return which columns (directions, columns) each direction of a start adds up."""
+    mix = np.zeros((len(start.directions), len(found.push)))
+    for row, names in zip(mix, start.directions, strict=True):
+        row[[found.keys[name] for name in names]] = 1.0
+    return mix
+
+
+def with_tolerances(matrix: Array, gradient: Array, found: Responses) -> tuple[Array, Array]:
+    """Add to normal equations, in place, the tolerances of the fitted numbers and a little stiffness of the directions.
+
+    Tolerances hold the quantities, not a direction that is the same response without its tolerance.
+    """
+    known = np.arange(len(found.tight))
+    own = np.arange(len(known), len(gradient))
+    matrix[known, known] += found.tight
+    gradient[known] += found.tight * found.away
+    matrix[own, own] += LEAST_OWN * matrix[own, own] + 1e-9  # a probe that does nothing gets nothing
+    return matrix, gradient
+
+
+def shortened(candidate: Candidate, start: Start, amplitude: Array, shares: Sequence[float]) -> tuple[tuple[float, ...], float]:
+    """Shorten an amplitude until its values lie where a fit may go; return the values and the share that is left of it."""
+    for share in shares:
+        values = start.values(share * amplitude)
+        pairs = ((unknown.bounds, value) for unknown, value in zip(candidate.unknowns, values, strict=True))
+        if all(low - 1e-12 <= value <= high + 1e-12 for (low, high), value in pairs):
             return values, share
-    return candidate.kept(values_of(0.0 * amplitude)), 0.0
+    return candidate.kept(start.values(0.0 * amplitude)), 0.0

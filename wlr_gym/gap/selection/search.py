@@ -17,6 +17,7 @@ from wlr_gym.gap.estimation.fit import Fit, cheapest, fit, linearise, widened
 from wlr_gym.gap.estimation.likelihood import estimate_noise
 from wlr_gym.gap.estimation.model import FittedModel, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
+from wlr_gym.gap.selection.alternative import rescored
 from wlr_gym.gap.selection.cross_validation import Finalist, accept, beside, fit_finalists
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.refit import refit, refit_thoroughly
@@ -28,6 +29,10 @@ Tell = Callable[[str], None]
 SHORTLIST = 8
 #: The same per name.
 PER_NAME = 3
+#: A candidate that explains a group of signals is refitted too if it improves their fit by this many times what is accepted ...
+PROPOSED = 1.5
+#: ... and so many at most.
+MOST_PROPOSED = 3
 #: Effects in one analysis.
 MOST_EFFECTS = 4
 
@@ -72,6 +77,14 @@ def shortlist(scores: Sequence[Score], cost: float = 0.0) -> list[Score]:
     return chosen
 
 
+def with_proposals(chosen: Sequence[Score], alone: Sequence[Score]) -> list[Score]:
+    """Return the shortlist with the best of the candidates that explain a group of signals well; ``alone``: best first."""
+    had = {score.candidate.label for score in chosen}
+    more = {score.candidate.label: score for score in reversed(alone) if score.gain > PROPOSED * least_gain(len(score.values))}
+    new = sorted((score for label, score in more.items() if label not in had), key=lambda score: -score.gain)
+    return [*chosen, *new[:MOST_PROPOSED]]
+
+
 def search_effects(
     problem: Problem,
     runs: Sequence[int],
@@ -97,8 +110,8 @@ def search_effects(
         candidates = [candidate for candidate in candidates if not _is_explained(current.model, candidate)]
         tell(f"screening {len(candidates)} candidates")
         found = responses(problem, current, runs, probes)
-        scores = screen(candidates, found, current.cost)
-        chosen = scores if problem.thorough else shortlist(scores, cost=current.cost)
+        scores, alone = rescored(problem, current, found, screen(candidates, found, current.cost))
+        chosen = scores if problem.thorough else with_proposals(shortlist(scores, cost=current.cost), alone)
         tell(f"refitting {len(chosen)} hypotheses")
         hypotheses = (
             refit_thoroughly(problem, runs, current, chosen) if given is None else refit(problem, runs, current, chosen, given)
@@ -171,11 +184,11 @@ def _deeper(problem: Problem, current: Fit, bare: Fit) -> bool:
     """Whether a model without a further effect, in another minimum than the present one, is clearly lower."""
     if problem.thorough:
         return False
-    autocorrelation_time = bare.noise.autocorrelation_time
-    lower = total_cost(problem, current.model, current.residuals, autocorrelation_time) - total_cost(
-        problem, bare.model, bare.residuals, autocorrelation_time
-    )
-    return lower > LEAST_GAIN
+    lower = [
+        total_cost(problem, current.model, current.residuals, tau) - total_cost(problem, bare.model, bare.residuals, tau)
+        for tau in (current.noise.autocorrelation_time, bare.noise.autocorrelation_time)  # bare may stand under an effect's
+    ]
+    return min(lower) > LEAST_GAIN
 
 
 def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tuple[Hypothesis, list[Hypothesis]]]:

@@ -6,14 +6,15 @@ the business of whoever uses it.
 
 from __future__ import annotations
 
-import struct
+import contextlib
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.hardware.dynamixel import protocol
+from wlr_gym.hardware.dynamixel.blocks import Block, BlockReading, IndirectBlock
 from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError, RestlessLineError
 from wlr_gym.hardware.dynamixel.protocol import Error, Status
 from wlr_gym.hardware.dynamixel.tables import ControlTable
@@ -33,47 +34,6 @@ _PING_SPACING = 3.0
 #: Time for the first answer to a ping of all, ms.
 _PING_START = 16.0
 _ERROR_NAMES = {error.value: error.name.lower().replace("_", " ") + " error" for error in Error}
-
-
-class Block:
-    """Neighbouring items of a control table that are read together.
-
-    Args:
-        table: of the servos.
-        first, last: names of the first and the last item.
-    """
-
-    def __init__(self, table: ControlTable, first: str, last: str) -> None:
-        self.address, self.length = table.block(first, last)
-        inside = [item for item in table.items.values() if self.address <= item.address < self.address + self.length]
-        self.names = tuple(item.name for item in inside)
-        pattern, place = "<", self.address
-        for item in inside:
-            letter = {1: "b", 2: "h", 4: "i"}[item.size]
-            pattern += f"{item.address - place}x" + (letter if item.signed else letter.upper())
-            place = item.address + item.size
-        self._struct = struct.Struct(pattern)
-
-    def decode(self, data: bytes) -> dict[str, int]:
-        """Return item -> count."""
-        return dict(zip(self.names, self._struct.unpack(data), strict=True))
-
-
-@dataclass(frozen=True)
-class BlockReading:
-    """What one servo answered to a block read.
-
-    Attributes:
-        counts: item -> count.
-        alert: it has a hardware error (the counts are valid all the same).
-        age: s since the servo took the reading, from its own clock; 0 where the block holds no clock.
-        restarted: its clock jumped: it was rebooted, or had no power.
-    """
-
-    counts: Mapping[str, int]
-    alert: bool
-    age: float = 0.0
-    restarted: bool = False
 
 
 @dataclass
@@ -129,13 +89,14 @@ class BusGroup:
         from wlr_gym.hardware.dynamixel.port import DynamixelPort
 
         self.name = name
-        self.servos = dict(servos)
+        self.servos: dict[int, ControlTable] = dict(servos)
         self.fast = True
-        self.statistics = Statistics()
+        self.statistics: Statistics = Statistics()
         self._port: DynamixelPort = (make_port or DynamixelPort)(port, baud_rate, patience)
         self._clock = clock
         self._clocks = {id: TickClock() for id in servos}
         self._fast_failures = 0
+        self._order = list(self.servos)
         self._asked: Block | None = None
         self._asked_at = 0.0
 
@@ -164,6 +125,10 @@ class BusGroup:
     def gone(self) -> bool:
         """Whether the port has failed since it was opened."""
         return self._port.gone
+
+    def on_same_port(self, servos: Mapping[int, ControlTable]) -> BusGroup:
+        """Return another group on the open port, for servos that are asked once in another order; use one at a time."""
+        return BusGroup(self.name, "", 0, servos, clock=self._clock, make_port=lambda *_: self._port)
 
     def __enter__(self) -> BusGroup:
         self.open()
@@ -215,6 +180,18 @@ class BusGroup:
         row = self._table(id)[item]
         self._ask(id, protocol.write(id, row.address, row.encode(count)), 0, f"write {item} = {count}")
 
+    def point(self, id: int, block: IndirectBlock) -> None:
+        """Make a servo's Indirect Data stand for the items of a block, and see that they do. A reboot undoes it.
+
+        Raises:
+            NoAnswerError, RefusedError: see there. NoAnswerError also where it holds something else afterwards.
+        """
+        address = self._table(id)["indirect_address_1"].address
+        self._ask(id, protocol.write(id, address, block.pointers), 0, "write indirect addresses")
+        raw = protocol.read(id, address, len(block.pointers))
+        if self._ask(id, raw, len(block.pointers), "read indirect addresses").data != block.pointers:
+            raise NoAnswerError(f"bus {self.name}, id {id}: the indirect addresses are not what was written")
+
     def reboot(self, id: int) -> None:
         """Reboot a servo and wait until it is back: RAM at its defaults, latched errors cleared, torque off.
 
@@ -263,7 +240,7 @@ class BusGroup:
         self._asked, self._asked_at = block, self._clock()
         self.statistics.exchanges += 1
         count = len(self.servos)
-        self._port.send_packet(protocol.sync_read(block.address, block.length, self.servos, self.fast), is_answered=True)
+        self._port.send_packet(protocol.sync_read(block.address, block.length, self._order, self.fast), is_answered=True)
         self._port.setPacketTimeout((block.length + 11) * count + 14 + count)
 
     def answers(self) -> dict[int, BlockReading]:
@@ -291,9 +268,17 @@ class BusGroup:
         now = self._clock()
         for id in self.servos.keys() - found.keys():
             self._count(self.statistics.missing, id)
+        self._ask_last(found)
         readings = {id: self._reading(block, status, now) for id, status in found.items()}
         oldest = now - self._asked_at + STALE  # an answer may have waited for us, but was not given before we asked
         return {id: reading for id, reading in readings.items() if self._is_good(id, reading, oldest)}
+
+    def _ask_last(self, found: Collection[int]) -> None:
+        """Ask the first servo that was silent last from now on: those named behind it wait for its answer."""
+        silent = next((id for id in self._order if id not in found), None)
+        if silent is not None:
+            self._order.remove(silent)
+            self._order.append(silent)
 
     def _reading(self, block: Block, status: Status, now: float) -> BlockReading:
         counts = block.decode(status.data)
@@ -322,25 +307,31 @@ class BusGroup:
         row = self._table(next(iter(counts)))[item]
         self._port.send_packet(protocol.sync_write(row.address, data), is_answered=False)
 
-    def torque_off(self, retries: int = 5) -> set[int]:
-        """Switch every motor off, whatever happened before; return the ids that did not confirm it.
+    def torque_off(self, retries: int = 5, ids: Iterable[int] | None = None) -> set[int]:
+        """Switch motors off, whatever happened before; return the ids that did not confirm it.
 
         First all at once without acknowledgement, then one by one until each has confirmed or ``retries`` are over.
+
+        Args:
+            retries: times that a servo is asked.
+            ids: which; None = all.
 
         Raises:
             BusGoneError: the port is gone.
         """
-        left = set(self.servos)
+        left = set(self.servos if ids is None else ids)
         for _ in range(retries):
-            self.write_all("torque_enable", dict.fromkeys(left, 0))
-            left = {id for id in left if not self._confirm_off(id)}
             if not left:
                 break
+            self.write_all("torque_enable", dict.fromkeys(left, 0))
+            left = {id for id in left if not self._confirm_off(id)}
         return left
 
     def _confirm_off(self, id: int) -> bool:
-        try:
+        """Switch a motor off; return whether it says that it is. The acknowledgement may get lost: what is read counts."""
+        with contextlib.suppress(NoAnswerError, RefusedError):
             self.write(id, "torque_enable", 0)
+        try:
             return self.read(id, "torque_enable") == 0
         except (NoAnswerError, RefusedError):
             return False

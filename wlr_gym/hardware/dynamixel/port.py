@@ -45,7 +45,7 @@ class DynamixelPort(sdk.PortHandler):
         super().__init__(path)
         self.baudrate = baud_rate
         self.patience = patience
-        self.parser = Parser()
+        self.parser: Parser = Parser()
         self.queue: list[Packet] = []
         self.suspect = False
         self.quiet = True

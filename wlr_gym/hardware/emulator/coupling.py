@@ -80,7 +80,7 @@ class PlantCoupling:
         self._sign = np.array([hardware.joints[joint].sign for joint in JOINTS], np.float64)
         units = [servo.table.per_count("present_position") for servo in servos]
         self._zero = np.array([hardware.joints[joint].zero * unit for joint, unit in zip(JOINTS, units, strict=True)])
-        self._effort_count = law.effort_counts(robot)
+        self._effort_count, self._idle_effort = law.effort_counts(robot), law.idle_effort(robot)
         nominal = Parameters.nominal(robot, 1)
         self._parameters = nominal.copy() if parameters is None else parameters.copy()
         self._gain_factor = self._parameters["servo.kp"][0] / nominal["servo.kp"][0]
@@ -89,10 +89,9 @@ class PlantCoupling:
         self._damping_factor = np.divide(self._damping, known, where=known > 0, out=np.ones(len(JOINTS)))
         leg, wheel = robot.servo.leg, robot.servo.wheel
         self._nominal_stall = np.where(_IS_LEG, leg.stall_torque, wheel.stall_torque)
-        speed = np.where(_IS_LEG, leg.no_load_speed, wheel.no_load_speed)
-        self._nominal_motor = law.motor_constants(self._nominal_stall, speed, robot.servo.supply_voltage)
-        self.nominal_supply = float(self._parameters["servo.supply_voltage"][0])
-        self.supply = self.nominal_supply
+        self._nominal_line, self._nominal_winding = law.line_constants(robot), law.winding(robot)
+        self.nominal_supply: float = float(self._parameters["servo.supply_voltage"][0])
+        self.supply: float = self.nominal_supply
         seeds = np.array([seed], np.uint64)
         plant.reset(seeds, self._parameters, state=state)
         plant.step(np.zeros((1, len(JOINTS))), np.zeros((1, len(JOINTS)), bool))  # compiles now, not under a client's eyes
@@ -100,6 +99,7 @@ class PlantCoupling:
         self._setpoints = np.zeros((1, len(JOINTS)))
         self._torque = np.zeros((1, len(JOINTS)), bool)
         self._own_law = np.zeros(len(JOINTS), bool)
+        self._own_voltage = np.zeros(len(JOINTS))  # V, encoder frame, of the emulator's own laws
         self._reference = np.zeros((2, len(JOINTS)))  # of the emulator's own laws
         self._plant_reference: Array | None = None  # of the plant's, at this tick
         self._turned = np.zeros(len(JOINTS))  # rad by which wheels were turned beyond what the plant's encoders count
@@ -122,7 +122,8 @@ class PlantCoupling:
         for k, servo in enumerate(self._servos):
             drive = servo.drive()
             self._torque[0, k] = drive.on
-            native = drive.mode in _NATIVE_MODES[bool(_IS_LEG[k])] and drive.goal_pwm >= 1.0
+            is_well = servo.encoder.is_true and servo.health.strength == 1.0
+            native = drive.mode in _NATIVE_MODES[bool(_IS_LEG[k])] and drive.goal_pwm >= 1.0 and is_well
             if drive.on and self._own_law[k] and native:
                 self._torque[0, k] = False  # one tick, in which the plant's profile generator comes back to the joint
             if not self._torque[0, k]:
@@ -145,19 +146,20 @@ class PlantCoupling:
 
     def _voltage_setpoint(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> tuple[float, tuple[float, ...]]:
         """Return the setpoint that makes the plant put a mode's voltage on the motor, and the gains that do it."""
-        voltage = self._sign[k] * self._voltage(k, drive, servo)
+        self._own_voltage[k] = self._voltage(k, drive, servo)
+        voltage = self._sign[k] * self._own_voltage[k]
         if _IS_LEG[k]:
-            return self._sign[k] * (servo.shaft.position - self._zero[k]) + voltage, _LEG_CARRIER
-        return self._sign[k] * servo.shaft.velocity + voltage, _WHEEL_CARRIER
+            return self._sign[k] * (servo.shaft.true_position - self._zero[k]) + voltage, _LEG_CARRIER
+        return self._sign[k] * servo.shaft.true_velocity + voltage, _WHEEL_CARRIER
 
     def _voltage(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> float:
         """Return the voltage (V, encoder frame) of a law the plant has not got, and move its profile on by a tick."""
-        shaft, supply, step = servo.shaft, self.supply, self.plant.options.control_period
+        shaft, supply, step = servo.shaft, servo.health.strength * self.supply, self.plant.options.control_period
         if not self._own_law[k]:
             self._reference[:, k] = shaft.reference()
             self._own_law[k] = True
-        constant, resistance = (values[k] for values in self._nominal_motor)
-        back_emf = constant * shaft.velocity
+        constant, resistance = (values[k] for values in self._nominal_winding)
+        back_emf = constant * shaft.true_velocity
         if drive.mode == PWM_MODE:
             return drive.goal_pwm * supply
         limit = drive.goal_pwm * supply
@@ -197,22 +199,26 @@ class PlantCoupling:
         effort = self._sign * sensors.joint_effort[0]
         position = self._zero + self._sign * (sensors.joint_position[0] + self._turned)
         velocity = self._sign * sensors.joint_velocity[0]
-        counts = np.rint(effort / self._effort_count)
+        counts = np.rint((effort + self._torque[0] * self._idle_effort * velocity) / self._effort_count)
         volt = float(sensors.supply_voltage[0])
-        constant, resistance = self._nominal_motor
-        pwm = np.where(self._torque[0], (resistance / constant * effort + constant * velocity) / max(self.supply, 1e-3), 0.0)
+        constant, resistance = self._nominal_line
+        inferred = resistance / constant * effort + constant * velocity  # the plant does not tell its voltage
+        voltage = np.where(self._own_law, self._own_voltage, inferred)
+        pwm = np.where(self._torque[0], voltage / max(self.supply, 1e-3), 0.0)
         load = effort / self._nominal_stall
         columns = zip(position.tolist(), velocity.tolist(), counts.tolist(), pwm.tolist(), load.tolist(), strict=True)
         for servo, (p, v, e, u, strain) in zip(self._servos, columns, strict=True):
             shaft = servo.shaft
-            shaft.position, shaft.velocity, shaft.effort, shaft.pwm, shaft.load, shaft.voltage = p, v, int(e), u, strain, volt
+            shaft.effort, shaft.pwm, shaft.load, shaft.voltage = int(e), u, strain, volt
+            shaft.true_position, shaft.true_velocity = p, v
+            shaft.position, shaft.velocity = servo.encoder.read(p, v)
 
     def _reference_of(self, k: int) -> tuple[float, float]:
         """Return where the profile generator of joint ``k`` stands: rad and rad/s, encoder frame."""
         if self._own_law[k] or not self.plant.capabilities.can_set_state:
             return self._reference[0, k], self._reference[1, k]
         if self._plant_reference is None:
-            state = self.plant.get_state()
+            state = self.plant.mechanical_state()
             position = state.reference_position[0].copy()
             position[LEG_SLICE] += self.plant.parameters["joint.zero_offset"][0]
             position += self._turned
@@ -220,6 +226,15 @@ class PlantCoupling:
         return self._plant_reference[0, k], self._plant_reference[1, k]
 
     # ---- a hand ----
+
+    def set_parameter(self, name: str, place: int, value: float) -> None:
+        """Let the plant have another parameter from now on: what a hand does that holds a wheel.
+
+        Raises:
+            InputError: a value beyond the parameter's bounds.
+        """
+        self._parameters[name][0, place] = value
+        self.plant.set_parameters(self._parameters)
 
     def turn(self, joint: str, angle: float) -> None:
         """Turn a joint by hand while torque is off.
@@ -236,7 +251,7 @@ class PlantCoupling:
         k = JOINTS.index(joint)
         wheels = self.sensors.joint_position[0, WHEEL_SLICE].copy()
         if _IS_LEG[k]:
-            state = self.plant.get_state()
+            state = self.plant.mechanical_state()
             state.joint_position[0, k] += angle
             self.sensors = self.plant.reset(state=state)
             self._turned[WHEEL_SLICE] += wheels  # a reset plant counts its wheels from zero

@@ -41,8 +41,19 @@ FAULTS: dict[str, FaultKind] = {
     "overload": FaultKind("the servo finds itself overloaded: error, shutdown"),
     "overheat": FaultKind("the servo heats up", 2.0, "degC/s"),
     "sag": FaultKind("the supply drops", 3.0, "V"),
+    "torque_lost": FaultKind("Torque Enable is cleared, without an error", duration=0.005),
+    "reboot_matching_tick": FaultKind("the servo reboots, and its Realtime Tick goes on as if it had not", duration=0.005),
+    "encoder_frozen": FaultKind("the encoder repeats its reading, whatever the shaft does"),
+    "encoder_jump": FaultKind("the encoder is off from here on", 0.5, "rad"),
+    "slow_servo": FaultKind("the motor gets but a part of the voltage it should", 0.05, "of it"),
+    "limit_changed": FaultKind("something else holds the servo's Goal PWM at this", 200, "counts"),
+    "duplicate_id": FaultKind("a second servo with the same id answers at the same time: both answers are garbled"),
+    "imu_frozen": FaultKind("the chip repeats its values; the microcontroller numbers and stamps them anew"),
+    "imu_stale": FaultKind("the microcontroller sends the same frame again and again"),
 }
-_REPLY_FAULTS = ("drop", "delay", "late", "flip", "truncate", "noise")
+_REPLY_FAULTS = ("drop", "delay", "late", "flip", "truncate", "noise", "duplicate_id")
+#: Bytes of an answer before the error byte, which are the same in both of two servos with one id.
+_SAME = 8
 _KEYS = ("probability", "value", "after", "duration")
 
 
@@ -167,6 +178,9 @@ class FaultBoard:
         if "flip" in hits:
             bit = int(self._random.integers(8 * len(raw)))
             raw = bytes(byte ^ (1 << bit % 8 if k == bit // 8 else 0) for k, byte in enumerate(raw))
+        if "duplicate_id" in hits:
+            others = self._random.bytes(len(raw))
+            raw = bytes(byte & other if k >= _SAME else byte for k, (byte, other) in enumerate(zip(raw, others, strict=True)))
         if "truncate" in hits:
             raw = raw[: int(self._random.integers(1, len(raw)))]
         if "noise" in hits:

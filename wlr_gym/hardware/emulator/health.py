@@ -24,12 +24,13 @@ class Health:
 
     Attributes:
         temperature: degC; a reboot does not cool the motor.
-        heating_rate: degC/s that a fault adds.
+        heating_rate: degC/s that a fault adds. strength: part of the supply that reaches the motor.
     """
 
     def __init__(self) -> None:
         self.temperature = AMBIENT
-        self.heating_rate = 0.0
+        self.heating_rate: float = 0.0
+        self.strength: float = 1.0
         self._overload_time = 0.0
 
     def reboot(self) -> None:

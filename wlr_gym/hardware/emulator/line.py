@@ -63,7 +63,7 @@ class BusLine:
 
     def __init__(self, name: str, servos: Sequence[EmulatedServo], faults: FaultBoard, timing: LineTiming) -> None:
         self.name = name
-        self.servos = list(servos)
+        self.servos: list[EmulatedServo] = list(servos)
         self.timing = timing
         self.instructions = 0
         self._faults = faults
@@ -139,8 +139,21 @@ class BusLine:
             servo.set_power(not unpowered)
             heat = active(now, "overheat", places)
             servo.health.heating_rate = heat.value if heat else 0.0
-            if active(now, "overload", places) and not unpowered:
+            if unpowered:
+                continue
+            if active(now, "overload", places):
                 servo.raise_error(OVERLOAD)
+            if active(now, "reboot_matching_tick", places):
+                servo.boot(keep_clock=True)
+            if active(now, "torque_lost", places):
+                servo.write(servo.table["torque_enable"].address, b"\0")
+            if (limit := active(now, "limit_changed", places)) is not None:
+                servo.set("goal_pwm", round(limit.value))
+            weak = active(now, "slow_servo", places)
+            servo.health.strength = weak.value if weak else 1.0
+            jump = active(now, "encoder_jump", places)
+            servo.encoder.offset = jump.value if jump else 0.0
+            servo.encoder.is_frozen = bool(active(now, "encoder_frozen", places))
 
     # ---- who answers ----
 

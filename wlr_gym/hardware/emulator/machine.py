@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, load_table
@@ -13,13 +15,15 @@ from wlr_gym.hardware.emulator.faults import Fault, FaultBoard, parse_fault
 from wlr_gym.hardware.emulator.line import BusLine, Emission, LineTiming
 from wlr_gym.hardware.emulator.servo import FIRMWARE, EmulatedServo
 from wlr_gym.hardware.imu.frames import ImuFrame, encode_frame
-from wlr_gym.hardware.imu.reading import Conversion
+from wlr_gym.hardware.imu.reading import Conversion, Counts
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState
 from wlr_gym.physics.plants.forces import Force
 from wlr_gym.robot import JOINTS, Robot
 from wlr_gym.robot.parameters import Parameters
 
+#: Frames after which the last bit changes of a chip without noise.
+IMU_DITHER = 3
 #: 30 degC as the chip counts it.
 _IMU_TEMPERATURE = round((30.0 - 36.53) * 340)
 
@@ -45,6 +49,11 @@ class MachineOptions:
     firmware: int = FIRMWARE
     factory: bool = False
     timing: LineTiming = field(default_factory=LineTiming)
+
+    def plant_options(self) -> PlantOptions:
+        """Return the options of the plant behind it."""
+        substeps = max(1, round(self.tick / 0.001))
+        return PlantOptions(control_period=self.tick, physics_step=self.tick / substeps, sensor_noise=self.sensor_noise)
 
 
 class Machine:
@@ -81,10 +90,10 @@ class Machine:
         forces: Sequence[Force] = (),
         state: PlantState | None = None,
     ) -> None:
-        self.options = options or MachineOptions()
+        self.options: MachineOptions = options or MachineOptions()
         self.robot = robot
         self.hardware = hardware
-        self.plant = plant or make_plant(self.options.backend, robot, 1, _plant_options(self.options), forces)
+        self.plant: Plant = plant or make_plant(self.options.backend, robot, 1, self.options.plant_options(), forces)
         if self.plant.count != 1 or abs(self.plant.options.control_period - self.options.tick) > 1e-12:
             raise InputError(
                 f"the emulator needs a plant of 1 robot stepped every {self.options.tick:g} s, got {self.plant.count} "
@@ -92,16 +101,18 @@ class Machine:
             )
         self.time = 0.0
         self.ticks = 0
-        self.faults = FaultBoard(self.options.seed)
+        self.faults: FaultBoard = FaultBoard(self.options.seed)
         self._imu_output: list[Emission] = []
         self._imu = Conversion(hardware.imu)
         self._frames = 0
-        self.servos = {joint: self._make_servo(joint) for joint in JOINTS}
+        self._imu_values = (0, 0, 0), (0, 0, 0)
+        self._imu_frame = ImuFrame(0, 0, (0, 0, 0), _IMU_TEMPERATURE, (0, 0, 0))
+        self.servos: dict[str, EmulatedServo] = {joint: self._make_servo(joint) for joint in JOINTS}
         servos = list(self.servos.values())
-        self.coupling = PlantCoupling(robot, hardware, self.plant, servos, parameters, self.options.seed, state)
+        self.coupling: PlantCoupling = PlantCoupling(robot, hardware, self.plant, servos, parameters, self.options.seed, state)
         for servo in servos:
             servo.boot(0.0)
-        self.lines = {
+        self.lines: dict[str, BusLine] = {
             name: BusLine(name, [self.servos[joint] for joint in bus.joints], self.faults, self.options.timing)
             for name, bus in hardware.buses.items()
         }
@@ -156,11 +167,20 @@ class Machine:
         sensors = self.coupling.sensors
         self._frames += 1
         stamp = self._frames / self.hardware.imu.rate
-        force, rate = self._imu.counts(sensors.accelerometer[0], sensors.gyro[0])
-        frame = ImuFrame(self._frames % 65536, round(stamp * 1e6) % 2**32, force, _IMU_TEMPERATURE, rate)
+        if not self.faults.active(self.time, "imu_frozen", ["imu"]):
+            self._imu_values = self._chip_counts(sensors.accelerometer[0], sensors.gyro[0])
+        force, rate = self._imu_values
+        if not self.faults.active(self.time, "imu_stale", ["imu"]):
+            self._imu_frame = ImuFrame(self._frames % 65536, round(stamp * 1e6) % 2**32, force, _IMU_TEMPERATURE, rate)
+        frame = self._imu_frame
         raw, delay = self.faults.mangle(self.time, encode_frame(frame), ["imu"])
         if raw and not self.faults.happens(self.time, "dead", ["imu"]):
             self._imu_output.append(Emission(self.time + delay, raw))
+
+    def _chip_counts(self, accelerometer: np.ndarray, gyro: np.ndarray) -> tuple[Counts, Counts]:
+        """Return what the chip counts. Its last bit never rests, also where the plant's sensors have no noise."""
+        force, (x, y, z) = self._imu.counts(accelerometer, gyro)
+        return force, (x, y, z if self.options.sensor_noise else z + self._frames // IMU_DITHER % 2)
 
     def take_imu_output(self) -> list[Emission]:
         """Return the frames sent since the last call."""
@@ -194,8 +214,3 @@ class Machine:
         self.coupling.supply = max(0.0, self.coupling.nominal_supply - (sag.value if sag else 0.0))
         for line in self.lines.values():
             line.apply_faults(self.time)
-
-
-def _plant_options(options: MachineOptions) -> PlantOptions:
-    substeps = max(1, round(options.tick / 0.001))
-    return PlantOptions(control_period=options.tick, physics_step=options.tick / substeps, sensor_noise=options.sensor_noise)

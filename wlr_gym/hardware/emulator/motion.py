@@ -26,7 +26,8 @@ class Shaft:
     """What the physics hands to a servo each tick.
 
     Attributes:
-        position, velocity: rad from encoder count 0, rad/s.
+        position, velocity: rad from encoder count 0, rad/s, as the encoder says.
+        true_position, true_velocity: as it is.
         effort: counts of Present Current or Present Load, positive as the encoder counts.
         load: motor torque over stall torque, 0 to about 1.
         voltage: V at the servo.
@@ -36,11 +37,38 @@ class Shaft:
 
     position: float = 0.0
     velocity: float = 0.0
+    true_position: float = 0.0
+    true_velocity: float = 0.0
     effort: int = 0
     load: float = 0.0
     voltage: float = 12.0
     pwm: float = 0.0
     reference: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)
+
+
+class ShaftEncoder:
+    """What a servo's encoder says of its shaft.
+
+    Attributes:
+        offset: rad that it is off. is_frozen: it repeats its reading.
+    """
+
+    def __init__(self) -> None:
+        self.offset = 0.0
+        self.is_frozen = False
+        self._position = 0.0
+
+    @property
+    def is_true(self) -> bool:
+        """Whether it says what is."""
+        return self.offset == 0.0 and not self.is_frozen
+
+    def read(self, position: float, velocity: float) -> tuple[float, float]:
+        """Return position (rad) and velocity (rad/s) as the firmware sees them."""
+        if self.is_frozen:
+            return self._position, 0.0
+        self._position = position + self.offset
+        return self._position, velocity
 
 
 @dataclass(frozen=True)

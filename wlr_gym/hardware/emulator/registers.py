@@ -26,7 +26,7 @@ class Registers:
 
     def __init__(self, table: ControlTable, present: Mapping[str, Callable[[], int]], changed: Callable[[str], None]) -> None:
         self.table = table
-        self.memory = bytearray(TABLE_SIZE)
+        self.memory: bytearray = bytearray(TABLE_SIZE)
         self._present = present
         self._changed = changed
         items = table.items.values()
@@ -76,8 +76,19 @@ class Registers:
         if length == 0 or address + length > TABLE_SIZE:
             return Error.ACCESS, b""
         if not self._pointers.keys().isdisjoint(range(address, address + length)):
-            return Error.NONE, b"".join(self._read_plain(self._resolve(a), 1) for a in range(address, address + length))
+            runs = self._runs(address, length)
+            return Error.NONE, b"".join(self._read_plain(place, size) for place, size in runs)
         return Error.NONE, self._read_plain(address, length)
+
+    def _runs(self, address: int, length: int) -> list[tuple[int, int]]:
+        """Return the neighbouring bytes, as (address, length), that a block with indirect data stands for."""
+        runs: list[tuple[int, int]] = []
+        for place in map(self._resolve, range(address, address + length)):
+            if runs and sum(runs[-1]) == place:
+                runs[-1] = runs[-1][0], runs[-1][1] + 1
+            else:
+                runs.append((place, 1))
+        return runs
 
     def _read_plain(self, address: int, length: int) -> bytes:
         block = (address, length)

@@ -20,7 +20,7 @@ from wlr_gym.hardware.dynamixel.tables import (
     Item,
 )
 from wlr_gym.hardware.emulator.health import Health
-from wlr_gym.hardware.emulator.motion import FULL_PWM, EncoderFrame, MotorDrive, Shaft, motor_drive
+from wlr_gym.hardware.emulator.motion import FULL_PWM, EncoderFrame, MotorDrive, Shaft, ShaftEncoder, motor_drive
 from wlr_gym.hardware.emulator.registers import GOAL_REGISTERS, Registers
 
 # Not in the e-manual: chosen.
@@ -48,6 +48,7 @@ class EmulatedServo:
     Attributes:
         registers: its control table's content.
         shaft: written by the physics before :meth:`advance`.
+        encoder: what it sees of the shaft.
         health: temperature and load.
         dead: no power at the electronics: silent, motor off.
         set, read: see :class:`Registers`.
@@ -57,12 +58,13 @@ class EmulatedServo:
         self.name = name
         self.table = table
         self.firmware = firmware
-        self.shaft = Shaft()
-        self.health = Health()
+        self.shaft: Shaft = Shaft()
+        self.encoder: ShaftEncoder = ShaftEncoder()
+        self.health: Health = Health()
         self.dead = False
         self._drive: MotorDrive | None = None
         self._frame = EncoderFrame(table.per_count("present_position"))
-        self.registers = Registers(table, self._make_present_values(), self._register_changed)
+        self.registers: Registers = Registers(table, self._make_present_values(), self._register_changed)
         self._get = self.registers.get
         self.set = self.registers.set
         self.read = self.registers.read
@@ -86,16 +88,17 @@ class EmulatedServo:
         self.registers.load_defaults(in_eeprom=True)
         self.set("firmware_version", self.firmware)
 
-    def boot(self, silence: float = BOOT_TIME) -> None:
+    def boot(self, silence: float = BOOT_TIME, *, keep_clock: bool = False) -> None:
         """Start the firmware: RAM to its defaults, latches cleared, torque as Startup Configuration says.
 
         Args:
             silence: s during which it does not answer.
+            keep_clock: Realtime Tick goes on.
         """
         self.registers.load_defaults(in_eeprom=False)
         self.health.reboot()
-        self._registered: tuple[int, bytes] | None = None
-        self._clock = 0.0
+        self._registered = None
+        self._clock = self._clock if keep_clock else 0.0
         self._silence = silence
         self._since_packet = 0.0
         self._shut_down = False

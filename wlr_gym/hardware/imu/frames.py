@@ -100,6 +100,6 @@ class FrameParser:
     def _take(self, raw: bytes) -> ImuFrame:
         _, sequence, microseconds, ax, ay, az, temperature, gx, gy, gz = _LAYOUT.unpack(raw[:-2])
         if self._last is not None:
-            self.lost += (sequence - self._last - 1) % 65536
+            self.lost += (sequence - self._last - 1) % 65536 if sequence != self._last else 0  # the same again is none lost
         self._last = sequence
         return ImuFrame(sequence, microseconds, (ax, ay, az), temperature, (gx, gy, gz))

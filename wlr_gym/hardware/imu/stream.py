@@ -12,8 +12,12 @@ from wlr_gym.hardware.imu.frames import FrameParser, ImuFrame
 from wlr_gym.hardware.imu.reading import Conversion, ImuGoneError, ImuReading, ImuStatistics
 from wlr_gym.hardware.ports import open_serial
 
-#: Bytes taken at once; more than the system keeps for a port nobody reads.
+#: Bytes taken at once; systems give 4 kB at a time, and keep more for a port that nobody reads.
 _CHUNK = 65536
+#: Reads until the port must be empty: 256 kB.
+_LARGEST_BACKLOG = 64
+#: s since the port was last empty, up to which frames are hardly older than that: they relate the clocks.
+RECENT = 0.1
 
 
 class Device(Protocol):
@@ -39,30 +43,44 @@ class StreamClock:
 
     The frame that came soonest after its stamp sets the offset between the clocks, so ages are short by at most what that one
     took: at a poll, up to one frame period. The microcontroller's clock may be wrong by ``drift`` (a ceramic resonator is by
-    0.5 %, an RC oscillator by 2 %). A clock that jumps further than ``latest`` restarted.
+    0.5 %, an RC oscillator by 2 %). A clock that goes back, or that is ahead of ours by more than ``jump``, restarted.
     """
 
-    drift = 0.02  #: part by which the microcontroller's clock may be wrong
-    latest = 2.0  #: s
+    drift: float = 0.02  #: part by which the microcontroller's clock may be wrong
+    jump: float = 0.1  #: s
     _turn = 2**32 * 1e-6  #: s after which the clock wraps
 
     def __init__(self) -> None:
         self._offset: float | None = None
         self._time = 0.0
+        self._last = 0
 
-    def age(self, microseconds: int, now: float) -> tuple[float, bool]:
-        """Return the age (s) of a frame that is here at ``now`` (s), and whether the microcontroller restarted."""
+    def age(self, microseconds: int, now: float, *, is_recent: bool = True) -> tuple[float | None, bool]:
+        """Return the age (s) of a frame that is here at ``now`` (s), and whether the microcontroller restarted.
+
+        Args:
+            microseconds: the frame's stamp.
+            now: s.
+            is_recent: the port was empty a moment ago, so the frame is hardly older. Only such a frame can relate the clocks:
+                in a backlog nobody knows how old the newest is. The age is None while they are not related.
+        """
         sample = microseconds * 1e-6 - now
         if self._offset is None:
-            self._offset, self._time = sample, now
+            return self._relate(microseconds, now, is_recent), False
         ahead = (sample - self._offset + self._turn / 2) % self._turn - self._turn / 2
         drift = self.drift * (now - self._time)
-        if ahead > 0.1 + drift or ahead < -self.latest - drift:
-            self._offset, self._time = sample, now
-            return 0.0, True
+        is_back = (microseconds - self._last) % 2**32 > 2**31
+        if is_back or ahead > self.jump + drift:
+            return self._relate(microseconds, now, is_recent), True
+        self._last = microseconds
         if ahead > -drift:
             self._offset, self._time = self._offset + ahead, now
         return max(0.0, -ahead - drift), False
+
+    def _relate(self, microseconds: int, now: float, is_recent: bool) -> float | None:
+        self._last, self._time = microseconds, now
+        self._offset = microseconds * 1e-6 - now if is_recent else None
+        return 0.0 if is_recent else None
 
 
 class ImuStream:
@@ -95,6 +113,7 @@ class ImuStream:
         self._parser = FrameParser()
         self._frame_clock = StreamClock()
         self._newest: tuple[ImuFrame, float] | None = None
+        self._emptied_at = self._clock()
 
     def open(self) -> None:
         """Open the port and throw away what piled up in it.
@@ -105,6 +124,7 @@ class ImuStream:
         self._reset()
         self._device = self._make_device(self._port)
         self._device.reset_input_buffer()
+        self._emptied_at = self._clock()
 
     def close(self) -> None:
         """Close the port."""
@@ -131,13 +151,14 @@ class ImuStream:
         return frames
 
     def read(self) -> ImuReading | None:
-        """Return the newest frame; see :class:`wlr_gym.hardware.imu.driver.Imu`."""
+        """Return the newest frame; see :class:`wlr_gym.hardware.imu.driver.Imu`. None also while nobody knows how old it is."""
         frames = self.frames()
         now = self._clock()
+        is_recent, self._emptied_at = now - self._emptied_at <= RECENT, now
         if frames:
-            age, restarted = self._frame_clock.age(frames[-1].microseconds, now)
+            age, restarted = self._frame_clock.age(frames[-1].microseconds, now, is_recent=is_recent)
             self.statistics.restarts += restarted
-            self._newest = frames[-1], now - age
+            self._newest = None if age is None else (frames[-1], now - age)
         if self._newest is None:
             return None
         frame, taken = self._newest
@@ -146,7 +167,13 @@ class ImuStream:
     def _received(self) -> bytes:
         if self._device is None:
             raise ImuGoneError(f"IMU port {self._port.port}: not open")
+        data = b""
         try:
-            return self._device.read(_CHUNK)
+            for _ in range(_LARGEST_BACKLOG):
+                part = self._device.read(_CHUNK)
+                data += part
+                if not part:
+                    break
+            return data
         except (OSError, TypeError) as error:  # pyserial's exceptions are OSErrors; TypeError: its port was closed
             raise ImuGoneError(f"IMU port {self._port.port} is gone: {error}") from None

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import Counter
-from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import Profile
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
-from wlr_gym.hardware.safety import preflight, rules
-from wlr_gym.hardware.safety.rules import Decision, Memory, RobotStatus
+from wlr_gym.hardware.dynamixel.errors import NoAnswerError
+from wlr_gym.hardware.safety import preflight, registers, rules
+from wlr_gym.hardware.safety.check import Check
+from wlr_gym.hardware.safety.rules import Decision, Memory
+from wlr_gym.hardware.safety.state import Level, RobotStatus
 from wlr_gym.hardware.servos import JointReadings, Servos
 from wlr_gym.hardware.timing import Clock
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
@@ -80,7 +82,7 @@ class CommandLimiter:
         self.__servos = servos
         self.robot, self.hardware, self.limits = robot, hardware, hardware.safety
         self.dry_run = dry_run
-        self.profile = profile or Profile()
+        self.profile: Profile = profile or Profile()
         self.interventions: Counter[str] = Counter()
         self.setpoints = np.zeros(len(JOINTS))
         self.torque_on = np.zeros(len(JOINTS), bool)
@@ -98,27 +100,23 @@ class CommandLimiter:
         """Read all joints; see :meth:`Servos.read`."""
         return self.__servos.read()
 
+    @property
+    def broken_packets(self) -> int:
+        """Packets with a wrong checksum; see :attr:`Servos.broken_packets`."""
+        return self.__servos.broken_packets
+
     def read_health(self) -> tuple[Array, Array]:
         """Return voltages and temperatures; see :meth:`Servos.read_health`."""
         return self.__servos.read_health()
 
-    def latched(self, joints: Iterable[str]) -> list[str]:
-        """Return those of the joints whose watchdog has stopped them, or that do not say."""
-        return [joint for joint in joints if not self._listens(joint)]
-
-    def _listens(self, joint: str) -> bool:
-        try:
-            return self.__servos.get(joint, "bus_watchdog") >= 0
-        except (NoAnswerError, RefusedError):
-            return False
-
-    def check(self, reads: int) -> list[preflight.Check]:
+    def check(self, reads: int) -> list[Check]:
         """Return all preflight checks. A watchdog that an earlier run left latched is cleared, where nothing else is wrong."""
+        self.__servos.unsupervise()  # a servo that had no power meanwhile has lost its indirect addresses
         self.__servos.set_patience(CALM_PATIENCE)
         found = self._examine()
         wrong = [check for check in found if not check.ok and check.is_fatal]
         if wrong and not self.dry_run and all(check.what == "watchdog" for check in wrong):
-            preflight.mend(self.__servos, wrong)
+            registers.mend(self.__servos, wrong)
             found = self._examine()
             wrong = [check for check in found if not check.ok and check.is_fatal]
         if not wrong:
@@ -126,7 +124,7 @@ class CommandLimiter:
             found.append(preflight.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
         return found
 
-    def _examine(self) -> list[preflight.Check]:
+    def _examine(self) -> list[Check]:
         return preflight.check_servos(self.__servos, self.robot, self.hardware)
 
     # ---- life ----
@@ -136,18 +134,33 @@ class CommandLimiter:
         """Whether torque may be on."""
         return self._armed
 
-    def arm(self) -> None:
-        """Prepare registers, ask for no motion, switch torque on, arm the watchdog.
+    def prepare(self) -> None:
+        """Set the registers that a run depends on, with torque off.
 
         Raises:
-            NoAnswerError, RefusedError, BusGoneError: a servo did not take it. Torque may be on: call :meth:`off`.
+            NoAnswerError, RefusedError, BusGoneError: a servo did not take it.
         """
         self._memory = Memory()
         self.__servos.set_patience(CALM_PATIENCE)
         self.ratings = rules.ratings_of(self.robot, self.ratings.period, *self._register_limits())
-        self._armed = True
         if not self.dry_run:
-            self._prepare()
+            goal_pwm = self._prepare()
+            self.ratings = replace(
+                self.ratings,
+                watchdog=self._watchdog_count,
+                goal_pwm=goal_pwm,
+                pwm_share=self.__servos.joint_map.pwm_share(goal_pwm),
+                profile=self.profile,
+            )
+            self.__servos.supervise()
+
+    def arm(self) -> None:
+        """Ask for no motion, switch torque on, arm the watchdog; :meth:`prepare` comes first.
+
+        Raises:
+            NoAnswerError, RefusedError, BusGoneError: a servo did not take it. Torque may be on: call :meth:`off`.
+        """
+        self._armed = True
         self.setpoints = rules.resting(self._positions())
         self.torque_on[:] = True
         if self.dry_run:
@@ -163,7 +176,7 @@ class CommandLimiter:
 
     def _arm_watchdogs(self) -> None:
         """Arm all watchdogs at once, and see that they are: where one bus is waited for, those of the other one would trip."""
-        count = math.ceil(self.limits.watchdog / WATCHDOG_UNIT - 1e-9)  # up: what is judged by the limit has not tripped yet
+        count = self._watchdog_count
         wrong: list[str] = []
         for _ in range(_ARM_TRIES):
             self.__servos.write_item("bus_watchdog", dict.fromkeys(JOINTS, count))
@@ -173,10 +186,17 @@ class CommandLimiter:
                 return
         raise NoAnswerError(f"the watchdog of {', '.join(wrong)} does not say that it is armed")
 
-    def _prepare(self) -> None:
+    @property
+    def _watchdog_count(self) -> int:
+        return math.ceil(self.limits.watchdog / WATCHDOG_UNIT - 1e-9)  # up: what is judged by the limit has not tripped yet
+
+    def _prepare(self) -> Array:
+        """Set the registers that a run depends on; return Goal PWM (8,) in counts."""
         servos = self.__servos
-        for joint in JOINTS:
-            servos.set(joint, "goal_pwm", servos.get(joint, "pwm_limit"))
+        goal_pwm = np.zeros(len(JOINTS))
+        for k, joint in enumerate(JOINTS):
+            goal_pwm[k] = servos.get(joint, "pwm_limit")
+            servos.set(joint, "goal_pwm", int(goal_pwm[k]))
             for item in _PREPARED:
                 default = servos.table(joint)[item].default
                 assert isinstance(default, int)
@@ -184,6 +204,7 @@ class CommandLimiter:
             for item, value in self._profile_of(joint).items():
                 count = round(value / servos.table(joint).per_count(item))
                 servos.set(joint, item, count if value == 0.0 else max(1, count))  # 0 would be no profile at all
+        return goal_pwm
 
     def _profile_of(self, joint: str) -> dict[str, float]:
         """Profile registers of a joint, rad/s and rad/s2."""
@@ -248,7 +269,7 @@ class CommandLimiter:
         decision = rules.decide(limits, self.ratings, status, self._memory, self.setpoints, wanted, torque_on)
         self._memory = decision.memory
         self.interventions.update({*decision.limited, *(verdict.rule for verdict in decision.verdicts)})
-        if decision.level == rules.Level.OFF:
+        if decision.level == Level.OFF:
             return decision
         self.setpoints = decision.setpoints
         if not self.dry_run:
@@ -268,18 +289,21 @@ class CommandLimiter:
         All buses at once and unconfirmed first, so that a dead one does not delay the others; then each servo until it has
         confirmed. A port that is gone is opened again when it is back.
         """
-        self._armed = False
         self.torque_on[:] = False
         if self.dry_run:
+            self._armed = False
             return []
         servos = self.__servos
+        servos.unsupervise()
         for _ in range(2):
             servos.torque_off_unacknowledged()
         end = self._clock.now() + self.limits.off_time
-        while (left := servos.torque_off(1)) and self._clock.now() < end:
+        left: list[str] = list(JOINTS)
+        while (left := servos.torque_off(1, left)) and self._clock.now() < end:
             self._clock.wait_until(self._clock.now() + _OFF_PAUSE)
             servos.reopen_gone()
         with contextlib.suppress(ConnectionError):
             # it stays armed where a motor may still be on
             servos.write_item("bus_watchdog", {joint: 0 for joint in JOINTS if joint not in left})
+        self._armed = False  # not before: an interrupted attempt is made again
         return left

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,14 +13,17 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.calibration import ACCEL_REST, GYRO_REST, motion
-from wlr_gym.hardware.config import Hardware, ImuPort
+from wlr_gym.hardware.config import Bus, Hardware, ImuPort
 from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError, RestlessLineError
-from wlr_gym.hardware.dynamixel.tables import ControlTable, load_table
+from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.hardware.imu.driver import Imu
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
 from wlr_gym.hardware.imu.reading import ImuGoneError
-from wlr_gym.hardware.ports import PortInUseError
+from wlr_gym.hardware.ports import PortInUseError, is_pseudo_terminal
+from wlr_gym.hardware.safety.check import Check
+from wlr_gym.hardware.safety.registers import REPAIR, REQUIRED, check_answers, check_registers, expected_count
 from wlr_gym.hardware.servos import Servos
+from wlr_gym.hardware.timing import processor_share
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
 if TYPE_CHECKING:
@@ -35,68 +37,20 @@ FAST_READ_FIRMWARE = 45
 WARM = 60
 #: Reads before the timed ones: the bus finds out whether its servos know fast reads.
 _UNTIMED_READS = 5
+#: Share of a processor below which the computer is busy with other programs.
+_OWN_SHARE = 0.9
+#: How an emulated robot does without real time.
+STEPPED = "end other programs, or drive it in emulated time, where nothing is late: wlr deploy --emulated --stepped"
 #: s an IMU is looked at.
 LOOK_TIME = 1.0
+#: s from emptying the IMU's port until what comes is of now.
+SETTLE_TIME = 0.05
 #: rad/s a calibrated gyroscope may read at rest.
 LARGEST_RATE = 0.02
 #: rad that gravity may be off the vertical.
 LARGEST_TILT = math.radians(10.0)
 #: Part that gravity's length may be off.
 LARGEST_LENGTH_ERROR = 0.05
-
-
-class Check(NamedTuple):
-    """One thing that was looked at.
-
-    Attributes:
-        where: joint, bus, or ``robot``.
-        what: name of the check.
-        ok: as it should be.
-        found, expected: in words.
-        remedy: what to do about it.
-        is_fatal: nothing may move while it is not ok; else a warning.
-        fix: item and count to write (torque off) that would mend it; None = by hand.
-    """
-
-    where: str
-    what: str
-    ok: bool
-    found: str
-    expected: str
-    remedy: str
-    is_fatal: bool = True
-    fix: tuple[str, int] | None = None
-
-    def __str__(self) -> str:
-        state = "ok" if self.ok else "FAULT" if self.is_fatal else "warning"
-        text = f"{state:8}{self.where:10} {self.what}: {self.found}"
-        return text if self.ok else f"{text}, expected {self.expected}. {self.remedy}"
-
-
-@dataclass(frozen=True)
-class _Rule:
-    """An item that must hold a count; ``expected`` None: what the hardware file's ``eeprom`` says, else the default."""
-
-    item: str
-    expected: int | None
-    reason: str
-    is_fatal: bool = True
-
-
-_RULES = (
-    _Rule("operating_mode", None, "setpoints would be read as another quantity"),
-    _Rule("drive_mode", 0, "direction and profile units belong in the hardware file, torque must not come on by itself"),
-    _Rule(
-        "homing_offset",
-        0,
-        "with an offset a watchdog stop may move the motor (DynamixelSDK #584); use the hardware file's zero",
-    ),
-    _Rule("startup_configuration", 0, "torque must not come on at power-up"),
-    _Rule("shutdown", None, "overload, overheating and electrical shock must cut torque"),
-    _Rule("temperature_limit", None, "the factory's limit protects the motor"),
-    _Rule("status_return_level", 2, "refused writes would go unnoticed"),
-    _Rule("return_delay_time", None, "each answer waits this long", is_fatal=False),
-)
 
 
 def open_ports(servos: Servos, imu: Imu, hardware: Hardware) -> list[Check]:
@@ -143,6 +97,8 @@ def check_servos(servos: Servos, robot: Robot, hardware: Hardware, joints: Seque
 def _check_servo(servos: Servos, robot: Robot, hardware: Hardware, joint: str) -> Iterator[Check]:
     bus_name, bus = next((name, bus) for name, bus in hardware.buses.items() if joint in bus.joints)
     id, table = robot.dynamixel_ids[joint], load_table(bus.model)
+    line = servos.groups[bus_name].statistics
+    broken = line.crc_errors
     try:
         number, firmware = servos.ping(joint)
     except RestlessLineError:
@@ -151,7 +107,11 @@ def _check_servo(servos: Servos, robot: Robot, hardware: Hardware, joint: str) -
         return
     except NoAnswerError:
         remedy = f"Check power, cable and adapter of bus {bus_name} ({bus.port}), and the servo's id and baud rate with a scan."
-        yield Check(joint, "answer", False, "none", f"one from id {id} at {bus.baud_rate} bit/s", remedy)
+        found = "none"
+        if broken := line.crc_errors - broken:
+            found = f"{broken} broken packets"
+            remedy = f"Is there a second servo with id {id}? Connect them one at a time. If not: {remedy}"
+        yield Check(joint, "answer", False, found, f"one from id {id} at {bus.baud_rate} bit/s", remedy)
         return
     yield Check(joint, "answer", True, f"id {id}", "", "")
     remedy = "The hardware file names another model than is mounted, or ids are swapped."
@@ -169,46 +129,58 @@ def _check_servo(servos: Servos, robot: Robot, hardware: Hardware, joint: str) -
     fast = f"{FAST_READ_FIRMWARE} or newer for fast reads"
     yield Check(joint, "fast reads", firmware >= FAST_READ_FIRMWARE, str(firmware), fast, "Update the firmware.", False)
     try:
-        yield from _check_items(servos, bus.eeprom, joint, table)
-        yield from _check_state(servos, joint)
+        yield (answers := check_answers(servos, joint))
+        if not answers.found.isdigit():
+            return
+        found = list(check_registers(servos, bus, bus_name, joint))
+        yield from found
+        if joint in LEGS and all(check.ok for check in found if check.what in REQUIRED):  # else its angle is another one
+            yield _check_leg(servos, robot, hardware, bus, joint)
+        yield from _check_state(servos, hardware, bus, joint)
     except (NoAnswerError, RefusedError) as error:
         yield Check(joint, "reading", False, str(error), "answers", "The line is bad: check cable, termination and ground.")
 
 
-def _check_items(servos: Servos, eeprom: dict[str, int], joint: str, table: ControlTable) -> Iterator[Check]:
-    for rule in _RULES:
-        default = table[rule.item].default
-        assert isinstance(default, int), "rules are about items with a default of their own"
-        expected = eeprom.get(rule.item, default) if rule.expected is None else rule.expected
-        found = servos.get(joint, rule.item)
-        remedy = f"Write {rule.item} = {expected}: {rule.reason}."
-        fix = (rule.item, expected)
-        yield Check(joint, rule.item, found == expected, str(found), str(expected), remedy, rule.is_fatal, fix)
-
-
-def _check_state(servos: Servos, joint: str) -> Iterator[Check]:
+def _check_state(servos: Servos, hardware: Hardware, bus: Bus, joint: str) -> Iterator[Check]:
     voltage = servos.get(joint, "present_input_voltage")
-    low, high = servos.get(joint, "min_voltage_limit"), servos.get(joint, "max_voltage_limit")
+    low, high = expected_count(bus, "min_voltage_limit"), expected_count(bus, "max_voltage_limit")
+    low = max(low, math.ceil(10.0 * hardware.safety.low_voltage - 1e-9))  # below it the run would stop at once
     remedy = "Charge the battery, or check supply and cables; power should be fed in on both sides of a long chain."
     yield Check(
         joint, "supply", low <= voltage <= high, f"{voltage / 10:.1f} V", f"{low / 10:.1f} to {high / 10:.1f} V", remedy
     )
     temperature = servos.get(joint, "present_temperature")
     yield Check(joint, "temperature", temperature < WARM, f"{temperature} degC", f"below {WARM} degC", "Let it cool down.")
-    if joint in LEGS:
-        place = servos.get(joint, "present_position")
-        low, high = servos.get(joint, "min_position_limit"), servos.get(joint, "max_position_limit")
-        remedy = "Turn the leg back by hand, or correct the servo's position limits: it would jump to them."
-        yield Check(joint, "position", low <= place <= high, f"{place}", f"{low} to {high}", remedy)
     errors = servos.hardware_errors(joint)
     remedy = "Find the cause, let the servo cool, then reboot it; the latch is there for a reason."
     yield Check(joint, "hardware error", not errors, ", ".join(errors) or "none", "none", remedy)
     latched = servos.get(joint, "bus_watchdog") < 0
-    remedy = "Write bus_watchdog = 0: the line went silent in an earlier run, setpoints are refused until then."
+    remedy = f"The line went silent in an earlier run, and setpoints are refused since: {REPAIR}."
     yield Check(joint, "watchdog", not latched, "latched" if latched else "clear", "clear", remedy, True, ("bus_watchdog", 0))
     on = bool(servos.get(joint, "torque_enable"))
     remedy = "Something else drives the robot, or a run ended badly. Switching off may drop it: hold it first."
     yield Check(joint, "torque", not on, "on" if on else "off", "off", remedy)
+
+
+def _check_leg(servos: Servos, robot: Robot, hardware: Hardware, bus: Bus, joint: str) -> Check:
+    """Is the leg inside its range and its servo's turn? One that is not went past something: it is not driven back."""
+    count = servos.get(joint, "present_position")
+    angle = float(servos.joint_map.position(np.full(len(JOINTS), count))[JOINTS.index(joint)])
+    low, high = expected_count(bus, "min_position_limit"), expected_count(bus, "max_position_limit")
+    first, last = robot.leg_limits
+    ends = [int(servos.joint_map.setpoint_counts(np.full(len(JOINTS), end))[JOINTS.index(joint)]) for end in (first, last)]
+    if not low <= min(ends) <= max(ends) <= high:
+        found, expected = f"{min(ends)} to {max(ends)} counts", f"within {low} to {high}"
+        remedy = "Sign or zero in the hardware file are wrong: wlr calibrate joints."
+        return Check(joint, "range", False, found, expected, remedy)
+    margin = hardware.safety.leg_margin  # a leg may rest on its stop
+    ok = low <= count <= high and first - margin <= angle <= last + margin
+    found, expected = f"{angle:.2f} rad ({count})", f"{first:g} to {last:g} rad, and {low} to {high} counts"
+    remedy = (
+        "It is not driven back through what it went past: turn it back by hand, torque is off. "
+        "If it is where it should be, its zero is wrong: wlr calibrate joints."
+    )
+    return Check(joint, "position", ok, found, expected, remedy)
 
 
 def check_bus_speed(servos: Servos, reads: int, budget: float, now: Callable[[], float] = time.perf_counter) -> Check:
@@ -233,9 +205,20 @@ def check_bus_speed(servos: Servos, reads: int, budget: float, now: Callable[[],
         times[k] = now() - start
     median, slow = (1e3 * np.percentile(times, [50, 99])).tolist()
     found = f"median {median:.2f} ms, p99 {slow:.2f} ms, {lost} of {8 * reads} answers lost"
-    remedy = "Set the adapters' latency timer to 1 ms, raise the baud rate, set return_delay_time = 0, check the cables."
     ok = slow <= budget * 1e3 and lost <= 0.01 * 8 * reads
+    remedy = "" if ok else _speed_remedy(servos, now)
     return Check("robot", "bus speed", ok, found, f"p99 below {budget * 1e3:g} ms and 1 % lost", remedy)
+
+
+def _speed_remedy(servos: Servos, now: Callable[[], float]) -> str:
+    """Return what to do about a slow bus: it may be the computer that is slow."""
+    share = processor_share(now)
+    busy = f"a program that never waits gets {share:.0%} of a processor"
+    if any(map(is_pseudo_terminal, servos.ports.values())):
+        return f"This computer is too busy, or too slow, for an emulated robot in real time ({busy}): {STEPPED}."
+    if share < _OWN_SHARE:
+        return f"This computer is too busy to drive a robot ({busy}): end other programs, or use another computer."
+    return "Set the adapters' latency timer to 1 ms, raise the baud rate, set return_delay_time = 0, check the cables."
 
 
 def check_latency_timers(hardware: Hardware, system: Path = Path("/sys")) -> list[Check]:
@@ -301,7 +284,9 @@ def check_imu(imu: Imu, port: ImuPort, clock: Clock, seconds: float = LOOK_TIME)
         seconds: for how long.
     """
     try:
-        imu.read()
+        imu.read()  # what piled up does not count ...
+        clock.wait_until(clock.now() + SETTLE_TIME)
+        imu.read()  # ... nor what was thrown away behind it
         before = imu.statistics.readings, imu.statistics.lost, imu.statistics.errors
         samples = sample_imu(imu, clock, seconds)
     except ImuGoneError as error:
@@ -345,27 +330,3 @@ def _check_rest(samples: ImuSamples) -> list[Check]:
         Check("imu", "gravity", right, f"{length:.2f} m/s2", gravity, scale, False),
         Check("imu", "level", tilt < LARGEST_TILT, f"{math.degrees(tilt):.1f} deg", f"below {level}", stand),
     ]
-
-
-def mend(servos: Servos, checks: Iterable[Check]) -> list[Check]:
-    """Write the fixes of the checks that failed; return the ones that could not be mended.
-
-    A servo whose torque is on is left alone: its EEPROM is locked, and what holds it might let go.
-
-    Raises:
-        BusGoneError: a port is gone.
-    """
-    left = []
-    checks = list(checks)
-    is_on = {check.where for check in checks if check.what == "torque" and not check.ok}
-    for check in checks:
-        if check.ok:
-            continue
-        try:
-            if check.fix is None or check.where in is_on:
-                left.append(check)
-            else:
-                servos.set(check.where, *check.fix)
-        except (NoAnswerError, RefusedError):
-            left.append(check)
-    return left

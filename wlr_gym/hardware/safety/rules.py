@@ -6,130 +6,38 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from enum import IntEnum
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
 from wlr_gym.hardware.limits import SafetyLimits
-from wlr_gym.physics.servo import motor_constants
+from wlr_gym.hardware.safety import supervision
+from wlr_gym.hardware.safety.state import FINE, REQUESTS, Array, Level, Mask, Ratings, RobotStatus, Verdict
+from wlr_gym.hardware.safety.supervision import JointMemory
+from wlr_gym.physics.servo import current_law
 from wlr_gym.robot import JOINTS, LEGS, Robot
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 #: s over which the accelerometer corrects the gyroscope's vertical.
 VERTICAL_TIME = 0.5
 #: m/s2 that the accelerometer may differ from gravity while it is used for that.
 VERTICAL_BAND = 2.0
-#: Fastest believable speed of a joint, over its motor's no-load speed; a faster reading is an outlier.
-OUTLIER_SPEED = 2.0
-#: rad a reading may jump by noise alone.
-OUTLIER_NOISE = 0.03
 _N = len(JOINTS)
 _IS_LEG = np.arange(_N) < len(LEGS)
 
 
-class Level(IntEnum):
-    """What the robot may do, from harmless to worst; the worst verdict counts."""
-
-    DRIVE = 0  #: as asked, within limits
-    COAST = 1  #: the last setpoints hold
-    HOLD = 2  #: wheels stop, legs stay; goes on when the reason is over
-    STOP = 3  #: as HOLD, then torque off for good
-    OFF = 4  #: torque off now
-
-
-class Verdict(NamedTuple):
-    """One finding: how bad it is, which rule, what was found."""
-
-    level: Level
-    rule: str
-    text: str
-
-
-#: The verdict where nothing is found.
-FINE = Verdict(Level.DRIVE, "", "")
-#: Rules that somebody asks for: they are no faults.
-REQUESTS = ("stop", "emergency stop")
-
-
-@dataclass(frozen=True)
-class RobotStatus:
-    """What is known of the robot at a control step. Arrays are in joint order.
-
-    Attributes:
-        time: s.
-        position, velocity, effort: (8,) last good readings, rad, rad/s, N m.
-        silence: (8,) s since the joint's last good reading; 0 = it answered in this step.
-        alert, restarted: (8,) hardware error; rebooted since the last reading.
-        voltage, temperature: (8,) V, degC, as last read.
-        gyro, accelerometer: (3,) rad/s, m/s2, body frame.
-        imu_silence: s since the IMU's last reading.
-        up: (3,) the vertical in the body frame.
-        late_ticks: control steps in a row that started a period late or more. late_share: of the last second's.
-        operator_silence: s since the operator's last sign. idle: s for which nothing was sent to the servos.
-        lost: ports that are gone, in words. latched: joints that their watchdog has stopped, in words.
-        trouble: why log or terminal failed.
-        asked_to_stop: why a stop was asked for. asked_off: why torque is to go off at once.
-    """
-
-    time: float
-    position: Array
-    velocity: Array
-    effort: Array
-    silence: Array
-    alert: Mask
-    restarted: Mask
-    voltage: Array
-    temperature: Array
-    gyro: Array
-    accelerometer: Array
-    imu_silence: float
-    up: Array
-    late_ticks: int = 0
-    late_share: float = 0.0
-    operator_silence: float = 0.0
-    idle: float = 0.0
-    lost: str = ""
-    latched: str = ""
-    trouble: str = ""
-    asked_to_stop: str = ""
-    asked_off: str = ""
-
-
 @dataclass(frozen=True)
 class Memory:
-    """What lasts from step to step: how long things have been beyond their limits, s."""
+    """What lasts from step to step: how long things have been beyond their limits, s; motors (8,) that are on; joints."""
 
     loaded: Array = field(default_factory=lambda: np.zeros(_N))
     current: float = 0.0
     sagged: float = 0.0
     tilted: float = 0.0
     tilting: float = 0.0
-
-
-@dataclass(frozen=True)
-class Ratings:
-    """Ratings of the robot's motors, and what its servos' registers allow.
-
-    Attributes:
-        low, high: (8,) setpoints the servos take, rad and rad/s.
-        leg_limits: rad, of the robot file.
-        stall_torque: (8,) N m. amperes: (8,) A per N m. no_load_speed: (8,) rad/s.
-        period: s of a control step.
-    """
-
-    low: Array
-    high: Array
-    leg_limits: tuple[float, float]
-    stall_torque: Array
-    amperes: Array
-    no_load_speed: Array
-    period: float
+    torque_on: Mask = field(default_factory=lambda: np.ones(_N, bool))
+    joints: JointMemory = field(default_factory=JointMemory)
 
 
 def ratings_of(robot: Robot, period: float, low: Array | None = None, high: Array | None = None) -> Ratings:
@@ -137,15 +45,15 @@ def ratings_of(robot: Robot, period: float, low: Array | None = None, high: Arra
     motors = (robot.servo.leg, robot.servo.wheel)
     stall = np.repeat([motor.stall_torque for motor in motors], 4)
     speed = np.repeat([motor.no_load_speed for motor in motors], 4)
-    constant, _ = motor_constants(stall, speed, robot.servo.supply_voltage)
     return Ratings(
         np.full(_N, -np.inf) if low is None else low,
         np.full(_N, np.inf) if high is None else high,
         robot.leg_limits,
         stall,
-        1.0 / constant,
+        current_law(robot),
         speed,
         period,
+        robot.servo.supply_voltage,
     )
 
 
@@ -196,8 +104,8 @@ def decide(
     """
     on = np.ones(_N, bool) if torque_on is None else np.asarray(torque_on, bool)
     setpoints, refusal = take_request(wanted, on, status.position, previous)
-    memory = remember(limits, ratings, status, memory)
-    found = list(judge(limits, status, memory))
+    memory = remember(limits, ratings, status, memory, previous)
+    found = list(judge(limits, ratings, status, memory))
     verdicts = (*found, refusal) if refusal else tuple(found)
     level = max((verdict.level for verdict in verdicts), default=Level.DRIVE)
     if level == Level.COAST:
@@ -206,7 +114,7 @@ def decide(
         setpoints = np.where(_IS_LEG, previous, 0.0)
     start = np.where(on, previous, resting(status.position))
     setpoints, limited = limit_setpoints(limits, ratings, setpoints, start, status.position, slow_down(limits, status))
-    return Decision(level, setpoints, on, verdicts, limited if level == Level.DRIVE else {}, memory)
+    return Decision(level, setpoints, on, verdicts, limited if level == Level.DRIVE else {}, replace(memory, torque_on=on))
 
 
 # ---- the request ----
@@ -274,12 +182,12 @@ def slow_down(limits: SafetyLimits, status: RobotStatus) -> float:
 # ---- supervision ----
 
 
-def remember(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: Memory) -> Memory:
+def remember(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: Memory, previous: Array) -> Memory:
     """Count on how long things have been beyond their limits; loads and currents cool down as fast as they heat up."""
     period = ratings.period
     over = np.abs(status.effort) > limits.load * ratings.stall_torque
     loaded = np.maximum(memory.loaded + np.where(over, period, -period), 0.0)
-    amperes = float(np.abs(status.effort) @ ratings.amperes)
+    amperes = float(np.abs(ratings.currents.current(status.effort, status.velocity)).sum())
     current = max(memory.current + (period if amperes > limits.current else -period), 0.0)
     sagging = bool(np.nanmin(status.voltage, initial=np.inf) < limits.low_voltage)
     tilting = max(tilt_of(status.up), tilt_of(turned(status.up, status.gyro, limits.tilt_horizon))) > limits.tilt
@@ -289,10 +197,12 @@ def remember(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory
         memory.sagged + period if sagging else 0.0,
         memory.tilted + period if tilt_of(status.up) > limits.tilt else 0.0,
         memory.tilting + period if tilting else 0.0,
+        memory.torque_on,
+        supervision.remember(limits, ratings, status, memory.joints, previous, memory.torque_on),
     )
 
 
-def judge(limits: SafetyLimits, status: RobotStatus, memory: Memory) -> Iterator[Verdict]:
+def judge(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: Memory) -> Iterator[Verdict]:
     """Yield every finding of a control step."""
     if status.asked_off:
         yield Verdict(Level.OFF, "emergency stop", status.asked_off)
@@ -303,13 +213,14 @@ def judge(limits: SafetyLimits, status: RobotStatus, memory: Memory) -> Iterator
     if status.idle > limits.watchdog:
         text = f"nothing was sent for {status.idle:.2f} s: the servos' watchdog has stopped them, and they refuse setpoints"
         yield Verdict(Level.OFF, "idle", text)
-    if status.latched:
-        text = f"{status.latched} heard nothing for too long: the servos' watchdog has stopped them, and they refuse setpoints"
+    if latched := ", ".join(JOINTS[k] for k in np.flatnonzero(status.registers.watchdog < 0.0)):
+        text = f"{latched} heard nothing for too long: the servos' watchdog has stopped them, and they refuse setpoints"
         yield Verdict(Level.STOP, "watchdog", text)
     if status.trouble:
         yield Verdict(Level.STOP, "computer", status.trouble)
     yield from _judge_answers(limits, status)
     yield from _judge_servos(limits, status, memory)
+    yield from supervision.judge(limits, ratings, status, memory.joints, memory.torque_on)
     lean = f"{tilt_of(status.up):.2f} rad, turning at {np.linalg.norm(status.gyro[:2]):.1f} rad/s"
     if memory.tilted > limits.tilt_time:
         yield Verdict(Level.OFF, "tilt", f"{lean}, limit {limits.tilt:g}")
@@ -328,18 +239,21 @@ def _judge_answers(limits: SafetyLimits, status: RobotStatus) -> Iterator[Verdic
     longest = float(status.silence.max())
     if longest > 0.0:
         joints = ", ".join(JOINTS[k] for k in np.flatnonzero(status.silence > 0.0))
-        text = f"no answer from {joints} for {longest:.2f} s"
+        text = f"no answer from {joints} for {longest:.2f} s (limit {limits.silence:g} s): check cable and power"
+        if status.broken:
+            text += f"; {status.broken} broken packets came instead: two servos with the same id, or a bad line"
         level = Level.OFF if longest > limits.silence else Level.HOLD if longest > limits.coast else Level.COAST
         yield Verdict(level, "silence", text)
     if status.imu_silence > limits.imu_silence:
-        yield Verdict(Level.STOP, "imu", f"no reading for {status.imu_silence:.2f} s")
+        text = f"no reading for {status.imu_silence:.2f} s (limit {limits.imu_silence:g} s): check cable and power"
+        yield Verdict(Level.STOP, "imu", text)
 
 
 def _judge_servos(limits: SafetyLimits, status: RobotStatus, memory: Memory) -> Iterator[Verdict]:
     for k in np.flatnonzero(status.restarted):
         yield Verdict(Level.OFF, "restart", f"{JOINTS[k]} was rebooted or had no power")
     for k in np.flatnonzero(status.alert):
-        yield Verdict(Level.STOP, "alert", f"{JOINTS[k]} has a hardware error")
+        yield Verdict(Level.STOP, "alert", f"{JOINTS[k]} has a hardware error: {supervision.error_text(status, int(k))}")
     for k in np.flatnonzero(status.temperature >= limits.hot):
         yield Verdict(Level.STOP, "temperature", f"{JOINTS[k]} has {status.temperature[k]:.0f} degC, limit {limits.hot:g}")
     for k in np.flatnonzero(memory.loaded > limits.load_time):
@@ -376,13 +290,3 @@ def next_up(up: Array, gyro: Array, accelerometer: Array, time: float) -> Array:
 def tilt_of(up: Array) -> float:
     """Return the angle (rad) between the body's z axis and the vertical."""
     return float(np.arccos(np.clip(up[2], -1.0, 1.0)))
-
-
-# ---- readings ----
-
-
-def plausible(ratings: Ratings, before: RobotStatus, position: Array, time: float) -> Mask:
-    """Return which positions (8,) a joint can have reached since the last look; NaN is none."""
-    elapsed = np.maximum(time - before.time, ratings.period) + before.silence
-    reach = OUTLIER_SPEED * ratings.no_load_speed * elapsed + OUTLIER_NOISE
-    return np.abs(position - before.position) <= reach

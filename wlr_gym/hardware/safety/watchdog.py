@@ -1,14 +1,17 @@
-"""A second process that switches the motors off when the one that drives the robot dies without doing it (``kill -9``).
+"""A second process that switches the motors off when the one that drives the robot dies or hangs (``kill -9``, SIGSTOP).
 
-``python -m wlr_gym.hardware.safety.watchdog`` reads one line of JSON (buses and ids), answers ``ready`` and waits. ``done``
-ends it. When the other process is gone instead, it opens the ports and switches torque off until every servo has confirmed.
-Until it is that far, the servos' Bus Watchdog has stopped the motion.
+``python -m wlr_gym.hardware.safety.watchdog`` reads one line of JSON (buses and ids), answers ``ready`` and waits. Then each
+line is a sign of life: the seconds within which the next one comes. The control step gives it, never a thread of its own: a
+process whose control loop hangs gives none. ``done`` ends it. When the other process is gone instead, it opens the ports and
+switches torque off until every servo has confirmed; one that hangs it kills first, for the ports are held exclusively. Until it
+is that far, the servos' Bus Watchdog has stopped the motion.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import select
 import signal
@@ -27,6 +30,8 @@ from wlr_gym.robot import Robot
 START_TIME = 30.0
 #: s to go on trying to reach a servo.
 TRY_TIME = 60.0
+#: s that a killed process may take to be gone.
+KILL_TIME = 5.0
 #: s between looks at whether its parent lives.
 LOOK_TIME = 0.05
 #: s between tries to switch off.
@@ -39,6 +44,9 @@ class WatchdogProcess:
     Args:
         robot, hardware: ids and ports.
         log: folder in which the process notes what it did (``guard.jsonl``); None = nowhere.
+
+    Attributes:
+        trouble: why it takes no signs of life; empty = it does.
 
     Raises:
         InputError: the process does not start.
@@ -55,9 +63,11 @@ class WatchdogProcess:
             }
             for name, bus in hardware.buses.items()
         ]
+        self.trouble = ""
         self.process = subprocess.Popen(
             [sys.executable, "-m", "wlr_gym.hardware.safety.watchdog"],
             stdin=subprocess.PIPE,
+            bufsize=0,
             stdout=subprocess.PIPE,
             start_new_session=True,  # a Ctrl-C at the terminal is for the driving process
         )
@@ -66,12 +76,20 @@ class WatchdogProcess:
         assert self.process.stdout is not None
         with contextlib.suppress(OSError):
             self.process.stdin.write(json.dumps(spec).encode() + b"\n")
-            self.process.stdin.flush()
         is_up = select.select([self.process.stdout], [], [], START_TIME)[0]
         if not is_up or self.process.stdout.readline() != b"ready\n":
             self.process.kill()
             self.process.wait()
             raise InputError("the watchdog process does not start; without it nothing is driven")
+        os.set_blocking(self.process.stdin.fileno(), False)  # a control step waits for nobody
+
+    def expect(self, seconds: float) -> None:
+        """Give a sign of life: the next one comes within ``seconds``, or this process hangs; inf = there may be none."""
+        assert self.process.stdin is not None
+        try:
+            os.write(self.process.stdin.fileno(), f"{seconds:g}\n".encode())
+        except OSError as error:
+            self.trouble = f"the watchdog process is gone: {error}"
 
     def release(self) -> None:
         """Report that torque is off, and let the process end."""
@@ -81,6 +99,43 @@ class WatchdogProcess:
             self.process.stdin.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(2.0)
+
+
+class Guard:
+    """The watchdog process of a control loop, from its start until torque is off.
+
+    Args:
+        robot, hardware: see :class:`WatchdogProcess`.
+        is_wanted: False = there is none, and nothing here does anything.
+
+    Attributes:
+        process: None = it does not run.
+    """
+
+    def __init__(self, robot: Robot, hardware: Hardware, is_wanted: bool) -> None:
+        self.process: WatchdogProcess | None = None
+        self._robot, self._hardware, self._is_wanted = robot, hardware, is_wanted
+
+    def start(self, log: Path | None) -> None:
+        """Start the process, if it does not run; see :class:`WatchdogProcess`."""
+        if self._is_wanted and self.process is None:
+            self.process = WatchdogProcess(self._robot, self._hardware, log)
+
+    def expect(self, seconds: float) -> None:
+        """Give a sign of life; see :meth:`WatchdogProcess.expect`."""
+        if self.process is not None:
+            self.process.expect(seconds)
+
+    @property
+    def trouble(self) -> str:
+        """Why the process takes no signs of life; empty = it does, or there is none."""
+        return "" if self.process is None else self.process.trouble
+
+    def release(self) -> None:
+        """Let the process end: torque is off."""
+        if self.process is not None:
+            self.process.release()
+            self.process = None
 
 
 def switch_off(groups: list[BusGroup], seconds: float) -> dict[str, set[int]]:
@@ -94,25 +149,38 @@ def switch_off(groups: list[BusGroup], seconds: float) -> dict[str, set[int]]:
                 group.write_all("torque_enable", dict.fromkeys(group.servos, 0))
         for group in groups:
             with contextlib.suppress(InputError, ConnectionError):
-                left[group.name] = group.torque_off(1)
+                left[group.name] = group.torque_off(1, left[group.name])
             group.close()
         if not any(left.values()) or time.monotonic() > end:
             return {name: ids for name, ids in left.items() if ids}
         time.sleep(_PAUSE)
 
 
-def _wait_for_the_end(parent: int) -> bool:
-    """Return whether the driving process is gone without having said ``done``."""
-    text = b""
+def _wait_for_the_end(parent: int) -> str:
+    """Return why motors must be switched off, once they must: ``gone`` or ``hangs``; empty = it said ``done``."""
+    rest, end = b"", math.inf
     while os.getppid() == parent:
         if select.select([0], [], [], LOOK_TIME)[0]:
             data = os.read(0, 4096)
-            text += data
-            if b"done" in text:
-                return False
+            *lines, rest = (rest + data).split(b"\n")
+            if b"done" in lines:
+                return ""
             if not data:
-                return True
-    return True
+                return "gone"
+            if lines:
+                end = time.monotonic() + float(lines[-1])
+        elif time.monotonic() > end:
+            return "hangs"
+    return "gone"
+
+
+def _kill(parent: int) -> None:
+    """Kill the process that hangs, and wait until it is gone, and its ports free."""
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(parent, signal.SIGKILL)
+    end = time.monotonic() + KILL_TIME
+    while os.getppid() == parent and time.monotonic() < end:
+        time.sleep(0.001)
 
 
 def main() -> int:
@@ -132,13 +200,17 @@ def main() -> int:
         for bus in spec["buses"]
     ]
     os.write(1, b"ready\n")
-    if not _wait_for_the_end(parent):
+    why = _wait_for_the_end(parent)
+    if not why:
         return 0
+    if why == "hangs":
+        _kill(parent)
     left = switch_off(groups, TRY_TIME)
     if spec["log"] is not None:
         event = {
             "t": round(time.monotonic(), 6),
             "event": "torque off",
+            "driver": why,
             "unconfirmed": {name: sorted(ids) for name, ids in left.items()},
         }
         with contextlib.suppress(OSError), open(spec["log"], "ab") as file:

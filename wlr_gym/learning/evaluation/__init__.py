@@ -4,6 +4,7 @@ from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card, score
 from wlr_gym.learning.evaluation.card_report import (
     comparison_rows,
     rows,
+    seed_rows,
     sweep_comparison_rows,
     sweep_rows,
     transfer_rows,
@@ -46,6 +47,7 @@ __all__ = [
     "roll_out",
     "rows",
     "score",
+    "seed_rows",
     "start_episodes",
     "summarise",
     "sweep_comparison_rows",

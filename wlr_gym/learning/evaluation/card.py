@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -25,6 +25,8 @@ MAIN = "main"
 OTHER_PLANT = "other plant"
 #: The subject that scores are counted from, if it plays.
 IDLE = "do_nothing"
+#: Training seeds from which the interquartile mean is not the mean.
+FEWEST = 4
 #: Metrics that are compared by their difference: a share of 0 %, or of a reward with an arbitrary zero, says nothing.
 BY_DIFFERENCE = ("success", "falls", "reward")
 
@@ -36,13 +38,19 @@ def bootstrap(blocks: int, episodes: int) -> Bootstrap:
 
 
 def _bootstrap(played: Played) -> Bootstrap:
-    return bootstrap(*played.pairs["success"].shape[:2])
+    return bootstrap(*played.pairs["success"].shape[1:3])
 
 
 def scores_of(played: Played) -> Scores:
-    """Return metric -> estimate."""
-    resampling = _bootstrap(played)
-    return {key: resampling.mean(pairs) for key, pairs in played.pairs.items()}
+    """Return metric -> estimate, mean over training seeds."""
+    resampling, units = _bootstrap(played), {metric.key: metric.unit for metric in metrics_of(played.measures)}
+    return {key: _possible(resampling.mean(pairs), key, units[key]) for key, pairs in played.pairs.items()}
+
+
+def _possible(estimate: Estimate, key: str, unit: str) -> Estimate:
+    """Return an estimate without the part of its interval that cannot be: few training seeds that differ give wide ones."""
+    low = estimate.low if key == "reward" else max(estimate.low, min(0.0, estimate.mean))
+    return Estimate(estimate.mean, low, min(estimate.high, 100.0) if unit == "%" else estimate.high)
 
 
 def score(rollout: Rollout) -> Scores:
@@ -67,6 +75,49 @@ def compare(ours: Played, theirs: Played, metrics: Sequence[Metric]) -> Scores:
 
 
 @dataclass(frozen=True)
+class SeedScores:
+    """Scores of the training seeds of a recipe.
+
+    Attributes:
+        scores: training seed -> metric -> estimate; the interval is over episodes alone.
+        interquartile_mean: metric -> estimate, its interval over training seeds and episodes; empty below ``FEWEST`` seeds.
+    """
+
+    scores: Mapping[str, Scores]
+    interquartile_mean: Scores
+
+    @property
+    def median_seed(self) -> str:
+        """Training seed in the middle by tracking error (reward where the task has no limits); of two, the better one."""
+        by_error = {seed: own["tracking_error"].mean for seed, own in self.scores.items()}
+        if np.isnan(list(by_error.values())).any():
+            by_error = {seed: -own["reward"].mean for seed, own in self.scores.items()}
+        return sorted(by_error, key=lambda seed: by_error[seed])[(len(by_error) - 1) // 2]
+
+    def median(self, key: str) -> float:
+        """Return the median of a metric over training seeds."""
+        return float(np.median([own[key].mean for own in self.scores.values()]))
+
+    def spread(self, key: str) -> float:
+        """Return largest minus smallest score over the magnitude of the median, %; NaN where that is zero."""
+        values = [own[key].mean for own in self.scores.values()]
+        middle = abs(self.median(key))
+        return float(100.0 * (max(values) - min(values)) / middle) if middle > 0.0 else np.nan
+
+
+def seed_scores(played: Played, seeds: Sequence[str]) -> SeedScores:
+    """Return the scores of each training seed of a subject."""
+    resampling = _bootstrap(played)
+    pairs = played.pairs
+    scores = {
+        seed: scores_of(replace(played, pairs={key: own[index : index + 1] for key, own in pairs.items()}))
+        for index, seed in enumerate(seeds)
+    }
+    enough = len(seeds) >= FEWEST
+    return SeedScores(scores, {key: resampling.interquartile_mean(own) for key, own in pairs.items()} if enough else {})
+
+
+@dataclass(frozen=True)
 class Card:
     """Everything that was played and what it was played for.
 
@@ -74,6 +125,7 @@ class Card:
         results: condition -> subject -> what is kept. Conditions: ``MAIN``, perhaps ``OTHER_PLANT``, and those of the sweeps.
         sweeps: which were played.
         conditions: what to say about how it was played.
+        training_seeds: subject -> training seed of each of its policies, where there are several.
         identities: subject -> what identifies it; see :func:`wlr_gym.learning.evaluation.subjects.identity`.
     """
 
@@ -81,6 +133,7 @@ class Card:
     sweeps: tuple[Sweep, ...] = ()
     conditions: Mapping[str, Any] = field(default_factory=dict)
     identities: Mapping[str, str] = field(default_factory=dict)
+    training_seeds: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def main(self) -> dict[str, Played]:
@@ -122,7 +175,10 @@ class Card:
         idle = self.main[IDLE].pairs["reward"]
         resampling = _bootstrap(self.main[ours])
         reward = {name: played.pairs["reward"] for name, played in self.main.items()}
-        return {name: resampling.share(reward[ours], reward[name], idle, idle) for name in others if name != IDLE}
+        subjects = (0, 1, 2, 2)
+        return {
+            name: resampling.share(reward[ours], reward[name], idle, idle, subjects=subjects) for name in others if name != IDLE
+        }
 
     @cached_property
     def kept(self) -> dict[str, Estimate]:
@@ -130,8 +186,17 @@ class Card:
         other = self.results.get(OTHER_PLANT, {})
         if IDLE not in other:
             return {}
-        shape = other[IDLE].pairs["reward"].shape
+        blocks, episodes = other[IDLE].pairs["reward"].shape[1:3]
         there = {name: played.pairs["reward"] for name, played in other.items()}
-        here = {name: played.pairs["reward"][: shape[0], : shape[1]] for name, played in self.main.items()}
-        resampling = bootstrap(*shape[:2])
-        return {name: resampling.share(there[name], here[name], there[IDLE], here[IDLE]) for name in self.names if name != IDLE}
+        here = {name: played.pairs["reward"][:, :blocks, :episodes] for name, played in self.main.items()}
+        resampling, subjects = bootstrap(blocks, episodes), (0, 0, 2, 2)
+        return {
+            name: resampling.share(there[name], here[name], there[IDLE], here[IDLE], subjects=subjects)
+            for name in self.names
+            if name != IDLE
+        }
+
+    @cached_property
+    def seed_scores(self) -> dict[str, SeedScores]:
+        """Subject -> scores of each of its training seeds, where there are several."""
+        return {name: seed_scores(self.main[name], seeds) for name, seeds in self.training_seeds.items()}

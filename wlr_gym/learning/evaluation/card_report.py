@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from wlr_gym.base.files import replace_file, write_json, write_text
-from wlr_gym.learning.evaluation.card import BY_DIFFERENCE, MAIN, OTHER_PLANT, Card, Scores
+from wlr_gym.learning.evaluation.card import BY_DIFFERENCE, MAIN, OTHER_PLANT, Card, Scores, SeedScores
 from wlr_gym.learning.evaluation.conditions import BLOCK
 from wlr_gym.learning.evaluation.metrics import Metric
 from wlr_gym.learning.evaluation.statistics import CONFIDENCE, Estimate
@@ -18,6 +18,8 @@ from wlr_gym.learning.evaluation.statistics import CONFIDENCE, Estimate
 FORMAT = 2
 #: Beyond this a number is the quotient of something and next to nothing, such as the slip of a robot against one that rests.
 LARGEST = 1000.0
+#: Metrics that are shown for each training seed.
+PER_SEED = ("tracking_error", "success", "excess_slip", "reward")
 Table = list[list[str]]
 
 
@@ -96,6 +98,30 @@ def transfer_rows(card: Card, *, short: bool = False) -> Table:
     return table
 
 
+def seed_rows(card: Card, name: str, *, short: bool = False) -> Table:
+    """Return the scores of a subject's training seeds: a header, then one row per seed and those over all seeds."""
+    seeds = card.seed_scores[name]
+    metrics = [
+        metric for metric in card.metrics if metric.key in PER_SEED and np.isfinite(card.scores[MAIN][name][metric.key].mean)
+    ]
+
+    def row(title: str, scores: Scores) -> list[str]:
+        return [title, *(cell(scores[m.key], m.digits, short) for m in metrics)]
+
+    table = [["training seed", *(m.key if m.unit == "-" else f"{m.key} ({m.unit})" for m in metrics)]]
+    table += [row(seed, scores) for seed, scores in seeds.scores.items()]
+    table.append(row("mean", card.scores[MAIN][name]))
+    if seeds.interquartile_mean:
+        table.append(row("interquartile mean", seeds.interquartile_mean))
+    table.append(["median", *(_text(seeds.median(m.key), m.digits) for m in metrics)])
+    table.append(["(max - min) / median", *(_percent(seeds.spread(m.key)) for m in metrics)])
+    return table
+
+
+def _percent(value: float) -> str:
+    return f"{value:.0f} %" if value <= LARGEST else "-"
+
+
 def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
     """Return the card as Markdown. ``pictures``: name -> file, linked where they belong."""
     shown = dict(pictures or {})
@@ -106,7 +132,9 @@ def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
 
     lines = [f"# Score card: {ours}", "", *(f"- {name}: {value}" for name, value in card.conditions.items()), ""]
     lines += [*_table(rows(card.scores[MAIN], card.metrics)), ""]
-    lines += [f"Mean over episodes [{CONFIDENCE:.0%} bootstrap interval over seeds and episodes]; `-` where nothing moved.", ""]
+    over = "training seeds and episodes" if card.training_seeds else "seeds and episodes"
+    lines += [f"Mean over episodes [{CONFIDENCE:.0%} bootstrap interval over {over}]; `-` where nothing moved.", ""]
+    lines += _training_seeds(card)
     if len(card.names) > 1:
         lines += [f"## {ours} against the others, on the same episodes", ""]
         lines += [
@@ -135,6 +163,20 @@ def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _training_seeds(card: Card) -> list[str]:
+    lines = []
+    for name, seeds in card.seed_scores.items():
+        said = (
+            f"{len(seeds.scores)} trainings of one recipe; median seed: {seeds.median_seed}. The interval of one seed is over "
+        )
+        said += "episodes alone; that over all seeds contains training-seed variance."
+        lines += [f"## Training seeds of {name}", "", said, "", *_table(seed_rows(card, name)), ""]
+    single = [name for name in card.names if name not in card.training_seeds]
+    if lines and single:
+        lines += [f"One policy each, intervals without training-seed variance of theirs: {', '.join(single)}.", ""]
+    return lines
+
+
 def _table(table: Table) -> list[str]:
     header, *body = table
     return [f"| {' | '.join(header)} |", f"|{'---|' * len(header)}", *(f"| {' | '.join(row)} |" for row in body)]
@@ -159,11 +201,27 @@ def content(card: Card) -> dict[str, Any]:
             "better_than": _scores(card.comparison[OTHER_PLANT]),
             "score_kept": {name: _numbers(estimate) for name, estimate in card.kept.items()},
         }
+    if card.training_seeds:
+        document["training_seeds"] = {name: _seeds(seeds) for name, seeds in card.seed_scores.items()}
     return document
 
 
 def _scores(scores: Mapping[str, Scores]) -> dict[str, Any]:
-    return {name: {key: _numbers(estimate) for key, estimate in own.items()} for name, own in scores.items()}
+    return {name: _estimates(own) for name, own in scores.items()}
+
+
+def _estimates(scores: Scores) -> dict[str, Any]:
+    return {key: _numbers(estimate) for key, estimate in scores.items()}
+
+
+def _seeds(seeds: SeedScores) -> dict[str, Any]:
+    spread = {key: seeds.spread(key) for key in next(iter(seeds.scores.values()))}
+    return {
+        "scores": _scores(seeds.scores),
+        "interquartile_mean": _estimates(seeds.interquartile_mean),
+        "median_seed": seeds.median_seed,
+        "spread_in_percent_of_median": {key: value if np.isfinite(value) else None for key, value in spread.items()},
+    }
 
 
 def _numbers(estimate: Estimate) -> dict[str, float | None]:
@@ -189,15 +247,17 @@ def write_card(folder: Path, card: Card, pictures: Mapping[str, str] | None = No
 
 
 def write_episodes(path: Path, card: Card, first_seed: int) -> None:
-    """Write one row per condition, subject and episode as Parquet: seed and the episode's own metrics."""
+    """Write one row per condition, subject, training seed and episode as Parquet: seeds and the episode's own metrics."""
     import pandas
 
     frames = []
     for label, subjects in card.results.items():
         for name, played in subjects.items():
-            blocks, episodes = played.pairs["success"].shape[:2]
+            count, blocks, episodes = played.pairs["success"].shape[:3]
             seeds = first_seed + BLOCK * np.arange(blocks)[:, None] + np.arange(episodes)
-            table = {"condition": label, "policy": name, "seed": seeds.ravel()}
+            table = {"condition": label, "policy": name, "seed": np.tile(seeds.ravel(), count)}
+            if card.training_seeds:
+                table["training_seed"] = np.repeat(card.training_seeds.get(name, ("",) * count), blocks * episodes)
             with np.errstate(divide="ignore", invalid="ignore"):
                 table |= {key: (pairs[..., 0] / pairs[..., 1]).ravel() for key, pairs in played.pairs.items()}
             frames.append(pandas.DataFrame(table))

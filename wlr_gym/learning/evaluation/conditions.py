@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import groupby, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,8 +49,8 @@ class Condition:
 
     def __post_init__(self) -> None:
         for name, value, most in (("episodes", self.episodes, BLOCK), ("seeds", self.blocks, 1000)):
-            if not 1 <= value <= most:
-                raise InputError(f"{name} = {value}: expected 1 to {most}")
+            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+                raise InputError(f"{name} = {value!r}: expected a whole number from 1 to {most}")
 
     @property
     def cost(self) -> int:
@@ -65,7 +65,8 @@ Watch = Callable[[Condition, Subject, int, Rollout], object]
 
 def work(conditions: Sequence[Condition], subjects: Sequence[Subject], ticks: int) -> int:
     """Return how often ``tell`` of :func:`play` counts in all, for episodes of ``ticks`` environment steps."""
-    return sum(condition.cost * condition.blocks for condition in conditions) * len(subjects) * ticks
+    players = sum(len(subject.sources) for subject in subjects)
+    return sum(condition.cost * condition.blocks for condition in conditions) * players * ticks
 
 
 def play(
@@ -78,13 +79,15 @@ def play(
 ) -> Results:
     """Play every condition with every subject. Episode i of block k has seed ``first_seed + 10000 k + i``, whoever plays.
 
+    A subject of several training seeds plays every block with each of them.
+
     Args:
         environment: id.
         subjects: who plays.
         conditions: under which; neighbours with the same keywords and number of episodes share their environment.
         first_seed: of the first block.
         tell: called after every environment step with a description and its cost; see :func:`work`.
-        watch: called with every block that was played.
+        watch: called with every block that was played; once per training seed.
 
     Raises:
         InputError: unknown environment, policy, keyword or parameter; a policy that does not fit; or an environment of a policy
@@ -99,7 +102,7 @@ def play(
             for subject in subjects:
                 for condition in chosen:
                     blocks = _blocks(players[subject], subject, condition, first_seed, tell, watch, references)
-                    results[condition.label][subject.name] = summarise(blocks)
+                    results[condition.label][subject.name] = summarise(blocks, len(subject.sources))
     return results
 
 
@@ -121,11 +124,10 @@ def _blocks(
     watch: Watch | None,
     references: dict[tuple[str, int], _Given],
 ) -> Iterator[Rollout]:
-    """Play the blocks of a condition one after the other; each is checked against what the first subject was given."""
+    """Play the blocks of a condition with every player; each is checked against what the first subject was given."""
     text = f"{subject.name}: {condition.label}"
-    for block in range(condition.blocks):
-        core, policy = players[block % len(players)]
-        on_tick = None if tell is None else lambda: tell(text, condition.cost)
+    on_tick = None if tell is None else lambda: tell(text, condition.cost)
+    for (core, policy), block in product(players, range(condition.blocks)):
         seed = first_seed + BLOCK * block
         rollout = roll_out(core, policy, seed, on_tick, parameters=condition.parameters, commands=condition.commands)
         given = _Given(subject.name, rollout)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.envs.tasks.success import episode_max, episode_rms
+from wlr_gym.envs.tasks.success import FALL, Which, tracking_error
 from wlr_gym.learning.evaluation.rollout import Measure, Rollout
 
 Array = NDArray[np.float64]
@@ -20,8 +20,6 @@ SHORTEST_TRAVEL = 0.05
 ACTION_AT_LIMIT = 0.99
 #: Hz from which a movement of the action counts as jitter: no command of a task changes that fast.
 JITTER_FREQUENCY = 5.0
-#: What a fall adds to the tracking error of its episode, which otherwise knows the time before it only.
-FALL = 10.0
 #: Environment steps of one window of the spectrum; windows overlap by half.
 WINDOW = 128
 
@@ -84,13 +82,17 @@ def _limits(measure: Measure) -> dict[str, float]:
     return {kind: limit for kind in ("rms", "max") if (limit := getattr(measure, kind)) is not None}
 
 
+def _all_limits(measures: Sequence[Measure]) -> dict[Which, float]:
+    return {(measure.name, kind): limit for measure in measures for kind, limit in _limits(measure).items()}
+
+
 @dataclass(frozen=True)
 class Played:
-    """What is kept of S blocks of N episodes.
+    """What is kept of B blocks of N episodes, each played by T training seeds of one recipe (T = 1: one policy).
 
     Attributes:
         measures: of the task.
-        pairs: metric -> (S, N, 2), numerator and denominator of each episode. Over many episodes a metric is the sum of its
+        pairs: metric -> (T, B, N, 2), numerator and denominator of each episode. Over many episodes a metric is the sum of its
             numerators over the sum of its denominators, so that in figures per metre an episode of little travel weighs little.
         frequency: (F,) Hz. power: (F,) density of the action, mean over joints and episodes, 1/Hz; NaN if none was long enough.
     """
@@ -101,8 +103,13 @@ class Played:
     power: Array
 
 
-def summarise(rollouts: Iterable[Rollout]) -> Played:
-    """Return what is kept of blocks of episodes of the same number each; takes one after the other."""
+def summarise(rollouts: Iterable[Rollout], training_seeds: int = 1) -> Played:
+    """Return what is kept of blocks of episodes of the same number each; takes one after the other.
+
+    Args:
+        rollouts: all blocks of the first training seed, then those of the next.
+        training_seeds: how many there are.
+    """
     measures: tuple[Measure, ...] = ()
     frequency, powers, pairs = np.zeros(0), [], []
     for rollout in rollouts:
@@ -113,7 +120,10 @@ def summarise(rollouts: Iterable[Rollout]) -> Played:
     power = np.concatenate(powers)
     seen = power[np.isfinite(power[:, 0])]
     mean = seen.mean(axis=0) if len(seen) else np.full(frequency.size, np.nan)
-    return Played(measures, {key: np.stack([block[key] for block in pairs]) for key in pairs[0]}, frequency, mean)
+    shape = (training_seeds, -1, *pairs[0]["success"].shape)
+    return Played(
+        measures, {key: np.stack([block[key] for block in pairs]).reshape(shape) for key in pairs[0]}, frequency, mean
+    )
 
 
 def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, Array]:
@@ -133,7 +143,7 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
     values = {
         **{name if kind == "rms" else f"{name}_{kind}": error for (name, kind), error in errors.items()},
         "tracking_error": (
-            tracking_error(rollout.measures, errors, rollout.fell),
+            tracking_error(_all_limits(rollout.measures), errors, rollout.fell),
             ones if has_limits(rollout.measures) else 0.0 * ones,
         ),
         "success": 100.0 * rollout.succeeded,
@@ -151,7 +161,7 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
     return {key: np.stack(value if isinstance(value, tuple) else (value, ones), axis=1) for key, value in values.items()}
 
 
-def errors_of(measures: Sequence[Measure], measured: Array, active: Mask) -> dict[tuple[str, str], Array]:
+def errors_of(measures: Sequence[Measure], measured: Array, active: Mask) -> dict[Which, Array]:
     """Return (measure, ``rms`` or ``max``) -> (N,), in SI units; ``max`` where it is limited.
 
     Args:
@@ -161,23 +171,11 @@ def errors_of(measures: Sequence[Measure], measured: Array, active: Mask) -> dic
     """
     errors = {}
     for k, measure in enumerate(measures):
-        errors[measure.name, "rms"] = episode_rms(measured[:, :, k], active)
+        seen = np.where(active, measured[:, :, k], 0.0)
+        errors[measure.name, "rms"] = np.sqrt((seen**2).sum(axis=0) / np.maximum(active.sum(axis=0), 1))
         if measure.max is not None:
-            errors[measure.name, "max"] = episode_max(measured[:, :, k], active)
+            errors[measure.name, "max"] = np.abs(seen).max(axis=0)
     return errors
-
-
-def tracking_error(measures: Sequence[Measure], errors: Mapping[tuple[str, str], Array], fell: Mask) -> Array:
-    """Return the tracking error of each episode (N,): rms of what is reached of every limit; a fall adds :data:`FALL`.
-
-    Args:
-        measures: of the task; without a limit among them the rms is 0.
-        errors: see :func:`errors_of`.
-        fell: (N,) a termination term ended the episode.
-    """
-    limits = {(m.name, kind): limit for m in measures for kind, limit in _limits(m).items()}
-    shares = np.array([errors[which] / limit for which, limit in limits.items()]).reshape(len(limits), len(fell))
-    return np.sqrt((shares**2).sum(axis=0) / max(1, len(limits))) + FALL * fell
 
 
 def travelled(rollout: Rollout) -> Array:

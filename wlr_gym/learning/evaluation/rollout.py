@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs.tasks.success import succeeded
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
 from wlr_gym.robot import Robot
 
@@ -108,12 +107,12 @@ def make_core(environment: str, episodes: int, keywords: Mapping[str, Any]) -> C
         InputError: unknown environment or keyword.
     """
     from wlr_gym.envs.core import Core
-    from wlr_gym.envs.registry import task_name_of
+    from wlr_gym.envs.registry import task_source_of
     from wlr_gym.envs.settings import read_settings
 
     if episodes < 1:
         raise InputError(f"episodes = {episodes}: expected 1 or more")
-    return Core(task_name_of(environment), read_settings(keywords), episodes)
+    return Core(task_source_of(environment), read_settings(keywords), episodes)
 
 
 def start_episodes(core: Core, policy: Policy, first_seed: int, options: Mapping[str, Any] | None = None) -> None:
@@ -126,6 +125,19 @@ def start_episodes(core: Core, policy: Policy, first_seed: int, options: Mapping
         core.seed(row, first_seed + row)
     core.begin_episodes(core.everyone, options)
     policy.reset(core.everyone)
+
+
+def seen_observations(core: Core, policy: Policy, seconds: float) -> NDArray[np.float32]:
+    """Return the observations (M, D) of all robots of ``core`` while a policy drives them for so long, or until they end."""
+    start_episodes(core, policy, 0)
+    active, seen = core.everyone.copy(), []
+    for _ in range(round(seconds / core.task.config.control_period)):
+        if not active.any():
+            break
+        seen.append(core.observation[active])
+        core.step(policy.act(core.observation), active)
+        active &= ~(core.terminated | core.truncated)
+    return np.concatenate(seen)
 
 
 def roll_out(
@@ -151,6 +163,8 @@ def roll_out(
     Raises:
         InputError: a real robot.
     """
+    from wlr_gym.envs.infos import Infos
+
     if not core.plant.capabilities.has_truth:
         raise InputError(f"backend '{core.settings.backend}' has no truth to score by; to drive the robot: wlr deploy")
     start_episodes(core, policy, first_seed, {"parameters": dict(parameters or {}), "command": dict(commands or {})})
@@ -176,7 +190,7 @@ def roll_out(
         measures=measures_of(core),
         command_names=core.task.commands,
         fell=core.terminated.copy(),
-        succeeded=succeeded(core.task.config, stacked["measured"], stacked["active"], core.terminated),
+        succeeded=Infos(core).succeeded(),
         friction=friction,
         sampled=core.randomization.elements,
         samples=table[:, core.randomization.columns],

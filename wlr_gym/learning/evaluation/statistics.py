@@ -1,17 +1,20 @@
-"""Means and differences with bootstrap confidence intervals over seeds and episodes."""
+"""Means and differences with bootstrap confidence intervals over training seeds, blocks of episodes, and episodes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit
 
 Array = NDArray[np.float64]
 
 RESAMPLES = 2000
 CONFIDENCE = 0.95
+#: Share of the training seeds that the interquartile mean leaves out at either end, rounded down to whole seeds.
+TRIM = 0.25
 
 
 @dataclass(frozen=True)
@@ -28,44 +31,113 @@ class Estimate:
         return self.low > 0.0 or self.high < 0.0
 
 
-class Bootstrap:
-    """Resampling in two stages: seeds with replacement, then episodes within each (Davison and Hinkley 1997, section 3.8).
+def mean(scores: Array) -> Array:
+    """Return the mean over training seeds, (R, T) to (R,)."""
+    return scores.mean(axis=1)
 
-    All subjects play the same episodes and get the same resamples, so that differences between them are paired.
+
+def interquartile_mean(scores: Array) -> Array:
+    """Return the mean over the middle half of the training seeds, (R, T) to (R,); that of all where T is below 4."""
+    cut = int(TRIM * scores.shape[1])
+    return np.sort(scores, axis=1)[:, cut : scores.shape[1] - cut].mean(axis=1)
+
+
+def expansion(seeds: int) -> float:
+    """Return by how much resampled means of T training seeds must spread more to give Student's interval; 0 for one seed.
+
+    Resampling few values gives too narrow an interval: the variance lacks T / (T - 1), and normal quantiles stand for those of
+    Student's t with T - 1 degrees of freedom (Hesterberg 2015, section 4).
+    """
+    if seeds < 2:
+        return 0.0
+    tail = 0.5 * (1.0 + CONFIDENCE)
+    return float(np.sqrt(seeds / (seeds - 1.0)) * stdtrit(seeds - 1, tail) / ndtri(tail))
+
+
+@dataclass(frozen=True)
+class _Draws:
+    """A metric as measured, then resampled, (RESAMPLES + 1,): in its episodes only, and in its training seeds too."""
+
+    episodes: Array
+    both: Array
+    seeds: int
+
+
+class Bootstrap:
+    """Resampling of blocks, of episodes within them (Davison and Hinkley 1997, section 3.8), and of training seeds.
+
+    All subjects play the same episodes and get the same resamples of them, so that differences between them are paired. So do
+    all training seeds of a subject: what is particular to an episode does not average out over seeds. Training seeds of one
+    subject have nothing to do with those of another: each subject's are resampled by themselves, as blocks of all their
+    episodes.
 
     Args:
-        seeds: S, blocks of episodes with their own seeds.
+        blocks: B, of episodes with their own seeds.
         episodes: N per block.
     """
 
-    def __init__(self, seeds: int, episodes: int) -> None:
+    def __init__(self, blocks: int, episodes: int) -> None:
         draws = np.random.default_rng(0)
-        counts = draws.multinomial(episodes, np.full(episodes, 1.0 / episodes), (RESAMPLES, seeds)).astype(np.float64)
-        chosen = draws.integers(0, seeds, (RESAMPLES, seeds))
-        weights = np.zeros((RESAMPLES, seeds, episodes))
-        for stage in range(seeds):
+        counts = draws.multinomial(episodes, np.full(episodes, 1.0 / episodes), (RESAMPLES, blocks)).astype(np.float64)
+        chosen = draws.integers(0, blocks, (RESAMPLES, blocks))
+        weights = np.zeros((RESAMPLES, blocks, episodes))
+        for stage in range(blocks):
             weights[np.arange(RESAMPLES), chosen[:, stage]] += counts[:, stage]
         self._weights = weights.reshape(RESAMPLES, -1)
 
-    def draws(self, pairs: Array) -> Array:
-        """Return the metric (RESAMPLES + 1,) of numerators and denominators (S, N, 2): as measured, then resampled."""
-        flat = pairs.reshape(-1, 2)
-        sums = np.concatenate([flat.sum(axis=0, keepdims=True), self._weights @ flat])
-        return np.divide(sums[:, 0], sums[:, 1], out=np.full(len(sums), np.nan), where=sums[:, 1] > 0)
+    def scores(self, pairs: Array) -> Array:
+        """Return each training seed's metric (RESAMPLES + 1, T) of numerators and denominators (T, B, N, 2).
 
-    def estimate(self, function: Callable[..., Array], *pairs: Array) -> Estimate:
-        """Return ``function`` of the metrics of ``pairs`` with its interval."""
+        The first row is as measured, the others with resampled episodes.
+        """
+        flat = pairs.reshape(-1, self._weights.shape[1], 2)
+        columns = flat.transpose(1, 0, 2).reshape(self._weights.shape[1], -1)
+        sums = np.concatenate([columns.sum(axis=0, keepdims=True), self._weights @ columns]).reshape(-1, len(flat), 2)
+        above, below = sums[:, :, 0], sums[:, :, 1]
+        return np.divide(above, below, out=np.full(above.shape, np.nan), where=below > 0)
+
+    def estimate(
+        self,
+        function: Callable[..., Array],
+        *pairs: Array,
+        subjects: Sequence[int] | None = None,
+        over_seeds: Callable[[Array], Array] = mean,
+    ) -> Estimate:
+        """Return ``function`` of metrics with its interval.
+
+        Args:
+            function: of as many metrics, each (RESAMPLES + 1,), as there are ``pairs``.
+            pairs: numerators and denominators (T, B, N, 2), or (B, N, 2) of one training seed; T may differ.
+            subjects: number of the subject that each belongs to; None = all different ones.
+            over_seeds: makes one score of those of a subject's training seeds.
+        """
+        numbers = range(len(pairs)) if subjects is None else subjects
+        drawn = [self._draw(pair, number, over_seeds) for pair, number in zip(pairs, numbers, strict=True)]
+        several = [draws.seeds for draws in drawn if draws.seeds > 1]
+        factor = expansion(min(several, default=1))
         with np.errstate(divide="ignore", invalid="ignore"):
-            values = function(*(self.draws(pair) for pair in pairs))
+            values = function(*(draws.episodes for draws in drawn))
+            values = values + factor * (function(*(draws.both for draws in drawn)) - values)
         if not np.isfinite(values[0]):
             return Estimate(np.nan, np.nan, np.nan)
         tail = 50.0 * (1.0 - CONFIDENCE)
         low, high = np.nanpercentile(np.where(np.isfinite(values), values, np.nan)[1:], (tail, 100.0 - tail))
         return Estimate(float(values[0]), float(low), float(high))
 
+    def _draw(self, pairs: Array, subject: int, over_seeds: Callable[[Array], Array]) -> _Draws:
+        scores = self.scores(pairs)
+        seeds = scores.shape[1]
+        chosen = np.random.default_rng([subject, seeds]).integers(0, seeds, (RESAMPLES, seeds))
+        chosen = np.concatenate([np.arange(seeds)[None], chosen])
+        return _Draws(over_seeds(scores), over_seeds(np.take_along_axis(scores, chosen, axis=1)), seeds)
+
     def mean(self, pairs: Array) -> Estimate:
-        """Return the metric itself."""
+        """Return the metric itself, mean over training seeds."""
         return self.estimate(lambda value: value, pairs)
+
+    def interquartile_mean(self, pairs: Array) -> Estimate:
+        """Return the metric itself, interquartile mean over training seeds (Agarwal et al. 2021)."""
+        return self.estimate(lambda value: value, pairs, over_seeds=interquartile_mean)
 
     def difference(self, ours: Array, theirs: Array) -> Estimate:
         """Return ours - theirs."""
@@ -75,8 +147,9 @@ class Bootstrap:
         """Return by how much ours is smaller than theirs, in % of theirs."""
         return self.estimate(lambda a, b: 100.0 * (1.0 - a / b), ours, theirs)
 
-    def share(self, ours: Array, theirs: Array, our_zero: Array, their_zero: Array) -> Estimate:
-        """Return ours in % of theirs, each above its own zero."""
+    def share(self, ours: Array, theirs: Array, our_zero: Array, their_zero: Array, *, subjects: Sequence[int]) -> Estimate:
+        """Return ours in % of theirs, each above its own zero; ``subjects`` as for :meth:`estimate`."""
         return self.estimate(
-            lambda a, b, zero_a, zero_b: 100.0 * (a - zero_a) / (b - zero_b), ours, theirs, our_zero, their_zero
-        )
+            lambda a, b, zero_a, zero_b: 100.0 * (a - zero_a) / (b - zero_b),
+            ours, theirs, our_zero, their_zero, subjects=subjects,
+        )  # fmt: skip

@@ -12,11 +12,16 @@ from typing import TYPE_CHECKING, Any
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import merge_changes
 from wlr_gym.learning.evaluation.rollout import make_core
+from wlr_gym.learning.evaluation.training_seeds import by_seed, common_name, expand
 from wlr_gym.policy import agent_names, find_policy, load_agent_config, make_policy, policy_environment
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
     from wlr_gym.policy import Policy
+
+
+#: What names one or several policies; see :func:`read_subjects`.
+Source = str | Path
 
 
 @dataclass(frozen=True)
@@ -25,35 +30,56 @@ class Subject:
 
     Attributes:
         name: heads the column.
-        sources: agent, policy file or folder, or shipped policy. Several are the same agent trained with several seeds: block
-            k of the episodes is played by source k modulo their number, so that the intervals cover training seeds too.
+        sources: agent, policy file or folder, or shipped policy. Several are trainings of one recipe: all play all episodes.
+        seeds: training seed of each of several sources, as text.
     """
 
     name: str
     sources: tuple[str, ...]
+    seeds: tuple[str, ...] = ()
 
 
-def read_subjects(texts: Sequence[str | Path]) -> tuple[Subject, ...]:
-    """Return subjects for ``SOURCE``, ``NAME=SOURCE`` or ``NAME=SOURCE,SOURCE,...``; a repeated one counts once.
+def read_subjects(given: Sequence[Source | Sequence[Source]]) -> tuple[Subject, ...]:
+    """Return subjects; a repeated one counts once.
+
+    Args:
+        given: for each subject ``SOURCE`` or ``NAME=SOURCE``, and for trainings of one recipe that differ in the seed
+            ``SOURCE,SOURCE,...`` after a name, a list of sources, a pattern such as ``out/trials/lr=1e-3-*``, or a folder that
+            holds nothing but their run folders.
 
     Raises:
-        InputError: no source, or two subjects of the same name.
+        InputError: no source, two subjects of the same name, or policies of one subject that are not trainings of one recipe.
     """
-    subjects = list(dict.fromkeys(_subject(str(text)) for text in texts))
+    subjects = list(dict.fromkeys(_subject([one] if isinstance(one, str | Path) else one) for one in given))
     for index, subject in enumerate(subjects):
         if subject.name in [other.name for other in subjects[:index]]:
             raise InputError(f"two policies are called '{subject.name}': write NAME=POLICY for one of them")
     return tuple(subjects)
 
 
-def _subject(text: str) -> Subject:
-    name, equals, sources = text.partition("=")
-    if not equals or Path(text).exists():
-        return Subject(text, (text,))
-    found = tuple(source for source in sources.split(",") if source)
-    if not name or not found:
+def _subject(given: Sequence[Source]) -> Subject:
+    texts = [str(text) for text in given]
+    found = [_named(text) for text in texts]
+    sources = tuple(dict.fromkeys(source for _, several in found for source in several))
+    if not sources:
+        raise InputError("no policy given")
+    name = next((name for name, _ in found if name), texts[0] if len(texts) == 1 else common_name(texts))
+    if len(sources) == 1:
+        return Subject(name, sources)
+    seeds = by_seed(name, sources)
+    return Subject(name, tuple(seeds.values()), tuple(seeds))
+
+
+def _named(text: str) -> tuple[str, tuple[str, ...]]:
+    """Return the name that a text gives, or none, and the policies."""
+    found = expand(text)
+    if found or "=" not in text or Path(text).exists():
+        return "", found or (text,)
+    name, _, sources = text.partition("=")
+    parts = [part for part in sources.split(",") if part]
+    if not name or not parts:
         raise InputError(f"policy '{text}': expected NAME=POLICY or NAME=POLICY,POLICY,...")
-    return Subject(name, found)
+    return name, tuple(source for part in parts for source in expand(part) or (part,))
 
 
 def identity(subject: Subject) -> str:

@@ -17,7 +17,8 @@ import numpy as np
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.provenance import record_provenance
-from wlr_gym.learning.evaluation.metrics import errors_of, has_limits, tracking_error
+from wlr_gym.envs.infos import Infos
+from wlr_gym.learning.evaluation.metrics import has_limits
 from wlr_gym.learning.evaluation.rollout import make_core, measures_of, start_episodes
 from wlr_gym.policy import Policy, Training, write_contract
 from wlr_gym.policy.control import PidConfig, task_settings
@@ -107,13 +108,8 @@ def _changed(settings: Mapping[str, Any], name: str, step: float, model: type[Pi
 def tracking_score(core: Core, policy: Policy, first_seed: int) -> float:
     """Return the score of whole episodes, one per robot of ``core`` (see the module); less is better."""
     start_episodes(core, policy, first_seed)
-    going, measured = [], []
     active = core.everyone.copy()
     while active.any():
         core.step(policy.act(core.observation), active)
-        going.append(active.copy())
-        measured.append(core.measures.copy())
         active &= ~(core.terminated | core.truncated)
-    measures = measures_of(core)
-    errors = errors_of(measures, np.stack(measured), np.stack(going))
-    return float(tracking_error(measures, errors, core.terminated).mean())
+    return float(Infos(core).tracking_error().mean())

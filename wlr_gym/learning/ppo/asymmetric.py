@@ -55,7 +55,9 @@ class AsymmetricPolicy(ActorCriticPolicy):
         assert isinstance(self.observation_space, spaces.Dict)
         assert isinstance(self.net_arch, list)
         seen = _width(self.observation_space, "policy")
-        self.mlp_extractor = AsymmetricNetworks(seen, self.features_dim, self.net_arch, self.activation_fn, self.device)
+        self.mlp_extractor: AsymmetricNetworks = AsymmetricNetworks(
+            seen, self.features_dim, self.net_arch, self.activation_fn, self.device
+        )
 
 
 def _width(space: spaces.Dict, group: str) -> int:

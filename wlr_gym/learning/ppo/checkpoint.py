@@ -1,9 +1,11 @@
-"""Checkpoints: a policy folder plus the random state, moved into place in one step. An interrupted write leaves none behind."""
+"""Checkpoints: a policy folder plus random state and robots, moved into place in one step. An interrupted write leaves none."""
 
 from __future__ import annotations
 
+import pickle
 import random
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,20 +20,36 @@ from wlr_gym.policy import read_contract, write_contract
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
 
+    from wlr_gym.envs import Sb3VecEnv
+
 RANDOM_FILE = "random_state.pt"
+ROBOTS_FILE = "robots.pkl"
 PREFIX = "step_"
 
 
-def save(folder: Path, model: PPO, config: PpoConfig, contract: dict[str, Any], environment: str) -> Path:
-    """Write weights, optimiser, contract, step count and random state into ``folder``, replacing what is there."""
+def save(
+    folder: Path, model: PPO, config: PpoConfig, env: Sb3VecEnv, notes: Mapping[str, Any], *, to_resume: bool = False
+) -> Path:
+    """Write weights, optimiser, contract and step count into ``folder``, replacing what is there.
+
+    Args:
+        folder: of the policy or checkpoint.
+        model, config, env: what trains.
+        notes: what the contract says of the training besides: its environment's id, scores.
+        to_resume: also write random state and robots, so that :func:`restore` goes on where this was.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
     model.save(temporary / MODEL_FILE)
-    torch.save(random_state(), temporary / RANDOM_FILE)
-    training = {"environment": environment, "steps": model.num_timesteps, "updates": model._n_updates, "seed": config.seed}
-    write_contract(temporary, "ppo", config.model_dump(mode="json"), contract, training)
+    if to_resume:
+        torch.save(random_state(), temporary / RANDOM_FILE)
+        robots = (env.get_state(), np.asarray(model._last_episode_starts))
+        (temporary / ROBOTS_FILE).write_bytes(pickle.dumps(robots))
+    noise = float(model.policy.get_parameter("log_std").detach().mean())
+    training = {"steps": model.num_timesteps, "updates": model._n_updates, "seed": config.seed, "log_std": noise, **notes}
+    write_contract(temporary, "ppo", config.model_dump(mode="json"), env.contract(), training)
     shutil.rmtree(folder, ignore_errors=True)
     temporary.replace(folder)
     return folder
@@ -54,8 +72,8 @@ def drop_old(folder: Path, keep: int) -> None:
         shutil.rmtree(old)
 
 
-def restore(folder: Path, model: PPO) -> None:
-    """Put weights, optimiser, step count and random state of a checkpoint into ``model``.
+def restore(folder: Path, model: PPO, env: Sb3VecEnv) -> None:
+    """Put weights, optimiser, step count, random state and robots of a checkpoint into ``model`` and ``env``.
 
     Raises:
         InputError: the checkpoint cannot be read.
@@ -64,9 +82,13 @@ def restore(folder: Path, model: PPO) -> None:
     try:
         model.set_parameters(str(folder / MODEL_FILE), exact_match=True, device="cpu")
         state = torch.load(folder / RANDOM_FILE, weights_only=True)
+        snapshot, starts = pickle.loads((folder / ROBOTS_FILE).read_bytes())  # as trusted as the model's own file
     except Exception as error:  # zip, pickle and torch each raise their own kinds for a broken file
         raise InputError(f"{folder}: not a readable checkpoint: {error}") from None
     model.num_timesteps, model._n_updates = training["steps"], training["updates"]
+    env.reset()
+    model._last_obs = env.set_state(snapshot)
+    model._last_episode_starts = starts
     set_random_state(state)
 
 

@@ -15,6 +15,7 @@ class PpoConfig(SettingsModel):
     Attributes:
         seed: of weights, exploration, minibatches and episodes; the same seed gives the same run bit for bit.
         total_steps: environment steps of all robots together.
+        schedule_steps: steps over which the learning rate falls; it stays where it ended after that. None = ``total_steps``.
         num_envs, steps_per_env: robots, and environment steps of each, per update.
         batch_size: samples per gradient step. Small ones cap the speed: the optimiser, not the physics, takes the time.
         epochs: passes over the samples of an update.
@@ -25,6 +26,8 @@ class PpoConfig(SettingsModel):
         hidden_layers, activation: of the networks of policy and value, which share nothing.
         initial_log_std: logarithm of the exploration noise at the start, in actions.
         teacher: agent whose actions the actor learns before PPO starts (``warm_start.py``); None = from nothing.
+        evaluate_every: environment steps between scores on held-out episodes (``held_out.py``); 0 = never.
+        evaluation_episodes: how many these are.
         checkpoint_every: environment steps between checkpoints.
         keep_checkpoints: how many of the newest stay.
         torch_threads: more than 1 was slower on busy machines, and changes the last bits.
@@ -34,6 +37,7 @@ class PpoConfig(SettingsModel):
 
     seed: int = Field(0, ge=0)
     total_steps: int = Field(5_000_000, gt=0)
+    schedule_steps: int | None = Field(None, gt=0)
     num_envs: int = Field(512, gt=0)
     steps_per_env: int = Field(32, gt=1)
     batch_size: int = Field(4096, gt=1)
@@ -52,6 +56,8 @@ class PpoConfig(SettingsModel):
     activation: Literal["tanh", "elu", "relu"] = "tanh"
     initial_log_std: float = 0.0
     teacher: str | None = None
+    evaluate_every: int = Field(500_000, ge=0)
+    evaluation_episodes: int = Field(64, gt=0)
     checkpoint_every: int = Field(1_000_000, gt=0)
     keep_checkpoints: int = Field(3, gt=0)
     torch_threads: int = Field(1, gt=0)

@@ -1,4 +1,4 @@
-"""What training measures per update (rewards by term, slip, falls, losses): a row of ``learning_curve.csv`` and TensorBoard."""
+"""What training measures per update (rewards by term, slip, falls, losses), and the files of numbers over steps."""
 
 from __future__ import annotations
 
@@ -87,33 +87,33 @@ def _arrays(name: str, value: Any) -> dict[str, NDArray]:
     return {name: np.asarray(value)}
 
 
-class LearningCurve:
-    """``learning_curve.csv``: a row per update, written at once.
+class CurveFile:
+    """A CSV file of numbers over steps (``learning_curve.csv``, ``held_out.csv``); each row is written at once.
 
     Args:
-        path: of the file; rows beyond ``steps`` (of updates that a resumed run repeats) are dropped.
+        path: of the file; rows beyond ``steps``, which a resumed run repeats, are dropped, the others stay as they are.
         steps: environment steps done so far.
     """
 
     def __init__(self, path: Path, steps: int) -> None:
         self.path = path
-        old = [row for row in read_curve(path) if row["steps"] <= steps] if path.is_file() and steps else []
-        replace_file(path, lambda temporary: self._rewrite(temporary, old))
+        kept = _first_rows(path, steps) if path.is_file() else ""
+        replace_file(path, lambda temporary: temporary.write_text(kept, encoding="utf-8"))
 
-    def _rewrite(self, path: Path, table: list[dict[str, float]]) -> None:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            if table:
-                writer = csv.DictWriter(file, list(table[0]))
-                writer.writeheader()
-                writer.writerows(table)
-
-    def append(self, row: dict[str, float]) -> None:
+    def append(self, row: Mapping[str, float]) -> None:
         """Add a row."""
         with self.path.open("a", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(row))
             if file.tell() == 0:
                 writer.writeheader()
             writer.writerow(row)
+
+
+def _first_rows(path: Path, steps: int) -> str:
+    """Return header and rows up to ``steps`` as they are written; nothing where there are none."""
+    count = sum(row["steps"] <= steps for row in read_curve(path))
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    return "".join(lines[: count + 1]) if count else ""
 
 
 def losses(logged: dict[str, Any]) -> dict[str, float]:

@@ -16,28 +16,43 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.settings import parse_config
 from wlr_gym.learning.ppo.config import PpoConfig
+from wlr_gym.policy import contract_of
 
 MODEL_FILE = "model.zip"
+#: Settings that make the network.
+NETWORK = ("hidden_layers", "activation")
+#: Logarithm of the exploration noise of a start from a file, which does not say that of each joint. The mean over joints of
+#: what shipped ones had in the end, e**-3.5, costs 5 % of the reward on the legs, and made policies worse; docs/learning.md.
+LOG_STD = -4.6
+#: Divergence that ends the passes of an update early, where little noise makes a small step of the weights a large one.
+TARGET_KL = 0.02
 #: Weights that act; the others belong to the critic or to exploration.
 ACTOR = ("mlp_extractor.policy_net.", "action_net.")
 
 
-class PpoPolicy:
-    """The mean action of a network, clipped to [-1, 1]."""
+class ModulePolicy:
+    """A torch module, observations (N, D) to actions (N, 8), as a policy."""
 
-    def __init__(self, network: Any) -> None:
+    def __init__(self, module: Any) -> None:
         import torch
 
-        self.network = network
-        self._actor, self._torch = actor(network), torch
+        self._module, self._torch = module, torch
 
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return actions (N, 8) for observations (N, D)."""
         with self._torch.no_grad():
-            return self._actor(self._torch.as_tensor(np.asarray(observations, dtype=np.float32))).numpy()
+            return self._module(self._torch.as_tensor(np.asarray(observations, dtype=np.float32))).numpy()
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
         """Nothing to forget: the network has no memory."""
+
+
+class PpoPolicy(ModulePolicy):
+    """The mean action of a network, clipped to [-1, 1]."""
+
+    def __init__(self, network: Any) -> None:
+        super().__init__(actor(network))
+        self.network = network
 
 
 def make_policy(contract: Mapping[str, Any], config: Mapping[str, Any]) -> PpoPolicy:
@@ -75,6 +90,41 @@ def export_network(folder: Path, contract: Mapping[str, Any]) -> bytes:
     from wlr_gym.learning.ppo.export import to_onnx
 
     return to_onnx(actor(load_policy(folder, contract).network), len(contract["environment"]["observation"]))
+
+
+def settings_to_start_from(source: str | Path) -> dict[str, Any]:
+    """Return the settings of a fine-tuning: those of the policy's training, at the rate at which it ended.
+
+    Raises:
+        InputError: no policy there, or one that PPO did not train.
+    """
+    contract = contract_to_start_from(source)
+    settings = dict(contract["config"])
+    settings["learning_rate"] = settings.get("final_learning_rate", PpoConfig.model_fields["final_learning_rate"].default)
+    settings["target_kl"] = settings.get("target_kl") or TARGET_KL
+    return settings | {"teacher": None, "initial_log_std": LOG_STD, "schedule_steps": None}
+
+
+def with_network_of(config: PpoConfig, source: str | Path) -> PpoConfig:
+    """Return settings with the network of a policy.
+
+    Raises:
+        InputError: no policy there, or one that PPO did not train.
+    """
+    own = contract_to_start_from(source)["config"]
+    return parse_settings({**config.model_dump(), **{name: own[name] for name in NETWORK if name in own}})
+
+
+def contract_to_start_from(source: str | Path) -> Mapping[str, Any]:
+    """Return the contract of a policy that PPO trained.
+
+    Raises:
+        InputError: no policy there, or one that PPO did not train.
+    """
+    contract = contract_of(source)
+    if contract["agent"] != "ppo":
+        raise InputError(f"'{source}' is of agent '{contract['agent']}': expected a policy that PPO trained")
+    return contract
 
 
 def actor(network: Any) -> Any:

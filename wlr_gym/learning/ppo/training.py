@@ -1,7 +1,7 @@
-"""The training loop: updates, learning curve, checkpoints, stopping in good order, resuming.
+"""The training loop: updates, stopping in good order, resuming.
 
-Every checkpoint starts new episodes with seeds made from the run's seed and the steps done. So a run that was killed and
-resumed from a checkpoint continues exactly, bit for bit, as it would have without the interruption.
+A checkpoint holds the learner and a snapshot of all robots. So a run that was killed or stopped, and resumed from a checkpoint,
+continues exactly, bit for bit, as it would have without the interruption.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
@@ -19,7 +20,6 @@ import torch
 from gymnasium import spaces
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from stable_baselines3 import PPO
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
 from wlr_gym.base.files import make_output_folder
@@ -28,31 +28,68 @@ from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.ppo import checkpoint
 from wlr_gym.learning.ppo.asymmetric import AsymmetricPolicy
 from wlr_gym.learning.ppo.config import PpoConfig
-from wlr_gym.learning.ppo.curve import LearningCurve, Meter, losses
-from wlr_gym.learning.ppo.policy import parse_settings, policy_keywords
+from wlr_gym.learning.ppo.curve import Meter, losses
+from wlr_gym.learning.ppo.fine_tuning import start_from
+from wlr_gym.learning.ppo.policy import parse_settings, policy_keywords, with_network_of
+from wlr_gym.learning.ppo.training_log import TrainingLog
 from wlr_gym.learning.ppo.warm_start import imitate
-from wlr_gym.policy import Training
+from wlr_gym.policy import Training, TrainingProgress
 
 
 def run_training(training: Training) -> Path:
     """Train and return the folder of the final policy.
 
-    The run folder then holds ``config.yaml``, ``provenance.yaml``, ``learning_curve.csv``, ``tensorboard/``,
-    ``checkpoints/step_.../`` (each a policy folder) and ``policy/``.
+    The run folder then holds ``config.yaml``, ``provenance.yaml``, ``learning_curve.csv``, ``held_out.csv``, ``tensorboard/``,
+    ``checkpoints/step_.../`` (each a policy folder), ``best/`` (the policy that did best on the held-out episodes) and
+    ``policy/``.
 
     Raises:
-        InputError: bad settings.
-        KeyboardInterrupt: after a checkpoint was saved; the message says how to resume.
+        InputError: bad settings, or a policy to start from that does not fit.
+        KeyboardInterrupt: stopped by Ctrl-C or SIGTERM, after a checkpoint was saved; the message says how to resume.
         TrainingError: a loss, weight or observation is not finite; the message names the file with the state.
+        Exception: what ``on_update`` raised, after a checkpoint was saved.
     """
     config = parse_settings(training.config)
-    torch.set_num_threads(config.torch_threads)
+    if training.init is not None:
+        config = with_network_of(config, training.init)
     env = Sb3VecEnv(training.environment, config.num_envs, **config.environment)
     try:
-        _record(training, config)
-        return _train(training, config, env)
+        with torch_threads(config.torch_threads):
+            model = make_model(env, config)
+            start = checkpoint.newest(training.folder / "checkpoints") if training.resume else None
+            if start is not None:
+                checkpoint.restore(start, model, env)
+            else:
+                _begin(training, config, env, model)
+            _record(training, config)
+            return _train(training, config, env, model)
     finally:
         env.close()
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch use so many threads, and as many as before afterwards."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _begin(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) -> None:
+    """Start from nothing, a teacher or a trained policy."""
+    if training.resume:
+        print(f"{training.folder}: no checkpoint yet; training starts from the beginning", flush=True)
+    begin_episodes(model, env, config.seed)
+    if training.init is not None:
+        start_from(model, env, config, training.init)
+    elif config.teacher is not None:
+        imitate(model, env, config)
+    else:
+        return
+    begin_episodes(model, env, config.seed)
 
 
 def _record(training: Training, config: PpoConfig) -> None:
@@ -61,6 +98,8 @@ def _record(training: Training, config: PpoConfig) -> None:
         return
     make_output_folder(training.folder)  # only now: bad settings leave nothing behind
     settings = {"environment": training.environment, "agent": "ppo", "settings": config.model_dump(mode="json")}
+    if training.init is not None:
+        settings["init"] = str(training.init)
     record_provenance(training.folder, settings, config.seed)
 
 
@@ -94,44 +133,76 @@ def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
     )
 
 
-def _train(training: Training, config: PpoConfig, env: Sb3VecEnv) -> Path:
-    folder = training.folder
-    model = make_model(env, config)
-    start = checkpoint.newest(folder / "checkpoints") if training.resume else None
-    if start is not None:
-        checkpoint.restore(start, model)
-    elif training.resume:
-        print(f"{folder}: no checkpoint yet; training starts from the beginning", flush=True)
-    begin_episodes(model, env, config.seed)
-    if start is None and config.teacher is not None:
-        imitate(model, env, config)
-        begin_episodes(model, env, config.seed)
-    curve = LearningCurve(folder / "learning_curve.csv", model.num_timesteps)
-    meter = Meter(env.core, folder / "failure.npz")
-    model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
-    model._setup_learn(config.total_steps - model.num_timesteps, callback=meter, reset_num_timesteps=False)
+@dataclass(frozen=True)
+class Session:
+    """What takes part in a training: the request, its settings, robots, learner, what watches it and what writes."""
+
+    training: Training
+    config: PpoConfig
+    env: Sb3VecEnv
+    model: PPO
+    meter: Meter
+    log: TrainingLog
+
+
+def _train(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) -> Path:
+    with StopRequest() as stop:  # before the first file: who sees one and presses Ctrl-C finds a checkpoint
+        log = TrainingLog(training, config, env, model)
+        try:
+            meter = Meter(env.core, training.folder / "failure.npz")
+            model._setup_learn(config.total_steps - model.num_timesteps, callback=meter, reset_num_timesteps=False)
+            with _progress(training, config, model.num_timesteps) as show:
+                if not log.scores:
+                    log.score()
+                _updates(Session(training, config, env, model, meter, log), stop, show)
+            place = log.save_checkpoint()
+            if stop.requested:
+                raise KeyboardInterrupt(f"interrupted; saved {place}; resume with: wlr train --resume {training.folder}")
+            if model.num_timesteps >= config.total_steps:
+                log.score()
+            return log.save_policy()
+        finally:
+            log.close()
+
+
+def _updates(session: Session, stop: StopRequest, show: Callable[[TrainingProgress], None]) -> None:
+    """Update until the steps or the time are over, or somebody asks to stop."""
+    training, config, model, log = session.training, session.config, session.model, session.log
     began, first = time.monotonic(), model.num_timesteps
+    stopped = False
+    while model.num_timesteps < config.total_steps and not (stop.requested or stopped):
+        if training.max_seconds is not None and time.monotonic() - began > training.max_seconds:
+            return
+        before = model.num_timesteps
+        session.env.set_progress(before)
+        row = update(model, session.meter, config)
+        seconds = time.monotonic() - began
+        row |= {"seconds": seconds, "steps_per_second": (model.num_timesteps - first) / seconds}
+        log.update(row)
+        if config.evaluate_every and crossed(config.evaluate_every, before, model.num_timesteps):
+            log.score()
+        if crossed(config.checkpoint_every, before, model.num_timesteps):
+            log.save_checkpoint()
+        progress = TrainingProgress(training.folder, model.num_timesteps, config.total_steps, row, log.scores)
+        show(progress)
+        stopped = _tell(training, progress, log)
 
-    def out_of_time() -> bool:
-        return training.max_seconds is not None and time.monotonic() - began > training.max_seconds
 
-    with StopRequest() as stop, _progress(training, config, first) as show:
-        while model.num_timesteps < config.total_steps and not stop.requested and not out_of_time():
-            before = model.num_timesteps
-            env.set_progress(before)
-            row = update(model, meter, config)
-            seconds = time.monotonic() - began
-            row |= {"seconds": seconds, "steps_per_second": (model.num_timesteps - first) / seconds}
-            _log(model, curve, row)
-            show(row)
-            if model.num_timesteps // config.checkpoint_every > before // config.checkpoint_every:
-                _save_checkpoint(training, config, env, model)
-                begin_episodes(model, env, config.seed)
-    if model.num_timesteps < config.total_steps:  # nothing is lost: --resume continues from here
-        place = _save_checkpoint(training, config, env, model)
-        if stop.requested:
-            raise KeyboardInterrupt(f"interrupted; saved {place}; resume with: wlr train --resume {folder}")
-    return checkpoint.save(folder / "policy", model, config, env.contract(), training.environment)
+def crossed(every: int, before: int, now: int) -> bool:
+    """Return whether a multiple of ``every`` steps was reached."""
+    return now // every > before // every
+
+
+def _tell(training: Training, progress: TrainingProgress, log: TrainingLog) -> bool:
+    """Tell ``on_update`` how far the training is; return whether it asks to stop."""
+    if training.on_update is None:
+        return False
+    try:
+        training.on_update(progress)
+    except BaseException:
+        log.save_checkpoint()
+        raise
+    return progress.stop_requested
 
 
 def begin_episodes(model: PPO, env: Sb3VecEnv, seed: int) -> None:
@@ -147,7 +218,8 @@ def update(model: PPO, meter: Meter, config: PpoConfig) -> dict[str, float]:
     assert model.env is not None
     try:
         model.collect_rollouts(model.env, meter, model.rollout_buffer, n_rollout_steps=config.steps_per_env)
-        model._update_current_progress_remaining(model.num_timesteps, config.total_steps)
+        schedule = config.schedule_steps or config.total_steps
+        model._update_current_progress_remaining(min(model.num_timesteps, schedule), schedule)
         model.train()
     except FloatingPointError as error:
         meter.fail(str(error))
@@ -165,24 +237,10 @@ def _healthy(model: PPO) -> bool:
     return finite and bool((noise > 0).all())
 
 
-def _log(model: PPO, curve: LearningCurve, row: dict[str, float]) -> None:
-    curve.append(row)
-    for name, value in row.items():
-        if name != "steps":
-            model.logger.record(f"{'reward' if name.startswith('term.') else 'training'}/{name.removeprefix('term.')}", value)
-    model.logger.dump(step=model.num_timesteps)
-
-
-def _save_checkpoint(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) -> Path:
-    checkpoints = training.folder / "checkpoints"
-    place = checkpoints / checkpoint.name_of(model.num_timesteps)
-    checkpoint.save(place, model, config, env.contract(), training.environment)
-    checkpoint.drop_old(checkpoints, config.keep_checkpoints)
-    return place
-
-
 class StopRequest:
-    """Turns the first Ctrl-C into a request to stop after the present update; a second one interrupts at once."""
+    """Turns the first Ctrl-C or SIGTERM into a request to stop after the present update; a second one interrupts at once."""
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self) -> None:
         self.requested = False
@@ -190,7 +248,7 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if self._catching:
-            self._previous = signal.signal(signal.SIGINT, self._take)
+            self._previous = {number: signal.signal(number, self._take) for number in self.SIGNALS}
         return self
 
     def _take(self, number: int, frame: FrameType | None) -> None:
@@ -200,19 +258,28 @@ class StopRequest:
 
     def __exit__(self, *_: object) -> None:
         if self._catching:
-            signal.signal(signal.SIGINT, self._previous)
+            for number, handler in self._previous.items():
+                signal.signal(number, handler)
 
 
 @contextmanager
-def _progress(training: Training, config: PpoConfig, first: int) -> Iterator[Callable[[dict[str, float]], None]]:
-    """Show a progress bar over the steps; yields a function that is given rows of the learning curve."""
-    text = TextColumn("{task.fields[speed]:,.0f} steps/s, reward {task.fields[reward]:.3f}/s, slip {task.fields[slip]:.3f} m/s")
-    columns = (TextColumn("training"), BarColumn(), TaskProgressColumn(), text, TimeRemainingColumn())
+def _progress(training: Training, config: PpoConfig, first: int) -> Iterator[Callable[[TrainingProgress], None]]:
+    """Show a progress bar over the steps; yields a function that is told how far the training is."""
+    columns = (
+        TextColumn("training"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[said]}"),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, disable=not training.progress) as bar:
-        task = bar.add_task("", total=config.total_steps, completed=first, speed=0.0, reward=0.0, slip=0.0)
+        task = bar.add_task("", total=config.total_steps, completed=first, said="")
 
-        def show(row: dict[str, float]) -> None:
-            speed, reward, slip = row["steps_per_second"], row["reward_per_second"], row["slip_speed"]
-            bar.update(task, completed=row["steps"], speed=speed, reward=reward, slip=slip)
+        def show(progress: TrainingProgress) -> None:
+            row, held_out = progress.metrics, progress.held_out
+            said = f"{row['steps_per_second']:,.0f} steps/s, reward {row['reward_per_second']:.3f}/s"
+            if "tracking_error" in held_out:
+                said += f", held out: tracking error {held_out['tracking_error']:.3f}, success {held_out['success']:.0f} %"
+            bar.update(task, completed=progress.steps, said=said)
 
         yield show

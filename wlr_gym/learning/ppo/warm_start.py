@@ -1,6 +1,6 @@
-"""A start from a controller that works: actor and critic imitate it, and PPO continues from there.
+"""A start from a policy that works: actor and critic imitate it, or the critic alone, and PPO continues from there.
 
-The controller drives all robots for an episode, with noise on its actions so that it is seen to correct errors. The actor
+The policy drives all robots for a while, with noise on its actions so that it is seen to correct errors. The actor
 learns its actions (without the noise), the critic its discounted rewards. Own random numbers: nothing else is shifted.
 """
 
@@ -16,7 +16,7 @@ from torch import nn
 
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.ppo.config import PpoConfig
-from wlr_gym.policy import Policy, load_agent, load_agent_config
+from wlr_gym.policy import Policy, make_policy
 
 #: 1 sigma of the noise on the controller's actions.
 NOISE = 0.03
@@ -35,20 +35,33 @@ Observations = dict[str, NDArray[np.float32]]
 def imitate(model: PPO, env: Sb3VecEnv, config: PpoConfig) -> None:
     """Fit the networks of ``model`` to the controller ``config.teacher``."""
     assert config.teacher is not None
-    teacher = load_agent(config.teacher).make_policy(env.contract(), load_agent_config(config.teacher))
-    observations, actions, returns = _demonstrate(env, teacher, config)
+    teacher = make_policy(config.teacher, env.contract())
+    observations, actions, returns = _demonstrate(env, teacher, config, env.core.limit)
     _fit(model, observations, torch.as_tensor(actions), torch.as_tensor(returns), config.seed)
 
 
+def fit_critic(model: PPO, env: Sb3VecEnv, config: PpoConfig, policy: Policy) -> None:
+    """Fit the critic of ``model`` to a policy that acts; the environment steps that it drives for this count as training."""
+    ticks = min(env.core.limit, 2 * _horizon(config))
+    observations, _, returns = _demonstrate(env, policy, config, ticks)
+    _fit(model, observations, None, torch.as_tensor(returns), config.seed)
+    model.num_timesteps += ticks * env.num_envs
+
+
+def _horizon(config: PpoConfig) -> int:
+    """Return after how many environment steps a reward counts for nothing any more (0.7 %)."""
+    return int(5.0 / (1.0 - config.gamma))
+
+
 def _demonstrate(
-    env: Sb3VecEnv, teacher: Policy, config: PpoConfig
+    env: Sb3VecEnv, teacher: Policy, config: PpoConfig, ticks: int
 ) -> tuple[Observations, NDArray[np.float32], NDArray[np.float32]]:
     """Return observations {group: (M, ...)}, the teacher's actions (M, 8), and discounted rewards (M,) from there on."""
     noise = np.random.default_rng(config.seed)
     seen, actions, rewards, dones = [], [], [], []
     observation = _groups(env.reset())
     teacher.reset(np.ones(env.num_envs, bool))
-    for _ in range(env.core.limit):
+    for _ in range(ticks):
         action = teacher.act(observation["policy"])
         seen.append(observation)
         actions.append(action)
@@ -59,7 +72,7 @@ def _demonstrate(
         rewards.append(reward)
         dones.append(done)
     returns = _discounted(np.array(rewards), np.array(dones), config.gamma)
-    horizon = min(int(5.0 / (1.0 - config.gamma)), len(seen) // 2)  # later rewards are cut off
+    horizon = min(_horizon(config), len(seen) // 2)  # later rewards are cut off
     kept = range(0, len(seen) - horizon, STRIDE)
     groups = {name: np.concatenate([seen[tick][name] for tick in kept]) for name in observation}
     return groups, np.concatenate([actions[tick] for tick in kept]), np.concatenate([returns[tick] for tick in kept])
@@ -79,20 +92,29 @@ def _discounted(rewards: NDArray[np.float32], dones: NDArray[np.bool_], gamma: f
     return sums
 
 
-def _fit(model: PPO, observations: Observations, actions: torch.Tensor, returns: torch.Tensor, seed: int) -> None:
+def _fit(model: PPO, observations: Observations, actions: torch.Tensor | None, returns: torch.Tensor, seed: int) -> None:
+    """Fit actor and critic to actions (M, 8) and returns (M,); without actions the critic alone, the actor stays."""
     policy = model.policy
-    optimiser = torch.optim.Adam(policy.parameters(), lr=LEARNING_RATE)
+    moved = policy.parameters() if actions is not None else _critic(policy)
+    optimiser = torch.optim.Adam(moved, lr=LEARNING_RATE)
     tensors = {name: torch.as_tensor(values) for name, values in observations.items()}
     order = torch.Generator().manual_seed(seed)
     policy.set_training_mode(True)
     for epoch in range(EPOCHS):
         optimiser.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - epoch / EPOCHS)
-        for rows in torch.randperm(len(actions), generator=order).split(BATCH_SIZE):
+        for rows in torch.randperm(len(returns), generator=order).split(BATCH_SIZE):
             batch = {name: values[rows] for name, values in tensors.items()}
             seen = batch if len(batch) > 1 else batch["policy"]
-            mean = policy.get_distribution(seen).distribution.mean  # pyright: ignore[reportAttributeAccessIssue, reportArgumentType]
             value = policy.predict_values(seen).flatten()  # pyright: ignore[reportArgumentType]
-            loss = nn.functional.mse_loss(mean, actions[rows]) + nn.functional.mse_loss(value, returns[rows])
+            loss = nn.functional.mse_loss(value, returns[rows])
+            if actions is not None:
+                mean = policy.get_distribution(seen).distribution.mean  # pyright: ignore[reportAttributeAccessIssue, reportArgumentType]
+                loss = nn.functional.mse_loss(mean, actions[rows]) + loss
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
+
+
+def _critic(policy: Any) -> list[torch.nn.Parameter]:
+    """Return the weights that only values depend on."""
+    return [*policy.mlp_extractor.value_net.parameters(), *policy.value_net.parameters()]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numba import njit
@@ -35,7 +35,7 @@ class Quality(SettingsModel):
         focal_std: px, 1 sigma of fx and fy; centre_std: px, of cx and cy.
     """
 
-    model_config = ConfigDict(allow_inf_nan=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(allow_inf_nan=True)
 
     views: int
     rejected: int

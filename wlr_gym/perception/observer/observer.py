@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.perception.observer import slip_filter
 from wlr_gym.perception.observer.layout import ESTIMATE_LAYOUT
 from wlr_gym.perception.observer.state import constants, state_type
@@ -48,6 +49,10 @@ class SlipObserver:
         """Take in the readings of one control step later of the masked robots. A reading that is no number is the last one."""
         self._require(mask, sensors)
         slip_filter.update(self._constants, self._states, mask, sensors, self.values)
+
+    def stores(self) -> dict[str, RowStore]:
+        """Return everything that decides the estimates to come."""
+        return {"estimate": self.values, "filter": self._states}
 
     def _require(self, mask: Mask, sensors: Array) -> None:
         if mask.shape != (self.count,) or sensors.shape != (self.count, SENSOR_LAYOUT.width):

@@ -34,10 +34,10 @@ class Node:
     __array_ufunc__ = None  # numpy scalars defer to the reflected operators below
 
     def __init__(self, graph: Graph, op: str, operands: tuple[Operand, ...], index: int) -> None:
-        self.graph = graph
-        self.op = op
-        self.operands = operands
-        self.index = index
+        self.graph: Graph = graph
+        self.op: str = op
+        self.operands: tuple[Operand, ...] = operands
+        self.index: int = index
 
     def __add__(self, other: Operand) -> Operand:
         if not isinstance(other, Node):

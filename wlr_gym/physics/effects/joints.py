@@ -87,7 +87,7 @@ EFFECTS: tuple[Effect, ...] = (
             TORQUE,
             "straight",
             JOINT_SETS,
-            known={"coefficient": Known("servo.viscous_friction[{}]", step=0.02, wheel_step=0.004)},
+            known={"coefficient": Known("servo.viscous_friction[{}]", step=0.2, wheel_step=0.004)},
         ),
     ),
     Effect(

@@ -58,6 +58,15 @@ def make_plant(
     return getattr(importlib.import_module(module), name)(robot, count, options, **given)
 
 
+def robot_file(hardware: RobotOptions) -> str | None:
+    """Return the robot file that a real robot's hardware file names; None = none.
+
+    Raises:
+        InputError: a hardware file that cannot be read, or is wrong.
+    """
+    return importlib.import_module("wlr_gym.hardware.config").load_hardware(hardware.hardware).robot
+
+
 def check_backend(backend: str) -> None:
     """Raise :class:`InputError` for a backend that does not exist, before anything is made or written for it."""
     if backend not in BACKENDS:

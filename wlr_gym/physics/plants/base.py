@@ -7,14 +7,16 @@ world frame is the floor frame (x, y in the floor, z its normal); on a slope gra
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.robot import JOINTS, LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameter_table import XYZ
 from wlr_gym.robot.parameters import Parameters
@@ -41,14 +43,14 @@ class Layout:
     """Which columns of a signal matrix hold which channel."""
 
     def __init__(self, channels: tuple[Channel, ...]) -> None:
-        self.channels = {channel.name: channel for channel in channels}
+        self.channels: dict[str, Channel] = {channel.name: channel for channel in channels}
         self.slices: dict[str, slice] = {}
         start = 0
         for channel in channels:
             self.slices[channel.name] = slice(start, start + len(channel.elements))
             start += len(channel.elements)
         self.width = start
-        self.elements = tuple(element for channel in channels for element in channel.elements)
+        self.elements: tuple[str, ...] = tuple(element for channel in channels for element in channel.elements)
 
     def view(self, values: Array, name: str) -> Array:
         """Return the columns of ``name``: shape (N,) for a scalar channel, (N, size) otherwise."""
@@ -119,7 +121,7 @@ class _Signals:
     __slots__ = ("values",)
 
     def __init__(self, values: Array) -> None:
-        self.values = values
+        self.values: Array = values
 
     def __getattr__(self, name: str) -> Array:
         if name.startswith("__"):
@@ -154,7 +156,7 @@ class Capabilities:
     Attributes:
         name: ``gibbs_appell``, ``mujoco`` or ``dynamixel``.
         has_truth: ``truth()`` works.
-        can_set_state: ``get_state`` and ``set_state`` work (simulators).
+        can_set_state: ``mechanical_state``, ``get_state`` and ``set_state`` work (simulators).
         real_time: ``step`` blocks until the control period is over (robot).
     """
 
@@ -361,8 +363,31 @@ class Plant(Protocol):
         """Return the true state after the last step or reset (simulators only)."""
         ...
 
-    def get_state(self) -> PlantState:
-        """Return a copy of the mechanical and servo state (simulators only)."""
+    def mechanical_state(self) -> PlantState:
+        """Return a copy of the mechanical and servo state, for ``reset(state=...)`` (simulators only)."""
+        ...
+
+    def get_state(self, rows: int | Sequence[int] | NDArray[Any] | None = None) -> Snapshot:
+        """Return everything that decides what comes next, sensors and parameters included (simulators only).
+
+        Args:
+            rows: numbers of robots, or a mask (N,); None = all.
+
+        Raises:
+            InputError: not robots of this plant, or a real robot.
+        """
+        ...
+
+    def set_state(self, snapshot: Snapshot, rows: int | Sequence[int] | NDArray[Any] | None = None) -> Sensors:
+        """Put robots into the state of a snapshot, from which they go on bit for bit (simulators only); return the readings.
+
+        Args:
+            snapshot: of one robot, for all of ``rows``, or of one for each, from any batch with the same robot and options.
+            rows: numbers of robots, or a mask (N,); None = all.
+
+        Raises:
+            InputError: a snapshot that does not fit (names the first difference), or a real robot; nothing has changed then.
+        """
         ...
 
     def close(self) -> None:

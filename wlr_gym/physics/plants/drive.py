@@ -33,8 +33,8 @@ Array = NDArray[np.float64]
 
 JOINTS = range(8)
 JOINT_LANES = (
-    "kp", "kd", "volt_gain", "back_emf_damping", "viscous", "weight", "gear_bound", "inverse_constant", "effort_scale",
-    "velocity_limit", "acceleration_limit",
+    "kp", "kd", "volt_gain", "back_emf_damping", "viscous", "weight", "gear_bound",
+    "inverse_constant", "idle_current", "effort_scale", "velocity_limit", "acceleration_limit",
     "torque_scale", "stribeck_torque", "inverse_stribeck_speed", "load_friction",
     "ripple_amplitude", "ripple_order", "ripple_phase",
     "half_play", "rotor_inertia", "teeth_stiffness", "teeth_damping",
@@ -59,38 +59,37 @@ def pack(parameters: Parameters, robot: Robot, step: float, moved_inertia: Array
 
     Args:
         parameters: (N) batch.
-        robot: for the voltage at which the motors' data hold, and the nominal torque constants.
+        robot: for the voltage at which the motors' data hold, and the nominal currents.
         step: s.
         moved_inertia: (N, 8) inertia that turns with each rotor, its own included, while the gear is rigid, kg m2. The implicit
             share of the damping is fitted to it (with play: to the rotor's own), so that a free joint decays exactly
             (:func:`fitted_weight`). None makes the damping fully implicit.
     """
-    nominal_voltage = robot.servo.supply_voltage
     constant, resistance = servo.motor_constants(
-        parameters["servo.stall_torque"], parameters["servo.no_load_speed"], nominal_voltage
+        parameters["servo.stall_torque"], parameters["servo.no_load_speed"], robot.servo.supply_voltage
     )
+    line, law = servo.line_constants(robot)[0], servo.current_law(robot)
     back_emf_damping = constant * constant / resistance
     viscous, armature = parameters["servo.viscous_friction"], parameters["servo.armature"]
     torque_scale, play = parameters["servo.torque_scale"], parameters["servo.backlash"]
-    velocity_limit, acceleration_limit = servo.profile_limits(
-        parameters["servo.profile_velocity"], parameters["servo.profile_acceleration"]
-    )
+    limits = servo.profile_limits(parameters["servo.profile_velocity"], parameters["servo.profile_acceleration"])
     weight = np.ones_like(armature)
     if moved_inertia is not None:
         moved = np.where(play > 0.0, armature, moved_inertia)
         weight = fitted_weight(step * (back_emf_damping * torque_scale + viscous) / moved)
     joint = {
-        "kp": parameters["servo.kp"],
+        "kp": servo.position_gains(parameters),
         "kd": parameters["servo.kd"],
         "volt_gain": constant / resistance,
         "back_emf_damping": back_emf_damping,
         "viscous": viscous,
         "weight": weight,
         "gear_bound": step * parameters["servo.coulomb_friction"],
-        "inverse_constant": 1.0 / constant,
-        "effort_scale": servo.effort_constants(robot) / constant,
-        "velocity_limit": velocity_limit,
-        "acceleration_limit": acceleration_limit,
+        "inverse_constant": 1.0 / (constant * (law.torque_constant / line)),
+        "idle_current": np.broadcast_to(law.idle, constant.shape),
+        "effort_scale": line / constant,
+        "velocity_limit": limits[0],
+        "acceleration_limit": limits[1],
         "torque_scale": torque_scale,
         "stribeck_torque": parameters["servo.stribeck_torque"],
         "inverse_stribeck_speed": 1.0 / parameters["servo.stribeck_speed"],
@@ -212,7 +211,7 @@ def _supply_drop(lanes: Lanes, voltages: Sequence[Value], rates: Sequence[Value]
     for j in JOINTS:
         on, inverse_constant = lanes[f"on{j}"], lanes[f"inverse_constant{j}"]
         torque = on * (lanes[f"volt_gain{j}"] * voltages[j] - lanes[f"back_emf_damping{j}"] * rates[j])
-        total = total + ops.absolute(torque) * inverse_constant
+        total = total + ops.absolute(torque * inverse_constant + on * lanes[f"idle_current{j}"] * rates[j])
         conductance = conductance + on * (lanes[f"volt_gain{j}"] * inverse_constant)
     resistance, drop = lanes["supply_resistance"], lanes["supply_drop"]
     change = (resistance * total - drop) * (1.0 / (1.0 + resistance * conductance))
@@ -395,5 +394,6 @@ def finish(
         out[f"current_torque{j}"] = current_torque
     out[f"motor_torque{j}"] = torque
     out[f"work{j}"] = step * (torque * (0.5 * (new_rate + old_rate)))
-    out[f"electrical_work{j}"] = step * (current_torque * voltage * lanes[f"inverse_constant{j}"])
+    idle = on * lanes[f"idle_current{j}"] * mean_rate
+    out[f"electrical_work{j}"] = step * (current_torque * voltage * lanes[f"inverse_constant{j}"] + voltage * idle)
     return out

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import normals4, stream_number, words4
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Channel, Layout, PlantOptions
 from wlr_gym.physics.servo import REGISTER_UNITS, effort_counts
 from wlr_gym.robot import FIRST_WHEEL, JOINTS, WHEEL_SLICE, Robot
@@ -269,6 +270,10 @@ class SensorModel:
         errors = [parameters[name].reshape(self.count, -1)[rows] for name in _CALIBRATION]
         errors.append(imu_to_body(parameters)[rows].reshape(-1, 9))
         self._states[rows, :_WHEEL_ZERO] = np.concatenate(errors, axis=1)
+
+    def stores(self) -> dict[str, RowStore]:
+        """Return what the sensors remember: noise seeds and counters, errors, start pose, camera."""
+        return {"noise_seeds": self._seeds, "ticks": self._ticks, "sensors": self._states}
 
     def measure(self, raw: Array, out: Array, start: int = 0, stop: int | None = None) -> None:
         """Read the sensors of robots ``start`` to ``stop`` one control tick on; the rest of ``out`` stays.

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.plants.base import PlantState
 from wlr_gym.robot import LEG_SLICE
 from wlr_gym.robot.parameter_table import SPECS
@@ -29,6 +30,8 @@ class Setpoints(Protocol):
     def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None: ...
 
     def push(self, setpoints: Array) -> tuple[Array, Array, Array]: ...
+
+    def stores(self) -> dict[str, RowStore]: ...
 
 
 class SetpointHistory:
@@ -73,6 +76,27 @@ class SetpointHistory:
             return setpoints, setpoints, self._switch_time
         return self._at(self._ticks), self._at(self._ticks + 1), self._switch_time
 
+    def stores(self) -> dict[str, RowStore]:
+        """Return the setpoints that were written, newest first (delays are parameters)."""
+        return {"setpoints": _NewestFirst(self)}
+
     def _at(self, ticks: NDArray[np.intp]) -> Array:
         places = (self._head - ticks) % len(self._ring)
         return np.take_along_axis(self._ring, places[None], axis=0)[0]
+
+
+class _NewestFirst:
+    """The ring as rows (M, depth, 8) of robots, wherever its head is."""
+
+    def __init__(self, history: SetpointHistory) -> None:
+        self._history = history
+
+    def _places(self, rows: NDArray[np.intp]) -> tuple[NDArray[Any], NDArray[Any]]:
+        depth = len(self._history._ring)
+        return (self._history._head - np.arange(depth)[None, :]) % depth, rows[:, None]
+
+    def __getitem__(self, rows: NDArray[np.intp]) -> Array:
+        return self._history._ring[self._places(rows)]
+
+    def __setitem__(self, rows: NDArray[np.intp], values: Array) -> None:
+        self._history._ring[self._places(rows)] = values

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.snapshot import RowStore, Snapshot, check_fit, read_rows, take_snapshot, write_snapshot
 from wlr_gym.physics.plants.base import (
     SENSOR_LAYOUT,
     TRUTH_LAYOUT,
+    Capabilities,
     PlantOptions,
     PlantState,
     Sensors,
@@ -21,7 +25,7 @@ from wlr_gym.physics.plants.base import (
 )
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
 from wlr_gym.physics.plants.setpoints import SetpointHistory, Setpoints
-from wlr_gym.robot import LEG_SLICE, Robot
+from wlr_gym.robot import LEG_SLICE, Robot, robot_hash
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -38,13 +42,15 @@ class Simulator(ABC):
     A simulator ends its constructor with :meth:`_start`, and defines ``step`` and what is abstract here.
     """
 
+    capabilities: Capabilities
+
     def __init__(self, robot: Robot, count: int, options: PlantOptions | None) -> None:
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise InputError(f"number of robots is {count!r}, expected 1 or more")
         self.robot = robot
-        self.options = options or PlantOptions()
-        self.substeps = self.options.substeps
-        self.parameters = Parameters.nominal(robot, count)
+        self.options: PlantOptions = options or PlantOptions()
+        self.substeps: int = self.options.substeps
+        self.parameters: Parameters = Parameters.nominal(robot, count)
         self._count = count
         self._all = np.arange(count)
         self._truth = Truth(np.zeros((count, TRUTH_LAYOUT.width)))
@@ -70,8 +76,16 @@ class Simulator(ABC):
         """Put robots ``rows`` where ``state`` (N) says."""
 
     @abstractmethod
-    def get_state(self) -> PlantState:
+    def mechanical_state(self) -> PlantState:
         """Return a copy of the mechanical and servo state."""
+
+    @abstractmethod
+    def _engine_stores(self) -> dict[str, RowStore]:
+        """Return what the simulation itself remembers of its robots from one tick to the next."""
+
+    @abstractmethod
+    def _note_restored(self) -> None:
+        """Follow up a state that was written into the stores."""
 
     @abstractmethod
     def _look(self, rows: Rows) -> None:
@@ -114,6 +128,53 @@ class Simulator(ABC):
         self._take_parameters(parameters, rows)
         self._setpoints.set_delays(rows, self.parameters)
         self._sensors.set_errors(rows, self.parameters)
+
+    # ---- snapshots ----
+
+    def _fits(self) -> dict[str, Any]:
+        """What a plant must be like to take this one's state."""
+        options = self.options
+        return {
+            "backend": self.capabilities.name,
+            "robot": robot_hash(self.robot),
+            "precision": options.precision,
+            "control_period": options.control_period,
+            "physics_step": options.physics_step,
+            "sensor_noise": options.sensor_noise,
+        }
+
+    def _stores(self) -> dict[str, RowStore]:
+        """Everything that decides what comes next, but for the parameters."""
+        return {
+            "truth": self._truth.values,
+            "raw": self._raw,
+            "readings": self._readings.values,
+            "time": self._time,
+            **self._setpoints.stores(),
+            **self._sensors.stores(),
+            **self._engine_stores(),
+        }
+
+    def get_state(self, rows: int | Sequence[int] | NDArray[Any] | None = None) -> Snapshot:
+        """Return everything that decides what comes next; see :meth:`wlr_gym.physics.plants.base.Plant.get_state`."""
+        stores = {"parameters": self.parameters.values, **self._stores()}
+        return take_snapshot(stores, read_rows(rows, self._count), self._fits())
+
+    def set_state(self, snapshot: Snapshot, rows: int | Sequence[int] | NDArray[Any] | None = None) -> Sensors:
+        """Put robots into the state of a snapshot; see :meth:`wlr_gym.physics.plants.base.Plant.set_state`."""
+        index = read_rows(rows, self._count)
+        stores = self._stores()
+        check_fit(snapshot, index, self._fits(), ["parameters", *stores])
+        values = snapshot.arrays["parameters"]
+        changed = (self.parameters.values[index] != values).any(axis=1)
+        if changed.any():
+            self.parameters.values[index] = values
+            new = np.unique(index[changed])  # MuJoCo wants them in order
+            self._use_parameters(new, Parameters(self.parameters.values[new]))
+        write_snapshot(snapshot, stores, index)
+        self._setpoints.set_delays(index, self.parameters)
+        self._note_restored()
+        return self._readings
 
     def use_setpoints(self, setpoints: Setpoints) -> None:
         """Take the setpoints from a schedule of one's own instead of the history of those written."""

@@ -47,7 +47,7 @@ sys.exit(main(["deploy", "pid", "--emulated", "--hardware", sys.argv[1], "--seco
 #: Safety limits that let a drive on a busy computer go on: an answer that comes late makes a tick late, and is counted there.
 _PATIENT = {
     "patience": 0.2, "read_time": 5.0, "late": 10**6, "late_share": 1.0, "silence": 9.0, "coast": 8.0, "imu_silence": 9.0,
-    "watchdog": 2.5,
+    "watchdog": 2.5, "heartbeat": 30.0,
 }  # fmt: skip
 Cycle = Callable[[], None]
 
@@ -62,7 +62,8 @@ def measure_bus(size: Size) -> list[Measurement]:
 def _measure_cycle(size: Size) -> list[Measurement]:
     """Cycles per second, processor time of a cycle, and the time from the readings' arrival to the setpoints' departure."""
     cycles = size(1000, 20)
-    robot, hardware = load_robot(), load_hardware()
+    hardware = load_hardware()
+    robot = load_robot(hardware.robot or "nominal")
     with _answering(robot, hardware) as ports, contextlib.ExitStack() as stack:
         wired = with_ports(hardware, ports)
         ours, delay = stack.enter_context(_our_cycle(robot, wired))
@@ -145,6 +146,7 @@ def _our_cycle(robot: Robot, hardware: Hardware) -> Iterator[tuple[Cycle, Callab
 
     setpoints = np.where(np.arange(len(JOINTS)) < len(LEGS), np.pi / 2, 1.0)
     with Servos(robot, hardware, 1.0, lambda: 0.0) as servos:  # recorded answers: the servos' clocks stand still
+        servos.supervise()
 
         def cycle() -> None:
             if not servos.read().answered.all():

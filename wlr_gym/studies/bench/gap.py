@@ -13,11 +13,10 @@ import importlib
 import json
 import os
 import shutil
-import subprocess
-import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, write_json, write_text
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
+from wlr_gym.learning.sweep.jobs import Ended, Job, Send, serve, spread
 from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED, BlindCase, case
 from wlr_gym.studies.bench.blind.score import FAILED, score
 
@@ -35,7 +35,7 @@ from wlr_gym.studies.bench.blind.score import FAILED, score
 Analyser = Callable[[Path, Path], Mapping[str, Any]]
 #: Of a result: what the score is made of.
 _ANSWER = ("verdict", "message", "effects", "equivalent", "gap", "wall_seconds", "blind_test")
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+_MODULE = "wlr_gym.studies.bench.gap"
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,7 @@ def run_blind_test(
     analyser: str = "wlr_gym.studies.bench.gap:analyse_folder",
     say: Callable[[str], None] = print,
     answers: Path | None = None,
+    ray: str | None = None,
 ) -> dict[str, Any]:
     """Make the data sets, analyse them, score them.
 
@@ -96,6 +97,8 @@ def run_blind_test(
         analyser: what is tested, as ``module:function`` that other processes can import.
         say: shown progress.
         answers: ``answers.json`` of another folder, whose sets are not analysed again, but for those that failed.
+        ray: None = processes of this machine; ``local`` = a Ray that is started here; otherwise the address of a cluster whose
+            nodes share ``plan.out``.
 
     Returns:
         The score, as in ``score.json``.
@@ -115,7 +118,7 @@ def run_blind_test(
     left = [one for one in cases if one.name not in there]
     if len(left) < len(cases):
         say(f"{len(cases) - len(left)} of {len(cases)} results are there already")
-    _run(plan, left, analyser, say)
+    _run(plan, left, analyser, say, ray)
     report = score(_kept(plan, cases), {one.name: one.as_dict() for one in cases})
     write_json(plan.out / "score.json", report)
     write_answers(plan.out)
@@ -242,62 +245,66 @@ def read_result(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def _run(plan: Plan, cases: Sequence[BlindCase], analyser: str, say: Callable[[str], None]) -> None:
-    """Work through the sets, ``processes`` at a time, and say after each how long the rest will take."""
-    begin, done, left, working = time.monotonic(), 0, list(cases), {}
-    try:
-        while left or working:
-            while left and len(working) < plan.processes:
-                one = left.pop(0)
-                working[one.name] = one, _start(plan, one, analyser)
-            time.sleep(0.1)
-            for one, process in [pair for pair in working.values() if pair[1].poll() is not None]:
-                del working[one.name]
-                done += 1
-                passed = time.monotonic() - begin
-                rest = passed / done * (len(cases) - done)
-                line = _outcome(plan, one, process.returncode)
-                write_answers(plan.out)
-                say(f"{done}/{len(cases)}  {line}  {_clock(passed)} passed, about {_clock(rest)} to go")
-    finally:
-        for _, process in working.values():
-            process.terminate()
+def _run(plan: Plan, cases: Sequence[BlindCase], analyser: str, say: Callable[[str], None], ray: str | None) -> None:
+    """Work through the sets, in processes of their own, and say after each how long the rest will take."""
+    begin, named = time.monotonic(), {one.name: one for one in cases}
+    jobs = [_job(plan, one, analyser) for one in cases]
+    with _spreading(plan, analyser, say, ray) as spread_out:
+        for done, ended in enumerate(spread_out(jobs), 1):
+            passed = time.monotonic() - begin
+            rest = passed / done * (len(cases) - done)
+            line = _outcome(plan, named[ended.name], ended.error)
+            write_answers(plan.out)
+            say(f"{done}/{len(cases)}  {line}  {_clock(passed)} passed, about {_clock(rest)} to go")
 
 
-def _start(plan: Plan, one: BlindCase, analyser: str) -> subprocess.Popen[bytes]:
-    """Start a process for one set: what it breaks or leaks is gone with it, and it can be stopped."""
-    task = {**vars(plan), "out": str(plan.out), "index": one.seed - plan.first_seed, "analyser": analyser}
-    with open(_log_file(plan, one), "wb") as log:
-        return subprocess.Popen(
-            [sys.executable, "-m", "wlr_gym.studies.bench.gap", json.dumps(task)],
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, **dict.fromkeys(_THREADS, "1")},
-        )
+@contextmanager
+def _spreading(
+    plan: Plan, analyser: str, say: Callable[[str], None], ray: str | None
+) -> Iterator[Callable[[Sequence[Job]], Iterator[Ended]]]:
+    """Yield what runs jobs: processes of this machine, or a Ray cluster."""
+    if ray is None:
+        yield lambda jobs: spread(jobs, plan.processes)
+        return
+    from wlr_gym.learning.sweep.ray_cluster import LOCAL, connected, fit_nodes, spread_on_ray
+
+    with connected(ray, plan.processes if ray == LOCAL else None):
+        check = Job("check", _MODULE, {"check": analyser}, str((plan.out / "work" / "check.log").resolve()))
+        nodes = fit_nodes(check, say)
+        yield lambda jobs: spread_on_ray(jobs, nodes, plan.processes)
+
+
+def _job(plan: Plan, one: BlindCase, analyser: str) -> Job:
+    """Return the job of one set: what it breaks or leaks is gone with its process, and it can be stopped."""
+    task = {**vars(plan), "out": str(plan.out.resolve()), "index": one.seed - plan.first_seed, "analyser": analyser}
+    _log_file(plan, one).unlink(missing_ok=True)
+    return Job(one.name, _MODULE, task, str(_log_file(plan, one).resolve()))
 
 
 def _log_file(plan: Plan, one: BlindCase) -> Path:
     return plan.out / "work" / f"{one.name}.log"
 
 
-def _outcome(plan: Plan, one: BlindCase, code: int) -> str:
+def _outcome(plan: Plan, one: BlindCase, error: str) -> str:
     """Say how a set went; a process that died without a result has failed."""
     file, log = plan.result_file(one), _log_file(plan, one)
     if not file.is_file():
-        last = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
-        message = f"the process ended with {code}: {' '.join(last)}"
-        write_json(file, {"verdict": "failed", "message": message, "blind_test": _origin(plan, one)})
+        write_json(file, {"verdict": "failed", "message": _without(plan.out, error), "blind_test": _origin(plan, one)})
     result = read_result(file)
     if result["verdict"] != "failed":
-        log.unlink()
+        log.unlink(missing_ok=True)
     return f"{one.name}: {result['verdict']}, {result.get('wall_seconds', 0):.0f} s"
 
 
-def _main(task: dict[str, Any]) -> None:
-    """Do one set, in a process of its own."""
-    index, module, _, function = task.pop("index"), *task.pop("analyser").partition(":")
-    plan = Plan(**{**task, "out": Path(task["out"]), "runs": tuple(task["runs"])})
-    run_case(plan, case(index, plan.first_seed), getattr(importlib.import_module(module), function))
+def _work(task: Mapping[str, Any], send: Send) -> None:
+    """Do one set, in a process of its own; or find out whether one could be done here."""
+    module, _, function = task.get("analyser", task.get("check")).partition(":")
+    if "check" in task:
+        importlib.import_module(module)
+        return
+    fields = {name: value for name, value in task.items() if name not in ("index", "analyser")}
+    plan = Plan(**{**fields, "out": Path(task["out"]), "runs": tuple(task["runs"])})
+    run_case(plan, case(task["index"], plan.first_seed), getattr(importlib.import_module(module), function))
 
 
 def _clock(seconds: float) -> str:
@@ -349,4 +356,4 @@ def make_data(folder: Path, one: BlindCase, runs: Sequence[int] = range(8)) -> N
 
 
 if __name__ == "__main__":
-    _main(json.loads(sys.argv[1]))
+    serve(_work)

@@ -69,7 +69,7 @@ def _add_servos(robot: Robot, parameters: Parameters) -> Callable[[mujoco.MjSpec
     )
     gain = constant / resistance
     limit = gain * parameters["servo.supply_voltage"][0]
-    kp, kd = gain * parameters["servo.kp"][0], gain * parameters["servo.kd"][0]
+    kp, kd = gain * servo.position_gains(parameters)[0], gain * parameters["servo.kd"][0]
 
     def add(spec: mujoco.MjSpec) -> None:
         for index, name in enumerate(JOINTS):
@@ -105,14 +105,14 @@ class MujocoLoopPlant:
     control period, contact forces and friction torques are not filled in, all motors are always on, setpoints are not delayed.
     """
 
-    capabilities = Capabilities(BACKEND, has_truth=True, can_set_state=True, real_time=False)
+    capabilities: Capabilities = Capabilities(BACKEND, has_truth=True, can_set_state=True, real_time=False)
     soft = True
 
     def __init__(self, robot: Robot, count: int = 1, options: PlantOptions | None = None) -> None:
         if count != 1:
             raise InputError(f"backend '{BACKEND}' drives one robot, not {count}")
         self.robot = robot
-        self.options = options or PlantOptions()
+        self.options: PlantOptions = options or PlantOptions()
         self.parameters = Parameters.nominal(robot, 1)
         self._truth = Truth(np.zeros((1, TRUTH_LAYOUT.width)))
         self._raw = np.zeros((1, RAW_LAYOUT.width))
@@ -156,7 +156,7 @@ class MujocoLoopPlant:
 
     def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
         """Change parameters in mid-run; the state stays."""
-        state = self.get_state()
+        state = self.mechanical_state()
         self.parameters = parameters.copy()
         self._build()
         self._put(state)
@@ -168,7 +168,7 @@ class MujocoLoopPlant:
         data.qvel[3:6], data.qvel[6:] = state.angular_velocity_in_body[0], state.joint_velocity[0, _MUJOCO]
         data.act[:] = state.reference_position[0, WHEEL_SLICE]
 
-    def get_state(self) -> PlantState:
+    def mechanical_state(self) -> PlantState:
         """Return a copy of the mechanical and servo state."""
         truth = self._truth
         reference, speed = truth.joint_position.copy(), np.zeros((1, 8))

@@ -93,7 +93,7 @@ def _deploy(demo: Demo, patch: Any, seed: int) -> None:
     from wlr_gym.policy import make_policy, policy_environment
 
     hardware = {"emulated": True, "log": demo.measured, "effects": patch}
-    keywords = {"backend": "dynamixel", "hardware": hardware, "episode_length": demo.run_seconds}
+    keywords = {"backend": "dynamixel", "robot": "nominal", "hardware": hardware, "episode_length": demo.run_seconds}
     core = make_core(ENVIRONMENT, 1, keywords | policy_environment(POLICY))
     try:
         ended = deploy(core, make_policy(POLICY, core.contract()), seed)

@@ -45,7 +45,7 @@ WORKERS: Mapping[str, tuple[DemoStage, ...]] = {
 TellWorker = Callable[[str, str, float], None]
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")
 #: s that a worker has to come to an end after Ctrl-C, before it is killed.
-_PATIENCE = 20.0
+_PATIENCE = 60.0
 
 
 @dataclass

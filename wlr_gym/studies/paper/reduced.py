@@ -285,7 +285,7 @@ class ReducedModel:
             parameters["servo.stall_torque"][:, pair], parameters["servo.no_load_speed"][:, pair], nominal
         )
         self._constant, self._resistance, self._many = constant, resistance, many
-        self._kp, self._kd = parameters["servo.kp"][:, pair], parameters["servo.kd"][:, pair]
+        self._kp, self._kd = servo.position_gains(parameters)[:, pair], parameters["servo.kd"][:, pair]
         self._supply = parameters["servo.supply_voltage"][:, None]
         self._viscous = many * parameters["servo.viscous_friction"][:, pair]
         self._dry = many * parameters["servo.coulomb_friction"][:, pair]

@@ -43,6 +43,11 @@ HARDWARE_ERRORS = {
 Bound = int | str | None
 
 
+def error_names(bits: int) -> list[str]:
+    """Return the names of the errors in Hardware Error Status."""
+    return [name for bit, name in HARDWARE_ERRORS.items() if bits & bit]
+
+
 @dataclass(frozen=True)
 class Item:
     """One row of a control table.

@@ -65,7 +65,7 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
     v, w = vector(lanes, "v"), vector(lanes, "w")
     u_base = [*(v[k] + step * gravity[k] for k in range(3)), *w]  # uniform gravity accelerates every point alike
     w_mid = [1.5 * w[k] - 0.5 * lanes[f"last_w{a}"] for k, a in enumerate(AXES)]
-    joints = joints_of(lanes)
+    joints = joints_of(lanes, features)
     out, voltages = drive.command(lanes, joints, time, step, features)
     mass, bias, corners = _inertia(lanes, w_mid)
 

@@ -19,9 +19,10 @@ from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import friction, gauss, kinematics, lanes
 from wlr_gym.physics.plants.gibbs_appell import step as source
-from wlr_gym.physics.plants.gibbs_appell.lanes import FORMULA_INPUTS, FORMULA_OUTPUTS, INPUTS, STORED, TICK_SUMS
+from wlr_gym.physics.plants.gibbs_appell.lanes import FORMULA_INPUTS, FORMULA_OUTPUTS, INPUTS, SINGLE, STORED, TICK_SUMS, TURN
 from wlr_gym.physics.plants.gibbs_appell.packing import PARAMETER_LANES
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT
+from wlr_gym.robot import FIRST_WHEEL
 
 WIDTH = {"float64": 8, "float32": 16}
 
@@ -45,8 +46,10 @@ class _Lanes(Mapping[str, Any]):
         raise TypeError("lanes are read by name")
 
 
-def trace(features: frozenset[str]) -> dict[str, dict[str, Any]]:
+def trace(features: frozenset[str], precision: str) -> dict[str, dict[str, Any]]:
     """Trace all blocks: name -> outputs. ``prepare`` holds what depends on parameters and inputs alone."""
+    if precision == "float32":
+        features |= {SINGLE}
     owner = Graph()
     lanes = _Lanes(owner)
     step, time = owner.input("step"), owner.input("time")
@@ -92,7 +95,7 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
 
     With formula forces the driver is a module of its own (:func:`driver_source`): a new formula leaves the blocks as they are.
     """
-    blocks = trace(features)
+    blocks = trace(features, precision)
     start = _places(blocks, width)
 
     def load(name: str) -> str:
@@ -115,14 +118,14 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
             *body,
             "",
         ]
-    return "\n".join(lines) + ("" if "forces" in features else _driver(start, width))
+    return "\n".join(lines) + ("" if "forces" in features else _driver(start, width, precision))
 
 
 def driver_source(features: frozenset[str], precision: str, width: int, blocks: str, formulas: str) -> str:
     """Return the driver module that steps the blocks of module ``blocks`` under the formula forces of module ``formulas``."""
-    traced = trace(features)
+    traced = trace(features, precision)
     imports = f"from {blocks} import {', '.join(traced)}\nfrom {formulas} import evaluate\nF = np.{precision}\n"
-    return imports + _driver(_places(traced, width), width, _APPLY_FORMULAS)
+    return imports + _driver(_places(traced, width), width, precision, _APPLY_FORMULAS)
 
 
 def _places(blocks: Mapping[str, Mapping[str, Any]], width: int) -> dict[str, int]:
@@ -132,7 +135,7 @@ def _places(blocks: Mapping[str, Mapping[str, Any]], width: int) -> dict[str, in
     return {name: index * width for index, name in enumerate(names)}
 
 
-def _driver(start: Mapping[str, int], width: int, apply_formulas: str = "") -> str:
+def _driver(start: Mapping[str, int], width: int, precision: str, apply_formulas: str = "") -> str:
     values = {
         "width": width,
         "scratch": len(start) * width,
@@ -153,8 +156,24 @@ def _driver(start: Mapping[str, int], width: int, apply_formulas: str = "") -> s
         "sensed_count": len(FORMULA_INPUTS),
         "formula": start.get(FORMULA_OUTPUTS[0]),
         "formula_count": len(FORMULA_OUTPUTS),
+        "wheel_angle": start["wheel_angle0"],
+        "wheel_reference": start[f"reference_position{FIRST_WHEEL}"],
+        "turns": start["turns0"],
+        "zero_angle": start["zero_angle0"],
+        "zero_rest": start["zero_rest0"],
+        "rounding": start["rounding_px"],
+        "wheel_column": TRUTH_LAYOUT.slices["joint_position"].start + FIRST_WHEEL,
+        "raw_wheel_column": RAW_LAYOUT.slices["joint_position"].start + FIRST_WHEEL,
+        "raw_pose": RAW_LAYOUT.slices["pose"].start,
+        "turn": TURN,
     }
-    return _DRIVER.format(**values, apply_formulas=apply_formulas.format(**values))
+    single = precision == "float32"
+    parts = {
+        "apply_formulas": apply_formulas.format(**values),
+        "unwrap": _UNWRAP.format(**values) if single else "",
+        "count_anew": _COUNT_ANEW.format(**values) if single else "",
+    }
+    return _DRIVER.format(**values, **parts)
 
 
 _DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
@@ -163,6 +182,30 @@ _APPLY_FORMULAS = """
             seen = W[{sensed} : {sensed} + {sensed_count} * {width}].reshape({sensed_count}, {width})
             pushes = W[{formula} : {formula} + {formula_count} * {width}].reshape({formula_count}, {width})
             evaluate(seen, formula_values[tile], memory[tile], pushes, step)"""
+#: Single precision: the shown wheel angles and place, put together in double precision.
+_UNWRAP = """
+        for i in range(4):
+            at = i * {width} + k
+            angle = np.float64(W[{zero_angle} + at]) + np.float64(W[{zero_rest} + at]) + np.float64(W[{wheel_angle} + at])
+            angle += {turn!r} * np.float64(W[{turns} + at])
+            TRUTH[row, {wheel_column} + i] = angle
+            RAW[row, {raw_wheel_column} + i] = angle
+        for i in range(2):
+            place = TRUTH[row, i] - np.float64(W[{rounding} + i * {width} + k])
+            TRUTH[row, i] = place
+            RAW[row, {raw_pose} + i] = place"""
+#: Single precision: wheel angles, and the servos' references with them, count from where the wheels stand after each tick.
+_COUNT_ANEW = """
+        for at in range(4 * {width}):
+            moved = W[{wheel_angle} + at]
+            angle = np.float64(W[{zero_angle} + at]) + np.float64(W[{zero_rest} + at]) + np.float64(moved)
+            turned = np.rint(angle / {turn!r})
+            angle -= turned * {turn!r}
+            W[{zero_angle} + at] = angle
+            W[{zero_rest} + at] = angle - np.float64(W[{zero_angle} + at])
+            W[{turns} + at] += F(turned)
+            W[{wheel_angle} + at] = F(0.0)
+            W[{wheel_reference} + at] -= moved"""
 _DRIVER = """
 {decorator}
 def scatter(W, TRUTH, RAW, tile, count):
@@ -172,7 +215,7 @@ def scatter(W, TRUTH, RAW, tile, count):
             TRUTH[row, c] = W[{truth} + c * {width} + k]
         for c in range({raw_count}):
             RAW[row, c] = W[{raw} + c * {width} + k]
-        RAW[row, {raw_count}] = math.atan2(W[{sine} + k], W[{cosine} + k])
+        RAW[row, {raw_count}] = math.atan2(W[{sine} + k], W[{cosine} + k]){unwrap}
 
 
 {decorator}
@@ -201,7 +244,7 @@ def tick(
             for _ in range(sweeps):
                 sweep(W)
             finish(W, step)
-            drift(W, step if s + 1 < substeps else half)
+            drift(W, step if s + 1 < substeps else half){count_anew}
         observe(W, step)
         scatter(W, TRUTH, RAW, tile, count)
         X[tile] = W[:{stored}]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Value, Vector
 from wlr_gym.physics.plants import drive
-from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS
+from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, SINGLE
 
 
 def cross(a: Sequence[Value], b: Sequence[Value]) -> Vector:
@@ -93,7 +93,13 @@ def slip_velocity(
     return slip
 
 
-def joints_of(lanes: Lanes) -> list[drive.Joint]:
+def wheel_angle(lanes: Lanes, i: int, features: frozenset[str]) -> Value:
+    """Angle of a wheel relative to its leg; in single precision within the present turn, with the present tick's motion."""
+    own = lanes[f"wheel_angle{i}"]
+    return lanes[f"zero_angle{i}"] + own if SINGLE in features else own
+
+
+def joints_of(lanes: Lanes, features: frozenset[str]) -> list[drive.Joint]:
     """Return the eight joints as the drive sees them."""
     joints: list[drive.Joint] = []
     for i in CORNERS:
@@ -101,5 +107,6 @@ def joints_of(lanes: Lanes) -> list[drive.Joint]:
         joints.append(drive.Joint(angle, lanes[f"leg_rate{i}"] - lanes["wy"], angle + lanes[f"zero_offset{i}"]))
     for i in CORNERS:
         angle = lanes[f"wheel_angle{i}"]
-        joints.append(drive.Joint(angle, lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"], angle))
+        rate = lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"]
+        joints.append(drive.Joint(wheel_angle(lanes, i, features), rate, angle))
     return joints

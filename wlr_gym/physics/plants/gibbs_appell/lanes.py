@@ -5,6 +5,8 @@ Every function of the step maps lanes (state, parameters, inputs; each a scalar)
 
 from __future__ import annotations
 
+import math
+
 from wlr_gym.physics.plants import drive
 from wlr_gym.physics.plants.forces import COORDINATES
 from wlr_gym.physics.plants.forces import INPUTS as INPUTS_OF_FORMULAS
@@ -33,7 +35,17 @@ STATE: tuple[str, ...] = (
     *(f"rolling_friction{i}" for i in CORNERS),
     *(f"gyro_{a}" for a in AXES),
     *(f"acceleration_{a}" for a in AXES),
+    # single precision only: what rounding has added to the position so far, and where wheel angles are counted from: whole
+    # turns, an angle, and what that lacks by rounding
+    *(f"rounding_p{a}" for a in "xy"),
+    *(f"turns{i}" for i in CORNERS),
+    *(f"zero_angle{i}" for i in CORNERS),
+    *(f"zero_rest{i}" for i in CORNERS),
 )
+#: Among the features: single precision, in which a sum over hours must not be one number.
+SINGLE = "single"
+#: A turn of a wheel, rad.
+TURN = 2.0 * math.pi
 #: Results of the last substep or of the whole tick, kept with the state for the observation block.
 RESULTS: tuple[str, ...] = (
     *(f"normal{i}" for i in CORNERS),

@@ -5,17 +5,19 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors
 from wlr_gym.physics.plants.forces import MEMORY, Force, compile_forces
 from wlr_gym.physics.plants.gibbs_appell import kernel, packing
-from wlr_gym.physics.plants.gibbs_appell.lanes import STORED
+from wlr_gym.physics.plants.gibbs_appell.lanes import STORED, TURN
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -136,6 +138,12 @@ class GibbsAppellPlant(Simulator):
         zero_offset = np.zeros((rows.size, 8))
         zero_offset[:, LEG_SLICE] = self.parameters["joint.zero_offset"][rows]
         reference = state.reference_position[rows] + zero_offset
+        place, wheels, zero = state.position[rows, :2], state.joint_position[rows, WHEEL_SLICE], np.zeros((rows.size, 4))
+        if self._float is np.float32:  # sums over hours begin small
+            wheels, zero = zero, wheels
+            reference[:, WHEEL_SLICE] -= zero
+        turns = np.rint(zero / TURN)
+        zero = zero - TURN * turns
         groups = {
             "p{}": (state.position[rows], "xyz"),
             "q{}": (quaternion, "wxyz"),
@@ -144,7 +152,11 @@ class GibbsAppellPlant(Simulator):
             "last_w{}": (w, "xyz"),
             "gyro_{}": (w, "xyz"),
             "leg_angle{}": (state.joint_position[rows, LEG_SLICE], range(4)),
-            "wheel_angle{}": (state.joint_position[rows, WHEEL_SLICE], range(4)),
+            "wheel_angle{}": (wheels, range(4)),
+            "turns{}": (turns, range(4)),
+            "zero_angle{}": (zero, range(4)),
+            "zero_rest{}": (zero - zero.astype(self._float), range(4)),
+            "rounding_p{}": (place.astype(self._float) - place, "xy"),
             "leg_rate{}": (leg_rate, range(4)),
             "last_leg_rate{}": (leg_rate, range(4)),
             "wheel_rate{}": (wheel_rate, range(4)),
@@ -170,7 +182,7 @@ class GibbsAppellPlant(Simulator):
         wound = np.zeros((rows.size, 8)) if state.wind_up is None else state.wind_up[rows]
         _scatter(self._memory, self._width, rows, wound, slice(1, None))
 
-    def get_state(self) -> PlantState:
+    def mechanical_state(self) -> PlantState:
         """Return a copy of the mechanical and servo state."""
         values = _gather(self._lanes, self._width, np.arange(self._count)).astype(np.float64)
 
@@ -179,9 +191,11 @@ class GibbsAppellPlant(Simulator):
 
         reference = columns("reference_position{}", range(8))
         reference[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
+        if self._float is np.float32:
+            reference[:, WHEEL_SLICE] += self._truth.joint_position[:, WHEEL_SLICE] - columns("wheel_angle{}", range(4))
         has_play = self.parameters["servo.backlash"] > 0.0
         return PlantState(
-            position=columns("p{}", "xyz"),
+            position=self._truth.position.copy(),
             quaternion=columns("q{}", "wxyz"),
             linear_velocity_in_body=columns("v{}", "xyz"),
             angular_velocity_in_body=columns("w{}", "xyz"),
@@ -195,6 +209,16 @@ class GibbsAppellPlant(Simulator):
             time=self._time.copy(),
             wind_up=_gather(self._memory, self._width, self._all)[:, 1:].astype(np.float64),
         )
+
+    def _fits(self) -> dict[str, Any]:
+        return super()._fits() | {"formulas": self._formulas.module if self._formulas else "", "sweeps": self.sweeps}
+
+    def _engine_stores(self) -> dict[str, RowStore]:
+        lanes = {"lanes": self._lanes, "memory": self._memory, "force_values": self._formula_values}
+        return {name: _LaneRows(values, self._width) for name, values in lanes.items()}
+
+    def _note_restored(self) -> None:
+        self._pad(self._lanes)
 
     def expect_all_effects(self) -> None:
         """Compile for every family of effects; see :class:`wlr_gym.physics.plants.simulator.Simulator`."""
@@ -260,3 +284,16 @@ def _scatter(lanes: Array, width: int, rows: NDArray[np.intp], values: Array, wh
 def _gather(lanes: Array, width: int, rows: NDArray[np.intp]) -> Array:
     tiles, places = np.divmod(rows, width)
     return lanes.reshape(lanes.shape[0], -1, width)[tiles, :, places]
+
+
+class _LaneRows:
+    """Lanes as rows of robots."""
+
+    def __init__(self, lanes: Array, width: int) -> None:
+        self._lanes, self._width = lanes, width
+
+    def __getitem__(self, rows: NDArray[np.intp]) -> Array:
+        return _gather(self._lanes, self._width, rows)
+
+    def __setitem__(self, rows: NDArray[np.intp], values: Array) -> None:
+        _scatter(self._lanes, self._width, rows, values)

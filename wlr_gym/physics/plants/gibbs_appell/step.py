@@ -23,6 +23,8 @@ in ``friction.py``; ``kinematics.py`` has the geometry, ``lanes.py`` the names.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value
 from wlr_gym.physics.plants import drive, ground
@@ -36,9 +38,10 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     slip_velocity,
     to_body,
     vector,
+    wheel_angle,
     wheel_points,
 )
-from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, INPUTS_OF_FORMULAS
+from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, INPUTS_OF_FORMULAS, SINGLE, TURN
 from wlr_gym.robot import FIRST_WHEEL
 
 
@@ -56,6 +59,8 @@ def drift(lanes: Lanes, duration: Value, features: frozenset[str] = frozenset())
     norm = 1.5 - 0.5 * dot(new, new)  # one Newton step keeps the quaternion at unit length
     for name, value in zip("wxyz", new, strict=True):
         out[f"q{name}"] = value * norm
+    if SINGLE in features:
+        out |= _compensated(lanes, {f"p{a}": duration * dot(rows[k], v) for k, a in enumerate("xy")})
     t = [2.0 * x for x in cross(v, e)]  # v in the turned frame: rotate by the inverse increment
     t2 = cross(t, e)
     for k, a in enumerate(AXES):
@@ -64,8 +69,18 @@ def drift(lanes: Lanes, duration: Value, features: frozenset[str] = frozenset())
         out[f"leg_angle{i}"] = lanes[f"leg_angle{i}"] + duration * (lanes[f"leg_rate{i}"] - w[1])
         out[f"wheel_angle{i}"] = lanes[f"wheel_angle{i}"] + duration * (lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"])
     if "backlash" in features:
-        for j, joint in enumerate(joints_of(lanes)):
+        for j, joint in enumerate(joints_of(lanes, features)):
             out[f"rotor_lead{j}"] = lanes[f"rotor_lead{j}"] + duration * (lanes[f"rotor_rate{j}"] - joint.rate)
+    return out
+
+
+def _compensated(lanes: Lanes, changes: Mapping[str, Value]) -> Out:
+    """Add changes by Kahan's sum: far from the origin single precision rounds off much of what a step adds."""
+    out: Out = {}
+    for name, change in changes.items():
+        wanted = change - lanes[f"rounding_{name}"]
+        new = lanes[name] + wanted
+        out |= {name: new, f"rounding_{name}": (new - lanes[name]) - wanted}
     return out
 
 
@@ -125,6 +140,9 @@ def observe(lanes: Lanes, step: Value, features: frozenset[str] = frozenset()) -
     out |= {f"linear_velocity_in_body_{a}": lanes[f"v{a}"] for a in AXES}
     out |= {f"angular_velocity_in_body_{a}": lanes[f"w{a}"] for a in AXES}
     out |= {f"joint_position_{j}": lanes[f"{'leg' if j < FIRST_WHEEL else 'wheel'}_angle{j % FIRST_WHEEL}"] for j in range(8)}
+    if SINGLE in features:
+        wheels = {i: wheel_angle(lanes, i, features) + TURN * lanes[f"turns{i}"] for i in CORNERS}
+        out |= {f"joint_position_{FIRST_WHEEL + i}": angle for i, angle in wheels.items()}
     out |= {f"joint_velocity_{i}": lanes[f"leg_rate{i}"] - w[1] for i in CORNERS}
     out |= {f"joint_velocity_{FIRST_WHEEL + i}": lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"] for i in CORNERS}
     out |= {f"motor_torque_{j}": lanes[f"motor_torque{j}"] for j in range(8)}

@@ -9,6 +9,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.model.dynamics import gravity_in_floor
 from wlr_gym.physics.plants.mujoco.mjcf import build_model, principal_inertia
 from wlr_gym.physics.plants.mujoco.step import CAPSULE_HALF_LENGTH
@@ -153,6 +154,12 @@ class RobotBatch:
         scale = (1.0 - CONTACT_IMPEDANCE) * self._inverse_weight[rows[:, None], wheels, 0]
         self._solref[rows, :, 0] = -scale * parameters["ground.normal_stiffness"]
         self._solref[rows, :, 1] = -scale * parameters["ground.normal_damping"]
+
+    def stores(self) -> dict[str, RowStore]:
+        """Return what a step takes from the one before it."""
+        names = ("qpos", "qvel", "warmstart", "applied", "armature", "gear_bound")
+        moving = ("pair_friction", "pair_margin", "geom_size", "geom_pos", "geom_quat")
+        return {name: getattr(self, name) for name in (*names, *moving)}
 
     def model_of(self, robot: int) -> mujoco.MjModel:
         """Return a copy of the model with the numbers of one robot."""

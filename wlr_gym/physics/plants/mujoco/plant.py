@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors
 from wlr_gym.physics.plants.forces import COORDINATES, INPUTS, MEMORY, Force, compile_forces
@@ -126,7 +128,7 @@ class MujocoPlant(Simulator):
         batch = self._batch
         self._state[rows], batch.qpos[rows], batch.qvel[rows], batch.warmstart[rows] = values, position, speed, 0.0
 
-    def get_state(self) -> PlantState:
+    def mechanical_state(self) -> PlantState:
         """Return a copy of the mechanical and servo state."""
 
         def columns(name: str) -> Array:
@@ -151,6 +153,17 @@ class MujocoPlant(Simulator):
             time=self._time.copy(),
             wind_up=self._memory[1:].T.copy(),
         )
+
+    def _fits(self) -> dict[str, Any]:
+        return super()._fits() | {"formulas": self._forces.module if self._forces else ""}
+
+    def _engine_stores(self) -> dict[str, RowStore]:
+        inputs = {f"input{number}": values for number, values in enumerate(self._inputs)}
+        by_robot = {"memory": self._memory.T, "force_values": self._force_values.T}
+        return {"servos": self._state, **inputs, **by_robot, **self._batch.stores()}
+
+    def _note_restored(self) -> None:
+        pass
 
     # ---- stepping ----
 

@@ -1,0 +1,236 @@
+"""What is wrong with a log is said: the file, the topic, the field."""
+
+import sqlite3
+
+import numpy as np
+import pytest
+from foreign_logs import (
+    NAMES,
+    RATE,
+    joint_state,
+    lab_frame,
+    lab_messages,
+    made_up,
+    ns,
+    write_mcap,
+    write_rosbag1,
+    write_rosbag2,
+)
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.logs import import_log, read_logs, suggest_map
+from wlr_gym.data.logs.map import content
+from wlr_gym.robot import JOINTS
+
+
+@pytest.fixture(scope="module")
+def messages():
+    return lab_messages(made_up(6.0))
+
+
+@pytest.fixture(scope="module")
+def mcap(messages, tmp_path_factory):
+    return write_mcap(tmp_path_factory.mktemp("mcap") / "lab.mcap", messages)
+
+
+@pytest.fixture(scope="module")
+def known(mcap):
+    return content(suggest_map(mcap).map)
+
+
+def test_no_such_file(tmp_path):
+    with pytest.raises(InputError, match=r"none.mcap: no such file or folder; expected an .mcap"):
+        list(read_logs(tmp_path / "none.mcap"))
+    (tmp_path / "a.txt").write_text("x")
+    with pytest.raises(InputError, match=r"a.txt: '.txt' files are not read"):
+        list(read_logs(tmp_path / "a.txt"))
+    (tmp_path / "b.mcap").touch()
+    with pytest.raises(InputError, match=r"b.mcap: empty file"):
+        list(read_logs(tmp_path / "b.mcap"))
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a.db3", "a.bag", "a.parquet"])
+def test_noise_is_no_log(tmp_path, name):
+    (tmp_path / name).write_bytes(np.random.default_rng(0).bytes(5000))
+    with pytest.raises(InputError, match=rf"{name}: cannot be read as"):
+        list(read_logs(tmp_path / name))
+
+
+def test_an_mcap_file_that_is_cut_off_is_read_up_to_there(mcap, known, tmp_path):
+    whole = mcap.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    (imported,) = import_log(tmp_path / "cut.mcap", tmp_path / "runs", known)
+    assert "cut off or broken near byte" in imported.notes[0]
+    assert imported.path.is_file()
+
+
+def test_a_broken_chunk_is_left_out(mcap, known, tmp_path):
+    whole = bytearray(mcap.read_bytes())
+    place = len(whole) // 2
+    whole[place : place + 40] = b"\xff" * 40
+    (tmp_path / "broken.mcap").write_bytes(whole)
+    (imported,) = import_log(tmp_path / "broken.mcap", tmp_path / "runs", known)
+    assert any("broken" in note for note in imported.notes)
+
+
+def test_a_rosbag1_that_is_cut_off(tmp_path):
+    bag = write_rosbag1(tmp_path / "a.bag", lab_messages(made_up(3.0)))
+    bag.write_bytes(bag.read_bytes()[:-2000])
+    with pytest.raises(InputError, match=r"a.bag: cannot be read as rosbag1"):
+        list(read_logs(bag))
+
+
+def test_a_rosbag2_that_is_cut_off(messages, tmp_path):
+    bag = write_rosbag2(tmp_path / "b", messages)
+    (file,) = bag.glob("*.db3")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    try:
+        (log,) = read_logs(bag)
+    except InputError as error:
+        assert "b: cannot be read as rosbag2" in str(error)  # noqa: PT017
+    else:
+        assert "broken after" in log.notes[0]
+
+
+def test_a_bag_without_its_file(messages, tmp_path):
+    bag = write_rosbag2(tmp_path / "b", messages, "mcap")
+    next(bag.glob("*.mcap")).unlink()
+    with pytest.raises(InputError, match=r"metadata.yaml names b.mcap, which is not there"):
+        list(read_logs(bag))
+
+
+def test_a_topic_or_field_that_is_not_there(mcap, known, tmp_path):
+    wrong = {**known, "channels": {**known["channels"], "volt": {"topic": "/powr", "field": "voltage"}}}
+    with pytest.raises(InputError, match=r"lab.mcap: unknown topic '/powr' \(did you mean '/power'\?\)"):
+        import_log(mcap, tmp_path / "runs", wrong)
+    wrong = {**known, "channels": {**known["channels"], "volt": {"topic": "/power", "field": "volts"}}}
+    with pytest.raises(InputError, match=r"lab.mcap: channel 'volt': topic '/power': unknown field 'volts'"):
+        import_log(mcap, tmp_path / "runs", wrong)
+    assert not list((tmp_path / "runs").glob("run_*"))
+
+
+def test_a_wrong_unit_is_said_with_topic_and_field(mcap, known, tmp_path):
+    wrong = {**known, "channels": {**known["channels"], "pos": {"topic": "/chassis/joints", "field": "position[{joint}]"}}}
+    message = (
+        r"lab.mcap: row \d+, column 'pos_leg_lf': .* looks like degrees \(from topic '/chassis/joints', field 'position\[FL_h"
+    )
+    with pytest.raises(InputError, match=message):
+        import_log(mcap, tmp_path / "runs", wrong)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"chanels": {}}, r"unknown key 'chanels' \(did you mean 'channels'\?\)"),
+        ({"channels": {"pos_lg": {"topic": "a", "field": "b"}}}, r"unknown channel 'pos_lg' \(did you mean 'pos_leg'\?\)"),
+        ({"joints": {"leg_fl": "a"}}, r"unknown joint 'leg_fl'"),
+        ({"channels": {"pos": {"topic": "a", "field": "b", "unit": "degrees"}}}, r"unknown unit 'degrees'"),
+        ({"frames": {"imu": ["x", "y", "-z"]}}, r"expected x, y and z once each, right-handed"),
+    ],
+)
+def test_a_broken_map(mcap, tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        import_log(mcap, tmp_path / "runs", change)
+
+
+def test_mixed_units_are_said(tmp_path):
+    table = made_up(6.0)
+    messages = []
+    for k in range(0, len(table["t"]), 4):
+        position = [table[f"pos_{joint}"][k] for joint in JOINTS]
+        position[0] = np.degrees(position[0])
+        message = joint_state(ns(table["t"][k]), NAMES.values(), position)
+        messages.append((ns(table["t"][k]), "/joints", "sensor_msgs/msg/JointState", message))
+    found = suggest_map(write_mcap(tmp_path / "mixed.mcap", messages))
+    (said,) = [reason for reason in found.reasons if reason.what == "pos_leg"]
+    assert said.sure == "guess"
+    assert "mixed units in topic '/joints': position[FL_hip] in deg, position[FR_hip] in rad" in said.why
+    assert found.map.channels["pos_leg_lf"].unit == "deg"
+    assert found.map.channels["pos_leg_rf"].unit is None
+
+
+def test_two_robots_in_one_bag(messages, tmp_path):
+    both = [(time, f"/{robot}{topic}", kind, message) for time, topic, kind, message in messages for robot in ("alpha", "beta")]
+    bag = write_mcap(tmp_path / "two.mcap", both)
+    with pytest.raises(
+        InputError, match=r"two.mcap: two robots: topics .*say which in the map: namespace: /alpha  \(or /beta\)"
+    ):
+        suggest_map(bag)
+    found = suggest_map(bag, {"namespace": "/beta"}).map
+    assert {source.topic for source in found.channels.values()} == {
+        "/beta/chassis/joints", "/beta/chassis/target", "/beta/xsens/data", "/beta/mocap/base", "/beta/power",
+    }  # fmt: skip
+
+
+def test_two_robots_in_one_topic(tmp_path):
+    table, messages = made_up(3.0), []
+    for k in range(0, 2 * RATE, 4):
+        names = [f"{robot}_{NAMES[joint]}" for robot in ("r1", "r2") for joint in JOINTS]
+        values = [table[f"pos_{joint}"][k] for joint in JOINTS] * 2
+        message = joint_state(ns(table["t"][k]), names, values)
+        messages.append((ns(table["t"][k]), "/joints", "sensor_msgs/msg/JointState", message))
+    with pytest.raises(
+        InputError, match=r"topic '/joints': fields 'position\[r1_FL_hip\]' and .* are both the leg_lf: two robots"
+    ):
+        suggest_map(write_mcap(tmp_path / "two.mcap", messages))
+
+
+def test_a_type_without_a_definition_is_left_out_and_said(messages, tmp_path):
+    bag = write_rosbag2(tmp_path / "b", messages)
+    (file,) = bag.glob("*.db3")
+    with sqlite3.connect(file) as base:
+        base.execute("UPDATE topics SET type = 'lab_msgs/msg/Power' WHERE name = '/power'")
+        base.execute("DELETE FROM message_definitions")
+    text = (bag / "metadata.yaml").read_text().replace("sensor_msgs/msg/BatteryState", "lab_msgs/msg/Power")
+    (bag / "metadata.yaml").write_text(text)
+    (log,) = read_logs(bag)
+    assert "/power" not in log.topics
+    assert "/xsens/data" in log.topics  # of a type that ROS comes with
+    assert any("topic '/power': type 'lab_msgs/msg/Power': the file does not define it" in note for note in log.notes)
+
+
+def test_setpoints_that_are_not_there(messages, tmp_path):
+    bag = write_mcap(tmp_path / "a.mcap", [one for one in messages if one[1] != "/chassis/target"])
+    with pytest.raises(InputError, match=r"no source for cmd_leg_lf, .*: the setpoints that drove the robot"):
+        import_log(bag, tmp_path / "runs")
+
+
+def test_a_log_is_imported_once(mcap, known, tmp_path):
+    import_log(mcap, tmp_path / "runs", known)
+    with pytest.raises(InputError, match=r"run_01 comes from it already"):
+        import_log(mcap, tmp_path / "runs", known)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda frame: frame.drop(columns="time_ms"), "no column of times"),
+        (lambda frame: frame.assign(time_ms=frame["time_ms"][::-1].to_numpy()), "row 1, column 'time_ms': times must increase"),
+        (lambda frame: frame[:1], "1 rows; a recording has at least 2"),
+    ],
+)
+def test_broken_tables(tmp_path, change, message):
+    change(lab_frame(made_up(3.0))).to_csv(tmp_path / "a.csv", index=False)
+    with pytest.raises(InputError, match=message):
+        list(read_logs(tmp_path / "a.csv"))
+
+
+def test_other_encodings_are_said(tmp_path):
+    from mcap.writer import Writer
+
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("lab.Wheels", "jsonschema", b"{}")
+        places = {
+            "json": writer.register_channel("/wheels", "json", schema),
+            "pb": writer.register_channel("/pb", "protobuf", schema),
+        }
+        for k in range(3):
+            writer.add_message(places["json"], k, b'{"header": {"stamp": {"sec": 1, "nsec": 5}}, "speed": [1, 2.5]}', k)
+            writer.add_message(places["pb"], k, b"\x00", k)
+        writer.finish()
+    (log,) = read_logs(tmp_path / "a.mcap")
+    assert log.topics["/wheels"].fields["speed[1]"][1].tolist() == [2.5] * 3
+    assert log.topics["/wheels"].stamped is not None
+    assert any("topic '/pb': messages in 'protobuf' are not read" in note for note in log.notes)

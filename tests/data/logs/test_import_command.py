@@ -1,0 +1,133 @@
+"""wlr import and wlr export --to, as a user types them."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from foreign_logs import lab_messages, made_up, rows_of, write_mcap
+
+from wlr_gym.base.settings import read_yaml
+from wlr_gym.cli import BAD_INPUT, OK, main
+from wlr_gym.data import read_dataset, read_run, write_run
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    return write_mcap(tmp_path_factory.mktemp("mcap") / "lab.mcap", lab_messages(made_up(12.0)))
+
+
+def test_suggest_then_import(bag, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    assert main(["import", str(bag), "--suggest"]) == OK
+    said = capsys.readouterr().out
+    assert "sure" in said
+    assert "topic '/chassis/joints', in deg" in said
+    assert main(["import", str(bag), "--map", "map.yaml", "--out", "runs"]) == OK
+    said = capsys.readouterr().out
+    assert "as recorded" in said
+    assert "interpolated" in said
+    (run,) = read_dataset("runs").runs
+    assert run.meta.robot == "wlr-nominal"
+    record = read_yaml("runs/import.yaml")["run_01"]
+    assert record["channels"]["gyro_x"]["rate"] == pytest.approx(200.0)
+
+
+def test_a_map_that_is_there_is_not_overwritten(bag, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("map.yaml").write_text("every: 2  # mine\n")
+    for words in ([], ["--map", "map.yaml"]):
+        assert main(["import", str(bag), "--suggest", *words]) == BAD_INPUT
+        assert "map.yaml: is there already, and is another map: import with it" in capsys.readouterr().err
+    assert main(["import", str(bag), "--suggest", "--map", "map.yaml", "--out", "runs"]) == OK
+    assert Path("map.yaml").read_text() == "every: 2  # mine\n"
+    assert read_yaml("runs/map.yaml")["every"] == 2
+    assert len(read_run("runs/run_01.parquet")["t"]) == pytest.approx(300, abs=10)
+
+
+def test_a_map_in_the_folder_of_runs_stands(bag, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["import", str(bag), "--suggest", "--out", "runs"]) == OK
+    kept = Path("runs/map.yaml").read_text().replace("every: 1", "").replace("rows:", "every: 2\nrows:", 1)
+    Path("runs/map.yaml").write_text(kept)
+    shutil.copy(bag, "other.mcap")
+    assert main(["import", "other.mcap", "--suggest", "--out", "runs"]) == BAD_INPUT
+    assert "runs/map.yaml: is there already" in capsys.readouterr().err
+    assert Path("runs/map.yaml").read_text() == kept
+    assert main(["import", "other.mcap", "--out", "runs"]) == OK
+    assert len(read_run("runs/run_02.parquet")["t"]) == pytest.approx(300, abs=10)
+
+
+def test_exports_overwrite_nothing(tmp_path, capsys):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    runs = [write_run(tmp_path / name / "run_01.csv", rows_of(made_up(1.0))) for name in ("a", "b")]
+    out = tmp_path / "bags"
+    assert main(["export", *map(str, runs), "--to", "mcap", "--out", str(out)]) == BAD_INPUT
+    assert f"both would be {out / 'run_01.mcap'}" in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
+    assert main(["export", str(runs[0]), "--to", "mcap", "--out", str(out)]) == OK
+    first = (out / "run_01.mcap").read_bytes()
+    assert main(["export", str(runs[1]), "--to", "mcap", "--out", str(out)]) == BAD_INPUT
+    assert "run_01.mcap: is there already" in capsys.readouterr().err
+    assert (out / "run_01.mcap").read_bytes() == first
+
+
+def test_our_own_runs_come_back_whole(bag, tmp_path, capsys):
+    run = write_run(tmp_path / "run_01.csv", rows_of(made_up(1.0)))
+    assert main(["export", str(run), "--to", "mcap"]) == OK
+    own, out = str(tmp_path / "run_01.mcap"), ["--out", str(tmp_path / "back")]
+    for words in (["--split", "3"], ["--robot", "nominal"]):
+        assert main(["import", own, *words, *out]) == BAD_INPUT
+        assert "takes neither split nor robot" in capsys.readouterr().err
+    assert main(["import", own, str(bag), *out]) == BAD_INPUT
+    assert f"{bag.name}: another program's log" in capsys.readouterr().err
+    assert not (tmp_path / "back").exists()
+
+
+def test_what_is_missing_is_said_with_its_cost(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "200")
+    messages = [one for one in lab_messages(made_up(6.0)) if one[1] not in ("/mocap/base", "/power")]
+    assert main(["import", str(write_mcap(tmp_path / "a.mcap", messages)), "--suggest", "--out", str(tmp_path / "runs")]) == OK
+    said = capsys.readouterr().out
+    assert "missing: cam_* of" in said
+    assert "what floor and wheels do" in said
+    assert "missing: volt: the supply counts as nominal" in said
+
+
+def test_a_run_goes_out_and_comes_back_without_a_map(tmp_path, capsys):
+    run = write_run(tmp_path / "runs" / "run_01.csv", rows_of(made_up(3.0)))
+    assert main(["export", str(run.parent), "--to", "mcap", "--out", str(tmp_path / "bags")]) == OK
+    assert main(["export", str(run), "--to", "rosbag2", "--out", str(tmp_path / "bags")]) == OK
+    logs = [str(tmp_path / "bags" / name) for name in ("run_01.mcap", "run_01.bag2")]
+    assert main(["import", *logs, "--out", str(tmp_path / "back")]) == OK
+    runs = read_dataset(tmp_path / "back").runs
+    first = read_run(run)
+    assert len(runs) == 2
+    for one in runs:
+        assert all(abs(one[name] - first[name]).max() <= 1e-9 for name in ("t", "pos_leg_lf", "cmd_wheel_rr"))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["import"], "expected logs to import"),
+        (["import", "nothing.mcap", "--suggest"], "nothing.mcap: no such file or folder"),
+        (["import", "LAB"], "--out: expected a folder"),
+        (["import", "LAB", "--out", "runs"], "give --map, or --suggest"),
+        (["export", "runs", "--to", "mcap", "--robot", "nominal"], "the options of policies do not go with it"),
+    ],
+)
+def test_bad_words(bag, tmp_path, monkeypatch, capsys, words, message):
+    monkeypatch.chdir(tmp_path)
+    assert main([str(bag) if word == "LAB" else word for word in words]) == BAD_INPUT
+    assert message in capsys.readouterr().err
+
+
+def test_missing_packages_are_named_with_the_extra(bag, monkeypatch, capsys, tmp_path):
+    import importlib.util
+
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "rosbags" else find(name, *rest))
+    assert main(["import", str(bag), "--suggest", "--out", str(tmp_path / "runs")]) == BAD_INPUT
+    assert "pip install 'wlr-gym[logs]'" in capsys.readouterr().err

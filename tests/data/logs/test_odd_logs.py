@@ -1,0 +1,203 @@
+"""Logs with lost frames, repeated times and holes: what is odd is left out and said, the rest comes in right."""
+
+import copy
+
+import numpy as np
+import pandas
+import pytest
+from foreign_logs import NAMES, RATE, joint_state, lab_frame, lab_messages, made_up, write_lerobot, write_mcap
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.data import read_run
+from wlr_gym.data.logs import import_log, read_logs, suggest_map
+from wlr_gym.data.logs.messages import make
+from wlr_gym.robot import WHEELS
+
+
+@pytest.fixture(scope="module")
+def table():
+    return made_up(12.0)
+
+
+@pytest.fixture(scope="module")
+def messages(table):
+    return lab_messages(table)
+
+
+def of_topic(messages, topic):
+    return [one for one in messages if one[1] == topic]
+
+
+def since_start(messages, one):
+    return (one[0] - messages[0][0]) * 1e-9
+
+
+@pytest.mark.parametrize("lost", [np.nan, 0.0])
+def test_a_frame_without_a_rotation_is_lost(messages, table, tmp_path, lost):
+    changed = copy.deepcopy(messages)
+    for _, _, _, message in of_topic(changed, "/mocap/base")[100:102]:
+        message.pose.position = make("geometry_msgs/msg/Point", x=lost, y=lost, z=lost)
+        message.pose.orientation = make("geometry_msgs/msg/Quaternion", **dict.fromkeys("xyzw", lost))
+    log = write_mcap(tmp_path / "a.mcap", changed)
+    found = suggest_map(log)
+    assert found.map.channels["gyro"].unit == "deg/s"
+    assert any(reason.what == "cam" and "2 frames without a rotation left out" in reason.why for reason in found.reasons)
+    (imported,) = import_log(log, tmp_path / "runs", found.map)
+    assert "topic '/mocap/base': 2 lost frames are left out" in imported.notes
+    run, seen = read_run(imported.path), np.isfinite(table["cam_yaw"])
+    known = np.isfinite(run["cam_yaw"])
+    start = imported.origin * 1e-9 - 1_760_000_000
+    for column in ("cam_x", "cam_yaw"):
+        right = np.interp(run["t"][known] + start, table["t"][seen], table[column][seen])
+        assert np.abs(run[column][known] - right).max() < 0.03
+
+
+def test_times_that_repeat_are_said(messages, tmp_path):
+    changed, stamp = copy.deepcopy(messages), None
+    for k, (_, _, _, message) in enumerate(of_topic(changed, "/chassis/joints")):
+        stamp = message.header.stamp if k % 2 == 0 else stamp
+        message.header.stamp = stamp
+    log = write_mcap(tmp_path / "a.mcap", changed)
+    assert suggest_map(log).map.clocks["/chassis/joints"].use == "log"
+    (whole,) = import_log(log, tmp_path / "whole")
+    assert len(read_run(whole.path)["t"]) > 590
+    (imported,) = import_log(log, tmp_path / "runs", suggest_map(write_mcap(tmp_path / "b.mcap", messages)).map)
+    note = "topic '/chassis/joints': 300 of 600 messages repeat a time and are left out: in the map, clocks: {/chassis/joints"
+    assert any(one.startswith(note) for one in imported.notes)
+
+
+def without_pose(table, mirrored=()):
+    changed = {name: -values if name.partition("_")[2] in mirrored else values for name, values in table.items()}
+    return [one for one in lab_messages(changed) if one[1] != "/mocap/base"]
+
+
+@pytest.mark.parametrize("mirrored", [(), ("wheel_rf", "wheel_rr"), ("wheel_lf", "wheel_lr")])
+def test_without_a_pose_the_gyroscope_shows_which_way_wheels_count(table, tmp_path, mirrored):
+    found = suggest_map(write_mcap(tmp_path / "a.mcap", without_pose(table, mirrored)))
+    assert {joint for joint, one in found.map.joints.items() if one.sign < 0} == set(mirrored)
+    assert found.map.channels["gyro"].unit == "deg/s"
+    said = {reason.what: reason for reason in found.reasons}
+    assert said["joints.wheel_*.sign"].sure == "likely"
+    assert said["pos_wheel"].sure == "likely"
+
+
+def test_without_a_pose_and_without_turns_wheels_are_a_guess(table, tmp_path):
+    straight = {name: values[: 5 * RATE] for name, values in table.items()}
+    found = suggest_map(write_mcap(tmp_path / "a.mcap", without_pose(straight, ("wheel_rf", "wheel_rr"))))
+    said = {reason.what: reason for reason in found.reasons}
+    assert said["joints.wheel_*.sign"].sure == said["gyro"].sure == "guess"
+    assert "no gyroscope that turns" in said["joints.wheel_*.sign"].why
+    assert "none of its axes turns about as much as the wheels" in said["gyro"].why
+
+
+@pytest.fixture(scope="module")
+def known(messages, tmp_path_factory):
+    return suggest_map(write_mcap(tmp_path_factory.mktemp("whole") / "a.mcap", messages)).map
+
+
+def test_an_import_that_fails_leaves_nothing(table, tmp_path):
+    folder = write_lerobot(tmp_path / "set", made_up(8.0))
+    file = folder / "data" / "chunk-000" / "file-000.parquet"
+    frame = pandas.read_parquet(file)
+    whole = suggest_map(folder).map
+    frame[frame["index"] <= frame["index"].max() // 2 + 1].to_parquet(file)  # of the second episode one row is left
+    with pytest.raises(InputError):
+        import_log(folder, tmp_path / "runs", whole)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_recording_with_a_hole_is_cut_there(messages, known, tmp_path):
+    log = write_mcap(tmp_path / "a.mcap", [one for one in messages if not 4.0 < since_start(messages, one) < 9.0])
+    imported = import_log(log, tmp_path / "runs", known, split=2.0)
+    runs = [read_run(one.path) for one in imported]
+    assert sum(len(run["t"]) for run in runs) > 340
+    assert all(np.diff(run["t"]).max() < 0.1 for run in runs)
+    assert [round(run["t"][-1]) for run in runs] == [2, 2, 3]
+
+
+def test_setpoints_that_end_early_are_held_and_said(messages, known, tmp_path):
+    """As of robots that are sent a setpoint only when it changes."""
+    log = write_mcap(
+        tmp_path / "a.mcap", [one for one in messages if one[1] != "/chassis/target" or since_start(messages, one) < 5.0]
+    )
+    (imported,) = import_log(log, tmp_path / "runs", known)
+    run = read_run(imported.path)
+    assert len(run["t"]) > 590
+    late = run["t"] > 5.1
+    assert (run["cmd_wheel_lf"][late] == run["cmd_wheel_lf"][-1]).all()
+    (note,) = [one for one in imported.notes if "silent" in one]
+    assert note.startswith("topic '/chassis/target': silent for up to 6.9 s: its last message is held over 34")
+
+
+def split_joints(messages):
+    """Return the log with legs and wheels in topics of their own, wheels 3 ms later and silent from 4.0 to 4.6 s."""
+    wheels = [name for joint, name in NAMES.items() if joint in WHEELS]
+    for time, topic, kind, message in messages:
+        if topic != "/chassis/joints":
+            yield time, topic, kind, message
+            continue
+        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        for name, joints, late in (("/legs", set(NAMES.values()) - set(wheels), 0), ("/wheels", wheels, 3_000_000)):
+            places = [message.name.index(one) for one in joints]
+            values = (message.position[places], message.velocity[places], message.effort[places])
+            if name == "/legs" or not 4.0 < (time - messages[0][0]) * 1e-9 < 4.6:
+                yield time + late, name, kind, joint_state(stamp + late, joints, *values)
+
+
+def test_rows_in_a_hole_of_another_topic_are_left_out(messages, tmp_path):
+    log = write_mcap(tmp_path / "a.mcap", sorted(split_joints(messages), key=lambda one: one[0]))
+    (imported,) = import_log(log, tmp_path / "runs")
+    run = read_run(imported.path)
+    assert len(run["t"]) == pytest.approx(600 - 35, abs=4)
+    assert np.diff(run["t"]).max() == pytest.approx(0.6, abs=0.05)
+    (note,) = [one for one in imported.notes if "hole" in one]
+    assert "'pos_wheel_lf' (topic '/wheels') has a hole there" in note
+    assert "(0.6 s) are left out" in note
+
+
+def test_a_channel_that_begins_late_is_named(messages, known, tmp_path):
+    log = write_mcap(
+        tmp_path / "a.mcap", [one for one in messages if one[1] != "/chassis/target" or since_start(messages, one) > 2.0]
+    )
+    (imported,) = import_log(log, tmp_path / "runs", known)
+    (note,) = [one for one in imported.notes if "at the beginning" in one]
+    assert "rows (2.0 s) at the beginning are left out: 'cmd_leg_lf' (topic '/chassis/target') is not known there" in note
+
+
+def table_of(tmp_path, times, name="timestamp"):
+    frame = lab_frame(made_up(3.0)).drop(columns="comment").rename(columns={"time_ms": name})
+    frame[name] = times(frame[name])
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    return tmp_path / "a.csv"
+
+
+@pytest.mark.parametrize(
+    ("unit", "since"),
+    [(1e-3, 0), (1, 0), (1e3, 0), (1e6, 0), (1e6, 1_760_000_000 * 10**9)],
+    ids=["s", "ms", "us", "ns", "epoch"],
+)
+def test_the_unit_of_times_shows_by_their_size(tmp_path, unit, since):
+    whole = np.int64 if unit > 1 else np.float64
+    (log,) = read_logs(table_of(tmp_path, lambda ms: (ms * unit).round(3).astype(whole) + since))
+    assert np.median(np.diff(log.topics["table"].received)) == pytest.approx(2e7)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("time", "in no unit of time"), ("time_ms", "read as ms"), ("time_s", "read as s")]
+)
+def test_times_of_no_unit_are_refused(tmp_path, name, message):
+    log = table_of(tmp_path, lambda ms: ms * 1e9, name)
+    with pytest.raises(InputError, match=rf"column '{name}': rows are 2e\+10 apart, {message}"):
+        list(read_logs(log))
+
+
+@pytest.mark.parametrize("seconds", [0.05, 0.3, 0.9])
+def test_a_log_that_is_too_short_to_be_looked_at_is_refused(messages, tmp_path, seconds):
+    log = write_mcap(tmp_path / "a.mcap", [one for one in messages if since_start(messages, one) < seconds])
+    with pytest.raises(InputError, match=r"topic '/chassis/joints': 0\.\d+ s are too short to be looked at"):
+        suggest_map(log)
+
+
+def test_a_pose_that_is_too_short_is_no_pose(messages, tmp_path):
+    short = [one for one in messages if one[1] not in ("/mocap/base", "/xsens/data") or since_start(messages, one) < 0.5]
+    assert not {"cam", "gyro", "acc"} & set(suggest_map(write_mcap(tmp_path / "a.mcap", short)).map.channels)

@@ -1,0 +1,499 @@
+"""``wlr commission`` on emulated robots in emulated time: an unaltered one differs nowhere, one that differs is found."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import yaml
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import data_directory
+from wlr_gym.cli import main, run_command
+from wlr_gym.cli.commission import CommissionOptions, run
+from wlr_gym.cli.robot_options import HardwareOption
+from wlr_gym.data import read_dataset
+from wlr_gym.data.format import RunMeta
+from wlr_gym.hardware import calibration as find
+from wlr_gym.hardware.config import Mounting, load_hardware
+from wlr_gym.hardware.measured import Measured
+from wlr_gym.robot import JOINTS, LEGS, WHEELS, load_robot
+from wlr_gym.robot.parameters import Parameters
+
+pytest.importorskip("dynamixel_sdk")
+pytest.importorskip("serial")
+
+from wlr_gym.hardware.commissioning import runner
+from wlr_gym.hardware.commissioning.contract import StandTest
+from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
+from wlr_gym.hardware.commissioning.errors import PowerError, QuitError, TroubleError
+from wlr_gym.hardware.commissioning.person import TerminalPerson
+from wlr_gym.hardware.commissioning.registry import TESTS, choose
+from wlr_gym.hardware.commissioning.runner import Commissioning, run_test
+from wlr_gym.hardware.commissioning.stand import Stand
+from wlr_gym.hardware.emulator import Server
+from wlr_gym.hardware.emulator.link import emulated_link
+from wlr_gym.hardware.emulator.stand import EmulatedStand
+
+NOMINAL = load_hardware()
+ROBOT = load_robot(NOMINAL.robot or "nominal")
+QUANTITIES = {quantity.name: quantity for test in TESTS.values() for quantity in test.quantities}
+
+
+def motors_on(machine):
+    return [joint for joint, servo in machine.servos.items() if servo["torque_enable"] and not servo.dead]
+
+
+def results_of(folder):
+    return {result["test"]: result for result in json.loads((folder / "commission.json").read_text())}
+
+
+def differing(folder):
+    """(quantity, place) of everything that is not as expected."""
+    found = [finding for result in results_of(folder).values() for finding in result["findings"]]
+    return {(one["quantity"], one["where"]) for one in found if one["verdict"] == "differs"}
+
+
+# ---- an unaltered robot ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def nominal(tmp_path_factory):
+    """Exit code and folder of the whole commissioning of an emulated robot."""
+    out = tmp_path_factory.mktemp("commissioning")
+    return main(["commission", "--emulated", "--out", str(out)]), out
+
+
+def test_an_unaltered_robot_differs_nowhere(nominal):
+    code, out = nominal
+    assert differing(out) == set()
+    assert code == 0
+    results = results_of(out)
+    assert list(results) == list(TESTS)
+    assert {result["state"] for result in results.values()} == {"done"}
+    assert sum(len(result["findings"]) for result in results.values()) > 100
+
+
+def test_what_it_measures_is_what_the_emulator_is_made_of(nominal):
+    measured = load_hardware(nominal[1] / "hardware.yaml").measured
+    for wheel in WHEELS:
+        assert measured.integral_cycle[wheel].value == pytest.approx(1e-3, rel=0.05)
+        assert measured.load_per_pwm[wheel].value == pytest.approx(0.0, abs=0.05)  # its load is torque
+        friction = ROBOT.servo.wheel.coulomb_friction / ROBOT.servo.wheel.stall_torque
+        assert measured.running_load[wheel].value == pytest.approx(friction, rel=0.2)
+        assert measured.stall_load[wheel].value == pytest.approx(1.0, abs=0.05)
+        assert NOMINAL.safety.watchdog < measured.watchdog_stop_time[wheel].value < 0.5
+    for bus in NOMINAL.buses:
+        assert measured.adapter_latency[bus].value == pytest.approx(0.0018, abs=0.0005)
+        assert measured.adapter_latency[bus].unit == "s"
+
+
+def test_the_hardware_file_keeps_its_comments_and_gets_every_measured_value(nominal):
+    text = (nominal[1] / "hardware.yaml").read_text()
+    source = (data_directory("configs") / "hardware/nominal.yaml").read_text()
+    assert text.startswith(source)
+    assert re.search(r"# Measured on the robot by wlr commission", text)
+    found = load_hardware(nominal[1] / "hardware.yaml")
+    assert found.model_copy(update={"measured": Measured()}) == NOMINAL
+    assert set(found.measured.model_fields_set) == set(Measured.model_fields)
+
+
+def test_every_measured_field_is_a_quantity_of_a_test():
+    assert set(Measured.model_fields) <= set(QUANTITIES)
+
+
+def test_its_runs_are_measured_runs(nominal):
+    dataset = read_dataset(nominal[1])
+    names = {result["run"] for result in results_of(nominal[1]).values()} - {""}
+    assert {run.path.name for run in dataset.runs} == names
+    step = results_of(nominal[1])["velocity_step"]["run"]
+    run = next(run for run in dataset.runs if run.path.name == step)
+    assert np.nanmax(run["cmd_wheel_lf"]) == pytest.approx(3.0)
+    assert run["vel_wheel_lf"][-1] == pytest.approx(3.0, abs=0.1)
+    assert np.isnan(run["cmd_leg_lf"]).all()
+    assert json.loads((nominal[1] / "load.json").read_text())["samples"]["pwm_wheel_lf"][-1] == pytest.approx(0.49, abs=0.05)
+
+
+# ---- a robot that differs --------------------------------------------------------------------------------------------
+
+
+def changed(name, joint, factor):
+    parameters = Parameters.nominal(ROBOT)
+    parameters[name][0, JOINTS.index(joint)] *= factor
+    return parameters
+
+
+def make(folder, emulated, *tests, person=None):
+    """Commission an emulated robot; return the results by test."""
+    link = emulated_link(emulated.machine)
+    found = []
+    with Commissioning(ROBOT, NOMINAL, link, person or EmulatedPerson(emulated), folder, RunMeta()) as commissioning:
+        assert commissioning.faults() == []
+        for result in commissioning.make(choose(tests)):
+            found.append(result)
+            assert motors_on(emulated.machine) == []
+    return {result.test: result for result in found}
+
+
+def found_in(results):
+    findings = [finding for result in results.values() for finding in result.findings]
+    return {(finding.quantity.name, finding.where) for finding in findings if not finding.is_expected}
+
+
+@pytest.mark.parametrize(
+    ("name", "joint", "factor", "test", "quantities"),
+    [
+        ("servo.stall_torque", "wheel_rf", 0.7, "stall", {"stall_load"}),
+        ("servo.kp", "wheel_lr", 0.7, "velocity_step", {"velocity_loop_time", "integral_cycle"}),
+        ("servo.coulomb_friction", "wheel_rr", 2.0, "load", {"running_load"}),
+        ("servo.kp", "wheel_lf", 0.4, "watchdog", {"watchdog_stop_time"}),
+    ],
+)
+def test_a_servo_that_differs_is_found_and_named(tmp_path, name, joint, factor, test, quantities):
+    results = make(tmp_path, EmulatedStand(ROBOT, NOMINAL, parameters=changed(name, joint, factor)), test)
+    assert found_in(results) == {(quantity, joint) for quantity in quantities}
+    assert not results[test].is_good
+
+
+def test_a_rubbing_wheel_and_a_slow_adapter_are_told_on_the_command_line(tmp_path, capsys):
+    patch = {"effects": [{"name": "coulomb_friction", "where": ["wheel_rf"], "parameters": {"torque": 0.05}}]}
+    (tmp_path / "rub.yaml").write_text(yaml.safe_dump(patch))
+    words = ["commission", "--emulated", "--out", str(tmp_path / "out"), "--tests", "latency", "load"]
+    code = main([*words, "--effects", str(tmp_path / "rub.yaml"), "--fault", "delay legs value=0.015"])
+    assert code == 1
+    assert differing(tmp_path / "out") == {("adapter_latency", "legs"), ("running_load", "wheel_rf")}
+    shown = capsys.readouterr().out
+    assert "legs, adapter_latency: median time of a ping" in shown
+    assert "wheel_rf, running_load: load of the free wheel" in shown
+    assert load_hardware(tmp_path / "out" / "hardware.yaml").measured.adapter_latency["legs"].value > 0.01
+
+
+def test_a_joint_mounted_the_other_way_and_a_wrong_zero_are_found(tmp_path):
+    mounted = find.with_mountings(NOMINAL, {"leg_rf": Mounting(sign=1, zero=1024), "wheel_lr": Mounting(sign=-1, zero=0)})
+    results = make(tmp_path, EmulatedStand(ROBOT, mounted), "joints")
+    assert found_in(results) == {("joint_sign", "leg_rf"), ("joint_sign", "wheel_lr")}
+    offset = {"name": "joint_zero_offset", "where": ["leg_lr"], "parameters": {"angle": 0.08}}
+    results = make(tmp_path, EmulatedStand(ROBOT, NOMINAL, {"effects": [offset]}), "joints")
+    assert found_in(results) == {("joint_zero", "leg_lr")}
+
+
+def test_an_imu_that_is_mounted_otherwise_is_found(tmp_path):
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    link = emulated_link(emulated.machine)
+    turned = NOMINAL.imu.model_copy(
+        update={"calibration": NOMINAL.imu.calibration.model_copy(update={"mounting": (0, 0, 1.57)})}
+    )
+    from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu
+
+    assert isinstance(link.clock, EmulatedWorld)
+    link.imu = MemoryImu(link.clock, turned)
+    with Commissioning(ROBOT, NOMINAL, link, EmulatedPerson(emulated), tmp_path, RunMeta()) as commissioning:
+        (result,) = commissioning.make(choose(["imu"]))
+    wrong = {finding.quantity.name for finding in result.findings if not finding.is_expected}
+    assert wrong == {"gyro_roll", "gyro_pitch", "tilt_roll", "tilt_pitch"}
+
+
+# ---- whatever happens, motors are off --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stood():
+    """An emulated robot, and the stand that may drive it."""
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    link = emulated_link(emulated.machine)
+    link.open()
+    yield emulated, Stand(ROBOT, NOMINAL, link)
+    link.close()
+
+
+def spinning(then):
+    def measure(stand, person):
+        stand.prepare(JOINTS)
+        stand.switch_on(JOINTS)
+        stand.spin(dict.fromkeys(WHEELS, 2.0))
+        stand.weaken("wheel_lf")
+        stand.run(0.1)
+        then(stand)
+        return []
+
+    return StandTest("trial", "", "", "", (), measure)
+
+
+def fail(error):
+    raise error
+
+
+@pytest.mark.parametrize("error", [TroubleError("odd"), QuitError(), RuntimeError("a mistake"), KeyboardInterrupt()])
+def test_motors_are_off_and_registers_back_however_a_test_ends(stood, error):
+    emulated, stand = stood
+    seen = []
+
+    def end(stand):
+        seen.append(motors_on(emulated.machine))
+        seen.append({servo["bus_watchdog"] for servo in emulated.machine.servos.values()})
+        fail(error)
+
+    with pytest.raises(type(error)):
+        run_test(spinning(end), stand, EmulatedPerson(emulated))
+    assert seen == [list(JOINTS), {10}]  # armed, 0.2 s
+    assert motors_on(emulated.machine) == []
+    wheel, leg = emulated.machine.servos["wheel_lf"], emulated.machine.servos["leg_lf"]
+    assert (wheel["goal_velocity"], wheel["goal_pwm"], wheel["bus_watchdog"]) == (0, 885, 0)
+    assert leg["goal_position"] == leg["present_position"]
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("dead wheel_rr", "no answer from wheel_rr"),
+        ("overload wheel_rr", "wheel_rr: a hardware error"),
+        ("brownout wheel_rr", "wheel_rr"),
+        ("unplug wheels", "unplugged"),
+    ],
+)
+def test_a_fault_ends_the_test_with_motors_off(stood, fault, words):
+    emulated, stand = stood
+
+    def fault_then_run(stand):
+        emulated.machine.inject(fault)
+        stand.run(1.0)
+
+    with pytest.raises((TroubleError, ConnectionError, PowerError)) as ended:
+        run_test(spinning(fault_then_run), stand, EmulatedPerson(emulated))
+    chain = f"{ended.value} {ended.value.__context__}"
+    assert words in chain
+    assert [joint for joint in motors_on(emulated.machine) if "unplug" not in fault or joint in LEGS] == []
+
+
+def test_a_held_wheel_ends_the_test(stood):
+    emulated, stand = stood
+
+    def hold(stand, person):
+        stand.prepare(WHEELS)
+        stand.switch_on(WHEELS)
+        emulated.brake("wheel_lf")
+        stand.spin({"wheel_lf": 3.0})
+        stand.run(3.0)
+        return []
+
+    with pytest.raises(TroubleError, match=r"wheel_lf: above 40% of stall torque: does something hold it\?"):
+        run_test(StandTest("trial", "", "", "", (), hold), stand, EmulatedPerson(emulated))
+    assert motors_on(emulated.machine) == []
+
+
+def test_torque_that_does_not_go_off_ends_everything(tmp_path):
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+
+    class Saboteur(EmulatedPerson):
+        def watch_supply(self):
+            emulated.machine.inject("dead wheel_rr")
+
+    results = make_ignoring_power(tmp_path, emulated, Saboteur(emulated))
+    assert [(result.test, result.state) for result in results] == [("stall", "stopped")]
+    assert results[0].reason == "CUT THE POWER: torque is not confirmed off at wheel_rr"
+
+
+def make_ignoring_power(folder, emulated, person):
+    link = emulated_link(emulated.machine)
+    with Commissioning(ROBOT, NOMINAL, link, person, folder, RunMeta()) as commissioning:
+        return list(commissioning.make([TESTS["stall"], TESTS["latency"]]))
+
+
+@pytest.mark.parametrize("fault", ["", "dead wheel_rr"])
+def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp_path, monkeypatch, fault):
+    guards = []
+
+    class Guard:
+        def __init__(self, *_):
+            self.is_released = False
+            guards.append(self)
+
+        def release(self):
+            self.is_released = True
+
+    monkeypatch.setattr(runner, "WatchdogProcess", Guard)
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    link = emulated_link(emulated.machine)
+    link.is_serial = True
+
+    class Saboteur(EmulatedPerson):
+        def turn(self, joint, angle):
+            super().turn(joint, angle)
+            if fault:
+                emulated.machine.inject(fault)
+
+    with Commissioning(ROBOT, NOMINAL, link, Saboteur(emulated), tmp_path, RunMeta()) as commissioning:
+        list(commissioning.make(choose(["joints"])))
+    assert [guard.is_released for guard in guards] == [not fault]
+
+
+def test_the_stand_has_limits_of_its_own(stood):
+    _, stand = stood
+    for speeds in ({"wheel_lf": 3.1}, {"wheel_lf": float("nan")}, {"leg_lf": 1.0}):
+        with pytest.raises(InputError, match="expected a wheel and 3 rad/s at most"):
+            stand.spin(speeds)
+    with pytest.raises(InputError, match=r"leg_lf: by 0.2 rad to 1.77, expected a leg, 0.12 rad at most"):
+        stand.lean("leg_lf", 0.2)
+    slow = NOMINAL.model_copy(update={"safety": NOMINAL.safety.model_copy(update={"wheel_speed": 1.5})})
+    stand.hardware = slow
+    with pytest.raises(InputError, match=r"wheel_lf: 2 rad/s, expected a wheel and 1.5 rad/s at most"):
+        stand.spin({"wheel_lf": 2.0})
+
+
+def test_a_robot_with_a_fault_is_not_switched_on(tmp_path, capsys):
+    words = ["commission", "--emulated", "--out", str(tmp_path), "--tests", "watchdog", "--fault", "dead leg_rf"]
+    assert main(words) == 1
+    shown = capsys.readouterr().out
+    assert "leg_rf     answer: none" in shown
+    assert "Nothing was switched on" in shown
+    assert not (tmp_path / "commission.json").exists()
+
+
+# ---- the person ------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_armed_while_hands_are_at_the_robot(stood):
+    emulated, stand = stood
+
+    class Watcher(EmulatedPerson):
+        def turn(self, joint, angle):
+            assert {servo["bus_watchdog"] for servo in emulated.machine.servos.values()} == {0}
+            super().turn(joint, angle)
+
+    run_test(TESTS["torque_on"], stand, Watcher(emulated))
+
+
+class Human:
+    """Reads the questions and does with the emulated robot what they ask for; ``answers`` to questions they are found in."""
+
+    def __init__(self, emulated, **answers):
+        self.emulated, self.answers = emulated, answers
+        self.asked = []
+
+    def __call__(self, text):
+        assert motors_on(self.emulated.machine) == [], text
+        self.asked.append(text)
+        for words, answer in self.answers.items():
+            if words in text:
+                return answer
+        joint = text.split()[0]
+        if turned := re.search(r"(swing its foot to the|roll it) (back|front|forward|backward) by about (\d+) deg", text):
+            way = 1 if turned.group(2) in ("back", "forward") else -1
+            self.emulated.turn(joint, way * np.deg2rad(float(turned.group(3))))
+        elif "straight down" in text and joint in LEGS:
+            self.emulated.straighten(joint)
+        elif "hold the tyre" in text:
+            self.emulated.brake(joint)
+        elif "let go" in text:
+            self.emulated.release(joint)
+        return ""
+
+
+def beside(monkeypatch, emulated):
+    monkeypatch.setattr(HardwareOption, "link_to", lambda self, robot, hardware, patch=None: emulated_link(emulated.machine))
+
+
+def test_a_human_is_led_through_and_nobody_is_asked_while_a_motor_is_on(monkeypatch, tmp_path):
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    beside(monkeypatch, emulated)
+    mine = tmp_path / "mine.yaml"
+    mine.write_text((data_directory("configs") / "hardware/nominal.yaml").read_text())
+    drawn = f"{0.2**2 * emulated.stall_current:.3f}"
+    human = Human(emulated, **{"Write the measured": "y", "current while": drawn, "Sign and zero": "s"})
+    options = CommissionOptions(hardware=str(mine), out=tmp_path / "out", tests=("joints", "torque_on", "stall"))
+    assert run(options, human) == 0
+    assert [result["state"] for result in results_of(tmp_path / "out").values()] == ["skipped", "done", "done"]
+    starts = [text for text in human.asked if "Enter starts, s skips, q ends" in text]
+    assert len(starts) == 3
+    assert "Each wheel is to be held by hand" in starts[2]
+    found = load_hardware(mine)
+    assert found.measured.stall_current["wheel_lf"].value == pytest.approx(emulated.stall_current, rel=0.05)
+    assert not found.measured.joint_zero
+
+
+def test_how_the_body_is_to_be_turned():
+    asked = []
+    person = TerminalPerson(lambda text: asked.append(text) or "")
+    for angles in ({"roll": 0.35}, {"pitch": 0.35}, {"yaw": 0.35}, {}):
+        person.tilt(3.0, **angles)
+    ways = ["right side down by about 20 deg", "nose down by about 20 deg", "nose to the left by about 20 deg", "level"]
+    assert all(way in text and "within 3 s" in text for way, text in zip(ways, asked, strict=True))
+
+
+def test_the_way_out_is_always_open(monkeypatch, tmp_path):
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    beside(monkeypatch, emulated)
+    for word, made in (("Latency", 0), ("leg_lf (left front): swing", 2)):
+        out = tmp_path / str(made)
+        options = CommissionOptions(out=out, tests=("latency", "silent_servo", "joints"))
+        assert run(options, Human(emulated, **{word: "q", "Write": "n"})) == 1
+        states = [result["state"] for result in results_of(out).values()]
+        assert states == ["done"] * made + ["stopped"]
+
+
+@pytest.mark.slow
+def test_over_serial_ports_in_real_time(tmp_path):
+    pytest.importorskip("termios")
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    with Server(emulated.machine) as server:
+        words = ["commission", "--yes", "--out", str(tmp_path), "--tests", "latency", "watchdog", "velocity_step"]
+        main([*words, "--port", *(f"{name}={path}" for name, path in server.ports.items())])
+        assert motors_on(emulated.machine) == []
+    assert {result["state"] for result in results_of(tmp_path).values()} == {"done"}
+    assert not {place for quantity, place in differing(tmp_path) if not quantity.startswith("adapter")}
+
+
+def test_options_that_make_no_sense(tmp_path):
+    for words, message in (
+        (["--tests", "latncy", "--out", str(tmp_path)], "unknown test 'latncy' (did you mean 'latency'?)"),
+        ([], "--out: expected a folder"),
+        (["--fault", "drop legs", "--out", str(tmp_path)], "--fault is for the emulated robot"),
+        (["--effects", "stiff_leg", "--out", str(tmp_path)], "--effects: a real robot has its own"),
+    ):
+        with pytest.raises(InputError, match=re.escape(message)):
+            run_command("commission", words)
+
+
+def test_the_list_names_every_test(capsys):
+    assert main(["commission", "--list"]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in TESTS)
+
+
+def test_json_goes_to_the_standard_output(tmp_path, capsys):
+    assert main(["commission", "--emulated", "--out", str(tmp_path), "--tests", "latency", "--json"]) == 0
+    assert [result["test"] for result in json.loads(capsys.readouterr().out)] == ["latency"]
+
+
+def test_what_was_measured_must_be_of_this_robot(tmp_path):
+    text = (data_directory("configs") / "hardware/nominal.yaml").read_text()
+    file = tmp_path / "a.yaml"
+    file.write_text(text + "measured:\n  stall_load:\n    wheel_xy: {value: 1.0, unit: '-', date: '2026-01-01'}\n")
+    with pytest.raises(InputError, match=r"measured.stall_load: unknown joint or bus 'wheel_xy'"):
+        load_hardware(file)
+    file.write_text(text + "measured:\n  stal_load: {}\n")
+    with pytest.raises(InputError, match=r"unknown key 'measured.stal_load' \(did you mean 'stall_load'"):
+        load_hardware(file)
+
+
+def test_a_second_commissioning_keeps_what_it_did_not_measure(tmp_path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main(["commission", "--emulated", "--out", str(first), "--tests", "latency"]) == 0
+    file = first / "hardware.yaml"
+    assert main(["commission", "--emulated", "--hardware", str(file), "--out", str(second), "--tests", "silent_servo"]) == 0
+    found = load_hardware(second / "hardware.yaml").measured
+    assert found.adapter_latency == load_hardware(file).measured.adapter_latency
+    assert set(found.answers_behind_fast) == set(NOMINAL.buses)
+    text = (second / "hardware.yaml").read_text()
+    assert text.count("measured:") == text.count("by wlr commission") == 1
+
+
+def test_a_copy_of_the_hardware_file_still_finds_its_robot(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/robot.yaml").write_text("base: emanual\nname: mine\n")
+    text = (data_directory("configs") / "hardware/nominal.yaml").read_text()
+    file = tmp_path / "mine/hardware.yaml"
+    file.write_text(re.sub(r"(?m)^robot: \w+", "robot: robot.yaml", text))
+    words = ["commission", "--emulated", "--hardware", str(file), "--out", str(tmp_path / "out"), "--tests", "latency"]
+    assert main(words) == 0
+    assert load_robot(load_hardware(tmp_path / "out/hardware.yaml").robot or "").name == "mine"

@@ -1,0 +1,103 @@
+"""Jobs: processes that end in good order, whatever ends who waits for them."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import locked
+from wlr_gym.learning.sweep.jobs import Job, follow, spread
+
+#: Says what it sees, and leaves a file when it is ended in good order.
+MODULE = """
+import os, signal, sys, time, pathlib
+from wlr_gym.learning.sweep.jobs import serve
+
+def work(task, send):
+    here = pathlib.Path(task["folder"])
+    if task["do"] == "die":
+        print("the last words", file=sys.stderr)
+        os._exit(7)
+    if task["do"] == "raise":
+        raise OSError(28, "No space left on device", "a_file")
+    send({"threads": os.environ["OMP_NUM_THREADS"]})
+    if task["do"] == "wait":
+        def end(*_):
+            (here / "ended").write_text("in good order")
+            sys.exit()
+        signal.signal(signal.SIGTERM, end)
+        (here / "began").write_text("")
+        time.sleep(60)
+
+serve(work)
+"""
+
+
+@pytest.fixture
+def job(tmp_path, monkeypatch):
+    (tmp_path / "a_job_for_tests.py").write_text(MODULE)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    return lambda do: Job(do, "a_job_for_tests", {"do": do, "folder": str(tmp_path)}, str(tmp_path / f"{do}.txt"))
+
+
+def wait_for(path):
+    deadline = time.monotonic() + 30.0
+    while not path.exists():
+        assert time.monotonic() < deadline, f"{path} never came"
+        time.sleep(0.05)
+
+
+def test_each_ends_for_itself(job):
+    ended = {one.name: one.error for one in spread([job("die"), job("raise"), job("speak")], 2)}
+    assert ended["speak"] == ""
+    assert "process ended with 7" in ended["die"]
+    assert "the last words" in ended["die"]
+    assert "No space left on device" in ended["raise"]
+
+
+def test_one_hears_what_it_says_and_it_has_one_thread(job):
+    heard = []
+    assert follow(job("speak"), heard.append) == ""
+    assert heard == [{"threads": "1"}]
+
+
+def test_a_log_that_cannot_be_written_is_an_error_of_its_job(job, tmp_path):
+    good, bad = job("speak"), Job("bad", "a_job_for_tests", {}, str(tmp_path / "none" / "log.txt"))
+    ended = {one.name: one.error for one in spread([bad, good], 1)}
+    assert ended["speak"] == ""
+    assert "cannot be started" in ended["bad"]
+
+
+def test_jobs_end_in_good_order_with_who_runs_them(job, tmp_path):
+    running = spread([job("wait"), job("speak")], 2)
+    next(running)
+    wait_for(tmp_path / "began")
+    running.close()
+    assert (tmp_path / "ended").read_text() == "in good order"
+
+
+def test_jobs_end_in_good_order_when_who_waits_is_killed(job, tmp_path):
+    code = f"from wlr_gym.learning.sweep.jobs import *\nfollow({job('wait')!r}, print)"
+    waiting = subprocess.Popen([sys.executable, "-c", code])
+    wait_for(tmp_path / "began")
+    waiting.send_signal(signal.SIGKILL)
+    waiting.wait()
+    wait_for(tmp_path / "ended")
+
+
+def test_a_lock_is_held_among_processes_and_freed_by_death(tmp_path):
+    path = tmp_path / "lock"
+    code = f"import pathlib, time\nfrom wlr_gym.base.files import locked\nwith locked(pathlib.Path({str(path)!r}), 1):\n"
+    code += f"    pathlib.Path({str(tmp_path / 'held')!r}).touch(); time.sleep(60)"
+    holder = subprocess.Popen([sys.executable, "-c", code])
+    wait_for(tmp_path / "held")
+    with pytest.raises(InputError, match="held by another process"), locked(path, 0.2):
+        pass
+    holder.kill()
+    holder.wait()
+    with locked(path, 0.2):
+        pass

@@ -1,0 +1,155 @@
+"""Plans: what they say, what they refuse, before any trial begins."""
+
+import pytest
+
+import wlr_gym
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.settings import parse_config
+from wlr_gym.cli import main, sweep
+from wlr_gym.learning.sweep.plan import (
+    SweepPlan,
+    known_settings,
+    label_of,
+    read_plan,
+    resolve,
+    trial_of,
+    trials_of,
+    whole_settings,
+)
+
+ENVIRONMENT = "WLR-Velocity-v0"
+
+
+def plan(**fields):
+    return parse_config(SweepPlan, {"environment": ENVIRONMENT, **fields}, "test")
+
+
+def test_a_grid_is_all_combinations_with_all_seeds():
+    whole = resolve(plan(space={"gamma": [0.9, 0.97], "environment.randomization": ["ice", None]}, seeds=[3, 4]))
+    trials = trials_of(known_settings(whole) or [], whole.seed_list)
+    assert len(trials) == 8
+    assert trials[3].name == "gamma=0.9,environment.randomization=null,seed=4"
+    settings = whole_settings(whole, trials[0])
+    assert (settings["gamma"], settings["seed"], settings["environment"]["randomization"]) == (0.9, 3, "ice")
+    assert settings["environment"]["precision"] == "float32"
+    assert whole.settings["environment"]["randomization"] != "ice"
+
+
+def test_what_a_folder_keeps_is_the_whole_plan():
+    whole = resolve(plan(config="ppo_blind", settings={"total_steps": 1000}, space={"gamma": [0.9, 0.97]}))
+    again = parse_config(SweepPlan, whole.model_dump(mode="json"), "again")
+    assert again.config is None
+    assert whole_settings(again, trial_of({"gamma": 0.9}, 1)) == whole_settings(whole, trial_of({"gamma": 0.9}, 1))
+
+
+def test_random_settings_are_the_same_again_and_within_their_ranges():
+    fields = {
+        "space": {
+            "learning_rate": {"low": 1e-4, "high": 1e-2, "log": True},
+            "epochs": {"low": 2, "high": 4, "whole": True},
+            "activation": ["tanh", "elu"],
+        },
+        "search": {"method": "random", "trials": 50},
+    }
+    drawn = known_settings(plan(**fields))
+    assert drawn == known_settings(plan(**fields))
+    assert drawn is not None
+    assert all(1e-4 <= one["learning_rate"] <= 1e-2 for one in drawn)
+    assert 10 < sum(one["learning_rate"] < 1e-3 for one in drawn) < 40
+    assert {one["epochs"] for one in drawn} == {2, 3, 4}
+    assert {one["activation"] for one in drawn} == {"tanh", "elu"}
+
+
+def test_a_setting_drawn_twice_is_trained_once():
+    drawn = known_settings(plan(space={"gamma": [0.9, 0.97]}, search={"trials": 10}))
+    assert len(drawn or []) == 2
+
+
+def test_long_names_stay_different():
+    first, second = ({"environment.task": {"rewards": {"slip": {"weight": -w}, "x" * 200: {}}}} for w in (1.0, 2.0))
+    assert len(label_of(first)) < 200
+    assert label_of(first) != label_of(second)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"space": {"learning_rte": [1e-3]}}, "did you mean 'learning_rate'"),
+        ({"space": {"environment.randomisation": ["ice"]}}, "did you mean 'randomization'"),
+        ({"space": {"gamma": [0.9, 1.5]}}, "gamma=1.5,seed=0.*gamma"),
+        ({"space": {"gamma": [0.9, 0.9]}}, "two trials are called 'gamma=0.9,seed=0': the same value is given twice"),
+        ({"seeds": [1, 1]}, "two trials are called 'seed=1'"),
+        ({"space": {"environment.task": ["a/b", "a_b"]}}, "two trials are called"),
+        ({"space": {"batch_size": [512, 500]}}, "batch_size 500 does not divide"),
+        ({"agent": "do_nothing"}, "agents that have"),
+        ({"config": "ppo_blnd"}, "did you mean 'ppo_blind'"),
+        ({"environment": "WLR-Velocty-v0"}, "WLR-Velocity-v0"),
+    ],
+)
+def test_what_no_trial_can_do_is_refused_at_once(fields, message):
+    with pytest.raises(InputError, match=message):
+        resolve(plan(**fields))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"space": {"gamma": {"low": 0.9, "high": 0.99}}}, "is a range"),
+        ({"space": {"gamma": {"low": 0.99, "high": 0.9}}, "search": {}}, "not below"),
+        ({"search": {"trials": 3}}, "no 'space'"),
+        ({"search": {"trails": 3}, "space": {"gamma": [0.9]}}, "did you mean 'trials'"),
+        ({"space": {"seed": [1, 2]}}, "give 'seeds'"),
+        ({"seeds": 0}, "seeds"),
+        ({"sedes": 3}, "did you mean 'seeds'"),
+    ],
+)
+def test_bad_files_are_refused(fields, message):
+    with pytest.raises(InputError, match=message):
+        plan(**fields)
+
+
+def test_early_stopping_needs_scores_to_stop_by():
+    fields = {"space": {"gamma": [0.9, 0.97]}, "search": {"method": "grid", "early_stopping": True}}
+    whole = resolve(plan(**fields, settings={"total_steps": 180}))
+    assert whole.settings["evaluate_every"] == 20
+    with pytest.raises(InputError, match="set evaluate_every"):
+        resolve(plan(**fields, settings={"total_steps": 180, "evaluate_every": 100}))
+
+
+def test_options_are_laid_over_a_file(tmp_path):
+    file = tmp_path / "space.yaml"
+    file.write_text("space: {gamma: [0.9, 0.97]}\nsearch: {trials: 4}\n")
+    options = sweep.SweepOptions(ENVIRONMENT, search=file, seeds=2, set=("total_steps=1000", "learning_rate=1e-3,2e-3"))
+    made = sweep._plan(options)
+    assert made.space == {"gamma": [0.9, 0.97], "learning_rate": [1e-3, 2e-3]}
+    assert (made.seeds, made.settings) == (2, {"total_steps": 1000})
+    file.write_text(f"environment: {ENVIRONMENT}\nseeds: 3\n")
+    assert sweep._plan(sweep.SweepOptions(str(file), set=("hidden_layers=[64,64],[32,32]",))) == read_plan(
+        file, {"space": {"hidden_layers": [[64, 64], [32, 32]]}}
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "environment id"),
+        ([ENVIRONMENT, "--set", "learning_rte=1e-3,2e-3"], "did you mean 'learning_rate'"),
+        ([ENVIRONMENT, "--set", "gamma"], "--set gamma"),
+        ([ENVIRONMENT, "--workers", "0"], "workers = 0"),
+        ([ENVIRONMENT, "--search", "none.yaml"], "none.yaml"),
+        (["--resume", "nothing_there"], "sweep.yaml is missing"),
+        (["--resume", "somewhere", "--seeds", "3"], "as it was planned"),
+        ([ENVIRONMENT, "--ray", "a", "b"], "one address"),
+    ],
+)
+def test_bad_options_exit_with_2_and_leave_nothing(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["sweep", *arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.rglob("trials/*"))
+
+
+def test_a_used_folder_is_refused(tmp_path):
+    (tmp_path / "something").touch()
+    with pytest.raises(InputError, match=r"in use.*--resume"):
+        wlr_gym.sweep(ENVIRONMENT, tmp_path)

@@ -1,0 +1,127 @@
+"""Sweeps that are run (docs/sweep.md): results as of the same trainings alone, failures, interruptions, table and page."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+from sweep_runs import ENVIRONMENT, SETTINGS, assert_like_alone
+
+import wlr_gym
+from wlr_gym.base.settings import read_yaml
+from wlr_gym.cli import main
+
+pytest.importorskip("torch")
+
+#: Imported by every trial: the disk is full for one of them, as long as a file says so.
+FULL_DISK = """
+import errno, os, pathlib
+from wlr_gym.learning.ppo import checkpoint
+save = checkpoint.save
+
+def save_on_full_disk(folder, *arguments, **keywords):
+    if "gamma=0.9," in str(folder) and pathlib.Path(__file__).with_suffix(".full").exists():
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+    return save(folder, *arguments, **keywords)
+
+checkpoint.save = save_on_full_disk
+"""
+
+
+def test_one_fails_the_others_go_on_and_a_resume_completes_it(tmp_path, monkeypatch, capsys):
+    """Four trials, one of them without space on its disk; then there is space again."""
+    (tmp_path / "disk_for_tests.py").write_text(FULL_DISK)
+    (tmp_path / "disk_for_tests.full").touch()
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    file, out = tmp_path / "sweep.yaml", tmp_path / "out"
+    from wlr_gym.base.provenance import write_yaml
+
+    plan = {"environment": ENVIRONMENT, "settings": SETTINGS, "space": {"gamma": [0.9, 0.97]}, "seeds": 1}
+    write_yaml(file, {**plan, "imports": ["disk_for_tests"]})
+    assert main(["sweep", str(file), "--out", str(out), "--workers", "2"]) == 1
+    printed = capsys.readouterr().out
+    assert "gamma=0.9,seed=0: FAILED: OSError: [Errno 28] No space left on device" in printed
+    assert "1 trials FAILED" in printed
+    assert "No space left on device" in (out / "sweep.html").read_text()
+    (tmp_path / "disk_for_tests.full").unlink()
+    assert main(["sweep", "--resume", str(out)]) == 0
+    assert "1 of 2 trials are done already" in capsys.readouterr().out
+    found = wlr_gym.resume_sweep(out)  # nothing left to do
+    assert [one.status for one in found.trials] == ["done", "done"]
+    for one in found.trials:
+        assert_like_alone(one, tmp_path / f"alone_{one.trial.name}")
+
+    import pandas
+
+    table = pandas.read_parquet(out / "trials.parquet")
+    assert list(table["gamma"]) == [0.9, 0.97]
+    assert table["final_tracking_error"].tolist() == [one.final["tracking_error"] for one in found.trials]
+    assert np.all(table["best_tracking_error"].to_numpy() <= table["final_tracking_error"].to_numpy())
+    assert table["steps"].tolist() == [512, 512]
+    assert (out / table["folder"][0] / "policy").is_dir()
+    assert found.ranking[0].mean == table["final_tracking_error"].min()
+    assert read_yaml(out / "trials" / table["name"][0] / "config.yaml")["settings"]["gamma"] == 0.9
+
+
+#: Takes some seconds, with checkpoints on the way.
+LONGER = SETTINGS | {"total_steps": 25_600, "checkpoint_every": 640, "evaluate_every": 12_800}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_sweep_that_is_stopped_resumes_exactly(number, tmp_path):
+    out = tmp_path / "out"
+    code = f"import wlr_gym\nwlr_gym.sweep({ENVIRONMENT!r}, {str(out)!r}, settings={LONGER!r}, seeds=2)"
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a background shell has switched it off
+    driver = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, preexec_fn=heard)
+    deadline = time.monotonic() + 60.0
+    while not all(list(out.glob(f"trials/seed={seed}/checkpoints/step_*")) for seed in range(2)):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    driver.send_signal(number)
+    said = driver.communicate(timeout=60)[1]
+    if number != signal.SIGKILL:
+        assert f"resume with: wlr sweep --resume {out}" in said
+        assert (out / "sweep.html").is_file()
+    assert not any((out / "trials" / f"seed={seed}" / "policy").exists() for seed in range(2))
+    found = wlr_gym.resume_sweep(out)
+    assert [one.status for one in found.trials] == ["done", "done"]
+    for one in found.trials:
+        assert (one.folder / "provenance_resumed.yaml").is_file()
+        assert_like_alone(one, tmp_path / f"alone_{one.trial.seed}", LONGER)
+
+
+def test_settings_that_explain_the_scores_are_important(tmp_path):
+    from wlr_gym.learning.sweep.plan import trial_of
+    from wlr_gym.learning.sweep.results import TrialResult, importance, summarise
+
+    random = np.random.default_rng(0)
+    results = []
+    for rate in np.geomspace(1e-4, 1e-2, 12):
+        for gamma in (0.9, 0.97):
+            for seed in range(3):
+                score = {"steps": 10.0, "tracking_error": abs(np.log10(rate) + 3) + 0.1 * random.standard_normal()}
+                trial = trial_of({"learning_rate": float(rate), "gamma": gamma}, seed)
+                results.append(TrialResult(trial, "done", [score], 10, 1.0, "", tmp_path))
+    shares = importance(results, "tracking_error")
+    assert list(shares) == ["learning_rate", "gamma"]
+    assert shares["learning_rate"] > 0.6
+    assert shares["gamma"] < 0.05
+    ranking = summarise(results, "tracking_error")
+    assert 5e-4 < ranking[0].settings["learning_rate"] < 2e-3
+    assert len(ranking[0].values) == 3
+    assert [one.mean for one in ranking] == sorted(one.mean for one in ranking)
+
+
+def test_a_search_without_ray_names_the_extra(tmp_path, monkeypatch):
+    import importlib.util
+
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "ray" else find(name))
+    with pytest.raises(ImportError, match=r"wlr-gym\[sweep\]"):
+        wlr_gym.sweep(ENVIRONMENT, tmp_path / "out", space={"gamma": [0.9]}, search={"early_stopping": True})
+    assert not (tmp_path / "out").exists()

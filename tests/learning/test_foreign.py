@@ -1,0 +1,103 @@
+"""Policies of other programs as policy files: they act as their source does, action by action (docs/policy_file.md)."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import wlr_gym
+from wlr_gym.base.errors import InputError
+from wlr_gym.cli import main
+from wlr_gym.policy import contract_of, make_policy, policy_environment
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("onnxscript")
+
+from stable_baselines3 import PPO, SAC, TD3  # noqa: E402
+from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
+
+ID = "WLR-Velocity-v0"
+TASK = {"observer": {"camera": False}, "observations": {"estimated_slip_velocity": None}}
+
+
+@pytest.fixture(scope="module")
+def env():
+    return wlr_gym.Sb3VecEnv(ID, 4, seed=3, task=TASK)
+
+
+def readings(env, count=200):
+    """Observations of robots that act at random."""
+    rng, seen = np.random.default_rng(1), [env.reset()]
+    while len(seen) * env.num_envs < count:
+        seen.append(env.step(rng.uniform(-1, 1, (env.num_envs, 8)).astype(np.float32))[0])
+    return np.concatenate(seen)
+
+
+def act(path, env, observations):
+    """Actions of a file in a core that its contract chooses."""
+    assert policy_environment(path)["task"].keys() == {"observer", "observations"}
+    return make_policy(path, env.contract()).act(observations)
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "PPO squashed", "SAC", "TD3"])
+def test_an_archive_acts_as_its_model_predicts(env, tmp_path, algorithm):
+    """Through the command, normalisation included; the model's own ``predict`` and ``normalize_obs`` are the reference."""
+    normalised = VecNormalize(env, clip_obs=1.5)
+    normalised.reset()
+    for _ in range(30):
+        normalised.step(np.random.default_rng(2).uniform(-1, 1, (4, 8)).astype(np.float32))
+    made = {"PPO": PPO, "PPO squashed": PPO, "SAC": SAC, "TD3": TD3}[algorithm]
+    options = {"use_sde": True, "policy_kwargs": {"squash_output": True}} if algorithm == "PPO squashed" else {}
+    model = made("MlpPolicy", normalised, seed=4, device="cpu", **options)
+    with torch.no_grad():
+        for name, weights in model.policy.named_parameters():  # actions far from zero, some beyond the limit
+            weights.mul_(60.0 if name.startswith("action_net") else 1.5)
+    model.save(tmp_path / "model.zip")
+    normalised.save(str(tmp_path / "normalise.pkl"))
+    (tmp_path / "fed.yaml").write_text(
+        "environment: {task: {observer: {camera: false}, observations: {estimated_slip_velocity: null}}}\n"
+    )
+    out = tmp_path / "policy.onnx"
+    words = ["export", str(tmp_path / "model.zip"), "--env", ID, "--config", str(tmp_path / "fed.yaml")]
+    assert main([*words, "--normalizer", str(tmp_path / "normalise.pkl"), "--out", str(out)]) == 0
+    seen = readings(env)
+    expected = model.predict(normalised.normalize_obs(seen), deterministic=True)[0]
+    assert np.ptp(expected) > 0.5
+    np.testing.assert_allclose(act(out, env, seen), expected, atol=1e-5)
+    card = wlr_gym.evaluate(out, baselines=(), episodes=2)
+    assert card.scores["main"][str(out)]["tracking_error"].mean > 0.0
+
+
+def test_a_plain_network(env, tmp_path):
+    """CleanRL style: a module with layers of its own names and orders, normaliser as a module."""
+    torch.manual_seed(0)
+    width = env.observation_space.shape[0]
+    network = torch.nn.Sequential(
+        torch.nn.LayerNorm(width), torch.nn.Linear(width, 16), torch.nn.SiLU(), torch.nn.Linear(16, 8)
+    )
+    parity = wlr_gym.import_policy(network, env, tmp_path / "p.onnx", normalizer=torch.nn.Hardtanh(-0.5, 0.5))
+    assert parity.real <= 1e-5
+    seen = readings(env)
+    with torch.no_grad():
+        expected = network(torch.as_tensor(np.clip(seen, -0.5, 0.5))).clamp(-1, 1).numpy()
+    np.testing.assert_allclose(act(tmp_path / "p.onnx", env, seen), expected, atol=1e-5)
+    contract = contract_of(tmp_path / "p.onnx")
+    assert (contract["agent"], contract["training"]["environment"]) == ("imported", ID)
+
+
+def test_what_does_not_fit_is_refused_and_leaves_nothing(env, tmp_path, capsys):
+    out = tmp_path / "p.onnx"
+    width = env.observation_space.shape[0]
+    for network, message in (
+        (torch.nn.Linear(3, 8), f"rows of {width} numbers"),
+        (torch.nn.Linear(width, 7), r"expected float32 of shape \(2, 8\)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            wlr_gym.import_policy(network, env, out)
+    with pytest.raises(InputError, match="expected an environment of wlr_gym"):
+        wlr_gym.import_policy(torch.nn.Linear(width, 8), gym.make("CartPole-v1"), out)
+    (tmp_path / "broken.zip").write_bytes(b"no zip")
+    assert main(["export", str(tmp_path / "broken.zip"), "--env", ID, "--out", str(out)]) == 2
+    assert "not a readable archive" in capsys.readouterr().err
+    assert main(["export", str(tmp_path / "broken.zip"), "--out", str(out)]) == 2
+    assert "give --env" in capsys.readouterr().err
+    assert not out.exists()

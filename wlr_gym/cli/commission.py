@@ -1,0 +1,201 @@
+"""Commission a robot: scripted tests on a stand, wheels off the ground, each compared with the emulated robot.
+
+Asks before each test; motors are off after each. Writes measured runs, a JSON per test, and what was measured into the hardware
+file. Exit code 0: all as expected; 1: something differs, or a test could not be made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.options import PatchOption
+from wlr_gym.cli.robot_options import RobotOption, ask_terminal
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from wlr_gym.hardware.commissioning.comparison import StandFinding
+    from wlr_gym.hardware.commissioning.contract import StandTest
+    from wlr_gym.hardware.commissioning.person import Person
+    from wlr_gym.hardware.commissioning.runner import StandResult
+    from wlr_gym.hardware.config import Hardware
+    from wlr_gym.hardware.link import Link
+    from wlr_gym.robot import Robot
+
+#: File in ``--out`` with all results.
+REPORT = "commission.json"
+#: Columns that the table needs.
+_WIDTH = 110
+#: Digits of a value in the table.
+_DIGITS = 3
+
+
+@dataclass(frozen=True)
+class CommissionOptions(RobotOption, PatchOption):
+    """Test a robot on a stand.
+
+    Attributes:
+        out: folder for runs and results; made if it is not there.
+        tests: which tests to make; none = all. See --list.
+        fault: with --emulated: what goes wrong, as in wlr emulate: "delay legs value=0.015".
+        list: show the tests.
+        yes: do not ask before each test, and write the hardware file; what hands have to do is asked for all the same.
+        json: print the results as JSON instead of a table.
+    """
+
+    out: Path | None = None
+    tests: tuple[str, ...] = ()
+    fault: tuple[str, ...] = ()
+    list: bool = False
+    yes: bool = False
+    json: bool = False
+
+
+def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> int:
+    """Make the tests, print and write the results; 0 when all is as expected.
+
+    Args:
+        options: of the command.
+        ask: shows a text and returns what was typed; None = the terminal.
+
+    Raises:
+        InputError: unknown robot, hardware, test or patch, options that make no sense, ports that cannot be opened.
+    """
+    from rich.console import Console
+
+    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.hardware.commissioning.registry import choose
+
+    console = Console(soft_wrap=True, highlight=False, stderr=options.json)
+    console.width = max(console.width, _WIDTH)
+    tests = choose(options.tests)
+    if options.list:
+        _list(tests, console)
+        return OK
+    if options.out is None:
+        raise InputError("--out: expected a folder for runs and results")
+    if options.fault and not options.emulated:
+        raise InputError("--fault is for the emulated robot: add --emulated")
+    make_output_folder(options.out)
+    return _commission(options, options.out, tests, ask or partial(ask_terminal, what="commissioning"), console)
+
+
+def _commission(
+    options: CommissionOptions, out: Path, tests: Sequence[StandTest], ask: Callable[[str], str], console: Console
+) -> int:
+    from wlr_gym.base.files import write_json
+    from wlr_gym.data.format import RunMeta
+    from wlr_gym.data.replay import robot_entry
+    from wlr_gym.hardware.commissioning.runner import Commissioning, content_of
+
+    robot, hardware = options.load()
+    link, person = _robot(options, robot, hardware, ask)
+    meta = RunMeta(robot=robot_entry(options.robot_name(options.robot), out) or robot.name, notes="wlr commission, on a stand")
+    results: list[StandResult] = []
+    with Commissioning(robot, hardware, link, person, out, meta) as commissioning:
+        if faults := commissioning.faults():
+            console.print("\n".join([*faults, "Nothing was switched on: mend this first (wlr doctor)."]), style="bold red")
+            return FAILED
+        for result in commissioning.make(tests):
+            results.append(result)
+            console.print(f"{result.test}: {result.state}{f': {result.reason}' if result.reason else ''}")
+            write_json(out / REPORT, [content_of(one) for one in results])
+    findings = [finding for result in results for finding in result.findings]
+    if options.json:
+        print((out / REPORT).read_text(encoding="utf-8"))
+    else:
+        _print_table(findings, console)
+    if findings:
+        _save(options, out, findings, ask, console)
+    return OK if all(result.is_good for result in results) else FAILED
+
+
+def _robot(options: CommissionOptions, robot: Robot, hardware: Hardware, ask: Callable[[str], str]) -> tuple[Link, Person]:
+    """Return a link to the robot, and who stands beside it."""
+    from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
+    from wlr_gym.hardware.commissioning.person import TerminalPerson
+    from wlr_gym.hardware.emulator.link import emulated_link
+    from wlr_gym.hardware.emulator.stand import EmulatedStand
+
+    if not options.emulated:
+        return options.link_to(robot, hardware, options.patch()), TerminalPerson(ask, not options.yes)
+    stand = EmulatedStand(robot, hardware, options.patch())
+    for fault in options.fault:
+        stand.machine.inject(fault)
+    return emulated_link(stand.machine), EmulatedPerson(stand)
+
+
+def _save(
+    options: CommissionOptions, out: Path, findings: Iterable[StandFinding], ask: Callable[[str], str], console: Console
+) -> None:
+    """Write the hardware file with what was measured: a copy in ``--out``, and, of a real robot, the file itself if wanted."""
+    from wlr_gym.base.paths import find_config
+    from wlr_gym.hardware.calibration import save_hardware
+    from wlr_gym.hardware.commissioning.comparison import with_measurements
+    from wlr_gym.hardware.config import load_hardware
+
+    source = find_config("hardware", options.hardware)
+    changed = with_measurements(load_hardware(source), findings)  # what the file says, not ports of the command line
+    targets = [out / "hardware.yaml"]
+    is_own = options.hardware.endswith((".yaml", ".yml")) and not options.emulated
+    if is_own and (options.yes or ask(f"Write the measured values into {source}? [y/N]").strip().lower() in ("y", "yes")):
+        targets.append(source)
+    for target in targets:
+        save_hardware(target, source, changed, "measured", "Measured on the robot by wlr commission; see docs/robot.md.")
+        console.print(f"written: {target}")
+
+
+# ---- the report ------------------------------------------------------------------------------------------------------
+
+
+def _list(tests: Sequence[StandTest], console: Console) -> None:
+    from rich import box
+    from rich.table import Table
+
+    table = Table("test", "what", "hands", "what moves", box=box.SIMPLE)
+    for test in tests:
+        table.add_row(test.name, test.title, test.asks or "off", test.moves)
+    console.print(table)
+
+
+def _print_table(findings: Sequence[StandFinding], console: Console) -> None:
+    """One row for all places where a quantity is as expected, one for each where it differs; then what to do."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table("quantity", "where", "measured", "expected", "verdict", box=box.SIMPLE)
+    for column in table.columns:
+        column.no_wrap = True
+    for quantity in dict.fromkeys(finding.quantity for finding in findings):
+        alike = [finding for finding in findings if finding.quantity == quantity]
+        good = [finding for finding in alike if finding.is_expected]
+        for group in ([good] if good else []) + [[finding] for finding in alike if not finding.is_expected]:
+            table.add_row(*_row(group), style="" if group[0].is_expected else "red")
+    console.print(table)
+    wrong = [finding for finding in findings if not finding.is_expected]
+    for finding in wrong:
+        console.print(
+            f"{finding.where}, {finding.quantity.name}: {finding.quantity.doc}. {finding.quantity.remedy}", style="bold"
+        )
+    if findings and not wrong:
+        console.print(f"All {len(findings)} values as expected.", style="bold green")
+
+
+def _row(group: Sequence[StandFinding]) -> tuple[str, ...]:
+    """Table row of findings of one quantity."""
+    first, unit = group[0], group[0].quantity.unit
+    where = first.where if len(group) == 1 else f"{len(group)} places"
+    expected = f"{_span([one.expected for one in group], unit)} +- {max(one.room for one in group):.2g}"
+    return first.quantity.name, where, _span([one.measured for one in group], unit), expected, first.verdict
+
+
+def _span(values: Sequence[float], unit: str) -> str:
+    low, high = (f"{round(value, 9) + 0.0:.{_DIGITS}g}" for value in (min(values), max(values)))
+    text = low if low == high else f"{low} .. {high}"
+    return text if unit == "-" else f"{text} {unit}"

@@ -1,0 +1,187 @@
+"""Import logs of other programs as measured runs: MCAP, rosbag2, rosbag1, CSV, Parquet and LeRobot data sets; no ROS needed.
+
+A map says which topics and fields are which channels. --suggest proposes one from names, types and the numbers themselves, says
+how sure it is, and writes it; with --out it is used at once. What wlr export --to has written needs no map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.cli import OK
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from wlr_gym.data.logs import ImportedRun, Proposal
+
+_COLOURS = {"sure": "green", "likely": "yellow", "guess": "red"}
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    log: tyro.conf.Positional[tuple[Path, ...]]
+    """Logs: .mcap, .db3, .bag, .csv or .parquet files, folders of rosbag2, LeRobot data sets (version 3)."""
+    map: Path | None = None
+    """What topics and fields mean; with --suggest, what of it is known already, be it one line."""
+    suggest: bool = False
+    """Propose the map, from the first log, and write it: into --out, else to map.yaml here."""
+    out: Path | None = None
+    """Folder for the runs; made if it is not there."""
+    split: float | None = None
+    """Cut long recordings into runs of about so many seconds, where the robot is quietest."""
+    robot: str | None = None
+    """Robot file or config name; default: the one that the map's meta names, else the nominal one."""
+    format: Literal["parquet", "csv"] = "parquet"
+    """Of the runs."""
+
+
+def run(options: ImportOptions) -> int:
+    """Import, and say how each channel came about and what is missing.
+
+    Raises:
+        InputError: unreadable logs, a map that does not fit, runs that a reader would refuse.
+    """
+    from rich.console import Console
+
+    from wlr_gym.data.logs import import_log, read_map
+    from wlr_gym.data.logs.importing import MAP_FILE, is_own
+
+    _check(options)
+    console = Console(soft_wrap=True, highlight=False)
+    given: dict[str, Any] | None = read_map(options.map) if options.map is not None else None
+    if options.suggest:
+        found = _suggest(options, given or {}, console)
+        if options.out is None:
+            return OK
+        given = found
+    assert options.out is not None
+    if given is None and not (options.out / MAP_FILE).is_file():
+        _check_own([log for log in options.log if not is_own(log)])
+    for log in options.log:
+        with _reading(console, log) as tell:
+            imported = import_log(log, options.out, given, options.robot, options.split, f".{options.format}", tell)
+        _report(imported, console)
+    return OK
+
+
+def _check(options: ImportOptions) -> None:
+    if not options.log:
+        raise InputError("expected logs to import")
+    for log in options.log:
+        if not log.exists():
+            raise InputError(f"{log}: no such file or folder")
+    if options.out is None and not options.suggest:
+        raise InputError("--out: expected a folder for the runs")
+
+
+def _check_own(others: Sequence[Path]) -> None:
+    if others:
+        raise InputError(f"{others[0]}: another program's log: give --map, or --suggest to have one proposed")
+
+
+class _Reading:
+    """A bar that shows how much of a log has been read."""
+
+    def __init__(self, console: Console, log: Path) -> None:
+        from wlr_gym.cli.progress import progress
+
+        self._bar = progress(console)
+        self._log = log
+
+    def __enter__(self) -> Callable[[float], None]:
+        return partial(self._bar.__enter__(), "", f"reading {self._log.name}")
+
+    def __exit__(self, *error: Any) -> None:
+        self._bar.__exit__(*error)
+
+
+def _reading(console: Console, log: Path) -> _Reading:
+    return _Reading(console, log)
+
+
+# ---- the proposed map ------------------------------------------------------------------------------------------------
+
+
+def _suggest(options: ImportOptions, given: dict[str, Any], console: Console) -> dict[str, Any]:
+    """Propose, print and write a map; return what it says."""
+    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.data.logs import suggest_map
+    from wlr_gym.data.logs.importing import MAP_FILE, write_map
+    from wlr_gym.data.logs.map import content
+
+    target = (options.out or Path()) / MAP_FILE
+    with _reading(console, options.log[0]) as tell:
+        found = suggest_map(options.log[0], given, options.robot, tell)
+    _print_proposal(found, console)
+    make_output_folder(target.parent)
+    write_map(target, found.map)
+    console.print(f"written: {target}", markup=False)
+    return content(found.map)
+
+
+def _print_proposal(found: Proposal, console: Console) -> None:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table("of the map", "how sure", "why", box=box.SIMPLE)
+    for reason in found.reasons:
+        table.add_row(reason.what, Text(reason.sure, _COLOURS[reason.sure]), Text(reason.why))
+    console.print(table)
+    if found.unused:
+        console.print(f"not used: {', '.join(found.unused)}", style="dim", markup=False)
+    _print_costs(_columns(found), console)
+
+
+def _columns(found: Proposal) -> set[str]:
+    from wlr_gym.data.logs.map import GROUPS
+
+    return {column for key in found.map.channels for column in GROUPS.get(key, (key,))}
+
+
+def _print_costs(columns: set[str], console: Console) -> None:
+    from wlr_gym.data.logs.costs import costs
+
+    for missing, cost in costs(columns):
+        console.print(f"missing: {missing}: {cost}", style="yellow", markup=False)
+
+
+# ---- what was imported -----------------------------------------------------------------------------------------------
+
+
+def _report(imported: Sequence[ImportedRun], console: Console) -> None:
+    first = imported[0]
+    for note in first.notes:
+        console.print(f"{first.source}: {note}", style="yellow", markup=False)
+    if first.facts:
+        console.print(_facts_table(first))
+        _print_costs({fact.column for fact in first.facts}, console)
+    for one in imported:
+        console.print(f"written: {one.path}", markup=False)
+        for finding in one.findings:
+            console.print(f"  {finding.kind} in '{finding.column}': {finding.message}", style="yellow", markup=False)
+
+
+def _facts_table(one: ImportedRun) -> Any:
+    from rich import box
+    from rich.table import Table
+
+    table = Table("channels", "topic", "unit", "samples/s", "rows", "moved, ms rms", "rows with a value", box=box.SIMPLE)
+    groups: dict[tuple[Any, ...], list[Any]] = {}
+    for fact in one.facts:
+        key = (fact.column.partition("_")[0], fact.topic, fact.unit, fact.how)
+        groups.setdefault(key, []).append(fact)
+    for (kind, topic, unit, how), facts in groups.items():
+        columns = facts[0].column if len(facts) == 1 else f"{kind} ({len(facts)})"
+        moved = max(fact.moved for fact in facts)
+        known = min(fact.known for fact in facts)
+        table.add_row(columns, topic, unit, f"{facts[0].rate:.0f}", how, f"{1e3 * moved:.1f}", f"{100 * known:.0f} %")
+    return table

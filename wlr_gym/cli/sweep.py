@@ -1,0 +1,125 @@
+"""Train settings x seeds, or search settings. Ctrl-C leaves checkpoints; --resume continues every trial from its newest one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+import yaml
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.settings import parse_config, parse_yaml
+from wlr_gym.cli import FAILED, IMPORTED, OK
+from wlr_gym.cli.options import ray_address
+from wlr_gym.gap.report.text import number
+from wlr_gym.learning.sweep.page import PAGE_FILE, name_of
+from wlr_gym.learning.sweep.plan import SweepPlan, read_plan
+from wlr_gym.learning.sweep.results import TABLE_FILE
+from wlr_gym.learning.sweep.running import SweepResult, resume_sweep, start_sweep
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    what: tyro.conf.Positional[str | None] = None
+    """File of a sweep (YAML; see docs/sweep.md) or environment id (see: wlr envs)."""
+    config: str | None = None
+    """Settings of the agent: name in configs/agent/ or path of a YAML file; default: the agent's own."""
+    agent: str | None = None
+    """Agent to train: a folder of agents/; default: ppo."""
+    init: str | None = None
+    """Trained policy that every trial starts from."""
+    set: tuple[str, ...] = ()
+    """Settings, as key=value; several values make a grid: --set learning_rate=1e-3,2e-3 total_steps=500_000"""
+    search: Path | None = None
+    """File (YAML) with 'space' and 'search': what is searched, and how."""
+    seeds: int | None = None
+    """Trainings of each settings, with seeds from 0 on; default: 5."""
+    out: Path | None = None
+    """Folder of the sweep; default: runs_out/sweep_<environment or file>."""
+    resume: Path | None = None
+    """Folder of a sweep to resume, as it was planned; --ray and --workers may be others than before."""
+    ray: tuple[str, ...] | None = None
+    """Run on Ray: alone, it is started on this machine; with an address (auto, 10.0.0.1:6379), that cluster is used."""
+    workers: int | None = None
+    """Most trials at a time, each on one core; default: one per core."""
+
+
+def run(options: SweepOptions) -> int:
+    """Train, say how it goes, and print where table and page are."""
+    ray = ray_address(options.ray)
+    if options.resume is not None:
+        _require_own_plan(options)
+        found = resume_sweep(options.resume, ray=ray, workers=options.workers, say=_say)
+    else:
+        plan = _plan(options)
+        out = options.out or Path("runs_out") / f"sweep_{Path(options.what or '').stem.rpartition(':')[2]}"
+        found = start_sweep(plan, out, ray=ray, workers=options.workers, say=_say)
+    return _report(found)
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+def _require_own_plan(options: SweepOptions) -> None:
+    own = (options.what, options.config, options.agent, options.init, options.search, options.seeds, options.out)
+    if any(value is not None for value in own) or options.set:
+        raise InputError("--resume continues a sweep as it was planned; beside it there are --ray and --workers only")
+
+
+def _plan(options: SweepOptions) -> SweepPlan:
+    """Return the plan of a file, of the options, or of a file with options laid over it."""
+    if options.what is None:
+        raise InputError("expected the file of a sweep, or an environment id (see: wlr envs)")
+    changes: dict[str, Any] = {"imports": list(IMPORTED)} if IMPORTED else {}
+    given = {"config": options.config, "agent": options.agent, "init": options.init, "seeds": options.seeds}
+    changes |= {name: value for name, value in given.items() if value is not None}
+    changes |= _settings(options.set)
+    if not options.what.endswith((".yaml", ".yml")):
+        changes["environment"] = options.what
+    elif options.search is not None:
+        raise InputError(
+            f"--search {options.search}: expected an environment id beside it, not {options.what}, which may have a search"
+        )
+    file = options.what if "environment" not in changes else options.search
+    return read_plan(Path(file), changes) if file is not None else parse_config(SweepPlan, changes, "wlr sweep")
+
+
+def _settings(words: tuple[str, ...]) -> Mapping[str, Any]:
+    """Return what ``--set`` says: a setting with one value is for all trials, others span the grid."""
+    settings: dict[str, Any] = {}
+    space: dict[str, list[Any]] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        try:
+            values = parse_yaml(f"[{text}]") if name and equals and text else None
+        except yaml.YAMLError:
+            values = None
+        if not values:
+            raise InputError(f"--set {word}: expected key=value or key=value,value, such as learning_rate=1e-3,2e-3")
+        if len(values) > 1:
+            space[name] = values
+        else:
+            _nest(settings, name.split("."), values[0])
+    return {"settings": settings, "space": space}
+
+
+def _nest(settings: dict[str, Any], path: list[str], value: Any) -> None:
+    for part in path[:-1]:
+        settings = settings.setdefault(part, {})
+    settings[path[-1]] = value
+
+
+def _report(found: SweepResult) -> int:
+    if found.ranking:
+        best = found.ranking[0]
+        runs = len(best.values)
+        _say(f"best: {name_of(best.settings)}: {number(best.mean)} over {runs} seed{'s' if runs > 1 else ''}")
+        _say(f"score it: wlr evaluate {best.results[0].folder}")
+    _say(f"table: {found.folder / TABLE_FILE}\npage: {found.folder / PAGE_FILE}")
+    if found.failed:
+        _say(f"{len(found.failed)} trials FAILED; try them again: wlr sweep --resume {found.folder}")
+    return FAILED if found.failed else OK

@@ -1,0 +1,242 @@
+"""What a log's topics and fields mean: the map from them to the channels of a run, as data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import Field, field_validator
+
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_yaml
+from wlr_gym.data.format import CAMERA, COLUMNS, RunMeta
+from wlr_gym.data.logs.units import factor
+from wlr_gym.robot import JOINTS, LEGS, Robot
+
+#: Names that stand for several channels.
+GROUPS: dict[str, tuple[str, ...]] = {
+    **{kind: tuple(f"{kind}_{joint}" for joint in JOINTS) for kind in ("cmd", "pos", "vel", "eff")},
+    **{
+        f"{kind}_{part}": tuple(f"{kind}_{joint}" for joint in JOINTS if joint.startswith(part))
+        for kind in ("cmd", "pos", "vel", "eff")
+        for part in ("leg", "wheel")
+    },
+    **{kind: tuple(f"{kind}_{axis}" for axis in "xyz") for kind in ("gyro", "acc")},
+    "cam": CAMERA[:3],
+}
+#: Axes of a frame, as one of the log's.
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+_MAP_KEYS = (*(name for name in COLUMNS if name != "t"), *GROUPS)
+
+
+class ChannelSource(SettingsModel):
+    """Where a channel, or several, comes from: value = sign * (what the log says, in SI units - zero).
+
+    Attributes:
+        topic: of the log.
+        field: of its messages; ``{joint}`` stands for the joint's name in the log, ``{axis}`` for x, y or z. Of a quaternion
+            ``.yaw``, ``.pitch`` and ``.roll`` can be taken: ``pose.orientation.yaw``.
+        unit: of the log; None = SI.
+        sign: -1 = counts the other way.
+        zero: what the log says where the channel is 0, in SI units.
+        take: how a row gets its value: ``interpolate`` between the samples before and after it, ``hold`` the last one
+            (of setpoints: the one that holds in the middle of the row's step), ``nearest``, or ``frames``: only rows next to a
+            sample get one. None = ``hold`` for setpoints, ``frames`` for the camera, else ``interpolate``. What has a
+            sample at the row's own time is taken as it is.
+    """
+
+    topic: str
+    field: str
+    unit: str | None = None
+    sign: Literal[1, -1] = 1
+    zero: float = 0.0
+    take: Literal["interpolate", "hold", "nearest", "frames"] | None = None
+
+
+class JointSource(SettingsModel):
+    """A joint in the log: its name, which way it counts, and its angle (rad) where ours is 0."""
+
+    name: str
+    sign: Literal[1, -1] = 1
+    zero: float = 0.0
+
+
+class TopicClock(SettingsModel):
+    """When a topic's messages were measured: by their ``header`` or as the ``log`` received them, and s to add to that."""
+
+    use: Literal["header", "log"] = "header"
+    offset: float = 0.0
+
+
+class LogMap(SettingsModel):
+    """What a log's topics and fields mean.
+
+    Attributes:
+        rows: topic whose messages make the rows; None = that of the legs' positions.
+        every: of them, every so manieth makes a row.
+        joints: joint -> its name in the log, with sign and zero where they differ.
+        channels: channel, or group of channels (``pos``, ``pos_leg``, ``gyro``, ``cam``, ...) -> source; the narrower wins.
+        frames: ``imu`` or ``cam`` -> the axes of the log that our x, y and z are, such as ``[-y, x, z]``.
+        clocks: topic -> its clock.
+        namespace: topics that do not begin with it are another robot's.
+        meta: for ``meta.yaml``.
+    """
+
+    rows: str | None = None
+    every: int = Field(default=1, ge=1)
+    joints: dict[str, JointSource] = Field(default_factory=dict)
+    channels: dict[str, ChannelSource] = Field(default_factory=dict)
+    frames: dict[str, tuple[Axis, Axis, Axis]] = Field(default_factory=dict)
+    clocks: dict[str, TopicClock] = Field(default_factory=dict)
+    namespace: str | None = None
+    meta: RunMeta = RunMeta()
+
+    @field_validator("joints", mode="before")
+    @classmethod
+    def _plain_names(cls, value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        _known(value, JOINTS, "joint")
+        return {joint: {"name": one} if isinstance(one, str | int) else one for joint, one in value.items()}
+
+    @field_validator("channels")
+    @classmethod
+    def _known_channels(cls, value: dict[str, ChannelSource]) -> dict[str, ChannelSource]:
+        _known(value, _MAP_KEYS, "channel")
+        return value
+
+    @field_validator("frames")
+    @classmethod
+    def _right_handed(cls, value: dict[str, tuple[Axis, Axis, Axis]]) -> dict[str, tuple[Axis, Axis, Axis]]:
+        _known(value, ("imu", "cam"), "frame")
+        for name, axes in value.items():
+            if sorted(axis[-1] for axis in axes) != ["x", "y", "z"] or _handedness(axes) != 1:
+                raise InputError(f"frames.{name} = {list(axes)}: expected x, y and z once each, right-handed")
+        return value
+
+    def use(self, topic: str) -> TopicClock:
+        """Return the clock of a topic."""
+        return self.clocks.get(topic, TopicClock())
+
+
+def _known(names: Any, valid: Any, what: str) -> None:
+    for name in names:
+        if name not in valid:
+            raise unknown_name(what, str(name), valid)
+
+
+def _handedness(axes: tuple[str, ...]) -> int:
+    places = [("x", "y", "z").index(axis[-1]) for axis in axes]
+    even = places in ([0, 1, 2], [1, 2, 0], [2, 0, 1])
+    flipped = sum(axis.startswith("-") for axis in axes) % 2
+    return 1 if even != bool(flipped) else -1
+
+
+def read_map(path: str | Path) -> dict[str, Any]:
+    """Read a map file as it is written, to lay it over a proposed one.
+
+    Raises:
+        InputError: no YAML, an unknown key, a value of the wrong kind; the message names the nearest valid name.
+    """
+    data = read_yaml(path) or {}
+    parse_config(LogMap, data, str(path))
+    return data
+
+
+def combine(proposed: LogMap, given: Mapping[str, Any], where: str) -> LogMap:
+    """Return the proposed map with what is given laid over it.
+
+    Raises:
+        InputError: what comes out is no map.
+    """
+    return parse_config(LogMap, overlay(content(proposed), _plain(given)), where)
+
+
+def _plain(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a map with joints by name in the long form, so that only what it says replaces what was proposed."""
+    joints = given.get("joints") or {}
+    long = {joint: {"name": str(one)} if isinstance(one, str | int) else one for joint, one in joints.items()}
+    return {**given, **({"joints": long} if joints else {})}
+
+
+def content(found: LogMap) -> dict[str, Any]:
+    """Return what a map file says: all that is not as it would be without it."""
+    return found.model_dump(mode="json", exclude_defaults=True)
+
+
+def map_text(found: LogMap) -> str:
+    """Return the text of a map file."""
+    parts = []
+    for key, value in content(found).items():
+        style = None if isinstance(value, Mapping) else False  # one line for each of its entries
+        parts.append(yaml.safe_dump({key: value}, sort_keys=False, default_flow_style=style, width=140, allow_unicode=True))
+    return "".join(parts)
+
+
+# ---- what it means for each channel ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """Where one channel comes from.
+
+    Attributes:
+        column: channel.
+        topic, field: of the log.
+        factor, sign, zero: value = sign * (factor * field - zero).
+        unit: of the log, for messages.
+        take: how rows get their values.
+    """
+
+    column: str
+    topic: str
+    field: str
+    factor: float
+    sign: int
+    zero: float
+    unit: str
+    take: str
+
+
+def resolve(found: LogMap, robot: Robot, where: str) -> dict[str, Resolved]:
+    """Return column -> where it comes from, for every channel of the map.
+
+    Raises:
+        InputError: a joint without a name, or a unit that is none of the channel's.
+    """
+    resolved = {}
+    for column in COLUMNS:
+        keys = [column, *sorted((name for name, members in GROUPS.items() if column in members), key=len, reverse=True)]
+        key = next((name for name in keys if name in found.channels), None)
+        if key is not None:
+            resolved[column] = _resolve(found, column, found.channels[key], robot, where)
+    return resolved
+
+
+def _resolve(found: LogMap, column: str, source: ChannelSource, robot: Robot, where: str) -> Resolved:
+    kind, _, label = column.partition("_")
+    field, sign, zero = source.field, source.sign, source.zero
+    if label in JOINTS:
+        joint = found.joints.get(label)
+        if "{joint}" in field and joint is None:
+            raise InputError(f"{where}: channel '{column}': joints.{label} is missing: its name in the log")
+        if joint is not None:
+            field = field.replace("{joint}", joint.name)
+            sign *= joint.sign
+            zero += joint.zero if kind in ("pos", "cmd") and label in LEGS else 0.0
+    elif kind in ("gyro", "acc") or column in ("cam_x", "cam_y", "cam_z"):
+        axes = found.frames.get("cam" if kind == "cam" else "imu", ("x", "y", "z"))
+        axis = axes["xyz".index(label)]
+        sign *= -1 if axis.startswith("-") and "{axis}" in field else 1
+        field = field.replace("{axis}", axis[-1])
+    elif "{axis}" in field:  # heading and pitch come from the quaternion beside the position
+        field = field.replace("position.{axis}", f"orientation.{label}").replace("{axis}", label)
+    take = source.take or ("hold" if kind == "cmd" else "frames" if kind == "cam" else "interpolate")
+    angle_of_pose = column in ("cam_yaw", "cam_pitch") and source.unit in ("mm", "cm", "m")
+    unit = None if angle_of_pose else source.unit
+    return Resolved(
+        column, source.topic, field, factor(column, unit, robot, where), sign, zero, unit or COLUMNS[column].unit, take
+    )

@@ -1,0 +1,67 @@
+"""Headings and pitches from quaternions of a log, in whatever frame it has them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.data.logs.topics import Topic
+from wlr_gym.robot.parameter_table import XYZ
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+#: Angles that can be taken of a quaternion.
+ANGLES = ("yaw", "pitch", "roll")
+
+
+def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, where: str) -> tuple[Times, Array]:
+    """Return times (ns) and one angle (rad) of a quaternion: ``<its field>.yaw``, ``.pitch`` or ``.roll``.
+
+    Lost frames, whose quaternion is no rotation, are left out.
+
+    Args:
+        topic: that has it.
+        field: name of the angle.
+        use: clock of the topic.
+        axes: axes of the log that our x, y and z are, of the floor's frame and of the body's; None = the same.
+        where: for messages.
+
+    Raises:
+        InputError: no such quaternion.
+    """
+    stem, _, angle = field.rpartition(".")
+    at, quaternion, lost = _rotations(topic, stem, use, where)
+    at, quaternion = at[~lost], quaternion[~lost]
+    w, *vector = (quaternion / np.linalg.norm(quaternion, axis=1)[:, None]).T
+    if axes is not None:  # a proper turn of both frames: the quaternion's vector turns with them
+        vector = [vector[XYZ.index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0) for axis in axes]
+    x, y, z = vector
+    angles = {
+        "yaw": np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        "pitch": np.arcsin(np.clip(2 * (w * y - x * z), -1, 1)),
+        "roll": np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+    }
+    values = angles[angle]
+    return at, np.unwrap(values) if angle == "yaw" else values
+
+
+def lost_frames(topic: Topic, field: str, use: str, where: str) -> Times:
+    """Return the times (ns) at which the quaternion of an angle is no rotation: not known, or of length 0.
+
+    Its message's position is not one, either. Of a field that is no angle of a quaternion there are none.
+    """
+    stem, _, angle = field.rpartition(".")
+    if field in topic.fields or angle not in ANGLES:
+        return np.zeros(0, np.int64)
+    at, _, lost = _rotations(topic, stem, use, where)
+    return at[lost]
+
+
+def _rotations(topic: Topic, stem: str, use: str, where: str) -> tuple[Times, Array, NDArray[np.bool_]]:
+    """Return times, quaternions (n, 4), and which of them are no rotations."""
+    parts = [topic.series(f"{stem}.{part}", use, where) for part in "wxyz"]
+    quaternion = np.stack([values for _, values in parts], axis=1)
+    return parts[0][0], quaternion, ~(np.linalg.norm(quaternion, axis=1) >= 0.5)

@@ -1,0 +1,329 @@
+"""Propose units and frames of poses and of the IMU, and the clocks of their topics, from the motion that all of them show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.data.logs.align import Lag, find_lag
+from wlr_gym.data.logs.map import TopicClock
+from wlr_gym.data.logs.signals import (
+    GUESS,
+    LIKELY,
+    SURE,
+    BodyMotion,
+    LogSignals,
+    common_grid,
+    integral,
+    likeness,
+    over_windows,
+    unit_of,
+)
+from wlr_gym.data.logs.suggest_joints import JointFindings, angle
+from wlr_gym.data.logs.units import FACTORS
+from wlr_gym.robot import LEGS, WHEELS
+from wlr_gym.robot.parameter_table import XYZ
+from wlr_gym.robot.parameters import Parameters
+
+Array = NDArray[np.float64]
+
+#: s; poses are smoothed over this before they are differentiated.
+_SMOOTH = 0.2
+#: m/s: wheels whose sides differ by more turn the robot. rad/s: legs that are quicker move. s around either that do not count.
+_TURN_SPEED, _SWING, _AROUND = 0.02, 0.05, 0.3
+#: s; an IMU's clock that is off by more is moved before axes are looked for.
+_ROUGH = 0.1
+#: How much a gyroscope turns of what wheels or pose say: wheels slip in turns.
+_AS_MUCH = (0.12, 3.0)
+#: m/s2; standing readings whose length is off by more than this share are in no unit that is known.
+_GRAVITY_SHARE = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class ImuFindings:
+    """Units of ``gyro`` and ``acc``, and raw readings about the vertical and along the robot; None = not known."""
+
+    units: dict[str, str]
+    heading: Array | None
+    pushed: Array | None
+
+
+def smoothed(t: Array, values: Array, width: float = _SMOOTH) -> tuple[Array, Array, Array]:
+    """Return a grid, and value and rate of a signal on it, averaged over ``width`` seconds."""
+    grid = np.arange(t[0] + width, t[-1] - width, 0.02)
+    total = integral(t, values)
+    half = 0.5 * width
+    value = (np.interp(grid + half, t, total) - np.interp(grid - half, t, total)) / width
+    rate = (np.interp(grid + half, t, values) - np.interp(grid - half, t, values)) / width
+    return grid, value, rate
+
+
+# ---- pose ------------------------------------------------------------------------------------------------------------
+
+
+def find_pose(look: LogSignals) -> BodyMotion | None:
+    """Return how the body moved by its pose, on the log's clocks; unit and frame go into ``look``. None = no pose."""
+    if not look.has("cam_x", "cam_y", "cam_yaw"):
+        return None
+    if min(len(look.raw(f"cam_{axis}")[0]) for axis in ("x", "y", "yaw")) < 10:
+        return None
+    _upright(look)
+    t, x = look.raw("cam_x")
+    _, y = look.raw("cam_y")
+    at, yaw = look.raw("cam_yaw")
+    if len(t) != len(y):
+        return None
+    unit = look.chosen["cam_x"].unit or _length_unit(look, t, x, y)
+    if _in_degrees(look, yaw):
+        yaw = np.radians(yaw)
+        look.chosen["cam_yaw"] = replace(look.chosen["cam_yaw"], unit="deg")
+    for axis in ("x", "y"):
+        look.chosen[f"cam_{axis}"] = replace(look.chosen[f"cam_{axis}"], unit=unit)
+    scale = FACTORS["m"][unit]
+    x, y = (
+        values * (-1.0 if axis.startswith("-") else 1.0)
+        for values, axis in zip((x, y), look.frames.get("cam", XYZ), strict=False)
+    )
+    heading = np.interp(t, at, np.unwrap(yaw))
+    grid, _, vx = smoothed(t, x * scale)
+    vy, turned = smoothed(t, y * scale)[2], smoothed(t, heading)[1]
+    forward = integral(grid, vx * np.cos(turned) + vy * np.sin(turned))
+    topic = look.chosen["cam_x"].topic
+    by_name = look.log.topics[topic].kind.endswith(("PoseStamped", "Odometry")) or topic == "table"
+    look.note(
+        "cam", SURE if by_name else LIKELY, f"topic '{topic}', in {unit} by how fast the robot can be{_said_lost(look, topic)}"
+    )
+    if "odom" in topic.lower() or look.log.topics[topic].kind.endswith("Odometry"):
+        text = f"topic '{topic}' may be computed from the wheels: then it is no measurement: take 'cam' out of the map"
+        look.note("cam", GUESS, text)
+    return BodyMotion(grid, forward, turned)
+
+
+def _said_lost(look: LogSignals, topic: str) -> str:
+    lost = len(look.lost(topic))
+    return f"; {lost} frames without a rotation left out" if lost else ""
+
+
+def _in_degrees(look: LogSignals, yaw: Array) -> bool:
+    """Whether a heading of its own is in degrees: its name says so, or it goes beyond a turn and jumps at most by one."""
+    chosen = look.chosen["cam_yaw"]
+    if chosen.unit is not None or chosen.field.endswith(".yaw"):
+        return chosen.unit == "deg"
+    return float(np.quantile(np.abs(yaw), 0.95)) > 2.2 * np.pi and float(np.abs(np.diff(yaw)).max()) > 0.2
+
+
+def _length_unit(look: LogSignals, t: Array, x: Array, y: Array) -> str:
+    """Return the unit in which the robot is as fast as its wheels allow, at most."""
+    wheel = look.robot.servo.wheel
+    fastest = wheel.no_load_speed * look.robot.wheel.radius
+    vx, vy = smoothed(t, x)[2], smoothed(t, y)[2]
+    speed = float(np.quantile(np.hypot(vx, vy), 0.95))
+    units = FACTORS["m"]
+    return "m" if speed < 4.0 * fastest else "cm" if speed * units["cm"] > 0.3 * fastest else "mm"
+
+
+def _upright(look: LogSignals) -> None:
+    """Find out which axis of a pose points up: the one that hardly changes while the robot drives."""
+    if not look.has("cam_z") or "cam" in look.given.frames:
+        if "cam" in look.given.frames:
+            look.frames["cam"] = look.given.frames["cam"]
+        return
+    spread = [float(np.ptp(look.raw(f"cam_{axis}")[1])) for axis in XYZ]
+    still = int(np.argmin(spread))
+    if still == 2 or spread[still] > 0.3 * spread[2]:
+        return
+    look.frames["cam"] = ("x", "-z", "y") if still == 1 else ("y", "z", "x")
+    names = {axis: look.chosen[f"cam_{axis}"] for axis in XYZ}
+    for axis, of_log in zip(XYZ, look.frames["cam"], strict=True):
+        look.chosen[f"cam_{axis}"] = names[of_log[-1]]
+    look.note("frames.cam", LIKELY, f"its {XYZ[still]} axis hardly moves: it points up")
+
+
+# ---- wheels ----------------------------------------------------------------------------------------------------------
+
+
+def wheel_motion(look: LogSignals, found: JointFindings) -> BodyMotion | None:
+    """Return how the body would have moved without slip, by its wheels; None where not all of them are known."""
+    if not look.has(*(f"pos_{wheel}" for wheel in WHEELS)):
+        return None
+    nominal = Parameters.nominal(look.robot)
+    radius, track = float(nominal["wheel.radius"][0, 0]), 2.0 * float(nominal["hip.position"][0, 1])
+    tracks = [angle(look, found, wheel) for wheel in WHEELS]
+    t = tracks[0][0]
+    way = {wheel: radius * np.interp(t, *pair) for wheel, pair in zip(WHEELS, tracks, strict=True)}
+    left = 0.5 * (way["wheel_lf"] + way["wheel_lr"])
+    right = 0.5 * (way["wheel_rf"] + way["wheel_rr"])
+    return BodyMotion(t, 0.5 * (left + right), (right - left) / track, _straight(look, found, t, right - left))
+
+
+def _straight(look: LogSignals, found: JointFindings, t: Array, difference: Array) -> Array:
+    """Return 1 where neither the wheels turn the robot nor its legs move, nor have just done so, else 0."""
+    moving = np.abs(np.gradient(difference, t)) > _TURN_SPEED
+    for leg in (one for one in LEGS if look.has(f"pos_{one}")):
+        at, values = angle(look, found, leg)
+        grid, _, rate = smoothed(at, values)
+        moving |= np.interp(t, grid, np.abs(rate)) > _SWING
+    step = float(np.median(np.diff(t)))
+    around = np.ones(2 * max(round(_AROUND / step), 1) + 1)
+    return (np.convolve(moving, around, mode="same") < 0.5).astype(np.float64)
+
+
+# ---- IMU -------------------------------------------------------------------------------------------------------------
+
+
+def find_imu(look: LogSignals, body: BodyMotion | None, wheels: BodyMotion | None) -> ImuFindings:
+    """Return units of gyroscope and accelerometer, and what they read about the vertical and along the robot.
+
+    Axes and, roughly, the clock go into ``look``.
+    """
+    units: dict[str, str] = {}
+    up = _gravity(look, units)
+    yaw = _yaw_axis(look, body, wheels, units)
+    if "imu" in look.given.frames:
+        look.frames["imu"] = look.given.frames["imu"]
+    else:
+        _axes(look, up, yaw, body, wheels)
+    x, _, z = look.frames.get("imu", XYZ)
+    heading = _along(look, "gyro", z) if yaw is not None else None
+    pushed = _along(look, "acc", x) if up is not None else None
+    return ImuFindings(units, heading, pushed)
+
+
+def _along(look: LogSignals, kind: str, axis: str) -> Array:
+    _, values = look.raw(f"{kind}_{axis[-1]}")
+    return -values if axis.startswith("-") else values
+
+
+def _gravity(look: LogSignals, units: dict[str, str]) -> str | None:
+    """Return the accelerometer's axis that reads +g at rest; its unit by g."""
+    if not look.has("acc_x", "acc_y", "acc_z"):
+        return None
+    mean = np.array([float(np.median(look.raw(f"acc_{axis}")[1])) for axis in XYZ])
+    unit, off = unit_of(float(np.linalg.norm(mean)) / 9.81, FACTORS["m/s2"])
+    units["acc"] = look.chosen["acc_x"].unit if look.chosen["acc_x"].unit in FACTORS["m/s2"] else unit
+    axis = int(np.argmax(np.abs(mean)))
+    name = f"{'-' if mean[axis] < 0 else ''}{XYZ[axis]}"
+    sure = SURE if abs(off - 1.0) < _GRAVITY_SHARE else GUESS
+    text = f"topic '{look.chosen['acc_x'].topic}', in {units['acc']}: reads {off:.3f} g in the median, along its {name}"
+    look.note("acc", sure, text)
+    return name
+
+
+def _yaw_axis(look: LogSignals, body: BodyMotion | None, wheels: BodyMotion | None, units: dict[str, str]) -> str | None:
+    """Return the gyroscope's axis that turns as the robot does, its unit by how fast; sets the topic's clock."""
+    if not look.has("gyro_x", "gyro_y", "gyro_z"):
+        return None
+    units["gyro"] = look.chosen["gyro_x"].unit if look.chosen["gyro_x"].unit in FACTORS["rad/s"] else "rad/s"
+    topic = look.chosen["gyro_x"].topic
+    reference = wheels or body
+    if reference is None:
+        look.note("gyro", GUESS, f"topic '{topic}', in {units['gyro']}: no wheels and no pose to compare with")
+        return None
+    by = "the wheels" if wheels else "the pose"
+    lags = {axis: lag_of_gyro(look, axis, reference) for axis in XYZ}
+    known = {axis: lag for axis, lag in lags.items() if lag is not None}
+    if not known:
+        look.note(
+            "gyro", GUESS, f"topic '{topic}', in {units['gyro']}: too short, or none of its axes turns about as much as {by}"
+        )
+        return None
+    axis = max(known, key=lambda one: abs(known[one].correlation))
+    lag = known[axis]
+    if topic not in look.given.clocks and abs(lag.correlation) > 0.6 and abs(lag.seconds) > _ROUGH:
+        clock = look.clocks.get(topic, TopicClock())
+        look.clocks[topic] = clock.model_copy(update={"offset": clock.offset + lag.seconds})
+    sign = "-" if lag.correlation < 0 else ""
+    if abs(lag.correlation) < 0.6:
+        text = f"its turning does not go with {by} (correlation {abs(lag.correlation):.2f}): neither unit nor axis shows"
+        look.note("gyro", GUESS, f"topic '{topic}', in {units['gyro']}: {text}")
+        return None
+    if look.chosen["gyro_x"].unit is None:
+        units["gyro"] = _gyro_unit(look, axis, body or reference)
+    sure = GUESS if not look.sided else SURE if abs(lag.correlation) > 0.9 else LIKELY
+    text = f"topic '{topic}', in {units['gyro']}; its {sign}{axis} turns with {by} (correlation {abs(lag.correlation):.2f})"
+    text += "" if look.sided else ", whose signs are not known"
+    look.note("gyro", sure, text)
+    return f"{sign}{axis}"
+
+
+def lag_of_gyro(look: LogSignals, axis: str, reference: BodyMotion) -> Lag | None:
+    """Return how an axis of the gyroscope lags behind a heading; None where it does not turn about as much, in any unit."""
+    t, rate = look.raw(f"gyro_{axis}")
+    if len(t) < 2 or not _turns_as_much(t, rate, reference):
+        return None
+    return find_lag(t, integral(t, rate), reference.t, reference.heading)
+
+
+def _turns_as_much(t: Array, rate: Array, reference: BodyMotion) -> bool:
+    """Whether a raw rate turns about as much as a heading: noise goes with anything, by chance."""
+    grid = common_grid(t, reference.t)
+    if len(grid) < 2:
+        return False
+    sizes = [float(np.std(over_windows(*one, grid))) for one in ((t, integral(t, rate)), (reference.t, reference.heading))]
+    return sizes[1] > 0.0 and any(
+        _AS_MUCH[0] < FACTORS["rad/s"][unit] * sizes[0] / sizes[1] < _AS_MUCH[1] for unit in ("rad/s", "deg/s")
+    )
+
+
+def _gyro_unit(look: LogSignals, axis: str, reference: BodyMotion) -> str:
+    t, rate = look.raw(f"gyro_{axis}")
+    grid = common_grid(t, reference.t)
+    same = likeness(over_windows(t, integral(t, rate), grid), over_windows(reference.t, reference.heading, grid))
+    units = {unit: FACTORS["rad/s"][unit] for unit in ("rad/s", "deg/s")}
+    return unit_of(same.ratio, units)[0] if same is not None else "rad/s"
+
+
+def _axes(look: LogSignals, up: str | None, yaw: str | None, body: BodyMotion | None, wheels: BodyMotion | None) -> None:
+    """Set the IMU's axes: up by gravity and by how it turns, forward by how it is pushed."""
+    z = yaw or up
+    if z is None:
+        return
+    if up is not None and yaw is not None and up.strip("-") != yaw.strip("-"):
+        look.note("frames.imu", GUESS, f"gravity is along {up}, yet the robot turns about {yaw}: check the mounting")
+        return
+    if up is not None and yaw is not None and up != yaw:
+        text = f"the accelerometer reads gravity itself (along {up}) and not the floor's push: its sign is turned"
+        look.note("acc.sign", LIKELY, text)
+        look.acc_sign = -1
+    forward, correlation = _forward_axis(look, z, body, wheels)
+    axes = _complete(forward, z)
+    if axes == XYZ:
+        look.note("frames.imu", SURE if correlation > 0.5 else LIKELY, "as the body's, x forward, z up")
+        return
+    look.frames["imu"] = axes
+    sure = LIKELY if correlation > 0.5 else GUESS
+    look.note("frames.imu", sure, f"our x, y, z are its {', '.join(axes)}; forward by how it is pushed ({correlation:.2f})")
+
+
+def _forward_axis(look: LogSignals, z: str, body: BodyMotion | None, wheels: BodyMotion | None) -> tuple[str, float]:
+    """Return the axis along which the robot is pushed when it speeds up, and the correlation."""
+    others = [axis for axis in XYZ if axis != z.strip("-")]
+    usual = "x" if "x" in others else others[0]
+    motion = wheels or body
+    if motion is None or not look.has("acc_x", "acc_y", "acc_z"):
+        return usual, 0.0
+    grid, _, speed = smoothed(motion.t, motion.forward)
+    pushed = np.gradient(speed, grid)
+    best = (usual, 0.0)
+    for axis in others:
+        t, values = look.raw(f"acc_{axis}")
+        at, mean, _ = smoothed(t, values * look.acc_sign)
+        same = likeness(np.interp(grid, at, mean - mean.mean()), pushed - pushed.mean())
+        if same is not None and abs(same.correlation) > abs(best[1]):
+            best = (f"{'-' if same.correlation < 0 else ''}{axis}", same.correlation)
+    axis, correlation = best
+    return (axis, abs(correlation)) if abs(correlation) > 0.25 else (usual, abs(correlation))
+
+
+def _complete(x: str, z: str) -> tuple[str, str, str]:
+    """Return the axes with y = z cross x."""
+    vectors = []
+    for axis in (z, x):
+        vector = np.zeros(3)
+        vector[XYZ.index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
+        vectors.append(vector)
+    y = np.cross(*vectors)
+    place = int(np.argmax(np.abs(y)))
+    return (x, f"{'-' if y[place] < 0 else ''}{XYZ[place]}", z)

@@ -1,0 +1,55 @@
+"""Units that logs use: what one of them is in SI units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from wlr_gym.base.errors import unknown_name
+from wlr_gym.data.format import COLUMNS
+from wlr_gym.physics.servo import REGISTER_UNITS, current_law, effort_counts
+from wlr_gym.robot import JOINTS, Robot
+
+_TURN = 2.0 * math.pi
+_RPM = _TURN / 60.0
+_G = 9.80665
+_COUNTS = REGISTER_UNITS["XM540-W150-R"]
+
+#: SI unit -> unit -> factor. ``count`` is a count of a Dynamixel register.
+FACTORS: dict[str, dict[str, float]] = {
+    "rad": {"rad": 1.0, "deg": math.radians(1.0), "turn": _TURN, "count": _COUNTS["position"].per_count},
+    "rad/s": {
+        "rad/s": 1.0, "deg/s": math.radians(1.0), "rpm": _RPM, "turn/s": _TURN, "count": _COUNTS["velocity"].per_count,
+    },
+    "N m": {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2},
+    "m/s2": {"m/s2": 1.0, "g": _G, "mg": _G * 1e-3},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "V": {"V": 1.0, "mV": 1e-3},
+}  # fmt: skip
+#: Currents mean a torque by the robot's nominal torque constants; a count is one of Present Current (legs), Load (wheels).
+CURRENTS = ("A", "mA", "count")
+
+
+def units_of(column: str) -> Iterable[str]:
+    """Return the units that a column may be in, in a log."""
+    unit = COLUMNS[column].unit
+    return [*FACTORS[unit], *(CURRENTS if unit == "N m" else ())]
+
+
+def factor(column: str, unit: str | None, robot: Robot, where: str) -> float:
+    """Return what one ``unit`` of a column is in SI units; None = it is in SI units.
+
+    Raises:
+        InputError: no unit of this column.
+    """
+    si = COLUMNS[column].unit
+    if unit is None:
+        return 1.0
+    if unit in FACTORS[si]:
+        return FACTORS[si][unit]
+    if si != "N m" or unit not in CURRENTS:
+        raise unknown_name("unit", unit, units_of(column), f"{where}: channel '{column}'")
+    joint = JOINTS.index(column.removeprefix("eff_"))
+    if unit == "count":
+        return float(effort_counts(robot)[joint])
+    return float(current_law(robot).torque_constant[joint]) * (1e-3 if unit == "mA" else 1.0)

@@ -1,0 +1,285 @@
+"""A robot on a stand, wheels off the ground: what commissioning tests may do with it, and no more.
+
+Tests look at what servos do below the command limiter, so they do not go through it. This module is the only other one that
+drives motors, with limits of its own that are lower: slow wheels, a leg by a few degrees, low PWM where something is held. The
+Bus Watchdog is armed whenever a motor is on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.format import COMMANDS
+from wlr_gym.hardware.commissioning.errors import QuitError, TroubleError
+from wlr_gym.hardware.config import Hardware
+from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
+from wlr_gym.hardware.imu.reading import ImuGoneError
+from wlr_gym.hardware.link import Link
+from wlr_gym.hardware.operator import Operator
+from wlr_gym.hardware.safety.limiter import CALM_PATIENCE, WATCHDOG_UNIT
+from wlr_gym.hardware.servos import JointReadings
+from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
+
+Array = NDArray[np.float64]
+
+#: s between the rows of a run.
+PERIOD = 0.02
+#: rad/s: fastest wheel.
+TOP_SPEED = 3.0
+#: rad that a leg may be asked to move by, and rad/s it moves with.
+LARGEST_LEAN, LEAN_SPEED = 0.12, 0.5
+#: Part of the supply on a motor whose wheel is held: 0.3 N m, 9 N at the rim.
+LOW_PWM = 0.2
+#: Part of the stall torque above which a motor that should turn freely is blocked, and rows in a row.
+BLOCKED, BLOCKED_ROWS = 0.4, 3
+#: Counts of the whole supply.
+_FULL_PWM = 885
+#: Times to switch off servos that do not confirm it, and s between them.
+_OFF_TRIES, _OFF_PAUSE = 20, 0.05
+#: Items in RAM that tests depend on: back to their defaults before torque comes on, and after it is off.
+_REGISTERS = (
+    *("profile_velocity", "profile_acceleration", "velocity_p_gain", "velocity_i_gain", "position_p_gain"),
+    *("position_i_gain", "position_d_gain", "feedforward_1st_gain", "feedforward_2nd_gain"),
+)
+
+
+class Stand:
+    """A robot on a stand. Open its link before, close it afterwards.
+
+    Args:
+        robot, hardware: what it should be.
+        link: to it.
+
+    Attributes:
+        servos: for reading; tests write with the methods below only.
+        clock: of the link.
+        operator: Ctrl-C and signals.
+        samples: what a test notes beyond the rows.
+    """
+
+    def __init__(self, robot: Robot, hardware: Hardware, link: Link) -> None:
+        self.robot, self.hardware = robot, hardware
+        self.servos, self.clock = link.servos, link.clock
+        self.operator: Operator = Operator(link.clock)
+        self.samples: dict[str, list[float]] = {}
+        self._imu = link.imu
+        self._rows: list[Array] = []
+        self._setpoints = np.full(len(JOINTS), np.nan)
+        self._next = 0.0
+        self._silent = self._blocked = 0
+        stall = robot.servo.leg.stall_torque, robot.servo.wheel.stall_torque
+        self._stall = np.repeat(stall, 4)
+        self._last = np.zeros(3 * len(JOINTS))
+        self.servos.set_patience(CALM_PATIENCE)
+
+    # ---- rows ----
+
+    def begin(self) -> None:
+        """Begin a new run: no rows, nothing noted."""
+        self._rows, self.samples = [], {}
+        self._next = self.clock.now()
+        self._silent = self._blocked = 0
+
+    def step(self) -> JointReadings:
+        """Wait for the next row's time, read everything, and note it.
+
+        Raises:
+            TroubleError: a servo is silent, restarted, blocked or has an error.
+            QuitError: somebody asked for a stop.
+            BusGoneError: a port is gone.
+        """
+        self._next = max(self._next + PERIOD, self.clock.now())
+        self.wait_until(self._next)
+        time, readings = self.clock.now(), self.servos.read()
+        self._judge(readings)
+        joints = np.concatenate([readings.position, readings.velocity, readings.effort])
+        self._last = np.where(np.isnan(joints), self._last, joints)
+        self._rows.append(np.concatenate([[time], self._setpoints, self._last, self._imu_row()]))
+        return readings
+
+    def run(self, seconds: float) -> list[JointReadings]:
+        """Go on for so long; return the readings."""
+        return [self.step() for _ in range(max(1, round(seconds / PERIOD)))]
+
+    def wait_until(self, moment: float) -> None:
+        """Let time pass without a word on the line.
+
+        Raises:
+            QuitError: somebody asked for a stop.
+        """
+        self.clock.wait_until(moment)
+        if asked := self.operator.take():
+            raise QuitError(asked)
+
+    def _judge(self, readings: JointReadings) -> None:
+        silent = ~readings.answered
+        self._silent = self._silent + 1 if silent.any() else 0
+        if self._silent >= 2:
+            raise TroubleError(f"no answer from {_names(silent)}")
+        for mask, what in ((readings.alert, "a hardware error"), (readings.restarted, "restarted")):
+            if mask.any():
+                raise TroubleError(f"{_names(mask)}: {what}; see wlr doctor")
+        strained = np.abs(np.nan_to_num(readings.effort)) > BLOCKED * self._stall
+        self._blocked = self._blocked + 1 if strained.any() else 0
+        if self._blocked >= BLOCKED_ROWS:
+            raise TroubleError(f"{_names(strained)}: above {BLOCKED:.0%} of stall torque: does something hold it?")
+
+    def _imu_row(self) -> Array:
+        with contextlib.suppress(ImuGoneError):
+            if (reading := self._imu.read()) is not None:
+                return np.concatenate([reading.gyro, reading.accelerometer])
+        return np.full(6, np.nan)
+
+    def table(self) -> dict[str, Array]:
+        """Return the rows since :meth:`begin` as columns of a measured run; empty without two rows."""
+        if len(self._rows) < 2:
+            return {}
+        names = ["t", *COMMANDS, *(f"{kind}_{joint}" for kind in ("pos", "vel", "eff") for joint in JOINTS)]
+        names += [f"{kind}_{axis}" for kind in ("gyro", "acc") for axis in "xyz"]
+        table = dict(zip(names, np.array(self._rows).T, strict=True))
+        for wheel in WHEELS:
+            table[f"pos_{wheel}"] = table[f"pos_{wheel}"] - table[f"pos_{wheel}"][0]
+        return table
+
+    def imu_rows(self, count: int) -> tuple[Array, Array]:
+        """Return gyroscope and accelerometer (count, 3) of the last rows that have them, rad/s and m/s2."""
+        rows = np.array(self._rows[-count:])[:, -6:]
+        rows = rows[np.isfinite(rows).all(axis=1)]
+        if len(rows) < count // 2:
+            raise TroubleError(f"imu: {len(rows)} readings in {count} rows; see wlr doctor")
+        return rows[:, :3], rows[:, 3:]
+
+    # ---- motors ----
+
+    def prepare(self, joints: Iterable[str]) -> None:
+        """Set what a test depends on: gains and profiles at their defaults, legs slow, all of the PWM, setpoints at rest."""
+        for joint in joints:
+            for item in _REGISTERS:
+                default = self.servos.table(joint)[item].default
+                assert isinstance(default, int)
+                self.servos.set(joint, item, default)
+            self.servos.set(joint, "goal_pwm", self.servos.get(joint, "pwm_limit"))
+            if joint in LEGS:
+                speed = max(1, round(LEAN_SPEED / self.servos.table(joint).per_count("profile_velocity")))
+                self.servos.set(joint, "profile_velocity", speed)
+                self.servos.set(joint, "goal_position", self.servos.get(joint, "present_position"))
+            else:
+                self.servos.set(joint, "goal_velocity", 0)
+
+    def switch_on(self, joints: Iterable[str]) -> None:
+        """Switch torque on and arm the watchdogs; the servos' registers say what happens then."""
+        joints = list(joints)
+        for joint in joints:
+            k = JOINTS.index(joint)
+            self._setpoints[k] = self._goal(joint)
+            self.servos.set(joint, "torque_enable", 1)
+        count = math.ceil(self.hardware.safety.watchdog / WATCHDOG_UNIT - 1e-9)
+        for joint in sorted(joints, key=lambda joint: JOINTS.index(joint) % len(LEGS)):  # no bus is silent for long meanwhile
+            self.servos.set(joint, "bus_watchdog", count)
+
+    def switch_off(self, joints: Iterable[str]) -> None:
+        """Switch single motors off, and disarm their watchdogs; what they are to do stays in their registers."""
+        for joint in joints:
+            self.servos.set(joint, "torque_enable", 0)
+            self.servos.set(joint, "bus_watchdog", 0)
+            self._setpoints[JOINTS.index(joint)] = np.nan
+
+    def _goal(self, joint: str) -> float:
+        """Return the setpoint a servo holds, rad or rad/s."""
+        counts = np.zeros(len(JOINTS))
+        k = JOINTS.index(joint)
+        counts[k] = self.servos.get(joint, "goal_position" if joint in LEGS else "goal_velocity")
+        convert = self.servos.joint_map.position if joint in LEGS else self.servos.joint_map.velocity
+        return float(convert(counts)[k])
+
+    def spin(self, speeds: Mapping[str, float]) -> None:
+        """Write wheel speeds, rad/s; acknowledged by each servo.
+
+        Raises:
+            InputError: faster than the stand allows.
+            RefusedError: the servo does not take it.
+        """
+        limit = min(TOP_SPEED, self.hardware.safety.wheel_speed)
+        for wheel, speed in speeds.items():
+            if wheel not in WHEELS or not abs(speed) <= limit:
+                raise InputError(f"{wheel}: {speed:g} rad/s, expected a wheel and {limit:g} rad/s at most")
+            self._write_setpoint(wheel, "goal_velocity", speed)
+
+    def lean(self, leg: str, angle: float) -> None:
+        """Write a leg's setpoint ``angle`` (rad) beyond where it is now.
+
+        Raises:
+            InputError: farther than the stand allows, or out of the leg's range.
+        """
+        k = JOINTS.index(leg)
+        goal = float(self.servos.read().position[k]) + angle
+        low, high = (
+            end + way * self.hardware.safety.leg_margin for end, way in zip(self.robot.leg_limits, (1, -1), strict=True)
+        )
+        if leg not in LEGS or not abs(angle) <= LARGEST_LEAN or not low <= goal <= high:
+            raise InputError(
+                f"{leg}: by {angle:g} rad to {goal:.2f}, expected a leg, {LARGEST_LEAN:g} rad at most, and a goal in "
+                f"{low:.2f} to {high:.2f}: put the legs straight down"
+            )
+        self._write_setpoint(leg, "goal_position", goal)
+
+    def _write_setpoint(self, joint: str, item: str, value: float) -> None:
+        k = JOINTS.index(joint)
+        wanted = np.where(np.arange(len(JOINTS)) == k, value, 0.0)
+        self.servos.set(joint, item, int(self.servos.joint_map.setpoint_counts(wanted)[k]))
+        if not np.isnan(self._setpoints[k]):
+            self._setpoints[k] = value
+
+    def weaken(self, wheel: str) -> float:
+        """Let a motor have a small part of the supply only; return the part."""
+        count = round(LOW_PWM * _FULL_PWM)
+        self.servos.set(wheel, "goal_pwm", count)
+        return count / _FULL_PWM
+
+    def pwm(self) -> Array:
+        """Return the part of the supply on each motor (8,), -1 to 1 in the joints' directions; NaN without an answer."""
+        counts = self.servos.get_all("present_pwm")
+        return np.array([counts.get(joint, np.nan) * self.hardware.joints[joint].sign / _FULL_PWM for joint in JOINTS])
+
+    def load(self, effort: Array) -> Array:
+        """Return efforts (..., 8) in N m as parts of the stall torque."""
+        return effort / self._stall
+
+    # ---- off ----
+
+    def off(self) -> list[str]:
+        """Switch every motor off and put the registers back, whatever happened; return the joints that did not confirm."""
+        self.operator.is_switching_off = True
+        try:
+            return self._off()
+        finally:
+            self.operator.is_switching_off = False
+            self._setpoints[:] = np.nan
+
+    def _off(self) -> list[str]:
+        servos = self.servos
+        for _ in range(2):
+            servos.torque_off_unacknowledged()
+        left = servos.torque_off(1)
+        for _ in range(_OFF_TRIES):
+            if not left:
+                break
+            self.clock.wait_until(self.clock.now() + _OFF_PAUSE)
+            servos.reopen_gone()
+            left = servos.torque_off(1)
+        with contextlib.suppress(ConnectionError, NoAnswerError, RefusedError):
+            for joint in JOINTS:
+                if joint not in left:
+                    servos.set(joint, "bus_watchdog", 0)
+            self.prepare([joint for joint in JOINTS if joint not in left])
+        return left
+
+
+def _names(mask: NDArray[np.bool_]) -> str:
+    return ", ".join(JOINTS[k] for k in np.flatnonzero(mask))

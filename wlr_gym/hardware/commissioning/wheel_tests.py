@@ -1,0 +1,160 @@
+"""Tests of the wheels' servos: their velocity loop, what Present Load follows, and the stall."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.hardware.commissioning.contract import Reading, StandQuantity, StandTest
+from wlr_gym.hardware.commissioning.errors import TroubleError
+from wlr_gym.hardware.commissioning.person import Person
+from wlr_gym.hardware.commissioning.stand import LOW_PWM, Stand
+from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS
+
+#: rad/s of the step, s that are recorded, and the part of the step over which the response is fitted.
+_STEP, _STEP_TIME, _FITTED = 3.0, 2.0, (0.3, 0.9)
+#: rad/s at which the load is read, s until a wheel turns evenly, rows that are averaged.
+_SPEEDS, _EVEN, _ROWS = (1.0, 2.0, 3.0), 1.4, 10
+#: s that a held wheel pulls, and of it the part that is averaged; rad/s below which it counts as held.
+_HELD_TIME, _HELD_ROWS, _HELD_SPEED = 1.2, 20, 0.1
+_LOOP = "The servo's velocity loop is not the file's: gains in its registers, firmware, or the robot file's numbers for it."
+_FRICTION = "The wheel needs another torque to turn freely: a rubbing tyre, a tight screw, or a weak or worn motor."
+_LAW = "Present Load follows something else than on the emulator: efforts of the wheels in logs mean that instead of torque."
+_STALL = "Its motor is weaker or stronger than the file's: check supply and plugs; else exchange the servo, or measure again."
+
+
+def _measure_velocity_step(stand: Stand, person: Person) -> list[Reading]:
+    stand.prepare(WHEELS)
+    stand.switch_on(WHEELS)
+    stand.run(0.2)
+    stand.spin(dict.fromkeys(WHEELS, _STEP))
+    start = stand.clock.now()
+    times, speeds = [], []
+    while stand.clock.now() < start + _STEP_TIME:
+        speeds.append(stand.step().velocity[WHEEL_SLICE])
+        times.append(stand.clock.now() - start)
+    found = []
+    for wheel, speed in zip(WHEELS, np.array(speeds).T, strict=True):
+        time = _time_constant(wheel, np.array(times), speed)
+        found += [
+            Reading("velocity_loop_time", wheel, time),
+            Reading("integral_cycle", wheel, _integral_cycle(stand, time)),
+            Reading("velocity_error", wheel, float(1.0 - speed[-_ROWS:].mean() / _STEP)),
+        ]
+    return found
+
+
+def _time_constant(wheel: str, times: NDArray[np.float64], speed: NDArray[np.float64]) -> float:
+    """Return the time constant (s) of the error's decay, fitted where the wheel is on its way."""
+    part = speed / _STEP
+    late = np.flatnonzero(part > _FITTED[1])
+    way = np.arange(len(part)) < (late[0] if len(late) else len(part))
+    way &= (part > _FITTED[0]) & (part < _FITTED[1])
+    if way.sum() < 3:
+        raise TroubleError(f"{wheel}: {way.sum()} rows on the way to {_STEP:g} rad/s, expected 3 or more: it does not follow")
+    return float(-1.0 / np.polyfit(times[way], np.log(1.0 - part[way]), 1)[0])
+
+
+def _integral_cycle(stand: Stand, time: float) -> float:
+    """Return the servo's control cycle (s) that a time constant means.
+
+    Motor and rotor settle at once, so that speed, proportional and integral term balance: time = (K + kd) / kp, with K of the
+    torque-speed line. The robot file's kp holds for a cycle of 1 ms.
+    """
+    servo = stand.robot.servo
+    line = servo.supply_voltage / servo.wheel.no_load_speed
+    return 1e-3 * time * servo.wheel.kp / (line + servo.wheel.kd)
+
+
+VELOCITY_STEP = StandTest(
+    "velocity_step",
+    "Step response of the wheels' velocity loop",
+    "",
+    f"Wheels turn at {_STEP:g} rad/s for {_STEP_TIME:g} s.",
+    (
+        StandQuantity("velocity_loop_time", "s", "time constant of the way to a new speed", 0.0, _LOOP, 0.1),
+        StandQuantity("integral_cycle", "s", "control cycle that this means, by the robot file's gains", 0.0, _LOOP, 0.1),
+        StandQuantity("velocity_error", "-", "part of the speed that is missing in the end", 0.03, _LOOP),
+    ),
+    _measure_velocity_step,
+)
+
+
+def _measure_load(stand: Stand, person: Person) -> list[Reading]:
+    stand.prepare(WHEELS)
+    stand.switch_on(WHEELS)
+    loads, pwms = np.empty((len(_SPEEDS), len(WHEELS))), np.empty((len(_SPEEDS), len(WHEELS)))
+    for row, speed in enumerate(_SPEEDS):
+        stand.spin(dict.fromkeys(WHEELS, speed))
+        stand.run(_EVEN)
+        seen = [(stand.load(stand.step().effort)[WHEEL_SLICE], stand.pwm()[WHEEL_SLICE]) for _ in range(_ROWS)]
+        loads[row], pwms[row] = np.nanmean(np.array(seen), axis=0)
+    found = []
+    for k, wheel in enumerate(WHEELS):
+        stand.samples |= {f"load_{wheel}": loads[:, k].tolist(), f"pwm_{wheel}": pwms[:, k].tolist()}
+        slope = float(np.polyfit(pwms[:, k], loads[:, k], 1)[0])
+        found += [Reading("load_per_pwm", wheel, slope), Reading("running_load", wheel, float(loads[:, k].mean()))]
+    return found
+
+
+LOAD = StandTest(
+    "load",
+    "What Present Load follows",
+    "",
+    f"Wheels turn at {', '.join(f'{speed:g}' for speed in _SPEEDS)} rad/s, each for {_EVEN:g} s.",
+    (
+        StandQuantity(
+            "load_per_pwm", "-", "load over PWM from speed to speed, wheel free: 0 = it is torque, 1 = it is PWM", 0.3, _LAW
+        ),
+        StandQuantity("running_load", "-", "load of the free wheel, part of stall torque", 0.01, _FRICTION),
+    ),
+    _measure_load,
+)
+
+
+def _measure_stall(stand: Stand, person: Person) -> list[Reading]:
+    stand.prepare(WHEELS)
+    found = []
+    for wheel in WHEELS:
+        found += _stall(stand, person, wheel)
+    return found
+
+
+def _stall(stand: Stand, person: Person, wheel: str) -> list[Reading]:
+    k = JOINTS.index(wheel)
+    person.brake(wheel)
+    asked = stand.weaken(wheel)
+    stand.switch_on([wheel])
+    stand.spin({wheel: 2.0})
+    stand.run(_HELD_TIME - _HELD_ROWS * 0.02)
+    rows = [stand.step() for _ in range(_HELD_ROWS)]
+    person.watch_supply()
+    pwm = float(abs(np.nanmean([stand.pwm()[k] for _ in range(_ROWS)])))
+    supply = float(np.nanmean(stand.servos.read_health()[0])) / stand.robot.servo.supply_voltage
+    stand.switch_off([wheel])
+    speed = float(np.mean([readings.velocity[k] for readings in rows]))
+    if abs(speed) > _HELD_SPEED:
+        raise TroubleError(f"{wheel} turned at {speed:.2f} rad/s: hold it firmly")
+    load = float(np.mean([stand.load(readings.effort)[k] for readings in rows]))
+    found = [Reading("stall_pwm", wheel, pwm / asked), Reading("stall_load", wheel, load / (pwm * supply))]
+    current = person.supply_current()
+    person.release(wheel)
+    if current is not None:
+        found.append(Reading("stall_current", wheel, current / (pwm * pwm * supply)))
+    return found
+
+
+STALL = StandTest(
+    "stall",
+    "Stall of a held wheel",
+    "Each wheel is to be held by hand, one after the other.",
+    f"The held wheel pulls for {_HELD_TIME:g} s with {LOW_PWM:.0%} of the supply.",
+    (
+        StandQuantity(
+            "stall_pwm", "-", "PWM at the held wheel over the Goal PWM", 0.05, "The servo does not keep to Goal PWM."
+        ),
+        StandQuantity("stall_load", "-", "Present Load of the held wheel over PWM and supply", 0.05, _STALL, 0.1),
+        StandQuantity("stall_current", "A", "current at full voltage, from the supply's display", 0.1, _STALL, 0.25),
+    ),
+    _measure_stall,
+)

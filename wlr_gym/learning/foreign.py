@@ -1,0 +1,200 @@
+"""Policies that other programs trained: any torch network, or an archive of Stable-Baselines3, becomes a policy file."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.envs.core import Core
+from wlr_gym.envs.registry import task_source_of
+from wlr_gym.learning.evaluation.rollout import seen_observations
+from wlr_gym.learning.ppo.policy import ModulePolicy
+from wlr_gym.policy.export import Parity, write_policy_file
+from wlr_gym.policy.file import policy_content
+
+require_package("torch", "train")
+require_package("stable_baselines3", "train")
+
+import torch  # noqa: E402
+from stable_baselines3.common.policies import ActorCriticPolicy  # noqa: E402
+from stable_baselines3.common.save_util import load_from_zip_file  # noqa: E402
+from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
+from stable_baselines3.sac.policies import SACPolicy  # noqa: E402
+from stable_baselines3.td3.policies import TD3Policy  # noqa: E402
+
+#: The name that the contract gives as agent.
+AGENT = "imported"
+#: Robots that drive, and for how long (s), while file and network are compared.
+ROBOTS, SECONDS = 16, 4.0
+
+
+def import_policy(
+    network: torch.nn.Module | str | Path,
+    env: Any,
+    out: str | Path,
+    *,
+    normalizer: torch.nn.Module | VecNormalize | str | Path | None = None,
+) -> Parity:
+    """Make a policy file of a network that was trained elsewhere; ``wlr evaluate``, ``play`` and ``deploy`` take it.
+
+    Args:
+        network: maps (normalised) observations (N, D) to mean actions (N, 8), float32; or the path of an archive that
+            Stable-Baselines3 saved (PPO, A2C, SAC, TD3 and what is built on their policies). Actions are clipped to [-1, 1].
+        env: the environment of the training, made as it was then: single, vector or Stable-Baselines3. What its ``contract()``
+            says is what the file is fed.
+        out: file to write, ending in ``.onnx``.
+        normalizer: what observations went through before the network, folded into the file: a torch module, a
+            ``VecNormalize`` or the path of a saved one. None = nothing.
+
+    Returns:
+        The largest differences between the actions of file and network: over random observations, and over those of robots
+        that it drives.
+
+    Raises:
+        InputError: no environment of this library, a network that does not fit it, an archive that cannot be read, or a file
+            that cannot be written or answers differently.
+        MissingPackageError: a package is not installed.
+    """
+    require_package("onnxscript", "export")
+    from wlr_gym.learning.ppo.export import to_onnx
+
+    bare = getattr(env, "unwrapped", env)
+    if not hasattr(bare, "contract") or not hasattr(bare, "core"):
+        raise InputError(f"env = {env!r}: expected an environment of wlr_gym, made as it was for the training")
+    contract = bare.contract()
+    width, actions = len(contract["observation"]), len(contract["action"])
+    source = network if isinstance(network, torch.nn.Module) else sb3_network(Path(network))
+    whole = _Whole(_normalizer(normalizer, width), source).eval()
+    _check(whole, width, actions)
+    task = bare.core.settings.task
+    config = {"environment": {"task": dict(task)} if isinstance(task, Mapping) else {}}
+    content = policy_content(AGENT, config, contract, {"environment": bare.spec.id})
+    return write_policy_file(Path(out), to_onnx(whole, width), content, ModulePolicy(whole), _driven(bare, whole))
+
+
+class _Whole(torch.nn.Module):
+    """Normaliser, network and the clip of the actions."""
+
+    def __init__(self, normalizer: torch.nn.Module, network: torch.nn.Module) -> None:
+        super().__init__()
+        self.normalizer, self.network = normalizer, network
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return actions (N, 8) for observations (N, D)."""
+        return torch.clamp(self.network(self.normalizer(observation)), -1.0, 1.0)
+
+
+def _driven(bare: Any, network: torch.nn.Module) -> NDArray[np.float32]:
+    """Return observations (M, D) of robots that the network drives."""
+    source = bare.spec.kwargs.get("definition") or task_source_of(bare.spec.id)
+    core = Core(source, bare.core.settings, ROBOTS)
+    try:
+        return seen_observations(core, ModulePolicy(network), SECONDS)
+    finally:
+        core.close()
+
+
+def _check(network: torch.nn.Module, width: int, actions: int) -> None:
+    """Refuse a network that does not map observations to actions."""
+    try:
+        with torch.no_grad():
+            found = network(torch.zeros(2, width))
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise InputError(
+            f"the network does not take the environment's observations, rows of {width} numbers: {error}"
+        ) from None
+    if not isinstance(found, torch.Tensor) or found.shape != (2, actions) or found.dtype != torch.float32:
+        what = f"{found.dtype} of shape {tuple(found.shape)}" if isinstance(found, torch.Tensor) else type(found).__name__
+        raise InputError(f"the network returns {what} for 2 observations, expected float32 of shape (2, {actions})")
+
+
+# ---- normalisers ----
+
+
+class _Standardise(torch.nn.Module):
+    """(x - mean) / sqrt(variance + epsilon), clipped: what VecNormalize does."""
+
+    mean: torch.Tensor
+    scale: torch.Tensor
+
+    def __init__(self, given: VecNormalize) -> None:
+        super().__init__()
+        scale = 1.0 / np.sqrt(given.obs_rms.var + given.epsilon)  # type: ignore[union-attr]
+        self.register_buffer("mean", torch.as_tensor(given.obs_rms.mean, dtype=torch.float32))  # type: ignore[union-attr]
+        self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.float32))
+        self.limit = float(given.clip_obs)
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return torch.clamp((observation - self.mean) * self.scale, -self.limit, self.limit)
+
+
+def _normalizer(given: Any, width: int) -> torch.nn.Module:
+    if given is None:
+        return torch.nn.Identity()
+    if isinstance(given, torch.nn.Module):
+        return given
+    found = given if isinstance(given, VecNormalize) else _saved_normalizer(Path(given))
+    if not found.norm_obs:
+        return torch.nn.Identity()
+    shape = getattr(getattr(found, "obs_rms", None), "mean", np.zeros(0)).shape
+    if shape != (width,):
+        raise InputError(f"normalizer: statistics of shape {shape}, expected ({width},) as the environment observes")
+    return _Standardise(found)
+
+
+def _saved_normalizer(path: Path) -> VecNormalize:
+    try:
+        found = pickle.loads(path.read_bytes())
+    except Exception as error:  # pickle raises whatever the bytes lead it to
+        raise InputError(f"{path}: not a saved VecNormalize: {error}") from None
+    if not isinstance(found, VecNormalize):
+        raise InputError(f"{path}: holds {type(found).__name__}, expected a saved VecNormalize")
+    return found
+
+
+# ---- Stable-Baselines3 ----
+
+
+class _Sb3Mean(torch.nn.Module):
+    """The action that ``predict(deterministic=True)`` of a Stable-Baselines3 model returns, before the clip."""
+
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        policy = self.policy
+        if isinstance(policy, SACPolicy):
+            return torch.tanh(policy.actor.get_action_dist_params(observation)[0])
+        if isinstance(policy, TD3Policy):
+            return policy.actor(observation)
+        features = policy.extract_features(observation, policy.pi_features_extractor)
+        mean = policy.action_net(policy.mlp_extractor.forward_actor(features))
+        return torch.tanh(mean) if policy.squash_output else mean
+
+
+def sb3_network(path: Path) -> torch.nn.Module:
+    """Return the acting network of an archive that Stable-Baselines3 saved.
+
+    Raises:
+        InputError: absent, broken, or of a policy that is no torch network of the kinds above.
+    """
+    try:
+        data, parameters, _ = load_from_zip_file(path, device="cpu")
+        assert data is not None
+        spaces = data["observation_space"], data["action_space"]
+        keywords = {**data["policy_kwargs"], **({"use_sde": True} if data.get("use_sde") else {})}
+        policy = data["policy_class"](*spaces, lambda _: 0.0, **keywords)
+        policy.load_state_dict(parameters["policy"])
+    except Exception as error:  # zip, pickle and torch each raise their own kinds for a broken file
+        raise InputError(f"{path}: not a readable archive of Stable-Baselines3: {type(error).__name__}: {error}") from None
+    if not isinstance(policy, ActorCriticPolicy | SACPolicy | TD3Policy):
+        raise InputError(f"{path}: policy '{type(policy).__name__}': expected one of PPO, A2C, SAC or TD3")
+    policy.set_training_mode(False)
+    return _Sb3Mean(policy)

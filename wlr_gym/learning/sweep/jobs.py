@@ -1,0 +1,191 @@
+"""Jobs: work for processes of their own. What one breaks or leaks does not harm the others, and each has one thread.
+
+A job is a module that is run with a task (JSON) on its standard input, and says in lines of JSON on its standard output what it
+has to say; the last line is ``{"error": ""}``. Whatever else it prints goes to its log. Its input stays open as long as
+somebody waits for it. When that ends, for whatever reason, the job gets SIGTERM and ends in good order.
+
+:func:`follow` and what it uses need the standard library only: a cluster carries them to nodes that may have nothing else.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Generator, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+Send = Callable[[Mapping[str, Any]], None]
+
+#: Environment of a job: one thread each, as many jobs as there are cores.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+#: s that a job has to end in good order, before it is killed.
+PATIENCE = 60.0
+#: s between looks at jobs.
+POLL = 0.05
+
+
+@dataclass(frozen=True)
+class Job:
+    """One piece of work.
+
+    Attributes:
+        name: as messages call it.
+        module: run as ``python -m MODULE``; it calls :func:`serve`.
+        task: what it gets, plain types.
+        log: file that its output is added to.
+    """
+
+    name: str
+    module: str
+    task: Mapping[str, Any]
+    log: str
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a job ended: ``error`` is empty where all went well."""
+
+    name: str
+    error: str = ""
+
+
+# ---- who waits for jobs ----------------------------------------------------------------------------------------------
+
+
+def spread(jobs: Iterable[Job], workers: int) -> Generator[Ended, None, None]:
+    """Run jobs in processes of this machine, ``workers`` at a time; yield how each ended, as it does.
+
+    When the caller ends early (an exception, Ctrl-C), the running jobs are ended in good order.
+    """
+    left, running = list(jobs)[::-1], {}
+    try:
+        while left or running:
+            while left and len(running) < workers:
+                job = left.pop()
+                try:
+                    running[job.name] = job, start(job)
+                except OSError as error:
+                    yield Ended(job.name, f"cannot be started: {error}")
+            time.sleep(POLL)
+            for job, process in [pair for pair in running.values() if pair[1].poll() is not None]:
+                del running[job.name]
+                yield Ended(job.name, outcome(job, process, process.stdout.readlines()[-1:]))
+    finally:
+        stop([process for _, process in running.values()])
+
+
+def follow(job: Job, hear: Callable[[dict[str, Any]], object]) -> str:
+    """Run a job here and call ``hear`` with all that it says; return its error, empty where all went well."""
+    try:
+        process = start(job)
+    except OSError as error:
+        return f"cannot be started: {error}"
+    try:
+        last = []
+        for line in process.stdout:
+            last = [line]
+            if "error" not in json.loads(line):
+                hear(json.loads(line))
+        process.wait()
+        return outcome(job, process, last)
+    finally:
+        stop([process])
+
+
+def start(job: Job) -> Any:
+    """Start a job in a session of its own (Ctrl-C reaches it through who waits for it) and return its process."""
+    with open(job.log, "ab") as log:
+        process: Any = subprocess.Popen(
+            [sys.executable, "-m", job.module],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            env={**os.environ, **ONE_THREAD},
+            start_new_session=True,
+        )
+    try:
+        process.stdin.write(json.dumps(job.task) + "\n")
+        process.stdin.flush()
+    except BrokenPipeError:
+        pass  # it died at once; its log says why
+    return process
+
+
+def outcome(job: Job, process: Any, last: list[str]) -> str:
+    """Return the error of a job that ended; ``last`` is the last line it said."""
+    if last and "error" in (message := json.loads(last[0])):
+        return message["error"]
+    with open(job.log, "rb") as file:
+        said = file.read()[-2000:].decode("utf-8", errors="replace").strip().splitlines()[-1:]
+    return f"the process ended with {process.returncode}; last in {job.log}: {' '.join(said)}"
+
+
+def stop(processes: Iterable[Any]) -> None:
+    """Ask processes to end in good order, and see to it that they do."""
+    asked = [process for process in processes if process.poll() is None]
+    for process in asked:
+        process.stdin.close()
+    deadline = time.monotonic() + PATIENCE
+    try:
+        while any(process.poll() is None for process in asked) and time.monotonic() < deadline:
+            time.sleep(POLL)
+    finally:
+        for process in asked:
+            process.kill()
+
+
+# ---- a job -----------------------------------------------------------------------------------------------------------
+
+
+def serve(work: Callable[[Mapping[str, Any], Send], None]) -> None:
+    """Be a job's process: read the task, do the work, say how it ended.
+
+    Args:
+        work: called with the task, and a function that says something to who waits.
+    """
+    from wlr_gym.base.errors import InputError, MissingPackageError
+
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+
+    def send(message: Mapping[str, Any]) -> None:
+        print(json.dumps(message), file=answers, flush=True)
+
+    task = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    try:
+        work(task, send)
+    except (InputError, MissingPackageError) as error:
+        send({"error": str(error)})
+    except KeyboardInterrupt as interruption:
+        send({"error": f"stopped: {interruption}"})
+    except Exception as error:  # whatever it is, the other jobs go on
+        traceback.print_exc()
+        send({"error": f"{type(error).__name__}: {error}"})
+    else:
+        send({"error": ""})
+
+
+def _end_with_input() -> None:
+    """Wait for the end of the standard input: nobody waits for this job any more."""
+    while os.read(0, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def import_modules(names: Iterable[str]) -> None:
+    """Import what adds to the library (``wlr --import MODULE``), also from the present folder."""
+    if str(Path.cwd()) not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))
+    for name in names:
+        importlib.import_module(name)

@@ -1,0 +1,300 @@
+"""What a sweep is to do: settings x seeds as data, read from a file or made from options."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import itertools
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.settings import SettingsModel, merge_changes, parse_config, read_yaml
+from wlr_gym.envs.settings import EnvironmentOptions
+from wlr_gym.learning.training import settings_of
+from wlr_gym.policy.agents import agent_function, apply_changes, load_agent
+
+#: Metric of the held-out episodes -> whether less of it is better.
+METRICS = {"tracking_error": True, "success": False, "excess_slip": True, "reward": False}
+#: With early stopping: scores per training, where the settings do not say.
+SCORES = 9
+#: Characters of a trial's name before it is cut and a hash of its settings added.
+_LONGEST = 120
+
+
+class NumberRange(SettingsModel):
+    """Numbers that a search draws one from.
+
+    Attributes:
+        low, high: ends, both possible.
+        log: draw the logarithm evenly, for numbers that differ by factors.
+        whole: whole numbers only.
+    """
+
+    low: float
+    high: float
+    log: bool = False
+    whole: bool = False
+
+    @model_validator(mode="after")
+    def _ordered(self) -> NumberRange:
+        if not self.low < self.high:
+            raise ValueError(f"low {self.low:g} is not below high {self.high:g}")
+        if self.log and self.low <= 0.0:
+            raise ValueError(f"log needs low above 0, not {self.low:g}")
+        if self.whole and not (self.low.is_integer() and self.high.is_integer()):
+            raise ValueError(f"whole needs whole ends, not {self.low:g} and {self.high:g}")
+        return self
+
+    def draw(self, random: np.random.Generator) -> float | int:
+        """Return one of its numbers."""
+        low, high = (np.log(self.low), np.log(self.high)) if self.log else (self.low, self.high)
+        if self.whole:
+            return int(random.integers(int(self.low), int(self.high) + 1))
+        value = random.uniform(low, high)
+        return float(np.clip(np.exp(value), self.low, self.high) if self.log else value)
+
+
+class SearchPlan(SettingsModel):
+    """How settings are chosen, where not all of the grid are trained to their end.
+
+    A search trains each settings with the first seed; the best of them then with the other seeds.
+
+    Attributes:
+        method: ``grid`` (all of them), ``random``, or ``optuna`` (each chosen from what the earlier ones gave; Ray Tune).
+        trials: how many settings are chosen; not for a grid.
+        metric: held-out score that decides.
+        early_stopping: ASHA of Ray Tune: after 1/9 and 1/3 of the steps, only the best third so far goes on.
+        repeat_best: how many of the best are trained with the other seeds.
+        seed: of the choice.
+    """
+
+    method: Literal["grid", "random", "optuna"] = "random"
+    trials: int = Field(20, gt=0)
+    metric: Literal["tracking_error", "success", "excess_slip", "reward"] = "tracking_error"
+    early_stopping: bool = False
+    repeat_best: int = Field(3, gt=0)
+    seed: int = Field(0, ge=0)
+
+
+Seed = Annotated[int, Field(ge=0)]
+
+
+class SweepPlan(SettingsModel):
+    """A sweep, as a file says it (``wlr sweep FILE``) and as its folder keeps it (``sweep.yaml``).
+
+    Attributes:
+        environment: id.
+        agent: folder of ``agents/``.
+        config: its settings: name in ``configs/agent/`` or path; None = the agent's own.
+        init: trained policy that every trial starts from; None = none.
+        settings: changes of the settings, the same in all trials.
+        space: dotted name of a setting -> its values, or a :class:`NumberRange` for a search. All combinations make the grid.
+        seeds: how many, from 0 on, or which.
+        search: None = every settings of the grid with every seed.
+        imports: modules that trials import first: what registers your own task.
+    """
+
+    environment: str
+    agent: str = "ppo"
+    config: str | None = None
+    init: str | None = None
+    settings: dict[str, Any] = Field(default_factory=dict)
+    space: dict[str, NumberRange | Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
+    seeds: Annotated[int, Field(gt=0)] | Annotated[list[Seed], Field(min_length=1)] = 5
+    search: SearchPlan | None = None
+    imports: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _complete(self) -> SweepPlan:
+        ranges = [name for name, values in self.space.items() if isinstance(values, NumberRange)]
+        if ranges and (self.search is None or self.search.method == "grid"):
+            raise InputError(f"space: {', '.join(ranges)} is a range: give a list, or search with 'random' or 'optuna'")
+        if self.search is not None and not self.space:
+            raise InputError("search: there is no 'space' to search")
+        if "seed" in self.space:
+            raise InputError("space: 'seed' is none of its settings; give 'seeds'")
+        return self
+
+    @property
+    def seed_list(self) -> list[int]:
+        """The seeds themselves."""
+        return list(range(self.seeds)) if isinstance(self.seeds, int) else self.seeds
+
+    @property
+    def needs_ray(self) -> bool:
+        """Whether only Ray Tune can choose or stop its trials."""
+        return self.search is not None and (self.search.method == "optuna" or self.search.early_stopping)
+
+    @property
+    def metric(self) -> str:
+        """Held-out score that decides which settings are best."""
+        return self.search.metric if self.search else "tracking_error"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training of a sweep.
+
+    Attributes:
+        name: of its run folder: settings and seed.
+        settings: dotted name -> value: what this trial sets.
+        seed: of everything random in it.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+    seed: int
+
+    @property
+    def label(self) -> str:
+        """Its settings without its seed."""
+        return label_of(self.settings)
+
+
+def read_plan(path: Path, changes: Mapping[str, Any] | None = None) -> SweepPlan:
+    """Read a plan; ``changes`` are fields laid over the file's.
+
+    Raises:
+        InputError: broken, an unknown field, a bad value.
+    """
+    content = read_yaml(path)
+    if not isinstance(content, Mapping):
+        raise InputError(f"{path}: expected a mapping of {', '.join(SweepPlan.model_fields)}")
+    return parse_config(SweepPlan, merge_changes(dict(content), changes or {}), str(path))
+
+
+def resolve(plan: SweepPlan) -> SweepPlan:
+    """Return a plan with all settings in it, so that it means the same whatever happens to the files it names.
+
+    Raises:
+        InputError: unknown agent, config, environment or setting, a value that no trial can have, or two trials of one name.
+    """
+    agent_function(plan.agent, "train")
+    settings = merge_changes(settings_of(plan.environment, plan.config, plan.agent, plan.init), plan.settings)
+    if plan.search is not None and plan.search.early_stopping and isinstance(settings.get("total_steps"), int):
+        settings.setdefault("evaluate_every", max(1, settings["total_steps"] // SCORES))
+    init = plan.init if plan.init is None or not Path(plan.init).exists() else str(Path(plan.init).resolve())
+    whole = plan.model_copy(update={"config": None, "settings": settings, "init": init})
+    _check(whole)
+    return whole
+
+
+def whole_settings(plan: SweepPlan, trial: Trial) -> dict[str, Any]:
+    """Return all settings of a trial, as ``wlr train`` takes them."""
+    settings = copy.deepcopy(plan.settings)
+    apply_changes(settings, [f"{name}={json.dumps(value)}" for name, value in trial.settings.items()])
+    return settings | {"seed": trial.seed}
+
+
+def trials_of(settings: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[Trial]:
+    """Return the trials of settings x seeds.
+
+    Raises:
+        InputError: two of them have one name.
+    """
+    trials = [trial_of(chosen, seed) for chosen in settings for seed in seeds]
+    known: dict[str, Trial] = {}
+    for trial in trials:
+        other = known.setdefault(trial.name, trial)
+        if other is not trial:
+            same = "the same value is given twice" if other == trial else f"{dict(other.settings)} and {dict(trial.settings)}"
+            raise InputError(f"two trials are called '{trial.name}': {same}")
+    return trials
+
+
+def trial_of(settings: Mapping[str, Any], seed: int) -> Trial:
+    """Return the trial of some settings with a seed."""
+    label = label_of(settings)
+    return Trial(f"{label},seed={seed}" if label else f"seed={seed}", settings, seed)
+
+
+def label_of(settings: Mapping[str, Any]) -> str:
+    """Return settings as text that a folder may be called: ``learning_rate=0.001,gamma=0.97``."""
+    text = ",".join(f"{name}={_plain(value)}" for name, value in settings.items())
+    if len(text) <= _LONGEST:
+        return text
+    return f"{text[:_LONGEST]}-{hashlib.sha256(json.dumps(dict(settings)).encode()).hexdigest()[:8]}"
+
+
+def _plain(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+    return re.sub(r"[^\w.,+=-]", "_", text)
+
+
+def known_settings(plan: SweepPlan) -> list[dict[str, Any]] | None:
+    """Return the settings that are tried, in order: of the grid, or drawn at random; None where results decide (Optuna)."""
+    if plan.search is not None and plan.search.method == "optuna":
+        return None
+    if plan.search is not None and plan.search.method == "random":
+        random = np.random.default_rng(plan.search.seed)
+        drawn = [draw(plan, random) for _ in range(plan.search.trials)]
+        return list({label_of(settings): settings for settings in drawn}.values())  # each once
+    names = list(plan.space)
+    return [dict(zip(names, values, strict=True)) for values in itertools.product(*_lists(plan))]
+
+
+def _lists(plan: SweepPlan) -> Iterator[list[Any]]:
+    return (values for values in plan.space.values() if isinstance(values, list))
+
+
+def draw(plan: SweepPlan, random: np.random.Generator) -> dict[str, Any]:
+    """Return random settings out of the space."""
+    return {
+        name: values.draw(random) if isinstance(values, NumberRange) else values[random.integers(len(values))]
+        for name, values in plan.space.items()
+    }
+
+
+# ---- checks ----------------------------------------------------------------------------------------------------------
+
+
+def _check(plan: SweepPlan) -> None:
+    """Refuse what no trial could do, before any begins."""
+    settings = known_settings(plan)
+    random = plan.search is not None and plan.search.method == "random"
+    trials = trials_of(settings, plan.seed_list) if settings is not None and not random else []
+    for trial in trials or [trial_of(draw(plan, np.random.default_rng(0)), plan.seed_list[0])]:
+        whole = whole_settings(plan, trial)
+        _check_environment(whole.get("environment") or {}, trial.name)
+        try:
+            check_settings(plan.agent, whole)
+        except InputError as error:
+            raise InputError(f"trial {trial.name}: {error}") from None
+    if plan.search is not None and plan.search.early_stopping:
+        _check_early_stopping(plan)
+
+
+def check_settings(agent: str, settings: Mapping[str, Any]) -> None:
+    """Refuse settings with which an agent cannot begin to train on this machine, if the agent can tell.
+
+    Raises:
+        InputError: unknown, or a bad value.
+        MissingPackageError: a package is not installed.
+    """
+    if hasattr(load_agent(agent), "check_settings"):
+        agent_function(agent, "check_settings")(settings)
+
+
+def _check_environment(keywords: Mapping[str, Any], where: str) -> None:
+    for name in keywords:
+        if name not in EnvironmentOptions.__annotations__:
+            raise unknown_name("setting of the environment", name, EnvironmentOptions.__annotations__, f"trial {where}")
+
+
+def _check_early_stopping(plan: SweepPlan) -> None:
+    total, every = plan.settings.get("total_steps"), plan.settings.get("evaluate_every")
+    if not isinstance(total, int) or not isinstance(every, int) or not 0 < every <= total // 9:
+        raise InputError(
+            f"early_stopping: settings 'evaluate_every' = {every} and 'total_steps' = {total}: expected scores at least every "
+            "ninth of the steps; set evaluate_every"
+        )
+    if "total_steps" in plan.space:
+        raise InputError("early_stopping: trials must be comparable at equal steps: 'total_steps' cannot be searched")

@@ -1,0 +1,338 @@
+"""Sweeps from Python: what ``wlr sweep`` does."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.provenance import PROVENANCE_FILE, provenance, write_yaml
+from wlr_gym.base.settings import parse_config, read_yaml
+from wlr_gym.gap.report.text import duration
+from wlr_gym.learning.sweep.jobs import Ended, Job, spread
+from wlr_gym.learning.sweep.page import write_page
+from wlr_gym.learning.sweep.plan import SweepPlan, Trial, known_settings, resolve, trial_of, trials_of
+from wlr_gym.learning.sweep.results import (
+    DONE,
+    FAILED,
+    STOPPED_EARLY,
+    UNFINISHED,
+    Summary,
+    TrialResult,
+    is_complete,
+    read_result,
+    stopped_early,
+    summarise,
+    write_table,
+)
+from wlr_gym.learning.sweep.trial import LOCKS, LOGS, TRIALS, check_job, job_of
+
+PLAN_FILE = "sweep.yaml"
+#: Settings that a search has begun, a line of JSON each.
+BEGUN_FILE = "begun.jsonl"
+Say = Callable[[str], object]
+#: Runs jobs and yields how each ended.
+Run = Callable[[Iterable[Job]], Iterator[Ended]]
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What a sweep found.
+
+    Attributes:
+        folder: of the sweep; ``trials.parquet`` and ``sweep.html`` are in it.
+        trials: every trial with its scores.
+        ranking: settings over their seeds, best first.
+    """
+
+    folder: Path
+    trials: Sequence[TrialResult]
+    ranking: Sequence[Summary]
+
+    @property
+    def failed(self) -> list[TrialResult]:
+        """Trials that failed; ``error`` says why."""
+        return [one for one in self.trials if one.status == FAILED]
+
+
+def sweep(
+    env_id: str,
+    out: str | Path,
+    config: str | None = None,
+    *,
+    agent: str = "ppo",
+    settings: Mapping[str, Any] | None = None,
+    space: Mapping[str, Any] | None = None,
+    seeds: int | Sequence[int] = 5,
+    search: Mapping[str, Any] | None = None,
+    init: str | Path | None = None,
+    ray: str | None = None,
+    workers: int | None = None,
+    say: Say = print,
+) -> SweepResult:
+    """Train settings x seeds, as ``wlr sweep`` does. Each trial is an ordinary run folder, and a process with one thread.
+
+    Args:
+        env_id, config, agent, init: as for :func:`wlr_gym.train`.
+        out: folder to fill; it must be empty or absent.
+        settings: changes of the settings that all trials share.
+        space: dotted name of a setting -> list of values, or, for a search, ``{"low": 1e-4, "high": 1e-2, "log": True}``.
+            All combinations of lists make the grid.
+        seeds: how many, from 0 on, or which.
+        search: fields of :class:`wlr_gym.learning.sweep.plan.SearchPlan`, such as
+            ``{"method": "optuna", "trials": 20, "early_stopping": True}``; None = every settings with every seed.
+        ray: None = processes of this machine; ``"local"`` = a Ray that is started here; otherwise the address of a cluster,
+            such as ``"auto"``. Optuna and early stopping run on Ray in any case.
+        workers: most trials at a time; None = one per core.
+        say: told, in lines, how it goes.
+
+    Returns:
+        What was found. Trials that failed are in it; the others went on.
+
+    Raises:
+        InputError: an unknown name or setting, two trials of one name, a folder that is in use.
+        MissingPackageError: Ray or Optuna is needed and not installed.
+        KeyboardInterrupt: Ctrl-C or SIGTERM, after the trials saved checkpoints; :func:`resume_sweep` continues.
+    """
+    fields = {
+        "environment": env_id,
+        "agent": agent,
+        "config": config,
+        "init": None if init is None else str(init),
+        "settings": dict(settings or {}),
+        "space": {name: dict(given) if isinstance(given, Mapping) else given for name, given in (space or {}).items()},
+        "seeds": seeds if isinstance(seeds, int) else list(seeds),
+        "search": None if search is None else dict(search),
+    }
+    return start_sweep(parse_config(SweepPlan, fields, "sweep"), out, ray=ray, workers=workers, say=say)
+
+
+def start_sweep(
+    plan: SweepPlan, out: str | Path, *, ray: str | None = None, workers: int | None = None, say: Say = print
+) -> SweepResult:
+    """Run a plan in a new folder; arguments, result and errors as of :func:`sweep`."""
+    folder = Path(out)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: in use; give another folder, or resume what is there: wlr sweep --resume {folder}")
+    whole = resolve(plan)
+    _check_machines(whole, ray, workers)
+    for name in ("", TRIALS, LOGS, LOCKS):
+        make_output_folder(folder / name)
+    write_yaml(folder / PROVENANCE_FILE, provenance(whole.seed_list[0]))
+    write_yaml(folder / PLAN_FILE, whole.model_dump(mode="json"))
+    return _run(whole, folder, ray, workers, say)
+
+
+def resume_sweep(folder: str | Path, *, ray: str | None = None, workers: int | None = None, say: Say = print) -> SweepResult:
+    """Continue a sweep that was stopped or lost machines: trials go on from their checkpoints; failed ones are tried again.
+
+    Args:
+        folder: of the sweep; it is continued as it was planned.
+        ray, workers, say: as for :func:`sweep`; they need not be those of before.
+
+    Returns:
+        What was found.
+
+    Raises:
+        InputError: not the folder of a sweep.
+        KeyboardInterrupt: as for :func:`sweep`.
+    """
+    file = Path(folder) / PLAN_FILE
+    if not file.is_file():
+        raise InputError(f"{folder}: not the folder of a sweep: {PLAN_FILE} is missing")
+    plan = parse_config(SweepPlan, read_yaml(file), str(file))
+    _check_machines(plan, ray, workers)
+    return _run(plan, Path(folder), ray, workers, say)
+
+
+# ---- running ---------------------------------------------------------------------------------------------------------
+
+
+def _check_machines(plan: SweepPlan, ray: str | None, workers: int | None) -> None:
+    """Refuse where nothing could run."""
+    if workers is not None and (not isinstance(workers, int) or workers < 1):
+        raise InputError(f"workers = {workers!r}: expected 1 or more")
+    if ray is not None or plan.needs_ray:
+        require_package("ray", "sweep")
+    if plan.search is not None and plan.search.method == "optuna":
+        require_package("optuna", "sweep")
+
+
+def _run(plan: SweepPlan, folder: Path, ray: str | None, workers: int | None, say: Say) -> SweepResult:
+    """Train what is left of a plan, on this machine's processes or on Ray."""
+    book = _Book(plan, folder, say)
+    if ray is None and not plan.needs_ray:
+        count = workers or usable_cores()
+        say(f"{book.size}; {count} at a time, processes of this machine")
+        with _sigterm_interrupts():
+            return book.result_of(lambda: _train_all(book, lambda jobs: spread(jobs, count)))
+    from wlr_gym.learning.sweep.ray_cluster import LOCAL, connected, fit_nodes, spread_on_ray
+
+    address = ray or LOCAL
+    with connected(address, workers), _sigterm_interrupts():
+        say(f"{book.size}; Ray {'on this machine' if address == LOCAL else f'at {address}'}")
+        nodes = fit_nodes(check_job(plan, folder), say)
+        search = partial(_search_with_tune, book, nodes, workers) if plan.needs_ray else None
+        return book.result_of(lambda: _train_all(book, lambda jobs: spread_on_ray(jobs, nodes, workers), search))
+
+
+def usable_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _sigterm_interrupts() -> Iterator[None]:
+    """Let SIGTERM end the block as Ctrl-C does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _train_all(book: _Book, run: Run, search: Callable[[], None] | None = None) -> None:
+    """Train the grid with all seeds; or search with the first seed, then train the best with the others."""
+    plan = book.plan
+    if plan.search is None:
+        book.train(trials_of(known_settings(plan) or [], plan.seed_list), run)
+        return
+    if search is not None:
+        search()
+    else:
+        book.train(trials_of(known_settings(plan) or [], plan.seed_list[:1]), run)
+    best = [dict(one.settings) for one in summarise(book.results(), plan.metric)[: plan.search.repeat_best]]
+    book.train(trials_of(best, plan.seed_list), run)
+
+
+def _search_with_tune(book: _Book, nodes: Mapping[str, str], at_once: int | None) -> None:
+    from wlr_gym.learning.sweep.tune_search import search_with_tune
+
+    known = known_settings(book.plan)
+    begun = read_begun(book.folder)
+    for settings in known if known is not None else begun:
+        book.enter(trial_of(settings, book.plan.seed_list[0]))
+    search_with_tune(book.plan, book.folder, begun, book.stopped, nodes, at_once, book.begin, book.end)
+
+
+def read_begun(folder: Path) -> list[dict[str, Any]]:
+    """Return the settings that a search has begun, oldest first, each once."""
+    file = folder / BEGUN_FILE
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+    return list({line: json.loads(line) for line in lines if line.endswith("}")}.values())  # a last line may be cut short
+
+
+# ---- what is known of the trials -------------------------------------------------------------------------------------
+
+
+class _Book:
+    """Keeps how the trials of a sweep ended; writes table and page.
+
+    Args:
+        plan, folder, say: of the sweep.
+
+    Attributes:
+        stopped: names of the trials that a search had stopped early before this sweep was resumed.
+    """
+
+    def __init__(self, plan: SweepPlan, folder: Path, say: Say) -> None:
+        self.plan, self.folder, self.say = plan, folder, say
+        self.stopped = stopped_early(folder)
+        self._trials: dict[str, Trial] = {}
+        self._ended: dict[str, tuple[str, str]] = {}
+        self._began, self._done, self._expected = time.monotonic(), 0, 0
+
+    @property
+    def size(self) -> str:
+        """What the sweep will do, in words."""
+        plan, seeds = self.plan, len(self.plan.seed_list)
+        known = known_settings(plan)
+        count = len(known) if known is not None else plan.search.trials if plan.search else 0
+        steps = plan.settings.get("total_steps")
+        each = f" of {steps:,} environment steps" if isinstance(steps, int) and "total_steps" not in plan.space else ""
+        if plan.search is None:
+            return f"{count * seeds} trials: {count} settings x {seeds} seeds{each}"
+        best = min(plan.search.repeat_best, count)
+        return f"{count} trials{each}, then the best {best} with {seeds} seeds"
+
+    def enter(self, trial: Trial) -> None:
+        """Count a trial in."""
+        self._trials.setdefault(trial.name, trial)
+
+    def begin(self, trial: Trial) -> None:
+        """Note a trial that a search has chosen, in a line of a file."""
+        self.enter(trial)
+        with (self.folder / BEGUN_FILE).open("a", encoding="utf-8") as file:
+            file.write(f"{json.dumps(dict(trial.settings))}\n")
+
+    def train(self, trials: Sequence[Trial], run: Run) -> None:
+        """Train those of some trials that are not complete."""
+        for trial in trials:
+            self.enter(trial)
+        left = [trial for trial in trials if not is_complete(self.folder / TRIALS / trial.name)]
+        if len(left) < len(trials):
+            self.say(f"{len(trials) - len(left)} of {len(trials)} trials are done already")
+        self._began, self._done, self._expected = time.monotonic(), 0, len(left)
+        for ended in run(job_of(self.plan, trial, self.folder) for trial in left):
+            self.end(self._trials[ended.name], ended.error)
+
+    def end(self, trial: Trial, error: str, early: bool = False) -> None:
+        """Note how a trial ended; write the table."""
+        self.enter(trial)
+        self._ended[trial.name] = FAILED if error else STOPPED_EARLY if early else DONE, error
+        self._done += 1
+        self.say(self._line(trial))
+        try:
+            write_table(self.results(), self.folder)
+        except InputError as problem:  # a full disk; the trials go on
+            self.say(str(problem))
+
+    def _line(self, trial: Trial) -> str:
+        result = self._result(trial)
+        of = f"/{self._expected}" if self._expected else ""
+        if result.status == FAILED:
+            return f"{self._done}{of}  {trial.name}: FAILED: {result.error}"
+        scores = f"{self.plan.metric} {result.final[self.plan.metric]:.3f}" if self.plan.metric in result.final else "no scores"
+        passed = time.monotonic() - self._began
+        left = passed / self._done * (self._expected - self._done)
+        rest = f"; about {duration(left)} left" if left > 0.0 else ""
+        return f"{self._done}{of}  {trial.name}: {result.status}, {scores}, {duration(result.seconds)}{rest}"
+
+    def results(self) -> list[TrialResult]:
+        """Return what is known of all trials."""
+        return [self._result(trial) for trial in self._trials.values()]
+
+    def _result(self, trial: Trial) -> TrialResult:
+        return read_result(trial, self.folder / TRIALS / trial.name, *self._ended.get(trial.name, (UNFINISHED, "")))
+
+    def result_of(self, work: Callable[[], None]) -> SweepResult:
+        """Do the work; write table and page of what there is, however it ends; return the result."""
+        try:
+            work()
+        except KeyboardInterrupt:
+            self.write()
+            raise KeyboardInterrupt(
+                f"interrupted; trials have checkpoints; resume with: wlr sweep --resume {self.folder}"
+            ) from None
+        self.write()
+        results = self.results()
+        return SweepResult(self.folder, results, summarise(results, self.plan.metric))
+
+    def write(self) -> None:
+        """Write table and page."""
+        results = self.results()
+        write_table(results, self.folder)
+        write_page(self.plan, results, self.folder)

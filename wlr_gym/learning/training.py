@@ -1,0 +1,152 @@
+"""Training from Python: what ``wlr train`` does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
+from wlr_gym.base.settings import merge_changes, read_yaml
+from wlr_gym.envs.registry import task_name_of
+from wlr_gym.policy.agents import Training, TrainingProgress, agent_function, apply_changes, load_agent_config
+
+
+def train(
+    env_id: str,
+    out: str | Path,
+    config: str | Path | None = None,
+    *,
+    agent: str = "ppo",
+    settings: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    init: str | Path | None = None,
+    on_update: Callable[[TrainingProgress], object] | None = None,
+    max_seconds: float | None = None,
+    progress: bool = False,
+) -> Path:
+    """Train an agent on an environment, as ``wlr train`` does.
+
+    Args:
+        env_id: id of the environment, such as ``WLR-Velocity-v0``, or of a registered task.
+        out: run folder to fill; it must be empty or absent.
+        config: settings of the agent: name in ``configs/agent/`` or path of a YAML file; None = the agent's own, with
+            ``init`` those of that policy's training.
+        agent: a folder of ``agents/``.
+        settings: changes laid over the settings, such as
+            ``{"total_steps": 100_000, "environment": {"randomization": "ice"}}``.
+        seed: of everything random; None = that of the settings.
+        init: trained policy to start from: run or policy folder, policy file, or shipped policy. It must have been made for
+            this environment's observations and actions.
+        on_update: called with a :class:`wlr_gym.TrainingProgress` after every update; ``progress.stop()`` ends the training
+            in good order. What it raises ends it too, after a checkpoint was saved.
+        max_seconds: stop in good order after this wall time, s; :func:`resume_training` continues. None = no limit.
+        progress: show a progress bar.
+
+    Returns:
+        The folder of the policy, which :func:`wlr_gym.evaluate` and :func:`wlr_gym.load_policy` take. Beside it, ``best/`` is
+        the policy that did best on the held-out episodes, ``held_out.csv`` the scores of all.
+
+    Raises:
+        InputError: unknown environment, agent, policy or setting, a bad value, or a folder that is in use.
+        KeyboardInterrupt: Ctrl-C or SIGTERM, after a checkpoint was saved.
+    """
+    if not isinstance(settings, Mapping | None):
+        raise InputError(f"settings = {settings!r}: expected a mapping, such as {{'total_steps': 100_000}}")
+    chosen = merge_changes(settings_of(env_id, config, agent, init), settings or {})
+    if seed is not None:
+        chosen["seed"] = seed
+    request = Training(env_id, unused(Path(out)), chosen, False, max_seconds, progress, init, on_update)
+    return run_training(agent, request)
+
+
+def settings_of(
+    env_id: str, config: str | Path | None, agent: str, init: str | Path | None, changes: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """Return the settings of a training: of ``config``, of the policy to start from, or the agent's own.
+
+    Args:
+        env_id, config, agent, init: as for :func:`train`.
+        changes: ``key=value`` laid over them.
+
+    Raises:
+        InputError: unknown names, or a change that is not ``key=value``.
+    """
+    if init is None or config is not None:
+        return load_agent_config(config or agent, changes, task_name_of(env_id))
+    chosen = dict(agent_function(agent, "settings_to_start_from")(init))
+    apply_changes(chosen, changes)
+    return chosen
+
+
+def resume_training(
+    folder: str | Path,
+    *,
+    total_steps: int | None = None,
+    on_update: Callable[[TrainingProgress], object] | None = None,
+    max_seconds: float | None = None,
+    progress: bool = False,
+) -> Path:
+    """Continue a training that was stopped, or go on after its end, from its newest checkpoint, with its own settings.
+
+    Args:
+        folder: run folder.
+        total_steps: new end of the training, environment steps; the learning rate stays where its schedule ended.
+            None = as before.
+        on_update, max_seconds, progress: as for :func:`train`.
+
+    Returns:
+        The folder of the policy.
+
+    Raises:
+        InputError: not a run folder, nothing in it to resume, or an end before the present one.
+    """
+    path = Path(folder) / CONFIG_FILE
+    if not path.is_file():
+        raise InputError(f"{folder}: not a run folder: {CONFIG_FILE} is missing")
+    saved = read_yaml(path)
+    for key in ("environment", "agent", "settings"):
+        if not isinstance(saved, dict) or key not in saved:
+            raise InputError(f"{path}: '{key}' is missing")
+    if total_steps is not None:
+        _extend(saved["settings"], total_steps)
+        write_yaml(path, saved)
+    request = Training(
+        saved["environment"], Path(folder), saved["settings"], True, max_seconds, progress, saved.get("init"), on_update
+    )
+    return run_training(saved["agent"], request)
+
+
+def _extend(settings: dict[str, Any], total_steps: int) -> None:
+    """Move the end of a training, in place."""
+    before = settings.get("total_steps")
+    if not isinstance(before, int) or total_steps <= before:
+        raise InputError(f"total_steps = {total_steps}: expected more than the {before} steps of the run")
+    settings["schedule_steps"] = settings.get("schedule_steps") or before
+    settings["total_steps"] = total_steps
+
+
+def run_training(agent: str, training: Training) -> Path:
+    """Train, and return the folder of the policy.
+
+    Raises:
+        InputError: the agent has nothing to learn, or a time limit that is none.
+    """
+    limit = training.max_seconds
+    if limit is not None and (not isinstance(limit, int | float) or not limit > 0):
+        raise InputError(f"max_seconds = {limit!r}: expected a time above 0 s")
+    return agent_function(agent, "train")(training)
+
+
+def unused(folder: Path) -> Path:
+    """Return a folder that a training may fill.
+
+    Raises:
+        InputError: something is in it.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: cannot be a folder for the run: it is a file")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder}: not empty; give another folder, or resume what is there: wlr train --resume {folder}")
+    return folder
