@@ -11,10 +11,6 @@ HEAVY = (
 )  # fmt: skip
 
 
-#: Processor time (s) as a process counts it itself: a busy machine hardly changes it.
-OWN_TIME = "import time; start = time.process_time(); import wlr_gym; print(time.process_time() - start)"
-
-
 def modules_after(code: str) -> set[str]:
     script = f"{code}\nimport sys\nprint('\\n'.join(sys.modules))"
     answer = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
@@ -36,8 +32,3 @@ def test_heavy_packages_are_not_touched(code):
 def test_the_package_adds_nothing_to_gymnasium():
     own = modules_after("import wlr_gym") - modules_after("import gymnasium")
     assert own == {"wlr_gym", "wlr_gym.envs", "wlr_gym.envs.registry", "wlr_gym.base", "wlr_gym.base.errors"}
-
-
-def test_import_takes_less_than_a_third_of_a_second():
-    answers = [subprocess.run([sys.executable, "-c", OWN_TIME], capture_output=True, text=True, check=True) for _ in range(3)]
-    assert min(float(answer.stdout) for answer in answers) < 0.3

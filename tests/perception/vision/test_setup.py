@@ -4,7 +4,6 @@ import json
 import os
 import re
 import signal
-import threading
 import time
 from contextlib import nullcontext
 
@@ -244,6 +243,7 @@ class StandIn:
 
     def __init__(self, size, count):
         self.size, self.left, self.released = size, count, False
+        self.interrupted_at = -1
 
     def isOpened(self):  # noqa: N802 - OpenCV's names
         return self.size is not None
@@ -257,6 +257,8 @@ class StandIn:
     def grab(self):
         time.sleep(0.005)
         self.left -= 1
+        if self.left == self.interrupted_at:
+            os.kill(os.getpid(), signal.SIGINT)
         return self.left >= 0
 
     def retrieve(self):
@@ -278,7 +280,7 @@ def stand_in(monkeypatch, size, count=10**9):
 def test_a_live_camera_is_filmed_without_loss(ended, monkeypatch, tmp_path):
     device, handler = stand_in(monkeypatch, (640, 480)), signal.getsignal(signal.SIGINT)
     if ended == "by Ctrl-C":
-        threading.Timer(0.4, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+        device.interrupted_at = device.left - 60  # while it films: Ctrl-C before would end the tests
     video, times = film(0, tmp_path, TRUE, 0.4 if ended == "by time" else None)
     frames = list(Frames(str(video), times=times))
     assert len(frames) > 5
