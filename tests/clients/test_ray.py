@@ -23,7 +23,7 @@ def test_an_actor_steps_an_environment(env_id):
                     self.env.reset()
             return total
 
-    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
+    ray.init(address="local", num_cpus=1, include_dashboard=False, log_to_driver=False)
     try:
         remote = ray.get(ray.remote(Worker).remote(spec).drive.remote(200))
     finally:

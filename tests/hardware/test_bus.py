@@ -210,10 +210,31 @@ def test_defect_3_late_answer_is_not_taken_for_the_next(server, group):
     line.receive = lambda data, now, baud=None: [type(e)(e.time, late + e.data) for e in answer(data, now, baud)]
     assert group.read(2, "profile_velocity") == 5  # the two bytes in front do not fit
     line.receive = answer
-    group._port.suspect = True  # the exchange before was given up ...
+    group._port.suspect = 1  # the exchange before was given up ...
     server.call(lambda: server._ports["legs"].write(protocol.encode_status(2, 0, (777).to_bytes(4, "little"))))
     assert group.read(2, "profile_velocity") == 5  # ... so what is on its way is let pass first
     assert group.statistics.discarded > 0
+
+
+def test_a_question_asked_twice_and_answered_late_twice_does_not_answer_the_next(server, group):
+    """The first answer comes after the question was repeated; the second one while the next question would be asked."""
+    limit = group.read(2, "velocity_limit")
+    line, held = server.machine.lines["legs"], []
+    answer = line.receive
+    line.receive = lambda data, now, baud=None: held.append(answer(data, now, baud)) or []
+    with pytest.raises(NoAnswerError):
+        group.read(2, "velocity_limit")
+    (late,) = held
+    line.receive = lambda data, now, baud=None: held.append(answer(data, now, baud)) or late
+    assert group.read(2, "velocity_limit") == limit
+    line.receive = answer
+    second = b"".join(emission.data for emission in held[-1])
+    port = server._ports["legs"]
+    timer = threading.Timer(0.02, lambda: server.call(lambda: port.write(second)))
+    group.patience = 0.5  # the line is waited on, and the late answer passes
+    timer.start()
+    assert group.read(2, "max_position_limit") == 4095
+    assert group.statistics.discarded >= len(second)
 
 
 def test_defect_3_in_group_reads(server, group):

@@ -21,8 +21,23 @@ LEGS = (2, 3, 1, 4)
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
-    """The SDK gives up after 2 LATENCY_TIMER + 2 ms of wall time; a busy test machine may need longer."""
-    monkeypatch.setattr(sdk.port_handler, "LATENCY_TIMER", 150)
+    """The SDK gives up after 2 LATENCY_TIMER + 2 ms of wall time; a busy test machine may need much longer."""
+    monkeypatch.setattr(sdk.port_handler, "LATENCY_TIMER", 10_000)
+
+
+def until(condition):
+    """Wait for what takes its time on a busy machine."""
+    deadline = time.monotonic() + 120.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def unanswered(handler, port, servo):
+    """Whether a ping gets no answer; where none is expected, waiting long proves nothing."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sdk.port_handler, "LATENCY_TIMER", 150)
+        return handler.ping(port, servo)[1] == sdk.COMM_RX_TIMEOUT
 
 
 @pytest.fixture
@@ -48,16 +63,15 @@ def connect(server, bus="legs", baud=1_000_000):
 def test_ping_read_write_reboot_and_errors(server):
     port, handler = connect(server)
     assert handler.ping(port, 2) == (1130, sdk.COMM_SUCCESS, 0)
-    assert handler.ping(port, 99)[1] == sdk.COMM_RX_TIMEOUT
+    assert unanswered(handler, port, 99)
     assert handler.write1ByteTxRx(port, 2, 64, 1) == (sdk.COMM_SUCCESS, 0)
     assert handler.read1ByteTxRx(port, 2, 64) == (1, sdk.COMM_SUCCESS, 0)
     assert handler.write1ByteTxRx(port, 2, 9, 5) == (sdk.COMM_SUCCESS, 7)  # EEPROM is locked: access error
     assert handler.write4ByteTxRx(port, 2, 116, 5000) == (sdk.COMM_SUCCESS, 6)  # beyond the position limit
     assert handler.write4ByteTxRx(port, 2, 116, 2200) == (sdk.COMM_SUCCESS, 0)
-    time.sleep(0.6)
-    assert abs(handler.read4ByteTxRx(port, 2, 132)[0] - 2200) < 10
+    until(lambda: abs(handler.read4ByteTxRx(port, 2, 132)[0] - 2200) < 10)
     assert handler.reboot(port, 2) == (sdk.COMM_SUCCESS, 0)
-    time.sleep(0.4)
+    until(lambda: not unanswered(handler, port, 2))
     assert handler.read1ByteTxRx(port, 2, 64) == (0, sdk.COMM_SUCCESS, 0)
     port.closePort()
 
@@ -70,7 +84,7 @@ def test_reg_write_action_clear_and_factory_reset(server):
     assert handler.read1ByteTxRx(port, 2, 65)[0] == 1
     assert handler.clearMultiTurn(port, 2) == (sdk.COMM_SUCCESS, 0)
     assert handler.factoryReset(port, 2, 0x02) == (sdk.COMM_SUCCESS, 0)
-    time.sleep(0.4)
+    until(lambda: not unanswered(handler, port, 2))
     assert handler.read1ByteTxRx(port, 2, 9) == (250, sdk.COMM_SUCCESS, 0)
     port.closePort()
 
@@ -111,11 +125,11 @@ def test_broadcast_ping_finds_each_bus(server):
 
 def test_wrong_baud_rate_hears_nothing_and_the_right_one_does(server):
     port, handler = connect(server, baud=57_600)
-    assert handler.ping(port, 2)[1] == sdk.COMM_RX_TIMEOUT
+    assert unanswered(handler, port, 2)
     assert port.setBaudRate(1_000_000)
     assert handler.ping(port, 2)[1] == sdk.COMM_SUCCESS
     assert handler.write1ByteTxRx(port, 2, 8, 6)[0] == sdk.COMM_SUCCESS  # to 4 Mbit/s, answered at the old speed
-    assert handler.ping(port, 2)[1] == sdk.COMM_RX_TIMEOUT
+    assert unanswered(handler, port, 2)
     assert port.setBaudRate(4_000_000)
     assert handler.ping(port, 2)[1] == sdk.COMM_SUCCESS
     port.closePort()
@@ -151,9 +165,8 @@ def test_imu_stream(server):
 
     with serial.Serial(server.ports["imu"], 115200, timeout=0.2) as port:
         port.reset_input_buffer()
-        parser = FrameParser()
-        frames = [frame for _ in range(3) for frame in parser.feed(port.read(20 * SIZE))]
-    assert len(frames) > 40
+        parser, frames = FrameParser(), []
+        until(lambda: frames.extend(parser.feed(port.read(20 * SIZE))) or len(frames) > 40)
     assert parser.lost == 0
 
 

@@ -47,6 +47,8 @@ finally:
     plant.close()
 """
 
+PATIENCE = 120.0  # s: a busy computer may take this long
+
 
 @pytest.fixture
 def server():
@@ -73,13 +75,15 @@ def latched(server):
     return server.call(lambda: all(servo["bus_watchdog"] == -1 for servo in server.machine.servos.values()))
 
 
-def wait_until(condition, seconds):
-    """Return how long it took (s)."""
-    start = time.monotonic()
+def wait_until(condition):
+    """Return how long it took (s), and the longest time between two looks (s): how busy this computer was."""
+    start, last, longest = time.monotonic(), time.monotonic(), 0.0
     while not condition():
-        assert time.monotonic() - start < seconds
         time.sleep(0.005)
-    return time.monotonic() - start
+        now = time.monotonic()
+        longest, last = max(longest, now - last), now
+        assert now - start < PATIENCE
+    return time.monotonic() - start, longest
 
 
 def alive(pid):
@@ -95,8 +99,8 @@ def test_kill_9_is_no_way_past_torque_off(tmp_path, server):
     assert all(torque(server))
     driver.kill()
     driver.wait()
-    wait_until(lambda: not any(torque(server)), 10.0)
-    wait_until(lambda: not alive(watchdog), 10.0)
+    wait_until(lambda: not any(torque(server)))
+    wait_until(lambda: not alive(watchdog))
     assert (tmp_path / "log" / "guard.jsonl").read_text().count("torque off") == 1
     run = read_run(tmp_path / "log" / "partial_run_01.csv")  # all that was seen, readable as it is
     assert len(run.table) >= 10
@@ -106,11 +110,11 @@ def test_kill_9_is_no_way_past_torque_off(tmp_path, server):
 def test_signals_end_a_driving_process_in_good_order(tmp_path, server, name):
     driver, watchdog = start_driver(tmp_path, server)
     driver.send_signal(getattr(signal, name))
-    output, _ = driver.communicate(timeout=20)
+    output, _ = driver.communicate(timeout=PATIENCE)
     assert driver.returncode == 0
     assert f"stopped: stop: {name}" in output
     assert not any(torque(server))
-    wait_until(lambda: not alive(watchdog), 10.0)
+    wait_until(lambda: not alive(watchdog))
     assert len(read_run(tmp_path / "log" / "run_01.csv").table) > 10
     assert not (tmp_path / "log" / "guard.jsonl").exists()  # nothing was left for it
 
@@ -121,7 +125,7 @@ def test_the_watchdog_process_ends_when_it_is_told(server):
     watchdog.process.send_signal(signal.SIGTERM)
     assert watchdog.process.poll() is None
     watchdog.release()
-    assert watchdog.process.wait(5.0) == 0
+    assert watchdog.process.wait(PATIENCE) == 0
 
 
 def test_the_watchdog_process_waits_for_an_adapter_that_is_gone(server):
@@ -145,39 +149,44 @@ def test_a_driver_that_hangs_is_killed_and_torque_goes_off(tmp_path, server):
     """SIGSTOP: no signal is handled any more, and the port stays locked."""
     driver, watchdog = start_driver(tmp_path, server, heartbeat=0.8, watchdog=0.7)
     driver.send_signal(signal.SIGSTOP)
-    assert wait_until(lambda: not any(torque(server)), 20.0) < 1.5
-    assert driver.wait(5.0) == -signal.SIGKILL
-    wait_until(lambda: not alive(watchdog), 10.0)
+    wait_until(lambda: not any(torque(server)))
+    assert driver.wait(PATIENCE) == -signal.SIGKILL
+    wait_until(lambda: not alive(watchdog))
     assert '"driver": "hangs"' in (tmp_path / "log" / "guard.jsonl").read_text()
 
 
 def test_a_driver_whose_watchdog_process_is_gone_stops(tmp_path, server):
     driver, watchdog = start_driver(tmp_path, server)
     os.kill(watchdog, signal.SIGKILL)
-    output, _ = driver.communicate(timeout=20)
+    output, _ = driver.communicate(timeout=PATIENCE)
     assert "computer: the watchdog process is gone" in output
     assert not any(torque(server))
 
 
 @pytest.mark.slow
-def test_the_bounds_after_kill_9(tmp_path):
-    """On a computer that has time (of five tries one): wheels stand 0.25 s after the last packet, torque is off within 1 s."""
+@pytest.mark.parametrize(("end", "bounds"), [(signal.SIGKILL, (0.25, 1.0)), (signal.SIGSTOP, (1.5, 1.5))])
+def test_the_bounds_after_a_driver_ends_or_hangs(tmp_path, end, bounds):
+    """Wheels stand and torque is off within so many seconds, on a computer that has time (one try of ten)."""
     times = []
-    while len(times) < 5 and not (times and times[-1][0] < 0.25 and times[-1][1] < 1.0):
-        folder = tmp_path / str(len(times))
+    for attempt in range(10):
+        folder = tmp_path / str(attempt)
         folder.mkdir()
-        times.append(seconds_after_kill_9(folder))
-    assert times[-1][0] < 0.25, times
-    assert times[-1][1] < 1.0, times
+        stands, off, busy = seconds_after(end, folder)
+        times.append((stands, off, busy))
+        if stands < bounds[0] and off < bounds[1]:
+            return
+    if min(busy for *_, busy in times) > 0.05:
+        pytest.skip(f"this computer is too busy: {times}")
+    pytest.fail(f"{times}")
 
 
-def seconds_after_kill_9(folder):
-    """Return after how many seconds all wheels stand, and after how many torque is off."""
+def seconds_after(end, folder):
+    """Return after how many seconds all wheels stand, after how many torque is off, and the longest time between two looks (s)."""
     machine = Machine(ROBOT, HARDWARE, MachineOptions(timing=NO_TIME))
     with Server(machine) as server:
-        driver, _ = start_driver(folder, server, watchdog=HARDWARE.safety.watchdog)
-        driver.kill()
-        stands = wait_until(lambda: latched(server) or not any(torque(server)), 20.0)
-        off = stands + wait_until(lambda: not any(torque(server)), 20.0)
+        driver, _ = start_driver(folder, server, watchdog=HARDWARE.safety.watchdog, heartbeat=0.8)
+        driver.send_signal(end)
+        stands, busy = wait_until(lambda: latched(server) or not any(torque(server)))
+        off, busy_then = wait_until(lambda: not any(torque(server)))
         driver.wait()
-    return stands, off
+    return stands, stands + off, max(busy, busy_then)

@@ -292,7 +292,7 @@ class BusGroup:
     def _is_good(self, id: int, reading: BlockReading, oldest: float) -> bool:
         if reading.age > oldest:
             self._count(self.statistics.stale, id)
-            self._port.suspect = True
+            self._port.suspect = 1
             return False
         return True
 

@@ -20,6 +20,8 @@ from wlr_gym.hardware.dynamixel.errors import BusGoneError
 from wlr_gym.hardware.dynamixel.protocol import Instruction, Packet, Parser, Status
 from wlr_gym.hardware.ports import FAILURES, open_serial
 
+#: After an exchange was given up, the line is waited on to fall quiet before so many exchanges.
+_GIVEN_UP = 2
 #: A line that never falls quiet is waited for during the patience and this many times more ...
 _MORE_PATIENCE = 3.0
 #: ... yet no longer than this beyond the patience, s.
@@ -35,7 +37,7 @@ class DynamixelPort(sdk.PortHandler):
         patience: s an answer may take beyond its bytes' time on the wire.
 
     Attributes:
-        suspect: the last exchange did not end well; what still comes in belongs to it.
+        suspect: an exchange did not end well, and what still comes in may belong to it: so many good ones until it cannot.
         quiet: the line fell quiet when it was last waited for.
         gone: it has failed since it was opened.
         discarded: bytes thrown away because they belonged to an exchange that was given up.
@@ -47,7 +49,7 @@ class DynamixelPort(sdk.PortHandler):
         self.patience = patience
         self.parser: Parser = Parser()
         self.queue: list[Packet] = []
-        self.suspect = False
+        self.suspect = 0
         self.quiet = True
         self.gone = False
         self.discarded = 0
@@ -144,7 +146,7 @@ class DynamixelPort(sdk.PortHandler):
         """
         if is_answered or self.suspect:
             self.clearPort()
-        self.suspect = is_answered
+        self.suspect = _GIVEN_UP if is_answered else 0
         self.writePort(raw)
 
     def next_answer(self) -> Packet | None:
@@ -166,12 +168,13 @@ class DynamixelPort(sdk.PortHandler):
             raw: instruction.
             length: data bytes of a good answer.
         """
+        before = self.suspect
         self.send_packet(raw, is_answered=True)
         self.setPacketTimeout(len(raw) + 11 + (length or 3))
         while (packet := self.next_answer()) is not None:
             status = protocol.as_status(packet)
             if status is not None and status.id == raw[4] and (status.fault or len(status.data) == length):
-                self.suspect = False
+                self.suspect = max(0, before - 1)  # it may be the late answer to the same question; the second one still comes
                 return status
         return None
 
@@ -188,5 +191,5 @@ class DynamixelPort(sdk.PortHandler):
             for status in fast or ([single] if single else []):
                 if wanted.get(status.id) == len(status.data):
                     answers[status.id] = status
-        self.suspect = len(answers) < len(wanted)
+        self.suspect = 0 if len(answers) == len(wanted) else _GIVEN_UP
         return answers
