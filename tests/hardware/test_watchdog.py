@@ -181,7 +181,7 @@ def test_the_bounds_after_a_driver_ends_or_hangs(tmp_path, end, bounds):
 
 
 def seconds_after(end, folder):
-    """Return after how many seconds all wheels stand, after how many torque is off, and the longest time between two looks (s)."""
+    """Return after how many s all wheels stand, after how many torque is off, and the longest time between two looks (s)."""
     machine = Machine(ROBOT, HARDWARE, MachineOptions(timing=NO_TIME))
     with Server(machine) as server:
         driver, _ = start_driver(folder, server, watchdog=HARDWARE.safety.watchdog, heartbeat=0.8)
