@@ -14,7 +14,7 @@ from wlr_gym.physics.effects import EFFECTS
 
 TWINS = Path(__file__).resolve().parents[3] / "shared" / "data" / "twin_dev"
 LABELS = yaml.safe_load((TWINS / "labels.yaml").read_text(encoding="utf-8")) if TWINS.is_dir() else {}
-ASKED = os.environ.get("WLR_TWIN_SETS", "none_b backlash_rear_hips").split()
+ASKED = os.environ.get("WLR_TWIN_SETS", "backlash_rear_hips").split()
 #: Numbers that these data hardly tell: how high a load lies on a body that is to stay level.
 UNTOLD = {("payload", "z")}
 ERROR = 0.2
