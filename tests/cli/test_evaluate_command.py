@@ -1,5 +1,6 @@
 """``wlr evaluate``: options, files and messages."""
 
+import importlib.util
 import json
 
 import pytest
@@ -31,6 +32,15 @@ def test_it_writes_the_same_card_twice(tmp_path, capsys):
         "config.yaml",
         "provenance.yaml",
     }
+
+
+def test_an_agent_is_scored_without_what_policy_files_need(monkeypatch, capsys):
+    """A plain installation has no onnxruntime."""
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "onnxruntime" else find(name, *rest))
+    assert main(["evaluate", "velocity_blind", "--episodes", "2", "--no-progress"]) == 2
+    assert "onnxruntime" in capsys.readouterr().err
+    assert main(["evaluate", "pid", "--episodes", "2", "--no-progress"]) == 0
 
 
 def test_full_means_seeds_sweeps_and_both_simulators(tmp_path, monkeypatch, capsys):

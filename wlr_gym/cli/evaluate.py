@@ -144,7 +144,6 @@ def _complete(options: EvaluateOptions) -> EvaluateOptions:
     """Return the options with nothing left open that --full and the policy decide."""
     full = options.full
     environment = environment_of(options.env, read_subjects([options.policy])[0].sources[0])
-    shipped = [name for name in shipped_names() if trained_environment(name) == environment]
     chosen = {
         "env": environment,
         "episodes": FULL_EPISODES if full else EPISODES,
@@ -157,8 +156,13 @@ def _complete(options: EvaluateOptions) -> EvaluateOptions:
         fitting = fitting_baselines(environment, names)
         if len(fitting) < len(names):
             print(f"no baseline here, made for other tasks: {', '.join(name for name in names if name not in fitting)}")
-        chosen["baselines"] = (*fitting, *(shipped if full else ()))
+        chosen["baselines"] = (*fitting, *(_shipped_for(environment) if full else ()))
     return replace(options, **{name: value for name, value in chosen.items() if getattr(options, name) is None})
+
+
+def _shipped_for(environment: str) -> list[str]:
+    """Return the shipped policies that were trained in an environment; reading them needs onnxruntime."""
+    return [name for name in shipped_names() if trained_environment(name) == environment]
 
 
 def _check(options: EvaluateOptions) -> None:
