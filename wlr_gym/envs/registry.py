@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
@@ -15,15 +16,32 @@ def title_of(task_name: str) -> str:
     return "".join(word.capitalize() for word in task_name.split("_"))
 
 
+def plain_id(env_id: str) -> str:
+    """Return an id without the module before it, which is imported: ``my_tasks:WLR-Climb-v0``, as for ``gym.make``.
+
+    Raises:
+        InputError: no id, or no such module.
+    """
+    if not isinstance(env_id, str):
+        raise InputError(f"environment {env_id!r}: expected an id, such as {next(iter(ENVIRONMENTS))}")
+    module, colon, name = env_id.rpartition(":")
+    if colon and name not in ENVIRONMENTS:
+        try:
+            importlib.import_module(module)
+        except InputError:
+            raise
+        except (ModuleNotFoundError, TypeError, ValueError) as error:
+            raise InputError(f"environment '{env_id}': expected a module of Python before the colon: {error}") from None
+    return name
+
+
 def task_name_of(env_id: str) -> str:
     """Return the task behind an environment id: a name in ``configs/task/`` or the path of a task file.
 
     Raises:
-        InputError: no such id in this process.
+        InputError: no such id in this process, nor in the module before it (``my_tasks:WLR-Climb-v0``), which is imported.
     """
-    if not isinstance(env_id, str):
-        raise InputError(f"environment {env_id!r}: expected an id, such as {next(iter(ENVIRONMENTS))}")
-    name = env_id.rpartition(":")[2]
+    name = plain_id(env_id)
     if name not in ENVIRONMENTS:
         error = unknown_name("environment", env_id, ENVIRONMENTS)
         raise InputError(f"{error}; a task of your own is known once this process registered it (wlr --import MODULE)")
@@ -39,7 +57,7 @@ def task_source_of(env_id: str) -> str | dict[str, Any]:
     import gymnasium
 
     task = task_name_of(env_id)
-    return gymnasium.registry[env_id.rpartition(":")[2]].kwargs.get("definition", task)
+    return gymnasium.registry[plain_id(env_id)].kwargs.get("definition", task)
 
 
 def register_environments() -> None:

@@ -4,12 +4,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from functools import partial
 
 import numpy as np
 import pytest
-from sweep_runs import ENVIRONMENT, SETTINGS, assert_like_alone
+from sweep_runs import ENVIRONMENT, SETTINGS, assert_like_alone, checkpoints, wait_until
 
 import wlr_gym
 from wlr_gym.base.settings import read_yaml
@@ -67,32 +66,32 @@ def test_one_fails_the_others_go_on_and_a_resume_completes_it(tmp_path, monkeypa
     assert read_yaml(out / "trials" / table["name"][0] / "config.yaml")["settings"]["gamma"] == 0.9
 
 
-#: Takes some seconds, with checkpoints on the way.
-LONGER = SETTINGS | {"total_steps": 25_600, "checkpoint_every": 640, "evaluate_every": 12_800}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_a_sweep_that_is_stopped_resumes_exactly(number, tmp_path):
+def test_a_sweep_that_is_stopped_resumes_exactly(tmp_path, hold):
+    """Three times in a row, always in mid-run: first both trials at once, then one while the other waits for its turn."""
     out = tmp_path / "out"
-    code = f"import wlr_gym\nwlr_gym.sweep({ENVIRONMENT!r}, {str(out)!r}, settings={LONGER!r}, seeds=2)"
-    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a background shell has switched it off
-    driver = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, preexec_fn=heard)
-    deadline = time.monotonic() + 60.0
-    while not all(list(out.glob(f"trials/seed={seed}/checkpoints/step_*")) for seed in range(2)):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    driver.send_signal(number)
-    said = driver.communicate(timeout=60)[1]
-    if number != signal.SIGKILL:
-        assert f"resume with: wlr sweep --resume {out}" in said
-        assert (out / "sweep.html").is_file()
-    assert not any((out / "trials" / f"seed={seed}" / "policy").exists() for seed in range(2))
+    begin = f"wlr_gym.sweep({ENVIRONMENT!r}, {str(out)!r}, settings={SETTINGS!r}, seeds=2, workers=2)"
+    resume = f"wlr_gym.resume_sweep({str(out)!r}, workers=1)"
+    hold.touch()
+    for call, number, at_work in ((begin, signal.SIGINT, 2), (resume, signal.SIGTERM, 1), (resume, signal.SIGKILL, 1)):
+        before = checkpoints(out)
+        heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a background shell has switched it off
+        driver = subprocess.Popen(
+            [sys.executable, "-c", f"import wlr_gym\n{call}"], stderr=subprocess.PIPE, text=True, preexec_fn=heard
+        )
+        wait_until(lambda before=before, at_work=at_work: len(checkpoints(out) - before) == at_work, driver)
+        driver.send_signal(number)
+        said = driver.communicate(timeout=240)[1]
+        if number != signal.SIGKILL:
+            assert f"resume with: wlr sweep --resume {out}" in said
+            assert (out / "sweep.html").is_file()
+    assert not list(out.glob("trials/*/policy"))
+    hold.unlink()
     found = wlr_gym.resume_sweep(out)
     assert [one.status for one in found.trials] == ["done", "done"]
     for one in found.trials:
         assert (one.folder / "provenance_resumed.yaml").is_file()
-        assert_like_alone(one, tmp_path / f"alone_{one.trial.seed}", LONGER)
+        assert_like_alone(one, tmp_path / f"alone_{one.trial.seed}")
 
 
 def test_settings_that_explain_the_scores_are_important(tmp_path):
