@@ -5,6 +5,8 @@ import pytest
 from engine_runs import META, ROBOT, posture_and_turns, record, spaced
 
 from wlr_gym.data import Run
+from wlr_gym.data.write import write_run
+from wlr_gym.gap import analyse
 from wlr_gym.gap.robot.intake import CHECKS, findings_of
 
 
@@ -133,6 +135,19 @@ EFFECTS = [
 def test_an_effect_is_no_fault_of_the_data(effect, tmp_path):
     table = record(lively, spaced(7.0), [effect], noise=5).table
     assert not findings([table], tmp_path)
+
+
+def test_an_analysis_says_at_once_which_runs_it_leaves_out(good, tmp_path):
+    for k in range(3):
+        write_run(tmp_path / f"run_{k + 1:02d}.parquet", turned("eff_wheel_rr")(good.copy()), META)
+    told = []
+    found = analyse(tmp_path, tell=lambda stage, share: told.append(stage))
+    assert found.verdict == "bad_data"
+    assert not found.seconds, "nothing was fitted"
+    left_out = [stage for stage in told if stage.startswith("left out")]
+    assert [stage.split()[2] for stage in left_out] == ["run_01", "run_02", "run_03"]
+    assert "eff_wheel_rr at " in left_out[0]
+    assert "turn the sign of the column" in left_out[0]
 
 
 def test_lost_rows_frames_and_a_noisier_or_scaled_sensor_are_no_fault(good, tmp_path):

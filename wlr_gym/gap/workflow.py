@@ -122,7 +122,7 @@ def analyse(
     else:
         raise unknown_name("rig", rig, RIGS)
     problem, findings = opened
-    for finding in {finding.run: finding for finding in reversed(findings) if finding.fatal and finding.run}.values():
+    for finding in _first_of_every_run(findings):
         tell(f"left out {finding.place}: {finding.said}", STAGES["reading"])
     _refuse_left_out(heldout, findings)
     done = (
@@ -136,6 +136,15 @@ def analyse(
         tell("drawing", STAGES["drawing"])
         save_analysis(done, Path(out))
     return done
+
+
+def _first_of_every_run(findings: Sequence[IntakeFinding]) -> list[IntakeFinding]:
+    """The first reason why each run that cannot be used is left out."""
+    first: dict[str, IntakeFinding] = {}
+    for finding in findings:
+        if finding.fatal and finding.run:
+            first.setdefault(finding.run, finding)
+    return list(first.values())
 
 
 def _refuse_left_out(heldout: Sequence[str], findings: Sequence[IntakeFinding]) -> None:
