@@ -134,8 +134,8 @@ def _print(analysis: Analysis, out: Path, console: Console) -> None:
 
 def _findings(analysis: Analysis) -> Iterator[str]:
     for finding in analysis.intake:
-        place = " ".join(filter(None, [finding.run, finding.channel]))
-        yield f"  {'data' if not finding.fatal else 'FATAL'}: {f'{place}: ' if place else ''}{finding.text}"
+        place = f"{finding.place}: " if finding.place else ""
+        yield f"  {'FATAL' if finding.fatal else 'data'}: {place}{finding.said}"
 
 
 def _numbers(analysis: Analysis) -> Iterator[str]:

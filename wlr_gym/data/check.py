@@ -148,7 +148,8 @@ def _check_clock(t: Array, where: str) -> None:
     if back.any():
         row = int(np.argmax(back)) + 1
         raise InputError(
-            f"{where}: row {row}, column 't': {t[row]:.6f} s does not come after {t[row - 1]:.6f} s; t must increase"
+            f"{where}: row {row}, column 't': {t[row]:.6f} s does not come after {t[row - 1]:.6f} s; t must increase: "
+            "split the run where a clock was set back, or record it again with a monotonic clock"
         )
     period = float(np.median(np.diff(t)))
     if period > 1.0:

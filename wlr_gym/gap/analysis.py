@@ -35,8 +35,10 @@ class IntakeFinding:
     Attributes:
         run, channel: where; "" for all.
         kind: short word (``gap``, ``wrap``, ``dead``, ``clipped``, ``units``, ``few_runs`` ...).
-        text: what was seen and what to do.
-        fatal: the analysis cannot go on.
+        text: what was seen.
+        fatal: the run, or without one the whole set, cannot be used.
+        time: s from the run's first row, where it was seen first; None = it is of the whole run.
+        expected, remedy: what would be right, and what to do; "" where the text says it.
     """
 
     run: str
@@ -44,6 +46,20 @@ class IntakeFinding:
     kind: str
     text: str
     fatal: bool = False
+    time: float | None = None
+    expected: str = ""
+    remedy: str = ""
+
+    @property
+    def place(self) -> str:
+        """Run, channel and time in words: ``run_03 gyro_z at 4.20 s``."""
+        at = None if self.time is None else f"at {self.time:.2f} s"
+        return " ".join(filter(None, [self.run, self.channel, at]))
+
+    @property
+    def said(self) -> str:
+        """What was seen, what would be right, and what to do, in words."""
+        return "; ".join(filter(None, [self.text, self.expected and f"expected {self.expected}", self.remedy]))
 
 
 @dataclass(frozen=True)

@@ -122,6 +122,8 @@ def analyse(
     else:
         raise unknown_name("rig", rig, RIGS)
     problem, findings = opened
+    for finding in _first_of_every_run(findings):
+        tell(f"left out {finding.place}: {finding.said}", STAGES["reading"])
     _refuse_left_out(heldout, findings)
     done = (
         _bad_data(str(data), findings)
@@ -136,12 +138,20 @@ def analyse(
     return done
 
 
+def _first_of_every_run(findings: Sequence[IntakeFinding]) -> list[IntakeFinding]:
+    """The first reason why each run that cannot be used is left out."""
+    first: dict[str, IntakeFinding] = {}
+    for finding in findings:
+        if finding.fatal and finding.run:
+            first.setdefault(finding.run, finding)
+    return list(first.values())
+
+
 def _refuse_left_out(heldout: Sequence[str], findings: Sequence[IntakeFinding]) -> None:
     """A run that cannot be used cannot be held out either."""
     for finding in findings:
         if finding.fatal and finding.run in heldout:
-            place = f"{finding.run} {finding.channel}".strip()
-            raise InputError(f"--heldout {finding.run}: the run cannot be used: {place}: {finding.text}")
+            raise InputError(f"--heldout {finding.run}: the run cannot be used: {finding.place}: {finding.said}")
 
 
 def _bad_data(data: str, findings: Sequence[IntakeFinding]) -> Analysis:

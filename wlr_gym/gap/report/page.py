@@ -23,6 +23,7 @@ from wlr_gym.gap.analysis import (
     ChannelGap,
     Detectable,
     GapFigures,
+    IntakeFinding,
     RunGap,
     Statistic,
 )
@@ -311,12 +312,23 @@ def _intake(analysis: Analysis) -> str:
         return section("The data", "<p>Nothing odd was noticed about the data.</p>")
     ordered = sorted(analysis.intake, key=lambda one: not one.fatal)
     rows = [
-        ("fatal" if one.fatal else "noted", one.run or "all", one.channel or "all", one.kind.replace("_", " "), one.text)
+        (
+            "fatal" if one.fatal else "noted",
+            one.run or "all",
+            one.channel or "all",
+            _moment(one),
+            one.kind.replace("_", " "),
+            one.said,
+        )
         for one in ordered
     ]
     classes = ["fatal" if one.fatal else "" for one in ordered]
     text = "<p>What was noticed about the data before any model was asked.</p>"
-    return section("The data", text, table(("", "run", "channel", "kind", "what was seen"), rows, classes=classes))
+    return section("The data", text, table(("", "run", "channel", "from", "kind", "what was seen"), rows, classes=classes))
+
+
+def _moment(finding: IntakeFinding) -> str:
+    return "" if finding.time is None else f"{finding.time:.2f} s"
 
 
 def _use(analysis: Analysis, folder: Path) -> str:

@@ -233,7 +233,7 @@ def sentence(analysis: Analysis) -> str:
 
 
 def _bad_data(analysis: Analysis) -> str:
-    causes = [finding.text.rstrip(".") for finding in analysis.intake if finding.fatal]
+    causes = [": ".join(filter(None, [one.place, one.said])).rstrip(".") for one in analysis.intake if one.fatal]
     more = f" (and {len(causes) - 1} more reason{'s' if len(causes) > 2 else ''})" if len(causes) > 1 else ""
     return f"These data cannot be used: {causes[0]}{more}." if causes else "These data cannot be used."
 
