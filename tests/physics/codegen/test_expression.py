@@ -98,7 +98,7 @@ def test_compiled_source_gives_the_value_of_the_tree(tree):
     if not np.isfinite(expected) or abs(expected) > 1e9:
         return
     lines = emit({"y": traced}, lambda name: repr(values[name]), lambda name, text: f"{name} = {text}", "")
-    scope: dict = {"math": math, "np": np}
+    scope: dict = {"math": math, "np": np, "select": lambda condition, a, b: a if condition else b}
     exec("\n".join(lines), scope)
     assert scope["y"] == pytest.approx(expected, rel=1e-6, abs=1e-6)
 

@@ -16,7 +16,7 @@ from wlr_gym.envs.tasks.signals import START, Signals, Value
 from wlr_gym.envs.tasks.task import Task
 from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
-from wlr_gym.physics.codegen import Graph, emit, load_module, ops
+from wlr_gym.physics.codegen import Graph, emit, load_module, ops, straight_line_source
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
 from wlr_gym.robot import JOINTS
 
@@ -149,9 +149,9 @@ def reader(task: Task, matrices: Mapping[str, Array]) -> Callable[[str], Value]:
 def compile_scores(task: Task) -> TermKernel:
     """Trace and compile the rewards, terminations and measures of a task."""
     stores = {"total": "total[i]"}
-    stores |= {f"over.{name}": f"over[i, {k}]" for k, name in enumerate(task.terminations)}
-    stores |= {f"term.{name}": f"terms[i, {k}]" for k, name in enumerate(task.rewards)}
-    stores |= {f"measure.{name}": f"measures[i, {k}]" for k, name in enumerate(task.measures)}
+    stores |= {f"over.{name}": f"over[{k}]" for k, name in enumerate(task.terminations)}
+    stores |= {f"term.{name}": f"terms[{k}]" for k, name in enumerate(task.rewards)}
+    stores |= {f"measure.{name}": f"measures[{k}]" for k, name in enumerate(task.measures)}
     outputs = expressions(task, Graph().input)
     return _compile(task, "evaluation", outputs, stores, _SCORES_HEAD, _SCORES_TAIL)
 
@@ -159,7 +159,7 @@ def compile_scores(task: Task) -> TermKernel:
 def compile_computed(task: Task) -> TermKernel:
     """Trace and compile the computed observations of a task."""
     outputs = computed_expressions(task, Graph().input)
-    stores = {element: f"computed[i, {k}]" for k, element in enumerate(task.computed)}
+    stores = {element: f"computed[{k}]" for k, element in enumerate(task.computed)}
     return _compile(task, "computation", outputs, stores, _COMPUTED_HEAD, ())
 
 
@@ -172,16 +172,21 @@ def _compile(
     def load(name: str) -> str:
         if name in columns:
             matrix, column = columns[name]
-            return f"{matrix}[i, {column}]"
+            return f"{matrix}[{column}]"
         return f"numbers[{numbers.setdefault(name, len(numbers))}]"
 
-    lines = emit(outputs, load, lambda name, value: f"{stores[name]} = {value}", "        ")
-    source = "\n".join([_DECORATOR, *head, *lines, *tail, ""])
+    lines = emit(outputs, load, lambda name, value: f"{stores[name]} = {value}", "")
+    block = straight_line_source("terms_of_robot", [*_ROWS, "total", "numbers", "i"], lines)
+    rows = ", ".join(f"numbers_of({name}[i])" for name in _ROWS)
+    call = f"        terms_of_robot({rows}, numbers_of(total), numbers_of(numbers), i)"
+    source = "\n".join([*block, "", _DECORATOR, *head, call, *tail, ""])
     name = task.config.name
     module = load_module(f"{kind}_{name}", source, f"wlr_gym: compiling the {kind} of task '{name}' (once)")
     return TermKernel(module.run, np.array([number(task, name) for name in numbers], dtype=np.float64))
 
 
+#: Matrices that have a row per robot in a kernel; of a row that no term reads nothing is asked.
+_ROWS = (*MATRICES, "terms", "over", "measures")
 _DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
 _UNPACK = f"    {', '.join(MATRICES)} = signals"
 _SCORES_HEAD = (
@@ -210,6 +215,8 @@ _SCORES_TAIL = (
 _COMPUTED_HEAD = (
     "def run(active, signals, numbers):",
     _UNPACK,
+    "    terms = over = measures = computed",
+    "    total = numbers",
     "    for i in range(computed.shape[0]):",
     "        if not active[i]:",
     "            continue",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 Operand = Any  # Node | float; Any keeps arithmetic on mixed operands readable
@@ -182,14 +182,13 @@ def emit(
         indent: leading white space.
         constant: prints a number in the kernel's precision.
         fused: print ``a * b + c`` as ``fma(a, b, c)`` (exactly one rounding, on every machine). Explicit fusion keeps
-            results equal for any vector width; compiler contraction does not. Choices are printed as ``select(...)``, because
-            numba's compile time grows with the number of branches.
+            results equal for any vector width; compiler contraction does not.
 
     Returns:
-        Source lines. All loads precede all stores, so a block may overwrite what it reads.
+        Source lines. All loads precede all stores, so a block may overwrite what it reads. Choices are printed as
+        ``select(...)``: no branches.
     """
     absorbed = _absorbed_products(live_nodes(outputs.values())) if fused else {}
-    choice = "select({}, {}, {})" if fused else "{1} if {0} else {2}"
     names: dict[int, str] = {}
     lines: list[str] = []
 
@@ -198,14 +197,28 @@ def emit(
 
     for node in _needed(outputs.values(), absorbed):
         expression = (
-            load(node.operands[0])
-            if node.op == "input"
-            else _expression(node, text, constant, absorbed.get(node.index), choice)
+            load(node.operands[0]) if node.op == "input" else _expression(node, text, constant, absorbed.get(node.index))
         )
         names[node.index] = f"t{node.index}"
         lines.append(f"{indent}t{node.index} = {expression}")
     lines += [indent + store(name, text(value)) for name, value in outputs.items()]
     return lines
+
+
+def straight_line_source(name: str, parameters: Sequence[str], lines: Sequence[str]) -> list[str]:
+    """Return the source of an intrinsic ``name`` with positional ``parameters`` that runs the ``lines`` of :func:`emit`.
+
+    numba compiles them without analysing them: :mod:`wlr_gym.physics.codegen.straight_line`.
+    """
+    listed = ", ".join(parameters)
+    return [
+        f'{name.upper()} = """',
+        *lines,
+        '"""',
+        "@intrinsic",
+        f"def {name}(typing_context, {listed}):",
+        f"    return straight_line({name.upper()}, {' '.join(parameters)!r}, ({listed},))",
+    ]
 
 
 def _absorbed_products(order: Iterable[Node]) -> dict[int, Node]:
@@ -235,9 +248,7 @@ def _needed(roots: Iterable[Operand], absorbed: Mapping[int, Node]) -> list[Node
     return _ordered(roots, children)
 
 
-def _expression(
-    node: Node, text: Callable[[Operand], str], constant: Callable[[float], str], product: Node | None, choice: str
-) -> str:
+def _expression(node: Node, text: Callable[[Operand], str], constant: Callable[[float], str], product: Node | None) -> str:
     if product is not None:
         return _fused(node, product, text)
     args = [text(x) for x in node.operands]
@@ -251,11 +262,11 @@ def _expression(
         case "neg":
             return f"-{args[0]}"
         case "where":
-            return choice.format(f"{args[0]} > {constant(0.0)}", args[1], args[2])
+            return f"select({args[0]} > {constant(0.0)}, {args[1]}, {args[2]})"
         case "minimum":
-            return choice.format(f"{args[0]} < {args[1]}", *args)
+            return f"select({args[0]} < {args[1]}, {args[0]}, {args[1]})"
         case "maximum":
-            return choice.format(f"{args[0]} > {args[1]}", *args)
+            return f"select({args[0]} > {args[1]}, {args[0]}, {args[1]})"
         case "absolute":
             return f"abs({args[0]})"
     raise KeyError(node.op)

@@ -13,7 +13,18 @@ from types import ModuleType
 from typing import Any
 
 from wlr_gym.physics import servo
-from wlr_gym.physics.codegen import Graph, Node, emit, graph, hoist, live_nodes, load_module, ops, source_of
+from wlr_gym.physics.codegen import (
+    Graph,
+    Node,
+    emit,
+    graph,
+    hoist,
+    live_nodes,
+    load_module,
+    ops,
+    source_of,
+    straight_line_source,
+)
 from wlr_gym.physics.model import equations
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
@@ -107,15 +118,17 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
     lines = [f"F = np.{precision}", ""]
     for block, outputs in blocks.items():
         used = {node.operands[0] for node in live_nodes(outputs.values()) if node.op == "input"}
-        arguments = ", ".join(["W", *(name for name in _SCALARS if name in used)])
-        body = emit(outputs, load, lambda name, text: f"w[{start[name]} + k] = {text}", " " * 8, constant, fused=True)
+        scalars = [name for name in _SCALARS if name in used]
+        body = emit(outputs, load, lambda name, text: f"w[{start[name]} + k] = {text}", "", constant, fused=True)
         lines += [
+            *straight_line_source(f"{block}_of_robot", ["w", "k", *scalars], body),
+            "",
             _DECORATOR,
-            f"def {block}({arguments}):",
+            f"def {block}({', '.join(['W', *scalars])}):",
             "    whole_registers()",
             "    w = numbers_of(W)",
             f"    for k in range({width}):",
-            *body,
+            f"        {block}_of_robot({', '.join(['w', 'k', *scalars])})",
             "",
         ]
     return "\n".join(lines) + ("" if "forces" in features else _driver(start, width, precision))
@@ -274,7 +287,7 @@ def load_kernel(features: frozenset[str], precision: str, width: int, formulas: 
     tag = "_".join(["gibbs_appell", precision, str(width), *sorted(features)])
     message = (
         f"wlr_gym: compiling the Gibbs-Appell engine ({precision}, {width} robots side by side); "
-        "about 15 s, once on this machine"
+        "some seconds, once on this machine"
     )
     blocks = load_module(tag, lambda: kernel_source(features, precision, width), message, _SOURCE_KEY)
     if formulas is None:

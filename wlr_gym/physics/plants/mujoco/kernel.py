@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics import servo
-from wlr_gym.physics.codegen import Graph, emit, graph, live_nodes, load_module, ops, source_of
+from wlr_gym.physics.codegen import Graph, emit, graph, live_nodes, load_module, ops, source_of, straight_line_source
 from wlr_gym.physics.plants import drive, forces, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import kinematics, lanes
@@ -114,10 +114,11 @@ def trace() -> dict[str, dict[str, Any]]:
 def kernel_source() -> str:
     """Return the kernel module's source."""
     blocks = trace()
-    observed = {name: f"truth[i, {k}]" for k, name in enumerate(blocks["observe"])}
+    observed = {name: f"truth[{k}]" for k, name in enumerate(blocks["observe"])}
     for k, name in enumerate(list(observed)[TRUTH_LAYOUT.width :]):
-        observed[name] = f"raw[i, {k}]" if k < RAW_LAYOUT.width - 1 else name
-    named = {name: f"inputs[{k}, i]" for k, name in enumerate(forces.INPUTS)}
+        observed[name] = f"raw[{k}]" if k < RAW_LAYOUT.width - 1 else name
+    named = {name: f"inputs[{k} * count + i]" for k, name in enumerate(forces.INPUTS)}
+    rows = [f"        {name} = array_at(table[i, {k}])" for k, name in enumerate(_ROWS)]
     lines = []
     for block, outputs in blocks.items():
         used = {node.operands[0] for node in live_nodes(outputs.values()) if node.op == "input"}
@@ -128,22 +129,22 @@ def kernel_source() -> str:
         def load(name: str) -> str:
             return name if name in _SCALARS else _PLACES[name]
 
-        body = emit(
-            outputs,
-            load,
-            lambda name, text, places=places: f"{places[name]} = {text}",
-            " " * 8,
-            lambda value: repr(value) if value >= 0 else f"({value!r})",
-            fused=True,
-        )
+        body = emit(outputs, load, lambda name, text, places=places: f"{places[name]} = {text}", "", fused=True)
         if block == "observe":
-            body.append(f"        raw[i, {RAW_LAYOUT.width - 1}] = math.atan2(heading_sine, heading_cosine)")
-        arguments = ", ".join(["table", "rows", *own, *scalars])
+            body.append(f"raw[{RAW_LAYOUT.width - 1}] = math.atan2(heading_sine, heading_cosine)")
         signature = "" if block == "features" else _signature(len(own), len(scalars))
-        lines += [f"@njit({signature}cache=True, nogil=True, error_model='numpy')"]
-        lines += [f"def {block}({arguments}):", "    count = len(table)", "    for i in rows:"]
-        lines += [f"        {name} = array_at(table[i, {k}])" for k, name in enumerate(_ROWS)]
-        lines += [*body, "", ""]
+        pointers = [f"numbers_of({name})" if block == "features" else f"numbers_of({name}[i])" for name in own]
+        lines += [
+            *straight_line_source(f"{block}_of_robot", [*_ROWS, *own, "i", "count", *scalars], body),
+            "",
+            f"@njit({signature}cache=True, nogil=True, error_model='numpy')",
+            f"def {block}({', '.join(['table', 'rows', *own, *scalars])}):",
+            "    count = len(table)",
+            "    for i in rows:",
+            *rows,
+            f"        {block}_of_robot({', '.join([*_ROWS, *pointers, 'i', 'count', *scalars])})",
+            "",
+        ]
     return "\n".join(["from numba import types", "", *lines])
 
 
@@ -155,7 +156,7 @@ def _signature(own: int, scalars: int) -> str:
 
 def load_kernel() -> ModuleType:
     """Load (first use: generate and compile) the kernel module."""
-    message = "wlr_gym: compiling the MuJoCo plant's kernel; about 10 s, once on this machine"
+    message = "wlr_gym: compiling the MuJoCo plant's kernel; some seconds, once on this machine"
     return load_module("mujoco_plant", kernel_source, message, _SOURCE_KEY)
 
 
