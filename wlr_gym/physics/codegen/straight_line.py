@@ -82,7 +82,7 @@ class _Lowering:
                 return self.context.get_constant(self.number, value)
             case ast.Subscript():
                 return self.builder.load(self.address(node))
-            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=value)):
+            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
                 return self.context.get_constant(self.number, -value)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 return self.builder.fneg(self.value(operand))
