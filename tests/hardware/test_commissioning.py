@@ -23,6 +23,8 @@ from wlr_gym.robot.parameters import Parameters
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
+from robot_rig import hardware_file
+
 from wlr_gym.hardware.commissioning import runner
 from wlr_gym.hardware.commissioning.contract import StandTest
 from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
@@ -528,12 +530,12 @@ def test_over_serial_ports(tmp_path, monkeypatch):
     emulated = EmulatedStand(ROBOT, NOMINAL, options=MachineOptions(timing=NO_TIME))
     with Server(emulated.machine, real_time=False) as server:
         monkeypatch.setattr("wlr_gym.hardware.link.MonotonicClock", lambda: ServedClock(server))
-        monkeypatch.setattr("wlr_gym.hardware.commissioning.stand.CALM_PATIENCE", 5.0)
-        words = ["commission", "--yes", "--out", str(tmp_path), "--tests", "watchdog", "velocity_step"]
-        main([*words, "--port", *(f"{name}={path}" for name, path in server.ports.items())])
+        mine = hardware_file(tmp_path, server.ports, patience=10.0, watchdog=NOMINAL.safety.watchdog)
+        words = ["--hardware", str(mine), "--yes", "--out", str(tmp_path), "--tests", "watchdog", "velocity_step"]
+        assert main(["commission", *words]) == 0
         assert motors_on(emulated.machine) == []
     assert {result["state"] for result in results_of(tmp_path).values()} == {"done"}
-    assert not differing(tmp_path)
+    assert set(load_hardware(mine).measured.velocity_loop_time) == set(WHEELS)
 
 
 class ServedClock:

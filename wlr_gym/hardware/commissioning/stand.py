@@ -78,7 +78,7 @@ class Stand:
         stall = robot.servo.leg.stall_torque, robot.servo.wheel.stall_torque
         self._stall = np.repeat(stall, 4)
         self._last = np.zeros(3 * len(JOINTS))
-        self.servos.set_patience(CALM_PATIENCE)
+        self.servos.set_patience(max(CALM_PATIENCE, hardware.safety.patience))
 
     # ---- rows ----
 
