@@ -284,8 +284,7 @@ class EmulatedServo:
 
     def pause(self, duration: float) -> None:
         """Let the clock alone go on, by ``duration`` s."""
-        if not self.dead:
-            self._clock += duration
+        self._clock += duration
 
     def _watchdog_stop(self) -> None:
         """The line went silent: stop, keep torque, latch."""
