@@ -181,12 +181,12 @@ def test_defect_1_time_out_is_what_was_asked_for(server):
     port.closePort()
     with connect(server, 0.005) as group:
         spent = []
-        for _ in range(5):  # the second one also waits for a quiet line
+        while not spent or (min(spent) > 0.025 and len(spent) < 200):  # one try, of a computer that has time, is enough
             start = time.monotonic()
             with pytest.raises(NoAnswerError, match="bus legs, id 2: ping: no answer"):
                 group.ping(2)
             spent.append(time.monotonic() - start)
-        assert min(spent) < 0.025
+        assert 0.005 < min(spent) < 0.025
 
 
 def test_defect_2_waiting_takes_no_processor_time(server):
@@ -411,6 +411,13 @@ def test_steady_readings_are_fresh_whatever_the_clocks_speed(speed):
     assert not any(restarted for _, restarted in answers)
 
 
+def test_a_first_reading_that_waited_for_us_is_no_reason_to_call_the_next_one_a_reboot():
+    clock = TickClock()
+    assert clock.age(5000, 10.3, waited=0.302) == (0.0, False)  # nobody knows better than that it is 0 to 0.302 s old
+    assert clock.age(5320, 10.32, waited=0.002) == (0.0, False)
+    assert clock.age(5340 + 100, 10.34, waited=0.002) == (0.0, True)  # now the clocks are known
+
+
 def test_an_answer_to_an_earlier_request_is_told_by_its_age():
     clock = TickClock()
     feed(clock, [(0.02 * k, 20.0 * k) for k in range(100)])
@@ -427,17 +434,19 @@ def test_a_reboot_is_told_from_lateness():
     assert clock.age(340, 2.34) == (0.0, False)
 
 
-def test_an_answer_that_waited_for_us_is_old_but_not_stale(server):
-    """Two buses are asked at once; while one times out, the other one's answer lies in the buffer."""
+@pytest.mark.parametrize("seconds", [0.05, 1.5])
+def test_an_answer_that_waited_for_us_is_old_but_not_stale(server, seconds):
+    """While one bus times out, or this program is not given the processor, the other bus' answer lies in the buffer."""
     waited = 0.0
     group = BusGroup("legs", server.ports["legs"], 1_000_000, LEGS, PATIENCE, lambda: server.machine.time + waited)
     with group:
         assert set(read_all(group, FAST_BLOCK)) == set(LEGS)
         group.ask_all(FAST_BLOCK)
-        waited = 0.05
+        waited = seconds
         readings = group.answers()
     assert set(readings) == set(LEGS)
-    assert readings[2].age == pytest.approx(0.05, abs=0.003)
+    assert readings[2].age == pytest.approx(seconds, rel=0.03)  # clocks may drift by 2 %
+    assert not readings[2].restarted
     assert group.statistics.stale == {}
 
 

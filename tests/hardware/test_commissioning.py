@@ -23,6 +23,8 @@ from wlr_gym.robot.parameters import Parameters
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
+from robot_rig import hardware_file
+
 from wlr_gym.hardware.commissioning import runner
 from wlr_gym.hardware.commissioning.contract import StandTest
 from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
@@ -31,7 +33,8 @@ from wlr_gym.hardware.commissioning.person import TerminalPerson
 from wlr_gym.hardware.commissioning.registry import TESTS, choose
 from wlr_gym.hardware.commissioning.runner import Commissioning, run_test
 from wlr_gym.hardware.commissioning.stand import Stand
-from wlr_gym.hardware.emulator import Server
+from wlr_gym.hardware.emulator import MachineOptions, Server
+from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.emulator.stand import EmulatedStand
 
@@ -431,16 +434,122 @@ def test_the_way_out_is_always_open(monkeypatch, tmp_path):
         assert states == ["done"] * made + ["stopped"]
 
 
-@pytest.mark.slow
-def test_over_serial_ports_in_real_time(tmp_path):
-    pytest.importorskip("termios")
+# ---- a computer that is busy -----------------------------------------------------------------------------------------
+
+
+class Hiccups:
+    """A clock of whose waits some last 0.5 s longer, for the computer was busy with something else.
+
+    Args:
+        clock: of the robot.
+        waits: which, from 1.
+    """
+
+    def __init__(self, clock, waits):
+        self.clock, self.waits, self.count = clock, waits, 0
+        self.now = clock.now
+
+    def wait_until(self, moment):
+        self.count += 1
+        self.clock.wait_until(moment + (0.5 if self.count in self.waits else 0.0))
+
+
+def make_with_hiccups(folder, test, waits, person=None):
+    """Commission an emulated robot; return the result, and its machine."""
     emulated = EmulatedStand(ROBOT, NOMINAL)
-    with Server(emulated.machine) as server:
-        words = ["commission", "--yes", "--out", str(tmp_path), "--tests", "latency", "watchdog", "velocity_step"]
-        main([*words, "--port", *(f"{name}={path}" for name, path in server.ports.items())])
+    link = emulated_link(emulated.machine)
+    link.clock = Hiccups(link.clock, waits)
+    with Commissioning(ROBOT, NOMINAL, link, person or EmulatedPerson(emulated), folder, RunMeta()) as commissioning:
+        (result,) = commissioning.make(choose([test]))
+    assert motors_on(emulated.machine) == []
+    return result, emulated.machine
+
+
+@pytest.mark.parametrize(
+    ("test", "wait"),
+    [
+        ("velocity_step", 10),  # the setpoint is refused ...
+        ("velocity_step", 20),  # ... or wheels stop on their way
+        ("load", 70),
+        ("watchdog", 80),  # not in the silence that is wanted
+        ("torque_on", 215),
+        ("stall", 30),
+    ],
+)
+def test_a_test_is_made_once_more_where_the_computer_was_silent_for_too_long(tmp_path, test, wait):
+    result, _ = make_with_hiccups(tmp_path, test, {wait})
+    assert result.state == "done"
+    assert result.is_good
+    (reason,) = result.repeated
+    assert re.search(r"_\w\w: stopped by the Bus Watchdog: this computer, or the bus, was silent for longer than 0.2 s", reason)
+    assert json.loads((tmp_path / f"{test}.json").read_text())["repeated"] == [reason]
+    assert len(read_dataset(tmp_path).runs) == 1  # not the one whose wheels were stopped
+
+
+def test_a_computer_that_is_always_busy_is_named_and_not_the_servo(tmp_path):
+    result, _ = make_with_hiccups(tmp_path, "velocity_step", range(8, 100000, 8))
+    assert (result.state, len(result.repeated)) == ("failed", 2)
+    assert re.search(r"silent for longer than 0.2 s, in 3 tries$", result.reason)
+    assert "refused" not in result.reason
+    assert result.run == ""
+    assert not result.findings
+
+
+def test_who_is_beside_the_robot_is_asked_before_a_test_is_made_once_more(tmp_path):
+    asked = []
+    person = TerminalPerson(lambda text: asked.append(text) or ("" if len(asked) == 1 else "q"))
+    result, _ = make_with_hiccups(tmp_path, "velocity_step", {20}, person)
+    assert [text.startswith("Once more, for wheel_lf") for text in asked] == [False, True]
+    assert (result.state, len(result.repeated)) == ("stopped", 1)
+
+
+def test_a_setpoint_that_is_refused_for_another_reason_is_told_as_it_is(tmp_path):
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+
+    class Saboteur(EmulatedPerson):
+        def ready(self, test):
+            emulated.machine.servos["wheel_lf"].set("velocity_limit", 50)
+
+    result = make(tmp_path, emulated, "velocity_step", person=Saboteur(emulated))["velocity_step"]
+    assert (result.state, result.repeated) == ("failed", ())
+    assert "write goal_velocity" in result.reason
+    assert "refused (data limit error)" in result.reason
+
+
+def test_a_lost_answer_now_and_then_leaves_no_gap(tmp_path):
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    emulated.machine.inject("drop probability=0.01")
+    results = make(tmp_path, emulated, "velocity_step", "stall")
+    assert found_in(results) == set()
+    assert {result.state for result in results.values()} == {"done"}
+
+
+def test_over_serial_ports(tmp_path, monkeypatch):
+    """In emulated time: what the emulator and this process are given of the processor does not matter."""
+    pytest.importorskip("termios")
+    emulated = EmulatedStand(ROBOT, NOMINAL, options=MachineOptions(timing=NO_TIME))
+    with Server(emulated.machine, real_time=False) as server:
+        monkeypatch.setattr("wlr_gym.hardware.link.MonotonicClock", lambda: ServedClock(server))
+        mine = hardware_file(tmp_path, server.ports, patience=10.0, watchdog=NOMINAL.safety.watchdog)
+        words = ["--hardware", str(mine), "--yes", "--out", str(tmp_path), "--tests", "watchdog", "velocity_step"]
+        assert main(["commission", *words]) == 0
         assert motors_on(emulated.machine) == []
     assert {result["state"] for result in results_of(tmp_path).values()} == {"done"}
-    assert not {place for quantity, place in differing(tmp_path) if not quantity.startswith("adapter")}
+    assert set(load_hardware(mine).measured.velocity_loop_time) == set(WHEELS)
+
+
+class ServedClock:
+    """The emulated time of a robot on serial ports, which passes when somebody waits."""
+
+    def __init__(self, server):
+        self.server = server
+
+    def now(self):
+        return self.server.machine.time
+
+    def wait_until(self, moment):
+        if (left := moment - self.now()) > 0.0:
+            self.server.advance(left)
 
 
 def test_options_that_make_no_sense(tmp_path):

@@ -194,6 +194,19 @@ def test_unplugged_port_is_gone_and_comes_back(tmp_path):
     assert not link.exists()
 
 
+def test_an_emulator_that_is_slower_than_time_answers_and_its_clocks_go_on(monkeypatch):
+    machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions(sensor_noise=False, timing=NO_TIME))
+    step = machine.step
+    monkeypatch.setattr(machine, "step", lambda: time.sleep(2 * machine.options.tick) or step())
+    with Server(machine) as server:
+        port, handler = connect(server)
+        until(lambda: server.slipped > 0.3)
+        assert handler.ping(port, 2)[1] == sdk.COMM_SUCCESS
+        port.closePort()
+        clock, lived = server.call(lambda: (machine.servos["leg_lf"]["realtime_tick"], machine.time + server.slipped))
+    assert clock == pytest.approx(1e3 * lived, abs=1.0)
+
+
 def test_a_failure_of_the_simulator_is_told(stepped, monkeypatch):
     def fail(*_):
         raise ZeroDivisionError("in the plant")

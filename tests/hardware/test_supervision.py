@@ -13,6 +13,7 @@ from wlr_gym.hardware.safety.rules import Memory
 from wlr_gym.hardware.safety.state import Level
 from wlr_gym.hardware.safety.supervision import reach, unseen
 from wlr_gym.hardware.servos import ServoRegisters
+from wlr_gym.robot import JOINTS
 
 ARMED = replace(RATINGS, watchdog=10.0, goal_pwm=np.full(8, 885.0))
 ROLL = np.r_[HOME[:4], [3.0] * 4]
@@ -112,6 +113,21 @@ def test_a_leg_whose_motor_turns_and_whose_count_does_not_is_frozen():
     assert ticks * 0.02 <= 0.1
     count = 0.0015
     assert run(50, lambda tick: turning(2, 1.0, 0.2) | {"position": HOME + at(count * tick, 2)})[0] is None
+
+
+@pytest.mark.parametrize(("joint", "setpoints"), [(2, HOME), (6, HOME + at(1.5, 6))])
+def test_an_encoder_whose_last_bits_rattle_is_frozen_all_the_same(joint, setpoints):
+    """At a wheel's 1.5 rad/s the tracking rule never sees it, and its servo would drive it at full voltage."""
+
+    def rattling(tick):
+        seen = turning(joint, 0.2 * np.sin(2.0 * tick), 0.2)
+        return seen | {"position": HOME + at(0.0015 * (tick % 3 - 1), joint)}
+
+    verdict, ticks = run(100, rattling, setpoints)
+    assert verdict is not None
+    assert (verdict.rule, verdict.level) == ("frozen", Level.OFF)
+    assert verdict.text.startswith(JOINTS[joint])
+    assert ticks * 0.02 <= (0.1 if joint == 2 else 0.8)
 
 
 def test_a_leg_that_turns_back_may_repeat_its_count_by_chance():

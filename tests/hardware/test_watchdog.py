@@ -131,7 +131,7 @@ def test_the_watchdog_process_ends_when_it_is_told(server):
 def test_the_watchdog_process_waits_for_an_adapter_that_is_gone(server):
     groups = [
         BusGroup(
-            name, server.ports[name], bus.baud_rate, {ROBOT.dynamixel_ids[j]: load_table(bus.model) for j in bus.joints}, 0.1
+            name, server.ports[name], bus.baud_rate, {ROBOT.dynamixel_ids[j]: load_table(bus.model) for j in bus.joints}, 30.0
         )
         for name, bus in HARDWARE.buses.items()
     ]
@@ -163,7 +163,7 @@ def test_a_driver_whose_watchdog_process_is_gone_stops(tmp_path, server):
     assert not any(torque(server))
 
 
-@pytest.mark.slow
+@pytest.mark.realtime
 @pytest.mark.parametrize(("end", "bounds"), [(signal.SIGKILL, (0.25, 1.0)), (signal.SIGSTOP, (1.5, 1.5))])
 def test_the_bounds_after_a_driver_ends_or_hangs(tmp_path, end, bounds):
     """Wheels stand and torque is off within so many seconds, on a computer that has time (one try of ten)."""

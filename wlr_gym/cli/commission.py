@@ -104,6 +104,8 @@ def _commission(
             return FAILED
         for result in commissioning.make(tests):
             results.append(result)
+            for reason in result.repeated:
+                console.print(f"{result.test}: made once more: {reason}")
             console.print(f"{result.test}: {result.state}{f': {result.reason}' if result.reason else ''}")
             write_json(out / REPORT, [content_of(one) for one in results])
     findings = [finding for result in results for finding in result.findings]

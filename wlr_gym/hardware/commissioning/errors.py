@@ -7,6 +7,10 @@ class TroubleError(RuntimeError):
     """A test cannot go on; the message says why. Torque goes off."""
 
 
+class TrippedError(TroubleError):
+    """The Bus Watchdog stopped a motor that a test drives: what was measured says nothing about the servo."""
+
+
 class SkippedError(Exception):
     """The person does not want this test."""
 

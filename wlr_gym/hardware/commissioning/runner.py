@@ -17,7 +17,7 @@ from wlr_gym.data.write import write_run
 from wlr_gym.hardware.commissioning.comparison import StandFinding, compare
 from wlr_gym.hardware.commissioning.contract import Reading, StandTest
 from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
-from wlr_gym.hardware.commissioning.errors import PowerError, QuitError, SkippedError, TroubleError
+from wlr_gym.hardware.commissioning.errors import PowerError, QuitError, SkippedError, TrippedError, TroubleError
 from wlr_gym.hardware.commissioning.person import Person
 from wlr_gym.hardware.commissioning.stand import Stand
 from wlr_gym.hardware.config import Hardware
@@ -33,6 +33,8 @@ from wlr_gym.robot import Robot
 
 #: How a test can end.
 DONE, SKIPPED, FAILED, STOPPED = "done", "skipped", "failed", "stopped"
+#: Times that a test is made whose motors the Bus Watchdog stopped.
+TRIES = 3
 #: Of the emulated robot's sensor noise: other noise than that of an emulated robot under test, whose seed is 0.
 _SEED = 1
 _TROUBLE = (TroubleError, NoAnswerError, RefusedError, ConnectionError, InputError)
@@ -48,6 +50,7 @@ class StandResult:
         reason: why it is not done.
         findings: what was measured, and what was expected.
         run: name of its measured run; empty = it has no rows.
+        repeated: why it was begun anew, once for each time.
     """
 
     test: str
@@ -55,6 +58,7 @@ class StandResult:
     reason: str = ""
     findings: tuple[StandFinding, ...] = field(default=())
     run: str = ""
+    repeated: tuple[str, ...] = ()
 
     @property
     def is_good(self) -> bool:
@@ -123,15 +127,30 @@ class Commissioning:
                 watchdog.release()
 
     def _make(self, test: StandTest) -> StandResult:
+        """Make a test; once more where the Bus Watchdog stopped its motors, for that is no fault of theirs."""
+        repeated: list[str] = []
+        while True:
+            try:
+                return self._try(test, tuple(repeated))
+            except TrippedError as error:
+                repeated.append(str(error))
+
+    def _try(self, test: StandTest, repeated: tuple[str, ...]) -> StandResult:
+        again = f"Once more, for {repeated[-1]}. " if repeated else ""
         try:
-            self._person.ready(f"{test.title}. {test.moves} {test.asks or 'Hands off.'}")
+            self._person.ready(f"{again}{test.title}. {test.moves} {test.asks or 'Hands off.'}")
         except SkippedError:
-            return StandResult(test.name, SKIPPED)
+            return StandResult(test.name, SKIPPED, repeated=repeated)
         except QuitError:
-            return StandResult(test.name, STOPPED, "asked to")
+            return StandResult(test.name, STOPPED, "asked to", repeated=repeated)
         state, reason, readings = DONE, "", []
         try:
             readings = run_test(test, self._stand, self._person)
+        except TrippedError as error:
+            if len(repeated) + 1 < TRIES:
+                raise
+            state, reason = FAILED, f"{error}, in {TRIES} tries"
+            self._stand.begin()  # no run: motors that were stopped did not follow its commands
         except QuitError as asked:
             state, reason = STOPPED, str(asked) or "asked to"
         except PowerError as error:
@@ -140,7 +159,8 @@ class Commissioning:
         except _TROUBLE as error:
             state, reason = FAILED, str(error)
         expected = run_test(test, self._model, self._model_person) if readings else []
-        result = StandResult(test.name, state, reason, tuple(compare(test, readings, expected)), self._log_run())
+        findings = tuple(compare(test, readings, expected))
+        result = StandResult(test.name, state, reason, findings, self._log_run(), repeated)
         write_json(self._folder / f"{test.name}.json", content_of(result) | {"samples": self._stand.samples})
         return result
 
@@ -166,11 +186,27 @@ def run_test(test: StandTest, stand: Stand, person: Person) -> list[Reading]:
     stand.begin()
     with stop_on_signals(stand.operator):
         try:
-            readings = test.measure(stand, person)
+            readings = measured(test, stand, person)
         finally:
             left = stand.off()
             if left:
                 raise PowerError(f"CUT THE POWER: torque is not confirmed off at {', '.join(left)}")
+    return readings
+
+
+def measured(test: StandTest, stand: Stand, person: Person) -> list[Reading]:
+    """Return what a test measures.
+
+    Raises:
+        TrippedError: a watchdog stopped a motor meanwhile, whatever else that led to: a refused setpoint, a wheel that stands.
+    """
+    try:
+        readings = test.measure(stand, person)
+    except (TroubleError, NoAnswerError, RefusedError):
+        with contextlib.suppress(ConnectionError):
+            stand.check_watchdogs()
+        raise
+    stand.check_watchdogs()
     return readings
 
 
@@ -194,6 +230,7 @@ def content_of(result: StandResult) -> dict[str, Any]:
         "test": result.test,
         "state": result.state,
         "reason": result.reason,
+        "repeated": list(result.repeated),
         "run": result.run,
         "time": time,
         "findings": findings,

@@ -10,13 +10,14 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import COMMANDS
-from wlr_gym.hardware.commissioning.errors import QuitError, TroubleError
+from wlr_gym.hardware.commissioning.errors import QuitError, TrippedError, TroubleError
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 from wlr_gym.hardware.imu.reading import ImuGoneError
@@ -73,10 +74,11 @@ class Stand:
         self._setpoints = np.full(len(JOINTS), np.nan)
         self._next = 0.0
         self._silent = self._blocked = 0
+        self._armed: set[str] = set()
         stall = robot.servo.leg.stall_torque, robot.servo.wheel.stall_torque
         self._stall = np.repeat(stall, 4)
         self._last = np.zeros(3 * len(JOINTS))
-        self.servos.set_patience(CALM_PATIENCE)
+        self.servos.set_patience(max(CALM_PATIENCE, hardware.safety.patience))
 
     # ---- rows ----
 
@@ -85,9 +87,10 @@ class Stand:
         self._rows, self.samples = [], {}
         self._next = self.clock.now()
         self._silent = self._blocked = 0
+        self._armed.clear()
 
     def step(self) -> JointReadings:
-        """Wait for the next row's time, read everything, and note it.
+        """Wait for the next row's time, read everything, and note it; one lost answer leaves the values of the row before.
 
         Raises:
             TroubleError: a servo is silent, restarted, blocked or has an error.
@@ -101,7 +104,8 @@ class Stand:
         joints = np.concatenate([readings.position, readings.velocity, readings.effort])
         self._last = np.where(np.isnan(joints), self._last, joints)
         self._rows.append(np.concatenate([[time], self._setpoints, self._last, self._imu_row()]))
-        return readings
+        position, velocity, effort = self._last.reshape(3, -1)
+        return replace(readings, position=position, velocity=velocity, effort=effort)
 
     def run(self, seconds: float) -> list[JointReadings]:
         """Go on for so long; return the readings."""
@@ -116,6 +120,32 @@ class Stand:
         self.clock.wait_until(moment)
         if asked := self.operator.take():
             raise QuitError(asked)
+
+    def fall_silent(self, seconds: float) -> JointReadings:
+        """Read a last time and return it, then say nothing for ``seconds`` more than the watchdogs' time: they trip."""
+        last = self.step()
+        self.check_watchdogs()
+        self._armed.clear()
+        self.wait_until(self.clock.now() + self.hardware.safety.watchdog + seconds)
+        return last
+
+    def check_watchdogs(self) -> None:
+        """See that no watchdog has stopped a motor unasked; it does, and refuses setpoints, when nobody speaks for long.
+
+        Raises:
+            TrippedError: one has.
+            BusGoneError: a port is gone.
+        """
+        held = self.servos.get_all("bus_watchdog") if self._armed else {}
+        if tripped := [joint for joint in JOINTS if joint in self._armed and held.get(joint, 0) < 0]:
+            raise TrippedError(
+                f"{', '.join(tripped)}: stopped by the Bus Watchdog: this computer, or the bus, was silent for longer than "
+                f"{self._watchdog_count * WATCHDOG_UNIT:g} s"
+            )
+
+    @property
+    def _watchdog_count(self) -> int:
+        return math.ceil(self.hardware.safety.watchdog / WATCHDOG_UNIT - 1e-9)
 
     def _judge(self, readings: JointReadings) -> None:
         silent = ~readings.answered
@@ -179,15 +209,17 @@ class Stand:
             k = JOINTS.index(joint)
             self._setpoints[k] = self._goal(joint)
             self.servos.set(joint, "torque_enable", 1)
-        count = math.ceil(self.hardware.safety.watchdog / WATCHDOG_UNIT - 1e-9)
+        self._armed.update(joints)
         for joint in sorted(joints, key=lambda joint: JOINTS.index(joint) % len(LEGS)):  # no bus is silent for long meanwhile
-            self.servos.set(joint, "bus_watchdog", count)
+            self.servos.set(joint, "bus_watchdog", self._watchdog_count)
 
     def switch_off(self, joints: Iterable[str]) -> None:
         """Switch single motors off, and disarm their watchdogs; what they are to do stays in their registers."""
+        self.check_watchdogs()
         for joint in joints:
             self.servos.set(joint, "torque_enable", 0)
             self.servos.set(joint, "bus_watchdog", 0)
+            self._armed.discard(joint)
             self._setpoints[JOINTS.index(joint)] = np.nan
 
     def _goal(self, joint: str) -> float:

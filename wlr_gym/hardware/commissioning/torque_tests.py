@@ -28,8 +28,7 @@ def _measure_watchdog(stand: Stand, person: Person) -> list[Reading]:
     speed = np.mean([readings.velocity for readings in stand.run(0.2)], axis=0)[WHEEL_SLICE]
     if (np.abs(speed) < 0.5 * _SPEED).any():
         raise TroubleError(f"wheels turn at {np.round(speed, 2).tolist()} rad/s, asked for {_SPEED:g}")
-    last = stand.step()
-    stand.wait_until(stand.clock.now() + stand.hardware.safety.watchdog + _SILENCE)
+    last = stand.fall_silent(_SILENCE)
     after = stand.step()
     rolled = (after.position - last.position)[WHEEL_SLICE]
     found = [Reading("watchdog_stop_time", wheel, float(rolled[k] / speed[k])) for k, wheel in enumerate(WHEELS)]

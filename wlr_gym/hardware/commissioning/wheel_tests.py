@@ -31,11 +31,13 @@ def _measure_velocity_step(stand: Stand, person: Person) -> list[Reading]:
     start = stand.clock.now()
     times, speeds = [], []
     while stand.clock.now() < start + _STEP_TIME:
-        speeds.append(stand.step().velocity[WHEEL_SLICE])
-        times.append(stand.clock.now() - start)
+        readings = stand.step()
+        speeds.append(readings.velocity[WHEEL_SLICE])
+        # when the servo took it: where an answer is waited for in vain, the others have been there for long
+        times.append(stand.clock.now() - start - readings.age[WHEEL_SLICE])
     found = []
-    for wheel, speed in zip(WHEELS, np.array(speeds).T, strict=True):
-        time = _time_constant(wheel, np.array(times), speed)
+    for wheel, moments, speed in zip(WHEELS, np.array(times).T, np.array(speeds).T, strict=True):
+        time = _time_constant(wheel, moments, speed)
         found += [
             Reading("velocity_loop_time", wheel, time),
             Reading("integral_cycle", wheel, _integral_cycle(stand, time)),
@@ -45,11 +47,11 @@ def _measure_velocity_step(stand: Stand, person: Person) -> list[Reading]:
 
 
 def _time_constant(wheel: str, times: NDArray[np.float64], speed: NDArray[np.float64]) -> float:
-    """Return the time constant (s) of the error's decay, fitted where the wheel is on its way."""
+    """Return the time constant (s) of the error's decay, fitted on the wheel's way; times of lost answers are NaN."""
     part = speed / _STEP
     late = np.flatnonzero(part > _FITTED[1])
     way = np.arange(len(part)) < (late[0] if len(late) else len(part))
-    way &= (part > _FITTED[0]) & (part < _FITTED[1])
+    way &= (part > _FITTED[0]) & (part < _FITTED[1]) & np.isfinite(times)
     if way.sum() < 3:
         raise TroubleError(f"{wheel}: {way.sum()} rows on the way to {_STEP:g} rad/s, expected 3 or more: it does not follow")
     return float(-1.0 / np.polyfit(times[way], np.log(1.0 - part[way]), 1)[0])

@@ -284,7 +284,7 @@ class BusGroup:
         counts = block.decode(status.data)
         age, restarted = 0.0, False
         if "realtime_tick" in counts:
-            age, restarted = self._clocks[status.id].age(counts["realtime_tick"], now)
+            age, restarted = self._clocks[status.id].age(counts["realtime_tick"], now, now - self._asked_at)
         if status.alert:
             self._count(self.statistics.alerts, status.id)
         return BlockReading(counts, status.alert, age, restarted)

@@ -105,6 +105,7 @@ class Machine:
         self._imu_output: list[Emission] = []
         self._imu = Conversion(hardware.imu)
         self._frames = 0
+        self._paused = 0.0
         self._imu_values = (0, 0, 0), (0, 0, 0)
         self._imu_frame = ImuFrame(0, 0, (0, 0, 0), _IMU_TEMPERATURE, (0, 0, 0))
         self.servos: dict[str, EmulatedServo] = {joint: self._make_servo(joint) for joint in JOINTS}
@@ -151,6 +152,12 @@ class Machine:
         while self.time >= (self._frames + 1) / self.hardware.imu.rate - 1e-9:
             self._read_imu()
 
+    def pause(self, duration: float) -> None:
+        """Let ``duration`` s pass in which nothing happens (a busy computer): quartzes do not stop, so all clocks go on."""
+        self._paused += duration
+        for servo in self.servos.values():
+            servo.pause(duration)
+
     def turn(self, joint: str, angle: float) -> None:
         """Turn a joint by hand while torque is off; see :meth:`PlantCoupling.turn`.
 
@@ -166,7 +173,7 @@ class Machine:
     def _read_imu(self) -> None:
         sensors = self.coupling.sensors
         self._frames += 1
-        stamp = self._frames / self.hardware.imu.rate
+        stamp = self._frames / self.hardware.imu.rate + self._paused
         if not self.faults.active(self.time, "imu_frozen", ["imu"]):
             self._imu_values = self._chip_counts(sensors.accelerometer[0], sensors.gyro[0])
         force, rate = self._imu_values

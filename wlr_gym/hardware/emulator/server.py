@@ -23,8 +23,10 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.emulator.commands import run_command
 from wlr_gym.hardware.emulator.machine import Machine
 
-#: Emulated time may fall behind by this much (s); beyond, it slips, as on a computer that was suspended.
-LARGEST_LAG = 0.25
+#: Emulated time may fall behind by this much (s); beyond, it slips. Short of what trips a Bus Watchdog: bytes wait meanwhile.
+LARGEST_LAG = 0.05
+#: s by which it may be behind when bytes have come in, and servos say what time it is.
+ANSWER_LAG = 0.005
 _TCGETS2 = 0x802C542A  # Linux ioctl: terminal settings with the speed as a number
 
 
@@ -249,12 +251,17 @@ class Server:
     def _catch_up(self) -> None:
         if not self._real_time:
             return
-        lag = self._now() - self.machine.time
-        if lag > LARGEST_LAG:
-            self.slipped += lag - LARGEST_LAG
-            self._origin += lag - LARGEST_LAG
-        while self.machine.time + self.machine.options.tick <= self._now():
+        self._slip(LARGEST_LAG)
+        now = self._now()  # not asked again: who is slower than time would never listen
+        while self.machine.time + self.machine.options.tick <= now:
             self._step()
+
+    def _slip(self, largest: float) -> None:
+        """Give up the time (s) by which emulated time is further behind."""
+        if self._real_time and (more := self._now() - self.machine.time - largest) > 0.0:
+            self.slipped += more
+            self._origin += more
+            self.machine.pause(more)
 
     def _advance(self, duration: float) -> None:
         for _ in range(round(duration / self.machine.options.tick)):
@@ -284,6 +291,7 @@ class Server:
             port, line = self._ports[name], self.machine.lines.get(name)
             data = port.read() if port.plugged else b""
             if data and line is not None:  # the microcontroller of the IMU takes no orders
+                self._slip(ANSWER_LAG)
                 self._queue(name, line.receive(data, self._now(), port.baud_rate()))
 
     def _queue(self, name: str, emissions: list) -> None:

@@ -282,6 +282,10 @@ class EmulatedServo:
         if error := self.health.advance(step, self.shaft, self._get):
             self.raise_error(error)
 
+    def pause(self, duration: float) -> None:
+        """Let the clock alone go on, by ``duration`` s."""
+        self._clock += duration
+
     def _watchdog_stop(self) -> None:
         """The line went silent: stop, keep torque, latch."""
         self.set("bus_watchdog", -1)

@@ -41,7 +41,7 @@ _PREPARED = (
 )
 #: s of Bus Watchdog per count (e-manual).
 WATCHDOG_UNIT = 0.02
-#: s an answer may take while nothing moves: where no control step waits for it, a slow computer is no dead servo.
+#: s an answer may take at least while nothing moves: where no control step waits for it, a slow computer is no dead servo.
 CALM_PATIENCE = 0.05
 #: Fastest setpoints of legs on the way to the start pose, over ``start_speed``: a minimum-jerk path needs 1.9 of it.
 CALM_SPEED = 2.0
@@ -112,7 +112,7 @@ class CommandLimiter:
     def check(self, reads: int) -> list[Check]:
         """Return all preflight checks. A watchdog that an earlier run left latched is cleared, where nothing else is wrong."""
         self.__servos.unsupervise()  # a servo that had no power meanwhile has lost its indirect addresses
-        self.__servos.set_patience(CALM_PATIENCE)
+        self.__servos.set_patience(max(CALM_PATIENCE, self.limits.patience))
         found = self._examine()
         wrong = [check for check in found if not check.ok and check.is_fatal]
         if wrong and not self.dry_run and all(check.what == "watchdog" for check in wrong):
@@ -141,7 +141,7 @@ class CommandLimiter:
             NoAnswerError, RefusedError, BusGoneError: a servo did not take it.
         """
         self._memory = Memory()
-        self.__servos.set_patience(CALM_PATIENCE)
+        self.__servos.set_patience(max(CALM_PATIENCE, self.limits.patience))
         self.ratings = rules.ratings_of(self.robot, self.ratings.period, *self._register_limits())
         if not self.dry_run:
             goal_pwm = self._prepare()

@@ -20,6 +20,8 @@ from wlr_gym.robot import JOINTS, LEGS
 LINE_ERROR = 0.05
 #: ... and part of its torque's share of that line: resistance grows with temperature, constants are nominal.
 LINE_SLOPE_ERROR = 0.3
+#: rad by which a reading that stands still may rattle, 3 counts, and rad/s that it then shows.
+RATTLE, RATTLE_SPEED = 0.005, 0.25
 #: rad/s below which a wheel's setpoint need not move it: it may be less than its friction for long.
 CREEP = 0.05
 #: s in which the wheels' velocity loop follows.
@@ -35,14 +37,16 @@ class JointMemory:
     """What lasts from step to step of joints and IMU.
 
     Attributes:
+        still_at: (8,) rad, reading from which on a joint has stayed the same but for the encoder's last bits.
         position, velocity: (8,) rad, rad/s, last read. A leg that turns back may by chance repeat one of them, not both.
         ramp: (8,) rad/s, speed that the wheels' profile asks for by now; legs 0.
         reference: (8,) rad/s, speed that the wheels should have by now; legs 0.
-        unmoved: (8,) rad a joint should have moved since its reading last changed.
+        unmoved: (8,) rad a joint should have moved since then.
         away: (8,) s for which a joint has stayed away from its setpoint.
         imu: (6,) last rates and specific forces. imu_same: s for which they have not changed at all.
     """
 
+    still_at: Array = field(default_factory=lambda: np.full(_N, np.nan))
     position: Array = field(default_factory=lambda: np.full(_N, np.nan))
     velocity: Array = field(default_factory=lambda: np.full(_N, np.nan))
     ramp: Array = field(default_factory=lambda: np.zeros(_N))
@@ -95,14 +99,17 @@ def remember(
     ramp = np.where(torque_on, next_ramp(ratings, memory.ramp, np.clip(previous, -largest, largest)), 0.0)
     reference = np.where(torque_on, memory.reference + (ramp - memory.reference) * ratings.period / WHEEL_LAG, 0.0)
     expected = np.where(_IS_LEG, line_speed(ratings, status), np.where(np.abs(reference) > CREEP, reference, 0.0))
-    same = seen & (status.position == memory.position) & (status.velocity == memory.velocity)
-    unmoved = np.where(same, memory.unmoved + expected * ratings.period, np.where(seen, 0.0, memory.unmoved))
+    same = (status.position == memory.position) & (status.velocity == memory.velocity)
+    rattles = (np.abs(status.position - memory.still_at) <= RATTLE) & (np.abs(status.velocity) <= RATTLE_SPEED)
+    moved = seen & ~(same | rattles)
+    unmoved = np.where(moved, 0.0, memory.unmoved + np.where(seen, expected * ratings.period, 0.0))
     off = seen & is_away(limits, ratings, status, previous, reference)
     away = np.where(off, memory.away + ratings.period, np.where(seen, 0.0, memory.away))
     imu = np.concatenate([status.gyro, status.accelerometer])
     heard = ratings.period if status.imu_silence <= ratings.period else 0.0  # silence has a rule of its own
     imu_same = memory.imu_same + heard if np.array_equal(imu, memory.imu) else 0.0
     return JointMemory(
+        np.where(moved, status.position, memory.still_at),
         status.position,
         status.velocity,
         ramp,
