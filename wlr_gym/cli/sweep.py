@@ -12,9 +12,9 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config, parse_yaml
+from wlr_gym.base.text import number
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import ray_address
-from wlr_gym.gap.report.text import number
 from wlr_gym.learning.sweep.page import PAGE_FILE, name_of
 from wlr_gym.learning.sweep.plan import SweepPlan, read_plan
 from wlr_gym.learning.sweep.results import TABLE_FILE

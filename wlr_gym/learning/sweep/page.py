@@ -11,8 +11,8 @@ import numpy as np
 
 from wlr_gym import __version__
 from wlr_gym.base.files import write_text
-from wlr_gym.gap.report.html import commands, document, folded, pictures_of, section, table
-from wlr_gym.gap.report.text import duration, number
+from wlr_gym.base.html import commands, document, folded, pictures_of, section, table
+from wlr_gym.base.text import duration, number
 from wlr_gym.learning.sweep import figures
 from wlr_gym.learning.sweep.plan import SweepPlan
 from wlr_gym.learning.sweep.results import (

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from wlr_gym.base import jobs as jobs_module
 from wlr_gym.base.errors import InputError
-from wlr_gym.learning.sweep import jobs as jobs_module
-from wlr_gym.learning.sweep.jobs import Ended, Job, follow
+from wlr_gym.base.jobs import Ended, Job, follow
 
 #: Address that means: start Ray on this machine.
 LOCAL = "local"

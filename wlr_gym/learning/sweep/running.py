@@ -16,10 +16,10 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.jobs import Ended, Job, spread
 from wlr_gym.base.provenance import PROVENANCE_FILE, provenance, write_yaml
 from wlr_gym.base.settings import parse_config, read_yaml
-from wlr_gym.gap.report.text import duration
-from wlr_gym.learning.sweep.jobs import Ended, Job, spread
+from wlr_gym.base.text import duration
 from wlr_gym.learning.sweep.page import write_page
 from wlr_gym.learning.sweep.plan import SweepPlan, Trial, known_settings, resolve, trial_of, trials_of
 from wlr_gym.learning.sweep.results import (

@@ -10,12 +10,12 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import locked
-from wlr_gym.learning.sweep.jobs import Job, follow, spread
+from wlr_gym.base.jobs import Job, follow, spread
 
 #: Says what it sees, and leaves a file when it is ended in good order.
 MODULE = """
 import os, signal, sys, time, pathlib
-from wlr_gym.learning.sweep.jobs import serve
+from wlr_gym.base.jobs import serve
 
 def work(task, send):
     here = pathlib.Path(task["folder"])
@@ -81,7 +81,7 @@ def test_jobs_end_in_good_order_with_who_runs_them(job, tmp_path):
 
 
 def test_jobs_end_in_good_order_when_who_waits_is_killed(job, tmp_path):
-    code = f"from wlr_gym.learning.sweep.jobs import *\nfollow({job('wait')!r}, print)"
+    code = f"from wlr_gym.base.jobs import *\nfollow({job('wait')!r}, print)"
     waiting = subprocess.Popen([sys.executable, "-c", code])
     wait_for(tmp_path / "began")
     waiting.send_signal(signal.SIGKILL)
