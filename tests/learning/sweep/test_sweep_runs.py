@@ -94,28 +94,6 @@ def test_a_sweep_that_is_stopped_resumes_exactly(tmp_path, hold):
         assert_like_alone(one, tmp_path / f"alone_{one.trial.seed}")
 
 
-def test_settings_that_explain_the_scores_are_important(tmp_path):
-    from wlr_gym.learning.sweep.plan import trial_of
-    from wlr_gym.learning.sweep.results import TrialResult, importance, summarise
-
-    random = np.random.default_rng(0)
-    results = []
-    for rate in np.geomspace(1e-4, 1e-2, 12):
-        for gamma in (0.9, 0.97):
-            for seed in range(3):
-                score = {"steps": 10.0, "tracking_error": abs(np.log10(rate) + 3) + 0.1 * random.standard_normal()}
-                trial = trial_of({"learning_rate": float(rate), "gamma": gamma}, seed)
-                results.append(TrialResult(trial, "done", [score], 10, 1.0, "", tmp_path))
-    shares = importance(results, "tracking_error")
-    assert list(shares) == ["learning_rate", "gamma"]
-    assert shares["learning_rate"] > 0.6
-    assert shares["gamma"] < 0.05
-    ranking = summarise(results, "tracking_error")
-    assert 5e-4 < ranking[0].settings["learning_rate"] < 2e-3
-    assert len(ranking[0].values) == 3
-    assert [one.mean for one in ranking] == sorted(one.mean for one in ranking)
-
-
 def test_a_search_without_ray_names_the_extra(tmp_path, monkeypatch):
     import importlib.util
 

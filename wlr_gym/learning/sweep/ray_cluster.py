@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import socket
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -73,7 +73,7 @@ def carried(*modules: Any) -> Iterator[None]:
             cloudpickle.unregister_pickle_by_value(module)
 
 
-def spread_on_ray(jobs: Iterable[Job], nodes: NodeSelector, at_once: int | None = None) -> Iterator[Ended]:
+def spread_on_ray(jobs: Iterable[Job], nodes: NodeSelector, at_once: int | None = None) -> Generator[Ended, None, None]:
     """Run jobs on the connected cluster, a core each; yield how each ended, as it does.
 
     A job whose node is lost is started again on another one.
