@@ -7,7 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from sweep_runs import ENVIRONMENT, SETTINGS, assert_like_alone, checkpoints, wait_until
+from sweep_runs import ENVIRONMENT, SETTINGS, assert_like_alone, checkpoints
+from waiting import wait_until
 
 import wlr_gym
 from wlr_gym.base.errors import InputError
@@ -29,8 +30,17 @@ sys.meta_path.insert(0, Without())
 """
 
 
+@pytest.fixture(scope="module", autouse=True)
+def patient_ray():
+    """Ray kills no process for the machine's memory, which other tests fill, and no node because it answers late."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_memory_monitor_refresh_ms", "0")
+        patch.setenv("RAY_health_check_timeout_ms", "60000")
+        yield
+
+
 @pytest.fixture(scope="module")
-def cluster(hold):
+def cluster(hold_file):
     """One node with one core."""
     from ray.cluster_utils import Cluster
 
@@ -46,9 +56,11 @@ def test_a_node_dies_in_mid_run_and_the_sweep_ends_complete(cluster, hold, tmp_p
     hold.touch()
 
     def kill_the_node():
-        wait_until(lambda: len(checkpoints(out)) == 2)  # both nodes are at work
-        cluster.remove_node(node, allow_graceful=False)
-        hold.unlink()
+        try:
+            wait_until(lambda: len(checkpoints(out)) == 2)  # both nodes are at work
+            cluster.remove_node(node, allow_graceful=False)
+        finally:
+            hold.unlink()  # or the sweep would wait for ever
 
     with ThreadPoolExecutor(1) as beside:
         killing = beside.submit(kill_the_node)

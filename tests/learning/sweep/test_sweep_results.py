@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pandas
 import pytest
-from sweep_runs import wait_until
+from waiting import wait_until
 
 import wlr_gym
 from wlr_gym.base.errors import InputError

@@ -8,7 +8,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from sweep_runs import ENVIRONMENT, SETTINGS, assert_like_alone, checkpoints, wait_until
+from sweep_runs import ENVIRONMENT, SETTINGS, assert_like_alone, checkpoints
+from waiting import LONGEST, wait_until
 
 import wlr_gym
 from wlr_gym.base.settings import read_yaml
@@ -81,7 +82,7 @@ def test_a_sweep_that_is_stopped_resumes_exactly(tmp_path, hold):
         )
         wait_until(lambda before=before, at_work=at_work: len(checkpoints(out) - before) == at_work, driver)
         driver.send_signal(number)
-        said = driver.communicate(timeout=240)[1]
+        said = driver.communicate(timeout=LONGEST)[1]
         if number != signal.SIGKILL:
             assert f"resume with: wlr sweep --resume {out}" in said
             assert (out / "sweep.html").is_file()
