@@ -7,8 +7,8 @@ from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 OWN = GibbsAppellPlant._choose_kernel
 
 
-def choose_shared(plant: GibbsAppellPlant) -> None:
+def choose_shared(self: GibbsAppellPlant) -> None:
     """Choose the kernel for all effects where the robot has any."""
-    if drive.families(plant.parameters) | ground.families(plant.parameters):
-        plant.expect_all_effects()
-    OWN(plant)
+    if drive.families(self.parameters) | ground.families(self.parameters):
+        self.expect_all_effects()
+    OWN(self)

@@ -4,6 +4,8 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from waiting import wait_until
@@ -63,6 +65,12 @@ def test_a_log_that_cannot_be_written_is_an_error_of_its_job(job, tmp_path):
     ended = {one.name: one.error for one in spread([bad, good], 1)}
     assert ended["speak"] == ""
     assert "cannot be started" in ended["bad"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no disk that is always full")
+def test_the_error_is_known_though_the_log_is_on_the_full_disk(job):
+    full = replace(job("raise"), log="/dev/full")
+    assert "No space left on device" in follow(full, print)
 
 
 def test_jobs_end_in_good_order_with_who_runs_them(job, tmp_path):

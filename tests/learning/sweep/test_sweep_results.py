@@ -117,6 +117,17 @@ def test_jobs_are_ended_before_an_interruption_goes_on(book):
     assert (ended, caught.type) == (["in good order"], KeyboardInterrupt)
 
 
+def test_a_table_that_cannot_be_written_says_what_is_there(book, monkeypatch):
+    write_curve(book.folder / "trials" / TRIALS[0].name, 64)
+
+    def full(results, folder):
+        raise InputError(f"{folder}/trials.parquet: cannot be written: No space left on device")
+
+    monkeypatch.setattr(running, "write_table", full)
+    with pytest.raises(InputError, match=r"No space left.*failed: 1.*wlr sweep --resume"):
+        book.result_of(lambda: book.end(TRIALS[0], "no space"))
+
+
 def test_two_cannot_run_one_sweep(tmp_path, monkeypatch):
     monkeypatch.setattr(running, "_HANDOVER", 0.1)
     write_yaml(tmp_path / "sweep.yaml", PLAN.model_dump(mode="json"))

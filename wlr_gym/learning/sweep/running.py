@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -347,9 +348,18 @@ class _Book:
             raise KeyboardInterrupt(
                 f"interrupted; trials have checkpoints; resume with: wlr sweep --resume {self.folder}"
             ) from None
-        self.write()
+        try:
+            self.write()
+        except InputError as problem:
+            again = f"wlr sweep --resume {self.folder}"
+            raise InputError(f"{problem}; {self._count()}; when it can be written: {again}") from None
         results = self.results()
         return SweepResult(self.folder, results, summarise(results, self.plan.metric))
+
+    def _count(self) -> str:
+        """Return how many trials there are of each status, in words."""
+        found = Counter(one.status for one in self.results())
+        return f"trials {', '.join(f'{status}: {number}' for status, number in found.items())}"
 
     def write(self) -> None:
         """Write table and page; trials that were stopped early write their last checkpoint before they are read."""
