@@ -118,7 +118,7 @@ def _report(found: SweepResult) -> int:
         best = found.ranking[0]
         runs = len(best.values)
         _say(f"best: {name_of(best.settings)}: {number(best.mean)} over {runs} seed{'s' if runs > 1 else ''}")
-        _say(f"score it: wlr evaluate {best.results[0].folder}")
+        _say(f"score it: wlr evaluate {best.policies}")
     _say(f"table: {found.folder / TABLE_FILE}\npage: {found.folder / PAGE_FILE}")
     if found.failed:
         _say(f"{len(found.failed)} trials FAILED; try them again: wlr sweep --resume {found.folder}")

@@ -1,6 +1,7 @@
 """What a sweep knows of its trials, and does as they end: the table, the ranking, what matters. Nothing is trained here."""
 
 import os
+import shlex
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import Ended
 from wlr_gym.base.provenance import write_yaml
+from wlr_gym.learning.evaluation.training_seeds import expand
 from wlr_gym.learning.sweep import running
 from wlr_gym.learning.sweep.plan import SweepPlan, trial_of, trials_of
 from wlr_gym.learning.sweep.results import TrialResult, importance, summarise, write_table
@@ -68,6 +70,30 @@ def test_a_trial_that_has_ended_is_read_once(book, monkeypatch):
     book.train(TRIALS, lambda jobs: (Ended(job.name) for job in jobs))
     assert sorted(set(reads)) == sorted(trial.name for trial in TRIALS)
     assert len(reads) <= 2 * len(TRIALS)
+
+
+def test_the_page_is_written_while_others_are_trained_and_not_for_each(book, monkeypatch):
+    pages, now = [], [1000.0]
+    monkeypatch.setattr(running, "write_page", lambda plan, results, folder: pages.append(now[0]))
+    monkeypatch.setattr(running.time, "monotonic", lambda: now[0])
+    book._page_due = 1060.0
+    for seconds in (30.0, 31.0, 1.0, 60.0):
+        now[0] += seconds
+        book.end(TRIALS[0], "")
+    assert pages == [1061.0, 1122.0]
+
+
+def test_all_seeds_of_the_best_are_scored_as_one_column(tmp_path):
+    """The command that is printed names its trials, no others."""
+    folders = [tmp_path / "a sweep" / "trials" / trial.name for trial in trials_of([{"gamma": 0.9}, {"gamma": 0.95}], [0, 12])]
+    for folder in folders:
+        (folder / "policy").mkdir(parents=True)
+        (folder / "policy" / "contract.json").write_text("{}")
+    results = [result({"gamma": 0.9}, folder, seed=seed) for folder, seed in zip(folders, (0, 12), strict=False)]
+    (text,) = shlex.split(summarise(results, "tracking_error")[0].policies)
+    assert expand(text) == (str(folders[0]), str(folders[1]))
+    (text,) = shlex.split(summarise(results[1:], "tracking_error")[0].policies)
+    assert text == str(folders[1])
 
 
 def test_what_failed_is_read_again_when_it_was_tried_again(book):

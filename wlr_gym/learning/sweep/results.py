@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,6 +178,13 @@ class Summary:
     def mean(self) -> float:
         """Mean over the seeds."""
         return float(np.mean(self.values))
+
+    @property
+    def policies(self) -> str:
+        """Its trainings as ``wlr evaluate`` takes them, quoted for a shell: all seeds as one column."""
+        first = self.results[0]
+        every = first.folder.with_name(first.trial.name.removesuffix(str(first.trial.seed)) + "*")
+        return shlex.quote(str(first.folder if len(self.results) == 1 else every))
 
 
 def summarise(results: Sequence[TrialResult], metric: str) -> list[Summary]:

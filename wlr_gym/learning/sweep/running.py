@@ -264,6 +264,7 @@ class _Book:
         self._ended: dict[str, tuple[str, str]] = {}
         self._known: dict[str, TrialResult] = {}
         self._began, self._done, self._expected = time.monotonic(), 0, 0
+        self._page_due = self._began + 60.0
 
     @property
     def size(self) -> str:
@@ -309,8 +310,16 @@ class _Book:
         self.say(self._line(trial))
         try:
             write_table(self.results(), self.folder)
+            self._write_page_now_and_then()
         except InputError as problem:  # a full disk; the trials go on
             self.say(str(problem))
+
+    def _write_page_now_and_then(self) -> None:
+        """Write the page as trials end, each minute at most and in 2 % of the time at most."""
+        if (began := time.monotonic()) < self._page_due:
+            return
+        write_page(self.plan, self.results(), self.folder)
+        self._page_due = time.monotonic() + max(60.0, 50.0 * (time.monotonic() - began))
 
     def _line(self, trial: Trial) -> str:
         result = self._result(trial)
