@@ -32,8 +32,9 @@ sys.meta_path.insert(0, Without())
 
 @pytest.fixture(scope="module", autouse=True)
 def patient_ray():
-    """Ray kills no process for the machine's memory, which other tests fill, and no node because it answers late."""
+    """Other tests may fill memory and cores: Ray kills no process for that, and no node that answers late."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_worker_niceness", "0")
         patch.setenv("RAY_memory_monitor_refresh_ms", "0")
         patch.setenv("RAY_health_check_timeout_ms", "60000")
         yield
