@@ -30,7 +30,7 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
         workers: cores of a Ray that is started here; None = all.
 
     Raises:
-        InputError: there is no such cluster.
+        InputError: there is no such cluster, or Ray cannot be started.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
@@ -44,8 +44,9 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
         else:
             _require_answer(address)
             ray.init(address=address, **quiet)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise InputError(f"--ray {address}: no Ray cluster answers: {str(error).splitlines()[0]}") from None
+    except Exception as error:  # Ray raises that itself where a node takes more than 30 s to start
+        what = "Ray cannot be started" if address == LOCAL else "no Ray cluster answers"
+        raise InputError(f"--ray {address}: {what}: {next(iter(str(error).splitlines()), type(error).__name__)}") from None
     try:
         with carried(jobs_module, importlib.import_module(__name__)):
             yield
