@@ -18,3 +18,8 @@ def duration(seconds: float) -> str:
     if whole >= 3600:
         return f"{whole // 3600} h {whole % 3600 // 60} min"
     return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
+
+
+def counted(count: int, word: str) -> str:
+    """Return ``1 trial``, ``2 trials``."""
+    return f"{count} {word}{'' if count == 1 else 's'}"

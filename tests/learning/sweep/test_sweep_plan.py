@@ -84,6 +84,8 @@ def test_long_names_stay_different():
         ({"space": {"environment.task": ["a/b", "a_b"]}}, "two trials are called"),
         ({"space": {"batch_size": [512, 500]}}, "batch_size 500 does not divide"),
         ({"agent": "do_nothing"}, "agents that have"),
+        ({"agent": "pid", "space": {"yaw_rate_q": [1.0]}}, "did you mean 'yaw_rate_p'"),
+        ({"agent": "slip_compensating", "settings": {"gamma": 0.9}}, "agent 'slip_compensating': unknown key 'gamma'"),
         ({"config": "ppo_blnd"}, "did you mean 'ppo_blind'"),
         ({"environment": "WLR-Velocty-v0"}, "WLR-Velocity-v0"),
     ],

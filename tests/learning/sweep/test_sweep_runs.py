@@ -45,7 +45,7 @@ def test_one_fails_the_others_go_on_and_a_resume_completes_it(tmp_path, monkeypa
     assert main(["sweep", str(file), "--out", str(out), "--workers", "2"]) == 1
     printed = capsys.readouterr().out
     assert "gamma=0.9,seed=0: FAILED: OSError: [Errno 28] No space left on device" in printed
-    assert "1 trials FAILED" in printed
+    assert "1 trial FAILED" in printed
     assert "No space left on device" in (out / "sweep.html").read_text()
     (tmp_path / "disk_for_tests.full").unlink()
     assert main(["sweep", "--resume", str(out)]) == 0

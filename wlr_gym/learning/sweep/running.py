@@ -20,7 +20,7 @@ from wlr_gym.base.files import locked, make_output_folder
 from wlr_gym.base.jobs import PATIENCE, Ended, Job, spread
 from wlr_gym.base.provenance import PROVENANCE_FILE, provenance, write_yaml
 from wlr_gym.base.settings import parse_config, read_yaml
-from wlr_gym.base.text import duration
+from wlr_gym.base.text import counted, duration
 from wlr_gym.learning.sweep.page import write_page
 from wlr_gym.learning.sweep.plan import SweepPlan, Trial, known_settings, resolve, trial_of, trials_of
 from wlr_gym.learning.sweep.results import (
@@ -275,9 +275,9 @@ class _Book:
         steps = plan.settings.get("total_steps")
         each = f" of {steps:,} environment steps" if isinstance(steps, int) and "total_steps" not in plan.space else ""
         if plan.search is None:
-            return f"{count * seeds} trials: {count} settings x {seeds} seeds{each}"
+            return f"{counted(count * seeds, 'trial')}: {count} settings x {counted(seeds, 'seed')}{each}"
         best = min(plan.search.repeat_best, count)
-        return f"{count} trials{each}, then the best {best} with {seeds} seeds"
+        return f"{counted(count, 'trial')}{each}, then the best {best} with {counted(seeds, 'seed')}"
 
     def enter(self, trial: Trial) -> None:
         """Count a trial in."""
