@@ -8,19 +8,11 @@ def shared_kernels():
     A family that a robot does not use changes none of its bits: tests/physics/test_effect_bits_engine.py, on the product's own
     choice (``own_kernels``).
     """
-    from wlr_gym.physics.plants import drive, ground
-    from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
-
-    choose = GibbsAppellPlant._choose_kernel
-
-    def choose_shared(plant: GibbsAppellPlant) -> None:
-        if drive.families(plant.parameters) | ground.families(plant.parameters):
-            plant.expect_all_effects()
-        choose(plant)
+    from shared_kernels import OWN, GibbsAppellPlant, choose_shared
 
     patch = pytest.MonkeyPatch()
     patch.setattr(GibbsAppellPlant, "_choose_kernel", choose_shared)
-    yield choose
+    yield OWN
     patch.undo()
 
 

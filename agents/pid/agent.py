@@ -14,6 +14,11 @@ from wlr_gym.policy import Training
 from wlr_gym.policy.control import Pid, PidConfig, task_settings
 
 
+def check_settings(config: Mapping[str, Any]) -> None:
+    """Refuse settings that are none."""
+    task_settings(PidConfig, {"task": ""}, config, "pid")
+
+
 def make_policy(contract: Mapping[str, Any], config: Mapping[str, Any]) -> Pid:
     """Return the controller for an environment's contract."""
     return Pid(contract, task_settings(PidConfig, contract, config, "pid"))

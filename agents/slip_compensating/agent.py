@@ -11,6 +11,11 @@ from wlr_gym.policy.control import task_settings
 from wlr_gym.policy.slip_compensating import SlipCompensating, SlipCompensatingConfig
 
 
+def check_settings(config: Mapping[str, Any]) -> None:
+    """Refuse settings that are none."""
+    task_settings(SlipCompensatingConfig, {"task": ""}, config, "slip_compensating")
+
+
 def make_policy(contract: Mapping[str, Any], config: Mapping[str, Any]) -> SlipCompensating:
     """Return the controller for an environment's contract."""
     return SlipCompensating(contract, task_settings(SlipCompensatingConfig, contract, config, "slip_compensating"))

@@ -12,6 +12,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.text import number
 from wlr_gym.data.format import CHANNELS, COLUMNS
 from wlr_gym.gap.analysis import Analysis, ChannelGap, Evidence, FoundEffect, HeatMap, IntakeFinding, ParameterEstimate, Place
 from wlr_gym.gap.report import folder
@@ -19,20 +20,7 @@ from wlr_gym.gap.report.folder import check_folder, save_analysis
 from wlr_gym.gap.report.page import report
 from wlr_gym.gap.report.plots import draw, figures
 from wlr_gym.gap.report.result import result_of
-from wlr_gym.gap.report.text import (
-    _GROUPS,
-    channel,
-    closure,
-    error,
-    estimate,
-    feature,
-    number,
-    percent,
-    places,
-    plain,
-    sentence,
-    title,
-)
+from wlr_gym.gap.report.text import _GROUPS, channel, closure, error, estimate, feature, percent, places, plain, sentence, title
 
 EVERY = pytest.mark.parametrize("analysis", examples.ALL.values(), ids=list(examples.ALL))
 PICTURE = {"gap": b"\x89PNG"}
@@ -326,9 +314,6 @@ def test_states_come_with_their_unit():
 
 
 def test_numbers_in_words():
-    assert [number(value) for value in (0.041249, 5312.4, 12.0, 1e-7, -0.5, float("nan"))] == [
-        "0.0412", "5312", "12", "1e-07", "-0.5", "-"
-    ]  # fmt: skip
     assert [error(value) for value in (1.0, 12.34, 456.0, float("nan"))] == ["1.00", "12.3", "456", "-"]
     assert [percent(share) for share in (0.951, -0.004, -0.27)] == ["95 %", "0 %", "-27 %"]
     angle = examples.UNKNOWN_EFFECT.effects[0].parameters["a0"]

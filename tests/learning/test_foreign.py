@@ -74,7 +74,9 @@ def test_a_plain_network(env, tmp_path):
     network = torch.nn.Sequential(
         torch.nn.LayerNorm(width), torch.nn.Linear(width, 16), torch.nn.SiLU(), torch.nn.Linear(16, 8)
     )
+    network[1].eval()  # the rest is in training, and stays
     parity = wlr_gym.import_policy(network, env, tmp_path / "p.onnx", normalizer=torch.nn.Hardtanh(-0.5, 0.5))
+    assert [module.training for module in network] == [True, False, True, True]
     assert parity.real <= 1e-5
     seen = readings(env)
     with torch.no_grad():
@@ -84,12 +86,21 @@ def test_a_plain_network(env, tmp_path):
     assert (contract["agent"], contract["training"]["environment"]) == ("imported", ID)
 
 
+class Branch(torch.nn.Linear):
+    """What no graph can be: which way it goes depends on its input."""
+
+    def forward(self, input):
+        return super().forward(input) if input.sum() > 0.0 else -super().forward(input)
+
+
 def test_what_does_not_fit_is_refused_and_leaves_nothing(env, tmp_path, capsys):
     out = tmp_path / "p.onnx"
     width = env.observation_space.shape[0]
     for network, message in (
         (torch.nn.Linear(3, 8), f"rows of {width} numbers"),
         (torch.nn.Linear(width, 7), r"expected float32 of shape \(2, 8\)"),
+        (torch.nn.LSTM(width, 8), r"returns tuple for 2 observations, expected float32 of shape \(2, 8\)"),
+        (Branch(width, 8), "cannot be written as an ONNX graph: "),
     ):
         with pytest.raises(InputError, match=message):
             wlr_gym.import_policy(network, env, out)

@@ -1,1 +1,4 @@
-"""What every package may use: errors, files, paths, provenance, random numbers, settings. Imports nothing above it."""
+"""What every package may use: errors, files, jobs, paths, provenance, random numbers, reports, settings.
+
+Imports nothing above it.
+"""

@@ -51,7 +51,7 @@ def run(options: DemoOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.gap.report.text import duration
+    from wlr_gym.base.text import duration
     from wlr_gym.studies.demo.page import write_page
     from wlr_gym.studies.demo.workers import WORKERS, run_workers
 

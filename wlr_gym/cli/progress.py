@@ -46,6 +46,6 @@ def progress(console: Console, workers: Sequence[str] = ("",), shown: bool = Tru
 
 def time_left(passed: float, share: float) -> str:
     """Return the remaining time in words; empty while it is not known."""
-    from wlr_gym.gap.report.text import duration
+    from wlr_gym.base.text import duration
 
     return f"about {duration(passed * (1.0 - share) / share)} left" if LEAST_SHARE <= share < 1.0 and passed > 1.0 else ""

@@ -12,9 +12,9 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config, parse_yaml
+from wlr_gym.base.text import counted, number
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import ray_address
-from wlr_gym.gap.report.text import number
 from wlr_gym.learning.sweep.page import PAGE_FILE, name_of
 from wlr_gym.learning.sweep.plan import SweepPlan, read_plan
 from wlr_gym.learning.sweep.results import TABLE_FILE
@@ -116,10 +116,9 @@ def _nest(settings: dict[str, Any], path: list[str], value: Any) -> None:
 def _report(found: SweepResult) -> int:
     if found.ranking:
         best = found.ranking[0]
-        runs = len(best.values)
-        _say(f"best: {name_of(best.settings)}: {number(best.mean)} over {runs} seed{'s' if runs > 1 else ''}")
-        _say(f"score it: wlr evaluate {best.results[0].folder}")
+        _say(f"best: {name_of(best.settings)}: {number(best.mean)} over {counted(len(best.values), 'seed')}")
+        _say(f"score it: wlr evaluate {best.policies}")
     _say(f"table: {found.folder / TABLE_FILE}\npage: {found.folder / PAGE_FILE}")
     if found.failed:
-        _say(f"{len(found.failed)} trials FAILED; try them again: wlr sweep --resume {found.folder}")
+        _say(f"{counted(len(found.failed), 'trial')} FAILED; try them again: wlr sweep --resume {found.folder}")
     return FAILED if found.failed else OK

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -70,12 +71,36 @@ def import_policy(
     contract = bare.contract()
     width, actions = len(contract["observation"]), len(contract["action"])
     source = network if isinstance(network, torch.nn.Module) else sb3_network(Path(network))
-    whole = _Whole(_normalizer(normalizer, width), source).eval()
-    _check(whole, width, actions)
+    whole = _Whole(_normalizer(normalizer, width), source)
     task = bare.core.settings.task
     config = {"environment": {"task": dict(task)} if isinstance(task, Mapping) else {}}
     content = policy_content(AGENT, config, contract, {"environment": bare.spec.id})
-    return write_policy_file(Path(out), to_onnx(whole, width), content, ModulePolicy(whole), _driven(bare, whole))
+    with _acting(whole):
+        _check(whole, width, actions)
+        try:
+            graph = to_onnx(whole, width)
+        except torch.onnx.OnnxExporterError as error:
+            raise InputError(f"the network cannot be written as an ONNX graph: {_reason(error)}") from error
+        return write_policy_file(Path(out), graph, content, ModulePolicy(whole), _driven(bare, whole))
+
+
+@contextmanager
+def _acting(network: torch.nn.Module) -> Iterator[None]:
+    """Let a network act, not train, until the end of the block; then each of its modules is as it was."""
+    before = {module: module.training for module in network.modules()}
+    network.eval()
+    try:
+        yield
+    finally:
+        for module, training in before.items():
+            module.training = training
+
+
+def _reason(error: BaseException) -> str:
+    """Return the first line of what the exporter itself ran into."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return f"{type(error).__name__}: {next(iter(str(error).strip().splitlines()), '')}"
 
 
 class _Whole(torch.nn.Module):
@@ -87,7 +112,11 @@ class _Whole(torch.nn.Module):
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """Return actions (N, 8) for observations (N, D)."""
-        return torch.clamp(self.network(self.normalizer(observation)), -1.0, 1.0)
+        return torch.clamp(self.unclipped(observation), -1.0, 1.0)
+
+    def unclipped(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return what the network itself answers."""
+        return self.network(self.normalizer(observation))
 
 
 def _driven(bare: Any, network: torch.nn.Module) -> NDArray[np.float32]:
@@ -100,14 +129,14 @@ def _driven(bare: Any, network: torch.nn.Module) -> NDArray[np.float32]:
         core.close()
 
 
-def _check(network: torch.nn.Module, width: int, actions: int) -> None:
+def _check(network: _Whole, width: int, actions: int) -> None:
     """Refuse a network that does not map observations to actions."""
     try:
         with torch.no_grad():
-            found = network(torch.zeros(2, width))
+            found = network.unclipped(torch.zeros(2, width))
     except (RuntimeError, ValueError, TypeError) as error:
         raise InputError(
-            f"the network does not take the environment's observations, rows of {width} numbers: {error}"
+            f"the network does not take the environment's observations, rows of {width} numbers: {_reason(error)}"
         ) from None
     if not isinstance(found, torch.Tensor) or found.shape != (2, actions) or found.dtype != torch.float32:
         what = f"{found.dtype} of shape {tuple(found.shape)}" if isinstance(found, torch.Tensor) else type(found).__name__

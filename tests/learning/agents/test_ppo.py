@@ -5,12 +5,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
 import yaml
 from ppo_runs import ENVIRONMENT, SETTINGS, assert_same_weights, curve, train, weights
+from waiting import wait_until
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
@@ -79,9 +79,7 @@ def test_killed_run_resumes_exactly(run, tmp_path):
     options = ["--config", str(blank), "--out", str(folder), "--no-progress", "--set", *changes]
     process = subprocess.Popen([*command, *options], stdout=subprocess.DEVNULL)
     try:
-        deadline = time.monotonic() + 120
-        while not list(folder.glob("checkpoints/step_*")) and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.02)
+        wait_until(lambda: list(folder.glob("checkpoints/step_*")), process)
     finally:
         process.kill()
         process.wait()

@@ -1,9 +1,11 @@
-"""What trials of the sweeps' tests import: a task of short episodes, and a training that waits in mid-run."""
+"""What trials of the sweeps' tests import: a task of short episodes, a training that waits in mid-run, the tests' kernels."""
 
 import os
 import tempfile
 import time
 from pathlib import Path
+
+from shared_kernels import GibbsAppellPlant, choose_shared
 
 import wlr_gym
 from wlr_gym.base.paths import find_config
@@ -37,5 +39,6 @@ def wait_at_checkpoints() -> None:
     training.StopRequest._take, training_log.TrainingLog.save_checkpoint = take_and_note, save_and_wait
 
 
+GibbsAppellPlant._choose_kernel = choose_shared
 if HOLD.is_file():
     wait_at_checkpoints()

@@ -1,8 +1,5 @@
 """A small sweep, trials that wait in mid-run, and how a trial is compared with the same training run alone."""
 
-import subprocess
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +24,6 @@ SETTINGS: dict[str, Any] = {
 def checkpoints(out: Path) -> set[Path]:
     """Return the checkpoints of all trials of a sweep."""
     return set(out.glob("trials/*/checkpoints/step_*"))
-
-
-def wait_until(happened: Callable[[], object], process: subprocess.Popen | None = None) -> None:
-    """Wait until ``happened()``; the process that makes it happen must live as long."""
-    deadline = time.monotonic() + 240.0
-    while not happened():
-        assert time.monotonic() < deadline, "it never happened"
-        assert process is None or process.poll() is None, "the process ended before"
-        time.sleep(0.02)
 
 
 def weights(folder: Path) -> dict[str, Any]:

@@ -4,10 +4,12 @@ import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from sweep_runs import ENVIRONMENT, SETTINGS, assert_like_alone, checkpoints, wait_until
+from sweep_runs import ENVIRONMENT, SETTINGS, assert_like_alone, checkpoints
+from waiting import LONGEST, wait_until
 
 import wlr_gym
 from wlr_gym.base.errors import InputError
@@ -29,8 +31,37 @@ sys.meta_path.insert(0, Without())
 """
 
 
+@pytest.fixture(scope="module", autouse=True)
+def patient_ray():
+    """Other tests may fill memory and cores: Ray kills no process for it and gives no slow node up."""
+    from ray._private import services
+    from ray.cluster_utils import Cluster
+
+    ask = services.get_node
+
+    def ask_until_there(*arguments):
+        found = []
+
+        def there():
+            with suppress(RuntimeError):
+                found.append(ask(*arguments))
+            return found
+
+        wait_until(there)
+        return found[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_worker_niceness", "0")
+        patch.setenv("RAY_memory_monitor_refresh_ms", "0")
+        patch.setenv("RAY_health_check_timeout_ms", "60000")
+        patch.setenv("RAY_gcs_server_port_wait_time_s", f"{LONGEST:.0f}")
+        patch.setattr(services, "get_node", ask_until_there)  # 30 s, whatever the machine does
+        patch.setattr(Cluster._wait_for_node, "__defaults__", (LONGEST,))
+        yield
+
+
 @pytest.fixture(scope="module")
-def cluster(hold):
+def cluster(hold_file):
     """One node with one core."""
     from ray.cluster_utils import Cluster
 
@@ -46,9 +77,11 @@ def test_a_node_dies_in_mid_run_and_the_sweep_ends_complete(cluster, hold, tmp_p
     hold.touch()
 
     def kill_the_node():
-        wait_until(lambda: len(checkpoints(out)) == 2)  # both nodes are at work
-        cluster.remove_node(node, allow_graceful=False)
-        hold.unlink()
+        try:
+            wait_until(lambda: len(checkpoints(out)) == 2)  # both nodes are at work
+            cluster.remove_node(node, allow_graceful=False)
+        finally:
+            hold.unlink()  # or the sweep would wait for ever
 
     with ThreadPoolExecutor(1) as beside:
         killing = beside.submit(kill_the_node)
@@ -119,3 +152,12 @@ def test_no_cluster_answers(tmp_path):
     with pytest.raises(InputError, match=r"--ray 127.0.0.1:1: no Ray cluster answers"):
         wlr_gym.sweep(ENVIRONMENT, tmp_path / "out", ray="127.0.0.1:1")
     assert Path(tmp_path / "out" / "sweep.yaml").is_file()  # to be resumed when there is one
+
+
+def test_ray_that_cannot_be_started_is_said(tmp_path, monkeypatch):
+    def init(**options):
+        raise Exception("The current node timed out during startup.\nMore of it.")
+
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(InputError, match=r"--ray local: Ray cannot be started: The current node timed out during startup\.$"):
+        wlr_gym.sweep(ENVIRONMENT, tmp_path / "out", ray="local")

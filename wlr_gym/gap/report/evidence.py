@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from html import escape
 
+from wlr_gym.base.html import heading, section, table
+from wlr_gym.base.text import number
 from wlr_gym.gap.analysis import REJECTED, SELECTED, Analysis, Evidence, FoundEffect
 from wlr_gym.gap.problem import Range
-from wlr_gym.gap.report.html import heading, section, table
-from wlr_gym.gap.report.text import estimate, listed, number, percent, places, plain, unit_of
+from wlr_gym.gap.report.text import estimate, listed, percent, places, plain, unit_of
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.html import commands, document, folded, heading, pictures_of, section, table
+from wlr_gym.base.text import duration, number
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.gap.analysis import (
     BAD_DATA,
@@ -28,18 +30,15 @@ from wlr_gym.gap.analysis import (
     Statistic,
 )
 from wlr_gym.gap.report.evidence import evidence_section
-from wlr_gym.gap.report.html import commands, document, folded, heading, pictures_of, section, table
 from wlr_gym.gap.report.recommendation import record_commands
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, patch_of
 from wlr_gym.gap.report.text import (
     adequacy,
     channel,
     closure,
-    duration,
     error,
     interval,
     listed,
-    number,
     percent,
     places,
     plain,

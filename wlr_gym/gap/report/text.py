@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
+from wlr_gym.base.text import number
 from wlr_gym.gap.analysis import (
     BAD_DATA,
     EFFECT_FOUND,
@@ -114,13 +115,6 @@ def listed(words: Sequence[str], last: str = "and") -> str:
 # ---- numbers ---------------------------------------------------------------------------------------------------------
 
 
-def number(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits; ``-`` if it is none."""
-    if not math.isfinite(value):
-        return "-"
-    return f"{value:.0f}" if 10**digits <= abs(value) < 1e7 else f"{value:.{digits}g}"
-
-
 def error(value: float) -> str:
     """Return an error in units of noise, with as many decimals as one can care for."""
     return f"{value:.{2 if value < 9.995 else 1 if value < 99.95 else 0}f}" if math.isfinite(value) else "-"
@@ -159,12 +153,6 @@ def _digits(value: float, uncertainty: float) -> int:
     if not 0.0 < uncertainty < abs(value):
         return 3
     return max(3, math.ceil(math.log10(abs(value) / uncertainty)) + 1)
-
-
-def duration(seconds: float) -> str:
-    """Return ``3 min 20 s``."""
-    whole = round(seconds)
-    return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
 
 
 # ---- the verdict -----------------------------------------------------------------------------------------------------

@@ -57,6 +57,8 @@ def curves(ranking: Sequence[Summary], names: Sequence[str], metric: str) -> Fig
             _draw(axes, ranking[rank], names[rank], name, COLOURS[rank] if rank < len(COLOURS) else OTHERS)
         axes.set(xlabel="environment steps (millions)", ylabel=_WORDS[name])
         axes.grid(alpha=0.3)
+        if name == "success":
+            axes.set_ylim(-2.0, 102.0)
         if name == "tracking_error":
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")

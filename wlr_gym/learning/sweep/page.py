@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -11,8 +12,8 @@ import numpy as np
 
 from wlr_gym import __version__
 from wlr_gym.base.files import write_text
-from wlr_gym.gap.report.html import commands, document, folded, pictures_of, section, table
-from wlr_gym.gap.report.text import duration, number
+from wlr_gym.base.html import commands, document, folded, pictures_of, section, table
+from wlr_gym.base.text import duration, number
 from wlr_gym.learning.sweep import figures
 from wlr_gym.learning.sweep.plan import SweepPlan
 from wlr_gym.learning.sweep.results import (
@@ -41,10 +42,10 @@ def write_page(plan: SweepPlan, results: Sequence[TrialResult], folder: Path) ->
     Raises:
         InputError: it cannot be written.
     """
-    write_text(folder / PAGE_FILE, page(plan, results, folder))
+    write_text(folder / PAGE_FILE, page(plan, results))
 
 
-def page(plan: SweepPlan, results: Sequence[TrialResult], folder: Path) -> str:
+def page(plan: SweepPlan, results: Sequence[TrialResult]) -> str:
     """Return the page."""
     ranking = summarise(results, plan.metric)
     count = {status: sum(one.status == status for one in results) for status in (DONE, STOPPED_EARLY, FAILED, UNFINISHED)}
@@ -57,7 +58,7 @@ def page(plan: SweepPlan, results: Sequence[TrialResult], folder: Path) -> str:
         _best(plan, ranking),
         _curves(plan, ranking),
         _importance(plan, results),
-        _use(plan, ranking, folder),
+        _use(plan, ranking),
         _trials(plan, results),
         f"<footer><p>wlr_gym {escape(__version__)}; the table of all trials: <code>trials.parquet</code>.</p></footer>",
     ]
@@ -138,7 +139,7 @@ def _others(plan: SweepPlan) -> list[str]:
 def _ranking_row(plan: SweepPlan, one: Summary, names: Sequence[str]) -> tuple[str, ...]:
     ended = [result for result in one.results if result.status == DONE] or one.results
     others = (float(np.mean([result.final.get(name, np.nan) for result in ended])) for name in _others(plan))
-    seeds = str(len(one.values)) if one.is_whole else "stopped early"
+    seeds = str(len(one.values)) if one.is_whole else one.results[0].status
     figures_of = (number(one.mean), number(min(one.values)), number(max(one.values)))
     return (*(_value(one.settings.get(name)) for name in names), seeds, *figures_of, *map(number, others))
 
@@ -172,12 +173,14 @@ def _importance(plan: SweepPlan, results: Sequence[TrialResult]) -> str:
     return section("What matters", text, table(("setting", "share"), rows, {1}), pictures_of("effects", picture, caption))
 
 
-def _use(plan: SweepPlan, ranking: Sequence[Summary], folder: Path) -> str:
+def _use(plan: SweepPlan, ranking: Sequence[Summary]) -> str:
     if not ranking:
         return ""
-    best = ranking[0].results[0].folder
-    lines = [f"wlr evaluate {one.folder} --env {plan.environment}" for one in ranking[0].results[:1]]
-    lines.append(f"wlr play --agent {best}")
+    best = ranking[0]
+    lines = [
+        f"wlr evaluate {best.policies} --env {plan.environment}",
+        f"wlr play --agent {shlex.quote(str(best.results[0].folder))}",
+    ]
     return section("Use the best", "<p>Each trial is an ordinary run folder:</p>", commands(lines))
 
 

@@ -258,10 +258,10 @@ def draw(plan: SweepPlan, random: np.random.Generator) -> dict[str, Any]:
 
 def _check(plan: SweepPlan) -> None:
     """Refuse what no trial could do, before any begins."""
-    settings = known_settings(plan)
-    random = plan.search is not None and plan.search.method == "random"
-    trials = trials_of(settings, plan.seed_list) if settings is not None and not random else []
-    for trial in trials or [trial_of(draw(plan, np.random.default_rng(0)), plan.seed_list[0])]:
+    known = known_settings(plan)
+    trials_of([{}] if known is None else known, plan.seed_list)  # no name twice
+    for settings in [draw(plan, np.random.default_rng(0))] if known is None else known:
+        trial = trial_of(settings, plan.seed_list[0])
         whole = whole_settings(plan, trial)
         _check_environment(whole.get("environment") or {}, trial.name)
         try:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib
 import os
 import socket
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from wlr_gym.base import jobs as jobs_module
 from wlr_gym.base.errors import InputError
-from wlr_gym.learning.sweep import jobs as jobs_module
-from wlr_gym.learning.sweep.jobs import Ended, Job, follow
+from wlr_gym.base.jobs import Ended, Job, follow
 
 #: Address that means: start Ray on this machine.
 LOCAL = "local"
@@ -30,10 +30,11 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
         workers: cores of a Ray that is started here; None = all.
 
     Raises:
-        InputError: there is no such cluster.
+        InputError: there is no such cluster, or Ray cannot be started.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    os.environ.setdefault("RAY_worker_niceness", "0")  # 15 otherwise: trials would stand still beside other work
     import ray
 
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
@@ -43,8 +44,9 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
         else:
             _require_answer(address)
             ray.init(address=address, **quiet)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise InputError(f"--ray {address}: no Ray cluster answers: {str(error).splitlines()[0]}") from None
+    except Exception as error:  # Ray raises that itself where a node takes more than 30 s to start
+        what = "Ray cannot be started" if address == LOCAL else "no Ray cluster answers"
+        raise InputError(f"--ray {address}: {what}: {next(iter(str(error).splitlines()), type(error).__name__)}") from None
     try:
         with carried(jobs_module, importlib.import_module(__name__)):
             yield
@@ -73,7 +75,7 @@ def carried(*modules: Any) -> Iterator[None]:
             cloudpickle.unregister_pickle_by_value(module)
 
 
-def spread_on_ray(jobs: Iterable[Job], nodes: NodeSelector, at_once: int | None = None) -> Iterator[Ended]:
+def spread_on_ray(jobs: Iterable[Job], nodes: NodeSelector, at_once: int | None = None) -> Generator[Ended, None, None]:
     """Run jobs on the connected cluster, a core each; yield how each ended, as it does.
 
     A job whose node is lost is started again on another one.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,7 +111,13 @@ def table(results: Sequence[TrialResult], out: Path) -> pandas.DataFrame:
     """Return one row per trial: name, its settings, seed, status, final and best held-out scores, steps, seconds, folder."""
     import pandas
 
-    return pandas.DataFrame([_row(one, out) for one in results])
+    names = dict.fromkeys(name for one in results for name in one.trial.settings)
+    columns = {name: _column([one.trial.settings.get(name) for one in results]) for name in names}
+    rows = [
+        {"name": one.trial.name, **{name: column[at] for name, column in columns.items()}, **_outcome(one, out)}
+        for at, one in enumerate(results)
+    ]
+    return pandas.DataFrame(rows)
 
 
 def write_table(results: Sequence[TrialResult], out: Path) -> None:
@@ -133,19 +140,19 @@ def stopped_early(out: Path) -> set[str]:
     return set(frame.loc[frame["status"] == STOPPED_EARLY, "name"])
 
 
-def _row(one: TrialResult, out: Path) -> dict[str, Any]:
-    row: dict[str, Any] = {"name": one.trial.name}
-    row |= {name: _cell(value) for name, value in one.trial.settings.items()}
-    row |= {"seed": one.trial.seed, "status": one.status}
+def _outcome(one: TrialResult, out: Path) -> dict[str, Any]:
+    row: dict[str, Any] = {"seed": one.trial.seed, "status": one.status}
     row |= {f"final_{name}": one.final.get(name, np.nan) for name in METRICS}
     row |= {f"best_{name}": one.best.get(name, np.nan) for name in METRICS}
     row |= {"best_steps": one.best.get("steps", np.nan), "steps": one.steps, "seconds": one.seconds}
     return row | {"error": one.error, "folder": str(one.folder.relative_to(out))}
 
 
-def _cell(value: Any) -> Any:
-    """Return a setting as a column can hold it: numbers and words as they are, anything else as JSON."""
-    return value if isinstance(value, bool | int | float | str) else json.dumps(value)
+def _column(values: Sequence[Any]) -> Sequence[Any]:
+    """Return a setting's values as one column can hold them: numbers, words or truths (None is missing), all else as JSON."""
+    given = [value for value in values if value is not None]
+    kinds = {"number" if isinstance(value, int | float) and not isinstance(value, bool) else type(value) for value in given}
+    return values if kinds in ({"number"}, {str}, {bool}) else [json.dumps(value) for value in values]
 
 
 # ---- settings over seeds ---------------------------------------------------------------------------------------------
@@ -171,6 +178,13 @@ class Summary:
     def mean(self) -> float:
         """Mean over the seeds."""
         return float(np.mean(self.values))
+
+    @property
+    def policies(self) -> str:
+        """Its trainings as ``wlr evaluate`` takes them, quoted for a shell: all seeds as one column."""
+        first = self.results[0]
+        every = first.folder.with_name(first.trial.name.removesuffix(str(first.trial.seed)) + "*")
+        return shlex.quote(str(first.folder if len(self.results) == 1 else every))
 
 
 def summarise(results: Sequence[TrialResult], metric: str) -> list[Summary]:

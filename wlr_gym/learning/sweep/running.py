@@ -7,19 +7,20 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.files import locked, make_output_folder
+from wlr_gym.base.jobs import PATIENCE, Ended, Job, spread
 from wlr_gym.base.provenance import PROVENANCE_FILE, provenance, write_yaml
 from wlr_gym.base.settings import parse_config, read_yaml
-from wlr_gym.gap.report.text import duration
-from wlr_gym.learning.sweep.jobs import Ended, Job, spread
+from wlr_gym.base.text import counted, duration
 from wlr_gym.learning.sweep.page import write_page
 from wlr_gym.learning.sweep.plan import SweepPlan, Trial, known_settings, resolve, trial_of, trials_of
 from wlr_gym.learning.sweep.results import (
@@ -40,9 +41,11 @@ from wlr_gym.learning.sweep.trial import LOCKS, LOGS, TRIALS, check_job, job_of
 PLAN_FILE = "sweep.yaml"
 #: Settings that a search has begun, a line of JSON each.
 BEGUN_FILE = "begun.jsonl"
+#: s that a sweep waits for one that is just ending in the same folder.
+_HANDOVER = 5.0
 Say = Callable[[str], object]
 #: Runs jobs and yields how each ended.
-Run = Callable[[Iterable[Job]], Iterator[Ended]]
+Run = Callable[[Iterable[Job]], Generator[Ended, None, None]]
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,7 @@ def sweep(
         What was found. Trials that failed are in it; the others went on.
 
     Raises:
-        InputError: an unknown name or setting, two trials of one name, a folder that is in use.
+        InputError: an unknown name or setting, two trials of one name, a folder that is in use, a cluster that does not answer.
         MissingPackageError: Ray or Optuna is needed and not installed.
         KeyboardInterrupt: Ctrl-C or SIGTERM, after the trials saved checkpoints; :func:`resume_sweep` continues.
     """
@@ -126,8 +129,7 @@ def start_sweep(
         raise InputError(f"{folder}: in use; give another folder, or resume what is there: wlr sweep --resume {folder}")
     whole = resolve(plan)
     _check_machines(whole, ray, workers)
-    for name in ("", TRIALS, LOGS, LOCKS):
-        make_output_folder(folder / name)
+    make_output_folder(folder)
     write_yaml(folder / PROVENANCE_FILE, provenance(whole.seed_list[0]))
     write_yaml(folder / PLAN_FILE, whole.model_dump(mode="json"))
     return _run(whole, folder, ray, workers, say)
@@ -144,7 +146,7 @@ def resume_sweep(folder: str | Path, *, ray: str | None = None, workers: int | N
         What was found.
 
     Raises:
-        InputError: not the folder of a sweep.
+        InputError: not the folder of a sweep, or another process runs it.
         KeyboardInterrupt: as for :func:`sweep`.
     """
     file = Path(folder) / PLAN_FILE
@@ -170,18 +172,25 @@ def _check_machines(plan: SweepPlan, ray: str | None, workers: int | None) -> No
 
 def _run(plan: SweepPlan, folder: Path, ray: str | None, workers: int | None, say: Say) -> SweepResult:
     """Train what is left of a plan, on this machine's processes or on Ray."""
-    book = _Book(plan, folder, say)
-    if ray is None and not plan.needs_ray:
+    for name in (TRIALS, LOGS, LOCKS):
+        make_output_folder(folder / name)
+    with locked(folder / LOCKS / "sweep", _HANDOVER):
+        book = _Book(plan, folder, say)
+        if ray is not None or plan.needs_ray:
+            return _run_on_ray(book, ray, workers)
         count = workers or usable_cores()
         say(f"{book.size}; {count} at a time, processes of this machine")
         with _sigterm_interrupts():
             return book.result_of(lambda: _train_all(book, lambda jobs: spread(jobs, count)))
+
+
+def _run_on_ray(book: _Book, ray: str | None, workers: int | None) -> SweepResult:
     from wlr_gym.learning.sweep.ray_cluster import LOCAL, connected, fit_nodes, spread_on_ray
 
-    address = ray or LOCAL
+    plan, address = book.plan, ray or LOCAL
     with connected(address, workers), _sigterm_interrupts():
-        say(f"{book.size}; Ray {'on this machine' if address == LOCAL else f'at {address}'}")
-        nodes = fit_nodes(check_job(plan, folder), say)
+        book.say(f"{book.size}; Ray {'on this machine' if address == LOCAL else f'at {address}'}")
+        nodes = fit_nodes(check_job(plan, book.folder), book.say)
         search = partial(_search_with_tune, book, nodes, workers) if plan.needs_ray else None
         return book.result_of(lambda: _train_all(book, lambda jobs: spread_on_ray(jobs, nodes, workers), search))
 
@@ -253,7 +262,9 @@ class _Book:
         self.stopped = stopped_early(folder)
         self._trials: dict[str, Trial] = {}
         self._ended: dict[str, tuple[str, str]] = {}
+        self._known: dict[str, TrialResult] = {}
         self._began, self._done, self._expected = time.monotonic(), 0, 0
+        self._page_due = self._began + 60.0
 
     @property
     def size(self) -> str:
@@ -264,9 +275,9 @@ class _Book:
         steps = plan.settings.get("total_steps")
         each = f" of {steps:,} environment steps" if isinstance(steps, int) and "total_steps" not in plan.space else ""
         if plan.search is None:
-            return f"{count * seeds} trials: {count} settings x {seeds} seeds{each}"
+            return f"{counted(count * seeds, 'trial')}: {count} settings x {counted(seeds, 'seed')}{each}"
         best = min(plan.search.repeat_best, count)
-        return f"{count} trials{each}, then the best {best} with {seeds} seeds"
+        return f"{counted(count, 'trial')}{each}, then the best {best} with {counted(seeds, 'seed')}"
 
     def enter(self, trial: Trial) -> None:
         """Count a trial in."""
@@ -286,19 +297,29 @@ class _Book:
         if len(left) < len(trials):
             self.say(f"{len(trials) - len(left)} of {len(trials)} trials are done already")
         self._began, self._done, self._expected = time.monotonic(), 0, len(left)
-        for ended in run(job_of(self.plan, trial, self.folder) for trial in left):
-            self.end(self._trials[ended.name], ended.error)
+        with closing(run(job_of(self.plan, trial, self.folder) for trial in left)) as ends:  # jobs end before who runs them
+            for ended in ends:
+                self.end(self._trials[ended.name], ended.error)
 
     def end(self, trial: Trial, error: str, early: bool = False) -> None:
         """Note how a trial ended; write the table."""
         self.enter(trial)
         self._ended[trial.name] = FAILED if error else STOPPED_EARLY if early else DONE, error
+        self._known.pop(trial.name, None)
         self._done += 1
         self.say(self._line(trial))
         try:
             write_table(self.results(), self.folder)
+            self._write_page_now_and_then()
         except InputError as problem:  # a full disk; the trials go on
             self.say(str(problem))
+
+    def _write_page_now_and_then(self) -> None:
+        """Write the page as trials end, each minute at most and in 2 % of the time at most."""
+        if (began := time.monotonic()) < self._page_due:
+            return
+        write_page(self.plan, self.results(), self.folder)
+        self._page_due = time.monotonic() + max(60.0, 50.0 * (time.monotonic() - began))
 
     def _line(self, trial: Trial) -> str:
         result = self._result(trial)
@@ -316,23 +337,45 @@ class _Book:
         return [self._result(trial) for trial in self._trials.values()]
 
     def _result(self, trial: Trial) -> TrialResult:
-        return read_result(trial, self.folder / TRIALS / trial.name, *self._ended.get(trial.name, (UNFINISHED, "")))
+        """Read a trial's run folder, once after it has ended: in a sweep of thousands others end all the time."""
+        if trial.name in self._known:
+            return self._known[trial.name]
+        result = read_result(trial, self.folder / TRIALS / trial.name, *self._ended.get(trial.name, (UNFINISHED, "")))
+        if result.status != UNFINISHED:
+            self._known[trial.name] = result
+        return result
 
     def result_of(self, work: Callable[[], None]) -> SweepResult:
         """Do the work; write table and page of what there is, however it ends; return the result."""
         try:
             work()
         except KeyboardInterrupt:
-            self.write()
+            try:
+                self.write()
+            except InputError as problem:
+                self.say(str(problem))
             raise KeyboardInterrupt(
                 f"interrupted; trials have checkpoints; resume with: wlr sweep --resume {self.folder}"
             ) from None
-        self.write()
+        try:
+            self.write()
+        except InputError as problem:
+            again = f"wlr sweep --resume {self.folder}"
+            raise InputError(f"{problem}; {self._count()}; when it can be written: {again}") from None
         results = self.results()
         return SweepResult(self.folder, results, summarise(results, self.plan.metric))
 
+    def _count(self) -> str:
+        """Return how many trials there are of each status, in words."""
+        found = Counter(one.status for one in self.results())
+        return f"trials {', '.join(f'{status}: {number}' for status, number in found.items())}"
+
     def write(self) -> None:
-        """Write table and page."""
+        """Write table and page; trials that were stopped early write their last checkpoint before they are read."""
+        for name, (status, _) in self._ended.items():
+            if status == STOPPED_EARLY and self._known.pop(name, None):
+                with suppress(InputError), locked(self.folder / LOCKS / name, 2 * PATIENCE):
+                    pass
         results = self.results()
         write_table(results, self.folder)
         write_page(self.plan, results, self.folder)

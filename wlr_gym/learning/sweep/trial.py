@@ -17,9 +17,9 @@ import numpy as np
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import locked
+from wlr_gym.base.jobs import PATIENCE, Job, Send, import_modules, serve
 from wlr_gym.base.paths import PACKAGE
 from wlr_gym.base.provenance import CONFIG_FILE, git_commit
-from wlr_gym.learning.sweep.jobs import PATIENCE, Job, Send, import_modules, serve
 from wlr_gym.learning.sweep.plan import SweepPlan, Trial, check_settings, draw, trial_of, whole_settings
 from wlr_gym.learning.sweep.results import is_complete, scores_of
 from wlr_gym.learning.training import resume_training, run_training

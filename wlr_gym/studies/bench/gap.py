@@ -25,9 +25,9 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, write_json, write_text
+from wlr_gym.base.jobs import Ended, Job, Send, serve, spread
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
-from wlr_gym.learning.sweep.jobs import Ended, Job, Send, serve, spread
 from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED, BlindCase, case
 from wlr_gym.studies.bench.blind.score import FAILED, score
 

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.gap.report.html import heading, table
-from wlr_gym.gap.report.text import listed, number, places, plain, unit_of
+from wlr_gym.base.html import heading, table
+from wlr_gym.base.text import number
+from wlr_gym.gap.report.text import listed, places, plain, unit_of
 from wlr_gym.studies.demo.settings import Demo
 from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, Section, Tell, drawn, paragraph, picture
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.gap.report.html import heading, table
+from wlr_gym.base.html import heading, table
 from wlr_gym.learning.evaluation import FIRST_SEED, MAIN, Card, Condition, Estimate, Subject, play, work
 from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
 from wlr_gym.studies.demo.stage import Section, Tell, paragraph, picture

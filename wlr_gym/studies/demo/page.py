@@ -8,7 +8,7 @@ from pathlib import Path
 
 from wlr_gym import __version__
 from wlr_gym.base.files import write_text
-from wlr_gym.gap.report.html import document, section
+from wlr_gym.base.html import document, section
 from wlr_gym.studies.demo.settings import Demo
 from wlr_gym.studies.demo.stage import FAILED, NOT_SHOWN, SHOWN, SKIPPED, Section
 

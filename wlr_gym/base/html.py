@@ -1,4 +1,4 @@
-"""Building blocks of the HTML report. Texts are escaped here; ``parts`` are HTML already."""
+"""Building blocks of HTML reports. Texts are escaped here; ``parts`` are HTML already."""
 
 from __future__ import annotations
 

@@ -9,6 +9,7 @@ somebody waits for it. When that ends, for whatever reason, the job gets SIGTERM
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -126,7 +127,8 @@ def outcome(job: Job, process: Any, last: list[str]) -> str:
     if last and "error" in (message := json.loads(last[0])):
         return message["error"]
     with open(job.log, "rb") as file:
-        said = file.read()[-2000:].decode("utf-8", errors="replace").strip().splitlines()[-1:]
+        file.seek(max(0, os.path.getsize(job.log) - 2000))
+        said = file.read(2000).decode("utf-8", errors="replace").strip().splitlines()[-1:]
     return f"the process ended with {process.returncode}; last in {job.log}: {' '.join(said)}"
 
 
@@ -170,8 +172,9 @@ def serve(work: Callable[[Mapping[str, Any], Send], None]) -> None:
     except KeyboardInterrupt as interruption:
         send({"error": f"stopped: {interruption}"})
     except Exception as error:  # whatever it is, the other jobs go on
-        traceback.print_exc()
         send({"error": f"{type(error).__name__}: {error}"})
+        with contextlib.suppress(OSError):  # the log may be on the disk that is full
+            traceback.print_exc()
     else:
         send({"error": ""})
 

@@ -4,18 +4,20 @@ import os
 import signal
 import subprocess
 import sys
-import time
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from waiting import wait_until
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import locked
-from wlr_gym.learning.sweep.jobs import Job, follow, spread
+from wlr_gym.base.jobs import Job, follow, spread
 
 #: Says what it sees, and leaves a file when it is ended in good order.
 MODULE = """
 import os, signal, sys, time, pathlib
-from wlr_gym.learning.sweep.jobs import serve
+from wlr_gym.base.jobs import serve
 
 def work(task, send):
     here = pathlib.Path(task["folder"])
@@ -31,7 +33,7 @@ def work(task, send):
             sys.exit()
         signal.signal(signal.SIGTERM, end)
         (here / "began").write_text("")
-        time.sleep(60)
+        time.sleep(600)
 
 serve(work)
 """
@@ -42,13 +44,6 @@ def job(tmp_path, monkeypatch):
     (tmp_path / "a_job_for_tests.py").write_text(MODULE)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
     return lambda do: Job(do, "a_job_for_tests", {"do": do, "folder": str(tmp_path)}, str(tmp_path / f"{do}.txt"))
-
-
-def wait_for(path):
-    deadline = time.monotonic() + 30.0
-    while not path.exists():
-        assert time.monotonic() < deadline, f"{path} never came"
-        time.sleep(0.05)
 
 
 def test_each_ends_for_itself(job):
@@ -72,29 +67,35 @@ def test_a_log_that_cannot_be_written_is_an_error_of_its_job(job, tmp_path):
     assert "cannot be started" in ended["bad"]
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no disk that is always full")
+def test_the_error_is_known_though_the_log_is_on_the_full_disk(job):
+    full = replace(job("raise"), log="/dev/full")
+    assert "No space left on device" in follow(full, print)
+
+
 def test_jobs_end_in_good_order_with_who_runs_them(job, tmp_path):
     running = spread([job("wait"), job("speak")], 2)
     next(running)
-    wait_for(tmp_path / "began")
+    wait_until((tmp_path / "began").exists)
     running.close()
     assert (tmp_path / "ended").read_text() == "in good order"
 
 
 def test_jobs_end_in_good_order_when_who_waits_is_killed(job, tmp_path):
-    code = f"from wlr_gym.learning.sweep.jobs import *\nfollow({job('wait')!r}, print)"
+    code = f"from wlr_gym.base.jobs import *\nfollow({job('wait')!r}, print)"
     waiting = subprocess.Popen([sys.executable, "-c", code])
-    wait_for(tmp_path / "began")
+    wait_until((tmp_path / "began").exists)
     waiting.send_signal(signal.SIGKILL)
     waiting.wait()
-    wait_for(tmp_path / "ended")
+    wait_until((tmp_path / "ended").exists)
 
 
 def test_a_lock_is_held_among_processes_and_freed_by_death(tmp_path):
     path = tmp_path / "lock"
     code = f"import pathlib, time\nfrom wlr_gym.base.files import locked\nwith locked(pathlib.Path({str(path)!r}), 1):\n"
-    code += f"    pathlib.Path({str(tmp_path / 'held')!r}).touch(); time.sleep(60)"
+    code += f"    pathlib.Path({str(tmp_path / 'held')!r}).touch(); time.sleep(600)"
     holder = subprocess.Popen([sys.executable, "-c", code])
-    wait_for(tmp_path / "held")
+    wait_until((tmp_path / "held").exists)
     with pytest.raises(InputError, match="held by another process"), locked(path, 0.2):
         pass
     holder.kill()
