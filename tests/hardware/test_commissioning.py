@@ -1,6 +1,7 @@
 """``wlr commission`` on emulated robots in emulated time: an unaltered one differs nowhere, one that differs is found."""
 
 import json
+import math
 import re
 
 import numpy as np
@@ -314,6 +315,9 @@ def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp
         def release(self):
             self.is_released = True
 
+        def expect(self, seconds):
+            pass
+
     monkeypatch.setattr(runner, "WatchdogProcess", Guard)
     emulated = EmulatedStand(ROBOT, NOMINAL)
     link = emulated_link(emulated.machine)
@@ -328,6 +332,23 @@ def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp
     with Commissioning(ROBOT, NOMINAL, link, Saboteur(emulated), tmp_path, RunMeta()) as commissioning:
         list(commissioning.make(choose(["joints"])))
     assert [guard.is_released for guard in guards] == [not fault]
+
+
+@pytest.mark.parametrize("name", ["torque_on", "watchdog", "velocity_step"])
+def test_the_next_sign_of_life_comes_in_time_while_a_motor_is_on(stood, name):
+    emulated, stand = stood
+    signs = []
+    stand.sign_of_life = lambda seconds: signs.append((stand.clock.now(), seconds))
+    run_test(TESTS[name], stand, EmulatedPerson(emulated))
+    times, promised = np.array(signs).T
+    assert promised[-1] == math.inf
+    assert motors_on(emulated.machine) == []
+    assert len(signs) > 10
+    waited = np.diff(times)
+    on = np.isfinite(promised[:-1])
+    assert (waited[on] < promised[:-1][on]).all()
+    late = promised[:-1][on] - waited[on]  # how much later than needed it would be seen that nothing comes any more
+    assert (late[:-1] < 2.1).all()
 
 
 def test_the_stand_has_limits_of_its_own(stood):

@@ -118,8 +118,10 @@ class Commissioning:
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Have a process beside this one that switches the motors of a real robot off when this one is killed."""
+        """Have a process beside this one that switches the motors of a real robot off when this one is killed or hangs."""
         watchdog = WatchdogProcess(self._robot, self._hardware, self._folder) if self._link.is_serial else None
+        if watchdog is not None:
+            self._stand.sign_of_life = watchdog.expect
         try:
             yield
         finally:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -43,6 +43,8 @@ BLOCKED, BLOCKED_ROWS = 0.4, 3
 _FULL_PWM = 885
 #: Times to switch off servos that do not confirm it, and s between them.
 _OFF_TRIES, _OFF_PAUSE = 20, 0.05
+#: s beyond its waits that a stand is busy between two signs of life; and while it switches off.
+LONGEST_BUSY, LONGEST_OFF = 2.0, 20.0
 #: Items in RAM that tests depend on: back to their defaults before torque comes on, and after it is off.
 _REGISTERS = (
     *("profile_velocity", "profile_acceleration", "velocity_p_gain", "velocity_i_gain", "position_p_gain"),
@@ -62,6 +64,8 @@ class Stand:
         clock: of the link.
         operator: Ctrl-C and signals.
         samples: what a test notes beyond the rows.
+        sign_of_life: told, while a motor is on, within how many seconds the next sign comes (inf: no motor is on). It is for
+            the watchdog process.
     """
 
     def __init__(self, robot: Robot, hardware: Hardware, link: Link) -> None:
@@ -69,12 +73,14 @@ class Stand:
         self.servos, self.clock = link.servos, link.clock
         self.operator: Operator = Operator(link.clock)
         self.samples: dict[str, list[float]] = {}
+        self.sign_of_life: Callable[[float], None] = lambda seconds: None
         self._imu = link.imu
         self._rows: list[Array] = []
         self._setpoints = np.full(len(JOINTS), np.nan)
         self._next = 0.0
         self._silent = self._blocked = 0
         self._armed: set[str] = set()
+        self._is_on = False
         stall = robot.servo.leg.stall_torque, robot.servo.wheel.stall_torque
         self._stall = np.repeat(stall, 4)
         self._last = np.zeros(3 * len(JOINTS))
@@ -117,6 +123,8 @@ class Stand:
         Raises:
             QuitError: somebody asked for a stop.
         """
+        if self._is_on:
+            self.sign_of_life(max(0.0, moment - self.clock.now()) + LONGEST_BUSY)
         self.clock.wait_until(moment)
         if asked := self.operator.take():
             raise QuitError(asked)
@@ -137,6 +145,8 @@ class Stand:
             BusGoneError: a port is gone.
         """
         held = self.servos.get_all("bus_watchdog") if self._armed else {}
+        if len(held) < len(JOINTS):  # waiting for the silent one took the time: it is the reason, not this computer
+            return
         if tripped := [joint for joint in JOINTS if joint in self._armed and held.get(joint, 0) < 0]:
             raise TrippedError(
                 f"{', '.join(tripped)}: stopped by the Bus Watchdog: this computer, or the bus, was silent for longer than "
@@ -205,6 +215,8 @@ class Stand:
     def switch_on(self, joints: Iterable[str]) -> None:
         """Switch torque on and arm the watchdogs; the servos' registers say what happens then."""
         joints = list(joints)
+        self._is_on = True
+        self.sign_of_life(LONGEST_BUSY)
         for joint in joints:
             k = JOINTS.index(joint)
             self._setpoints[k] = self._goal(joint)
@@ -298,6 +310,7 @@ class Stand:
         servos = self.servos
         for _ in range(2):
             servos.torque_off_unacknowledged()
+        self.sign_of_life(LONGEST_OFF)
         left = servos.torque_off(1)
         for _ in range(_OFF_TRIES):
             if not left:
@@ -310,6 +323,8 @@ class Stand:
                 if joint not in left:
                     servos.set(joint, "bus_watchdog", 0)
             self.prepare([joint for joint in JOINTS if joint not in left])
+        self._is_on = False
+        self.sign_of_life(math.inf)
         return left
 
 
