@@ -267,7 +267,8 @@ def test_traced_law_equals_numpy(law):
     source = "\n".join(emit(outputs, lambda n: n, lambda n, v: f"{n} = {v}", ""))
     expected = np.atleast_2d(function(*columns.T))
     for row in range(len(columns)):
-        scope = {"math": math, **{f"x{i}": float(x) for i, x in enumerate(columns[row])}}
+        scope: dict = {"math": math, "select": lambda condition, a, b: a if condition else b}
+        scope |= {f"x{i}": float(x) for i, x in enumerate(columns[row])}
         exec(source, scope)
         np.testing.assert_allclose([scope[name] for name in outputs], expected[:, row], rtol=1e-12, atol=1e-15)
 
