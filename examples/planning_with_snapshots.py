@@ -21,9 +21,8 @@ import gymnasium as gym
 import numpy as np
 
 import wlr_gym  # noqa: F401
-from wlr_gym.learning.evaluation.metrics import summarise
-from wlr_gym.learning.evaluation.rollout import measures_of, roll_out
-from wlr_gym.policy.agents import agent_function, load_agent_config
+from wlr_gym.learning.evaluation import measures_of, roll_out, summarise
+from wlr_gym.policy import load_agent_config, make_policy
 
 ID = "WLR-Velocity-v0"
 #: Horizon in control steps of 20 ms; the noise changes every so many of them.
@@ -76,11 +75,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="one short episode")
     quick = parser.parse_args().quick
-    config = load_agent_config("pid")
-    settings = {"randomization": "ice", "episode_length": 2.0 if quick else 20.0, **config.pop("environment")}
+    trained_on = load_agent_config("pid")["environment"]
+    settings = {"randomization": "ice", "episode_length": 2.0 if quick else 20.0, **trained_on}
     env: Any = gym.make_vec(ID, num_envs=1 if quick else 8, **settings)
     model: Any = gym.make_vec(ID, num_envs=FUTURES, **settings)
-    pid = agent_function("pid", "make_policy")(env.contract(), config)
+    pid = make_policy("pid", env.contract())
     alone = errors(env, pid)
     begin = time.perf_counter()
     planned = errors(env, Planner(env, model, pid))

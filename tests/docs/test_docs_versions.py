@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.util
 import inspect
+import re
 from typing import Any
 
 import pytest
-from blocks import ROOT
+from blocks import PAGES, ROOT, blocks
 
 import wlr_gym
 from wlr_gym.envs.registry import ENVIRONMENTS
 from wlr_gym.envs.tasks.task_config import read_task
 
 
-def _public_modules() -> dict[str, str]:
+def _pages() -> Any:
     spec = importlib.util.spec_from_file_location("pages", ROOT / ".ci" / "docs" / "pages.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.API
+    return module
 
 
 def _public(module: Any) -> dict[str, Any]:
@@ -42,7 +44,7 @@ def test_the_table_is_that_of_the_task_files():
     assert block.splitlines()[3:] == rows
 
 
-@pytest.mark.parametrize("name", _public_modules().values())
+@pytest.mark.parametrize("name", _pages().API.values())
 def test_public_names_are_documented_and_typed(name):
     module = importlib.import_module(name)
     assert module.__doc__
@@ -53,6 +55,40 @@ def test_public_names_are_documented_and_typed(name):
             untyped = [p for p in inspect.signature(value).parameters.values() if p.annotation is inspect.Parameter.empty]
             assert not untyped, f"{name}.{label}: {untyped}"
             assert inspect.signature(value).return_annotation is not inspect.Signature.empty, f"{name}.{label}"
+
+
+def _imported(text: str) -> set[tuple[str, str]]:
+    """(module, name) of all that a program imports from this library."""
+    statements = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ImportFrom)]
+    own = [node for node in statements if str(node.module).startswith("wlr_gym")]
+    return {(str(node.module), alias.name) for node in own for alias in node.names}
+
+
+def test_examples_and_pages_use_what_is_public():
+    modules = {"wlr_gym", *_pages().API.values()}
+    programs = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "examples").glob("*.py")}
+    for page in PAGES:
+        found = [block.text for block in blocks(page) if block.language == "python"]
+        programs[page.name] = "\n".join(found)
+    used = {(name, *pair) for name, text in programs.items() for pair in _imported(text)}
+    assert len(used) > 30
+    for name, module, label in sorted(used):
+        if f"{module}.{label}" in modules or (module, label) == ("wlr_gym.cli", "main"):
+            continue
+        assert module in modules, f"{name}: {module} is no page of the Python interface"
+        listed = getattr(importlib.import_module(module), "__all__", [label])
+        assert label in listed, f"{name}: {module}.{label} is not public"
+        assert not label.startswith("_"), f"{name}: {module}.{label} is not public"
+
+
+def test_roles_of_docstrings_are_links_on_the_site():
+    shown, found = _pages().on_page_content, set()
+    for path in (ROOT / "wlr_gym").rglob("*.py"):
+        found |= set(re.findall(r":[a-z]+:`[^`]+`", path.read_text(encoding="utf-8")))
+    assert len(found) > 100
+    for role in found:
+        kind, name, _ = role.split("`")
+        assert kind not in shown(f"<p>{kind}<code>{name}</code></p>"), role
 
 
 def test_the_package_says_that_it_is_typed():

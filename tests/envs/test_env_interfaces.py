@@ -2,9 +2,11 @@
 
 import inspect
 import pickle
+import re
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 from typing import Any, get_type_hints
 
 import gymnasium as gym
@@ -103,6 +105,9 @@ def test_options_have_one_list_of_names_and_types():
     assert options == get_type_hints(Settings)
     for name in EnvironmentOptions.__annotations__:
         assert f"\n    {name}: " in str(inspect.getdoc(EnvironmentOptions)), name
+    page = Path(__file__).parents[2].joinpath("docs", "environments.md").read_text(encoding="utf-8")
+    table = page.split("**Keywords**")[1].split("**Info**")[0]
+    assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == [*EnvironmentOptions.__annotations__]
 
 
 def test_the_second_word_for_the_backend(fake):

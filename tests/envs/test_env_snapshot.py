@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from fake_plant import FakePlant
 
 import wlr_gym  # noqa: F401
 from wlr_gym.base.errors import InputError
@@ -225,3 +227,13 @@ def test_a_snapshot_of_something_else_is_refused_and_nothing_changes() -> None:
     np.testing.assert_equal(env.get_state().arrays, kept.arrays)
     with pytest.raises(gym.error.ResetNeeded):
         make("engine", 2).get_state()
+
+
+def test_a_plant_whose_state_cannot_be_set_says_so(fake: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As that of docs/extending.md, which has no such methods at all."""
+    monkeypatch.setattr(FakePlant, "capabilities", replace(FakePlant.capabilities, can_set_state=False))
+    env: Any = gym.make("WLR-Velocity-v0").unwrapped
+    env.reset(seed=0)
+    for call in (env.get_state, lambda: env.set_state(None)):
+        with pytest.raises(InputError, match="backend 'gibbs_appell': its robots cannot be saved and set back"):
+            call()

@@ -55,7 +55,7 @@ class TaskMethods:
             rows: numbers of robots, or a mask (N,); None = all.
 
         Raises:
-            InputError: not robots of this batch, or a real robot.
+            InputError: not robots of this batch, or a plant whose state cannot be set (a real robot).
             gymnasium.error.ResetNeeded: before the first reset.
         """
         return self._snapshots.take(rows)
@@ -72,7 +72,8 @@ class TaskMethods:
             The observations of all robots of the batch.
 
         Raises:
-            InputError: a snapshot that does not fit (names the first difference), or a real robot; nothing has changed then.
+            InputError: a snapshot that does not fit (names the first difference), or a plant whose state cannot be set (a real
+                robot); nothing has changed then.
         """
         self._snapshots.put(snapshot, rows)
         return self.core.observations()

@@ -33,8 +33,9 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
     """N robots for Stable-Baselines3, without the loop of ``DummyVecEnv``; bit-identical to it with the same seeds.
 
     An ended episode is followed by the next in the same step. Its info then holds ``terminal_observation``,
-    ``TimeLimit.truncated`` and ``episode_reward_terms``; infos of other robots are empty, to be cheap (the present values of
-    all robots are in ``core``: ``reward``, ``terms``, ``plant.truth()``), but for ``randomization`` when it changed.
+    ``TimeLimit.truncated``, ``episode_reward_terms`` and ``episode_measures``; infos of other robots are empty, to be cheap
+    (present values of all robots are in ``core``: ``reward``, ``measures``, ``plant.truth()``), but for ``randomization`` when
+    it changed, and ``truth`` with ``truth_info=True``.
 
     Args:
         env_id: id such as ``WLR-Velocity-v0``, or the spec of an environment.

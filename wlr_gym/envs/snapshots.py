@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import RowStore, Snapshot, check_fit, read_rows, take_snapshot, write_snapshot
 from wlr_gym.envs.core import Core
 
@@ -20,9 +21,14 @@ class Snapshots:
 
     Args:
         core: of the environment.
+
+    Raises:
+        InputError: a plant whose state cannot be set.
     """
 
     def __init__(self, core: Core) -> None:
+        if not core.plant.capabilities.can_set_state:
+            raise InputError(f"backend '{core.settings.backend}': its robots cannot be saved and set back; simulators can")
         self._core = core
         self._fits = {
             "task": core.task.config.model_dump(mode="json"),

@@ -17,6 +17,8 @@ def register_task(path: str | Path) -> str:
     ``WLR-HillClimb-v0``. Gymnasium and every command that takes an id know it from then on. The spec of such an environment
     holds the whole task: ``gym.make(spec)`` works in a process that never saw the file, such as a worker of
     ``AsyncVectorEnv`` or Ray. Terms of your own (rewards, observations) are code: there their module must be imported first.
+    Robot and randomisation files of your own that the task names are named by their absolute paths: another machine needs them
+    too (or give a ``Robot`` as ``robot=`` and a mapping as ``randomization=``).
 
     Args:
         path: of the file, or the name of one in ``configs/task/``.

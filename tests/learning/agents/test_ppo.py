@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.learning.ppo.training_log import TrainingLog
+from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
 
 torch = pytest.importorskip("torch")
@@ -119,6 +121,14 @@ def test_a_run_stopped_anywhere_goes_on_as_if_it_were_not(run, tmp_path):
     assert_same_weights(resumed, run / "policy")
     lines = [line.split(",")[0] for line in (folder / "learning_curve.csv").read_text().splitlines()]
     assert lines == ["steps", "64", "128", "192", "256", "320", "384"]  # whole numbers stay whole numbers
+
+
+def test_a_plant_whose_state_cannot_be_set_is_trained_on_and_resumed_with_new_episodes(tmp_path, monkeypatch):
+    monkeypatch.setattr(GibbsAppellPlant, "capabilities", replace(GibbsAppellPlant.capabilities, can_set_state=False))
+    train(tmp_path, total_steps=128)
+    resumed = train(tmp_path, resume=True, total_steps=256)
+    assert read_contract(resumed)["training"]["steps"] == 256
+    assert [row["steps"] for row in curve(tmp_path)] == [64.0, 128.0, 192.0, 256.0]
 
 
 def test_the_environment_is_told_how_far_training_is(run, tmp_path, monkeypatch):

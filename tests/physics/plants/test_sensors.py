@@ -7,7 +7,7 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import spawn_seeds
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT, PlantOptions, Sensors
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, PlantOptions, Sensors, Truth
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
 from wlr_gym.physics.servo import effort_counts
 from wlr_gym.robot import load_robot
@@ -303,3 +303,15 @@ def test_wrong_shapes_are_refused():
     raw, out = buffers(3)
     with pytest.raises(InputError, match="sensors of 2 robots"):
         model.measure(raw, out)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [np.zeros((2, 3), order="F"), np.zeros((4, 6))[:, ::2], np.zeros((2, 3), np.float32)],
+    ids=["columns", "part", "single"],
+)
+def test_numbers_that_kernels_would_misread_are_refused(values):
+    """Kernels read the rows of any plant's matrices, users' own included, by their place in memory."""
+    for kind in (Sensors, Truth):
+        with pytest.raises(InputError, match=f"{kind.__name__}: expected float64 numbers row by row"):
+            kind(values)

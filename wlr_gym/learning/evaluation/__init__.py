@@ -15,7 +15,7 @@ from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, play, 
 from wlr_gym.learning.evaluation.episode_recorder import EpisodeRecorder, record_episodes, write_samples
 from wlr_gym.learning.evaluation.learning_curve import read_curve
 from wlr_gym.learning.evaluation.metrics import Metric, Played, metrics_of, summarise
-from wlr_gym.learning.evaluation.rollout import Measure, Rollout, make_core, roll_out, start_episodes
+from wlr_gym.learning.evaluation.rollout import Measure, Rollout, make_core, measures_of, roll_out, start_episodes
 from wlr_gym.learning.evaluation.statistics import Estimate
 from wlr_gym.learning.evaluation.subjects import Subject, identity, make_player, read_subjects
 from wlr_gym.learning.evaluation.sweeps import Sweep, read_sweep, sweeps_for
@@ -38,6 +38,7 @@ __all__ = [
     "identity",
     "make_core",
     "make_player",
+    "measures_of",
     "metrics_of",
     "play",
     "read_curve",

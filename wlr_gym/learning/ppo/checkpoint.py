@@ -36,7 +36,8 @@ def save(
         folder: of the policy or checkpoint.
         model, config, env: what trains.
         notes: what the contract says of the training besides: its environment's id, scores.
-        to_resume: also write random state and robots, so that :func:`restore` goes on where this was.
+        to_resume: also write random state and robots, so that :func:`restore` goes on where this was. Robots of a plant whose
+            state cannot be set begin new episodes there.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{folder.name}.part")
@@ -45,7 +46,8 @@ def save(
     model.save(temporary / MODEL_FILE)
     if to_resume:
         torch.save(random_state(), temporary / RANDOM_FILE)
-        robots = (env.get_state(), np.asarray(model._last_episode_starts))
+        can_set_state = env.core.plant.capabilities.can_set_state
+        robots = (env.get_state() if can_set_state else None, np.asarray(model._last_episode_starts))
         (temporary / ROBOTS_FILE).write_bytes(pickle.dumps(robots))
     noise = float(model.policy.get_parameter("log_std").detach().mean())
     training = {"steps": model.num_timesteps, "updates": model._n_updates, "seed": config.seed, "log_std": noise, **notes}
@@ -86,9 +88,9 @@ def restore(folder: Path, model: PPO, env: Sb3VecEnv) -> None:
     except Exception as error:  # zip, pickle and torch each raise their own kinds for a broken file
         raise InputError(f"{folder}: not a readable checkpoint: {error}") from None
     model.num_timesteps, model._n_updates = training["steps"], training["updates"]
-    env.reset()
-    model._last_obs = env.set_state(snapshot)
-    model._last_episode_starts = starts
+    model._last_obs, model._last_episode_starts = env.reset(), np.ones(env.num_envs, bool)
+    if snapshot is not None:
+        model._last_obs, model._last_episode_starts = env.set_state(snapshot), starts
     set_random_state(state)
 
 

@@ -121,6 +121,8 @@ class _Signals:
     __slots__ = ("values",)
 
     def __init__(self, values: Array) -> None:
+        if values.dtype != np.float64 or not values.flags.c_contiguous:  # kernels read rows by their place in memory
+            raise InputError(f"{type(self).__name__}: expected float64 numbers row by row (C order), got {values.dtype}")
         self.values: Array = values
 
     def __getattr__(self, name: str) -> Array:
