@@ -217,7 +217,10 @@ class RunGap:
 
 @dataclass(frozen=True)
 class ChannelGap:
-    """RMS residual of one channel over the held-out runs, in noise units; channels of a kind share a ``group``."""
+    """RMS residual of one channel over the held-out runs, in noise units; channels of a kind share a ``group``.
+
+    ``worse``: the effects make it significantly worse (:mod:`wlr_gym.gap.validation.worse`).
+    """
 
     channel: str
     unit: str
@@ -226,6 +229,7 @@ class ChannelGap:
     calibrated: float
     after: float
     group: str = ""
+    worse: bool = False
 
 
 @dataclass(frozen=True)
@@ -327,6 +331,18 @@ class Turning:
 
 
 @dataclass(frozen=True)
+class Threshold:
+    """By how much an effect with one unknown had to improve the fit in a round of the search, and what chance alone gives.
+
+    ``by_chance``: 98 % of draws of chance have no larger improvement (:mod:`wlr_gym.gap.selection.threshold`); NaN = not drawn.
+    """
+
+    round: int
+    least: float
+    by_chance: float
+
+
+@dataclass(frozen=True)
 class Recommendation:
     """A run to record next: name of an excitation, and why."""
 
@@ -348,6 +364,7 @@ class Analysis:
     equivalent: tuple[Equivalent, ...] = ()
     calibration: Mapping[str, Calibrated] = field(default_factory=dict)
     evidence: tuple[Evidence, ...] = ()
+    thresholds: tuple[Threshold, ...] = ()
     localisation: tuple[Place, ...] = ()
     relations: tuple[Relation, ...] = ()
     heat_maps: tuple[HeatMap, ...] = ()

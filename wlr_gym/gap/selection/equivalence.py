@@ -22,11 +22,11 @@ RIVAL = 0.75
 AGREED = 2.0
 
 
-def selection_frequency(selected: Hypothesis, others: Sequence[Hypothesis], cost: float = 0.0) -> float:
+def selection_frequency(selected: Hypothesis, others: Sequence[Hypothesis], threshold: float = LEAST_GAIN) -> float:
     """Return the share of bootstrap samples of the runs in which the selected effect is accepted and no other fits better.
 
-    A run counts by its part in the gain, as fitted to all runs: no sample is refitted. ``cost`` is that of the model
-    without the effect.
+    A run counts by its part in the gain, as fitted to all runs: no sample is refitted. ``threshold``: see
+    :func:`wlr_gym.gap.selection.screening.least_gain`.
     """
     rng = np.random.default_rng(0)
     rivals = [other for other in others if other.candidate.name != selected.candidate.name and not other.tolerable]
@@ -34,7 +34,7 @@ def selection_frequency(selected: Hypothesis, others: Sequence[Hypothesis], cost
     parts = _parts(selected)[picks]
     gains = parts.sum(axis=1)
     agreed = -parts.clip(max=0.0).sum(axis=1) <= MOST_HARM * parts.clip(min=0.0).sum(axis=1)
-    wins = agreed & (gains >= least_gain(len(selected.values), cost))
+    wins = agreed & (gains >= least_gain(len(selected.values), threshold))
     for rival in rivals:
         wins &= gains >= _parts(rival)[picks].sum(axis=1)
     return float(wins.mean())
