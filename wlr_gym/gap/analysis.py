@@ -106,6 +106,7 @@ class Evidence:
             ``implausible``, ``within tolerance``, ``removed`` or ``rejected at screening``.
         reason: of the outcome, one sentence.
         by_run: fall of the weighted squares per fit run; empty where it was only screened.
+        probability: of this candidate among all that were refitted and none of them; 0 where it was only screened.
     """
 
     round: int
@@ -117,6 +118,7 @@ class Evidence:
     outcome: str
     reason: str
     by_run: Mapping[str, float] = field(default_factory=dict)
+    probability: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -335,11 +337,13 @@ class Threshold:
     """By how much an effect with one unknown had to improve the fit in a round of the search, and what chance alone gives.
 
     ``by_chance``: 98 % of draws of chance have no larger improvement (:mod:`wlr_gym.gap.selection.threshold`); NaN = not drawn.
+    ``none``: probability that none of the refitted candidates is missing (:mod:`wlr_gym.gap.selection.evidence`).
     """
 
     round: int
     least: float
     by_chance: float
+    none: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -215,7 +215,10 @@ def analyse_problem(
         evidence=tuple(
             entry for number, look in enumerate(search.rounds, 1) for entry in evidence_of(problem, number, look, fitted, kept)
         ),
-        thresholds=tuple(Threshold(k, look.threshold, chance(look.by_chance)) for k, look in enumerate(search.rounds, 1)),
+        thresholds=tuple(
+            Threshold(k, look.threshold, chance(look.by_chance), look.probabilities[1])
+            for k, look in enumerate(search.rounds, 1)
+        ),
         localisation=places,
         relations=relations(search.rounds[0].scores),
         heat_maps=maps,
@@ -319,7 +322,7 @@ def _equivalent(problem: Problem, search: SearchResult) -> tuple[Equivalent, ...
         if look.selected is None or look.selected.candidate.label not in kept:
             continue
         swapped = search.swaps.get(look.selected.candidate.label)
-        others = equivalents(*swapped) if swapped else equivalents(look.selected, look.hypotheses)
+        others = equivalents(*swapped) if swapped else look.equivalents
         if others:
             names = (look.selected.candidate.name, *(other.candidate.name for other in others))
             groups.append(Equivalent(names, separating_run(names, problem.motions)))
@@ -339,7 +342,7 @@ def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int
 
     ``kept`` are the labels of what the final model has: what was selected may have been removed again.
     """
-    equal = {h.candidate.label for h in equivalents(look.selected, look.hypotheses)} if look.selected else set()
+    equal, (shares, _) = {h.candidate.label for h in look.equivalents}, look.probabilities
     entries = [
         Evidence(
             number,
@@ -350,8 +353,9 @@ def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int
             h.predicted_gain,
             *_outcome(h, look, equal, kept),
             {problem.runs[k]: float(gain) for k, gain in zip(fitted, h.by_run, strict=True)},
+            share,
         )
-        for h in look.hypotheses
+        for h, share in zip(look.hypotheses, shares, strict=True)
     ]
     seen = {entry.name for entry in entries}
     for score in look.scores:

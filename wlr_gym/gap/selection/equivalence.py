@@ -46,13 +46,21 @@ def _parts(hypothesis: Hypothesis) -> Array:
     return hypothesis.by_run * (hypothesis.gain / total) if total > 0.0 < hypothesis.gain else hypothesis.by_run
 
 
-def equivalents(selected: Hypothesis, others: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return the best hypothesis of every other name that the data cannot distinguish from the selected one."""
+def equivalents(selected: Hypothesis, others: Sequence[Hypothesis], credible: Sequence[str] = ()) -> list[Hypothesis]:
+    """Return the best hypothesis of every other name that the data cannot distinguish from the selected one.
+
+    ``credible``: names that cannot be left out of a set with 95 % of the probability.
+    """
     found: dict[str, Hypothesis] = {}
     for other in others:
         name = other.candidate.name
         possible = not other.at_bound and not other.tolerable
-        if name != selected.candidate.name and possible and name not in found and _as_good(selected, other):
+        if (
+            name != selected.candidate.name
+            and possible
+            and name not in found
+            and (name in credible or _as_good(selected, other))
+        ):
             found[name] = other
     return list(found.values())
 

@@ -19,6 +19,8 @@ from wlr_gym.gap.estimation.model import FittedModel, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.selection.alternative import Products, rescored
 from wlr_gym.gap.selection.cross_validation import Finalist, accept, beside, fit_finalists
+from wlr_gym.gap.selection.equivalence import equivalents
+from wlr_gym.gap.selection.evidence import credible_names, probabilities
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.refit import refit, refit_thoroughly
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, is_visible, least_gain, responses, screen
@@ -56,6 +58,17 @@ class Round:
     selected: Hypothesis | None
     threshold: float = LEAST_GAIN
     by_chance: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+
+    @property
+    def probabilities(self) -> tuple[list[float], float]:
+        """Probability of each hypothesis, and that of none of them."""
+        return probabilities(self.hypotheses, self.scores)
+
+    @property
+    def equivalents(self) -> list[Hypothesis]:
+        """The best hypothesis of every other name that the data cannot distinguish from the selected one."""
+        names = credible_names(self.hypotheses, self.probabilities[0])
+        return [] if self.selected is None else equivalents(self.selected, self.hypotheses, names)
 
 
 @dataclass(frozen=True, eq=False)
