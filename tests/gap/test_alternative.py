@@ -13,7 +13,7 @@ from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Candidate, Start
 from wlr_gym.gap.report.text import sentence
 from wlr_gym.gap.selection import cross_validation
-from wlr_gym.gap.selection.alternative import rescored
+from wlr_gym.gap.selection.alternative import Products, rescored
 from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
 from wlr_gym.gap.selection.search import search_effects
 from wlr_gym.gap.workflow import analyse_problem
@@ -51,7 +51,7 @@ def scored(problem):
     probes, candidates = problem.candidates(found.model.setting, found.residuals, RUNS)
     responded = responses(problem, found, RUNS, probes)
     first = screen(candidates, responded)
-    return found, first, *rescored(problem, found, responded, first)
+    return found, first, *rescored(problem, found, responded, Products.of(found, responded), first)
 
 
 def of(scores, name):

@@ -1,5 +1,6 @@
 """Replays of runs that the engine itself made: what went in must come out."""
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,11 @@ from engine_runs import META, ROBOT, abrupt, free_rear_wheels, nominal, posture_
 from wlr_gym.data import RunMeta
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.noise import channel_noise
-from wlr_gym.gap.robot import simulate
+from wlr_gym.gap.robot import loop, simulate
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
 from wlr_gym.gap.robot.recorder import TRUTH
-from wlr_gym.gap.robot.simulate import WrittenSetpoints, replay_batch
+from wlr_gym.gap.robot.schedule import WrittenSetpoints
+from wlr_gym.gap.robot.simulate import replay_batch
 from wlr_gym.gap.robot.windows import anchored_residuals
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
 from wlr_gym.robot import JOINTS
@@ -96,9 +98,47 @@ def test_company_and_order_do_not_change_a_bit(run, other):
     assert np.max(np.abs(together[0].values[0] - together[0].values[1]) / NOISE) > 1.0
 
 
+def test_robots_are_shared_out_evenly_where_a_thread_is_worth_it():
+    assert simulate.shared_out(5, 5, 2) == [slice(0, 2), slice(2, 5)]
+    assert simulate.shared_out(1, 5, 2) == [slice(0, 1)]
+    assert simulate.shared_out(200, 5, 1) == [slice(0, 100), slice(100, 200)]
+    assert simulate.shared_out(220, 5, 3) == [slice(0, 73), slice(73, 147), slice(147, 220)]
+    assert simulate.shared_out(3, simulate.MOST_ROBOTS + 1, 1) == [slice(0, 1), slice(1, 2), slice(2, 3)]
+
+
+def test_threads_share_the_settings(other, monkeypatch):
+    """Each part is replayed in a thread of its own: the kernels let go of Python's lock."""
+    threads, whole = set(), simulate._replay_chunk
+    both = threading.Barrier(2, timeout=60.0)
+
+    def seen(*arguments):
+        both.wait()
+        threads.add(threading.get_ident())
+        return whole(*arguments)
+
+    monkeypatch.setattr(simulate, "LEAST_ROBOTS", 2)
+    monkeypatch.setattr(simulate, "_replay_chunk", seen)
+    replay_batch(ROBOT, [RunClock(other)], several(4), threads=2)
+    assert len(threads) == 2
+
+
+def test_the_compiled_loop_does_what_steps_from_python_do(run, other, monkeypatch):
+    """Two runs of different length and with other windows, motors that are off for a while, the truth."""
+    clocks, table = [RunClock(run, window=0.3), RunClock(other)], several(3)
+    compiled = replay_batch(ROBOT, clocks, table, with_truth=True)
+    monkeypatch.setattr(loop, "GibbsAppellPlant", type(None))
+    stepped = replay_batch(ROBOT, clocks, table, with_truth=True)
+    for one, same in zip(compiled, stepped, strict=True):
+        assert np.array_equal(one.values, same.values)
+        assert one.truth is not None
+        assert same.truth is not None
+        assert np.array_equal(one.truth, same.truth)
+
+
 def test_chunks_and_threads_do_not_change_a_bit(other, monkeypatch):
     table, clock = several(4), RunClock(other)
     whole = replay_batch(ROBOT, [clock], table, with_truth=True)[0]
+    monkeypatch.setattr(simulate, "LEAST_ROBOTS", 2)
     threaded = replay_batch(ROBOT, [clock], table, threads=2)[0]
     monkeypatch.setattr(simulate, "MOST_ROBOTS", 3)
     chunked = replay_batch(ROBOT, [clock], table, with_truth=True)[0]

@@ -240,7 +240,9 @@ def test_parameter_that_an_effect_replaces_is_a_rival_of_it():
 
 @pytest.mark.parametrize(("effects", "names"), [([], []), ([sized("drag", 0.8, "right")], ["drag right"])])
 def test_stuck_calibration_is_done_anew_from_where_refits_have_been(monkeypatch, effects, names):
-    monkeypatch.setattr(search, "shortlist", lambda scores, cost: scores[:2])  # also where none is predicted to improve the fit
+    monkeypatch.setattr(
+        search, "shortlist", lambda scores, threshold: scores[:2]
+    )  # also where none is predicted to improve the fit
     problem = Toy({"gain": 2.0, "offset": -2.0}, effects, rows=400)
     stuck, free, given = stuck_and_free(problem)
     found = search_effects(problem, RUNS, stuck, given=given)
@@ -580,7 +582,7 @@ def test_shortlist_keeps_some_of_every_name():
     names = [score.candidate.name for score in chosen]
     assert max(names.count(name) for name in names) == PER_NAME
     assert shortlist([replace(score, gain=0.1) for score in scores]) == []
-    assert shortlist(many, cost=1e6) == []  # next to nothing of what is left
+    assert shortlist(many, threshold=1e6) == []  # next to nothing of what is left
 
 
 def test_same_data_same_bits():

@@ -195,19 +195,19 @@ def explained(problem, name, gain, by_run):
 
 
 @pytest.mark.parametrize(
-    ("gain", "by_run", "cost", "expected"),
+    ("gain", "by_run", "threshold", "expected"),
     [
-        (100.0, [20] * 5, 0.0, 1.0),
-        (20.0, [20] * 5, 0.0, 1.0),
-        (15.0, [20] * 5, 0.0, 0.0),  # the runs' falls of squares are 100: what counts is the gain
-        (100.0, [20] * 5, 6000.0, 0.0),  # two percent of what is left is asked
-        (400.0, [300, -12, -12, -12, -12], 0.0, 0.67),  # drawn once it is enough, not at all (33 %) is harm alone
-        (400.0, [300, -90, -90, 140, 140], 0.0, 0.3),  # in most samples some are harmed too much: no effect
+        (100.0, [20] * 5, 16.0, 1.0),
+        (20.0, [20] * 5, 16.0, 1.0),
+        (15.0, [20] * 5, 16.0, 0.0),  # the runs' falls of squares are 100: what counts is the gain
+        (100.0, [20] * 5, 120.0, 0.0),
+        (400.0, [300, -12, -12, -12, -12], 16.0, 0.67),  # drawn once it is enough, not at all (33 %) is harm alone
+        (400.0, [300, -90, -90, 140, 140], 16.0, 0.3),  # in most samples some are harmed too much: no effect
     ],
 )
-def test_confidence_asks_of_every_sample_what_is_asked_of_an_effect(gain, by_run, cost, expected):
+def test_confidence_asks_of_every_sample_what_is_asked_of_an_effect(gain, by_run, threshold, expected):
     problem = Toy()
-    assert selection_frequency(explained(problem, "decoy_1", gain, by_run), [], cost) == pytest.approx(expected, abs=0.12)
+    assert selection_frequency(explained(problem, "decoy_1", gain, by_run), [], threshold) == pytest.approx(expected, abs=0.12)
 
 
 def test_confidence_asks_more_of_an_effect_with_more_numbers():
@@ -279,7 +279,7 @@ def test_what_is_detectable_is_a_size():
 
 
 def test_what_is_left_hides_more_effects():
-    """Two percent of what is left must be gained: what the screen calls visible requires that, too."""
+    """What the screen calls visible requires as much as is asked of an effect."""
     responded, candidates = screened(Toy(white=1.5))[1:]
     assert all(score.visible for score in screen(candidates, responded))
     hidden = [score for score in screen(candidates, responded, 1e9) if not score.visible]

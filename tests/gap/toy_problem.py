@@ -63,7 +63,7 @@ class Toy:
         ar1: of that error, correlation of neighbouring rows.
     """
 
-    metric, cap, steps, thorough, tempering, disagreement = "RMS in noise units", 50.0, 4, False, 1.0, 0.0
+    metric, cap, steps, threads, thorough, tempering, disagreement = "RMS in noise units", 50.0, 4, 1, False, 1.0, 0.0
     held_out: tuple[str, ...] = ()
     misfit = math.inf
     turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -69,6 +69,10 @@ class BenchOptions:
     """gap: run on Ray: alone, it is started on this machine; with an address (auto, 10.0.0.1:6379), that cluster is used."""
     answers: Path | None = None
     """gap: answers.json of another folder; its sets are not analysed again, but for those that failed."""
+    speed: tuple[Path, ...] = ()
+    """gap: instead of the blind test, time the analysis of these folders of runs and show where the time goes."""
+    threads: int = 2
+    """gap --speed: worker threads of an analysis."""
 
 
 def run(options: BenchOptions) -> int:
@@ -105,6 +109,8 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
 
     if len(asked) > 1:
         raise InputError(f"{BLIND_TEST} takes hours and is run alone, not with {', '.join(set(asked) - {BLIND_TEST})}")
+    if options.speed:
+        return _gap_speed(options)
     if options.out is None:
         raise InputError(f"{BLIND_TEST} needs --out DIR: finished data sets are kept there, so that it can be interrupted")
     console = Console(soft_wrap=True)
@@ -176,3 +182,15 @@ def _vision_table(rows: Sequence[VisionResult]) -> Table:
 
 
 _TABLES = {"convergence": _convergence_table, "vision": _vision_table}
+
+
+def _gap_speed(options: BenchOptions) -> int:
+    """Time analyses of the gap workflow, step by step."""
+    from wlr_gym.studies.bench.gap_speed import time_analyses
+
+    console = Console(soft_wrap=True)
+    found = time_analyses(options.speed, options.threads, lambda line: console.print(line, markup=False, highlight=False))
+    if options.json is not None:
+        write_json(options.json, {"machine": machine(), "threads": options.threads, "analyses": [asdict(one) for one in found]})
+        console.print(f"written: {options.json}")
+    return OK

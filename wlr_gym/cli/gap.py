@@ -121,11 +121,11 @@ def _known(options: GapOptions) -> Patch:
 def _print(analysis: Analysis, out: Path, console: Console) -> None:
     from wlr_gym.gap.report.folder import REPORT_FILE
     from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
-    from wlr_gym.gap.report.text import closure, sentence, title
+    from wlr_gym.gap.report.text import closure, made_worse, sentence, title
 
     colours = {"bad_data": "red", "not_excited": "yellow", "nothing_missing": "green"}
     console.print(title(analysis), style=f"bold {colours.get(analysis.verdict, 'blue')}")
-    said = [sentence(analysis), *filter(None, [closure(analysis)])]
+    said = [sentence(analysis), *filter(None, [made_worse(analysis), closure(analysis)])]
     for line in (*said, *_findings(analysis), *_numbers(analysis), *_advice(analysis)):
         console.print(line, markup=False)
     for label, name in (("report", REPORT_FILE), ("result", RESULT_FILE), ("patch", PATCH_FILE)):

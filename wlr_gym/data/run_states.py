@@ -37,7 +37,8 @@ def local_fit(t: Array, values: Array, at: Array, window: float, degree: int = 2
     fits = np.zeros((len(at), 3))
     for k, time in enumerate(at):
         offset = t - time
-        reach = max(window, 1.001 * float(np.sort(np.abs(offset))[min(2, len(t) - 1)]))
+        third = min(2, len(t) - 1)
+        reach = max(window, 1.001 * float(np.partition(np.abs(offset), third)[third]))
         near = np.abs(offset) < reach
         root_weight = (1 - np.abs(offset[near] / reach) ** 3) ** 1.5
         powers = np.vander(offset[near] / reach, degree + 1, increasing=True)

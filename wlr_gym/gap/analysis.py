@@ -106,6 +106,7 @@ class Evidence:
             ``implausible``, ``within tolerance``, ``removed`` or ``rejected at screening``.
         reason: of the outcome, one sentence.
         by_run: fall of the weighted squares per fit run; empty where it was only screened.
+        probability: of this candidate among all that were refitted and none of them; 0 where it was only screened.
     """
 
     round: int
@@ -117,6 +118,7 @@ class Evidence:
     outcome: str
     reason: str
     by_run: Mapping[str, float] = field(default_factory=dict)
+    probability: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -217,7 +219,10 @@ class RunGap:
 
 @dataclass(frozen=True)
 class ChannelGap:
-    """RMS residual of one channel over the held-out runs, in noise units; channels of a kind share a ``group``."""
+    """RMS residual of one channel over the held-out runs, in noise units; channels of a kind share a ``group``.
+
+    ``worse``: the effects make it significantly worse (:mod:`wlr_gym.gap.validation.worse`).
+    """
 
     channel: str
     unit: str
@@ -226,6 +231,7 @@ class ChannelGap:
     calibrated: float
     after: float
     group: str = ""
+    worse: bool = False
 
 
 @dataclass(frozen=True)
@@ -327,6 +333,20 @@ class Turning:
 
 
 @dataclass(frozen=True)
+class Threshold:
+    """By how much an effect with one unknown had to improve the fit in a round of the search, and what chance alone gives.
+
+    ``by_chance``: 98 % of draws of chance have no larger improvement (:mod:`wlr_gym.gap.selection.threshold`); NaN = not drawn.
+    ``none``: probability that none of the refitted candidates is missing (:mod:`wlr_gym.gap.selection.evidence`).
+    """
+
+    round: int
+    least: float
+    by_chance: float
+    none: float = math.nan
+
+
+@dataclass(frozen=True)
 class Recommendation:
     """A run to record next: name of an excitation, and why."""
 
@@ -348,6 +368,7 @@ class Analysis:
     equivalent: tuple[Equivalent, ...] = ()
     calibration: Mapping[str, Calibrated] = field(default_factory=dict)
     evidence: tuple[Evidence, ...] = ()
+    thresholds: tuple[Threshold, ...] = ()
     localisation: tuple[Place, ...] = ()
     relations: tuple[Relation, ...] = ()
     heat_maps: tuple[HeatMap, ...] = ()

@@ -34,6 +34,7 @@ from wlr_gym.gap.analysis import (
     IntakeFinding,
     ParameterEstimate,
     Place,
+    Threshold,
     Turning,
 )
 from wlr_gym.gap.estimation.fit import Fit, fit, widened
@@ -46,7 +47,9 @@ from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
 from wlr_gym.gap.selection.detectability import detectable
 from wlr_gym.gap.selection.equivalence import equivalents, selection_frequency
 from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.screening import least_gain
 from wlr_gym.gap.selection.search import Round, SearchResult, search_effects
+from wlr_gym.gap.selection.threshold import chance
 from wlr_gym.gap.validation.data_split import informative_split, named_split
 from wlr_gym.gap.validation.held_out import compare_models, mean_of_runs, mean_squares, noise_floor
 from wlr_gym.gap.validation.localisation import localise
@@ -193,7 +196,7 @@ def analyse_problem(
         features,
     )
     adequacy = adequacy_of(problem, fitted, search.fit)
-    shown = detectable(search.rounds[-1].scores, search.fit.cost)
+    shown = detectable(search.rounds[-1].scores, search.rounds[-1].threshold)
     turned = turning(problem, search.fit.residuals, features)
     effects = _effects(problem, search, fitted) or _turned(turned) or (_somewhere(problem, places) if nameless else ())
     kept = {candidate.label for candidate, _ in search.fit.model.effects}
@@ -211,6 +214,10 @@ def analyse_problem(
         calibration=_calibration(problem, search.fit),
         evidence=tuple(
             entry for number, look in enumerate(search.rounds, 1) for entry in evidence_of(problem, number, look, fitted, kept)
+        ),
+        thresholds=tuple(
+            Threshold(k, look.threshold, chance(look.by_chance), look.probabilities[1])
+            for k, look in enumerate(search.rounds, 1)
         ),
         localisation=places,
         relations=relations(search.rounds[0].scores),
@@ -261,7 +268,7 @@ def _verdict(search: SearchResult, effects: Sequence[FoundEffect]) -> str:
     if effects:
         return UNKNOWN if all(effect.name == UNKNOWN for effect in effects) else EFFECT_FOUND
     last = search.rounds[-1]
-    if any(shown_by_some_runs_only(h, last.cost) for h in last.hypotheses):
+    if any(shown_by_some_runs_only(h, last.threshold) for h in last.hypotheses):
         return NOT_EXCITED
     scores = last.scores
     visible = {score.candidate.name: False for score in scores}
@@ -277,7 +284,7 @@ def _effects(problem: Problem, search: SearchResult, fitted: Sequence[int]) -> t
     for (candidate, values), own in zip(search.fit.model.effects, intervals, strict=True):
         look = next(r for r in search.rounds if r.selected is not None and r.selected.candidate.label == candidate.label)
         assert look.selected is not None
-        frequency = selection_frequency(look.selected, look.hypotheses, look.cost)
+        frequency = selection_frequency(look.selected, look.hypotheses, look.threshold)
         tried = problem.reach(candidate.effect(values), setting, fitted) if candidate.formula else {}
         found.append(replace(found_effect(candidate, own, frequency, look.selected.gain), validity=tried))
     return tuple(sorted(found, key=lambda effect: -effect.gain))
@@ -315,7 +322,7 @@ def _equivalent(problem: Problem, search: SearchResult) -> tuple[Equivalent, ...
         if look.selected is None or look.selected.candidate.label not in kept:
             continue
         swapped = search.swaps.get(look.selected.candidate.label)
-        others = equivalents(*swapped) if swapped else equivalents(look.selected, look.hypotheses)
+        others = equivalents(*swapped) if swapped else look.equivalents
         if others:
             names = (look.selected.candidate.name, *(other.candidate.name for other in others))
             groups.append(Equivalent(names, separating_run(names, problem.motions)))
@@ -335,7 +342,7 @@ def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int
 
     ``kept`` are the labels of what the final model has: what was selected may have been removed again.
     """
-    equal = {h.candidate.label for h in equivalents(look.selected, look.hypotheses)} if look.selected else set()
+    equal, (shares, _) = {h.candidate.label for h in look.equivalents}, look.probabilities
     entries = [
         Evidence(
             number,
@@ -346,8 +353,9 @@ def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int
             h.predicted_gain,
             *_outcome(h, look, equal, kept),
             {problem.runs[k]: float(gain) for k, gain in zip(fitted, h.by_run, strict=True)},
+            share,
         )
-        for h in look.hypotheses
+        for h, share in zip(look.hypotheses, shares, strict=True)
     ]
     seen = {entry.name for entry in entries}
     for score in look.scores:
@@ -381,5 +389,6 @@ def _outcome(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Contain
     if not hypothesis.consistent:
         return "inconsistent", "helps some runs and harms others"
     if best is None:
-        return "too little", "improves the fit by less than chance and an imperfect simulator can"
+        least = least_gain(len(hypothesis.values), look.threshold)
+        return "too little", f"improves the fit by less than chance and an imperfect simulator can ({least:.0f})"
     return WORSE_FIT, f"improves the fit by {max(hypothesis.gain, 0.0) / best.gain:.0%} of what the selected effect does"

@@ -1,5 +1,7 @@
 """The tracer gives what numpy gives, and compiled kernels give it bit for bit at any width."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from llvmlite import binding
@@ -87,3 +89,12 @@ def test_sin_cos_reduces_large_angles():
 def test_python_branches_on_traced_values_are_refused():
     with pytest.raises(TypeError, match="where_positive"):
         bool(Graph().input("x"))
+
+
+def test_threads_that_load_a_module_at_once_are_given_it_whole(monkeypatch, tmp_path):
+    """A module is known by its name as soon as it begins to run: nobody may be given it before it has run."""
+    monkeypatch.setenv("WLR_GYM_CACHE", str(tmp_path))
+    slow = f"import time\ntime.sleep(0.2)\nvalue = {tmp_path.name!r}\n"
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: load_module("test_slow", slow).value, range(4)))
+    assert found == [tmp_path.name] * 4

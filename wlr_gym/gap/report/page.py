@@ -39,6 +39,7 @@ from wlr_gym.gap.report.text import (
     error,
     interval,
     listed,
+    made_worse,
     percent,
     places,
     plain,
@@ -114,7 +115,7 @@ def _header(analysis: Analysis) -> str:
     known = [str(effect.get("name", "")) for effect in analysis.known_effects]
     if known:
         facts.append(f"known from the start: {escape(listed([plain(name) for name in known]))}")
-    left = f"<p>{escape(closure(analysis))}</p>\n" if closure(analysis) else ""
+    left = "".join(f"<p>{escape(text)}</p>\n" for text in (made_worse(analysis), closure(analysis)) if text)
     return (
         f'<header>\n<p class="label">{escape(title(analysis))}</p>\n<h1>{escape(sentence(analysis))}</h1>\n{left}'
         f'<p class="small">{"; ".join(facts)}.</p>\n</header>\n{_tiles(analysis)}'

@@ -117,7 +117,7 @@ def recommend(
                 found.setdefault(apart[0], f"distinguishes {names[0]} from {other}: {apart[1]}")
     for hypothesis in last.hypotheses:
         name = hypothesis.candidate.name
-        if name in motions and shown_by_some_runs_only(hypothesis, last.cost):
+        if name in motions and shown_by_some_runs_only(hypothesis, last.threshold):
             found.setdefault(motions[name], f"only some runs show {name}: it fails cross-validation")
     if verdict != EFFECT_FOUND:
         visible: dict[str, bool] = {}

@@ -265,6 +265,7 @@ def result_of(analysis: Analysis, patch: Path | str = PATCH_FILE) -> Result:
         "closure": closure(analysis),
         "turning": None if analysis.turning is None else dict(vars(analysis.turning)),
         "evidence": [_evidence(one) for one in analysis.evidence],
+        "thresholds": [dict(vars(one)) for one in analysis.thresholds],
         "run_gaps": [dict(vars(one)) for one in analysis.run_gaps],
         "channel_gaps": [dict(vars(one)) for one in analysis.channel_gaps],
         "intake": [dict(vars(one)) for one in analysis.intake],

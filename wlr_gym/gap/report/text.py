@@ -45,6 +45,8 @@ _SIDES = {
 }
 #: Times the noise floor, from which on part of the gap is unexplained.
 UNEXPLAINED = 1.5
+#: Channels that effects make worse, of which so many are named.
+MOST_WORSE = 4
 #: Groups of channels in words; others as they are.
 _GROUPS = {
     "pos_leg": "the angles of the legs", "pos_wheel": "the angles of the wheels", "vel_leg": "the speeds of the legs",
@@ -188,6 +190,18 @@ def closure(analysis: Analysis) -> str:
 def _above(gap: ChannelGap, floor: float) -> float:
     """Mean square of a channel above the noise floor."""
     return max(gap.after**2 - floor**2, 0.0) if math.isfinite(gap.after) else 0.0
+
+
+def made_worse(analysis: Analysis) -> str:
+    """Return which channels of the held-out runs the effects make worse, in one sentence; empty if none."""
+    worse = [one for one in analysis.channel_gaps if one.worse] if analysis.added else []
+    if not worse:
+        return ""
+    worst = sorted(worse, key=lambda one: one.calibrated**2 - one.after**2)[:MOST_WORSE]
+    shown = listed([f"{channel(one.channel)} ({error(one.calibrated)} to {error(one.after)})" for one in worst])
+    more = f", and {len(worse) - len(worst)} more" if len(worse) > len(worst) else ""
+    which = "One channel gets" if len(worse) == 1 else f"{len(worse)} of {len(analysis.channel_gaps)} channels get"
+    return f"{which} significantly worse in the held-out runs: {shown}{more}."
 
 
 def adequacy(found: Adequacy) -> str:

@@ -50,7 +50,7 @@ class RigProblem:
     cap = LOST
     steps = 20
     #: A replay costs milliseconds, and a joint that sticks answers far from linearly: every hypothesis is worth a whole fit.
-    thorough, tempering, disagreement, misfit = True, 1.0, 0.0, math.inf
+    threads, thorough, tempering, disagreement, misfit = 1, True, 1.0, 0.0, math.inf
     turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})
     motions: Mapping[str, str] = MappingProxyType({})
 

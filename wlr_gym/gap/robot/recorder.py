@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -55,78 +55,96 @@ class Replays:
     truth: Array | None = None
 
 
+class Tape(NamedTuple):
+    """What a batch's readings are written into; all runs' rows one after the other, so that compiled code can reach them.
+
+    Attributes:
+        recent: (3, robots, len(CHANNELS)) readings of the last three ticks, by tick modulo 3.
+        shift: (robots, 4) rad, added to the wheel angles.
+        poses: (times, robots, 7) positions and quaternions, every :data:`POSE_TICKS` ticks.
+        place: (rows of all runs) when each row is read, in ticks.
+        begin: (runs + 1) first row of each run.
+        next_row: (runs) the row of each run that is read next.
+        anchored: (runs) tick of the last anchor.
+        soonest: (robots) s; the soonest that a goal acts after its row.
+        values: (settings times rows of all runs, len(CHANNELS)) what was read, run by run, setting by setting.
+        truth_columns: columns of the truth that are kept.
+        truths: the same as ``values`` of these.
+    """
+
+    recent: Array
+    shift: Array
+    poses: Array
+    place: Array
+    begin: NDArray[np.int64]
+    next_row: NDArray[np.int64]
+    anchored: NDArray[np.int64]
+    soonest: Array
+    values: Array
+    truth_columns: NDArray[np.int64]
+    truths: Array
+
+
 class Recorder:
     """Readings at the rows' times, on a straight line through two ticks; poses on a coarser clock, for the camera's delay."""
 
     def __init__(self, clocks: Sequence[RunClock], settings: int, first: PlantState, delay: Array, with_truth: bool) -> None:
-        self._soonest = delay.min(axis=1)
         self.clocks, self.settings, self.with_truth = clocks, settings, with_truth
         count = settings * len(clocks)
-        self.idle_setpoints = np.zeros((count, 8))
         self._wheels = first.joint_position[:, WHEEL_SLICE]
-        self._values = [np.zeros((settings, len(clock.t), len(CHANNELS))) for clock in clocks]
-        width = sum(len(TRUTH_LAYOUT.channels[name].elements) for name in TRUTH) if with_truth else 0
-        self._truths = [np.zeros((settings, len(clock.t), width)) for clock in clocks]
-        self._place = [(clock.t - clock.begin) / CLOCK for clock in clocks]
-        self._next = [0] * len(clocks)
         ticks = max(clock.ticks for clock in clocks) + 2
-        self._poses = np.zeros((ticks // POSE_TICKS + 2, count, _POSE))
-        self._recent = np.zeros((3, count, len(CHANNELS)))  # readings of this tick and the two before it, by tick modulo 3
-        self._anchored = [-1] * len(clocks)
-        self._torque = _torque_changes(clocks, ticks + POSE_TICKS, settings)
-        self._torque_on: NDArray[np.bool_] | None = None
+        rows = [len(clock.t) for clock in clocks]
+        columns = _truth_columns() if with_truth else np.zeros(0, np.int64)
+        self.tape: Tape = Tape(
+            recent=np.zeros((3, count, len(CHANNELS))),
+            shift=np.zeros((count, 4)),
+            poses=np.zeros((ticks // POSE_TICKS + 2, count, _POSE)),
+            place=np.concatenate([(clock.t - clock.begin) / CLOCK for clock in clocks]),
+            begin=np.cumsum([0, *rows]),
+            next_row=np.zeros(len(clocks), np.int64),
+            anchored=np.full(len(clocks), -1),
+            soonest=delay.min(axis=1),
+            values=np.zeros((settings * sum(rows), len(CHANNELS))),
+            truth_columns=columns,
+            truths=np.zeros((settings * sum(rows) if with_truth else 0, len(columns))),
+        )
+        self.torque: Mapping[int, NDArray[np.bool_]] = _torque_changes(clocks, ticks + POSE_TICKS, settings)
 
     def start(self, readings: Sensors) -> None:
         """Count the wheel angles from where the robots stand."""
-        self._shift = self._wheels - readings.joint_position[:, WHEEL_SLICE]
+        self.tape.shift[...] = self._wheels - readings.joint_position[:, WHEEL_SLICE]
 
     def start_anew(self, r: int, tick: int, readings: Sensors, truth: Truth) -> None:
         """Count the wheel angles of one run on after an anchor; what was read before it says nothing about what follows."""
         mine = self._mine(r)
-        self._shift[mine] = truth.joint_position[mine, WHEEL_SLICE] - readings.joint_position[mine, WHEEL_SLICE]
-        self._anchored[r] = tick
+        self.tape.shift[mine] = truth.joint_position[mine, WHEEL_SLICE] - readings.joint_position[mine, WHEEL_SLICE]
+        self.tape.anchored[r] = tick
 
     def _mine(self, r: int) -> slice:
         return slice(r * self.settings, (r + 1) * self.settings)
 
-    def torque_on(self, tick: int) -> NDArray[np.bool_] | None:
-        """Which motors are on; switching the torque is not delayed."""
-        if tick in self._torque:
-            self._torque_on = self._torque[tick]
-        return self._torque_on
-
     def see(self, tick: int, readings: Sensors, truth: Truth) -> None:
         """Take what is read at a tick; every tick must be seen."""
-        if tick % POSE_TICKS == 0:
-            self._poses[tick // POSE_TICKS] = truth.values[:, :_POSE]
-        _store(readings.values, self._shift, self._recent[tick % 3])
-        for r, place in enumerate(self._place):
-            while self._next[r] < len(place) and place[self._next[r]] <= tick:
-                self._take(r, tick, truth)
-
-    def _take(self, r: int, tick: int, truth: Truth) -> None:
-        row, mine = self._next[r], self._mine(r)
-        share = self._place[r][row] - (tick - 1)
-        if tick == 0 or share > 1.0 - 1e-9:
-            self._values[r][:, row] = self._recent[tick % 3, mine]
-        else:
-            # what an anchor kept of motors and IMU is the model's before it
-            only_moved = self._anchored[r] >= tick - 1
-            early = np.inf if only_moved or tick == 1 else (1.0 - share) * CLOCK
-            now, last, before = (self._recent[(tick - ago) % 3, mine] for ago in range(3))
-            _interpolate(share, now, last, before, self._soonest[mine], early, only_moved, self._values[r][:, row])
-        if self.with_truth:
-            self._truths[r][:, row] = np.concatenate([truth[name][mine] for name in TRUTH], axis=1)
-        self._next[r] += 1
+        take(tick, readings.values, truth.values, self.tape)
 
     def result(self, r: int, parameters: Parameters) -> Replays:
         """What was read of run ``r`` under every setting; ``parameters`` (settings) are its robots'."""
+        tape = self.tape
+        first, last = tape.begin[r], tape.begin[r + 1]
+        mine, shape = slice(self.settings * first, self.settings * last), (self.settings, last - first, -1)
         offset = np.asarray(self.clocks[r].run.meta.marker_offset, np.float64)
-        late = self._place[r][None, :] - parameters["camera.delay"][:, None] / CLOCK
+        late = tape.place[None, first:last] - parameters["camera.delay"][:, None] / CLOCK
         places = np.maximum(late / POSE_TICKS, 0.0)
         mount, scale = parameters["camera.mount_yaw"], parameters["camera.scale"]
-        _show(self._poses[:, self._mine(r)], offset, places, mount, scale, self._values[r][:, :, _CAMERA])
-        return Replays(self._values[r], self._truths[r] if self.with_truth else None)
+        values = tape.values[mine].reshape(shape)
+        _show(tape.poses[:, self._mine(r)], offset, places, mount, scale, values[:, :, _CAMERA])
+        return Replays(values, tape.truths[mine].reshape(shape) if self.with_truth else None)
+
+
+def _truth_columns() -> NDArray[np.int64]:
+    """Columns of the truth layout that :data:`TRUTH` names, in its order."""
+    columns = np.arange(TRUTH_LAYOUT.width)
+    return np.concatenate([columns[TRUTH_LAYOUT.slices[name]] for name in TRUTH])
 
 
 def _torque_changes(clocks: Sequence[RunClock], ticks: int, settings: int) -> dict[int, NDArray[np.bool_]]:
@@ -138,6 +156,27 @@ def _torque_changes(clocks: Sequence[RunClock], ticks: int, settings: int) -> di
     on = np.stack([clock.torque_on[row] for clock, row in zip(clocks, rows, strict=True)], axis=1)
     changed = np.flatnonzero((on[1:] != on[:-1]).any(axis=(1, 2))) + 1
     return {tick: np.repeat(on[tick], settings, axis=0) for tick in [0, *changed.tolist()]}
+
+
+@njit(cache=True, nogil=True)
+def take(tick: Any, readings: Any, truth: Any, tape: Any) -> None:
+    """Write what is read at a tick (robots, SENSOR_LAYOUT.width) onto a tape; see :class:`Tape`."""
+    if tick % POSE_TICKS == 0:
+        tape.poses[tick // POSE_TICKS] = truth[:, :_POSE]
+    _store(readings, tape.shift, tape.recent[tick % 3])
+    runs = len(tape.next_row)
+    settings = len(tape.shift) // runs
+    for r in range(runs):
+        first, rows = tape.begin[r], tape.begin[r + 1] - tape.begin[r]
+        while tape.next_row[r] < rows and tape.place[first + tape.next_row[r]] <= tick:
+            row = tape.next_row[r]
+            _read_row(
+                tick, tape.place[first + row], r * settings, settings, settings * first + row, rows, tape.anchored[r], tape
+            )
+            for i in range(settings if len(tape.truth_columns) else 0):
+                for k in range(len(tape.truth_columns)):
+                    tape.truths[settings * first + i * rows + row, k] = truth[r * settings + i, tape.truth_columns[k]]
+            tape.next_row[r] += 1
 
 
 @njit(cache=True, nogil=True)
@@ -158,27 +197,38 @@ def _store(readings: Any, shift: Any, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _interpolate(share: Any, now: Any, last: Any, before: Any, soonest: Any, early: Any, only_moved: Any, out: Any) -> None:
-    """Fill readings between the last tick and this one, ``out`` (robots, channels).
+def _read_row(tick: Any, place: Any, first: Any, settings: Any, out: Any, apart: Any, anchored: Any, tape: Any) -> None:
+    """Write one row of a run: readings of this tick, or on a line through the last one and this one.
 
     A row's own goal acts after its reading: where it would act before this tick, the line is that of the two ticks before.
+    What an anchor kept of motors and IMU is the model's before it: there only angles and speeds are on a line.
 
     Args:
-        share: of the tick that has passed at the row's time.
-        now, last, before: (robots, channels) at this tick, the last and the one before.
-        soonest: (robots) s; the soonest that a goal acts after its row.
-        early: s; a goal that acts sooner acts before this tick. Infinite = the ticks before tell nothing.
-        only_moved: whether only angles and speeds are on a line, the rest is this tick's.
+        tick: of the clock.
+        place: of the row, in ticks.
+        first: of the run's robots.
+        settings: how many there are.
+        out: where the first setting's row is written; the next one's ``apart`` rows further on.
+        apart: rows of the run.
+        anchored: tick of the run's last anchor.
+        tape: what is written into.
     """
-    for i in range(len(out)):
-        ahead = early < np.inf and soonest[i] < early
-        for c in range(out.shape[1]):
-            if only_moved and c >= _MOVED:
-                out[i, c] = now[i, c]
+    share = place - (tick - 1)
+    here = tick == 0 or share > 1.0 - 1e-9
+    only_moved = anchored >= tick - 1
+    early = np.inf if only_moved or tick == 1 else (1.0 - share) * CLOCK  # a goal that acts sooner acts before this tick
+    for i in range(settings):
+        robot = first + i
+        now, last, before = tape.recent[tick % 3, robot], tape.recent[(tick - 1) % 3, robot], tape.recent[(tick - 2) % 3, robot]
+        row = tape.values[out + i * apart]
+        ahead = early < np.inf and tape.soonest[robot] < early
+        for c in range(len(row)):
+            if here or (only_moved and c >= _MOVED):
+                row[c] = now[c]
             elif ahead:
-                out[i, c] = last[i, c] + share * (last[i, c] - before[i, c])
+                row[c] = last[c] + share * (last[c] - before[c])
             else:
-                out[i, c] = last[i, c] + share * (now[i, c] - last[i, c])
+                row[c] = last[c] + share * (now[c] - last[c])
 
 
 @njit(cache=True, nogil=True)

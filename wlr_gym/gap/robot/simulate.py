@@ -9,21 +9,22 @@ they were measured. All else (speeds, references, filters) is the simulation's o
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError
-from wlr_gym.base.snapshot import RowStore
 from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.run_states import start_state
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
+from wlr_gym.gap.robot.loop import follow
 from wlr_gym.gap.robot.recorder import POSE_TICKS, Recorder, Replays
+from wlr_gym.gap.robot.schedule import WrittenSetpoints
 from wlr_gym.physics.plants import drive, ground, make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, Sensors, standing_state
 from wlr_gym.physics.plants.forces import Force
@@ -39,60 +40,12 @@ Array = NDArray[np.float64]
 PHYSICS_STEP = 0.001
 #: Simulators that are twice as fast with numbers whose rounding (0.05 sensor noises after windows of 2 s) does not matter here.
 PRECISION = {"gibbs_appell": "float32"}
-#: Robots simulated at once: more need more memory and are no faster.
-MOST_ROBOTS = 1024
+#: Robots simulated at once: what they read stays in the processor's cache.
+MOST_ROBOTS = 512
+#: Robots that a further thread is worth.
+LEAST_ROBOTS = 12
 #: Kernels that replay all robots, the faster first: each further one would be compiled, for longer than it saves.
 KERNELS = ("without effects", "tyres that creep", "all effects")
-
-
-class WrittenSetpoints:
-    """Setpoints that arrive at their measured times, each joint's late by its own ``command.delay``."""
-
-    given = True
-
-    def __init__(self, clocks: Sequence[RunClock], run_of: NDArray[np.intp], delay: Array) -> None:
-        rows = [len(clock.t) for clock in clocks]
-        start = np.concatenate([[0], np.cumsum([n + 1 for n in rows])])[:-1]
-        self._times = np.concatenate([np.append(clock.t - clock.begin, np.inf) for clock in clocks])
-        self._goals = np.concatenate([np.vstack([clock.setpoints, clock.setpoints[-1:]]) for clock in clocks])
-        self._row = np.repeat(start[run_of][:, None], 8, axis=1)
-        self._delay = delay
-        self._newer, self._older, self._wait = (np.zeros(delay.shape) for _ in range(3))
-        self._tick = 0
-
-    def reset(self, rows: NDArray[np.intp], state: PlantState, parameters: Parameters) -> None:
-        """Nothing: the setpoints are given."""
-
-    def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
-        """Nothing: the delays are given."""
-
-    def stores(self) -> dict[str, RowStore]:
-        """Refuse: the setpoints are those of a recorded run."""
-        raise InputError("a plant that follows recorded setpoints cannot be saved and set back")
-
-    def push(self, setpoints: Array) -> tuple[Array, Array, Array]:
-        """Return the newer setpoints, the older setpoints and the time between (s) of the present tick; see SetpointHistory.
-
-        The next call overwrites them.
-        """
-        arrived = (self._newer, self._older, self._wait)
-        _arrive(self._tick * CLOCK, self._times, self._goals, self._delay, self._row, *arrived)
-        self._tick += 1
-        return arrived
-
-
-@njit(cache=True, nogil=True)
-def _arrive(now: Any, times: Any, setpoints: Any, delay: Any, rows: Any, newer: Any, older: Any, wait: Any) -> None:
-    """Fill the setpoints of a tick and move ``rows`` on to those that have arrived."""
-    for i in range(len(rows)):
-        for j in range(8):
-            older[i, j] = setpoints[rows[i, j], j]
-            due = times[rows[i, j] + 1] + delay[i, j] - now
-            wait[i, j] = 0.0
-            if due < CLOCK:
-                rows[i, j] += 1
-                wait[i, j] = max(due, 0.0)
-            newer[i, j] = setpoints[rows[i, j], j]
 
 
 def replay_batch(
@@ -117,32 +70,39 @@ def replay_batch(
         with_truth: keep the columns of :data:`wlr_gym.gap.robot.recorder.TRUTH` too.
         threads: worker threads; the result does not depend on it.
     """
-    settings = len(parameters)
-    chunk = max(1, MOST_ROBOTS // len(clocks))
     order = sorted(range(len(clocks)), key=lambda r: -clocks[r].ticks)  # a run that is over need not be simulated any further
     longest_first = [clocks[r] for r in order]
-    parts = [
-        _replay_chunk(
-            robot,
-            longest_first,
-            Parameters(parameters.values[k : k + chunk]),
-            backend,
-            forces,
-            None if constants is None or not forces else constants[k : k + chunk],
-            with_truth,
-            threads,
-        )
-        for k in range(0, settings, chunk)
-    ]
+    workers = threads if backend in PRECISION else 1  # others have threads of their own
+
+    def replay_part(part: slice) -> list[Replays]:
+        own = None if constants is None or not forces else constants[part]
+        chosen = Parameters(parameters.values[part])
+        return _replay_chunk(robot, longest_first, chosen, backend, forces, own, with_truth, 1 if workers > 1 else threads)
+
+    parts = shared_out(len(parameters), len(clocks), workers)
+    with ThreadPoolExecutor(workers) as pool:
+        found = list(pool.map(replay_part, parts) if workers > 1 else map(replay_part, parts))
+    return [_joined([part[r] for part in found]) for r in np.argsort(order)]
+
+
+def shared_out(settings: int, runs: int, workers: int) -> list[slice]:
+    """Return which settings are replayed together: at most :data:`MOST_ROBOTS` robots, and parts of equal size for each worker.
+
+    Less than a tile of robots costs as much as a tile: few are not shared out.
+    """
+    busy = max(1, min(workers, settings * runs // LEAST_ROBOTS))
+    each = max(1, MOST_ROBOTS // runs)
+    parts = busy * max(1, math.ceil(settings / (busy * each)))
+    edges = np.linspace(0, settings, min(parts, settings) + 1).round().astype(int)
+    return [slice(first, last) for first, last in itertools.pairwise(edges.tolist())]
+
+
+def _joined(parts: Sequence[Replays]) -> Replays:
+    """One run's replays under all settings."""
     if len(parts) == 1:
-        return [parts[0][r] for r in np.argsort(order)]
-    return [
-        Replays(
-            np.concatenate([part[r].values for part in parts]),
-            np.concatenate([part[r].truth for part in parts]) if with_truth else None,  # type: ignore[arg-type]
-        )
-        for r in np.argsort(order)
-    ]
+        return parts[0]
+    truths = [part.truth for part in parts if part.truth is not None]
+    return Replays(np.concatenate([part.values for part in parts]), np.concatenate(truths) if truths else None)
 
 
 def kernel_of(parameters: Parameters) -> str:
@@ -173,23 +133,26 @@ def _replay_chunk(
         plant.set_force_values(np.tile(constants, (runs, 1)))
     delay = lanes["command.delay"].copy()
     lanes["command.delay"] = 0.0
-    plant.use_setpoints(WrittenSetpoints(clocks, run_of, delay))
+    setpoints = WrittenSetpoints(clocks, run_of, delay)
+    plant.use_setpoints(setpoints)
     first = _join([_start(clock.run, robot, parameters, clock.begin - clock.t[0]) for clock in clocks])
     try:
         recorder = Recorder(clocks, settings, first, delay, with_truth)
         readings = plant.reset(parameters=lanes, state=first)
         recorder.start(readings)
-        ticks = POSE_TICKS * -(-max(clock.ticks for clock in clocks) // POSE_TICKS)  # the last pose is stored too
+        last = POSE_TICKS * -(-max(clock.ticks for clock in clocks) // POSE_TICKS)  # the last pose is stored too
         anchors, ends = _anchors_by_tick(clocks), np.array([clock.ticks + POSE_TICKS for clock in clocks])
-        for tick in range(ticks):
+        torque_on: NDArray[np.bool_] | None = None
+        stops = sorted({0, last, *(t for t in (*anchors, *recorder.torque, *ends.tolist()) if t < last)})
+        for tick, until in itertools.pairwise(stops):
             if tick in ends:
                 plant.keep_going(settings * int((ends > tick).sum()))
             for r, window in anchors.get(tick, ()):
                 readings = _anchor(plant, clocks[r], window, run_of == r, lanes, readings)
                 recorder.start_anew(r, tick, readings, plant.truth())
-            recorder.see(tick, readings, plant.truth())
-            readings = plant.step(recorder.idle_setpoints, recorder.torque_on(tick))
-        recorder.see(ticks, readings, plant.truth())
+            torque_on = recorder.torque.get(tick, torque_on)
+            follow(plant, setpoints.schedule, recorder, readings, torque_on, tick, until)
+        recorder.see(last, readings, plant.truth())
     finally:
         plant.close()
     return [recorder.result(r, Parameters(lanes.values[run_of == r])) for r in range(runs)]

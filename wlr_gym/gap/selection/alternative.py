@@ -9,8 +9,11 @@ needs the residuals themselves.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +25,7 @@ from wlr_gym.gap.problem import Candidate, Problem, Start
 from wlr_gym.gap.selection.screening import Responses, Score, directions, shortened, with_tolerances
 
 Array = NDArray[np.float64]
+_T = TypeVar("_T")
 
 #: Times that the noise follows the candidate.
 ROUNDS = 2
@@ -33,13 +37,16 @@ SCORED_PER_GROUP = 4
 SHARES = (1.0, 0.85, 0.7, 0.5, 0.3, 0.15, 0.05, 0.0)
 
 
-def rescored(problem: Problem, fit: Fit, found: Responses, scores: Sequence[Score]) -> tuple[list[Score], list[Score]]:
+def rescored(
+    problem: Problem, fit: Fit, found: Responses, products: Products, scores: Sequence[Score]
+) -> tuple[list[Score], list[Score]]:
     """Score candidates under the alternative.
 
     Args:
         problem: the system.
         fit: the model without the candidates.
         found: responses of its numbers and of the candidates' probes.
+        products: of both.
         scores: to first order, under the noise of ``fit``.
 
     Returns:
@@ -50,7 +57,6 @@ def rescored(problem: Problem, fit: Fit, found: Responses, scores: Sequence[Scor
     """
     if not scores:
         return [], []
-    products = Products.of(fit, found)
     system = _System(problem, fit, found, products, np.arange(len(products.rows)))
     best, rest = system.best(scores, SCORED)
     everywhere = sorted([*best, *(replace(s, gain=min(s.gain, 0.0)) for s in rest)], key=lambda score: -score.gain)
@@ -124,34 +130,59 @@ class _System:
         """Number of fitted numbers."""
         return len(self.found.tight)
 
-    @property
+    @cached_property
     def rows(self) -> Array:
         """Measured rows (channels)."""
         return self.products.rows[self.channels]
+
+    @cached_property
+    def square(self) -> Array:
+        """Squares of the residuals (channels)."""
+        return self.products.square[self.channels]
+
+    @cached_property
+    def push(self) -> Array:
+        """Products of columns and residuals (channels, columns)."""
+        return self.products.push[self.channels]
+
+    @cached_property
+    def gram(self) -> Array:
+        """Products of columns (channels, columns, columns)."""
+        return self.products.gram[self.channels]
+
+    @cached_property
+    def gram_known(self) -> Array:
+        """The same of the fitted numbers (channels, numbers, numbers)."""
+        return np.ascontiguousarray(self.gram[:, : self.known, : self.known])
 
     def best(self, scores: Sequence[Score], count: int) -> tuple[list[Score], list[Score]]:
         """Return the candidates that explain most squares, or gain most under the noise of the model without them, best
         first, scored under the alternative; and the rest.
         """
-        own = self.products.gram[self.channels][:, : self.known, : self.known]
-        bare = self._bare_costs(own)
-        rough = [max(self._rough(own, bare, start) for start in score.candidate.starts) for score in scores]
+        bare = self._bare_costs()
+        rough = self._each(lambda score: max(self._rough(bare, start) for start in score.candidate.starts), scores)
         lasting = np.argsort(rough)[::-1][:count].tolist()
         leading = np.argsort([score.gain for score in scores])[::-1][: count // 2].tolist()
         chosen = dict.fromkeys([*lasting, *leading])
-        best = [self._scored(scores[k]) for k in chosen]
+        best = self._each(self._scored, [scores[k] for k in chosen])
         return sorted(best, key=lambda score: -score.gain), [s for k, s in enumerate(scores) if k not in chosen]
 
-    def _bare_costs(self, own: Array) -> float:
+    def _each(self, work: Callable[[Score], _T], scores: Sequence[Score]) -> list[_T]:
+        """What comes of each score, by as many threads as the problem may use."""
+        if self.problem.threads == 1:
+            return [work(score) for score in scores]
+        with ThreadPoolExecutor(self.problem.threads) as pool:
+            return list(pool.map(work, scores))
+
+    def _bare_costs(self) -> float:
         """Minus two log likelihood without a candidate if every row were independent."""
-        weight = self._white().weight
-        matrix, gradient = np.tensordot(weight, own, 1), weight @ self.products.push[self.channels, : self.known]
-        matrix, gradient = with_tolerances(matrix, gradient, self.found)
+        weight, own, push = self._white().weight, self.gram_known, self.push[:, : self.known]
+        matrix, gradient = with_tolerances(np.tensordot(weight, own, 1), weight @ push, self.found)
         x = -np.linalg.solve(matrix, gradient)
-        square = self.products.square[self.channels] + 2.0 * self.products.push[self.channels, : self.known] @ x + (own @ x) @ x
+        square = self.square + 2.0 * push @ x + (own @ x) @ x
         return float(self.rows @ channel_costs(np.maximum(square, 0.0) / np.maximum(self.rows, 1)))
 
-    def _rough(self, own: Array, bare: float, start: Start) -> float:
+    def _rough(self, bare: float, start: Start) -> float:
         """Improvement if every row were independent: what orders candidates before their noise is known."""
         parts = self._parts(start)
         matrix, gradient = with_tolerances(*parts.normal(self._white().weight), self.found)
@@ -165,17 +196,13 @@ class _System:
 
     def _parts(self, start: Start) -> _Directions:
         """Products of the fitted numbers and of the directions of a start."""
-        mix, known, products = directions(start, self.found), self.known, self.products
+        mix, known = directions(start, self.found), self.known
         used = np.flatnonzero(mix.any(axis=0))
-        own = mix[:, used]
-        gram = products.gram[self.channels]
-        border = gram[:, :known][:, :, used] @ own.T
-        corner = own @ gram[:, used][:, :, used] @ own.T
-        top = np.concatenate([gram[:, :known, :known], border], axis=2)
-        whole = np.concatenate([top, np.concatenate([border.transpose(0, 2, 1), corner], axis=2)], axis=1)
-        pushed = products.push[self.channels]
+        own, own_gram, pushed = mix[:, used], self.gram[:, used], self.push
+        border = (own @ own_gram[:, :, :known]).transpose(0, 2, 1)
+        corner = own @ own_gram[:, :, used] @ own.T
         push = np.concatenate([pushed[:, :known], pushed[:, used] @ own.T], axis=1)
-        return _Directions(whole, push, products.square[self.channels], self.rows)
+        return _Directions(self.gram_known, border, corner, push, self.square, self.rows)
 
     def _scored(self, score: Score) -> Score:
         """The candidate's best start, under the alternative."""
@@ -238,20 +265,32 @@ class _System:
 
 @dataclass(frozen=True, eq=False)
 class _Directions:
-    """The products of the fitted numbers and a candidate's directions; see :class:`Products`."""
+    """The products of the fitted numbers and a candidate's directions (channels, ...); see :class:`Products`.
 
-    gram: Array
+    Attributes:
+        known: of the fitted numbers' columns.
+        border: of those and the directions.
+        corner: of the directions.
+        push, square, rows: of all columns and the residuals; of the residuals; measured rows.
+    """
+
+    known: Array
+    border: Array
+    corner: Array
     push: Array
     square: Array
     rows: Array
 
     def normal(self, weight: Array) -> tuple[Array, Array]:
         """Normal equations under weights (channels)."""
-        return np.tensordot(weight, self.gram, 1), weight @ self.push
+        known, border, corner = (np.tensordot(weight, part, 1) for part in (self.known, self.border, self.corner))
+        return np.block([[known, border], [border.T, corner]]), weight @ self.push
 
     def mean_squares(self, x: Array) -> Array:
         """Mean squares (channels) of the residuals after a step (numbers)."""
-        total = self.square + 2.0 * self.push @ x + (self.gram @ x) @ x
+        known, own = np.split(x, [self.known.shape[1]])
+        both = (self.known @ known) @ known + 2.0 * (self.border @ own) @ known + (self.corner @ own) @ own
+        total = self.square + 2.0 * self.push @ x + both
         return np.maximum(total, 0.0) / np.maximum(self.rows, 1)
 
 

@@ -217,29 +217,29 @@ def without_each_run(problem: Problem, found: Fit) -> list[FittedModel]:
 
 
 def accept(
-    problem: Problem, runs: Sequence[int], current: Fit, finals: Sequence[Finalist], bare: Fit, tell: Tell
+    problem: Problem, runs: Sequence[int], threshold: float, finals: Sequence[Finalist], bare: Fit, tell: Tell
 ) -> tuple[Finalist | None, list[Finalist], Fit]:
     """The best that improves the fit enough at a plausible value, also once converged; the finalists as far as they have
     converged; the best model without any of them.
 
     A formula is selected only where no named effect improves the fit by nearly as much.
     """
-    good = [final for final in finals if _is_good(current.cost, final.hypothesis)]
+    good = [final for final in finals if _is_good(threshold, final.hypothesis)]
     named = [final for final in good if not final.hypothesis.candidate.formula]
     if named and named[0].hypothesis.gain >= NAMED_FIRST * good[0].hypothesis.gain:
         good = [named[0], *(final for final in good if final is not named[0])]
     seen = list(finals)
     for final in good:
         converged, bare = (final, bare) if problem.thorough else converge(problem, runs, final, bare, tell)
-        if _is_good(current.cost, converged.hypothesis) and _tolerances_do(problem, runs, current.cost, converged, bare):
+        if _is_good(threshold, converged.hypothesis) and _tolerances_do(problem, runs, threshold, converged, bare):
             converged = replace(converged, hypothesis=replace(converged.hypothesis, tolerable=True))
         seen = [converged if other is final else other for other in seen]
-        if _is_good(current.cost, converged.hypothesis):
+        if _is_good(threshold, converged.hypothesis):
             return converged, seen, bare
     return None, seen, bare
 
 
-def _tolerances_do(problem: Problem, runs: Sequence[int], cost: float, final: Finalist, bare: Fit) -> bool:
+def _tolerances_do(problem: Problem, runs: Sequence[int], threshold: float, final: Finalist, bare: Fit) -> bool:
     """Whether tolerances that count once explain nearly as much: one number for all wheels costs less than four tolerances do,
     the more so where they are tempered."""
     if problem.tempering == 1.0 or final.hypothesis.gain > TOLERANCES_CANNOT:
@@ -259,16 +259,16 @@ def _tolerances_do(problem: Problem, runs: Sequence[int], cost: float, final: Fi
         ).cost
         for found in (bare, final.fit)
     ]
-    return costs[0] - costs[1] < least_gain(len(final.hypothesis.values), cost)
+    return costs[0] - costs[1] < least_gain(len(final.hypothesis.values), threshold)
 
 
-def shown_by_some_runs_only(hypothesis: Hypothesis, cost: float) -> bool:
-    """Whether a hypothesis would be accepted but for failing cross-validation; ``cost``: of the model so far."""
-    return not hypothesis.cross_validated and _is_good(cost, replace(hypothesis, cross_validated=True))
+def shown_by_some_runs_only(hypothesis: Hypothesis, threshold: float) -> bool:
+    """Whether a hypothesis would be accepted but for failing cross-validation; ``threshold``: of its round."""
+    return not hypothesis.cross_validated and _is_good(threshold, replace(hypothesis, cross_validated=True))
 
 
-def _is_good(cost: float, hypothesis: Hypothesis) -> bool:
-    return hypothesis.gain >= least_gain(len(hypothesis.values), cost) and hypothesis.plausible
+def _is_good(threshold: float, hypothesis: Hypothesis) -> bool:
+    return hypothesis.gain >= least_gain(len(hypothesis.values), threshold) and hypothesis.plausible
 
 
 def converge(problem: Problem, runs: Sequence[int], final: Finalist, bare: Fit, tell: Tell) -> tuple[Finalist, Fit]:

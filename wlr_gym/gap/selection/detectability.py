@@ -9,16 +9,17 @@ import numpy as np
 
 from wlr_gym.gap.analysis import Detectable
 from wlr_gym.gap.problem import Candidate
-from wlr_gym.gap.selection.screening import Score, least_amplitude
+from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, least_amplitude
 from wlr_gym.physics.effects import EFFECTS, EffectParameter
 
 
-def detectable(scores: Sequence[Score], cost: float = 0.0) -> dict[str, Detectable]:
+def detectable(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> dict[str, Detectable]:
     """Return the smallest severity of every effect that would have been accepted, at the place where it is hardest to see.
 
     Of an effect with directions of its own (x, y, z of a displaced mass) it is the one that shows best: in another it may hide
-    at any size. First order: the gain of an effect grows with the square of its severity. ``cost`` is that of the model without
-    it. Where no plausible size would show, its size is NaN. Formulas are left out: their laws have no size in common.
+    at any size. First order: the gain of an effect grows with the square of its severity. Where no plausible size would show,
+    its size is NaN. Formulas are left out: their laws have no size in common. ``threshold``: see
+    :func:`wlr_gym.gap.selection.screening.least_gain`.
     """
     found: dict[str, tuple[float, Detectable]] = {}
     for score in scores:
@@ -27,7 +28,7 @@ def detectable(scores: Sequence[Score], cost: float = 0.0) -> dict[str, Detectab
         start = score.start
         shown = np.diag(score.information)
         which = max((k for k in _sizes(score.candidate) if k < len(shown)), key=lambda k: float(shown[k]))
-        amplitude = least_amplitude(score.candidate, score.information, which, cost)
+        amplitude = least_amplitude(score.candidate, score.information, which, threshold)
         steps = np.zeros(len(start.directions))
         steps[min(which, len(steps) - 1)] = amplitude
         entry = _largest(score.candidate, start.values(steps))

@@ -22,11 +22,11 @@ RIVAL = 0.75
 AGREED = 2.0
 
 
-def selection_frequency(selected: Hypothesis, others: Sequence[Hypothesis], cost: float = 0.0) -> float:
+def selection_frequency(selected: Hypothesis, others: Sequence[Hypothesis], threshold: float = LEAST_GAIN) -> float:
     """Return the share of bootstrap samples of the runs in which the selected effect is accepted and no other fits better.
 
-    A run counts by its part in the gain, as fitted to all runs: no sample is refitted. ``cost`` is that of the model
-    without the effect.
+    A run counts by its part in the gain, as fitted to all runs: no sample is refitted. ``threshold``: see
+    :func:`wlr_gym.gap.selection.screening.least_gain`.
     """
     rng = np.random.default_rng(0)
     rivals = [other for other in others if other.candidate.name != selected.candidate.name and not other.tolerable]
@@ -34,7 +34,7 @@ def selection_frequency(selected: Hypothesis, others: Sequence[Hypothesis], cost
     parts = _parts(selected)[picks]
     gains = parts.sum(axis=1)
     agreed = -parts.clip(max=0.0).sum(axis=1) <= MOST_HARM * parts.clip(min=0.0).sum(axis=1)
-    wins = agreed & (gains >= least_gain(len(selected.values), cost))
+    wins = agreed & (gains >= least_gain(len(selected.values), threshold))
     for rival in rivals:
         wins &= gains >= _parts(rival)[picks].sum(axis=1)
     return float(wins.mean())
@@ -46,13 +46,21 @@ def _parts(hypothesis: Hypothesis) -> Array:
     return hypothesis.by_run * (hypothesis.gain / total) if total > 0.0 < hypothesis.gain else hypothesis.by_run
 
 
-def equivalents(selected: Hypothesis, others: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return the best hypothesis of every other name that the data cannot distinguish from the selected one."""
+def equivalents(selected: Hypothesis, others: Sequence[Hypothesis], credible: Sequence[str] = ()) -> list[Hypothesis]:
+    """Return the best hypothesis of every other name that the data cannot distinguish from the selected one.
+
+    ``credible``: names that cannot be left out of a set with 95 % of the probability.
+    """
     found: dict[str, Hypothesis] = {}
     for other in others:
         name = other.candidate.name
         possible = not other.at_bound and not other.tolerable
-        if name != selected.candidate.name and possible and name not in found and _as_good(selected, other):
+        if (
+            name != selected.candidate.name
+            and possible
+            and name not in found
+            and (name in credible or _as_good(selected, other))
+        ):
             found[name] = other
     return list(found.values())
 

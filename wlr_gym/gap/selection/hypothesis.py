@@ -36,6 +36,7 @@ class Hypothesis:
         base, base_residuals: the model without the effect, refitted as long.
         cross_validated: whether runs are replayed better by a fit to the other runs (checked for finalists only).
         tolerable: whether the tolerances of calibrated parameters allow as much.
+        occam: what its unknowns cost beside its gain (:func:`wlr_gym.gap.selection.evidence.occam`).
     """
 
     candidate: Candidate
@@ -48,11 +49,17 @@ class Hypothesis:
     base_residuals: list[Array] = field(repr=False)
     cross_validated: bool = True
     tolerable: bool = False
+    occam: float = 0.0
 
     @property
     def values(self) -> tuple[float, ...]:
         """Values of the candidate's unknowns."""
         return self.model.effects[-1][1]
+
+    @property
+    def evidence(self) -> float:
+        """Twice the log evidence beyond that of the model without it."""
+        return self.gain - self.occam
 
     @property
     def at_bound(self) -> bool:

@@ -13,6 +13,7 @@ from wlr_gym.gap.estimation.least_squares import channel_products, constrained_s
 from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise
 from wlr_gym.gap.estimation.model import FittedModel, moved, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem, Setting
+from wlr_gym.gap.selection.evidence import occam
 from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score
 
@@ -290,7 +291,7 @@ def _ranked(
         by_run = fall_by_run(residuals[-1], residual, estimate_noise(residual, autocorrelation_time))
         gain = base - total_cost(problem, model, residual, autocorrelation_time)
         hypothesis = Hypothesis(score.candidate, model, gain, by_run, score.gain, residual, models[-1], residuals[-1])
-        found.append(replace(hypothesis, tolerable=within_tolerance(problem, model)))
+        found.append(replace(hypothesis, tolerable=within_tolerance(problem, model), occam=occam(score, problem.tempering)))
     return sorted(found, key=lambda hypothesis: -hypothesis.gain)
 
 

@@ -7,7 +7,7 @@ is confounded with calibrated parameters within their tolerances scores nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from wlr_gym.gap.problem import Candidate, Probe, Problem, Setting, Start
 
 Array = NDArray[np.float64]
 
-#: Fall of minus two log posterior below which an effect is not accepted.
+#: Fall of minus two log posterior below which no effect is accepted; see :mod:`wlr_gym.gap.selection.threshold`.
 LEAST_GAIN = 16.0
 #: By how much more an effect must improve the fit for every unknown beyond the first.
 PER_UNKNOWN = 3.0
@@ -31,14 +31,14 @@ LEAST_OWN = 1e-4
 SHARES = (1.0, 0.7, 0.5, 0.3, 0.1, 0.0)
 
 
-def least_gain(unknowns: int, cost: float = 0.0) -> float:
-    """Return by how much an effect with so many unknowns must improve the fit; ``cost`` is that of the model without it."""
-    return max(LEAST_GAIN + PER_UNKNOWN * (unknowns - 1), LEAST_SHARE * cost)
+def least_gain(unknowns: int, threshold: float = LEAST_GAIN) -> float:
+    """Return by how much an effect with so many unknowns must improve the fit; ``threshold``: one with a single unknown."""
+    return threshold + PER_UNKNOWN * (unknowns - 1)
 
 
-def least_amplitude(candidate: Candidate, information: Array, k: int, cost: float = 0.0) -> float:
+def least_amplitude(candidate: Candidate, information: Array, k: int, threshold: float = LEAST_GAIN) -> float:
     """Return the smallest amplitude of direction ``k`` that would be accepted: clear, and beyond what a tolerance allows."""
-    clear = float(np.sqrt(least_gain(len(candidate.unknowns), cost) / max(float(information[k, k]), 1e-12)))
+    clear = float(np.sqrt(least_gain(len(candidate.unknowns), threshold) / max(float(information[k, k]), 1e-12)))
     tolerance = candidate.tolerances[k] if k < len(candidate.tolerances) else None
     return clear if tolerance is None else max(clear, tolerance.reach)
 
@@ -64,7 +64,7 @@ class Score:
     own: float
     information: Array
     start: Start
-    visible: bool
+    visible: bool = False
     step: Array | None = field(default=None, repr=False)
 
 
@@ -116,14 +116,15 @@ def project(problem: Problem, fit: Fit, columns: Sequence[NDArray[np.float32]], 
     return Responses(places, response, push, tight, away, information, *room(problem, fit.model), columns)
 
 
-def screen(candidates: Sequence[Candidate], found: Responses, cost: float = 0.0) -> list[Score]:
-    """Return the score of every candidate, best first; ``cost`` is that of the model without it."""
+def screen(candidates: Sequence[Candidate], found: Responses, threshold: float = LEAST_GAIN) -> list[Score]:
+    """Return the score of every candidate, best first; ``threshold``: see :func:`least_gain`."""
     nothing = _fall(found, np.zeros((0, len(found.push))))[0]
-    scores = [score for candidate in candidates if (score := _score(candidate, found, nothing, cost)) is not None]
-    return sorted(scores, key=lambda score: -score.gain)
+    scores = [score for candidate in candidates if (score := _score(candidate, found, nothing)) is not None]
+    seen = [replace(score, visible=is_visible(score, threshold)) for score in scores]
+    return sorted(seen, key=lambda score: -score.gain)
 
 
-def _score(candidate: Candidate, found: Responses, nothing: float, cost: float) -> Score | None:
+def _score(candidate: Candidate, found: Responses, nothing: float) -> Score | None:
     best: Score | None = None
     for start in candidate.starts:
         mix = directions(start, found)
@@ -134,7 +135,7 @@ def _score(candidate: Candidate, found: Responses, nothing: float, cost: float) 
         values, share = shortened(candidate, start, amplitude, SHARES)
         gain = (fall - nothing) * (2.0 * share - share**2)  # along the way to the minimum of a parabola
         if best is None or gain > best.gain:
-            best = Score(candidate, values, gain, own, information, start, _visible(candidate, start, information, cost))
+            best = Score(candidate, values, gain, own, information, start)
     return best
 
 
@@ -148,12 +149,13 @@ def _fall(found: Responses, mix: Array) -> tuple[float, Array]:
     return -float(2.0 * gradient @ x + x @ matrix @ x), x[known:]
 
 
-def _visible(candidate: Candidate, start: Start, information: Array, cost: float) -> bool:
+def is_visible(score: Score, threshold: float) -> bool:
     """Whether the smallest severity that would be accepted lies in the plausible range, in some direction."""
+    candidate, start, information = score.candidate, score.start, score.information
     for k in range(len(information)):
         for sign in (1.0, -1.0):
             amplitude = np.zeros(len(information))
-            amplitude[k] = sign * least_amplitude(candidate, information, k, cost)
+            amplitude[k] = sign * least_amplitude(candidate, information, k, threshold)
             values = start.values(amplitude)
             pairs = list(zip(candidate.unknowns, values, strict=True))
             if all(u.low <= v <= u.high for u, v in pairs) and any(v != u.neutral for u, v in pairs if u.is_size):

@@ -1,14 +1,14 @@
 """Search for missing effects: screen all candidates, refit the best of them, select the one that improves the fit most, repeat.
 
 A candidate is accepted if it lowers minus two log posterior by more than chance and an imperfect simulator can
-(:data:`LEAST_GAIN`, more for every further unknown, and ``LEAST_SHARE`` of what is left), if the runs agree on it, and if
+(:mod:`wlr_gym.gap.selection.threshold`, more for every further unknown), if the runs agree on it, and if
 its value lies inside its plausible range. Effects that become redundant beside others are removed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,16 @@ from wlr_gym.gap.estimation.fit import Fit, cheapest, fit, linearise, widened
 from wlr_gym.gap.estimation.likelihood import estimate_noise
 from wlr_gym.gap.estimation.model import FittedModel, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
-from wlr_gym.gap.selection.alternative import rescored
+from wlr_gym.gap.selection.alternative import Products, rescored
 from wlr_gym.gap.selection.cross_validation import Finalist, accept, beside, fit_finalists
+from wlr_gym.gap.selection.equivalence import equivalents
+from wlr_gym.gap.selection.evidence import credible_names, probabilities
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.refit import refit, refit_thoroughly
-from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, least_gain, responses, screen
+from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, is_visible, least_gain, responses, screen
+from wlr_gym.gap.selection.threshold import acceptance_threshold, largest_by_chance
 
+Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
 #: Hypotheses that are refitted in one round, at most.
@@ -39,12 +43,32 @@ MOST_EFFECTS = 4
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One round of the search: what was screened, what was refitted (best first), and which was selected."""
+    """One round of the search: what was screened, what was refitted (best first), and which was selected.
+
+    Attributes:
+        scores: of all candidates, best first.
+        hypotheses: refitted, best first.
+        selected: one of them, or None.
+        threshold: by how much one with a single unknown had to improve the fit.
+        by_chance: (draws) of :func:`wlr_gym.gap.selection.threshold.largest_by_chance`.
+    """
 
     scores: list[Score]
     hypotheses: list[Hypothesis]
     selected: Hypothesis | None
-    cost: float
+    threshold: float = LEAST_GAIN
+    by_chance: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+
+    @property
+    def probabilities(self) -> tuple[list[float], float]:
+        """Probability of each hypothesis, and that of none of them."""
+        return probabilities(self.hypotheses, self.scores)
+
+    @property
+    def equivalents(self) -> list[Hypothesis]:
+        """The best hypothesis of every other name that the data cannot distinguish from the selected one."""
+        names = credible_names(self.hypotheses, self.probabilities[0])
+        return [] if self.selected is None else equivalents(self.selected, self.hypotheses, names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +85,12 @@ class SearchResult:
     swaps: dict[str, tuple[Hypothesis, list[Hypothesis]]]
 
 
-def shortlist(scores: Sequence[Score], cost: float = 0.0) -> list[Score]:
-    """Return the best scores, at most :data:`PER_NAME` of one effect, and only those above a threshold.
+def shortlist(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> list[Score]:
+    """Return the best scores, at most :data:`PER_NAME` of one effect, and only those above a quarter of the threshold.
 
-    The improvement predicted to first order may be a quarter of the actual one; ``cost`` is that of the model without it.
+    The improvement predicted to first order may be a quarter of the actual one.
     """
-    least = 0.25 * least_gain(1, cost)
+    least = 0.25 * threshold
     chosen: list[Score] = []
     for score in scores:
         if len(chosen) == SHORTLIST:
@@ -110,8 +134,14 @@ def search_effects(
         candidates = [candidate for candidate in candidates if not _is_explained(current.model, candidate)]
         tell(f"screening {len(candidates)} candidates")
         found = responses(problem, current, runs, probes)
-        scores, alone = rescored(problem, current, found, screen(candidates, found, current.cost))
-        chosen = scores if problem.thorough else with_proposals(shortlist(scores, cost=current.cost), alone)
+        products = Products.of(current, found)
+        screened = screen(candidates, found)
+        scores, alone = rescored(problem, current, found, products, screened)
+        by_chance = np.zeros(0) if problem.thorough else largest_by_chance(problem, runs, current, found, products, scores)
+        threshold = acceptance_threshold(current.cost, by_chance)
+        visible = {score.candidate.label for score in screened if is_visible(score, threshold)}
+        scores = [replace(score, visible=score.candidate.label in visible) for score in scores]
+        chosen = scores if problem.thorough else with_proposals(shortlist(scores, threshold), alone)
         tell(f"refitting {len(chosen)} hypotheses")
         hypotheses = (
             refit_thoroughly(problem, runs, current, chosen) if given is None else refit(problem, runs, current, chosen, given)
@@ -122,7 +152,7 @@ def search_effects(
         if current is again or not _deeper(problem, current, bare):
             finals, bare = fit_finalists(problem, runs, current, hypotheses, bare, tell)
         if current is again or not _deeper(problem, current, bare):
-            accepted, finals, bare = accept(problem, runs, current, finals, bare, tell)
+            accepted, finals, bare = accept(problem, runs, threshold, finals, bare, tell)
         if current is not again and _deeper(problem, current, bare):
             tell("calibrated parameters fit better elsewhere: calibrated anew from there")
             anew = fit(problem, runs, bare.model, scatter=current.noise.scatter, steps=problem.steps)
@@ -132,7 +162,7 @@ def search_effects(
             continue
         merged = _merged(problem, finals, hypotheses, bare, accepted or (finals[0] if finals else None))
         selected = None if accepted is None else _labelled(merged, accepted.hypothesis)
-        rounds.append(Round(scores, merged, selected, current.cost))
+        rounds.append(Round(scores, merged, selected, threshold, by_chance))
         if accepted is None:
             break
         tell(f"selected: {accepted.hypothesis.candidate.label}")

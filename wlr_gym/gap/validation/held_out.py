@@ -17,6 +17,7 @@ from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
 from wlr_gym.gap.estimation.model import FittedModel
 from wlr_gym.gap.estimation.uncertainty import two_sided_95
 from wlr_gym.gap.problem import Problem, Setting
+from wlr_gym.gap.validation.worse import worse_channels
 
 Array = NDArray[np.float64]
 
@@ -85,6 +86,7 @@ def compare_models(
         RunGap(problem.runs[run], k >= len(fitted), *(level(s[k]) for s in squares), reduction=closed)
         for k, (run, closed) in enumerate(zip((*fitted, *heldout), singly, strict=True))
     )
+    worse = worse_channels(problem, heldout, *([r[k] for r in found[outside]] for k in (1, 2)))
     channels = tuple(
         ChannelGap(
             signal.name,
@@ -92,6 +94,7 @@ def compare_models(
             signal.noise,
             *(float(np.sqrt(mean_of_runs(s[outside])[c])) for s in squares),
             group=signal.group,
+            worse=bool(worse[c]),
         )
         for c, signal in enumerate(problem.signals)
         if np.isfinite(squares[0][outside][:, c]).any()

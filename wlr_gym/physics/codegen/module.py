@@ -9,6 +9,7 @@ import os
 import platform
 import sys
 import tempfile
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -21,6 +22,9 @@ from numba.extending import intrinsic
 from wlr_gym.physics.codegen.intrinsics import array_at, fma, numbers_of, select, whole_registers
 from wlr_gym.physics.codegen.straight_line import straight_line
 '''
+
+#: Modules are loaded one after the other: a thread must not be given one that another has only begun to run.
+_LOADING = threading.RLock()
 
 
 def cache_directory() -> Path:
@@ -71,6 +75,11 @@ def load_module(tag: str, source: str | Callable[[], str], message: str = "", ke
 
     identity = fingerprint(HEADER, source_of(intrinsics, straight_line), tag, key if callable(source) else source)
     name = f"{tag}_{identity}"
+    with _LOADING:
+        return _load(name, source, message)
+
+
+def _load(name: str, source: str | Callable[[], str], message: str) -> ModuleType:
     if name in sys.modules:
         return sys.modules[name]
     path = cache_directory() / f"{name}.py"

@@ -181,7 +181,8 @@ def _in_imu_frame(state: Any, row: Any, first: int, axis: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _measure(raw: Any, seeds: Any, ticks: Any, settings: Any, states: Any, outs: Any, start: Any, stop: Any) -> None:
+def measure_rows(raw: Any, seeds: Any, ticks: Any, settings: Any, states: Any, outs: Any, start: Any, stop: Any) -> None:
+    """Read the sensors of robots ``start`` to ``stop``: what :meth:`SensorModel.measure` does, for compiled loops."""
     for i in range(start, stop):
         row, state, out = raw[i], states[i], outs[i]
         for k in range(4):
@@ -263,13 +264,17 @@ class SensorModel:
         self._states[rows, _START_POSE:_SHOWN_POSE] = raw[rows, _RAW_POSE:]
         self._states[rows, _PHASE] = [_camera_phase(seed) for seed in self._seeds[rows]]
         for i in rows:
-            _measure(raw, self._seeds, self._ticks, self._settings, self._states, out, i, i + 1)
+            measure_rows(raw, *self.memory(), out, i, i + 1)
 
     def set_errors(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
         """Take zero errors, biases, mounting errors, camera scale and delay of robots ``rows``; nothing is forgotten."""
         errors = [parameters[name].reshape(self.count, -1)[rows] for name in _CALIBRATION]
         errors.append(imu_to_body(parameters)[rows].reshape(-1, 9))
         self._states[rows, :_WHEEL_ZERO] = np.concatenate(errors, axis=1)
+
+    def memory(self) -> tuple[NDArray[np.uint64], NDArray[np.int64], Array, Array]:
+        """Return noise seeds, counters, counts and noise levels, and states: what :func:`measure_rows` reads and writes."""
+        return self._seeds, self._ticks, self._settings, self._states
 
     def stores(self) -> dict[str, RowStore]:
         """Return what the sensors remember: noise seeds and counters, errors, start pose, camera."""
@@ -287,7 +292,7 @@ class SensorModel:
         """
         self._require(raw, out)
         end = self.count if stop is None else stop
-        _measure(raw, self._seeds, self._ticks, self._settings, self._states, out, start, end)
+        measure_rows(raw, *self.memory(), out, start, end)
 
     def _require(self, raw: Array, out: Array) -> None:
         if raw.shape != (self.count, RAW_LAYOUT.width) or out.shape != (self.count, SENSOR_LAYOUT.width):

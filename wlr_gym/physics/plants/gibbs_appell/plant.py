@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,47 @@ TILES_PER_THREAD = 8
 _LANE = {name: index for index, name in enumerate(STORED)}
 _ROTOR_LEAD = [_LANE[f"rotor_lead{j}"] for j in range(8)]
 _ROTOR_RATE = [_LANE[f"rotor_rate{j}"] for j in range(8)]
+
+
+class CompiledTick(NamedTuple):
+    """What one tick of a batch reads and writes, for compiled loops; arrays are the plant's own.
+
+    Attributes:
+        lanes, constants: state and parameters of the robots, tile by tile.
+        torque_on: (N, 8) 1 where a motor is on.
+        formula_values, memory: constants of the formula forces, and what they remember; the first row is the time.
+        truth, raw, readings: (N, columns) truth, what sensors see of it, and what they read.
+        time: (N) s.
+        seeds, ticks, settings, states: of the sensors; see :meth:`wlr_gym.physics.plants.sensors.SensorModel.memory`.
+        tiles: how many are moved.
+        robots: how many there are.
+        width: robots of a tile.
+        step, period: s; of the physics and of a tick.
+        substeps, sweeps: per tick, and passes over the friction rows per substep.
+        has_formulas: whether formula forces act, which read the time.
+    """
+
+    lanes: NDArray[Any]
+    constants: NDArray[Any]
+    torque_on: Array
+    formula_values: NDArray[Any]
+    memory: NDArray[Any]
+    truth: Array
+    raw: Array
+    readings: Array
+    time: Array
+    seeds: NDArray[np.uint64]
+    ticks: NDArray[np.int64]
+    settings: Array
+    states: Array
+    tiles: int
+    robots: int
+    width: int
+    step: Any
+    period: float
+    substeps: int
+    sweeps: int
+    has_formulas: bool
 
 
 class GibbsAppellPlant(Simulator):
@@ -267,6 +308,20 @@ class GibbsAppellPlant(Simulator):
     def _run(self, arguments: tuple[Array, ...], first: int, last: int) -> None:
         self._kernel.tick(*arguments, first, last, self._count, self._step, self.substeps, self.sweeps)
         self._sensors.measure(self._raw, self._readings.values, first * self._width, min(last * self._width, self._count))
+
+    def compiled_tick(self) -> tuple[Any, CompiledTick]:
+        """Return the compiled function that moves the robots by a tick, and what it works on: :meth:`step` without Python.
+
+        The function's arguments: lanes, constants, newer setpoints, older setpoints, switch time (N, 8), torque_on,
+        formula_values, memory, truth, raw, first tile, tiles, robots, step, substeps, sweeps; see :class:`CompiledTick`. Valid
+        until parameters change or :meth:`keep_going` is called.
+        """
+        tiles = self._chunks[-1][1]
+        arrays = (self._truth.values, self._raw, self._readings.values, self._time, *self._sensors.memory())
+        formulas = (self._formula_values, self._memory)
+        numbers = (tiles, self._count, self._width, self._step, self.options.control_period, self.substeps, self.sweeps)
+        own = (self._lanes, self._constants, self._torque_on, *formulas, *arrays, *numbers, self._formulas is not None)
+        return self._kernel.tick, CompiledTick(*own)
 
     def close(self) -> None:
         """Stop the worker threads."""
