@@ -9,7 +9,7 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.interchange import parse_urdf, recognise, urdf_text
-from wlr_gym.robot.interchange.robot_file import robot_of_text, robot_text
+from wlr_gym.robot.interchange.robot_file import robot_over, robot_text
 
 LINK = """
 <link name="{name}">
@@ -200,7 +200,7 @@ def test_a_written_file_is_the_robot_that_was_read(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(robot_text("mine", "nominal", found.numbers, comments={"body.mass": "without legs"}))
     robot = load_robot(path)
-    assert robot == robot_of_text(path.read_text(), path)
+    assert robot == robot_over("nominal", "mine", found.numbers, path)
     assert robot.leg.length == found.numbers["leg"]["length"]
     assert robot.servo.leg.kp == load_robot().servo.leg.kp
     assert robot.servo.wheel.armature == load_robot().servo.wheel.armature

@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import Field, field_serializer, field_validator, model_validator
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.settings import Layer, SettingsModel, overlay, parse_config, read_layers
+from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_layers
 from wlr_gym.robot.joints import JOINTS
 from wlr_gym.robot.tolerance import KEYS, ParameterTolerance, read_tolerances
 
@@ -285,19 +285,16 @@ def load_robot(source: str | Path | Robot = "nominal", *, check: bool = True) ->
     Raises:
         InputError: unreadable file, unknown or missing key, value of the wrong kind, or a physically impossible robot.
     """
-    robot = source if isinstance(source, Robot) else robot_of_layers(read_layers("robot", source))
+    robot = source if isinstance(source, Robot) else _read(source)
     faults = physical_faults(robot) if check else []
     if faults:
         raise InputError(f"robot '{robot.name}' cannot be simulated: " + "; ".join(faults))
     return robot
 
 
-def robot_of_layers(layers: list[Layer]) -> Robot:
-    """Return the robot of a file laid over its bases, the lowest first. The name is its own: another robot has another one.
-
-    Raises:
-        InputError: see :func:`wlr_gym.base.settings.parse_config`.
-    """
+def _read(source: str | Path) -> Robot:
+    """Read a robot file, laid over its bases. The name is its own: another robot has another one."""
+    layers = read_layers("robot", source)
     data, where = layers[0]
     robot = parse_config(Robot, data, where)  # what is wrong in a base is said with its own name
     for changes, where in layers[1:]:

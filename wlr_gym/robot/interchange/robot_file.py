@@ -10,8 +10,8 @@ from typing import Any
 import yaml
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.settings import layers_of, parse_yaml
-from wlr_gym.robot.description import Robot, load_robot, robot_of_layers
+from wlr_gym.base.settings import overlay, parse_config
+from wlr_gym.robot.description import Robot, load_robot
 
 #: Width at which a comment starts.
 _COMMENT = 42
@@ -57,14 +57,14 @@ def base_beside(base: str, out: Path) -> str:
     return Path(os.path.relpath(base, out.parent)).as_posix()
 
 
-def robot_of_text(text: str, where: Path, *, check: bool = True) -> Robot:
-    """Return the robot that a file at ``where`` with this text would be.
+def robot_over(base: str, name: str, numbers: Mapping[str, Any], where: Path, *, check: bool = True) -> Robot:
+    """Return the robot that a file at ``where`` with these numbers over ``base`` would be.
 
     Raises:
         InputError: as :func:`wlr_gym.robot.load_robot` of that file.
     """
-    data = parse_yaml(text)
-    robot = robot_of_layers(layers_of("robot", (data, str(where))))
+    below = load_robot(base, check=False).model_dump(mode="json")
+    robot = parse_config(Robot, overlay(below, {**numbers, "name": name}), str(where))
     return load_robot(robot, check=check)
 
 
