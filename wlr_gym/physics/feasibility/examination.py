@@ -80,9 +80,8 @@ def _tipping(robot: Robot, can: Capability) -> Iterator[Finding]:
     slope = min(can.tipping_uphill, can.tipping_downhill, can.tipping_sideways)
     if slope < 0.35:
         text = f"tips over on a slope of {math.degrees(slope):.3g} deg: centre of mass {can.com_height:.4g} m above the floor"
-        yield warning(
-            "tipping", slope, "rad", f"{text}, contacts at {min(home.ahead, home.behind, home.left, home.right):.4g} m"
-        )
+        nearest = min(home.ahead, home.behind, home.left, home.right)
+        yield warning("tipping", slope, "rad", f"{text}, nearest contacts {nearest:.4g} m aside")
     most = min(can.acceleration_of_motors, can.acceleration_of_grip)
     for limit, words in ((can.tipping_acceleration, "accelerating"), (can.tipping_deceleration, "braking")):
         if limit < most:

@@ -28,7 +28,7 @@ class Finding:
 
     def __str__(self) -> str:
         unit = "" if self.unit in ("", "-") else f" {self.unit}"
-        return self.text if self.value is None else f"{self.key} = {self.value:.4g}{unit}: {self.text}"
+        return self.text if self.value is None else f"{self.key} = {self.value:.6g}{unit}: {self.text}"
 
 
 def fault(key: str, value: float | None, unit: str, text: str) -> Finding:

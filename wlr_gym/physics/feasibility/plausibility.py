@@ -64,7 +64,7 @@ USUAL: dict[str, Usual] = {
     "sensors.control_rate": Usual(10.0, 1000.0, "Hz", (Mistake(1e3, "kHz"),)),
     "sensors.encoder.position": Usual(1e-6, 0.1, "rad", _ANGLE),
     "sensors.encoder.velocity": Usual(0.0, 0.5, "rad/s", _RATE),
-    "sensors.imu.gyro_noise": Usual(0.0, 0.1, "rad/s", _RATE),
+    "sensors.imu.gyro_noise": Usual(0.0, 0.1, "rad/s", (Mistake(math.radians(1.0), "deg/s"),)),
     "sensors.imu.accel_noise": Usual(0.0, 2.0, "m/s2", (Mistake(9.81e-3, "mg"),)),
     "sensors.camera.position_noise": Usual(0.0, 0.1, "m", _LENGTH),
 }
@@ -81,19 +81,24 @@ def odd_numbers(robot: Robot) -> Iterator[Finding]:
 
 def _outside_the_table(robot: Robot) -> Iterator[Finding]:
     for spec in TABLE:
-        for value in dict.fromkeys(spec.nominal(robot)):
-            if value is not None and not spec.low <= value <= spec.high:
-                key = next((source for source in spec.sources if isinstance(source, str)), spec.name)
-                hint = _mistaken(key, value)
-                text = f"is outside {range_in_words(spec.low, spec.high, spec.unit)}, what simulators take{hint}"
-                yield fault(key, value, spec.unit, text)
+        for source in dict.fromkeys(source for source in spec.sources if isinstance(source, str)):
+            for value in _stated(robot, source):
+                if not spec.low <= value <= spec.high:
+                    hint = _mistaken(source, value)
+                    text = f"is outside {range_in_words(spec.low, spec.high, spec.unit)}, what simulators take{hint}"
+                    yield fault(source, value, spec.unit, text)
+
+
+def _stated(robot: Robot, key: str) -> list[float]:
+    """Return the numbers at a key of the robot file."""
+    stated = attrgetter(key)(robot)
+    return [value for value in (stated if isinstance(stated, tuple) else (stated,)) if value is not None]
 
 
 def _unusual(robot: Robot) -> Iterator[Finding]:
     for key, usual in USUAL.items():
-        stated = attrgetter(key)(robot)
-        for value in stated if isinstance(stated, tuple) else (stated,):
-            if value is not None and not usual.low <= value <= usual.high:
+        for value in _stated(robot, key):
+            if not usual.low <= value <= usual.high:
                 unit = "" if usual.unit == "-" else f" {usual.unit}"
                 text = f"is unusual, expected {usual.low:.3g} to {usual.high:.3g}{unit}{_mistaken(key, value)}"
                 yield warning(key, value, usual.unit, text)
@@ -104,7 +109,7 @@ def _mistaken(key: str, value: float) -> str:
     usual = USUAL.get(key)
     for size, unit in usual.mistakes if usual else ():
         if usual and usual.low <= value * size <= usual.high:
-            return f"; in {unit}? {value:.4g} {unit} = {value * size:.4g} {usual.unit}"
+            return f"; in {unit}? {value:.6g} {unit} = {value * size:.4g} {usual.unit}"
         if usual and usual.low <= value / size <= usual.high and size in (1e-3, 1e-2):
             return f"; too small by {1 / size:.0f}? {value / size:.4g} {usual.unit} would be usual"
     return ""
