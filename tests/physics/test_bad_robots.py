@@ -34,7 +34,9 @@ BAD = {
     "body in t": ({"body": {"mass": 0.0028}}, FAULT, "body.mass", ["0.0028", "too small by 1000"]),
     "wheel in g": ({"wheel": {"mass": 20.0}}, FAULT, "wheel.mass", ["20 kg"]),
     "leg in g": ({"leg": {"mass": 30.0}}, FAULT, "leg.mass", ["30 kg"]),
-    "body inertia in g m2": ({"body": {"inertia": [25.04, 29.73, 52.48]}}, FAULT, "body.inertia", ["25.04", "[1e-05, 10] kg m2"]),
+    "body inertia in g m2": (
+        {"body": {"inertia": [25.04, 29.73, 52.48]}}, FAULT, "body.inertia", ["25.04", "[1e-05, 10] kg m2"],
+    ),
     "body inertia a thousand times too small": (
         {"body": {"inertia": [2.5e-5, 3.0e-5, 5.2e-5]}}, FAULT, "body.inertia", ["body.inertia x = 2.5e-05", "1001 times more"],
     ),
@@ -51,7 +53,9 @@ BAD = {
         {"wheel": {"spin_inertia": 1.156e-8, "transverse_inertia": 6.45e-9}}, WARNING, "wheel.spin_inertia", ["1.156e-08"],
     ),
     "torque in mN m": (servo("leg", stall_torque=7300.0), FAULT, "servo.leg.stall_torque", ["7300 mN m = 7.3 N m"]),
-    "torque a thousand times too small": (servo("wheel", stall_torque=0.0015), WARNING, "servo.wheel.stall_torque", ["0.0015", "too small by 1000"]),
+    "torque a thousand times too small": (
+        servo("wheel", stall_torque=0.0015), WARNING, "servo.wheel.stall_torque", ["0.0015", "too small by 1000"],
+    ),
     "leg speed in rpm": (servo("leg", no_load_speed=53.0), WARNING, "servo.leg.no_load_speed", ["53 rpm = 5.55 rad/s"]),
     "wheel speed in deg/s": (servo("wheel", no_load_speed=366.0), FAULT, "servo.wheel.no_load_speed", ["366 rpm"]),
     "supply in mV": ({"servo": {"supply_voltage": 12000.0}}, FAULT, "servo.supply_voltage", ["12000", "mV"]),
@@ -127,7 +131,7 @@ BAD = {
     ),
     "legs give way": (servo("leg", kp=5.0), WARNING, "servo.leg.kp", ["give way by 0.517 rad"]),
     "no gain": (servo("leg", kp=0.0), FAULT, "servo.leg.kp", ["follows no setpoint"]),
-    "brake for a motor": (servo("leg", coulomb_friction=5.0), WARNING, "servo.leg.coulomb_friction", ["68% of the stall torque"]),
+    "brake for a motor": (servo("leg", coulomb_friction=5.0), WARNING, "servo.leg.coulomb_friction", ["68% of the stall"]),
     "soft floor": ({"ground": {"normal_stiffness": 400.0}}, WARNING, "ground.normal_stiffness", ["0.0184 m into the floor"]),
     "undamped floor": ({"ground": {"normal_damping": 0.0}}, WARNING, "ground.normal_damping", ["damping ratio 0"]),
 }  # fmt: skip
