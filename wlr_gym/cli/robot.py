@@ -14,7 +14,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.robot_exchange import ExportOptions, ImportOptions, export_robot, import_robot
+from wlr_gym.cli.robot_exchange import RobotExportOptions, RobotImportOptions, export_robot, import_robot
 from wlr_gym.cli.robot_new import NewOptions, new_robot, print_findings
 
 if TYPE_CHECKING:
@@ -57,12 +57,12 @@ RobotOptions = (
     Annotated[NewOptions, tyro.conf.subcommand("new", description="a robot file from a few questions")]
     | Annotated[CheckOptions, tyro.conf.subcommand("check", description="what is wrong or odd about a robot, with numbers")]
     | Annotated[ShowOptions, tyro.conf.subcommand("show", description="what a robot is and can do; a picture")]
-    | Annotated[ImportOptions, tyro.conf.subcommand("import", description="a robot file from MJCF or URDF")]
-    | Annotated[ExportOptions, tyro.conf.subcommand("export", description="a robot as MJCF or URDF")]
+    | Annotated[RobotImportOptions, tyro.conf.subcommand("import", description="a robot file from MJCF or URDF")]
+    | Annotated[RobotExportOptions, tyro.conf.subcommand("export", description="a robot as MJCF or URDF")]
 )
 
 
-def run(options: NewOptions | CheckOptions | ShowOptions | ImportOptions | ExportOptions) -> int:
+def run(options: NewOptions | CheckOptions | ShowOptions | RobotImportOptions | RobotExportOptions) -> int:
     """Do what the sub-command says."""
     match options:
         case NewOptions():
@@ -71,9 +71,9 @@ def run(options: NewOptions | CheckOptions | ShowOptions | ImportOptions | Expor
             return _check(options)
         case ShowOptions():
             return _show(options)
-        case ImportOptions():
+        case RobotImportOptions():
             return import_robot(options)
-        case ExportOptions():
+        case RobotExportOptions():
             return export_robot(options)
 
 

@@ -22,7 +22,7 @@ SUFFIXES: dict[str, Format] = {".xml": "mjcf", ".mjcf": "mjcf", ".urdf": "urdf"}
 
 
 @dataclass(frozen=True)
-class ImportOptions:
+class RobotImportOptions:
     """Write a robot file of a robot with four legs of one hinge and a driven wheel on each; others are refused.
 
     Attributes:
@@ -45,7 +45,7 @@ class ImportOptions:
 
 
 @dataclass(frozen=True)
-class ExportOptions:
+class RobotExportOptions:
     """Write a robot as MJCF (the MuJoCo plant's own model) or URDF.
 
     Attributes:
@@ -63,7 +63,7 @@ class ExportOptions:
     json: bool = False
 
 
-def import_robot(options: ImportOptions) -> int:
+def import_robot(options: RobotImportOptions) -> int:
     """Read, write, and say what was averaged or left out; 1 when the robot cannot stand, drive or turn.
 
     Raises:
@@ -109,7 +109,7 @@ def _read(path: Path) -> LinkTree:
     return read_mjcf(path) if "<mujoco" in text and "<robot" not in text else parse_urdf(text, str(path))
 
 
-def export_robot(options: ExportOptions) -> int:
+def export_robot(options: RobotExportOptions) -> int:
     """Write the file, and say what it cannot hold.
 
     Raises:

@@ -13,7 +13,7 @@ from wlr_gym.cli.options import pairs
 from wlr_gym.cli.robot_options import ask_terminal
 
 if TYPE_CHECKING:
-    from wlr_gym.physics.feasibility import Finding
+    from wlr_gym.physics.feasibility import RobotFinding
     from wlr_gym.robot import Robot
     from wlr_gym.robot.outline import Question
 
@@ -102,7 +102,7 @@ def _as_options(answers: Mapping[str, Any]) -> str:
     )
 
 
-def print_findings(robot: Robot, findings: Sequence[Finding]) -> None:
+def print_findings(robot: Robot, findings: Sequence[RobotFinding]) -> None:
     """Print findings, faults first, and what they come to."""
     for finding in findings:
         print(f"{finding.level + ':':<9}{finding}")

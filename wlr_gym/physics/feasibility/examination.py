@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 
 from wlr_gym.physics.feasibility.capability import Capability, capability_of, speed_at
-from wlr_gym.physics.feasibility.findings import Finding, fault, warning
+from wlr_gym.physics.feasibility.findings import RobotFinding, fault, warning
 from wlr_gym.physics.feasibility.plausibility import odd_numbers
 from wlr_gym.physics.feasibility.stance import stance_of, stances
 from wlr_gym.robot import Robot, physical_faults
@@ -30,7 +30,7 @@ SPIN_UP = (1e-4, 0.5)
 DAMPING_RATIO = (0.02, 3.0)
 
 
-def examine_robot(robot: Robot) -> list[Finding]:
+def examine_robot(robot: Robot) -> list[RobotFinding]:
     """Return all findings, faults first.
 
     Args:
@@ -48,7 +48,7 @@ def _key(text: str) -> str:
     return text.partition(" ")[0]
 
 
-def _mechanics(robot: Robot, can: Capability) -> Iterator[Finding]:
+def _mechanics(robot: Robot, can: Capability) -> Iterator[RobotFinding]:
     if not _stands(robot):
         sine = math.sin(robot.home.leg_angle) * robot.leg.length
         text = f"wheels are {robot.leg.length:.4g} m x sin = {sine:.4g} m below the hips: the body lies on the floor"
@@ -66,7 +66,7 @@ def _stands(robot: Robot) -> bool:
     return stance_of(robot, robot.home.leg_angle).clearance > 0.0
 
 
-def _tipping(robot: Robot, can: Capability) -> Iterator[Finding]:
+def _tipping(robot: Robot, can: Capability) -> Iterator[RobotFinding]:
     """Static margin, then acceleration that motors and floor can give against the one that tips it over."""
     home = stance_of(robot, robot.home.leg_angle)
     names = {"ahead": "forward", "behind": "backward", "left": "to the left", "right": "to the right"}
@@ -89,7 +89,7 @@ def _tipping(robot: Robot, can: Capability) -> Iterator[Finding]:
             yield warning(f"tipping_{'ac' if words[0] == 'a' else 'de'}celeration", limit, "m/s2", text)
 
 
-def _driving(robot: Robot, can: Capability) -> Iterator[Finding]:
+def _driving(robot: Robot, can: Capability) -> Iterator[RobotFinding]:
     key = "servo.wheel.stall_torque"
     torque = robot.servo.wheel.stall_torque
     if can.wheel_torque <= 0.0:
@@ -111,7 +111,7 @@ def _driving(robot: Robot, can: Capability) -> Iterator[Finding]:
         yield warning("servo.wheel.no_load_speed", robot.servo.wheel.no_load_speed, "rad/s", text)
 
 
-def _turning(robot: Robot, can: Capability) -> Iterator[Finding]:
+def _turning(robot: Robot, can: Capability) -> Iterator[RobotFinding]:
     if can.wheel_torque <= 0.0 or min(robot.ground.mu_x, robot.ground.mu_y) <= 0.0:
         return
     grip = f"friction {robot.ground.mu_x:g} along, {robot.ground.mu_y:g} across"
@@ -124,7 +124,7 @@ def _turning(robot: Robot, can: Capability) -> Iterator[Finding]:
         yield warning("servo.wheel.no_load_speed", robot.servo.wheel.no_load_speed, "rad/s", text)
 
 
-def _holding(robot: Robot, can: Capability) -> Iterator[Finding]:
+def _holding(robot: Robot, can: Capability) -> Iterator[RobotFinding]:
     key, torque = "servo.leg.stall_torque", robot.servo.leg.stall_torque
     if can.holding_torque > torque:
         text = f"cannot stand: {can.total_mass:.4g} kg ask {can.holding_torque:.3g} N m of a leg at home"
@@ -143,7 +143,7 @@ def _holding(robot: Robot, can: Capability) -> Iterator[Finding]:
         yield warning("servo.leg.kp", robot.servo.leg.kp, "V/rad", text)
 
 
-def _leg_extremes(robot: Robot) -> Iterator[Finding]:
+def _leg_extremes(robot: Robot) -> Iterator[RobotFinding]:
     length = robot.leg.length
     nearest = 2.0 * robot.hip_position.x - length * (_most(robot, 1.0) + _most(robot, -1.0))
     if nearest < 2.0 * robot.wheel.radius:
@@ -173,7 +173,7 @@ def _limits(robot: Robot) -> str:
     return f"[{robot.leg_limits[0]:.3g}, {robot.leg_limits[1]:.3g}] rad"
 
 
-def _contact(robot: Robot, can: Capability) -> Iterator[Finding]:
+def _contact(robot: Robot, can: Capability) -> Iterator[RobotFinding]:
     ground = robot.ground
     if can.contact_sag > 0.25 * robot.wheel.radius:
         text = f"the weight presses the wheels {can.contact_sag:.3g} m into the floor; their radius is {robot.wheel.radius:g} m"
@@ -188,12 +188,12 @@ def _contact(robot: Robot, can: Capability) -> Iterator[Finding]:
 # --- motors -----------------------------------------------------------------------------------------------------------
 
 
-def _motors(robot: Robot) -> Iterator[Finding]:
+def _motors(robot: Robot) -> Iterator[RobotFinding]:
     for name, motor in (("leg", robot.servo.leg), ("wheel", robot.servo.wheel)):
         yield from _motor(f"servo.{name}", motor, robot.servo.supply_voltage)
 
 
-def _motor(where: str, motor: Motor, supply: float) -> Iterator[Finding]:
+def _motor(where: str, motor: Motor, supply: float) -> Iterator[RobotFinding]:
     friction, torque = motor.coulomb_friction, motor.stall_torque
     if friction >= torque:
         text = f"does not move: its gear friction is not less than its stall torque, {torque:.4g} N m"

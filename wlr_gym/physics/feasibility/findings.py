@@ -9,7 +9,7 @@ Level = Literal["fault", "warning"]
 
 
 @dataclass(frozen=True)
-class Finding:
+class RobotFinding:
     """A finding.
 
     Attributes:
@@ -31,11 +31,11 @@ class Finding:
         return self.text if self.value is None else f"{self.key} = {self.value:.6g}{unit}: {self.text}"
 
 
-def fault(key: str, value: float | None, unit: str, text: str) -> Finding:
+def fault(key: str, value: float | None, unit: str, text: str) -> RobotFinding:
     """Return a finding that stands against using the robot."""
-    return Finding("fault", key, value, unit, text)
+    return RobotFinding("fault", key, value, unit, text)
 
 
-def warning(key: str, value: float | None, unit: str, text: str) -> Finding:
+def warning(key: str, value: float | None, unit: str, text: str) -> RobotFinding:
     """Return a finding that is odd."""
-    return Finding("warning", key, value, unit, text)
+    return RobotFinding("warning", key, value, unit, text)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from operator import attrgetter
 from typing import NamedTuple
 
-from wlr_gym.physics.feasibility.findings import Finding, fault, warning
+from wlr_gym.physics.feasibility.findings import RobotFinding, fault, warning
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import TABLE, range_in_words
 
@@ -70,7 +70,7 @@ USUAL: dict[str, Usual] = {
 }
 
 
-def odd_numbers(robot: Robot) -> Iterator[Finding]:
+def odd_numbers(robot: Robot) -> Iterator[RobotFinding]:
     """Yield what no simulator takes, then what is outside the usual, then what does not fit its neighbours."""
     yield from _outside_the_table(robot)
     yield from _unusual(robot)
@@ -79,7 +79,7 @@ def odd_numbers(robot: Robot) -> Iterator[Finding]:
     yield from _places(robot)
 
 
-def _outside_the_table(robot: Robot) -> Iterator[Finding]:
+def _outside_the_table(robot: Robot) -> Iterator[RobotFinding]:
     for spec in TABLE:
         for source in dict.fromkeys(source for source in spec.sources if isinstance(source, str)):
             for value in _stated(robot, source):
@@ -95,7 +95,7 @@ def _stated(robot: Robot, key: str) -> list[float]:
     return [value for value in (stated if isinstance(stated, tuple) else (stated,)) if value is not None]
 
 
-def _unusual(robot: Robot) -> Iterator[Finding]:
+def _unusual(robot: Robot) -> Iterator[RobotFinding]:
     for key, usual in USUAL.items():
         for value in _stated(robot, key):
             if not usual.low <= value <= usual.high:
@@ -115,7 +115,7 @@ def _mistaken(key: str, value: float) -> str:
     return ""
 
 
-def _masses(robot: Robot) -> Iterator[Finding]:
+def _masses(robot: Robot) -> Iterator[RobotFinding]:
     total = robot.total_mass
     for key, mass in (("leg.mass", robot.leg.mass), ("wheel.mass", robot.wheel.mass)):
         if mass is not None and mass < 1e-4 * total:
@@ -125,7 +125,7 @@ def _masses(robot: Robot) -> Iterator[Finding]:
         yield warning("body.mass", robot.body.mass, "kg", f"is less than a tenth of the {total:.4g} kg of the robot")
 
 
-def _inertias(robot: Robot) -> Iterator[Finding]:
+def _inertias(robot: Robot) -> Iterator[RobotFinding]:
     """Compare with bodies of that size; :func:`wlr_gym.robot.physical_faults` has the platform's lower bound."""
     leg, wheel, body = robot.leg, robot.wheel, robot.body
     x, y, z = body.size
@@ -146,7 +146,7 @@ def _inertias(robot: Robot) -> Iterator[Finding]:
         yield fault("wheel.spin_inertia", wheel.spin_inertia, "kg m2", text)
 
 
-def _moment(key: str, value: float | None, mass: float | None, low: float, high: float, what: str) -> Iterator[Finding]:
+def _moment(key: str, value: float | None, mass: float | None, low: float, high: float, what: str) -> Iterator[RobotFinding]:
     """Compare a moment of inertia with a mass at distances ``low`` and ``high`` (m) from the axis."""
     if value is None or not mass:
         return
@@ -165,7 +165,7 @@ def _power_of_ten(value: float, least: float, most: float) -> str:
     return ""
 
 
-def _places(robot: Robot) -> Iterator[Finding]:
+def _places(robot: Robot) -> Iterator[RobotFinding]:
     body, hip, leg = robot.body, robot.hip_position, robot.leg
     for axis, value, size in (("x", hip.x, body.size[0]), ("y", hip.y, body.size[1])):
         if value > size:
