@@ -268,10 +268,9 @@ LOST = {
     ),
     "xml": ("sensors", "tolerances", "dynamixel_ids", "servo.supply_voltage", "servo.integral_cycle"),
 }
-LOST_OF_A_MOTOR = {
-    "urdf": {"kp", "kd", "gear_stiffness", "stall_current", "no_load_current"},
-    "xml": {"kp", "kd", "gear_stiffness", "stall_current", "no_load_current", "no_load_speed"},
-}
+#: Of a motor; a URDF has its no-load speed. (Counts are what a servo reports by.)
+_LAW = {"kp", "kd", "gear_stiffness", "stall_current", "no_load_current", "current_count", "load_count"}
+LOST_OF_A_MOTOR = {"urdf": _LAW, "xml": _LAW | {"no_load_speed"}}
 
 
 def leaves(tree, above=""):
