@@ -37,7 +37,8 @@ def _name(page: Path) -> str:
 
 def _run(page: Path, request: pytest.FixtureRequest, *, slow: bool) -> None:
     chosen = [block for block in blocks(page) if not block.mark or (slow and block.mark == "slow")]
-    if any(".render()" in block.text or "wlr_gym.render" in block.text or "--video" in block.text for block in chosen):
+    drawn = (".render()", "wlr_gym.render", "--video", "robot show")
+    if any(word in block.text for block in chosen for word in drawn):
         request.getfixturevalue("graphics")  # skips where there is no OpenGL
     run_page(page, slow=slow)
 

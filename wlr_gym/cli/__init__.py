@@ -28,6 +28,7 @@ IMPORTED: list[str] = []
 COMMANDS = {
     "envs": "list the environments, or describe one: its actions, observations and rewards",
     "effects": "list the effects that can be added to the robot, explain one, or check patch files",
+    "robot": "robot files of your own: new, check, show, import from and export to MJCF and URDF",
     "train": "train an agent on an environment; resumes after an interruption",
     "sweep": "train settings x seeds, or search settings, on this machine or a Ray cluster; resumes trial by trial",
     "evaluate": "score a policy or agent over many episodes, against baselines, with confidence intervals",

@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:
     import mujoco
 
+    from wlr_gym.robot import Robot
+
 Array = NDArray[np.float64]
 
 #: m above the floor: what every camera looks at, below or beside the body origin. It does not bounce with the body.
@@ -45,13 +47,22 @@ CAMERAS = {
 }
 
 
+#: m; front to rear wheels with all legs stretched out, up to which the cameras stay where :data:`CAMERAS` says.
+REACH = 0.65
+
+
+def magnification(robot: Robot) -> float:
+    """Return the factor on a camera's distance and on the height it looks at, so that a large robot is in the picture."""
+    return max(1.0, 2.0 * (robot.hip_position.x + robot.leg.length) / REACH)
+
+
 def up_direction(slope: Array) -> Array:
     """Return the direction against gravity in the floor frame for ``ground.slope`` (pitch, roll), rad."""
     pitch, roll = np.sin(slope)
     return np.array([pitch, roll, math.sqrt(max(0.0, 1.0 - pitch**2 - roll**2))])
 
 
-def aim(scene: mujoco.MjvScene, camera: FollowCamera, place: Array, yaw: float, up: Array) -> None:
+def aim(scene: mujoco.MjvScene, camera: FollowCamera, place: Array, yaw: float, up: Array, scale: float = 1.0) -> None:
     """Point the scene's camera at a robot, with gravity pulling down in the picture: a slope is seen as a slope.
 
     Args:
@@ -60,16 +71,17 @@ def aim(scene: mujoco.MjvScene, camera: FollowCamera, place: Array, yaw: float, 
         place: (x, y, ...) of the robot in the floor frame, m.
         yaw: heading of the robot, rad.
         up: (3,) unit vector against gravity in the floor frame.
+        scale: factor on distance and height; see :func:`magnification`.
     """
     azimuth = camera.azimuth + (yaw if camera.turns else 0.0)
     flat, rise = math.cos(camera.elevation), math.sin(camera.elevation)
     forward = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), rise])
     above = np.array([-rise * math.cos(azimuth), -rise * math.sin(azimuth), flat])
     tilt = _rotation_from_z_to(up)
-    target = np.array([place[0], place[1], LOOK_HEIGHT])
+    target = np.array([place[0], place[1], scale * LOOK_HEIGHT])
     for eye in scene.camera:
         eye.forward, eye.up = tilt @ forward, tilt @ above
-        eye.pos = target - camera.distance * (tilt @ forward)
+        eye.pos = target - scale * camera.distance * (tilt @ forward)
 
 
 def project(scene: mujoco.MjvScene, points: ArrayLike, size: tuple[int, int]) -> Array:

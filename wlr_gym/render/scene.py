@@ -115,7 +115,7 @@ class Scene:
     ) -> list[marks.Area]:
         eye = mujoco.MjvCamera()
         up = camera.up_direction(parameters["ground.slope"][row])
-        place = (camera.CAMERAS[self.view.camera], look_at, stage.yaw(), up)
+        place = (camera.CAMERAS[self.view.camera], look_at, stage.yaw(), up, camera.magnification(self.robot))
         # The endless floor is laid out around the camera the scene had before, so it gets its own first.
         mujoco.mjv_updateCamera(stage.model, stage.data, eye, scene)
         camera.aim(scene, *place)
@@ -130,8 +130,9 @@ class Scene:
     def _labels(self, floor: list[marks.Area], position: NDArray[np.float64]) -> list[overlay.Note]:
         """Write the friction of each area on it, beside the robot and clear of the other text."""
         width, height = self.view.size
-        middle = np.array([*position[:2], camera.LOOK_HEIGHT])
-        around = middle + 0.32 * np.vstack([np.eye(3), -np.eye(3)[:2]])
+        scale = camera.magnification(self.robot)
+        middle = np.array([*position[:2], scale * camera.LOOK_HEIGHT])
+        around = middle + 0.32 * scale * np.vstack([np.eye(3), -np.eye(3)[:2]])
         robot = self.pixels(middle)
         clear = np.linalg.norm(self.pixels(around) - robot, axis=1).max() + 0.02 * width
         notes = []

@@ -20,7 +20,7 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render import marks
-from wlr_gym.render.camera import CAMERAS, LOOK_HEIGHT
+from wlr_gym.render.camera import CAMERAS, LOOK_HEIGHT, magnification
 from wlr_gym.render.display import require_display
 from wlr_gym.render.scene import describe, marks_of
 from wlr_gym.render.stage import Stage
@@ -130,7 +130,7 @@ class Viewer:
         if not self._window.is_running():
             return False
         with self._window.lock():
-            self._window.cam.lookat[:] = [*truth.position[row, :2], LOOK_HEIGHT]
+            self._window.cam.lookat[:] = [*truth.position[row, :2], magnification(self.robot) * LOOK_HEIGHT]
             scene = self._window.user_scn
             scene.ngeom = 0
             floor = marks.areas(parameters, row, truth.position[row]) if self.view.friction else []
@@ -152,7 +152,7 @@ class Viewer:
         assert self._window is not None
         start, eye = CAMERAS[self.view.camera], self._window.cam
         eye.type = mujoco.mjtCamera.mjCAMERA_FREE
-        eye.distance, eye.elevation = 1.2 * start.distance, np.degrees(start.elevation)
+        eye.distance, eye.elevation = 1.2 * magnification(self.robot) * start.distance, np.degrees(start.elevation)
         eye.azimuth = np.degrees(start.azimuth + (stage.yaw() if start.turns else 0.0))
 
     def _pace(self, period: float) -> None:

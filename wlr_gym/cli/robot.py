@@ -1,0 +1,122 @@
+"""Robot files: make a ``new`` one, ``check`` and ``show`` one, ``import`` one from MJCF or URDF, ``export`` one to them.
+
+Exit code 0: done, nothing stands against the robot; 1: it cannot stand, drive or turn; 2: bad input, nothing written.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.robot_exchange import RobotExportOptions, RobotImportOptions, export_robot, import_robot
+from wlr_gym.cli.robot_new import NewOptions, new_robot, print_findings
+
+if TYPE_CHECKING:
+    from wlr_gym.robot import Robot
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """Look for what is wrong or odd about a robot: units, masses, inertias, and what it cannot do, with numbers.
+
+    Attributes:
+        robot: name in configs/robot/ or path.
+        strict: warnings too give exit code 1.
+        json: print the findings as JSON.
+    """
+
+    robot: Annotated[str, tyro.conf.Positional] = "nominal"
+    strict: bool = False
+    json: bool = False
+
+
+@dataclass(frozen=True)
+class ShowOptions:
+    """Show what a robot is and what it can do.
+
+    Attributes:
+        robot: name in configs/robot/ or path.
+        picture: picture to write (.png, .jpg, .webp): standing, and with its legs at their limits.
+        json: print the numbers as JSON.
+    """
+
+    robot: Annotated[str, tyro.conf.Positional] = "nominal"
+    picture: Path | None = None
+    json: bool = False
+
+
+RobotOptions = (
+    Annotated[NewOptions, tyro.conf.subcommand("new", description="a robot file from a few questions")]
+    | Annotated[CheckOptions, tyro.conf.subcommand("check", description="what is wrong or odd about a robot, with numbers")]
+    | Annotated[ShowOptions, tyro.conf.subcommand("show", description="what a robot is and can do; a picture")]
+    | Annotated[RobotImportOptions, tyro.conf.subcommand("import", description="a robot file from MJCF or URDF")]
+    | Annotated[RobotExportOptions, tyro.conf.subcommand("export", description="a robot as MJCF or URDF")]
+)
+
+
+def run(options: NewOptions | CheckOptions | ShowOptions | RobotImportOptions | RobotExportOptions) -> int:
+    """Do what the sub-command says."""
+    match options:
+        case NewOptions():
+            return new_robot(options)
+        case CheckOptions():
+            return _check(options)
+        case ShowOptions():
+            return _show(options)
+        case RobotImportOptions():
+            return import_robot(options)
+        case RobotExportOptions():
+            return export_robot(options)
+
+
+def _check(options: CheckOptions) -> int:
+    from wlr_gym.physics.feasibility import examine_robot
+    from wlr_gym.robot import load_robot
+
+    robot = load_robot(options.robot, check=False)
+    findings = examine_robot(robot)
+    if options.json:
+        print(json.dumps({"robot": robot.name, "findings": [asdict(finding) for finding in findings]}, indent=2))
+    else:
+        print_findings(robot, findings)
+    against = findings if options.strict else [finding for finding in findings if finding.level == "fault"]
+    return FAILED if against else OK
+
+
+def _show(options: ShowOptions) -> int:
+    from wlr_gym.robot import load_robot, robot_hash
+
+    if options.picture is not None and options.picture.suffix.lower() not in PICTURES:
+        raise InputError(f"--picture {options.picture}: expected a file that ends in {', '.join(PICTURES)}")
+    if options.picture is not None and not options.picture.parent.is_dir():
+        raise InputError(f"--picture {options.picture}: folder {options.picture.parent} does not exist")
+    robot = load_robot(options.robot)
+    numbers = _numbers(robot)
+    if options.json:
+        print(json.dumps({"robot": robot.name, "fingerprint": robot_hash(robot), "numbers": numbers}, indent=2))
+    else:
+        print(f"{robot.name}, fingerprint {robot_hash(robot)}")
+        for name, number in numbers.items():
+            print(f"  {name:<26}{number['value']:>10.4g} {number['unit']:<6} {number['meaning']}")
+    if options.picture is not None:
+        from wlr_gym.render.portrait import draw_portrait
+
+        draw_portrait(options.picture, robot)
+        if not options.json:
+            print(f"written: {options.picture}")
+    return OK
+
+
+def _numbers(robot: Robot) -> dict[str, dict[str, Any]]:
+    from wlr_gym.physics.feasibility import ENTRIES, capability_of
+
+    can = capability_of(robot)
+    return {name: {"value": getattr(can, name), "unit": unit, "meaning": doc} for name, (unit, doc) in ENTRIES.items()}

@@ -1,0 +1,372 @@
+"""The numbers of a robot file in a tree of links, and what of the tree a robot file has no number for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.robot.interchange.links import LinkShape, LinkTree, RigidLink, fuse_fixed
+from wlr_gym.robot.interchange.topology import Assembly, find_assemblies
+from wlr_gym.robot.joints import CORNER_SIGNS, LEGS, WHEELS
+
+Array = NDArray[np.float64]
+
+#: Digits that imported numbers keep: what rotations and sums add to the last ones is no part of the file.
+DIGITS = 14
+#: Differences up to this share are of rounding in the file: nothing is said.
+SAME = 1e-6
+#: Differences and left-out numbers up to this share of what they are compared with are said; larger ones are refused.
+SMALL = 0.05
+
+
+@dataclass(frozen=True)
+class JointMapping:
+    """What an angle of the file is here: ``angle here = sign * angle there + offset`` (rad)."""
+
+    joint: str
+    name: str
+    sign: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class ImportedRobot:
+    """What a file says of a robot.
+
+    Attributes:
+        name: of the robot in the file.
+        numbers: keys of a robot file -> values, nested as in one; only what the file states.
+        joints: of the file, in joint order.
+        notes: what was averaged, moved or left out, with numbers.
+    """
+
+    name: str
+    numbers: dict[str, Any]
+    joints: list[JointMapping]
+    notes: list[str] = field(default_factory=list)
+
+
+class _Reader:
+    """Collects numbers and notes; refuses what differs by too much."""
+
+    def __init__(self, source: str, idealise: bool) -> None:
+        self.source, self.idealise = source, idealise
+        self.numbers: dict[str, Any] = {}
+        self.notes: list[str] = []
+
+    def put(self, key: str, value: Any) -> None:
+        """Take a number, a list of them, or None, which is not stated; ``key`` is dotted."""
+        if value is None:
+            return
+        *groups, last = key.split(".")
+        place = self.numbers
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[last] = [rounded(one) for one in value] if isinstance(value, list | tuple) else rounded(value)
+
+    def one(self, what: str, values: Sequence[float | None], unit: str, scale: float | None = None) -> float | None:
+        """Return the number that four are; their mean where they differ a little.
+
+        Args:
+            what: name for messages.
+            values: of the corners, or of the joints.
+            unit: of them.
+            scale: what differences are compared with; None = the largest value.
+        """
+        stated = [value for value in values if value is not None]
+        if not stated:
+            return None
+        if len(stated) < len(values):
+            raise InputError(
+                f"{self.source}: {what}: stated for {len(stated)} of {len(values)} legs or wheels: expected all or none"
+            )
+        spread = max(stated) - min(stated)
+        share = spread / (scale or max(map(abs, stated)) or 1.0)
+        if share <= SAME:
+            return stated[0] if spread == 0.0 else sum(stated) / len(stated)
+        mean = sum(stated) / len(stated)
+        text = f"{what} = {', '.join(f'{value:.6g}' for value in stated)} {unit}: a robot file has one for all four"
+        self._accept(share, f"{text}; their mean {mean:.6g} is used", text)
+        return mean
+
+    def leave_out(self, what: str, value: float, unit: str, scale: float) -> None:
+        """Note a number that a robot file has no place for; refuse a large one."""
+        share = abs(value) / scale if scale else 0.0
+        if share > SAME:
+            text = f"{what} = {value:.4g} {unit}: a robot file has no number for it"
+            self._accept(share, f"{text}; left out ({100 * share:.2g} % of {scale:.4g} {unit})", text)
+
+    def _accept(self, share: float, note: str, refusal: str) -> None:
+        if share > SMALL and not self.idealise:
+            raise InputError(
+                f"{self.source}: {refusal}, and {100 * share:.3g} % is too much to pass over; accept it with --idealise"
+            )
+        self.notes.append(note)
+
+
+def rounded(value: float) -> float:
+    """Return a number to :data:`DIGITS` digits."""
+    return float(f"{float(value):.{DIGITS}g}") + 0.0
+
+
+def recognise(tree: LinkTree, *, idealise: bool = False) -> ImportedRobot:
+    """Return what a tree of links says of a robot with four legs of one hinge and four wheels.
+
+    The body's origin is put in the middle of the hips along x and y, and at the centre of the body's box along z.
+
+    Args:
+        tree: of a file.
+        idealise: accept that numbers are averaged or left out which change the robot by more than :data:`SMALL`.
+
+    Raises:
+        InputError: another kind of robot, or numbers that no robot file can hold; the message names them.
+    """
+    body, assemblies = find_assemblies(fuse_fixed(tree))
+    reader = _Reader(tree.source, idealise)
+    for key, value in tree.numbers.items():
+        reader.put(key, value)
+    origin = _origin(body, assemblies, reader)
+    _read_body(body, origin, assemblies, reader)
+    directions = [_leg_geometry(one, tree.source) for one in assemblies]
+    _read_legs(assemblies, directions, reader)
+    _read_wheels(assemblies, reader)
+    _read_drives(assemblies, reader)
+    offsets = [_leg_offset(one, angle) for one, (_, angle) in zip(assemblies, directions, strict=True)]
+    _read_limits(assemblies, offsets, reader)
+    _read_home(assemblies, offsets, reader)
+    joints = [JointMapping(ours, one.leg_joint.name, one.leg_sign, rounded(angle))
+              for ours, one, angle in zip(LEGS, assemblies, offsets, strict=True)]  # fmt: skip
+    joints += [JointMapping(ours, one.wheel_joint.name, one.wheel_sign, 0.0)
+               for ours, one in zip(WHEELS, assemblies, strict=True)]  # fmt: skip
+    return ImportedRobot(tree.name, reader.numbers, joints, reader.notes)
+
+
+# --- body -------------------------------------------------------------------------------------------------------------
+
+
+def _hips(assemblies: Sequence[Assembly]) -> Array:
+    """Hips (4, 3) in the plane of their wheels: the hinge has no other place along its axis."""
+    return np.array([[one.leg_frame.position[0], one.wheel_centre[1], one.leg_frame.position[2]] for one in assemblies])
+
+
+def _origin(body: RigidLink, assemblies: Sequence[Assembly], reader: _Reader) -> Array:
+    middle = _hips(assemblies).mean(axis=0)
+    box = _bounds(body.shapes)
+    height = 0.0 if box is None else float(box.mean(axis=0)[2])
+    origin = np.array([middle[0], middle[1], height])
+    if np.linalg.norm(origin) > SAME:
+        text = ", ".join(f"{value:.4g}" for value in origin)
+        reader.notes.append(f"body origin: put at ({text}) m of link '{body.name}': the middle of hips and body")
+    return origin
+
+
+def _bounds(shapes: Sequence[LinkShape]) -> Array | None:
+    """Lowest and highest corner (2, 3) of all shapes in the link's frame, m; None: there are none."""
+    corners = [corner for shape in shapes for corner in _corners(shape)]
+    return np.array([np.min(corners, axis=0), np.max(corners, axis=0)]) if corners else None
+
+
+def _corners(shape: LinkShape) -> Array:
+    """Points (N, 3) in the link's frame between which a shape lies."""
+    placement = shape.placement
+    if shape.kind == "mesh":
+        return placement.position + shape.points @ placement.rotation.T
+    if shape.kind == "box":
+        half = np.array(shape.size) / 2
+    else:
+        radius = shape.size[0]
+        beyond = {"cylinder": 0.0, "capsule": radius, "sphere": radius}[shape.kind]
+        half = np.array([radius, radius, sum(shape.size[1:]) / 2 + beyond])
+    reach = np.abs(placement.rotation) @ half
+    return np.array([placement.position - reach, placement.position + reach])
+
+
+def _read_body(body: RigidLink, origin: Array, assemblies: Sequence[Assembly], reader: _Reader) -> None:
+    hips = _hips(assemblies) - origin
+    _require_mass(body, reader.source)
+    reader.put("body.mass", body.mass)
+    box = _bounds(body.shapes)
+    if box is not None:
+        reader.put("body.size", list(box[1] - box[0]))
+    else:
+        reader.notes.append(f"body.size: link '{body.name}' has no box: taken from the base")
+    reader.put("body.inertia", list(np.diag(body.inertia)))
+    for (i, j), axes in (((0, 1), "xy"), ((0, 2), "xz"), ((1, 2), "yz")):
+        scale = math.sqrt(abs(body.inertia[i, i] * body.inertia[j, j]))
+        reader.leave_out(f"body '{body.name}': product of inertia {axes}", float(body.inertia[i, j]), "kg m2", scale)
+    reader.put("body.com_offset", list(body.com - origin))
+    signs = np.array(CORNER_SIGNS)
+    reader.put("hip_position.x", reader.one("hip_position.x", list(hips[:, 0] * signs[:, 0]), "m"))
+    reader.put("hip_position.y", reader.one("hip_position.y", list(hips[:, 1] * signs[:, 1]), "m"))
+    size = float(np.abs(hips[:, :2]).max())
+    reader.put("hip_position.z", reader.one("hip_position.z", list(hips[:, 2]), "m", scale=size))
+
+
+def _require_mass(link: RigidLink, source: str) -> None:
+    if link.mass <= 0.0:
+        raise InputError(f"{source}: link '{link.name}': mass = {link.mass:g} kg: expected more than 0")
+
+
+# --- legs -------------------------------------------------------------------------------------------------------------
+
+
+def _leg_geometry(one: Assembly, source: str) -> tuple[float, float]:
+    """Length (m), and the leg's angle here where the file's is 0 (rad)."""
+    x, _, z = one.wheel_frame.position - one.leg_frame.position
+    if math.hypot(x, z) == 0.0:
+        raise InputError(
+            f"{source}: leg '{one.leg_joint.name}': its wheel '{one.wheel_joint.name}' turns about the hip: length = 0 m"
+        )
+    return math.hypot(x, z), math.atan2(-z, x) + 0.0
+
+
+def _read_legs(assemblies: Sequence[Assembly], geometry: Sequence[tuple[float, float]], reader: _Reader) -> None:
+    lengths = [length for length, _ in geometry]
+    reader.put("leg.length", reader.one("leg.length", lengths, "m"))
+    rows = []
+    for one, (length, angle) in zip(assemblies, geometry, strict=True):
+        _require_mass(one.leg, reader.source)
+        axes = _leg_axes(angle)
+        com = axes.T @ (one.leg_frame.point(one.leg.com) - one.leg_frame.position)
+        inertia = axes.T @ one.leg_frame.rotation @ one.leg.inertia @ one.leg_frame.rotation.T @ axes
+        beside = float(com[1] + one.leg_frame.position[1] - one.wheel_centre[1])
+        where = f"leg '{one.leg.name}'"
+        reader.leave_out(f"{where}: centre of mass off the line hip to wheel", float(com[2]), "m", length)
+        reader.leave_out(f"{where}: centre of mass beside the wheel's plane", beside, "m", 2.0 * abs(one.wheel_centre[1]))
+        for (i, j), name in (((0, 1), "xy"), ((0, 2), "xz"), ((1, 2), "yz")):
+            scale = math.sqrt(abs(inertia[i, i] * inertia[j, j]))
+            reader.leave_out(f"{where}: product of inertia {name} in the leg's frame", float(inertia[i, j]), "kg m2", scale)
+        rows.append((one.leg.mass, float(com[0]), *(float(inertia[k, k]) for k in (2, 1, 0))))  # straight down: x, y, own axis
+    mass, com, *moments = zip(*rows, strict=True)
+    reader.put("leg.mass", reader.one("leg.mass", mass, "kg"))
+    along = reader.one("leg.com_along_leg", com, "m", scale=max(lengths))
+    if along is not None and along < 0.0:
+        raise InputError(
+            f"{reader.source}: leg.com_along_leg = {along:.6g} m: the legs' mass is behind the hip: expected 0 or more"
+        )
+    reader.put("leg.com_along_leg", along)
+    scale = max(map(max, moments))
+    reader.put("leg.inertia", [reader.one(f"leg.inertia {axis}", values, "kg m2", scale=scale)
+                               for axis, values in zip("xyz", moments, strict=True)])  # fmt: skip
+
+
+def _leg_offset(one: Assembly, angle: float) -> float:
+    """Return the leg's angle here where the file's is 0, in the turn in which the leg moves below the body (rad)."""
+    joint = one.leg_joint
+    middle = sum(joint.limits) / 2 if joint.limits else joint.home or 0.0
+    turns = round((one.leg_sign * middle + angle - math.pi / 2) / (2.0 * math.pi))
+    return angle - 2.0 * math.pi * turns
+
+
+def _leg_axes(angle: float) -> Array:
+    """Axes of a leg at an angle, as columns: along it, the body's y axis, and across."""
+    sine, cosine = math.sin(angle), math.cos(angle)
+    sine, cosine = (0.0 if abs(value) < 1e-15 else value for value in (sine, cosine))
+    return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+
+
+# --- wheels -----------------------------------------------------------------------------------------------------------
+
+
+def _read_wheels(assemblies: Sequence[Assembly], reader: _Reader) -> None:
+    sizes = [_wheel_size(one, reader) for one in assemblies]
+    reader.put("wheel.radius", reader.one("wheel.radius", [radius for radius, _ in sizes], "m"))
+    widths = [width for _, width in sizes]
+    reader.put("wheel.width", reader.one("wheel.width", widths, "m") if None not in widths else None)
+    rows = []
+    for one, (radius, _) in zip(assemblies, sizes, strict=True):
+        _require_mass(one.wheel, reader.source)
+        where, frame = f"wheel '{one.wheel.name}'", one.wheel_frame
+        inertia = frame.rotation @ one.wheel.inertia @ frame.rotation.T
+        centre = one.wheel_centre - frame.position
+        reader.leave_out(f"{where}: centre of mass off its axle", math.hypot(centre[0], centre[2]), "m", radius)
+        across = float(inertia[0, 0] + inertia[2, 2]) / 2
+        reader.leave_out(f"{where}: difference of its inertias across the axle", float(inertia[0, 0]) - across, "kg m2", across)
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            reader.leave_out(f"{where}: product of inertia", float(inertia[i, j]), "kg m2", across)
+        rows.append((one.wheel.mass, float(inertia[1, 1]), across))
+    for key, unit, values in zip(
+        ("mass", "spin_inertia", "transverse_inertia"), ("kg", "kg m2", "kg m2"), zip(*rows, strict=True), strict=True
+    ):
+        reader.put(f"wheel.{key}", reader.one(f"wheel.{key}", values, unit))
+
+
+def _wheel_size(one: Assembly, reader: _Reader) -> tuple[float, float | None]:
+    """Radius and width (m) by the link's shapes; None: no width."""
+    radius, width = 0.0, None
+    for shape in one.wheel.shapes:
+        axis = one.wheel_frame.rotation @ shape.placement.rotation[:, 2]
+        if shape.kind == "sphere":
+            radius = max(radius, shape.size[0])
+        elif shape.kind in ("cylinder", "capsule") and abs(axis[1]) > 1.0 - 1e-6:
+            radius = max(radius, shape.size[0])
+            width = max(width or 0.0, shape.size[1]) if shape.kind == "cylinder" else width
+    meshes = [_corners(shape) @ one.wheel_frame.rotation.T for shape in one.wheel.shapes if shape.kind == "mesh"]
+    if radius == 0.0 and meshes:
+        points = np.concatenate(meshes)
+        return float(np.hypot(points[:, 0], points[:, 2]).max()), float(np.ptp(points[:, 1]))
+    if radius == 0.0:
+        raise InputError(
+            f"{reader.source}: wheel '{one.wheel.name}' has no cylinder about its axle and no sphere: expected one"
+        )
+    return radius, width
+
+
+# --- drives -----------------------------------------------------------------------------------------------------------
+
+
+#: Field of a joint -> key of a motor in a robot file, and its unit.
+_DRIVE: Mapping[str, tuple[str, str]] = {
+    "effort": ("stall_torque", "N m"),
+    "velocity": ("no_load_speed", "rad/s"),
+    "armature": ("armature", "kg m2"),
+    "friction": ("coulomb_friction", "N m"),
+    "damping": ("viscous_friction", "N m s/rad"),
+}
+
+
+def _read_drives(assemblies: Sequence[Assembly], reader: _Reader) -> None:
+    for group in ("leg", "wheel"):
+        joints = [getattr(one, f"{group}_joint") for one in assemblies]
+        for name, (key, unit) in _DRIVE.items():
+            value = reader.one(f"{name} of the {group} joints", [getattr(joint, name) for joint in joints], unit)
+            if value == 0.0 and name != "damping":  # what files say where nobody knows; no servo has it
+                reader.notes.append(f"servo.{group}.{key}: 0 in the file: taken from the base")
+                value = None
+            reader.put(f"servo.{group}.{key}", value)
+
+
+def _read_limits(assemblies: Sequence[Assembly], offsets: Sequence[float], reader: _Reader) -> None:
+    spans = []
+    for one, offset in zip(assemblies, offsets, strict=True):
+        if one.leg_joint.limits is None:
+            return
+        low, high = sorted(one.leg_sign * angle + offset for angle in one.leg_joint.limits)
+        spans.append((low, high))
+    if all(high <= low for low, high in spans):
+        return
+    lows, highs = zip(*spans, strict=True)
+    low, high = max(lows), min(highs)
+    if max(low - min(lows), max(highs) - high) > SAME:
+        texts = ", ".join(f"[{first:.4g}, {last:.4g}]" for first, last in spans)
+        reader.notes.append(f"leg_limits: legs move in {texts} rad: a robot file has one for all four; what all can is used")
+    if low >= high:
+        raise InputError(f"{reader.source}: leg_limits: no angle is allowed to all legs: [{low:.6g}, {high:.6g}] rad")
+    reader.put("leg_limits", [low, high])
+
+
+def _read_home(assemblies: Sequence[Assembly], offsets: Sequence[float], reader: _Reader) -> None:
+    """Take the legs' angle of the file's own pose, where it is one for all."""
+    angles = [one.leg_sign * (one.leg_joint.home or 0.0) + offset for one, offset in zip(assemblies, offsets, strict=True)]
+    if any(one.leg_joint.home is None for one in assemblies):
+        return
+    if max(angles) - min(angles) > SAME:
+        reader.notes.append(f"home.leg_angle: legs at {', '.join(f'{angle:.4g}' for angle in angles)} rad: taken from the base")
+        return
+    reader.put("home.leg_angle", angles[0])

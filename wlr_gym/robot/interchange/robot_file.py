@@ -1,0 +1,80 @@
+"""Text of a robot file over a base, and the robot that it is."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.settings import overlay, parse_config
+from wlr_gym.robot.description import Robot, load_robot
+
+#: Width at which a comment starts.
+_COMMENT = 42
+
+
+def robot_text(
+    name: str, base: str, numbers: Mapping[str, Any], *, title: Iterable[str] = (), comments: Mapping[str, str] | None = None
+) -> str:
+    """Return a robot file (YAML).
+
+    Args:
+        name: of the robot.
+        base: config name or path of the robot that has all other numbers.
+        numbers: keys of a robot file -> values, nested as in one.
+        title: lines at its top, as comments.
+        comments: dotted key -> comment beside it.
+    """
+    lines = [*(f"# {line}".rstrip() for line in title), "", f"base: {_scalar(base)}", f"name: {_scalar(name)}", ""]
+    return "\n".join([*lines, *_lines(numbers, "", comments or {})]) + "\n"
+
+
+def _lines(numbers: Mapping[str, Any], above: str, comments: Mapping[str, str]) -> Iterator[str]:
+    indent = "  " * above.count(".")
+    for key, value in numbers.items():
+        if isinstance(value, Mapping):
+            yield f"{indent}{key}:"
+            yield from _lines(value, f"{above}{key}.", comments)
+            if not above:
+                yield ""
+            continue
+        line, comment = f"{indent}{key}: {_scalar(value)}", comments.get(above + key)
+        yield f"{line:<{_COMMENT}} # {comment}" if comment else line
+
+
+def _scalar(value: Any) -> str:
+    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("...\n").strip()
+
+
+def base_beside(base: str, out: Path) -> str:
+    """Return how a file at ``out`` names its base: a path is seen from the file's own folder."""
+    if not base.endswith((".yaml", ".yml")):
+        return base
+    return Path(os.path.relpath(base, out.parent)).as_posix()
+
+
+def robot_over(base: str, name: str, numbers: Mapping[str, Any], where: Path, *, check: bool = True) -> Robot:
+    """Return the robot that a file at ``where`` with these numbers over ``base`` would be.
+
+    Raises:
+        InputError: as :func:`wlr_gym.robot.load_robot` of that file.
+    """
+    below = load_robot(base, check=False).model_dump(mode="json")
+    robot = parse_config(Robot, overlay(below, {**numbers, "name": name}), str(where))
+    return load_robot(robot, check=check)
+
+
+def new_file(path: Path, *, force: bool) -> None:
+    """Refuse a file that is there, unless it may be replaced, and a folder that is not.
+
+    Raises:
+        InputError: naming it.
+    """
+    if path.exists() and not force:
+        raise InputError(f"--out {path}: exists; choose another name, or replace it with --force")
+    if not path.parent.is_dir():
+        raise InputError(f"--out {path}: folder {path.parent} does not exist")
