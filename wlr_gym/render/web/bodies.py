@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.render.colours import Colour
 from wlr_gym.render.stage import Stage
 
 Array = NDArray[np.float64]
@@ -22,22 +23,27 @@ _HIDDEN = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
-    """A body in its own frame.
+class Surface:
+    """Triangles of one colour in the frame of their body.
 
     Attributes:
-        name: of the model's body.
-        index: of it in the model.
         vertices: (V, 3) m.
-        faces: (F, 3) indices of vertices, seen from outside against the clock.
-        colours: (V, 3) red, green, blue, 0 to 255.
+        faces: (F, 3) indices of vertices; seen from outside they go round against the clock.
+        colour: red, green, blue, 0 to 1.
     """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A body in its own frame: its name and index in the model, and its surfaces, one per colour."""
 
     name: str
     index: int
-    vertices: Array
-    faces: NDArray[np.int64]
-    colours: NDArray[np.uint8]
+    surfaces: tuple[Surface, ...]
 
 
 def bodies(stage: Stage) -> list[Body]:
@@ -45,27 +51,37 @@ def bodies(stage: Stage) -> list[Body]:
     model, found = stage.model, []
     for index in range(1, model.nbody):
         first = int(model.body_geomadr[index])
-        geoms = [one for one in range(first, first + int(model.body_geomnum[index])) if _is_drawn(model, one)]
-        if geoms:
-            found.append(_merged(model, index, geoms))
+        colours: dict[Colour, list[int]] = {}
+        for geom in range(first, first + int(model.body_geomnum[index])):
+            if _is_drawn(model, geom):
+                colours.setdefault(_colour(model, geom), []).append(geom)
+        if colours:
+            found.append(Body(model.body(index).name, index, tuple(_surface(model, *one) for one in colours.items())))
     return found
+
+
+def joined(body: Body, colour: Colour) -> Surface:
+    """Return a body as one surface."""
+    return _joined([(one.vertices, one.faces) for one in body.surfaces], colour)
 
 
 def _is_drawn(model: Any, geom: int) -> bool:
     return int(model.geom_group[geom]) != _HIDDEN and float(model.geom_rgba[geom, 3]) > 0.0
 
 
-def _merged(model: Any, index: int, geoms: list[int]) -> Body:
-    parts = [_triangles(model, geom) for geom in geoms]
+def _colour(model: Any, geom: int) -> Colour:
+    red, green, blue = (float(part) for part in model.geom_rgba[geom, :3])
+    return red, green, blue
+
+
+def _surface(model: Any, colour: Colour, geoms: list[int]) -> Surface:
+    return _joined([_triangles(model, geom) for geom in geoms], colour)
+
+
+def _joined(parts: list[tuple[Array, NDArray[np.int64]]], colour: Colour) -> Surface:
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts[:-1])])
-    colours = [np.tile(np.rint(255 * model.geom_rgba[geom, :3]).astype(np.uint8), (len(v), 1)) for geom, (v, _) in zip(geoms, parts, strict=True)]
-    return Body(
-        model.body(index).name,
-        index,
-        np.concatenate([vertices for vertices, _ in parts]),
-        np.concatenate([faces + start for (_, faces), start in zip(parts, starts, strict=True)]),
-        np.concatenate(colours),
-    )
+    faces = np.concatenate([faces + start for (_, faces), start in zip(parts, starts, strict=True)])
+    return Surface(np.concatenate([vertices for vertices, _ in parts]), faces, colour)
 
 
 def _triangles(model: Any, geom: int) -> tuple[Array, NDArray[np.int64]]:
@@ -77,7 +93,6 @@ def _triangles(model: Any, geom: int) -> tuple[Array, NDArray[np.int64]]:
         mesh = trimesh.creation.box(extents=2.0 * size)
     elif kind == shapes.mjGEOM_CYLINDER:
         mesh = trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1], sections=SIDES)
-        mesh.unmerge_vertices()  # edges stay sharp
     elif kind == shapes.mjGEOM_CAPSULE:
         mesh = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=[SIDES // 2, SIDES // 2])
         mesh.apply_translation([0.0, 0.0, -mesh.bounds.mean(axis=0)[2]])

@@ -14,7 +14,7 @@ from wlr_gym.render.camera import CAMERAS, up_direction
 from wlr_gym.render.colours import Colour, friction_colour
 from wlr_gym.render.stage import Stage
 from wlr_gym.render.view import View
-from wlr_gym.render.web.bodies import bodies
+from wlr_gym.render.web.bodies import Body, bodies, joined
 from wlr_gym.render.web.page import floor_pose
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
@@ -95,16 +95,22 @@ class Figure:
         elif not np.array_equal(points.astype(np.float32), self._arrows.points):
             self._arrows.points, self._arrows.colors = points.astype(np.float32), colours
 
-    def _add(self, body: Any) -> Any:
+    def _add(self, body: Body) -> Any:
         name, scene = f"{self._root}/{body.name}", self._server.scene
-        if self.ghost:
-            return scene.add_mesh_simple(
-                name, body.vertices, body.faces, color=rgb(GHOST), opacity=GHOST_OPACITY, cast_shadow=False, receive_shadow=False
+        node = scene.add_frame(name, show_axes=False)
+        surfaces = [joined(body, GHOST)] if self.ghost else body.surfaces
+        for k, surface in enumerate(surfaces):
+            scene.add_mesh_simple(
+                f"{name}/{k}",
+                surface.vertices,
+                surface.faces,
+                color=rgb(surface.colour),
+                opacity=GHOST_OPACITY if self.ghost else None,
+                flat_shading=True,
+                cast_shadow=False,
+                receive_shadow=False,
             )
-        import trimesh
-
-        mesh = trimesh.Trimesh(body.vertices, body.faces, vertex_colors=body.colours, process=False)
-        return scene.add_mesh_trimesh(name, mesh, receive_shadow=False)
+        return node
 
 
 class Ground:
