@@ -13,7 +13,7 @@ from urllib.request import urlopen
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader", "--window-size=1000,640", "--remote-debugging-port=0",
+    "--enable-unsafe-swiftshader", "--window-size=1280,720", "--remote-debugging-port=0",
 )  # fmt: skip
 #: s.
 PATIENCE = 60.0
@@ -88,7 +88,8 @@ class Browser:
     def click(self, text):
         """Click on the button with a text."""
         script = f"""(() => {{
-            const found = [...document.querySelectorAll('button, [role=button]')].find(b => b.innerText.includes({json.dumps(text)}));
+            const buttons = [...document.querySelectorAll('button, [role=button]')];
+            const found = buttons.find(b => b.innerText.includes({json.dumps(text)}));
             if (!found) return null;
             found.scrollIntoView();
             const box = found.getBoundingClientRect();

@@ -216,7 +216,9 @@ def _web_viewer(options: PlayOptions, robot: Robot, on_key: KeyCallback | None) 
     return viewer
 
 
-def show(options: PlayOptions, core: Core, policy: Policy, driver: Driver | None, new_viewer: NewViewer = _window_viewer) -> None:
+def show(
+    options: PlayOptions, core: Core, policy: Policy, driver: Driver | None, new_viewer: NewViewer = _window_viewer
+) -> None:
     """Play in a window until it is closed, on a page until Ctrl-C, or for ``options.seconds``; ``new_viewer`` makes either."""
     from wlr_gym.learning.evaluation.film import commands, drive, present_time
     from wlr_gym.render.teleop import Keyboard

@@ -80,7 +80,9 @@ def _read(paths: Sequence[Path]) -> list[Run]:
     from wlr_gym.data import read_dataset, read_run
 
     if not paths:
-        raise InputError("expected runs (CSV or Parquet), or folders of runs; other programs' logs: wlr import makes runs of them")
+        raise InputError(
+            "expected runs (CSV or Parquet), or folders of runs; other programs' logs: wlr import makes runs of them"
+        )
     return [run for path in paths for run in (read_dataset(path).runs if path.is_dir() else [read_run(path)])]
 
 

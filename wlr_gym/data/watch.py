@@ -46,7 +46,8 @@ _PATIENCE = 0.5
 _AROUND = 1.0
 #: Elements of the truth that can be plotted where a simulator knows them.
 _TRUE = {
-    f"true {name}": name for name in ("slip_velocity", "contact_force", "linear_velocity_in_body", "position", "effective_friction")
+    f"true {name}": name
+    for name in ("slip_velocity", "contact_force", "linear_velocity_in_body", "position", "effective_friction")
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from wlr_gym.render.view import View
 
@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 #: What a page calls its cameras; the direction from which it is seen is the mouse's affair.
 _CAMERAS = {"goes with the robot": "follow", "turns with the robot": "chase"}
+#: Pixels.
+_PLOTS_WIDE = 380
 
 
 class Look:
@@ -41,3 +43,13 @@ class Look:
             slip=bool(self._slip.value),
             forces=bool(self._forces.value),
         )
+
+
+def plot_panel(server: viser.ViserServer) -> Any:
+    """Return a panel at the left edge, the other controls at the right one: what is added within it stands there."""
+    server.gui.main_panel.dock_right()
+    panel = server.gui.add_panel()
+    tab = panel.add_tab("Plots")
+    panel.dock_left()
+    panel.set_width(_PLOTS_WIDE)
+    return tab

@@ -16,7 +16,7 @@ from wlr_gym.render.scene import describe, legend
 from wlr_gym.render.teleop import DOWN, LEFT, RESET, RIGHT, SPACE, UP
 from wlr_gym.render.view import View
 from wlr_gym.render.viewer import KeyCallback, Pace
-from wlr_gym.render.web.controls import Look
+from wlr_gym.render.web.controls import Look, plot_panel
 from wlr_gym.render.web.figure import Figure, Ground, arrows_of
 from wlr_gym.render.web.page import HOST, PORT, TEXTS, aim, html_lines, open_server, say
 from wlr_gym.render.web.plots import Curve, Plots
@@ -81,8 +81,7 @@ class WebViewer:
             self._add_keys(on_key)
         self._look = Look(self.server, self.view)
         self._past = Past()
-        with self.server.gui.add_folder("Plots"):
-            self._plots = Plots(self.server, _TITLES, _FIRST)
+        self._plots = Plots(self.server, plot_panel(self.server), _TITLES, _FIRST)
         self._told = -np.inf
         say(self.address)
 

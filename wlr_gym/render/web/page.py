@@ -25,8 +25,12 @@ Array = NDArray[np.float64]
 PORT = 8080
 #: Only this machine: a page on a network could be driven by anyone on it.
 HOST = "localhost"
+#: Version of viser from which on it has panels, keys and uPlot.
+LEAST_VISER = (1, 1)
 #: Updates of the scene per second.
 UPDATES = 30.0
+#: Times the distance of pictures: panels stand at both sides.
+_FARTHER = 1.3
 #: Updates of texts and sliders per second.
 TEXTS = 6.0
 
@@ -56,7 +60,9 @@ class Address:
         here = environment.get("SSH_CONNECTION", "").split()
         machine = here[2] if len(here) == 4 else socket.gethostname()
         port = f" -p {here[3]}" if len(here) == 4 and here[3] != "22" else ""
-        lines.append(f"from another machine: ssh{port} -N -L {self.port}:localhost:{self.port} {_user()}@{machine}, then the same")
+        lines.append(
+            f"from another machine: ssh{port} -N -L {self.port}:localhost:{self.port} {_user()}@{machine}, then the same"
+        )
         return lines
 
 
@@ -77,13 +83,16 @@ def open_server(host: str = HOST, port: int = PORT, label: str = "wlr_gym") -> t
 
     Raises:
         MissingPackageError: no viser here (extra ``web``).
-        InputError: no such address, or no free port.
+        InputError: no such address, no free port, or a viser that is too old.
     """
     if not 1 <= port <= 65535:
         raise InputError(f"--port {port}: expected 1 to 65535")
     require_package("viser", "web")
     import viser
 
+    if tuple(int(part) for part in viser.__version__.split(".")[:2]) < LEAST_VISER:
+        least = ".".join(map(str, LEAST_VISER))
+        raise InputError(f"viser {viser.__version__} is too old: pip install 'wlr-gym[web]' brings {least} or later")
     _check_address(host)
     with contextlib.redirect_stdout(io.StringIO()):  # it says where it is in a way of its own
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
@@ -132,7 +141,7 @@ def eye(camera: FollowCamera) -> tuple[Array, Array]:
     flat, rise = np.cos(camera.elevation), np.sin(camera.elevation)
     forward = np.array([flat * np.cos(camera.azimuth), flat * np.sin(camera.azimuth), rise])
     look_at = np.array([0.0, 0.0, LOOK_HEIGHT])
-    return look_at - camera.distance * forward, look_at
+    return look_at - _FARTHER * camera.distance * forward, look_at
 
 
 def floor_pose(place: Array, yaw: float, up: Array, camera: FollowCamera) -> tuple[Array, Array]:
@@ -170,4 +179,3 @@ def html_lines(lines: list[str]) -> str:
 
     style = "font-size:0.85em; line-height:1.45; padding:0 0.8em 0.4em; font-variant-numeric:tabular-nums"
     return f'<div style="{style}">' + "<br>".join(map(html.escape, lines)) + "</div>"
-

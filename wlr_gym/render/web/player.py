@@ -14,7 +14,7 @@ from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render.scene import describe, legend
 from wlr_gym.render.view import View
 from wlr_gym.render.viewer import Pace
-from wlr_gym.render.web.controls import Look
+from wlr_gym.render.web.controls import Look, plot_panel
 from wlr_gym.render.web.figure import Figure, Ground, arrows_of
 from wlr_gym.render.web.page import HOST, PORT, TEXTS, UPDATES, aim, html_lines, open_server, say
 from wlr_gym.render.web.plots import Curve, Plots
@@ -228,9 +228,10 @@ class Player:
         self._speed: Any = gui.add_dropdown("speed", SPEEDS, initial_value="1")
         self._show_ghost: Any = gui.add_checkbox("ghost: replayed", True)
         self._look = Look(self.server, self._view)
-        with gui.add_folder("Plots"):
+        place = plot_panel(self.server)
+        with place:
             self._window: Any = gui.add_dropdown("shown", tuple(WINDOWS), initial_value="20 s")
-            self._plots = Plots(self.server, self.recording.titles, first)
+        self._plots = Plots(self.server, place, self.recording.titles, first)
         self._button.on_click(lambda _: self._turn())
         gui.add_command("play or pause", hotkey="space").on_trigger(lambda _: self._turn())
         for key, step in (("J", -1.0), ("L", 1.0)):

@@ -21,6 +21,8 @@ COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#1
 _NOW = "#444444"
 #: Pixels; height of a plot.
 _HEIGHT = 190
+#: s; half the width of the line at the present time.
+_THIN = 1e-6
 NOTHING = "(nothing)"
 
 
@@ -67,27 +69,29 @@ def thinned(curve: Curve, begin: float, end: float, columns: int = COLUMNS) -> t
 def aligned(curves: Sequence[Curve], begin: float, end: float, now: float) -> tuple[Array, ...]:
     """Return what uPlot draws: common times, a row of values per curve, and a row that is a line at the present time.
 
-    A curve has a value at each of the times between its own: on the line between them, so that what is drawn is the same.
+    A curve has a value at each of the times between its own: on the line between them, so that what is drawn is the same. Before
+    and after all its own times it stays as it is, and the line at the present time runs along the bottom: uPlot as viser feeds it
+    draws nothing of a plot with a NaN in it.
     """
     pieces = [thinned(curve, begin, end) for curve in curves]
     shown = np.concatenate([values for _, values in pieces]) if pieces else np.zeros(0)
     low, high = (float(shown.min()), float(shown.max())) if len(shown) else (0.0, 1.0)
     margin = 0.05 * (high - low) or 1e-3
-    t = np.unique(np.concatenate([[begin, now, now + 1e-6, end], *(piece for piece, _ in pieces)]))
+    t = np.unique(np.concatenate([[begin, now - _THIN, now, now + _THIN, end], *(piece for piece, _ in pieces)]))
     t = t[(t >= begin) & (t <= end)]
     rows = [_between(t, *piece) for piece in pieces]
-    line = np.full(len(t), np.nan)
+    line = np.full(len(t), low - margin)
     place = int(np.searchsorted(t, now))
-    line[place : place + 2] = (low - margin, high + margin)[: len(line[place : place + 2])]
+    line[place : place + 1] = high + margin
     return (t, *rows, line)
 
 
+def _is_in(curve: Curve, begin: float, end: float) -> bool:
+    return len(curve.t) > 0 and bool(curve.t[0] <= end and curve.t[-1] >= begin)
+
+
 def _between(t: Array, known: Array, values: Array) -> Array:
-    if not len(known):
-        return np.full(len(t), np.nan)
-    row = np.interp(t, known, values)
-    row[(t < known[0]) | (t > known[-1])] = np.nan
-    return row
+    return np.interp(t, known, values) if len(known) else np.zeros(len(t))
 
 
 class Plots:
@@ -95,20 +99,23 @@ class Plots:
 
     Args:
         server: of the page.
+        place: panel that they stand in.
         titles: what can be drawn, and its unit.
         first: what is drawn until something else is chosen.
     """
 
-    def __init__(self, server: viser.ViserServer, titles: Mapping[str, str], first: Sequence[str]) -> None:
-        self._server, self._units = server, dict(titles)
+    def __init__(self, server: viser.ViserServer, place: Any, titles: Mapping[str, str], first: Sequence[str]) -> None:
+        self._server, self._place, self._units = server, place, dict(titles)
         options = (NOTHING, *titles)
         self._choices: list[Any] = []
         self._plots: list[Any] = []
         self._drawn: list[tuple[str, ...]] = []
-        for k, name in enumerate(first):
-            self._choices.append(server.gui.add_dropdown(f"plot {k + 1}", options, initial_value=name if name in titles else NOTHING))
-            self._plots.append(None)
-            self._drawn.append(())
+        with place:
+            for k, name in enumerate(first):
+                chosen = name if name in titles else NOTHING
+                self._choices.append(server.gui.add_dropdown(f"plot {k + 1}", options, initial_value=chosen))
+                self._plots.append(None)
+                self._drawn.append(())
         self._places = [choice.order for choice in self._choices]
 
     @property
@@ -127,7 +134,7 @@ class Plots:
     def draw(self, curves: Mapping[str, Sequence[Curve]], begin: float, end: float, now: float) -> None:
         """Draw, from ``begin`` to ``end`` (s), the curves of what was chosen."""
         for k, name in enumerate(self.chosen):
-            mine = list(curves.get(name, ()))
+            mine = [curve for curve in curves.get(name, ()) if _is_in(curve, begin, end)]
             drawn = (name, *(curve.label for curve in mine))
             if self._plots[k] is not None and drawn != self._drawn[k]:
                 self._plots[k].remove()
@@ -144,16 +151,17 @@ class Plots:
     def _add(self, name: str, curves: Sequence[Curve], data: tuple[Array, ...], order: float) -> Any:
         series: list[dict[str, Any]] = [{"label": "t (s)"}]
         for curve in curves:
-            line = {"label": curve.label, "stroke": COLOURS[curve.colour % len(COLOURS)], "width": 1.5, "spanGaps": True}
+            line = {"label": curve.label, "stroke": COLOURS[curve.colour % len(COLOURS)], "width": 1.5}
             series.append(line | ({"dash": (6, 4)} if curve.dashed else {}))
         series.append({"label": "now", "stroke": _NOW, "width": 1})
         unit = self._units.get(name, "")
-        return self._server.gui.add_uplot(
-            data,
-            tuple(series),  # pyright: ignore[reportArgumentType]
-            title=f"{name} ({unit})" if unit else name,
-            scales={"x": {"time": False}},
-            legend={"show": True},
-            height=_HEIGHT,
-            order=order,
-        )
+        with self._place:
+            return self._server.gui.add_uplot(
+                data,
+                tuple(series),  # pyright: ignore[reportArgumentType]
+                title=f"{name} ({unit})" if unit else name,
+                scales={"x": {"time": False}},
+                legend={"show": True},
+                height=_HEIGHT,
+                order=order,
+            )
