@@ -1,5 +1,6 @@
-"""Watch measured runs on a page in the browser: robot, floor with its friction, slip, contact forces, the replayed ghost, and any
-channel over time. Works over ssh, without internet.
+"""Watch measured runs on a page in the browser, beside what a simulator makes of them. Works over ssh, without internet.
+
+The page shows the robot and its replayed ghost, the floor with its friction, slip and contact forces, and any channel over time.
 """
 
 from __future__ import annotations
@@ -80,9 +81,7 @@ def _read(paths: Sequence[Path]) -> list[Run]:
     from wlr_gym.data import read_dataset, read_run
 
     if not paths:
-        raise InputError(
-            "expected runs (CSV or Parquet), or folders of runs; other programs' logs: wlr import makes runs of them"
-        )
+        raise InputError("expected runs (CSV or Parquet), or folders of runs; wlr import makes runs of other programs' logs")
     return [run for path in paths for run in (read_dataset(path).runs if path.is_dir() else [read_run(path)])]
 
 

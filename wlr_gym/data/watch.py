@@ -78,7 +78,7 @@ class Track:
 
 
 class RunRecording:
-    """A run that a page plays, see :class:`wlr_gym.render.web.player.Recording`.
+    """A run that a page plays, see :class:`wlr_gym.render.web.player.Playable`.
 
     Args:
         run: a run.

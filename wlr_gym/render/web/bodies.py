@@ -1,4 +1,4 @@
-"""The robot's bodies as triangles: the shapes of :class:`wlr_gym.render.stage.Stage`, which pictures and the window draw, too."""
+"""The robot's bodies as triangles: the shapes of :class:`wlr_gym.render.stage.Stage`, as in pictures and the window."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo fills its namespace when it is imported.)
@@ -38,7 +38,7 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class BodyShape:
     """A body in its own frame: its name and index in the model, and its surfaces, one per colour."""
 
     name: str
@@ -46,7 +46,7 @@ class Body:
     surfaces: tuple[Surface, ...]
 
 
-def bodies(stage: Stage) -> list[Body]:
+def bodies(stage: Stage) -> list[BodyShape]:
     """Return the bodies of a stage that have something to draw; the floor is none of them."""
     model, found = stage.model, []
     for index in range(1, model.nbody):
@@ -56,11 +56,11 @@ def bodies(stage: Stage) -> list[Body]:
             if _is_drawn(model, geom):
                 colours.setdefault(_colour(model, geom), []).append(geom)
         if colours:
-            found.append(Body(model.body(index).name, index, tuple(_surface(model, *one) for one in colours.items())))
+            found.append(BodyShape(model.body(index).name, index, tuple(_surface(model, *one) for one in colours.items())))
     return found
 
 
-def joined(body: Body, colour: Colour) -> Surface:
+def joined(body: BodyShape, colour: Colour) -> Surface:
     """Return a body as one surface."""
     return _joined([(one.vertices, one.faces) for one in body.surfaces], colour)
 

@@ -16,7 +16,7 @@ _CAMERAS = {"goes with the robot": "follow", "turns with the robot": "chase"}
 _PLOTS_WIDE = 380
 
 
-class Look:
+class ViewControls:
     """What whoever watches wants to see.
 
     Args:

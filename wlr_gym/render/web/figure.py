@@ -14,7 +14,7 @@ from wlr_gym.render.camera import CAMERAS, up_direction
 from wlr_gym.render.colours import Colour, friction_colour
 from wlr_gym.render.stage import Stage
 from wlr_gym.render.view import View
-from wlr_gym.render.web.bodies import Body, bodies, joined
+from wlr_gym.render.web.bodies import BodyShape, bodies, joined
 from wlr_gym.render.web.page import floor_pose
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
@@ -95,7 +95,7 @@ class Figure:
         elif not np.array_equal(points.astype(np.float32), self._arrows.points):
             self._arrows.points, self._arrows.colors = points.astype(np.float32), colours
 
-    def _add(self, body: Body) -> Any:
+    def _add(self, body: BodyShape) -> Any:
         name, scene = f"{self._root}/{body.name}", self._server.scene
         node = scene.add_frame(name, show_axes=False)
         surfaces = [joined(body, GHOST)] if self.ghost else body.surfaces
@@ -113,7 +113,7 @@ class Figure:
         return node
 
 
-class Ground:
+class PageFloor:
     """The floor on the page: its colour is its friction, areas and pads of other friction lie on it."""
 
     def __init__(self, server: viser.ViserServer) -> None:

@@ -16,8 +16,8 @@ from wlr_gym.render.scene import describe, legend
 from wlr_gym.render.teleop import DOWN, LEFT, RESET, RIGHT, SPACE, UP
 from wlr_gym.render.view import View
 from wlr_gym.render.viewer import KeyCallback, Pace
-from wlr_gym.render.web.controls import Look, plot_panel
-from wlr_gym.render.web.figure import Figure, Ground, arrows_of
+from wlr_gym.render.web.controls import ViewControls, plot_panel
+from wlr_gym.render.web.figure import Figure, PageFloor, arrows_of
 from wlr_gym.render.web.page import HOST, PORT, TEXTS, aim, html_lines, open_server, say
 from wlr_gym.render.web.plots import Curve, Plots
 from wlr_gym.robot import Robot
@@ -47,7 +47,7 @@ _MOST = 12
 
 
 class WebViewer:
-    """Shows one robot on a page of the browser, no faster than real time; the counterpart of :class:`wlr_gym.render.viewer.Viewer`.
+    """Shows one robot on a page of the browser, no faster than real time; as :class:`wlr_gym.render.viewer.Viewer`.
 
     Args:
         robot: supplies the sizes that are no parameters.
@@ -75,11 +75,11 @@ class WebViewer:
         self.server, self.address = open_server(host, port, "wlr play")
         aim(self.server, self.view.camera)
         self._figure = Figure(self.server, "robot", robot)
-        self._ground = Ground(self.server)
+        self._ground = PageFloor(self.server)
         self._text: Any = self.server.gui.add_html("")
         if on_key is not None:
             self._add_keys(on_key)
-        self._look = Look(self.server, self.view)
+        self._look = ViewControls(self.server, self.view)
         self._past = Past()
         self._plots = Plots(self.server, plot_panel(self.server), _TITLES, _FIRST)
         self._told = -np.inf

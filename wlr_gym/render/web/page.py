@@ -104,7 +104,7 @@ def open_server(host: str = HOST, port: int = PORT, label: str = "wlr_gym") -> t
 
 
 def _light(server: viser.ViserServer) -> None:
-    """Light the scene from above: without shadows and reflections, which cost a browser without a graphics card 30 times more."""
+    """Light the scene from above: with shadows and reflections, a browser without a graphics card takes 30 times as long."""
     scene = server.scene
     scene.configure_default_lights(False)
     scene.configure_environment_map(None)
@@ -130,7 +130,7 @@ def say(address: Address) -> None:
 
 
 def aim(server: viser.ViserServer, camera: str) -> None:
-    """Put the eye of whoever opens the page where a camera of pictures is; the robot stands where the eye's world has its origin."""
+    """Put the eye of whoever opens the page where a camera of pictures is, about a robot at the origin of the eye's world."""
     position, look_at = eye(CAMERAS[camera])
     server.initial_camera.position = tuple(position)
     server.initial_camera.look_at = tuple(look_at)
@@ -161,7 +161,8 @@ def floor_pose(place: Array, yaw: float, up: Array, camera: FollowCamera) -> tup
     tilt = np.array([1.0 + up[2], *cross])
     tilt /= np.linalg.norm(tilt)
     whole = _product(turn, tilt)
-    return whole, -_rotated(whole, np.array([place[0], place[1], 0.0]))
+    moved = np.array([place[0], place[1], 0.0])
+    return whole, -_rotated(whole, moved)
 
 
 def _product(a: Array, b: Array) -> Array:
@@ -170,7 +171,8 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def _rotated(turn: Array, vector: Array) -> Array:
-    return vector + 2.0 * np.cross(turn[1:], np.cross(turn[1:], vector) + turn[0] * vector)
+    axis = turn[1:]
+    return np.asarray(vector + 2.0 * np.cross(axis, np.cross(axis, vector) + turn[0] * vector), np.float64)
 
 
 def html_lines(lines: list[str]) -> str:

@@ -14,8 +14,8 @@ from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render.scene import describe, legend
 from wlr_gym.render.view import View
 from wlr_gym.render.viewer import Pace
-from wlr_gym.render.web.controls import Look, plot_panel
-from wlr_gym.render.web.figure import Figure, Ground, arrows_of
+from wlr_gym.render.web.controls import ViewControls, plot_panel
+from wlr_gym.render.web.figure import Figure, PageFloor, arrows_of
 from wlr_gym.render.web.page import HOST, PORT, TEXTS, UPDATES, aim, html_lines, open_server, say
 from wlr_gym.render.web.plots import Curve, Plots
 from wlr_gym.robot import Robot
@@ -44,7 +44,7 @@ class Moment:
     forces: bool = True
 
 
-class Recording(Protocol):
+class Playable(Protocol):
     """What is played. Times are s since its beginning."""
 
     @property
@@ -106,17 +106,17 @@ class Player:
     def __init__(
         self,
         names: Sequence[str],
-        open: Callable[[int], Recording],
+        open: Callable[[int], Playable],
         first: Sequence[str],
         view: View | None = None,
         host: str = HOST,
         port: int = PORT,
     ) -> None:
         self._view, self._open, self._names = view or View(forces=True), open, list(names)
-        self.recording: Recording = open(0)
+        self.recording: Playable = open(0)
         self.server, self.address = open_server(host, port, "wlr view")
         aim(self.server, self._view.camera)
-        self._ground = Ground(self.server)
+        self._ground = PageFloor(self.server)
         self._figures: dict[str, Figure] = {}
         self._lock = threading.Lock()
         self._time, self._drawn, self._told, self._plotted = 0.0, -1.0, -np.inf, -np.inf
@@ -227,15 +227,15 @@ class Player:
         self._slider: Any = gui.add_slider("time (s)", 0.0, max(round(self.recording.length, 2), 0.01), 0.01, 0.0)
         self._speed: Any = gui.add_dropdown("speed", SPEEDS, initial_value="1")
         self._show_ghost: Any = gui.add_checkbox("ghost: replayed", True)
-        self._look = Look(self.server, self._view)
+        self._look = ViewControls(self.server, self._view)
         place = plot_panel(self.server)
         with place:
             self._window: Any = gui.add_dropdown("shown", tuple(WINDOWS), initial_value="20 s")
         self._plots = Plots(self.server, place, self.recording.titles, first)
         self._button.on_click(lambda _: self._turn())
         gui.add_command("play or pause", hotkey="space").on_trigger(lambda _: self._turn())
-        for key, step in (("J", -1.0), ("L", 1.0)):
-            gui.add_command(f"{step:+g} s", hotkey=key).on_trigger(lambda _, step=step: self.seek(self._time + step))
+        gui.add_command("1 s back", hotkey="J").on_trigger(lambda _: self.seek(self._time - 1.0))
+        gui.add_command("1 s on", hotkey="L").on_trigger(lambda _: self.seek(self._time + 1.0))
         self._slider.on_update(lambda event: self.seek(float(event.target.value)) if event.client is not None else None)
         self._figures = self._new_figures()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,7 +60,7 @@ def thinned(curve: Curve, begin: float, end: float, columns: int = COLUMNS) -> t
         return t, values
     edges = np.linspace(0, len(t), columns + 1).astype(int)
     kept = np.empty(2 * columns, int)
-    for k, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for k, (low, high) in enumerate(pairwise(edges.tolist())):
         piece = values[low:high]
         kept[2 * k : 2 * k + 2] = sorted((low + int(piece.argmin()), low + int(piece.argmax())))
     kept = np.unique(kept)
@@ -69,9 +70,9 @@ def thinned(curve: Curve, begin: float, end: float, columns: int = COLUMNS) -> t
 def aligned(curves: Sequence[Curve], begin: float, end: float, now: float) -> tuple[Array, ...]:
     """Return what uPlot draws: common times, a row of values per curve, and a row that is a line at the present time.
 
-    A curve has a value at each of the times between its own: on the line between them, so that what is drawn is the same. Before
-    and after all its own times it stays as it is, and the line at the present time runs along the bottom: uPlot as viser feeds it
-    draws nothing of a plot with a NaN in it.
+    A curve has a value at each of the times between its own: on the line between them, so that what is drawn is the same.
+    Before and after all its own times it stays as it is, and the line at the present time runs along the bottom: with a NaN
+    in it, uPlot as viser feeds it draws nothing.
     """
     pieces = [thinned(curve, begin, end) for curve in curves]
     shown = np.concatenate([values for _, values in pieces]) if pieces else np.zeros(0)
