@@ -1,6 +1,6 @@
 """Watch measured runs on a page in the browser, beside what a simulator makes of them. Works over ssh, without internet.
 
-The page shows the robot and its replayed ghost, the floor with its friction, slip and contact forces, and any channel over time.
+The page shows the robot and its replayed ghost, the floor's friction, slip and contact forces, and any channel over time.
 """
 
 from __future__ import annotations

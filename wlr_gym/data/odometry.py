@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 def rolled_poses(run: Run, robot: Robot) -> Array:
     """Return x, y (m) and yaw (rad) of a robot that rolls without slip, (rows, 3); through each frame of the camera it passes.
 
-    Between frames it moves as the wheels roll, along the heading that the gyroscope has turned to; without a gyroscope, that the
-    wheels of both sides turn to, as if they did not skid.
+    Between frames it moves as the wheels roll, along the heading that the gyroscope has turned to; without a gyroscope, that
+    the wheels of both sides turn to, as if they did not skid.
     """
     t = run["t"]
     steps, turns = _steps(run, robot), _turns(run, robot)
