@@ -8,7 +8,7 @@ import pytest
 
 from wlr_gym import cli
 from wlr_gym.base.errors import InputError
-from wlr_gym.data import read_run
+from wlr_gym.data import Simulation, read_run, simulate_again
 from wlr_gym.data.ghost import GHOST_CHANNELS
 from wlr_gym.data.odometry import rolled_poses
 from wlr_gym.data.replay import replay
@@ -16,6 +16,7 @@ from wlr_gym.data.run_states import start_state
 from wlr_gym.data.watch import RunRecording, open_recordings
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.robot import LEGS, WHEELS, load_robot
+from wlr_gym.robot.parameters import Parameters
 
 RUN = Path(__file__).parent / "data" / "run_01.parquet"
 
@@ -44,7 +45,11 @@ def test_without_a_camera_it_moves_as_its_wheels_roll():
     run, robot = read_run(RUN), load_robot()
     t = np.arange(100) * 0.02
     columns = {name: np.zeros(100) for name in run.table.columns if not name.startswith("cam")}
-    columns |= {"t": t, **{f"pos_{leg}": np.full(100, np.pi / 2) for leg in LEGS}, **{f"pos_{wheel}": 2.0 * t for wheel in WHEELS}}
+    columns |= {
+        "t": t,
+        **{f"pos_{leg}": np.full(100, np.pi / 2) for leg in LEGS},
+        **{f"pos_{wheel}": 2.0 * t for wheel in WHEELS},
+    }
     columns["gyro_z"] = np.full(100, 0.5)
     poses = rolled_poses(replace(run, table=run.table.iloc[:0].reindex(range(100))[list(columns)].assign(**columns)), robot)
     radius = 2.0 * robot.wheel.radius / 0.5  # of the circle: speed over yaw rate
@@ -65,7 +70,7 @@ def test_where_no_frame_is_near_it_goes_on_from_the_last_one():
 
 
 def test_the_ghost_is_the_replay():
-    """Not re-anchored, it is the replay's full run, which begins to be simulated a little earlier and ends up at its own ticks."""
+    """Not anchored anew, it is the replay's full run, which begins to be simulated a little earlier."""
     run = run_of(2.0)
     recording = RunRecording(run, segment=np.inf)
     recording.wait()
@@ -95,20 +100,27 @@ def test_an_anchored_ghost_stays_at_the_measured_robot():
     assert np.allclose(ghost.truth.joint_position[0, :4], at.truth.joint_position[0, :4], atol=0.01)
 
 
-def test_of_a_simulated_run_the_truth_is_shown(tmp_path):
-    out = tmp_path / "runs"
-    assert cli.main(["record", "--backend", "gibbs_appell", "--excitation", "straight", "--out", str(out)]) == 0
-    run = read_run(next(out.glob("run_*.parquet")))
-    if run.simulation is None:
-        pytest.skip("wlr record wrote no record of the simulation")
-    short = replace(run, table=run.table.iloc[:60])
+def test_of_a_simulated_run_the_truth_is_shown():
+    run = run_of(1.2)
+    robot = load_robot()
+    start = {
+        name: value[0].tolist()
+        for name, value in vars(start_state(run, robot, Parameters.nominal(robot))).items()
+        if value is not None
+    }
+    record = Simulation(
+        backend="gibbs_appell", control_period=0.02, physics_step=0.001, precision="float64", sensor_noise=False, seed=1,
+        parameters={"ground.mu_x[wheel_lf]": 0.3}, start=start,
+    )  # fmt: skip
+    short = replace(run, simulation=record)
     recording = RunRecording(short, backend=None)
     recording.wait()
     moment = recording.at(1.0)
     assert moment.slip
     assert moment.forces
-    row = recording._row(1.0)
-    assert np.allclose(moment.truth.joint_position[0, :4], [short[f"pos_{leg}"][row] for leg in LEGS], atol=0.02)
+    again = simulate_again(short, robot)
+    assert moment.truth.joint_position[0, 0] == pytest.approx(again["pos_leg_lf"][recording._row(1.0)], abs=1e-9)
+    assert moment.parameters["ground.mu_x"][0, 0] == 0.3
     assert "as simulated" in recording.lines(1.0)[0]
 
 
@@ -132,8 +144,12 @@ def test_what_cannot_be_replayed_is_refused_before_a_page_opens():
     ],
 )
 def test_bad_options_of_view_are_refused(arguments, message, capsys):
-    try:
-        assert cli.main(arguments) == 2
-    except SystemExit as ended:
-        assert ended.code == 2
+    assert _exit_code(arguments) == 2
     assert message in "".join(capsys.readouterr())
+
+
+def _exit_code(arguments):
+    try:
+        return cli.main(arguments)
+    except SystemExit as ended:
+        return ended.code

@@ -47,7 +47,9 @@ def test_bodies_fill_the_boxes_that_mujoco_has_around_their_geoms(stage):
 def test_a_wheel_is_as_wide_and_round_as_its_parameters_say():
     parameters = Parameters.nominal(ROBOT)
     parameters["wheel.radius"][0, 0] = 0.05
-    radii = {body.name: np.hypot(*joined(body, (0, 0, 0)).vertices[:, [0, 2]].T).max() for body in bodies(Stage(ROBOT, parameters))}
+    radii = {
+        body.name: np.hypot(*joined(body, (0, 0, 0)).vertices[:, [0, 2]].T).max() for body in bodies(Stage(ROBOT, parameters))
+    }
     assert radii[WHEELS[0]] == pytest.approx(0.05, abs=2e-3)
     assert radii[WHEELS[1]] == pytest.approx(ROBOT.wheel.radius, abs=2e-3)
 

@@ -18,7 +18,7 @@ from wlr_gym.render.view import View
 from wlr_gym.render.viewer import KeyCallback, Pace
 from wlr_gym.render.web.controls import ViewControls, plot_panel
 from wlr_gym.render.web.figure import Figure, PageFloor, arrows_of
-from wlr_gym.render.web.page import HOST, PORT, TEXTS, aim, html_lines, open_server, say
+from wlr_gym.render.web.page import HOST, PORT, TEXTS, aim, close_server, html_lines, open_server, say
 from wlr_gym.render.web.plots import Curve, Plots
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
@@ -119,7 +119,7 @@ class WebViewer:
 
     def close(self) -> None:
         """End the page."""
-        self.server.stop()
+        close_server(self.server)
 
     def _add_keys(self, on_key: KeyCallback) -> None:
         lock = threading.Lock()

@@ -103,6 +103,12 @@ def open_server(host: str = HOST, port: int = PORT, label: str = "wlr_gym") -> t
     return server, Address(host, int(server.get_port()))
 
 
+def close_server(server: viser.ViserServer) -> None:
+    """End a server; ending it again does nothing."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
 def _light(server: viser.ViserServer) -> None:
     """Light the scene from above: with shadows and reflections, a browser without a graphics card takes 30 times as long."""
     scene = server.scene

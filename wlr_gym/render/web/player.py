@@ -16,7 +16,7 @@ from wlr_gym.render.view import View
 from wlr_gym.render.viewer import Pace
 from wlr_gym.render.web.controls import ViewControls, plot_panel
 from wlr_gym.render.web.figure import Figure, PageFloor, arrows_of
-from wlr_gym.render.web.page import HOST, PORT, TEXTS, UPDATES, aim, html_lines, open_server, say
+from wlr_gym.render.web.page import HOST, PORT, TEXTS, UPDATES, aim, close_server, html_lines, open_server, say
 from wlr_gym.render.web.plots import Curve, Plots
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
@@ -163,7 +163,7 @@ class Player:
     def close(self) -> None:
         """End the page, and what is being worked out for it."""
         self.recording.close()
-        self.server.stop()
+        close_server(self.server)
 
     # ---- what is shown ----------------------------------------------------------------------------------------------
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,12 +57,10 @@ def thinned(curve: Curve, begin: float, end: float, columns: int = COLUMNS) -> t
     t, values = t[known], values[known]
     if len(t) <= 2 * columns:
         return t, values
-    edges = np.linspace(0, len(t), columns + 1).astype(int)
-    kept = np.empty(2 * columns, int)
-    for k, (low, high) in enumerate(pairwise(edges.tolist())):
-        piece = values[low:high]
-        kept[2 * k : 2 * k + 2] = sorted((low + int(piece.argmin()), low + int(piece.argmax())))
-    kept = np.unique(kept)
+    width = -(-len(t) // columns)
+    padded = np.pad(values, (0, -len(values) % width), mode="edge").reshape(-1, width)
+    starts = width * np.arange(len(padded))
+    kept = np.unique(np.concatenate([starts + padded.argmin(axis=1), starts + padded.argmax(axis=1)]))
     return t[kept], values[kept]
 
 
