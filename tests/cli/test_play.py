@@ -17,6 +17,7 @@ from wlr_gym.learning.evaluation.film import Journey, drive, film, film_length
 from wlr_gym.policy import make_policy
 from wlr_gym.render.teleop import RESET, UP, Script
 from wlr_gym.render.view import View
+from wlr_gym.render.viewer import Viewer
 
 
 @pytest.fixture
