@@ -136,7 +136,7 @@ def test_what_cannot_be_replayed_is_refused_before_a_page_opens():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["view"], "RUNS"),
+        (["view"], "expected runs (CSV or Parquet)"),
         (["view", str(RUN), "--segment", "0"], "--segment 0: expected more than 0 s"),
         (["view", str(RUN), "--backend", "dynamixel"], "a ghost needs a simulator"),
         (["view", "nowhere.parquet"], "nowhere.parquet"),
