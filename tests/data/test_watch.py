@@ -1,5 +1,7 @@
 """Runs as a page plays them: the measured robot, its ghost, and what a simulated run's own simulation knows."""
 
+# pyright: reportArgumentType=false, reportOptionalMemberAccess=false
+
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,4 +1,6 @@
 """Pages on a real server without a browser: what stands on them after a step, a key, a seek."""
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false
+# (What stands on a page is looked up in viser by name; stand-ins have only what is used.)
 
 import numpy as np
 import pytest
