@@ -1,8 +1,9 @@
-"""Drive a robot: in a window with the arrow keys or a gamepad, or into a video with commands by schedule."""
+"""Drive a robot: in a window or on a page in the browser with keys or a gamepad, or into a video with commands by schedule."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,14 +15,18 @@ from wlr_gym.cli import OK
 from wlr_gym.cli.options import PatchOption, environment_of
 from wlr_gym.render.display import require_display
 from wlr_gym.render.view import View
+from wlr_gym.render.web.page import HOST, PORT
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
     from wlr_gym.learning.evaluation.film import Driver
     from wlr_gym.policy import Policy
     from wlr_gym.render.teleop import Ranges, Script
-    from wlr_gym.render.viewer import OpenWindow
+    from wlr_gym.render.viewer import KeyCallback, Viewer
+    from wlr_gym.render.web.live import WebViewer
     from wlr_gym.robot import Robot
+
+    NewViewer = Callable[["PlayOptions", Robot, KeyCallback | None], Viewer | WebViewer]
 
 #: s; length of a video unless asked otherwise.
 SECONDS = 10.0
@@ -49,10 +54,16 @@ class PlayOptions(PatchOption):
     """Commands by schedule instead of keys: 0.1,0 for good, or 0:0.1,0; 3:0.05,0.3 from these times (s) on."""
     gamepad: bool = False
     """Take commands from the first gamepad instead of the keys."""
+    web: bool = False
+    """A page in the browser instead of a window: works over ssh; keys I, K, J and L drive."""
+    host: str = HOST
+    """Of the page: name or address to listen on; localhost = this machine, and ssh to it, only."""
+    port: int = PORT
+    """Of the page; where it is taken, the next free one."""
     video: Path | None = None
     """Write a video (.webp, .gif, .png, .mp4) instead of opening a window; without --command, the task's own commands."""
     seconds: float | None = None
-    """Length; default: 10 s of video, or until the window is closed."""
+    """Length; default: 10 s of video, or until the window is closed, or Ctrl-C."""
     fps: float = FPS
     """Pictures per second of a video, where the control period allows."""
     camera: str = "follow"
@@ -60,7 +71,7 @@ class PlayOptions(PatchOption):
     size: tuple[int, int] = (640, 480)
     """Width and height of the video, pixels."""
     forces: bool = False
-    """Also draw the friction force on each wheel."""
+    """Also draw the friction force on each wheel; a page can switch it on and off."""
     path: bool = False
     """In a video: also draw where the robot went and where its commands would have taken it."""
 
@@ -82,7 +93,7 @@ def run(options: PlayOptions) -> int:
         elif options.video is not None:
             _film(options, core, policy, driver)
         else:
-            show(options, core, policy, driver)
+            show(options, core, policy, driver, _web_viewer if options.web else _window_viewer)
     finally:
         core.close()
     return OK
@@ -105,9 +116,11 @@ def _check(options: PlayOptions) -> None:
     _view(options)
     if options.beside is not None and options.video is None:
         raise InputError("--beside: two robots are shown in a video only: add --video")
+    if options.web and options.video is not None:
+        raise InputError("--web and --video: one or the other")
     if options.video is not None:
         check_video(options.video)
-    else:
+    elif not options.web:
         require_display()
 
 
@@ -185,17 +198,33 @@ def _film_beside(options: PlayOptions, keywords: dict[str, Any]) -> None:
     print(f"written: {options.video}")
 
 
-def show(options: PlayOptions, core: Core, policy: Policy, driver: Driver | None, open: OpenWindow | None = None) -> None:
-    """Play in a window until it is closed, or for ``options.seconds``; ``open`` is how it is opened (tests)."""
-    from wlr_gym.learning.evaluation.film import commands, drive, present_time
-    from wlr_gym.render.teleop import HELP, Keyboard
-    from wlr_gym.render.viewer import Viewer, open_window
+def _window_viewer(options: PlayOptions, robot: Robot, on_key: KeyCallback | None) -> Viewer:
+    from wlr_gym.render.teleop import HELP
+    from wlr_gym.render.viewer import Viewer
 
-    period = core.task.config.control_period
-    on_key = driver.press if isinstance(driver, Keyboard) else None
-    viewer = Viewer(core.task.robot, _view(options), on_key, open or open_window)
     if on_key is not None:
         print(HELP)
+    return Viewer(robot, _view(options), on_key)
+
+
+def _web_viewer(options: PlayOptions, robot: Robot, on_key: KeyCallback | None) -> WebViewer:
+    from wlr_gym.render.web.live import HELP, WebViewer
+
+    viewer = WebViewer(robot, _view(options), on_key, options.host, options.port)
+    if on_key is not None:
+        print(HELP)
+    return viewer
+
+
+def show(
+    options: PlayOptions, core: Core, policy: Policy, driver: Driver | None, new_viewer: NewViewer = _window_viewer
+) -> None:
+    """Play in a window until it is closed, on a page until Ctrl-C, or for ``options.seconds``; ``new_viewer`` makes either."""
+    from wlr_gym.learning.evaluation.film import commands, drive, present_time
+    from wlr_gym.render.teleop import Keyboard
+
+    period = core.task.config.control_period
+    viewer = new_viewer(options, core.task.robot, driver.press if isinstance(driver, Keyboard) else None)
     try:
         for tick, _ in enumerate(drive(core, policy, options.seed, driver)):
             if options.seconds is not None and tick * period > options.seconds:

@@ -239,7 +239,7 @@ def _simulate(
     """
     clock = plant.options.control_period
     ticks = int(np.ceil(duration / clock))
-    setpoints, torque_on = _setpoints(run, parameters, begin, ticks, clock)
+    setpoints, torque_on = tick_setpoints(run, parameters, begin, ticks, clock)
     parameters = parameters.copy()
     parameters["command.delay"] = 0.0  # the setpoints come delayed
     snapshots = np.array([] if passing is None else np.rint((passing - begin[0]) / clock), dtype=int).tolist()
@@ -252,16 +252,16 @@ def _simulate(
         first_reading = sensors.joint_position[:, WHEEL_SLICE].copy()
         for tick in range(ticks + 1):
             states += [plant.mechanical_state() for _ in range(snapshots.count(tick))]
-            values[tick] = _readings(sensors, plant.truth(), wheels - first_reading, offset)
+            values[tick] = readings(sensors, plant.truth(), wheels - first_reading, offset)
             if tick < ticks:
                 sensors = plant.step(setpoints[tick], torque_on[tick])
     finally:
         plant.close()
-    _to_camera_frame(values, parameters)
+    camera_frame(values, parameters)
     return _Traces(begin, clock, values, float(parameters["camera.delay"][0])), _stacked(states)
 
 
-def _setpoints(run: Run, parameters: Parameters, begin: Array, ticks: int, clock: float) -> tuple[Array, NDArray[np.bool_]]:
+def tick_setpoints(run: Run, parameters: Parameters, begin: Array, ticks: int, clock: float) -> tuple[Array, NDArray[np.bool_]]:
     """Setpoints (ticks, robots, 8) and torque switches on the plant's clock: each row's holds until the next row's.
 
     Setpoints are delayed, switching the torque is not: as in :class:`wlr_gym.physics.plants.setpoints.SetpointHistory`.
@@ -295,7 +295,7 @@ def held_setpoints(run: Run) -> Array:
     return np.where(np.isnan(commands), stay, commands)
 
 
-def _readings(sensors: Sensors, truth: Truth, wheel_shift: Array, marker_offset: Array) -> Array:
+def readings(sensors: Sensors, truth: Truth, wheel_shift: Array, marker_offset: Array) -> Array:
     """One row of every channel (robots, len(CHANNELS)); wheel angles count on from their anchor. Camera: see below."""
     joints = [sensors.joint_position, sensors.joint_velocity, sensors.joint_effort]
     joints[0] = joints[0] + np.hstack([np.zeros_like(wheel_shift), wheel_shift])
@@ -305,7 +305,7 @@ def _readings(sensors: Sensors, truth: Truth, wheel_shift: Array, marker_offset:
     return np.column_stack([*joints, sensors.gyro, sensors.accelerometer, *camera, sensors.supply_voltage])
 
 
-def _to_camera_frame(values: Array, parameters: Parameters) -> None:
+def camera_frame(values: Array, parameters: Parameters) -> None:
     """Turn x and y into the camera's floor frame and make yaw continuous, in place.
 
     The camera channels come from the true pose, not from the plant's own camera: frames of a simulated camera would fall on

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from wlr_gym.data.sensor_columns import SENSED, channels
 from wlr_gym.data.simulation_record import Simulation, simulation_path
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import PlantOptions, PlantState
+from wlr_gym.physics.plants.base import PlantOptions, PlantState, Truth
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -47,19 +47,24 @@ def simulate_again(run: Run, robot: Robot, backend: str | None = None) -> dict[s
     Raises:
         InputError: no record beside the run, or one that does not fit the table or the plant.
     """
+    rows = [values for _, _, values in simulated_rows(run, robot, backend)]
+    return dict(zip(SENSED, np.array(rows).T, strict=True))
+
+
+def simulated_rows(run: Run, robot: Robot, backend: str | None = None) -> Iterator[tuple[Parameters, Truth, Array]]:
+    """Yield what :func:`simulate_again` knows at each row of a run: parameters (1), truth (1), channels of :data:`SENSED`."""
     record = _record_of(run)
     names = ("control_period", "physics_step", "precision", "sensor_noise")
     options = PlantOptions(**{name: getattr(record, name) for name in names})
     setpoints = np.stack([run[name] for name in COMMANDS], axis=1)
     parameters = simulated_parameters(run, robot)
     changes = {change.row: change.parameters for change in record.changes}
-    rows = np.empty((len(setpoints), len(SENSED)))
     forces = load_patch(record.formulas).forces
     plant = make_plant(record.backend if backend is None else backend, robot, 1, options, forces)
     try:
         sensors = plant.reset(np.array([record.seed], np.uint64), parameters, state=_state(record, run))
         for row, wanted in enumerate(setpoints):
-            rows[row] = channels(sensors, 0)
+            yield parameters, plant.truth(), channels(sensors, 0)
             if row in changes:
                 _set(parameters, changes[row])
                 plant.set_parameters(parameters)
@@ -67,7 +72,6 @@ def simulate_again(run: Run, robot: Robot, backend: str | None = None) -> dict[s
             sensors = plant.step(np.nan_to_num(wanted)[None], None if torque_on.all() else torque_on[None])
     finally:
         plant.close()
-    return dict(zip(SENSED, rows.T, strict=True))
 
 
 def _record_of(run: Run) -> Simulation:

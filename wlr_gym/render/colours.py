@@ -10,7 +10,9 @@ Colour = tuple[float, float, float]
 FRICTION = ((0.0, (0.30, 0.62, 0.96)), (0.3, (0.62, 0.82, 0.90)), (0.6, (0.80, 0.80, 0.78)), (1.0, (0.72, 0.50, 0.30)))
 #: Slip speed (m/s) -> colour of its arrow.
 SLIP = ((0.0, (1.0, 0.85, 0.10)), (0.05, (1.0, 0.55, 0.05)), (0.2, (0.90, 0.08, 0.08)))
+#: Arrows of friction and of normal force on a wheel.
 FORCE: Colour = (0.10, 0.45, 0.15)
+LOAD: Colour = (0.45, 0.62, 0.45)
 #: Paths over the floor: as commanded, and as driven.
 WANTED: Colour = (0.10, 0.10, 0.12)
 DRIVEN: Colour = (0.95, 0.10, 0.55)

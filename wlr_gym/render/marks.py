@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.plants.base import Truth
-from wlr_gym.render.colours import FORCE, Colour, friction_colour, slip_colour
+from wlr_gym.render.colours import FORCE, LOAD, Colour, friction_colour, slip_colour
 from wlr_gym.render.stage import Stage
 from wlr_gym.robot.parameter_table import PATCHES
 from wlr_gym.robot.parameters import Parameters
@@ -39,6 +39,8 @@ FORCE_BESIDE = 0.040
 #: m; areas are drawn on the floor this far around the robot.
 REACH = 15.0
 LAYER = 4e-4
+#: Away from the body along the axle (left): corners are lf, rf, lr, rr.
+OUTWARDS = np.array([[1.0], [-1.0], [1.0], [-1.0]])
 #: m; half the width of a trail.
 LINE = 0.004
 #: m; length of its pieces.
@@ -161,12 +163,21 @@ def force_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) -
     return _arrows(stage, parameters, row, FORCE_SCALE * force, FORCE_SCALE * FORCE_FLOOR, FORCE_BESIDE, [FORCE] * 4)
 
 
+def load_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) -> list[Arrow]:
+    """Return one arrow per loaded wheel: the floor's normal force on it, upwards beside the wheel."""
+    load = truth.contact_force[row].reshape(4, 3)[:, 2]
+    points, _, left = stage.contact_frames(parameters, row)
+    starts = points + FORCE_BESIDE * OUTWARDS * left
+    length = np.minimum(FORCE_SCALE * load, LONGEST_ARROW)
+    ends = starts + length[:, None] * [0.0, 0.0, 1.0]
+    return [Arrow(starts[wheel], ends[wheel], LOAD) for wheel in range(4) if load[wheel] >= FORCE_FLOOR]
+
+
 def _arrows(
     stage: Stage, parameters: Parameters, row: int, vectors: Array, shortest: float, beside: float, colours: list[Colour]
 ) -> list[Arrow]:
     points, heading, left = stage.contact_frames(parameters, row)
-    outwards = np.array([1.0, -1.0, 1.0, -1.0])[:, None] * left  # corners are lf, rf, lr, rr
-    starts = points + beside * outwards + [0.0, 0.0, SHAFT + LAYER * 5]
+    starts = points + beside * OUTWARDS * left + [0.0, 0.0, SHAFT + LAYER * 5]
     length = np.hypot(vectors[:, 0], vectors[:, 1])
     scale = np.minimum(1.0, LONGEST_ARROW / np.maximum(length, 1e-12))[:, None]
     ends = starts + scale * (vectors[:, :1] * heading + vectors[:, 1:] * left)

@@ -82,7 +82,7 @@ class Scene:
             return picture
         lines = describe(truth, parameters, row, time, command, title, slip=self.view.slip)
         return overlay.write(
-            picture, lines, self._legend(parameters, row), self.view.friction, self._labels(floor, truth.position[row])
+            picture, lines, legend(parameters, row, self.view), self.view.friction, self._labels(floor, truth.position[row])
         )
 
     def pixels(self, points: object) -> NDArray[np.float64]:
@@ -145,19 +145,6 @@ class Scene:
                 notes.append(overlay.Note(f"µ {area.mu:.2g}", _pair(places[np.argmax(good)])))
         return notes
 
-    def _legend(self, parameters: Parameters, row: int) -> list[str]:
-        mu = 0.5 * (parameters["ground.mu_x"][row] + parameters["ground.mu_y"][row])
-        low, high = f"{mu.min():.2f}", f"{mu.max():.2f}"
-        floor = f"floor µ {low}" if low == high else f"floors µ {low} to {high}"
-        lines = [f"{floor}, squares 0.2 m" if self.view.friction else "squares 0.2 m"]
-        if self.view.slip:
-            lines.append(f"slip: 0.1 m of arrow = {0.1 / marks.SLIP_SCALE:g} m/s")
-        if self.view.forces:
-            lines.append(f"friction (green): 0.1 m = {0.1 / marks.FORCE_SCALE:g} N")
-        if self.view.path:
-            lines.append("path: pink; as commanded: dashed")
-        return lines
-
 
 def marks_of(
     stage: Stage, truth: Truth, parameters: Parameters, row: int, floor: list[marks.Area], view: View
@@ -171,6 +158,21 @@ def marks_of(
     if view.slip:
         drawn += marks.slip_arrows(stage, truth, parameters, row)
     return drawn
+
+
+def legend(parameters: Parameters, row: int, view: View) -> list[str]:
+    """Return what the colours and arrows of a picture mean, line by line."""
+    mu = 0.5 * (parameters["ground.mu_x"][row] + parameters["ground.mu_y"][row])
+    low, high = f"{mu.min():.2f}", f"{mu.max():.2f}"
+    floor = f"floor µ {low}" if low == high else f"floors µ {low} to {high}"
+    lines = [f"{floor}, squares 0.2 m" if view.friction else "squares 0.2 m"]
+    if view.slip:
+        lines.append(f"slip: 0.1 m of arrow = {0.1 / marks.SLIP_SCALE:g} m/s")
+    if view.forces:
+        lines.append(f"friction (green): 0.1 m = {0.1 / marks.FORCE_SCALE:g} N")
+    if view.path:
+        lines.append("path: pink; as commanded: dashed")
+    return lines
 
 
 #: Command -> label, unit, and the truth that answers it.

@@ -40,12 +40,13 @@ class Stage:
 
     Attributes:
         model, data: MuJoCo's; the model's structure never changes, so viewers and canvases may keep it.
+        shape: changes when sizes or colours of the model do.
     """
 
     def __init__(self, robot: Robot, parameters: Parameters, row: int = 0, size: tuple[int, int] = (640, 480)) -> None:
         self.robot = robot
         self._extend = functools.partial(_dress, robot=robot, size=size)
-        self._shape = self._shape_of(parameters, row)
+        self.shape: bytes = self._shape_of(parameters, row)
         self.model: Any = self._build(parameters, row)
         self.data: Any = mujoco.MjData(self.model)
         self._addresses = [int(self.model.joint(joint).qposadr[0]) for joint in JOINTS]
@@ -54,11 +55,11 @@ class Stage:
     def pose(self, truth: Truth, parameters: Parameters, row: int = 0) -> None:
         """Put the robot where row ``row`` of a plant's truth is, in the shape that row of its parameters gives it."""
         shape = self._shape_of(parameters, row)
-        if shape != self._shape:
+        if shape != self.shape:
             other = self._build(parameters, row)
             for name in _SHAPES:
                 getattr(self.model, name)[:] = getattr(other, name)
-            self._shape = shape
+            self.shape = shape
         self.data.qpos[:3] = truth.position[row]
         self.data.qpos[3:7] = truth.quaternion[row]
         self.data.qpos[self._addresses] = truth.joint_position[row]

@@ -62,6 +62,27 @@ def open_window(model: mujoco.MjModel, data: mujoco.MjData, on_key: KeyCallback 
         raise InputError(f"MuJoCo's viewer does not open ({error}): {remedy}, or make a video instead") from None
 
 
+class Pace:
+    """Waits for the next tick, in real time.
+
+    Args:
+        clock, sleep: what time it is, and how to wait (tests).
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
+        self._clock, self._sleep = clock, sleep
+        self._next = -np.inf
+
+    def wait(self, period: float) -> None:
+        """Wait until ``period`` s after the last tick; after a hold-up of more than a few, continue from now."""
+        now = self._clock()
+        if now > self._next + 5 * period:
+            self._next = now
+        self._next += period
+        if self._next > now:
+            self._sleep(self._next - now)
+
+
 class Viewer:
     """Shows one robot, drawn like :class:`wlr_gym.render.scene.Scene`, no faster than real time.
 
@@ -87,10 +108,9 @@ class Viewer:
     ) -> None:
         self.robot = robot
         self.view: View = view or View()
-        self._on_key, self._open, self._clock, self._sleep = on_key, open, clock, sleep
+        self._on_key, self._open, self._pace = on_key, open, Pace(clock, sleep)
         self._stage: Stage | None = None
         self._window: Window | None = None
-        self._next = -np.inf
 
     @property
     def is_open(self) -> bool:
@@ -139,7 +159,7 @@ class Viewer:
             lines = describe(truth, parameters, row, time, command, title, slip=self.view.slip)
             self._window.set_texts([(None, mujoco.mjtGridPos.mjGRID_TOPLEFT, "\n".join(lines).replace("°", " deg"), "")])
         self._window.sync()
-        self._pace(period)
+        self._pace.wait(period)
         return True
 
     def close(self) -> None:
@@ -154,12 +174,3 @@ class Viewer:
         eye.type = mujoco.mjtCamera.mjCAMERA_FREE
         eye.distance, eye.elevation = 1.2 * magnification(self.robot) * start.distance, np.degrees(start.elevation)
         eye.azimuth = np.degrees(start.azimuth + (stage.yaw() if start.turns else 0.0))
-
-    def _pace(self, period: float) -> None:
-        """Wait for the next tick; after a hold-up of more than a few, continue from now instead of catching up."""
-        now = self._clock()
-        if now > self._next + 5 * period:
-            self._next = now
-        self._next += period
-        if self._next > now:
-            self._sleep(self._next - now)

@@ -201,3 +201,14 @@ def test_a_log_that_is_too_short_to_be_looked_at_is_refused(messages, tmp_path, 
 def test_a_pose_that_is_too_short_is_no_pose(messages, tmp_path):
     short = [one for one in messages if one[1] not in ("/mocap/base", "/xsens/data") or since_start(messages, one) < 0.5]
     assert not {"cam", "gyro", "acc"} & set(suggest_map(write_mcap(tmp_path / "a.mcap", short)).map.channels)
+
+
+@pytest.mark.parametrize(("separator", "decimal"), [(";", ","), (";", "."), ("\t", "."), ("\t", ",")])
+def test_tables_of_spreadsheets_are_read_as_those_with_commas(tmp_path, separator, decimal):
+    frame = lab_frame(made_up(2.0))
+    for name, options in (("plain", {}), ("other", {"sep": separator, "decimal": decimal})):
+        frame.to_csv(tmp_path / f"{name}.csv", index=False, **options)
+    (plain,), (other,) = (read_logs(tmp_path / f"{name}.csv") for name in ("plain", "other"))
+    assert set(plain.topics["table"].fields) == set(other.topics["table"].fields)
+    for name, (_, values) in plain.topics["table"].fields.items():
+        assert np.array_equal(values, other.topics["table"].fields[name][1])

@@ -112,19 +112,23 @@ def import_log(
     meta = map.meta.model_copy(update={"robot": map.meta.robot or robot or chosen.name})
     resolved = resolve(map, chosen, "map")
     check_map_file(out / MAP_FILE, map)
-    record, made = _read_record(out), []
+    record, made = _read_record(out), list[_Made]()
     for found in read_logs(log, wanted_fields(resolved), tell=tell):
         _check_new(found, record, out)
-        made += [_checked(found, part, resolved) for part in _parts(make_run(found, map, resolved), split)]
+        whole = make_run(found, map, resolved)
+        findings = [_check(part, found.name, resolved) for part in _parts(whole, split)]
+        made.append(_Made(Log(found.path, {}, found.notes, found.part), whole, findings))
+        del found  # what was read goes before the next is
     if not made:
         raise InputError(f"{log}: nothing in it")
     make_output_folder(out)
     write_map(out / MAP_FILE, map)
     imported = []
-    for part in made:  # the record goes with each run: whatever stops this, it knows all that are there
-        imported.append(_write(part, meta, out, suffix))
-        record[imported[-1].path.stem] = _entry(imported[-1])
-        _write_record(out, record)
+    for one in made:
+        for part, findings in zip(_parts(one.whole, split), one.findings, strict=True):  # cut again: parts are not kept
+            imported.append(_write(one.log, part, findings, meta, out, suffix))
+            record[imported[-1].path.stem] = _entry(imported[-1])
+            _write_record(out, record)  # with each run: whatever stops this, it knows all that are there
     return imported
 
 
@@ -172,27 +176,26 @@ def _import_own(log: Path, out: Path, suffix: str, tell: Share) -> ImportedRun:
 
 
 @dataclass(frozen=True, eq=False)
-class _Checked:
-    """A run that can be written, and what is odd about it."""
+class _Made:
+    """A recording that can be written: its log without the messages, and of each part what is odd about it."""
 
     log: Log
-    made: MadeRun
-    findings: tuple[Finding, ...]
+    whole: MadeRun
+    findings: list[tuple[Finding, ...]]
 
 
-def _checked(log: Log, made: MadeRun, resolved: Mapping[str, Resolved]) -> _Checked:
+def _check(made: MadeRun, name: str, resolved: Mapping[str, Resolved]) -> tuple[Finding, ...]:
     try:
-        findings = tuple(check_table(made.table, log.name))
+        return tuple(check_table(made.table, name))
     except InputError as error:
         raise InputError(_with_source(str(error), resolved)) from None
-    return _Checked(Log(log.path, {}, log.notes, log.part), made, findings)
 
 
-def _write(part: _Checked, meta: RunMeta, out: Path, suffix: str) -> ImportedRun:
-    path, log, made = next_run(out, suffix), part.log, part.made
+def _write(log: Log, made: MadeRun, findings: tuple[Finding, ...], meta: RunMeta, out: Path, suffix: str) -> ImportedRun:
+    path = next_run(out, suffix)
     write_run(path, made.table, meta)
     replace_file(path.with_name(f"{path.stem}.samples.parquet"), lambda temporary: _write_samples(temporary, made.samples))
-    return ImportedRun(path, log.name, made.origin, made.facts, part.findings, (*log.notes, *made.notes))
+    return ImportedRun(path, log.name, made.origin, made.facts, findings, (*log.notes, *made.notes))
 
 
 def _with_source(text: str, resolved: Mapping[str, Resolved]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -103,7 +103,10 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeR
     if missing:
         raise InputError(f"{log.name}: no source for {', '.join(missing)}: {_MISSING[missing[0].partition('_')[0]]}")
     lost = _lost(log, found, resolved)
-    series = {column: _series(log, found, source, lost) for column, source in resolved.items()}
+    series: dict[str, tuple[Times, Array]] = {}
+    for column, source in resolved.items():
+        at, values = _series(log, found, source, lost)
+        series[column] = (_known(at, series.values()), values)
     odd = [*_repeated(log, found, resolved), *(f"topic '{name}': {_frames(len(at))} left out" for name, at in lost.items())]
     times, notes = _row_times(log, found, resolved, series)
     times, more = _complete(times, series, resolved, log)
@@ -111,11 +114,12 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeR
     period = float(np.median(np.diff(times))) * 1e-9
     table: dict[str, Array] = {"t": _seconds(times, origin)}
     facts, samples = [], {}
+    seconds = {id(at): _seconds(at, origin) for at, _ in series.values()}
     for column, source in resolved.items():
         at, values = series[column]
         values = np.unwrap(values) if column == "cam_yaw" else values
         table[column], fact = _taken(times, at, values, source, period)
-        samples[column] = Samples(_seconds(at, origin), values)
+        samples[column] = Samples(seconds[id(at)], values)
         facts.append(fact)
     for wheel in (f"pos_{wheel}" for wheel in WHEELS):
         start = table[wheel][0]
@@ -124,6 +128,11 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeR
     notes = [*odd, *notes, *more, *_silent(times, series, resolved)]
     table = {name: table[name] for name in COLUMNS if name in table}
     return MadeRun(table, samples, tuple(facts), origin, tuple(notes))
+
+
+def _known(at: Times, series: Iterable[tuple[Times, Array]]) -> Times:
+    """Return the same times of another channel, where there are such: a topic's channels share them."""
+    return next((other for other, _ in series if len(other) == len(at) and np.array_equal(other, at)), at)
 
 
 def _seconds(times: Times, origin: int) -> Array:
@@ -179,7 +188,8 @@ def _series(log: Log, found: LogMap, source: Resolved, lost: Mapping[str, Times]
     keep = np.concatenate([np.diff(at) > 0, [True]])  # of two at one time, the later message
     if source.column not in COMMANDS:
         keep &= np.isfinite(raw)
-    at, raw = at[keep], raw[keep]
+    if not keep.all():
+        at, raw = at[keep], raw[keep]
     if len(at) < 2:
         raise InputError(f"{where}: topic '{source.topic}', field '{source.field}': {len(at)} samples, expected at least 2")
     values = source.factor * raw

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,7 +58,7 @@ def _read_frame(path: Path, tell: Share) -> tuple[pandas.DataFrame, list[str]]:
             frame = pandas.read_parquet(path)
         else:
             parts, done, size = [], 0, max(path.stat().st_size, 1)
-            for part in pandas.read_csv(path, chunksize=_ROWS, skipinitialspace=True, encoding="utf-8-sig"):
+            for part in pandas.read_csv(path, chunksize=_ROWS, skipinitialspace=True, encoding="utf-8-sig", **_dialect(path)):
                 parts.append(part)
                 done += int(part.memory_usage(index=False).sum())
                 tell(min(done / size, 1.0))
@@ -69,6 +70,15 @@ def _read_frame(path: Path, tell: Share) -> tuple[pandas.DataFrame, list[str]]:
     if len(repeated):
         raise InputError(f"{path}: column '{repeated[0]}' occurs twice")
     return frame, _columns_left_out(frame)
+
+
+def _dialect(path: Path) -> dict[str, Any]:
+    """Return how a CSV file separates: by comma, semicolon or tab; with the latter two, numbers may have a decimal comma."""
+    with path.open(encoding="utf-8-sig") as file:
+        header, first = file.readline(), file.readline()
+    separator = max(",;\t", key=header.count)
+    comma = separator != "," and re.search(r"\d,\d", first) is not None
+    return {"sep": separator, "decimal": "," if comma else "."}
 
 
 def _columns_left_out(frame: pandas.DataFrame) -> list[str]:

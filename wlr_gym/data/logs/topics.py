@@ -69,7 +69,10 @@ class Topic:
         if name not in self.fields:
             raise unknown_name("field", name, self.known | set(self.fields), f"{where}: topic '{self.name}'")
         rows, values = self.fields[name]
-        times = self.clock(use)[rows]
+        times = self.clock(use)
+        times = times if len(rows) == len(times) else times[rows]
+        if (np.diff(times) >= 0).all():  # nothing is copied, as a rule
+            return times, values
         order = np.argsort(times, kind="stable")
         return times[order], values[order]
 
@@ -110,12 +113,21 @@ class Log:
 
 @dataclass
 class _Buffer:
-    rows: array[int] = field(default_factory=lambda: array("q"))
+    """Values of one field; ``rows`` stays None as long as every message has it: their numbers are counted then."""
+
     values: array[float] = field(default_factory=lambda: array("d"))
+    rows: array[int] | None = None
+
+    def add(self, row: int, value: float) -> None:
+        if self.rows is None and row != len(self.values):
+            self.rows = array("q", range(len(self.values)))
+        if self.rows is not None:
+            self.rows.append(row)
+        self.values.append(value)
 
 
 class Collector:
-    """Gathers the messages of one topic: 16 bytes per number and message.
+    """Gathers the messages of one topic: 8 bytes per number, 16 of a field that not every message has.
 
     Args:
         kind: type of the messages.
@@ -148,18 +160,22 @@ class Collector:
         for name, value in numbers(message.content):
             self._known.add(name)
             if self.wanted is None or name in self.wanted:
-                buffer = self._buffers.setdefault(name, _Buffer())
-                buffer.rows.append(row)
-                buffer.values.append(value)
+                self._buffers.setdefault(name, _Buffer()).add(row, value)
 
     def topic(self, name: str) -> Topic:
-        """Return what was gathered."""
+        """Return what was gathered; nothing is copied, and nothing may be added any more."""
+        received, stamped = _array(self._received, np.int64), _array(self._stamped, np.int64)
+        every = np.arange(len(received))
         fields = {
-            key: (np.array(buffer.rows, np.int64), np.array(buffer.values, np.float64)) for key, buffer in self._buffers.items()
+            key: (every[: len(one.values)] if one.rows is None else _array(one.rows, np.int64), _array(one.values, np.float64))
+            for key, one in self._buffers.items()
         }
-        received, stamped = np.array(self._received, np.int64), np.array(self._stamped, np.int64)
         known = len(stamped) == len(received) and len(stamped) > 0 and bool((stamped > 0).any())
         return Topic(name, self.kind, received, stamped if known else None, fields, self._text, frozenset(self._known))
+
+
+def _array(values: array[Any], kind: type[np.generic]) -> NDArray[Any]:
+    return np.frombuffer(values, kind) if values else np.zeros(0, kind)
 
 
 # ---- what a message says ---------------------------------------------------------------------------------------------

@@ -1,0 +1,94 @@
+"""Watch measured runs on a page in the browser, beside what a simulator makes of them. Works over ssh, without internet.
+
+The page shows the robot and its replayed ghost, the floor's friction, slip and contact forces, and any channel over time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.cli import OK
+from wlr_gym.cli.options import PatchOption
+from wlr_gym.render.web.page import HOST, PORT
+
+if TYPE_CHECKING:
+    from wlr_gym.data import Run
+
+#: What is plotted until something else is chosen.
+FIRST = ("cam_xy", "vel_wheel", "pos_leg")
+
+
+@dataclass(frozen=True)
+class ViewOptions(PatchOption):
+    """Watch runs.
+
+    Attributes:
+        runs: runs (CSV or Parquet), or folders of runs.
+        backend: simulator of the ghost.
+        robot: robot file or config name; left out, the one meta.yaml names, else the nominal one.
+        ghost: replay the run, and show that robot, too.
+        segment: s between the points at which the ghost starts anew from the measured robot; inf = never.
+        host: name or address to listen on; localhost = this machine, and ssh to it, only.
+        port: where it is taken, the next free one.
+        seconds: end after this time; default: at Ctrl-C.
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    backend: str = "gibbs_appell"
+    robot: str | None = None
+    ghost: bool = True
+    segment: float = 10.0
+    host: str = HOST
+    port: int = PORT
+    seconds: float | None = None
+
+
+def run(options: ViewOptions) -> int:
+    """Serve the page until Ctrl-C.
+
+    Raises:
+        InputError: unreadable runs, patch, robot or backend, no such address.
+    """
+    import time
+
+    from wlr_gym.data.watch import open_recordings
+    from wlr_gym.physics.plants import REAL, check_backend
+    from wlr_gym.render.web.player import Player
+
+    check_backend(options.backend)
+    if options.backend in REAL:
+        raise InputError(f"--backend {options.backend}: a ghost needs a simulator; a real robot repeats a run with wlr replay")
+    if not options.segment > 0.0:
+        raise InputError(f"--segment {options.segment:g}: expected more than 0 s")
+    if options.seconds is not None and not options.seconds > 0.0:
+        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
+    runs = _read(options.runs)
+    backend = options.backend if options.ghost else None
+    opened = open_recordings(runs, options.robot, backend, options.patch(), options.segment)
+    player = Player(_names(runs), opened, FIRST, host=options.host, port=options.port)
+    end = float("inf") if options.seconds is None else time.monotonic() + options.seconds
+    player.run(lambda: time.monotonic() >= end)
+    return OK
+
+
+def _read(paths: Sequence[Path]) -> list[Run]:
+    from wlr_gym.data import read_dataset, read_run
+
+    if not paths:
+        raise InputError("expected runs (CSV or Parquet), or folders of runs; wlr import makes runs of other programs' logs")
+    return [run for path in paths for run in (read_dataset(path).runs if path.is_dir() else [read_run(path)])]
+
+
+def _names(runs: Sequence[Run]) -> list[str]:
+    """Return names that tell the runs apart: with their folders, where they must."""
+    names = [one.name for one in runs]
+    if len(set(names)) == len(names):
+        return names
+    names = [f"{one.path.parent.name}/{one.name}" for one in runs]
+    return names if len(set(names)) == len(names) else [f"{k + 1}: {one.path}" for k, one in enumerate(runs)]

@@ -1,0 +1,270 @@
+"""Runs as recordings that a page plays: the measured robot, its replayed ghost, and every channel over time.
+
+A page opens at once; what takes a simulator is worked out by a thread while it is watched:
+
+- the ghost: a plant driven with the run's setpoints, started anew from the measured robot every few seconds;
+- of a run that a simulator logged: the same simulation once more, which knows slip, forces and floor to the bit.
+
+The measured robot is drawn from encoders, camera and gyroscope, smoothed as for a replay; where no frame is near, it moves as
+its wheels roll and its gyroscope turns.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.data.film import truth_of
+from wlr_gym.data.format import COLUMNS
+from wlr_gym.data.ghost import GHOST_CHANNELS, replayed_rows
+from wlr_gym.data.odometry import rolled_poses
+from wlr_gym.data.read import Run
+from wlr_gym.data.replay import prepare
+from wlr_gym.data.resimulation import simulated_rows
+from wlr_gym.data.run_states import frame_near, has_camera, measured_state
+from wlr_gym.physics.effects import Patch
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT, Truth, standing_state
+from wlr_gym.render.web.player import Moment
+from wlr_gym.render.web.plots import Curve
+from wlr_gym.robot import Robot
+from wlr_gym.robot.parameters import Parameters
+from wlr_gym.robot.slip import contact_slip_velocity
+
+Array = NDArray[np.float64]
+
+#: s between the points at which the ghost starts anew from the measured robot.
+SEGMENT = 10.0
+#: s that closing waits.
+_PATIENCE = 0.5
+#: s around a time whose samples say where the robot is then.
+_AROUND = 1.0
+#: Elements of the truth that can be plotted where a simulator knows them.
+_TRUE = {
+    f"true {name}": name
+    for name in ("slip_velocity", "contact_force", "linear_velocity_in_body", "position", "effective_friction")
+}
+
+
+@dataclass(eq=False)
+class Track:
+    """What a simulator knows of a run, row by row, as far as it has come.
+
+    Attributes:
+        truths: (rows, :data:`TRUTH_LAYOUT` width); NaN where it has not come.
+        channels: (rows, channels); NaN there, too.
+        parameters: from which row on which parameters (1) held.
+        done: rows.
+        trouble: why it does not go on; empty = all is well.
+    """
+
+    truths: Array
+    channels: Array
+    parameters: list[tuple[int, Parameters]] = field(default_factory=list)
+    done: int = 0
+    trouble: str = ""
+
+    def moment(self, row: int) -> Moment | None:
+        """Return the robot at a row; None = it has not come so far."""
+        if row >= self.done:
+            return None
+        values = next(one for start, one in reversed(self.parameters) if start <= row)
+        return Moment(Truth(self.truths[row : row + 1]), values)
+
+
+class RunRecording:
+    """A run that a page plays, see :class:`wlr_gym.render.web.player.Playable`.
+
+    Args:
+        run: a run.
+        robot: file or config name; None = as the run's meta data say.
+        backend: simulator of the ghost; None = no ghost.
+        patch: what is added to the ghost's nominal model.
+        segment: s between the points at which the ghost starts anew from the measured robot; inf = never.
+
+    Raises:
+        InputError: no such robot, a patch that does not fit it, or a run that is too short to be replayed.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        robot: str | Path | None = None,
+        backend: str | None = "gibbs_appell",
+        patch: Patch | None = None,
+        segment: float = SEGMENT,
+    ) -> None:
+        self.run, self._backend, self._patch, self._segment = run, backend, patch, segment
+        self.robot: Robot
+        self.robot, self._model = prepare(run, robot, effects=patch)
+        self._t = run["t"] - run["t"][0]
+        self._rolled = rolled_poses(run, self.robot)
+        rows = len(self._t)
+        self.ghost = Track(np.full((rows, TRUTH_LAYOUT.width), np.nan), np.full((rows, len(GHOST_CHANNELS)), np.nan))
+        self.true = Track(np.full((rows, TRUTH_LAYOUT.width), np.nan), np.zeros((rows, 0)))
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="ghost", daemon=True)
+        self._thread.start()
+
+    @property
+    def name(self) -> str:
+        """Of the run."""
+        return self.run.name
+
+    @property
+    def length(self) -> float:
+        """s."""
+        return float(self._t[-1])
+
+    @property
+    def titles(self) -> Mapping[str, str]:
+        """Channels and groups of channels -> unit."""
+        names = [name for name in COLUMNS if name != "t" and name in self.run]
+        groups = {COLUMNS[name].group: COLUMNS[name].unit for name in names}
+        titles = groups | {name: COLUMNS[name].unit for name in names}
+        return titles | ({title: TRUTH_LAYOUT.channels[name].unit for title, name in _TRUE.items()} if self._simulates else {})
+
+    def at(self, time: float) -> Moment:
+        """Return the robot: as it was simulated, where that is known, else as it was measured."""
+        moment = self.true.moment(self._row(time))
+        return moment if moment is not None else self._measured(time)
+
+    def ghost_at(self, time: float) -> Moment | None:
+        """Return the replayed robot, as far as it has come."""
+        return self.ghost.moment(self._row(time))
+
+    def curves(self, title: str) -> list[Curve]:
+        """Return the measured channels, and the replayed ones dashed; of a truth the run's, and the ghost's dashed."""
+        if title in _TRUE:
+            return self._true_curves(_TRUE[title])
+        names = [name for name in COLUMNS if name in self.run and title in (name, COLUMNS[name].group)]
+        curves = []
+        for k, name in enumerate(names):
+            curves.append(Curve(name, self._t, self.run[name], colour=k))
+            if name in GHOST_CHANNELS and self.ghost.done > 1:
+                curves.append(Curve(f"{name}, replayed", *self._replayed_channel(name), dashed=True, colour=k))
+        return curves
+
+    def lines(self, time: float) -> list[str]:
+        """Return what robot and ghost are."""
+        lines = []
+        if self.run.simulation is not None:
+            known = self.true.moment(self._row(time)) is not None
+            lines.append("robot: as simulated" if known else "robot: as its sensors say; simulating the run again ...")
+        else:
+            lines.append("robot: measured; floor as in the model")
+        if self._backend is not None:
+            anew = "" if np.isinf(self._segment) else f", anew every {self._segment:g} s"
+            share = f"{100 * self.ghost.done / len(self._t):.0f} %"
+            state = "" if self.ghost.done == len(self._t) else f" ({share} worked out)"
+            lines.append(f"ghost: replayed on {self._backend}{anew}{state}")
+        return lines + [f"stopped: {track.trouble}" for track in (self.true, self.ghost) if track.trouble]
+
+    def wait(self) -> None:
+        """Wait until all is worked out."""
+        self._thread.join()
+
+    def close(self) -> None:
+        """Give up what is being worked out."""
+        self._closed.set()  # seen at the next row; a kernel that is being compiled is not waited for
+        self._thread.join(_PATIENCE)
+
+    # ---- what is measured -------------------------------------------------------------------------------------------
+
+    def _row(self, time: float) -> int:
+        """Return the last row that is not after a time."""
+        return max(int(np.searchsorted(self._t, time + 1e-9, side="right")) - 1, 0)
+
+    def _measured(self, time: float) -> Moment:
+        first, last = np.searchsorted(self._t, [time - _AROUND, time + _AROUND])
+        near = replace(self.run, table=self.run.table.iloc[max(int(first) - 1, 0) : int(last) + 1])
+        when = np.array([self.run["t"][0] + time])
+        background = standing_state(self.robot, self._model)
+        x, y, yaw = (np.interp(time, self._t, self._rolled[:, k]) for k in range(3))
+        background.position[0, :2] = x, y
+        background.quaternion[0] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
+        state = measured_state(near, when, background, self._model)
+        seen = has_camera(near) and bool(frame_near(near, when, self._model["camera.delay"][0])[0])
+        truth = truth_of(state)
+        if seen:
+            motion = (state.linear_velocity_in_body, state.angular_velocity_in_body, state.joint_position, state.joint_velocity)
+            truth["slip_velocity"][:] = contact_slip_velocity(self._model, state.quaternion, *motion).reshape(1, 8)
+        return Moment(truth, self._model, slip=seen, forces=False)
+
+    # ---- what is worked out -----------------------------------------------------------------------------------------
+
+    @property
+    def _simulates(self) -> bool:
+        return self.run.simulation is not None or self._backend is not None
+
+    def _work(self) -> None:
+        if self.run.simulation is not None:
+            self._fill(self.true, lambda: simulated_rows(self.run, self.robot))
+        if self._backend is not None:
+            self._fill(self.ghost, self._replayed)
+
+    def _replayed(self) -> Iterator[tuple[Parameters, Truth, Array]]:
+        assert self._backend is not None
+        for truth, channels in replayed_rows(self.run, self.robot, self._model, self._backend, self._patch, self._segment):
+            yield self._model, truth, channels
+
+    def _fill(self, track: Track, rows: Callable[[], Iterator[tuple[Parameters, Truth, Array]]]) -> None:
+        try:
+            for row, (parameters, truth, channels) in enumerate(rows()):
+                if self._closed.is_set():
+                    return
+                if not track.parameters or not np.array_equal(track.parameters[-1][1].values, parameters.values):
+                    track.parameters.append((row, parameters.copy()))
+                track.truths[row] = truth.values[0]
+                if track.channels.shape[1]:
+                    track.channels[row] = channels
+                track.done = row + 1
+        except InputError as error:
+            track.trouble = str(error)
+
+    def _replayed_channel(self, name: str) -> tuple[Array, Array]:
+        """Return times and values; what the camera shows is older than the ghost's pose by its delay."""
+        done = self.ghost.done
+        t, values = self._t[:done], self.ghost.channels[:done, GHOST_CHANNELS.index(name)]
+        if name.startswith("cam_"):
+            t = t + float(self._model["camera.delay"][0])
+        return t, _turned_to(values, self.run[name][:done]) if name == "cam_yaw" else values
+
+    def _true_curves(self, name: str) -> list[Curve]:
+        curves = []
+        for track, what, dashed in ((self.true, "", False), (self.ghost, ", replayed", True)):
+            values = track.truths[: track.done, TRUTH_LAYOUT.slices[name]]
+            for k, element in enumerate(TRUTH_LAYOUT.channels[name].elements if track.done > 1 else []):
+                curves.append(Curve(f"{element}{what}", self._t[: track.done], values[:, k], dashed=dashed, colour=k))
+        return curves
+
+
+def _turned_to(yaw: Array, measured: Array) -> Array:
+    """Return a heading, continuous, by the whole turns that bring it next to the measured one."""
+    known = np.isfinite(measured)
+    if not known.any():
+        return np.unwrap(yaw)
+    turned = np.unwrap(yaw)
+    return turned + 2.0 * np.pi * np.round(np.median(measured[known] - turned[known]) / (2.0 * np.pi))
+
+
+def open_recordings(
+    runs: Sequence[Run], robot: str | Path | None, backend: str | None, patch: Patch, segment: float
+) -> Callable[[int], RunRecording]:
+    """Return what opens each of some runs.
+
+    Raises:
+        InputError: what :class:`RunRecording` refuses of any of them.
+    """
+    for run in runs:
+        prepare(run, robot, effects=patch)
+
+    def open_one(place: int) -> RunRecording:
+        return RunRecording(runs[place], robot, backend, patch, segment)
+
+    return open_one

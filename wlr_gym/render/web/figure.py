@@ -1,0 +1,189 @@
+"""What stands on the page: a robot with its arrows, a ghost of it, and the floor with its friction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.physics.plants.base import Truth
+from wlr_gym.render import marks
+from wlr_gym.render.camera import CAMERAS, up_direction
+from wlr_gym.render.colours import Colour, friction_colour
+from wlr_gym.render.stage import Stage
+from wlr_gym.render.view import View
+from wlr_gym.render.web.bodies import BodyShape, bodies, joined
+from wlr_gym.render.web.page import floor_pose
+from wlr_gym.robot import Robot
+from wlr_gym.robot.parameters import Parameters
+
+if TYPE_CHECKING:
+    import viser
+
+Array = NDArray[np.float64]
+
+#: The node that everything stands on; it moves, so that the robot stays where eyes look at.
+FLOOR = "/floor"
+#: Colour and opacity of a ghost.
+GHOST: Colour = (0.20, 0.35, 0.85)
+GHOST_OPACITY = 0.35
+#: m; width of the floor, and of its squares as in pictures.
+_WIDE, _SQUARE = 60.0, 0.2
+#: m; heads of arrows.
+_HEAD, _HEAD_LENGTH = 2.2 * marks.SHAFT, 6.0 * marks.SHAFT
+#: m; where an arrow lies that is not shown: viser keeps their number.
+_BELOW = np.array([[0.0, 0.0, -9.0], [0.0, 0.0, -8.9]])
+_ARROWS = 12
+
+
+def rgb(colour: Colour) -> tuple[int, int, int]:
+    """Return a colour in 0 to 255."""
+    red, green, blue = (round(255 * part) for part in colour)
+    return red, green, blue
+
+
+class Figure:
+    """A robot on the page, and the arrows at its wheels.
+
+    Args:
+        server: of the page.
+        name: of its node.
+        robot: supplies the sizes that are no parameters.
+        ghost: drawn in one colour that the floor shines through, without arrows.
+    """
+
+    def __init__(self, server: viser.ViserServer, name: str, robot: Robot, ghost: bool = False) -> None:
+        self.robot, self.ghost = robot, ghost
+        self._server, self._root = server, f"{FLOOR}/{name}"
+        self._stage: Stage | None = None
+        self._shape = b""
+        self._nodes: list[tuple[int, Any]] = []
+        self._arrows: Any = None
+        self._frame: Any = server.scene.add_frame(self._root, show_axes=False, visible=False)
+
+    def hide(self) -> None:
+        """Take it off the page until it is posed again."""
+        if self._frame.visible:
+            self._frame.visible = False
+
+    def pose(self, truth: Truth, parameters: Parameters, row: int = 0) -> Stage:
+        """Put it where row ``row`` of a plant's truth is, in the sizes that row of its parameters gives it."""
+        if self._stage is None:
+            self._stage = Stage(self.robot, parameters, row)
+        stage = self._stage
+        stage.pose(truth, parameters, row)
+        if stage.shape != self._shape:
+            self._nodes = [(body.index, self._add(body)) for body in bodies(stage)]
+            self._shape = stage.shape
+        for index, node in self._nodes:
+            node.position, node.wxyz = stage.data.xpos[index], stage.data.xquat[index]
+        if not self._frame.visible:
+            self._frame.visible = True
+        return stage
+
+    def point(self, arrows: Sequence[marks.Arrow]) -> None:
+        """Show arrows; those of the time before go."""
+        points, colours = np.tile(_BELOW, (_ARROWS, 1, 1)), np.zeros((_ARROWS, 3), np.uint8)
+        for k, arrow in enumerate(arrows[:_ARROWS]):
+            points[k], colours[k] = (arrow.start, arrow.end), rgb(arrow.colour)
+        if self._arrows is None:
+            self._arrows = self._server.scene.add_arrows(
+                f"{self._root}/arrows", points, colours, shaft_radius=marks.SHAFT, head_radius=_HEAD, head_length=_HEAD_LENGTH
+            )
+        elif not np.array_equal(points.astype(np.float32), self._arrows.points):
+            self._arrows.points, self._arrows.colors = points.astype(np.float32), colours
+
+    def _add(self, body: BodyShape) -> Any:
+        name, scene = f"{self._root}/{body.name}", self._server.scene
+        node = scene.add_frame(name, show_axes=False)
+        surfaces = [joined(body, GHOST)] if self.ghost else body.surfaces
+        for k, surface in enumerate(surfaces):
+            scene.add_mesh_simple(
+                f"{name}/{k}",
+                surface.vertices,
+                surface.faces,
+                color=rgb(surface.colour),
+                opacity=GHOST_OPACITY if self.ghost else None,
+                flat_shading=True,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+        return node
+
+
+class PageFloor:
+    """The floor on the page: its colour is its friction, areas and pads of other friction lie on it."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._frame: Any = server.scene.add_frame(FLOOR, show_axes=False)
+        self._colour: Colour | None = None
+        self._areas: list[marks.Area] = []
+        self._shown: list[Any] = []
+        self._pads: list[Any] = []
+
+    def look(self, stage: Stage, truth: Truth, parameters: Parameters, row: int, camera: str) -> None:
+        """Move the floor so that the robot, posed in ``stage``, is seen as ``camera`` sees it."""
+        up = up_direction(parameters["ground.slope"][row])
+        turn, position = floor_pose(truth.position[row], stage.yaw(), up, CAMERAS[camera])
+        self._frame.wxyz, self._frame.position = turn, position
+
+    def show(self, stage: Stage, truth: Truth, parameters: Parameters, row: int, view: View) -> None:
+        """Draw the floor around the robot that is posed in ``stage``."""
+        mean = float(np.mean([parameters[f"ground.mu_{axis}"][row] for axis in "xy"]))
+        colour = friction_colour(mean)
+        if colour != self._colour:
+            self._plane(colour)
+        # Far around, so that areas need not be drawn anew at each step.
+        middle = np.round(truth.position[row] / marks.REACH) * marks.REACH
+        areas = marks.areas(parameters, row, middle) if view.friction else []
+        if areas != self._areas:
+            self._lay(areas)
+        self._put_pads(marks.spots(stage, parameters, row) if view.friction else [])
+
+    def _plane(self, colour: Colour) -> None:
+        self._server.scene.add_grid(
+            f"{FLOOR}/plane", _WIDE, _WIDE, cell_size=_SQUARE, section_size=5 * _SQUARE, cell_color=(170, 170, 170),
+            section_color=(140, 140, 140), plane_color=rgb(colour), plane_opacity=1.0, shadow_opacity=0.3, fade_distance=12.0,
+        )  # fmt: skip
+        self._colour = colour
+
+    def _lay(self, areas: list[marks.Area]) -> None:
+        for node in self._shown:
+            node.remove()
+        self._shown = [node for k, area in enumerate(areas) for node in self._area(k, area)]
+        self._areas = areas
+
+    def _area(self, k: int, area: marks.Area) -> list[Any]:
+        low, high, scene = np.array(area.low), np.array(area.high), self._server.scene
+        size = (*(high - low), 2.0 * area.height)
+        box = scene.add_box(
+            f"{FLOOR}/area_{k}", rgb(friction_colour(area.mu)), size, position=(*(0.5 * (low + high)), 0.0), cast_shadow=False
+        )
+        label = scene.add_label(f"{FLOOR}/label_{k}", f"µ {area.mu:.2g}", position=(float(low[0]), float(low[1]), 0.01))
+        return [box, label]
+
+    def _put_pads(self, spots: list[marks.Spot]) -> None:
+        if len(spots) != len(self._pads):
+            for node in self._pads:
+                node.remove()
+            self._pads = [
+                self._server.scene.add_cylinder(f"{FLOOR}/pad_{k}", 0.06, 10 * marks.LAYER, cast_shadow=False)
+                for k in range(len(spots))
+            ]
+        for node, spot in zip(self._pads, spots, strict=True):
+            node.position, colour = spot.centre * [1.0, 1.0, 0.0], rgb(friction_colour(spot.mu))
+            if tuple(node.color) != colour:
+                node.color = colour
+
+
+def arrows_of(stage: Stage, truth: Truth, parameters: Parameters, row: int, view: View) -> list[marks.Arrow]:
+    """Return the arrows of a posed robot: slip, and the floor's friction and normal force, where the view has them."""
+    arrows: list[marks.Arrow] = []
+    if view.slip:
+        arrows += marks.slip_arrows(stage, truth, parameters, row)
+    if view.forces:
+        arrows += marks.force_arrows(stage, truth, parameters, row) + marks.load_arrows(stage, truth, parameters, row)
+    return arrows
