@@ -73,7 +73,7 @@ def import_policy(
     whole = _Whole(_normalizer(normalizer, width), source).eval()
     _check(whole, width, actions)
     task = bare.core.settings.task
-    config = {"environment": {"task": dict(task)} if isinstance(task, Mapping) else {}}
+    config = {"environment": {"task": dict(task)} if isinstance(task, Mapping) else {}}  # its robot is in the contract
     content = policy_content(AGENT, config, contract, {"environment": bare.spec.id})
     return write_policy_file(Path(out), to_onnx(whole, width), content, ModulePolicy(whole), _driven(bare, whole))
 
