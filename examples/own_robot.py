@@ -1,7 +1,7 @@
 """Another robot from its file to the sim-to-real gap: 18 kg, legs of 0.3 m, wheels of 80 mm, servos of 24 V.
 
-File, training, tuned controller, evaluation, export, emulated deployment, recording and, without ``--quick``, the gap. Half an hour
-on two cores (``--quick``: a minute or two; its policy has not learnt to drive). docs/own_robot.md goes the same way step by step.
+Task, training, tuned controller, evaluation, export, emulated deployment, recording and, without ``--quick``, the gap. Half an
+hour on two cores (``--quick``: a minute or two, and no policy that can drive). docs/own_robot.md goes the same way step by step.
 
     python examples/own_robot.py [--quick] [--out FOLDER]
 """
@@ -43,10 +43,7 @@ def go(out: Path, quick: bool) -> None:
     wlr("envs", "WLR-Velocity-v0", "--robot", ROBOT)
     policy = out / "policy_run"
     wlr("train", "WLR-Velocity-v0", *blind, "--robot", ROBOT, "--set", steps, *small, "--no-progress", "--out", policy)
-    if quick:
-        search = ("--set", "search.rounds=1", "search.episodes=8", "search.steps={yaw_rate_p: 2.0}")
-    else:
-        search = ()
+    search = ("--set", "search.rounds=1", "search.episodes=8", "search.steps={yaw_rate_p: 2.0}") if quick else ()
     wlr("train", "WLR-Velocity-v0", "--agent", "pid", "--robot", ROBOT, *search, "--no-progress", "--out", out / "pid_run")
     # From here on nobody names the robot: what was trained with it finds it by itself.
     tuned = f"tuned_pid={out / 'pid_run'}"

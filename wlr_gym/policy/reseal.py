@@ -76,7 +76,7 @@ def _first_form(source: str, robot: Robot) -> str:
     for data, _ in read_layers("robot", source):
         tolerances = overlay(tolerances, data.get("tolerances") or {})
     adapter = TypeAdapter(dict[str, float | str])
-    numbers = robot.model_dump_json(exclude={"tolerances": True, "servo": LATER, "sensors": {"volt_count"}})
+    numbers = robot.model_dump_json(exclude={"tolerances": True, "individual": True, "servo": LATER, "sensors": {"volt_count"}})
     text = f'{numbers[:-1]},"tolerances":{adapter.dump_json(adapter.validate_python(tolerances)).decode()}}}'
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -14,9 +14,10 @@ from typing import Any
 
 from pydantic import Field, field_serializer, field_validator, model_validator
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_layers
 from wlr_gym.robot.joints import JOINTS
+from wlr_gym.robot.parameter_table import TABLE, range_in_words, spec_of
 from wlr_gym.robot.tolerance import KEYS, ParameterTolerance, read_tolerances
 
 Vector3 = tuple[float, float, float]
@@ -185,7 +186,12 @@ class Home(SettingsModel):
 
 
 class Robot(SettingsModel):
-    """A whole robot, as one ``configs/robot/*.yaml`` describes it."""
+    """A whole robot, as one ``configs/robot/*.yaml`` describes it.
+
+    Legs, wheels and their servos are alike but for ``individual``: element of the parameter table -> its value, such as
+    ``leg.length[leg_lf]: 0.13``. Simulators follow them; what a robot knows of itself (slip observer, controllers) goes by the
+    numbers that all share.
+    """
 
     name: str
     gravity: float = Field(ge=0)
@@ -200,6 +206,7 @@ class Robot(SettingsModel):
     servo: Servo
     ground: Ground
     sensors: SensorSet
+    individual: dict[str, float] = Field(default_factory=dict)
     tolerances: dict[str, ParameterTolerance] = Field(default_factory=dict)
 
     @field_validator("tolerances", mode="before")
@@ -218,6 +225,18 @@ class Robot(SettingsModel):
     @field_serializer("tolerances")
     def _tolerances_as_written(self, tolerances: dict[str, ParameterTolerance]) -> dict[str, str]:
         return {key: str(tolerance) for key, tolerance in tolerances.items()}
+
+    @field_validator("individual")
+    @classmethod
+    def _single_numbers_are_known(cls, individual: dict[str, float]) -> dict[str, float]:
+        valid = [element for spec in TABLE if spec.may_differ for element in spec.elements]
+        for element, value in individual.items():
+            if element not in valid:
+                raise unknown_name("number of a single leg, wheel or servo", element, valid, "individual")
+            spec = spec_of(element)
+            if not spec.low <= value <= spec.high:
+                raise InputError(f"individual.{element} = {value:g}: expected {range_in_words(spec.low, spec.high, spec.unit)}")
+        return individual
 
     @field_validator("leg_limits")
     @classmethod

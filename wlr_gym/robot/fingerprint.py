@@ -48,5 +48,7 @@ def _lines(model: BaseModel, above: str) -> Iterator[str]:
             continue
         if isinstance(value, BaseModel):
             yield from _lines(value, f"{above}{name}.")
+        elif isinstance(value, dict):
+            yield from (f"{above}{name}.{key} = {value[key]!r}" for key in value)
         else:
             yield f"{above}{name} = {value!r}"
