@@ -1,7 +1,7 @@
 """Another robot from its file to the sim-to-real gap: 18 kg, legs of 0.3 m, wheels of 80 mm, servos of 24 V.
 
 Task, training, tuned controller, evaluation, export, emulated deployment, recording and, without ``--quick``, the gap. Half an
-hour on two cores (``--quick``: a minute or two, and no policy that can drive). docs/own_robot.md goes the same way step by step.
+hour on two cores (``--quick``: a minute or two, and no policy that can drive). Step by step: docs/own_robot.md.
 
     python examples/own_robot.py [--quick] [--out FOLDER]
 """

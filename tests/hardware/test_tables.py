@@ -10,8 +10,11 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import load_hardware
-from wlr_gym.hardware.dynamixel.tables import TABLE_SIZE, load_table, model_names
+from wlr_gym.hardware.dynamixel.protocol import Error
+from wlr_gym.hardware.dynamixel.tables import INPUT_VOLTAGE, TABLE_SIZE, load_table, model_names
+from wlr_gym.hardware.emulator.servo import EmulatedServo
 from wlr_gym.hardware.fit import check_fit
+from wlr_gym.hardware.servos import JointMap
 from wlr_gym.robot import load_robot
 
 MODELS = {
@@ -209,3 +212,44 @@ def test_counts_that_do_not_fit_are_refused():
     assert table.block("realtime_tick", "present_position") == (120, 16)
     with pytest.raises(InputError, match="goal_pwm = 40000"):
         table["goal_pwm"].encode(40000)
+
+
+def test_an_emulated_servo_of_24_v_measures_its_supply():
+    servo = EmulatedServo("leg", load_table("XH540-V270-R"), {})
+    assert servo["present_input_voltage"] == 240
+    servo.advance(0.01)
+    assert servo["hardware_error_status"] == 0
+    servo.shaft.voltage = 10.0  # of a 12 V battery
+    servo.advance(0.01)
+    assert servo["hardware_error_status"] == INPUT_VOLTAGE
+    servo.shaft.pwm = 0.5
+    assert servo["present_pwm"] == round(0.5 * 885)
+
+
+def test_an_emulated_servo_counts_as_its_file_says(tmp_path):
+    table = load_table(str(own_servo(tmp_path, counts={"turn": 16384, "full_pwm": 2009})))
+    servo = EmulatedServo("leg", table, {"operating_mode": 4})
+    servo.shaft.position = 2.5 * math.pi
+    servo.shaft.pwm = -1.0
+    assert servo["present_position"] == round(1.25 * 16384)
+    assert servo["present_pwm"] == -2009
+    write = table["goal_position"]
+    assert servo.write(write.address, write.encode(table.extended_range)) == Error.NONE
+    assert servo.write(write.address, write.encode(table.extended_range + 1)) == Error.DATA_RANGE
+
+
+def test_counts_of_a_robot_are_those_of_its_servos(tmp_path):
+    own_servo(tmp_path, counts={"turn": 16384, "full_pwm": 2009})
+    hardware = load_hardware().model_dump(mode="json") | {"robot": None}
+    hardware["buses"]["legs"]["model"] = "mine.yaml"
+    hardware["joints"]["leg_lf"]["zero"] = 8192
+    (tmp_path / "hardware.yaml").write_text(yaml.safe_dump(hardware))
+    joints = JointMap(load_robot(), load_hardware(tmp_path / "hardware.yaml"))
+    counts = joints.setpoint_counts([math.pi / 4, *[0.0] * 7])
+    assert counts[0] == 8192 + 2048
+    assert joints.position(counts)[0] == pytest.approx(math.pi / 4)
+    assert joints.voltage_share([2009, 0, 0, 0, 885, 0, 0, 0])[[0, 4]] == pytest.approx([1.0, 1.0])
+    hardware["joints"]["leg_lf"]["zero"] = 16384
+    (tmp_path / "hardware.yaml").write_text(yaml.safe_dump(hardware))
+    with pytest.raises(InputError, match=r"joints\.leg_lf\.zero = 16384: expected 0 to 16383"):
+        load_hardware(tmp_path / "hardware.yaml")
