@@ -100,7 +100,7 @@ def run(options: DeployOptions) -> int:
     with contextlib.ExitStack() as last, contextlib.ExitStack() as stack:  # the stream ends when the motors are off
         ports = port_pairs(options.port)
         if options.emulated and not options.stepped:
-            ports |= stack.enter_context(_emulator(options, robot, console))
+            ports |= stack.enter_context(_emulator(options, console, robot))
         keywords = {"backend": "dynamixel", "hardware": _robot(options, ports), "episode_length": options.seconds}
         core = make_core(environment, 1, environment_for(options.policy, keywords | {"robot": robot}))
         stack.callback(core.close)
@@ -241,7 +241,7 @@ def _machine_of(loop: ControlLoop) -> Machine:
 
 
 @contextlib.contextmanager
-def _emulator(options: DeployOptions, robot: Any, console: Console) -> Iterator[dict[str, str]]:
+def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> Iterator[dict[str, str]]:
     """Start ``wlr emulate`` as a process of its own; yield its ports."""
     import subprocess
     import tempfile
