@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,13 +18,14 @@ from wlr_gym.data import Profile, Run, RunMeta, read_dataset, read_run
 from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.noise import channel_noise
-from wlr_gym.data.replay import ReplayResult, held_setpoints, profile_parameters, replay, robot_entry, robot_of
+from wlr_gym.data.replay import ReplayResult, held_setpoints, profile_parameters, replay, robot_of
+from wlr_gym.data.robot_file import note_robot
 from wlr_gym.data.run_states import local_fit
 from wlr_gym.physics.effects import apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, standing_state
 from wlr_gym.physics.plants.sensors import rotation
-from wlr_gym.robot import JOINTS, load_robot
+from wlr_gym.robot import JOINTS, load_robot, robot_hash
 from wlr_gym.robot.parameters import Parameters
 
 DATA = Path(__file__).parent / "data"
@@ -248,10 +250,26 @@ def test_the_robot_is_the_one_the_meta_data_name(tmp_path):
     assert robot_of(with_robot("heavy.yaml"), "nominal").name == "wlr-nominal"
     with pytest.raises(InputError, match=r"meta\.yaml: unknown robot 'wlr-nominall' \(did you mean 'wlr-nominal'"):
         robot_of(with_robot("wlr-nominall"))
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "heavy.yaml").rename(tmp_path / "mine" / "heavy.yaml")
-    assert robot_of(with_robot(robot_entry(str(tmp_path / "mine" / "heavy.yaml"), tmp_path))).name == "heavy"
-    assert robot_entry("nominal", tmp_path) is None
+
+
+def test_a_robot_of_ones_own_travels_beside_its_runs(tmp_path):
+    heavy = load_robot(ROBOT.model_dump(mode="json") | {"name": "heavy", "gravity": 5.0})
+    meta = note_robot(tmp_path / "here", heavy, RunMeta(ground="mat"))
+    assert (meta.robot, meta.robot_hash, meta.ground) == ("robot.yaml", robot_hash(heavy), "mat")
+    shutil.move(tmp_path / "here", tmp_path / "there")
+    run = Run(pandas.DataFrame(), meta, tmp_path / "there" / "run_01.csv")
+    assert robot_of(run) == heavy
+    file = tmp_path / "there" / "robot.yaml"
+    file.write_text(file.read_text().replace("gravity: 5.0", "gravity: 6.0"))
+    with pytest.raises(InputError, match=r"robot\.yaml: its fingerprint is .*, meta\.yaml says .*--robot"):
+        robot_of(run)
+    with pytest.raises(InputError, match="holds another robot than 'heavy'"):
+        note_robot(tmp_path / "there", heavy, RunMeta())
+
+
+def test_a_shipped_robot_is_named(tmp_path):
+    assert note_robot(tmp_path / "runs", ROBOT, RunMeta()) == RunMeta(robot="wlr-nominal")
+    assert not (tmp_path / "runs").exists()
 
 
 def test_legs_that_were_off_do_not_jump_when_torque_is_back():

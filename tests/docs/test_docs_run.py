@@ -13,6 +13,7 @@ NOT_RUN = {
     "docs/evaluation.md": 1,  # runs of one training with several seeds
     "docs/gap.md": 4,  # minutes each; the quickstart has one
     "docs/pictures.md": 1,  # a window
+    "docs/own_robot.md": 4,  # examples/own_robot.py goes the same way
     "docs/own_logs.md": 2,  # logs of somebody else's
     "docs/policy_file.md": 1,  # an archive of somebody else's
     "docs/quickstart.md": 1,  # installation

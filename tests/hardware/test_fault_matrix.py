@@ -17,12 +17,12 @@ from robot_rig import DRIVE, HARDWARE, JOINTS, PERIOD, ROBOT, Phase, Rig, Stoppe
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.read import read_run
+from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.hardware.emulator import FAULTS, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.log import read_events
-from wlr_gym.physics.servo import REGISTER_UNITS
 
-_COUNTS = (REGISTER_UNITS["XM540-W150-R"]["position"].per_count, REGISTER_UNITS["XL430-W250-T"]["velocity"].per_count)
+_COUNTS = (load_table("XM540-W150-R").units["position"], load_table("XL430-W250-T").units["velocity"])
 #: (8,) counts that a goal may change by in a tick, and one for rounding.
 LARGEST_STEP = (
     PERIOD * np.repeat([HARDWARE.safety.leg_speed, HARDWARE.safety.wheel_acceleration], 4) / np.repeat(_COUNTS, 4) + 1

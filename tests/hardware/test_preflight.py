@@ -1,5 +1,6 @@
 """Preflight checks on the emulator: a good robot passes all; each fault fails its check alone and names a remedy."""
 
+import dataclasses
 import threading
 import time
 
@@ -64,7 +65,7 @@ def test_a_good_robot_passes(servos):
 def test_each_fault_is_found_alone_and_not_mended(server, servos, item, count):
     servo = server.machine.servos["wheel_lr"]
     if item == "model_number":
-        object.__setattr__(servo, "table", type(servo.table)("XL430-W250-T", count, (1,), servo.table.items))
+        servo.table = dataclasses.replace(servo.table, model_number=count)
     else:
         servo.set(item, count)
     (check,) = failed(servos)

@@ -7,10 +7,10 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.dynamixel.protocol import Error
-from wlr_gym.hardware.dynamixel.tables import TABLE_SIZE, load_table
+from wlr_gym.hardware.dynamixel.tables import TABLE_SIZE, load_table, model_names
 from wlr_gym.hardware.emulator.servo import EmulatedServo
 
-MODELS = ("XM540-W150-R", "XL430-W250-T")
+MODELS = tuple(model_names())
 ROWS = [(model, item.name) for model in MODELS for item in load_table(model).items.values()]
 RULES = yaml.safe_load(Path(__file__).with_name("register_behaviour.yaml").read_text(encoding="utf-8"))
 

@@ -279,44 +279,26 @@ def test_traced_law_equals_numpy(law):
 # --- registers
 
 
-def test_registers_give_the_robot_files_numbers():
-    robot = load_robot()
-    assert servo.from_register("XM540-W150-R", "position_p_gain", 800) == pytest.approx(robot.servo.leg.kp, rel=2e-4)
-    assert servo.from_register("XL430-W250-T", "velocity_p_gain", 100) == pytest.approx(robot.servo.wheel.kd, rel=2e-4)
-    assert servo.from_register("XL430-W250-T", "velocity_i_gain", 1000) == pytest.approx(robot.servo.wheel.kp, rel=5e-4)
-    assert servo.from_register("XL430-W250-T", "position", 1) == pytest.approx(robot.sensors.encoder.position, rel=1e-12)
-    assert servo.from_register("XL430-W250-T", "velocity", 1) == pytest.approx(robot.sensors.encoder.velocity, rel=1e-12)
-
-
-def test_registers_give_the_papers_numbers():
-    assert servo.from_register("XL430-W250-T", "profile_velocity", 80) == pytest.approx(1.918474, abs=1e-5)
-    assert servo.from_register("XL430-W250-T", "profile_acceleration", 1) == pytest.approx(0.374508, abs=1e-6)
-    assert servo.from_register("XM540-W150-R", "profile_velocity", 15) == pytest.approx(0.359712, abs=1e-6)
-    assert servo.from_register("XM540-W150-R", "current", 372) == pytest.approx(1.0, abs=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("model", "quantity", "counts", "message"),
-    [
-        ("XM540", "position", 0.0, "unknown servo model 'XM540'.*did you mean 'XM540-W150-R'"),
-        ("XL430-W250-T", "curent", 0.0, "XL430-W250-T: unknown register quantity"),
-        ("XM540-W150-R", "load", 0.0, "unknown register quantity 'load'"),
-        ("XM540-W150-R", "velocty", 0.0, "did you mean 'velocity'"),
-        ("XL430-W250-T", "velocity", 2000, r"XL430-W250-T velocity: 47.* is outside \[-1023, 1023\] counts"),
-        ("XL430-W250-T", "position", math.nan, "outside"),
-        ("XL430-W250-T", "voltage", -1, "outside"),
-    ],
-)
-def test_bad_register_input_is_named(model, quantity, counts, message):
-    with pytest.raises(InputError, match=message):
-        servo.from_register(model, quantity, counts)
-
-
-def test_bad_counts_are_refused():
-    with pytest.raises(InputError, match="2048 counts"):
-        servo.from_register("XM540-W150-R", "current", [0, 2048])
-
-
 def test_counts_of_effort_are_those_of_the_registers():
     # XM540: 2.69 mA per count, 12 V / 5.55 rad/s; XL430: 0.1 % of 1.5 N m
     assert servo.effort_counts(load_robot()) == pytest.approx([2.69e-3 * 12 / 5.55] * 4 + [1.5e-3] * 4)
+
+
+def test_a_servo_may_measure_its_current_or_not_on_either_joint():
+    """Two servos on a leg's shaft (the current of one is read), one that measures no current; wheels that measure theirs."""
+    given = load_robot("emanual").model_dump(mode="json")
+    given["servo"]["leg"] |= {"current_count": 5.38e-3}
+    given["servo"]["wheel"] |= {"current_count": 2.69e-3}
+    changed = load_robot(given)
+    assert servo.measures_current(changed) == (True, True)
+    leg, wheel = 7.3 / 4.4, 1.5 / 1.4  # N m/A, of the e-manual's stall torques and currents
+    assert servo.effort_counts(changed) == pytest.approx([5.38e-3 * leg] * 4 + [2.69e-3 * wheel] * 4)
+    assert (servo.idle_effort(changed)[4:] > 0.0).all()
+    given["servo"]["leg"] |= {"current_count": None, "load_count": 1e-3}
+    without = load_robot(given)
+    assert servo.measures_current(without) == (False, True)
+    assert servo.effort_counts(without)[:4] == pytest.approx([7.3e-3] * 4)
+    assert (servo.idle_effort(without)[:4] == 0.0).all()
+    given["servo"]["leg"] |= {"current_count": 2.69e-3}
+    with pytest.raises(InputError, match=r"servo\.leg: current_count and load_count"):
+        load_robot(given)

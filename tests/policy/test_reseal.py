@@ -87,7 +87,7 @@ def test_another_robot_is_refused(old, tmp_path):
         (["--reseal"], "expected policies"),
         (["--reseal", "pid"], "'pid' is an agent"),
         (["--reseal", "velocity_blind", "--out", "x.onnx"], "neither --out nor --card"),
-        (["velocity_blind", "--robot", "nominal"], "--robot goes with --reseal"),
+        (["velocity_blind", "--robot", "nominal"], "--robot: of archives (.zip) and with --reseal only"),
         (["velocity_blind", "velocity_oracle"], "expected one policy, got 2"),
     ],
 )

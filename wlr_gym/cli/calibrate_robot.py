@@ -149,7 +149,7 @@ def _calibrate_joints(options: JointsOptions, robot: Robot, hardware: Hardware, 
     for joint, new in mountings.items():
         old = hardware.joints[joint]
         print(f"{joint:9} sign {old.sign:+d} -> {new.sign:+d}, zero {old.zero} -> {new.zero}")
-    note = f"Signs and zeros by wlr calibrate joints, {_today()}: count = zero + sign * angle / (2 pi / 4096)."
+    note = f"Signs and zeros by wlr calibrate joints, {_today()}: count = zero + sign * angle / (size of a count)."
     return _save(options.out, source, lambda file: with_mountings(file, mountings), "joints", note, ask)
 
 
@@ -177,11 +177,13 @@ def _calibrate(joint: str, robot: Robot, hardware: Hardware, servos: Servos, ask
             return None
         before = _counts(servos)
         _answer(ask, f"{name}: {move} and hold it there, then Enter.")
-        sign = find_sign(joint, before, _counts(servos))
+        turn = servos.table(joint).counts.turn
+        sign = find_sign(joint, before, _counts(servos), turn)
         if joint not in LEGS:
             return Mounting(sign=-1 if sign < 0 else 1, zero=hardware.joints[joint].zero)
         _answer(ask, f"{name}: hold it straight down, wheel's centre under the hip, then Enter.")
-        zero = find_zero(joint, sign, float(_counts(servos)[JOINTS.index(joint)]), robot.leg_limits)
+        straight_down = float(_counts(servos)[JOINTS.index(joint)])
+        zero = find_zero(joint, sign, straight_down, robot.leg_limits, turn)
         return Mounting(sign=-1 if sign < 0 else 1, zero=zero)
 
     return _until_good(look)

@@ -91,12 +91,11 @@ def _commission(
 ) -> int:
     from wlr_gym.base.files import write_json
     from wlr_gym.data.format import RunMeta
-    from wlr_gym.data.replay import robot_entry
     from wlr_gym.hardware.commissioning.runner import Commissioning, content_of
 
     robot, hardware = options.load()
     link, person = _robot(options, robot, hardware, ask)
-    meta = RunMeta(robot=robot_entry(options.robot_name(options.robot), out) or robot.name, notes="wlr commission, on a stand")
+    meta = RunMeta(robot=robot.name, notes="wlr commission, on a stand")
     results: list[StandResult] = []
     with Commissioning(robot, hardware, link, person, out, meta) as commissioning:
         if faults := commissioning.faults():

@@ -45,6 +45,8 @@ class DeployOptions(PatchOption):
     """Policy file or folder, run folder, or name of an agent or shipped policy."""
     env: str | None = None
     """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
+    robot: str | None = None
+    """Name in configs/robot/ or path; default: that of the hardware file, or the one that the policy was trained with."""
     hardware: str = "nominal"
     """Hardware file, or name in configs/hardware/: ports, mounting, safety limits."""
     port: tuple[str, ...] = ()
@@ -89,18 +91,18 @@ def run(options: DeployOptions) -> int:
     from wlr_gym.hardware.operator import Keys, stop_on_signals
     from wlr_gym.hardware.realtime import real_time
     from wlr_gym.learning.evaluation import make_core
-    from wlr_gym.policy import make_policy, policy_environment
+    from wlr_gym.policy import environment_for, make_policy
 
     command = _check(options)
     environment = environment_of(options.env, options.policy)
-    fed = policy_environment(options.policy)
+    robot = driven_robot(options)
     console = Console()
     with contextlib.ExitStack() as last, contextlib.ExitStack() as stack:  # the stream ends when the motors are off
         ports = port_pairs(options.port)
         if options.emulated and not options.stepped:
-            ports |= stack.enter_context(_emulator(options, console))
-        keywords = {"backend": "dynamixel", "hardware": _robot(options, ports), "episode_length": options.seconds} | fed
-        core = make_core(environment, 1, keywords)
+            ports |= stack.enter_context(_emulator(options, console, robot))
+        keywords = {"backend": "dynamixel", "hardware": _robot(options, ports), "episode_length": options.seconds}
+        core = make_core(environment, 1, environment_for(options.policy, keywords | {"robot": robot}))
         stack.callback(core.close)
         policy = make_policy(options.policy, core.contract())
         _say_what_is_not_known(core, console)
@@ -161,6 +163,26 @@ def busy_note(options: DeployOptions, reason: str) -> str:
     return f"This computer is too busy, or too slow, for an emulated robot in real time: {STEPPED}.\n"
 
 
+def driven_robot(options: DeployOptions) -> Any:
+    """Return the robot that is driven: the one asked for, else that of the hardware file, else the policy's; None = any.
+
+    The hardware file knows more of a robot than its policy does, such as currents. Where nobody named one, and the policy was
+    made for another robot than that of the nominal wiring, it is the policy's.
+    """
+    from wlr_gym.hardware.config import load_hardware
+    from wlr_gym.policy import policy_environment
+    from wlr_gym.robot import load_robot, robot_hash
+
+    made_for = policy_environment(options.policy).get("robot")
+    if options.robot is not None or made_for is None:
+        return options.robot
+    wired = load_hardware(options.hardware).robot
+    if wired is None:
+        return made_for
+    is_same = robot_hash(load_robot(wired)) == robot_hash(load_robot(made_for))
+    return made_for if options.hardware == DeployOptions.hardware and not is_same else wired
+
+
 def _robot(options: DeployOptions, ports: dict[str, str]) -> dict[str, Any]:
     """Return which robot is driven, and how it is connected."""
     return {
@@ -198,7 +220,7 @@ def _stream(path: Path | None, loop: ControlLoop, stack: contextlib.ExitStack) -
 
     if path is None:
         return None
-    loop.recorder.stream = stack.enter_context(McapStream(path, ROW[1:], loop.recorder.meta))
+    loop.recorder.stream = stack.enter_context(McapStream(path, ROW[1:], loop.recorder.meta, loop.robot))
     return loop.recorder.stream
 
 
@@ -219,14 +241,20 @@ def _machine_of(loop: ControlLoop) -> Machine:
 
 
 @contextlib.contextmanager
-def _emulator(options: DeployOptions, console: Console) -> Iterator[dict[str, str]]:
+def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> Iterator[dict[str, str]]:
     """Start ``wlr emulate`` as a process of its own; yield its ports."""
     import subprocess
     import tempfile
 
+    from wlr_gym.data.robot_file import write_robot
+    from wlr_gym.robot import load_robot
+
     with tempfile.TemporaryDirectory(prefix="wlr-robot-") as folder:
         links = Path(folder) / "ports"
         words = ["--links", str(links), "--hardware", options.hardware]
+        if robot is not None:
+            write_robot(Path(folder) / "robot.yaml", load_robot(robot))
+            words += ["--robot", str(Path(folder) / "robot.yaml")]
         for fault in options.fault:
             words += ["--fault", fault]
         if options.effects:

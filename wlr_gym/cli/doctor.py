@@ -130,13 +130,13 @@ def check_policy(source: str, robot: str) -> list[Check]:
     """Return whether a policy was made for this robot, its observations and its control period, and does without a camera."""
     from wlr_gym.hardware.safety.check import Check
     from wlr_gym.learning.evaluation.rollout import make_core
-    from wlr_gym.policy import check_contract, contract_of, needs_camera, policy_environment
+    from wlr_gym.policy import check_contract, contract_of, environment_for, needs_camera
 
     remedy = "Choose another policy, train it for this robot, or name the robot file it was trained with (--robot)."
     try:
         policy = contract_of(source)
         environment = policy.get("training", {}).get("environment", "WLR-Velocity-v0")
-        core = make_core(environment, 1, {"robot": robot} | policy_environment(source))
+        core = make_core(environment, 1, environment_for(source, {"robot": robot}))
         try:
             check_contract(policy["environment"], core.contract(), source)
         finally:

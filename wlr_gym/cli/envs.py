@@ -13,10 +13,9 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.cli import OK
 from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
-from wlr_gym.envs.tasks import Randomization, Task, describe, describe_randomization, load_randomization
-from wlr_gym.envs.tasks.task import build_task
+from wlr_gym.envs.tasks import Randomization, describe, describe_randomization, load_randomization, load_task
+from wlr_gym.envs.tasks.describe import describe_scaling
 from wlr_gym.envs.tasks.task_config import read_task
-from wlr_gym.robot import load_robot
 
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -25,6 +24,8 @@ PICTURES = (".png", ".svg", ".pdf")
 class EnvsOptions:
     env: tyro.conf.Positional[str | None] = None
     """Environment id to describe; without one all are listed."""
+    robot: str | None = None
+    """Robot that the numbers are for: name in configs/robot/ or path; default: the task's."""
     randomization: str | None = None
     """What to draw: name in configs/randomization/, path, or a gap result (.json); default: the task's."""
     picture: Path | None = None
@@ -34,17 +35,20 @@ class EnvsOptions:
 def run(options: EnvsOptions) -> int:
     """Print the list or the description."""
     if options.env is not None:
-        task = _task(options.env)
+        task = load_task(task_source_of(options.env), options.robot)
         randomization = load_randomization(options.randomization or task.config.randomization, task.robot)
-        print(f"{options.env}\n\n{describe(task)}\n\n{describe_randomization(randomization.config)}")
+        texts = [options.env, describe(task), describe_randomization(randomization.config)]
+        if options.robot is not None:
+            texts.append(describe_scaling(read_task(task_source_of(options.env)), task.robot))
+        print("\n\n".join(texts))
         if options.picture is not None:
             _draw(options.picture, randomization)
         return OK
-    if options.randomization is not None or options.picture is not None:
+    if any(value is not None for value in (options.robot, options.randomization, options.picture)):
         raise InputError("name the environment too, such as: wlr envs WLR-Velocity-v0 --randomization wide")
     table = Table("id", "action", "observation", "control", "episode", "commands", box=None)
     for env_id in ENVIRONMENTS:
-        task = _task(env_id)
+        task = load_task(task_source_of(env_id))
         config = task.config
         table.add_row(
             env_id, f"Box({len(task.actions)})", f"Box({len(task.policy)})", f"{1 / config.control_period:g} Hz",
@@ -62,8 +66,3 @@ def _draw(path: Path, randomization: Randomization) -> None:
     make_output_folder(path.parent, "--picture")
     draw_floors(path, [randomization])
     print(f"written: {path}")
-
-
-def _task(env_id: str) -> Task:
-    config = read_task(task_source_of(env_id))
-    return build_task(config, load_robot(config.robot))

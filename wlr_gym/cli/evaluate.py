@@ -29,6 +29,7 @@ from wlr_gym.learning.evaluation import (
     Condition,
     Rollout,
     Subject,
+    common_robot,
     comparison_rows,
     make_player,
     read_subjects,
@@ -53,6 +54,7 @@ from wlr_gym.learning.evaluation.scoring import (
 from wlr_gym.physics.effects import Patch
 from wlr_gym.policy import shipped_names, trained_environment
 from wlr_gym.render.video import check_video
+from wlr_gym.robot import robot_content
 
 #: With --full.
 FULL_BASELINES = ("do_nothing", "constant_command", "pid", "slip_compensating")
@@ -92,7 +94,7 @@ class EvaluateOptions(PatchOption):
     randomization: str | None = None
     """Name in configs/randomization/, path, or a gap result (.json); default: the task's."""
     robot: str | None = None
-    """Name in configs/robot/ or path; default: the task's."""
+    """Name in configs/robot/ or path; default: the robot that the policy was trained with, else the task's."""
     threads: int = 1
     """Threads of the simulator; results do not depend on it."""
     out: Path | None = None
@@ -117,13 +119,15 @@ def run(options: EvaluateOptions) -> int:
         make_output_folder(options.out)
     card, samples = _play(options, patch)
     print_card(card)
+    robot = options.robot or common_robot(read_subjects([options.policy, *(options.baselines or ())]))
     keywords = {
-        "randomization": options.randomization, "robot": options.robot, "effects": patch, "threads": options.threads,
+        "randomization": options.randomization, "robot": robot, "effects": patch, "threads": options.threads,
         "backend": BACKENDS[0] if options.backend == "both" else options.backend,
     }  # fmt: skip
     if options.out is not None:
         settings = {key: _plain(value) for key, value in asdict(options).items()}
-        record_provenance(options.out, settings | {"effects": patch.content()["effects"]}, options.seed)
+        driven = {} if robot is None else {"robot": robot_content(robot)}
+        record_provenance(options.out, settings | driven | {"effects": patch.content()["effects"]}, options.seed)
         _write(options.out, card, samples, options.seed)
         if options.record:
             _record(options, _shown(card, read_subjects([options.policy])[0]), options.out / "runs", keywords)

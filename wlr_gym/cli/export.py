@@ -48,7 +48,8 @@ class ExportOptions:
     reseal: bool = False
     """Instead, rewrite the contracts of policies in the present form, where the robot is the same, and say what changed."""
     robot: str | None = None
-    """With --reseal: name or path of the robot that they were trained with; default: as their contract says."""
+    """Of an archive, and with --reseal: name or path of the robot of the training; default: the task's, or the contract's.
+    Other policies carry their robot."""
 
 
 def run(options: ExportOptions) -> int:
@@ -59,12 +60,12 @@ def run(options: ExportOptions) -> int:
     if options.reseal:
         _reseal(options)
         return OK
-    if options.robot is not None:
-        raise InputError("--robot goes with --reseal: what is exported carries the robot of its training")
     if len(options.policy) != 1:
         raise InputError(f"expected one policy, got {len(options.policy)}; several go with --reseal")
     if options.policy[0].endswith(".zip"):
         _import(options)
+    elif options.robot is not None:
+        raise InputError("--robot: of archives (.zip) and with --reseal only; other policies carry the robot of their training")
     elif options.env or options.config or options.normalizer:
         raise InputError("--env, --config and --normalizer: of archives (.zip) only; other policies say themselves")
     elif options.card is None:
@@ -142,7 +143,7 @@ def _import(options: ExportOptions) -> None:
     settings = load_agent_config(options.config, (), task_name_of(options.env)) if options.config else {}
     out = options.out or Path("policy.onnx")
     make_output_folder(out.parent)
-    env = gymnasium.make(options.env, **fed_environment(settings.get("environment") or {}))
+    env = gymnasium.make(options.env, robot=options.robot, **fed_environment(settings.get("environment") or {}))
     parity = import_policy(options.policy[0], env, out, normalizer=options.normalizer)
     print(
         f"written: {out} ({out.stat().st_size / 1000:.0f} kB)\n"

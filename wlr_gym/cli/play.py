@@ -47,7 +47,7 @@ class PlayOptions(PatchOption):
     randomization: str | None = None
     """Name in configs/randomization/ or path; default: the task's."""
     robot: str | None = None
-    """Name in configs/robot/ or path; default: the task's."""
+    """Name in configs/robot/ or path; default: the robot that the policy was trained with, else the task's."""
     seed: int = 0
     """Seed of the first episode."""
     command: str | None = None
@@ -79,12 +79,14 @@ class PlayOptions(PatchOption):
 def run(options: PlayOptions) -> int:
     """Play, until the window is closed or the video is written."""
     from wlr_gym.learning.evaluation import make_core
-    from wlr_gym.policy import make_policy, policy_environment
+    from wlr_gym.policy import environment_for, make_policy
 
     _check(options)
     keywords: dict[str, Any] = {name: getattr(options, name) for name in ("backend", "randomization", "robot")}
     keywords["effects"] = options.patch()
-    core = make_core(environment_of(options.env, options.agent), 1, keywords | policy_environment(options.agent))
+    own = environment_for(options.agent, keywords)
+    keywords["robot"] = own["robot"]  # a second one drives the same robot
+    core = make_core(environment_of(options.env, options.agent), 1, own)
     try:
         policy = make_policy(options.agent, core.contract())
         driver = _driver(options, core)

@@ -67,7 +67,6 @@ def run(options: RecordOptions) -> int:
 
     from wlr_gym.data.format import RunMeta
     from wlr_gym.data.record import meta_of, same_profile, write_commands
-    from wlr_gym.data.replay import robot_entry
     from wlr_gym.physics.plants import REAL, check_backend
     from wlr_gym.robot import load_robot
 
@@ -88,8 +87,7 @@ def run(options: RecordOptions) -> int:
         for motion in motions:
             console.print(f"written: {write_commands(options.out, motion)}")
         return OK
-    named = robot_entry(chosen, options.out)
-    meta = meta_of(motions[0], robot, RunMeta(robot=named, ground=options.ground, notes=options.notes))
+    meta = meta_of(motions[0], robot, RunMeta(ground=options.ground, notes=options.notes))
     if options.backend in REAL:
         return _record_robot(options, motions, robot, meta, console)
     return _record_simulations(options, motions, robot, meta, console)

@@ -144,7 +144,7 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
     from wlr_gym.data.format import RunMeta
     from wlr_gym.data.record import meta_of, motion_of
     from wlr_gym.data.repetition import compare_repeat
-    from wlr_gym.data.replay import robot_entry, robot_of
+    from wlr_gym.data.replay import robot_of
     from wlr_gym.hardware.driving import drive_robot
 
     motions = [motion_of(measured) for measured in runs]
@@ -154,8 +154,7 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
         if not (options.emulated or options.yes):
             confirm(motion, robot, console)
         folder = options.out / "robot" / measured.name
-        named = robot_entry(chosen or str(measured.path.parent / (measured.meta.robot or "")), folder)
-        plant = options.plant_of(robot, folder, meta_of(motion, robot, RunMeta(robot=named)), patch)
+        plant = options.plant_of(robot, folder, meta_of(motion, robot, RunMeta()), patch)
         try:
             drive = drive_robot(plant, motion)
         finally:

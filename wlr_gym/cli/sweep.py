@@ -31,6 +31,8 @@ class SweepOptions:
     """Agent to train: a folder of agents/; default: ppo."""
     init: str | None = None
     """Trained policy that every trial starts from."""
+    robot: str | None = None
+    """Robot of all trials: name in configs/robot/ or path; default: that of the settings, else the task's."""
     set: tuple[str, ...] = ()
     """Settings, as key=value; several values make a grid: --set learning_rate=1e-3,2e-3 total_steps=500_000"""
     search: Path | None = None
@@ -65,7 +67,7 @@ def _say(line: str) -> None:
 
 
 def _require_own_plan(options: SweepOptions) -> None:
-    own = (options.what, options.config, options.agent, options.init, options.search, options.seeds, options.out)
+    own = (options.what, options.config, options.agent, options.init, options.search, options.seeds, options.out, options.robot)
     if any(value is not None for value in own) or options.set:
         raise InputError("--resume continues a sweep as it was planned; beside it there are --ray and --workers only")
 
@@ -78,6 +80,8 @@ def _plan(options: SweepOptions) -> SweepPlan:
     given = {"config": options.config, "agent": options.agent, "init": options.init, "seeds": options.seeds}
     changes |= {name: value for name, value in given.items() if value is not None}
     changes |= _settings(options.set)
+    if options.robot is not None:
+        _nest(changes["settings"], ["environment", "robot"], options.robot)
     if not options.what.endswith((".yaml", ".yml")):
         changes["environment"] = options.what
     elif options.search is not None:

@@ -13,7 +13,7 @@ from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import PatchOption, environment_of
-from wlr_gym.learning.training import resume_training, run_training, settings_of, unused
+from wlr_gym.learning.training import resume_training, run_training, settings_of, unused, with_robot
 from wlr_gym.policy import Training
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ class TrainOptions(PatchOption):
     """Settings to change, as key=value: --set total_steps=20_000_000 environment.randomization=wide"""
     backend: str | None = None
     """Simulator: gibbs_appell or mujoco (with --set environment.precision=float64); default: that of the settings."""
+    robot: str | None = None
+    """Name in configs/robot/ or path; default: that of the settings, else the task's. The run folder has it by content."""
     seed: int | None = None
     """Seed of everything random; default: that of the settings."""
     out: Path | None = None
@@ -85,7 +87,7 @@ def _config(options: TrainOptions, environment: str) -> dict[str, Any]:
     if options.backend is not None:
         config["environment"] = (config.get("environment") or {}) | {"backend": options.backend}
     add_effects(config, options.patch())
-    return config
+    return with_robot(config, options.robot)
 
 
 def add_effects(config: dict[str, Any], patch: Patch) -> None:
@@ -95,9 +97,9 @@ def add_effects(config: dict[str, Any], patch: Patch) -> None:
 
 
 def _require_own_settings(options: TrainOptions) -> None:
-    own = (options.env, options.out, options.config, options.seed, options.backend, options.init)
+    own = (options.env, options.out, options.config, options.seed, options.backend, options.robot, options.init)
     if any(value is not None for value in own) or options.set or options.effects:
         raise InputError(
             "--resume uses the settings of the run folder; leave out the environment, --out, --config, --set, --seed, "
-            "--backend, --init and --effects"
+            "--backend, --robot, --init and --effects"
         )

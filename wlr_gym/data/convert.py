@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.format import META_FILE, SUFFIXES
+from wlr_gym.data.format import META_FILE, SUFFIXES, RunMeta
 from wlr_gym.data.read import read_dataset, read_run
+from wlr_gym.data.robot_file import note_robot, robot_of_meta
 from wlr_gym.data.write import write_meta, write_run
 
 
@@ -24,11 +25,17 @@ def convert(source: str | Path, target: str | Path, suffix: str | None = None) -
     source, target = Path(source), Path(target)
     if source.is_file():
         run = read_run(source)
-        return [write_run(target, run.table, run.meta if (source.parent / META_FILE).is_file() else None, run.simulation)]
+        meta = _moved(run.meta, source.parent, target.parent) if (source.parent / META_FILE).is_file() else None
+        return [write_run(target, run.table, meta, run.simulation)]
     if suffix not in SUFFIXES:
         raise InputError(f"convert {source}: the format of a data set is {' or '.join(SUFFIXES)}, not {suffix!r}")
     data = read_dataset(source)
     written = [write_run(target / f"{run.name}{suffix}", run.table, simulation=run.simulation) for run in data.runs]
     if (source / META_FILE).is_file():
-        write_meta(target, data.meta)
+        write_meta(target, _moved(data.meta, source, target))
     return written
+
+
+def _moved(meta: RunMeta, source: Path, target: Path) -> RunMeta:
+    """Return meta data for another folder; a robot file that stands beside the runs goes with them."""
+    return meta if meta.robot_hash is None else note_robot(target, robot_of_meta(meta, source), meta)

@@ -13,6 +13,8 @@ from wlr_gym.robot.parameter_table import XYZ
 #: File suffixes a run may have.
 SUFFIXES = (".csv", ".parquet")
 META_FILE = "meta.yaml"
+#: Robot of the runs of a folder, where it is none that ships.
+ROBOT_FILE = "robot.yaml"
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,7 @@ class RunMeta(SettingsModel):
 
     Attributes:
         robot: path of a robot file (relative to the meta file) or name of a robot.
+        robot_hash: fingerprint of the robot in that file when the runs were recorded; None = not noted.
         profile: servo profile, rad/s2 and rad/s.
         ground: what the operator noted about the floor.
         marker_offset: marker centre in the body frame, m.
@@ -120,6 +123,7 @@ class RunMeta(SettingsModel):
     """
 
     robot: str | None = None
+    robot_hash: str | None = None
     profile: Profile = Profile()
     ground: str | None = None
     marker_offset: Vector3 = (0.0, 0.0, 0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from wlr_gym.data.format import CHANNELS, COLUMNS
-from wlr_gym.physics.servo import REGISTER_UNITS, effort_counts
+from wlr_gym.physics.servo import effort_counts
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
 
@@ -28,7 +28,7 @@ def noise_parts(robot: Robot) -> dict[str, tuple[float, float]]:
         "cam_z": (sensors.camera.position_noise, 0.0),
         "cam_yaw": (sensors.camera.yaw_noise, 0.0),
         "cam_pitch": (sensors.camera.yaw_noise, 0.0),
-        "volt": (sensors.volt_noise, REGISTER_UNITS["XM540-W150-R"]["voltage"].per_count),
+        "volt": (sensors.volt_noise, sensors.volt_count),
     }
     parts = {}
     for name in CHANNELS:

@@ -167,7 +167,7 @@ def record_simulation(
     )
     table = {"t": motion.period * np.arange(len(rows)), **dict(zip(COMMANDS, motion.setpoints.T, strict=True))}
     table |= dict(zip(SENSED, rows.T, strict=True))
-    return write_run(path, table, meta_of(motion, robot, meta), record)
+    return write_run(path, table, meta_of(motion, robot, meta), record, robot)
 
 
 def start_setpoints(motion: Motion, robot: Robot) -> Array:

@@ -11,7 +11,6 @@ times. Command delays shift the measured times of the setpoints, so a segment st
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,13 +18,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.paths import data_directory
-from wlr_gym.base.settings import read_yaml
+from wlr_gym.base.errors import InputError
 from wlr_gym.data.body_pose import euler_angles
-from wlr_gym.data.format import ANGLES_OF_THE_BODY, CHANNELS, COLUMNS, COMMANDS, META_FILE, Profile
+from wlr_gym.data.format import ANGLES_OF_THE_BODY, CHANNELS, COLUMNS, COMMANDS, Profile
 from wlr_gym.data.noise import channel_noise
 from wlr_gym.data.read import Run
+from wlr_gym.data.robot_file import robot_of_meta
 from wlr_gym.data.run_states import measured_state, start_state, starts_at_rest
 from wlr_gym.physics.effects import Source, apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant
@@ -93,30 +91,10 @@ class ReplayResult:
 def robot_of(run: Run, robot: Robot | str | Path | None = None) -> Robot:
     """Return the robot a run is of: ``robot`` if given, else the one its meta data name, else the nominal one.
 
-    ``meta.yaml`` may name a robot file (relative to itself), a config, or the ``name`` inside a config; see
-    :func:`robot_entry`.
-
     Raises:
-        InputError: no such robot; the message lists the shipped ones.
+        InputError: see :func:`wlr_gym.data.robot_file.robot_of_meta`.
     """
-    if robot is not None:
-        return load_robot(robot)
-    named = run.meta.robot
-    if named is None:
-        return load_robot()
-    if Path(named).suffix in {".yaml", ".yml"}:
-        return load_robot(run.path.parent / named)
-    shipped = {str((read_yaml(path) or {}).get("name")): path for path in (data_directory("configs") / "robot").glob("*.yaml")}
-    shipped |= {path.stem: path for path in shipped.values()}
-    if named not in shipped:
-        error = unknown_name("robot", named, shipped, str(run.path.parent / META_FILE))
-        raise InputError(f"{error}; a robot of your own is named by its file (a path from {META_FILE} on), or with --robot")
-    return load_robot(shipped[named])
-
-
-def robot_entry(robot: str, folder: Path) -> str | None:
-    """Return how the ``meta.yaml`` of a folder names a robot given by file; None where its own name will do: a config's."""
-    return os.path.relpath(robot, folder) if Path(robot).suffix in {".yaml", ".yml"} else None
+    return robot_of_meta(run.meta, run.path.parent) if robot is None else load_robot(robot)
 
 
 def profile_parameters(parameters: Parameters, profile: Profile) -> Parameters:

@@ -16,10 +16,13 @@ from wlr_gym.base.files import replace_file, write_text
 from wlr_gym.data.check import check_table
 from wlr_gym.data.format import COLUMNS, META_FILE, SUFFIXES, RunMeta
 from wlr_gym.data.read import read_meta
+from wlr_gym.data.robot_file import note_robot
 from wlr_gym.data.simulation_record import Simulation, write_simulation
 
 if TYPE_CHECKING:
     import pandas
+
+    from wlr_gym.robot import Robot
 
 
 def write_run(
@@ -27,8 +30,11 @@ def write_run(
     table: pandas.DataFrame | Mapping[str, ArrayLike],
     meta: RunMeta | None = None,
     simulation: Simulation | None = None,
+    robot: Robot | None = None,
 ) -> Path:
     """Write one run as CSV or Parquet, by the suffix of ``path``; with ``meta`` also the ``meta.yaml`` beside it.
+
+    With ``robot`` the meta data say which robot it is; see :func:`wlr_gym.data.robot_file.note_robot`.
 
     A simulated run also gets its record, ``<run>.simulation.yaml``; the record of a run that was there before goes with it.
 
@@ -45,7 +51,7 @@ def write_run(
     columns = {name: columns[name] for name in COLUMNS if name in columns}
     path.parent.mkdir(parents=True, exist_ok=True)
     if meta is not None:
-        write_meta(path.parent, meta)
+        write_meta(path.parent, meta if robot is None else note_robot(path.parent, robot, meta))
     write = _write_csv if path.suffix.lower() == ".csv" else _write_parquet
     replace_file(path, lambda temporary: write(temporary, columns))
     write_simulation(path, simulation)

@@ -26,14 +26,13 @@ from wlr_gym.envs.tasks.compiled_terms import Scores, compile_computed, compile_
 from wlr_gym.envs.tasks.describe import contract, describe
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.envs.tasks.signals import START
-from wlr_gym.envs.tasks.task import Task, bounds, build_task
-from wlr_gym.envs.tasks.task_config import RampConfig, read_task
+from wlr_gym.envs.tasks.task import Task, bounds, load_task
+from wlr_gym.envs.tasks.task_config import RampConfig
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver
 from wlr_gym.physics import plants
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, PlantOptions, Sensors
-from wlr_gym.robot import load_robot
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -51,11 +50,10 @@ def make_task(task_name: str | Mapping[str, Any], settings: Settings) -> Task:
         source = settings.task
     if settings.episode_length is not None:
         changes["episode_length"] = settings.episode_length
-    config = read_task(source, changes)
     robot = settings.robot
     if robot is None and settings.robot_options is not None:
         robot = plants.robot_file(settings.robot_options)
-    return build_task(config, load_robot(config.robot if robot is None else robot))
+    return load_task(source, robot, changes)
 
 
 class Core:

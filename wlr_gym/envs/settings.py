@@ -14,14 +14,14 @@ from wlr_gym.physics.effects import Patch, Source
 from wlr_gym.physics.plants import REAL
 from wlr_gym.physics.plants.robot_options import RobotOptions, read_robot_options
 from wlr_gym.render.view import View, read_view
-from wlr_gym.robot import WHEELS, Robot
+from wlr_gym.robot import WHEELS, Robot, RobotSource
 
 OBSERVATIONS = ("policy", "dict")
 
 #: Keyword -> types it takes, in Python and in words.
 _TYPES: dict[str, tuple[tuple[type, ...], str]] = {
     "backend": ((str,), "a name"),
-    "robot": ((str, Path, Robot, type(None)), "a name, a path or a Robot"),
+    "robot": ((str, Path, Mapping, Robot, type(None)), "a name, a path, a mapping or a Robot"),
     "randomization": ((str, Path, Mapping, RandomizationConfig, type(None)), "a name, a path or a mapping"),
     "task": ((str, Path, Mapping, type(None)), "a name, a path or a mapping"),
     "effects": ((str, Path, Mapping, list, tuple, Patch, type(None)), "a path or a list of effects"),
@@ -43,8 +43,9 @@ class EnvironmentOptions(TypedDict, total=False):
     Attributes:
         backend: which plant: ``gibbs_appell`` or ``mujoco``, or ``dynamixel``: the real robot, see ``docs/robot.md``.
         plant: the same as ``backend``, for callers whose own interface takes that word (TorchRL).
-        robot: name in ``configs/robot/``, path of a YAML file, or a :class:`wlr_gym.robot.Robot`; None = the task's,
-            of a real robot the one that its hardware file names.
+        robot: name in ``configs/robot/``, path of a YAML file, its content, or a :class:`wlr_gym.robot.Robot`;
+            None = the task's, of a real robot the one that its hardware file names. The task's numbers follow it by the rules
+            of its file (``scaling``).
         randomization: name in ``configs/randomization/`` (none, nominal, wide, slippery, asymmetric, ice, split, patches,
             slope), path of such a file or of a gap result (``.json``), or mapping; None = the task's.
         task: mapping laid over the task's file (``{"rewards": {"slip": {"weight": -2.0}}}``), or another task file.
@@ -66,7 +67,7 @@ class EnvironmentOptions(TypedDict, total=False):
 
     backend: str
     plant: str
-    robot: str | Path | Robot | None
+    robot: RobotSource | None
     randomization: str | Path | Mapping[str, Any] | None
     task: str | Path | Mapping[str, Any] | None
     effects: Source
@@ -86,7 +87,7 @@ class Settings:
     """Checked :class:`EnvironmentOptions` with their defaults."""
 
     backend: str = "gibbs_appell"
-    robot: str | Path | Robot | None = None
+    robot: RobotSource | None = None
     randomization: str | Path | Mapping[str, Any] | None = None
     task: str | Path | Mapping[str, Any] | None = None
     effects: Source = None

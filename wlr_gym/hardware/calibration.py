@@ -37,11 +37,11 @@ LARGEST_OFFSET = 1.6
 SAMPLES = 50
 #: rad: from a smaller tilt the forward direction cannot be found.
 LEAST_TILT = np.deg2rad(10.0)
-#: Counts a joint must be moved by hand (20 deg).
-LEAST_MOVE = 228
+#: Part of a turn that a joint must be moved by hand (20 deg).
+LEAST_MOVE = 20.0 / 360.0
 #: Part of a joint's move by which another one may move.
 LARGEST_SHARE = 0.5
-#: Counts of a servo's turn.
+#: Counts of a servo's turn, of the X series.
 COUNTS = 4096
 
 
@@ -191,7 +191,7 @@ def _vector(values: Array) -> Vector:
 # ---- servos ----------------------------------------------------------------------------------------------------------
 
 
-def find_sign(joint: str, before: ArrayLike, after: ArrayLike) -> int:
+def find_sign(joint: str, before: ArrayLike, after: ArrayLike, turn: int = COUNTS) -> int:
     """Return the sign of a joint that was moved by hand in its positive direction.
 
     Args:
@@ -205,28 +205,29 @@ def find_sign(joint: str, before: ArrayLike, after: ArrayLike) -> int:
     own = moved[JOINTS.index(joint)]
     others = np.where(np.arange(len(JOINTS)) == JOINTS.index(joint), 0.0, np.abs(moved))
     other = JOINTS[int(others.argmax())]
-    if others.max() > max(LEAST_MOVE, LARGEST_SHARE * abs(own)):
+    least = round(LEAST_MOVE * turn)
+    if others.max() > max(least, LARGEST_SHARE * abs(own)):
         raise InputError(
             f"{other} moved by {others.max():.0f} counts while {joint} was asked for: hold it still, or its id is swapped"
         )
-    if abs(own) < LEAST_MOVE:
-        raise InputError(f"{joint} moved by {abs(own):.0f} counts, expected {LEAST_MOVE} (20 deg) or more")
+    if abs(own) < least:
+        raise InputError(f"{joint} moved by {abs(own):.0f} counts, expected {least} (20 deg) or more")
     return 1 if own > 0 else -1
 
 
-def find_zero(joint: str, sign: int, straight_down: float, leg_limits: tuple[float, float]) -> int:
-    """Return the zero count of a leg that was held straight down (pi/2).
+def find_zero(joint: str, sign: int, straight_down: float, leg_limits: tuple[float, float], turn: int = COUNTS) -> int:
+    """Return the zero count of a leg that was held straight down (pi/2); ``turn``: counts per turn of its servo.
 
     Raises:
         InputError: the leg's range does not fit into the servo's turn; the horn must be moved.
     """
-    count = 2 * np.pi / COUNTS
+    count = 2 * np.pi / turn
     zero = round(straight_down - sign * (np.pi / 2) / count)
     ends = [zero + sign * angle / count for angle in leg_limits]
-    if not (0 <= zero < COUNTS and all(0 <= end < COUNTS for end in ends)):
+    if not (0 <= zero < turn and all(0 <= end < turn for end in ends)):
         raise InputError(
-            f"{joint} reads {straight_down:.0f} counts straight down, expected about 2048: its range would leave the servo's "
-            f"turn; take the horn off and put it back so that straight down reads 2048 +- 900"
+            f"{joint} reads {straight_down:.0f} counts straight down, expected about {turn // 2}: its range would leave the "
+            f"servo's turn; take the horn off and put it back so that straight down reads {turn // 2} +- {turn * 900 // 4096}"
         )
     return zero
 

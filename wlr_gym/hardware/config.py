@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -24,7 +24,11 @@ FIXED_REGISTERS = {"drive_mode": 0, "homing_offset": 0, "startup_configuration":
 
 
 class Bus(SettingsModel):
-    """One electrical bus: serial port, servo model, joints on it, and what the servos' EEPROM must hold (counts)."""
+    """One electrical bus: serial port, servo model, joints on it, and what the servos' EEPROM must hold (counts).
+
+    ``model`` is one that ships, such as ``XM540-W150-R``, or the path of a file with another's control table and data sheet,
+    seen from the hardware file first; see :mod:`wlr_gym.hardware.dynamixel.tables`.
+    """
 
     port: str
     model: str
@@ -91,10 +95,10 @@ class ImuPort(SettingsModel):
 
 
 class Mounting(SettingsModel):
-    """How a servo sits on its joint: count = zero + sign * angle / count size."""
+    """How a servo sits on its joint: count = zero + sign * angle / count size; ``zero`` is within the servo's turn."""
 
     sign: Literal[-1, 1] = 1
-    zero: int = Field(0, ge=0, le=4095)
+    zero: int = Field(0, ge=0)
 
 
 class PadButtons(SettingsModel):
@@ -151,8 +155,11 @@ class Hardware(SettingsModel):
     @model_validator(mode="after")
     def _registers_are_those_of_the_setpoints(self) -> Hardware:
         for name, bus in self.buses.items():
+            turn = load_table(bus.model).counts.turn
             for joint in bus.joints:
                 _require_registers(name, bus, joint)
+                if self.joints[joint].zero >= turn:
+                    raise ValueError(f"joints.{joint}.zero = {self.joints[joint].zero}: expected 0 to {turn - 1}")
         return self
 
 
@@ -174,10 +181,24 @@ def load_hardware(source: str | Path | Hardware = "nominal") -> Hardware:
     if isinstance(source, Hardware):
         return source
     data, where = read_config("hardware", source)
+    data = _with_servo_files(data, where)
     hardware = parse_config(Hardware, data, where)
     if hardware.robot is None:
         return hardware
     return hardware.model_copy(update={"robot": str(named_in(where, hardware.robot))})
+
+
+def _with_servo_files(data: Any, where: str) -> Any:
+    """Return a hardware file's content with servo models that are files named by their place."""
+    if not isinstance(data, dict) or not isinstance(data.get("buses"), dict):
+        return data
+    buses = {
+        name: {**bus, "model": str(named_in(where, bus["model"]))}
+        if isinstance(bus, dict) and str(bus.get("model", "")).endswith((".yaml", ".yml"))
+        else bus
+        for name, bus in data["buses"].items()
+    }
+    return {**data, "buses": buses}
 
 
 def with_ports(hardware: Hardware, ports: dict[str, str]) -> Hardware:

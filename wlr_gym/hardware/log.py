@@ -22,13 +22,14 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, RunMeta
 from wlr_gym.data.logs.stream import McapStream
+from wlr_gym.data.robot_file import note_robot
 from wlr_gym.data.sensor_columns import SENSED, channels
 from wlr_gym.data.write import write_meta
 from wlr_gym.hardware.safety.state import RobotStatus
 from wlr_gym.hardware.step import StepRecord
 from wlr_gym.hardware.timing import Clock
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
-from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS
+from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS, Robot
 
 PARTIAL = "partial_"
 #: Phases of the control loop that begin a table, and its kind.
@@ -91,15 +92,16 @@ class RunLog:
 
     Args:
         folder: made if it is not there; runs are numbered on from those in it.
-        meta: written as ``meta.yaml``.
+        meta: written as ``meta.yaml``, with the robot.
+        robot: whose runs they are.
 
     Raises:
         InputError: the folder cannot be written to, or its ``meta.yaml`` says something else.
     """
 
-    def __init__(self, folder: Path, meta: RunMeta) -> None:
+    def __init__(self, folder: Path, meta: RunMeta, robot: Robot) -> None:
         make_output_folder(folder)
-        write_meta(folder, meta)
+        write_meta(folder, note_robot(folder, robot, meta))
         self.folder = folder
         self.number: int = 1 + max((_number(path) for path in folder.iterdir()), default=0)
         self._tables: dict[str, CsvTable] = {}
@@ -173,6 +175,7 @@ class RunRecorder:
         folder: of the logs; None = none is written.
         meta: of the runs.
         clock: of the runs.
+        robot: whose runs they are.
 
     Attributes:
         log: of the present or last run.
@@ -181,8 +184,8 @@ class RunRecorder:
         stream: where rows of the run go besides; it has the columns of :data:`ROW`.
     """
 
-    def __init__(self, folder: Path | None, meta: RunMeta, clock: Clock) -> None:
-        self.folder, self.meta = folder, meta
+    def __init__(self, folder: Path | None, meta: RunMeta, clock: Clock, robot: Robot) -> None:
+        self.folder, self.meta, self._robot = folder, meta, robot
         self.log: RunLog | None = None
         self.trouble = ""
         self.stream: McapStream | None = None
@@ -204,7 +207,7 @@ class RunRecorder:
         if self.log is not None:
             self.log.finish()
         self.trouble = ""
-        self.log = RunLog(self.folder, self.meta)
+        self.log = RunLog(self.folder, self.meta, self._robot)
         self.log.event(self._clock.now(), "checks", found=self._checks)
 
     def phase(self, name: str, reason: str) -> None:

@@ -112,7 +112,7 @@ class ControlLoop:
         self.clock: Clock = link.clock
         self.operator: Operator = Operator(link.clock)
         self.pacer: Pacer = Pacer(link.clock, period)
-        self.recorder: RunRecorder = RunRecorder(log, meta, link.clock)
+        self.recorder: RunRecorder = RunRecorder(log, meta, link.clock, robot)
         self._link, self._is_open = link, False
         self._limiter = CommandLimiter(link.servos, robot, hardware, link.clock, period, dry_run, meta.profile)
         self._step = ControlStep(self._limiter, link.imu, self.operator, self.pacer)

@@ -17,6 +17,7 @@ from wlr_gym.hardware.dynamixel.blocks import Block, BlockReading, IndirectBlock
 from wlr_gym.hardware.dynamixel.bus import PATIENCE, BusGroup, open_all
 from wlr_gym.hardware.dynamixel.errors import BusGoneError, NoAnswerError
 from wlr_gym.hardware.dynamixel.tables import ControlTable, error_names, load_table
+from wlr_gym.hardware.fit import check_fit
 from wlr_gym.physics.servo import effort_counts, idle_effort
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 
@@ -54,7 +55,7 @@ class JointMap:
         self._position = np.array([table.per_count("present_position") for table in tables])
         self._velocity = np.array([table.per_count("present_velocity") for table in tables])
         self._effort, self._idle = effort_counts(robot), idle_effort(robot)
-        self._full_pwm = np.array([table["pwm_limit"].default for table in tables], np.float64)
+        self._full_pwm = np.array([table.counts.full_pwm for table in tables], np.float64)
 
     def pwm_share(self, counts: ArrayLike) -> Array:
         """Return the parts of the supply (8,) that Goal PWM lets through; 0 to 1."""
@@ -163,6 +164,7 @@ class Servos:
         clock: Callable[[], float] = time.monotonic,
         make_port: Callable[[str, int, float], DynamixelPort] | None = None,
     ) -> None:
+        check_fit(robot, hardware)
         self.joint_map: JointMap = JointMap(robot, hardware)
         self._ids = [robot.dynamixel_ids[joint] for joint in JOINTS]
         self._bus_of = {joint: name for name, bus in hardware.buses.items() for joint in bus.joints}
@@ -176,9 +178,8 @@ class Servos:
             table = load_table(bus.model)
             servos = {robot.dynamixel_ids[joint]: table for joint in bus.joints}
             self.groups[name] = BusGroup(name, bus.port, bus.baud_rate, servos, patience, clock, make_port)
-            effort = "present_current" if "present_current" in table.items else "present_load"
             self._motion[name] = Block(table, *_MOTION)
-            self._supervised[name] = IndirectBlock(table, ("realtime_tick", effort, *_STATE, *_REGISTERS))
+            self._supervised[name] = IndirectBlock(table, ("realtime_tick", table.effort, *_STATE, *_REGISTERS))
             self._health[name] = Block(table, *_HEALTH)
 
     def open(self) -> None:

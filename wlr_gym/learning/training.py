@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.base.settings import merge_changes, read_yaml
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.policy.agents import Training, TrainingProgress, agent_function, apply_changes, load_agent_config
+from wlr_gym.robot import RobotSource, robot_content
 
 
 def train(
@@ -22,6 +24,7 @@ def train(
     settings: Mapping[str, Any] | None = None,
     seed: int | None = None,
     init: str | Path | None = None,
+    robot: RobotSource | None = None,
     on_update: Callable[[TrainingProgress], object] | None = None,
     max_seconds: float | None = None,
     progress: bool = False,
@@ -39,6 +42,9 @@ def train(
         seed: of everything random; None = that of the settings.
         init: trained policy to start from: run or policy folder, policy file, or shipped policy. It must have been made for
             this environment's observations and actions.
+        robot: name in ``configs/robot/``, path of a robot file, its content, or a :class:`wlr_gym.robot.Robot`; None = as the
+            settings say, else the task's. It goes into the run folder and the policy by content: what was trained with a robot
+            finds it by itself.
         on_update: called with a :class:`wlr_gym.TrainingProgress` after every update; ``progress.stop()`` ends the training
             in good order. What it raises ends it too, after a checkpoint was saved.
         max_seconds: stop in good order after this wall time, s; :func:`resume_training` continues. None = no limit.
@@ -57,6 +63,8 @@ def train(
     chosen = merge_changes(settings_of(env_id, config, agent, init), settings or {})
     if seed is not None:
         chosen["seed"] = seed
+    if robot is not None:
+        chosen = with_robot(chosen, robot)
     request = Training(env_id, unused(Path(out)), chosen, False, max_seconds, progress, init, on_update)
     return run_training(agent, request)
 
@@ -78,6 +86,21 @@ def settings_of(
     chosen = dict(agent_function(agent, "settings_to_start_from")(init))
     apply_changes(chosen, changes)
     return chosen
+
+
+def with_robot(settings: Mapping[str, Any], robot: RobotSource | None = None) -> dict[str, Any]:
+    """Return an agent's settings with the robot of their environment by content, so that they mean the same anywhere.
+
+    Args:
+        settings: of the agent.
+        robot: instead of the one that they name; None = that one. Without any the settings stay as they are.
+
+    Raises:
+        InputError: no such robot, or one that cannot be simulated.
+    """
+    environment = settings.get("environment") or {}
+    chosen = environment.get("robot") if robot is None and isinstance(environment, Mapping) else robot
+    return dict(settings) if chosen is None else {**settings, "environment": {**environment, "robot": robot_content(chosen)}}
 
 
 def resume_training(
@@ -136,7 +159,7 @@ def run_training(agent: str, training: Training) -> Path:
     limit = training.max_seconds
     if limit is not None and (not isinstance(limit, int | float) or not limit > 0):
         raise InputError(f"max_seconds = {limit!r}: expected a time above 0 s")
-    return agent_function(agent, "train")(training)
+    return agent_function(agent, "train")(replace(training, config=with_robot(training.config)))
 
 
 def unused(folder: Path) -> Path:

@@ -1,23 +1,22 @@
-"""The Dynamixel servo, defined once for every simulator: profile generator, control law in voltage space, DC motor, registers.
+"""The Dynamixel servo, defined once for every simulator: profile generator, control law in voltage space, DC motor.
 
 Everything is at the output shaft, in SI units. The control law and the profile generator are written with
 :mod:`wlr_gym.physics.codegen.ops`, so the same source runs on floats, numpy arrays (any shape that broadcasts, float32 or
-float64) and traced nodes. Facts about the servos: ROBOTIS e-manual, XM540-W150 and XL430-W250.
+float64) and traced nodes. Facts about the servos: ROBOTIS e-manual; what their registers count: ``hardware/dynamixel/tables``.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError
 from wlr_gym.physics.codegen import ops
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, Robot
+from wlr_gym.robot.description import Motor
 from wlr_gym.robot.parameters import Parameters
 
 Value = Any  # float | numpy array | traced node
@@ -27,6 +26,9 @@ Array = NDArray[np.float64]
 NO_LIMIT = 1e6
 #: Distance (rad) at which a leg's profile counts as arrived: a few float32 roundings, 1/1500 of an encoder count.
 ARRIVAL = 1e-6
+#: s. The integral gain counts velocity errors per cycle of the servo's controller. No manual says how long it is: 1 kHz is
+#: assumed, and the parameter ``servo.integral_cycle`` is for what was measured.
+CYCLE = 1e-3
 #: Braking may be this much harder than nominal. In exact arithmetic it is only used when a new goal lies too close to stop at;
 #: in float32 it makes up for rounding along the braking curve, without which the profile overshoots by up to 2e-4 rad.
 BRAKING_RESERVE = 1.02
@@ -124,7 +126,7 @@ def controller_voltage(
 def position_gains(parameters: Parameters) -> Array:
     """Return the gains (N, 8) in V/rad as they act: a wheel's error is summed once a cycle; ``servo.kp`` holds for 1 ms."""
     gains = parameters["servo.kp"].copy()
-    gains[:, WHEEL_SLICE] *= _CYCLE / parameters["servo.integral_cycle"]
+    gains[:, WHEEL_SLICE] *= CYCLE / parameters["servo.integral_cycle"]
     return gains
 
 
@@ -257,97 +259,47 @@ def _rectangle(to_goal: Value, limit: Value, step: Value) -> tuple[Value, ...]:
     return travel, speed, speed, arrived
 
 
-# --- readings and registers -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Register:
-    """One register quantity: SI unit, SI value of one count, and the range of counts the servo accepts or reports."""
-
-    unit: str
-    per_count: float
-    low: int
-    high: int
-
-
-def _pwm(divisor: float) -> float:
-    """Volts per count of a gain register: PWM units over ``divisor``; 885 units are the supply, 12 V nominal."""
-    return 12.0 / 885 / divisor
-
-
-_TURN = 2 * math.pi
-_POSITION = _TURN / 4096
-_VELOCITY = 0.229 * _TURN / 60
-#: s. The integral gain counts velocity errors per cycle of the servo's controller. No manual says how long it is: 1 kHz is
-#: assumed, and the parameter ``servo.integral_cycle`` is for what was measured.
-_CYCLE = 1e-3
-_COMMON = {
-    "position": Register("rad", _POSITION, -1_048_575, 1_048_575),
-    "profile_velocity": Register("rad/s", _VELOCITY, 0, 32767),
-    "profile_acceleration": Register("rad/s2", 214.577 * _TURN / 3600, 0, 32767),
-    "pwm": Register("-", 1 / 885, -885, 885),
-    "position_p_gain": Register("V/rad", _pwm(128) / _POSITION, 0, 16383),
-    "velocity_p_gain": Register("V s/rad", _pwm(128) / _VELOCITY, 0, 16383),
-    "velocity_i_gain": Register("V/rad", _pwm(65536) / (_VELOCITY * _CYCLE), 0, 16383),
-}
-
-#: Register quantities per servo model: model -> quantity -> :class:`Register`. Gains hold for a 12 V supply: Position P
-#: Gain 800 is K_P = 800/128 PWM units per position count; Velocity P and I Gain are /128 and /65536 per velocity count.
-#: Position range: extended mode, 256 turns. XL430 load is inferred by the servo from its output, XM540 current is measured.
-REGISTER_UNITS: Mapping[str, Mapping[str, Register]] = {
-    "XM540-W150-R": {
-        **_COMMON,
-        "velocity": Register("rad/s", _VELOCITY, -1023, 1023),
-        "current": Register("A", 2.69e-3, -2047, 2047),
-        "voltage": Register("V", 0.1, 0, 160),
-    },
-    "XL430-W250-T": {
-        **_COMMON,
-        "velocity": Register("rad/s", _VELOCITY, -1023, 1023),
-        "load": Register("-", 1e-3, -1000, 1000),
-        "voltage": Register("V", 0.1, 0, 140),
-    },
-}
-
-
-def from_register(model: str, quantity: str, counts: ArrayLike) -> Any:
-    """Return the SI value(s) of register counts: float, or an array of the same shape.
-
-    Raises:
-        InputError: unknown model or quantity, or counts beyond the register's range.
-    """
-    if model not in REGISTER_UNITS:
-        raise unknown_name("servo model", model, REGISTER_UNITS)
-    if quantity not in REGISTER_UNITS[model]:
-        raise unknown_name("register quantity", quantity, REGISTER_UNITS[model], model)
-    register, values = REGISTER_UNITS[model][quantity], np.asarray(counts, dtype=np.float64)
-    bad = ~((values >= register.low) & (values <= register.high))
-    if bad.any():
-        worst = np.ravel(values)[np.ravel(bad)][0]
-        raise InputError(
-            f"{model} {quantity}: {worst * register.per_count:g} {register.unit} ({worst:g} counts) is outside "
-            f"[{register.low}, {register.high}] counts = "
-            f"[{register.low * register.per_count:g}, {register.high * register.per_count:g}] {register.unit}"
-        )
-    return float(values * register.per_count) if values.ndim == 0 else values * register.per_count
+# --- readings ---------------------------------------------------------------------------------------------------------
 
 
 def effort_counts(robot: Robot) -> Array:
     """Return one count of reported effort per joint (8,), N m.
 
-    Legs: XM540 Present Current, 2.69 mA times the nominal torque constant. Wheels: XL430 Present Load, 0.1 % of stall torque.
+    A servo that measures its current reports counts of that, and the nominal torque constant says what torque it is; one that
+    does not reports parts of its stall torque.
     """
-    leg = REGISTER_UNITS["XM540-W150-R"]["current"].per_count * current_law(robot).torque_constant[0]
-    wheel = REGISTER_UNITS["XL430-W250-T"]["load"].per_count * robot.servo.wheel.stall_torque
-    return np.repeat([leg, wheel], 4)
+    counts = np.empty(len(JOINTS))
+    constant = current_law(robot).torque_constant
+    for motor, joints, default in _effort_sensors(robot):
+        current, load = motor.current_count, motor.load_count
+        if current is None and load is None:
+            current, load = default
+        counts[joints] = current * constant[joints] if current is not None else motor.stall_torque * (load or 0.0)
+    return counts
 
 
 def idle_effort(robot: Robot) -> Array:
-    """Return what :func:`effort_counts` alone would read too much per rate (8,), N m s/rad: the legs' idle current.
+    """Return what :func:`effort_counts` alone would read too much per rate (8,), N m s/rad: the idle current.
 
-    The wheels' servos measure no current: their load is of torque, as the servo infers it.
+    It is 0 where a servo measures no current: its load is of torque, as the servo infers it.
     """
     law = current_law(robot)
     effort = law.torque_constant * law.idle
-    effort[WHEEL_SLICE] = 0.0
+    for joints, has_current in zip((LEG_SLICE, WHEEL_SLICE), measures_current(robot), strict=True):
+        if not has_current:
+            effort[joints] = 0.0
     return effort
+
+
+def measures_current(robot: Robot) -> tuple[bool, bool]:
+    """Whether the servos of legs and wheels measure their current."""
+    legs, wheels = (
+        (motor.current_count if motor.current_count or motor.load_count else default[0]) is not None
+        for motor, _, default in _effort_sensors(robot)
+    )
+    return legs, wheels
+
+
+def _effort_sensors(robot: Robot) -> tuple[tuple[Motor, slice, tuple[float | None, float | None]], ...]:
+    """Motors, their joints, and counts of current and load where the robot file says neither: of XM540-W150 and XL430-W250."""
+    return (robot.servo.leg, LEG_SLICE, (2.69e-3, None)), (robot.servo.wheel, WHEEL_SLICE, (None, 1e-3))

@@ -7,6 +7,7 @@ from wlr_gym.policy.model_card import write_model_card
 from wlr_gym.policy.reseal import reseal
 from wlr_gym.policy.sources import (
     contract_of,
+    environment_for,
     fed_environment,
     find_policy,
     is_policy,
@@ -26,6 +27,7 @@ __all__ = [
     "agent_names",
     "check_contract",
     "contract_of",
+    "environment_for",
     "export_policy",
     "fed_environment",
     "find_policy",

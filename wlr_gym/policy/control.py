@@ -32,15 +32,21 @@ FORWARD = ("command[linear_velocity_x]", "speed_command", "climb_command")
 ESTIMATED_FORWARD = "estimated_linear_velocity_in_body[x]"
 
 
-def known_robot(contract: Mapping[str, Any], name: str, agent: str) -> Robot:
-    """Return the robot whose numbers a controller uses.
+def known_robot(contract: Mapping[str, Any], name: str | None, agent: str) -> Robot:
+    """Return the robot whose numbers a controller uses: the environment's, as its contract describes it.
+
+    Args:
+        contract: of the environment.
+        name: robot that the settings name; None = any.
+        agent: whose settings, for messages.
 
     Raises:
-        InputError: it is not the environment's.
+        InputError: the settings name another one, or an older contract names one that it does not describe.
     """
-    robot = load_robot(name)
-    if robot_hash(robot) != contract["robot"]["hash"]:
-        raise InputError(f"agent '{agent}': robot '{name}' is not the environment's ('{contract['robot']['name']}')")
+    robot = load_robot(contract["robot"].get("description") or name or "nominal")
+    named = robot if name is None else load_robot(name)
+    if robot_hash(robot) != contract["robot"]["hash"] or robot_hash(named) != robot_hash(robot):
+        raise InputError(f"agent '{agent}': robot '{named.name}' is not the environment's ('{contract['robot']['name']}')")
     return robot
 
 
@@ -138,7 +144,7 @@ class PidConfig(SettingsModel):
     """Settings. Gains without a unit unless named.
 
     Attributes:
-        robot: whose geometry is used.
+        robot: whose geometry is used; None = the environment's. Another one than the environment's is refused.
         steering: wheel speed difference over what rolling alone needs for the wanted yaw rate.
         yaw_rate_p: on the error of the gyro's yaw rate. yaw_rate_i: on its integral, 1/s.
         velocity_p: on the error of the estimated forward velocity. velocity_i: on its integral, 1/s.
@@ -151,7 +157,7 @@ class PidConfig(SettingsModel):
         seed: of the first episode of the search. search: how it is made.
     """
 
-    robot: str = "nominal"
+    robot: str | None = None
     steering: float = Field(1.0, ge=0)
     yaw_rate_p: float = Field(0.0, ge=0)
     yaw_rate_i: float = Field(0.0, ge=0)

@@ -18,7 +18,7 @@ from wlr_gym.policy.file import CONTRACT_FILE, differences, with_defaults
 from wlr_gym.policy.model_card import SUFFIX as CARD_SUFFIX
 from wlr_gym.policy.model_card import file_hash
 from wlr_gym.policy.onnx_file import open_policy, seal
-from wlr_gym.policy.sources import contract_of
+from wlr_gym.policy.sources import contract_of, robot_of_contract
 from wlr_gym.robot import Robot, load_robot, robot_hash, servo_hash
 
 
@@ -40,12 +40,13 @@ def reseal(path: Path, robot: str | None = None) -> list[str]:
     """
     content = contract_of(path)
     before, resealed = content["environment"], copy.deepcopy(content)
-    source = robot or (content["config"].get("environment") or {}).get("robot") or "nominal"
+    source = robot or robot_of_contract(content) or "nominal"
     trained = load_robot(source)
     stated, fingerprint = (before.get("robot") or {}).get("hash"), robot_hash(trained)
-    if stated not in (fingerprint, _first_form(source, trained)):
+    if stated != fingerprint and (isinstance(source, Mapping) or stated != _first_form(source, trained)):
         raise InputError(
-            f"{path}: robot.hash is {stated!r}, that of robot '{source}' is {fingerprint!r}: not the robot of its training"
+            f"{path}: robot.hash is {stated!r}, that of robot '{robot or trained.name}' is {fingerprint!r}: not the robot of "
+            "its training"
         )
     now = with_defaults(resealed["environment"])
     now["robot"] |= {"hash": fingerprint, "servo": servo_hash(trained)}
@@ -64,8 +65,8 @@ def reseal(path: Path, robot: str | None = None) -> list[str]:
 #: Keys of ``servo`` that robot files got after the first form.
 LATER: Any = {
     "integral_cycle": True,
-    "leg": {"stall_current", "no_load_current"},
-    "wheel": {"stall_current", "no_load_current"},
+    "leg": {"stall_current", "no_load_current", "current_count", "load_count"},
+    "wheel": {"stall_current", "no_load_current", "current_count", "load_count"},
 }
 
 
@@ -75,7 +76,7 @@ def _first_form(source: str, robot: Robot) -> str:
     for data, _ in read_layers("robot", source):
         tolerances = overlay(tolerances, data.get("tolerances") or {})
     adapter = TypeAdapter(dict[str, float | str])
-    numbers = robot.model_dump_json(exclude={"tolerances": True, "servo": LATER})
+    numbers = robot.model_dump_json(exclude={"tolerances": True, "individual": True, "servo": LATER, "sensors": {"volt_count"}})
     text = f'{numbers[:-1]},"tolerances":{adapter.dump_json(adapter.validate_python(tolerances)).decode()}}}'
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

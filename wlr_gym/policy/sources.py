@@ -8,6 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.paths import data_directory
+from wlr_gym.base.settings import merge_changes
 from wlr_gym.policy.agents import Contract, Policy, agent_function, agent_names, load_agent_config
 from wlr_gym.policy.file import CONTRACT_FILE, check_contract, read_contract
 from wlr_gym.policy.onnx_file import SUFFIX, open_policy
@@ -133,20 +134,51 @@ def make_policy(source: str | Path, environment: Contract) -> Policy:
 def policy_environment(source: str | Path) -> dict[str, Any]:
     """Return the keywords that an environment must be made with so that a policy is fed what it was made for.
 
-    They are those of its training that decide what its inputs and outputs mean (see :data:`FED`). Conditions, such as backend,
-    randomisation, commands or precision, are not among them: a policy may be tried under others.
+    They are those of its training that decide what its inputs and outputs mean (see :data:`FED`), and its robot, by content.
+    Conditions, such as backend, randomisation, commands or precision, are not among them: a policy may be tried under others.
 
     Args:
         source: as of :func:`make_policy`.
 
     Returns:
-        ``{"task": ...}``, or nothing where the task is the one that ships.
+        ``{"task": ..., "robot": ...}``; without the task where it is the one that ships, without the robot where it is the
+        nominal one.
 
     Raises:
         InputError: neither an agent nor a policy, or a broken one.
     """
-    config = load_agent_config(source) if str(source) in agent_names() else contract_of(source)["config"]
-    return fed_environment(config.get("environment") or {})
+    if str(source) in agent_names():
+        return fed_environment(load_agent_config(source).get("environment") or {})
+    contract = contract_of(source)
+    robot = robot_of_contract(contract)
+    return fed_environment(contract["config"].get("environment") or {}) | ({} if robot is None else {"robot": robot})
+
+
+def robot_of_contract(content: Mapping[str, Any]) -> Any:
+    """Return the robot that a policy was made for, by content (of older policies: by name or path); None = the nominal one."""
+    stated = (content["environment"].get("robot") or {}).get("description")
+    return stated if stated is not None else (content["config"].get("environment") or {}).get("robot")
+
+
+def environment_for(source: str | Path, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keywords of an environment that feeds a policy what it was made for, under the conditions of ``given``.
+
+    A robot that is given holds: a policy that was made for another one is then refused by its contract. Without one it is that
+    of the policy.
+
+    Args:
+        source: as of :func:`make_policy`.
+        given: keywords of the environment, such as ``{"randomization": "ice", "robot": None}``.
+
+    Raises:
+        InputError: neither an agent nor a policy, or a broken one.
+    """
+    own = policy_environment(source)
+    if isinstance(own.get("task"), Mapping) and isinstance(given.get("task"), Mapping):
+        own["task"] = merge_changes(given["task"], own["task"])
+    if given.get("robot") is not None:
+        own.pop("robot", None)
+    return {**given, **own}
 
 
 def fed_environment(environment: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """The robot as data: its description, the table of its physical parameters, slip. No simulator, no equation of motion."""
 
-from wlr_gym.robot.description import Robot, Vector3, load_robot, physical_faults, standing_height
+from wlr_gym.robot.description import Robot, RobotSource, Vector3, load_robot, physical_faults, robot_content, standing_height
 from wlr_gym.robot.fingerprint import robot_hash, servo_hash
 from wlr_gym.robot.joints import (
     CORNER_NAMES,
@@ -26,10 +26,12 @@ __all__ = [
     "WHEELS",
     "WHEEL_SLICE",
     "Robot",
+    "RobotSource",
     "Vector3",
     "full_name",
     "load_robot",
     "physical_faults",
+    "robot_content",
     "robot_hash",
     "servo_hash",
     "standing_height",

@@ -8,14 +8,16 @@ straight down. Wheel angle: right-handed about body +y, relative to its leg; pos
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field, field_serializer, field_validator, model_validator
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_layers
 from wlr_gym.robot.joints import JOINTS
+from wlr_gym.robot.parameter_table import TABLE, range_in_words, spec_of
 from wlr_gym.robot.tolerance import KEYS, ParameterTolerance, read_tolerances
 
 Vector3 = tuple[float, float, float]
@@ -62,13 +64,17 @@ class Motor(SettingsModel):
     """One servo at its output shaft; torque, speed and currents at the nominal supply voltage (source: ROBOTIS e-manual).
 
     Torque and speed are the ends of the torque-speed line. Currents (A) at the same two ends say how current becomes torque;
-    without them the constant is that of the back-EMF (:func:`wlr_gym.physics.servo.current_law`).
+    without them the constant is that of the back-EMF (:func:`wlr_gym.physics.servo.current_law`). What the servo reports of its
+    torque: counts of ``current_count`` (A), or, where it measures no current, of ``load_count`` (share of the stall torque);
+    without either as the nominal robot's servos do.
     """
 
     stall_torque: float = Field(gt=0)
     no_load_speed: float = Field(gt=0)
     stall_current: float | None = Field(None, gt=0)
     no_load_current: float | None = Field(None, ge=0)
+    current_count: float | None = Field(None, gt=0)
+    load_count: float | None = Field(None, gt=0)
     kp: float = Field(ge=0)
     kd: float = Field(ge=0)
     armature: float = Field(gt=0)
@@ -92,6 +98,8 @@ class Servo(SettingsModel):
     def _currents_are_possible(self) -> Servo:
         for name, motor in (("leg", self.leg), ("wheel", self.wheel)):
             _check_currents(f"servo.{name}", motor, self.supply_voltage)
+            if motor.current_count is not None and motor.load_count is not None:
+                raise InputError(f"servo.{name}: current_count and load_count: a servo reports one of the two")
         return self
 
 
@@ -160,12 +168,13 @@ class CameraSensor(SettingsModel):
 
 
 class SensorSet(SettingsModel):
-    """What the robot can measure, and how badly."""
+    """What the robot can measure, and how badly; ``volt_count`` is one register count of the supply (V)."""
 
     control_rate: float = Field(gt=0)
     encoder: Encoder
     effort: EffortSensor
     volt_noise: float = Field(ge=0)
+    volt_count: float = Field(0.1, ge=0)
     imu: ImuSensor
     camera: CameraSensor
 
@@ -177,7 +186,12 @@ class Home(SettingsModel):
 
 
 class Robot(SettingsModel):
-    """A whole robot, as one ``configs/robot/*.yaml`` describes it."""
+    """A whole robot, as one ``configs/robot/*.yaml`` describes it.
+
+    Legs, wheels and their servos are alike but for ``individual``: element of the parameter table -> its value, such as
+    ``leg.length[leg_lf]: 0.13``. Simulators follow them; what a robot knows of itself (slip observer, controllers) goes by the
+    numbers that all share.
+    """
 
     name: str
     gravity: float = Field(ge=0)
@@ -192,6 +206,7 @@ class Robot(SettingsModel):
     servo: Servo
     ground: Ground
     sensors: SensorSet
+    individual: dict[str, float] = Field(default_factory=dict)
     tolerances: dict[str, ParameterTolerance] = Field(default_factory=dict)
 
     @field_validator("tolerances", mode="before")
@@ -210,6 +225,18 @@ class Robot(SettingsModel):
     @field_serializer("tolerances")
     def _tolerances_as_written(self, tolerances: dict[str, ParameterTolerance]) -> dict[str, str]:
         return {key: str(tolerance) for key, tolerance in tolerances.items()}
+
+    @field_validator("individual")
+    @classmethod
+    def _single_numbers_are_known(cls, individual: dict[str, float]) -> dict[str, float]:
+        valid = [element for spec in TABLE if spec.may_differ for element in spec.elements]
+        for element, value in individual.items():
+            if element not in valid:
+                raise unknown_name("number of a single leg, wheel or servo", element, valid, "individual")
+            spec = spec_of(element)
+            if not spec.low <= value <= spec.high:
+                raise InputError(f"individual.{element} = {value:g}: expected {range_in_words(spec.low, spec.high, spec.unit)}")
+        return individual
 
     @field_validator("leg_limits")
     @classmethod
@@ -275,21 +302,39 @@ def _triangle_faults(name: str, inertia: tuple[float | None, ...]) -> list[str]:
     return [f"{name} = {values} breaks the triangle inequality every rigid body obeys"]
 
 
-def load_robot(source: str | Path | Robot = "nominal", *, check: bool = True) -> Robot:
-    """Load a robot by config name or path.
+#: Name in ``configs/robot/``, path of a YAML file, content of such a file without a base, or a :class:`Robot`.
+RobotSource = str | Path | Mapping[str, Any] | Robot
+
+
+def load_robot(source: RobotSource = "nominal", *, check: bool = True) -> Robot:
+    """Load a robot by config name, path or content.
 
     Args:
-        source: name in ``configs/robot/``, path of a YAML file, or a :class:`Robot` (returned as it is).
+        source: see :data:`RobotSource`; a :class:`Robot` is returned as it is.
         check: refuse a robot that no rigid body can be (see :func:`physical_faults`).
 
     Raises:
         InputError: unreadable file, unknown or missing key, value of the wrong kind, or a physically impossible robot.
     """
-    robot = source if isinstance(source, Robot) else _read(source)
+    if isinstance(source, Mapping):
+        robot = parse_config(Robot, dict(source), "robot")
+    else:
+        robot = source if isinstance(source, Robot) else _read(source)
     faults = physical_faults(robot) if check else []
     if faults:
         raise InputError(f"robot '{robot.name}' cannot be simulated: " + "; ".join(faults))
     return robot
+
+
+def robot_content(source: RobotSource) -> dict[str, Any]:
+    """Return a robot as plain JSON types, which :func:`load_robot` takes: how it travels in run folders and contracts.
+
+    Every number is in it, those of its bases and defaults too.
+
+    Raises:
+        InputError: see :func:`load_robot`.
+    """
+    return load_robot(source).model_dump(mode="json")
 
 
 def _read(source: str | Path) -> Robot:

@@ -3,7 +3,8 @@
 The canonical form is one line ``key = value`` per number, sorted, under a title with the version of the form. A number that has
 its declared default is left out, so that a new field with a default changes the fingerprint of no robot that does not use it.
 Not in it: name, bus addresses, order of joints (there is one only) and tolerances; nor what turns a motor's torque into its
-current, which changes energy and counts of a sensor, but no motion: a policy from ``nominal`` fits ``emanual``.
+current and into counts, which changes energy and the rounding of a sensor, but no motion: a policy from ``nominal`` fits
+``emanual``.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ HASH_FORM = "2"
 #: Keys of a robot file that no simulator reads.
 NOT_SIMULATED = ("name", "joints", "dynamixel_ids", "tolerances")
 #: Keys of a motor that no motion depends on.
-CURRENTS = ("stall_current", "no_load_current")
+CURRENTS = ("stall_current", "no_load_current", "current_count", "load_count")
 
 
 def robot_hash(robot: Robot) -> str:
@@ -47,5 +48,7 @@ def _lines(model: BaseModel, above: str) -> Iterator[str]:
             continue
         if isinstance(value, BaseModel):
             yield from _lines(value, f"{above}{name}.")
+        elif isinstance(value, dict):
+            yield from (f"{above}{name}.{key} = {value[key]!r}" for key in value)
         else:
             yield f"{above}{name} = {value!r}"

@@ -65,7 +65,16 @@ class ParameterSpec:
     def nominal(self, robot: Any) -> list[float | None]:
         """Return the values (size) for a :class:`wlr_gym.robot.Robot`; None where its file has none."""
         values = [value for source in self.sources for value in _values(robot, source)]
-        return values * (self.size // len(values))
+        whole = values * (self.size // len(values))
+        if not robot.individual:
+            return whole
+        return [robot.individual.get(element, value) for element, value in zip(self.elements, whole, strict=True)]
+
+    @property
+    def may_differ(self) -> bool:
+        """Whether a robot's file may state it of a single leg, wheel or servo."""
+        single = self.labels in (LEGS, WHEELS, JOINTS, LEG_INERTIA_LABELS) and isinstance(self.sources[0], str)
+        return single and not self.name.startswith("ground.")
 
 
 def _values(robot: Any, source: str | float) -> list[float | None]:

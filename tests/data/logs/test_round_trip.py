@@ -1,6 +1,7 @@
 """Runs written as MCAP and rosbag2 come back: channels to the bit, times to 1 ns."""
 
 import math
+import shutil
 import threading
 from pathlib import Path
 
@@ -13,10 +14,13 @@ from hypothesis import strategies as st
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Run, read_run, write_run
+from wlr_gym.data.convert import convert
 from wlr_gym.data.format import COLUMNS, COMMANDS, REQUIRED, Profile, RunMeta
-from wlr_gym.data.logs import export_run, read_exported, read_logs
+from wlr_gym.data.logs import export_run, import_log, read_exported, read_logs
 from wlr_gym.data.logs.messages import nanoseconds, seconds
 from wlr_gym.data.logs.stream import McapStream
+from wlr_gym.data.replay import robot_of
+from wlr_gym.robot import load_robot, robot_content, robot_hash
 
 OPTIONAL = [name for name in COLUMNS if name not in REQUIRED]
 NUMBERS = st.one_of(st.floats(allow_nan=False, allow_infinity=False, width=64), st.just(math.nan), st.sampled_from([0.0, -0.0]))
@@ -180,3 +184,16 @@ def test_a_stream_that_failed_ends_at_once_though_its_queue_is_full(tmp_path, mo
     assert not ending.is_alive()
     assert str(error) in writing.trouble
     assert writing.left_out == 4
+
+
+@pytest.mark.parametrize(("form", "name"), [("mcap", "a.mcap"), ("rosbag2", "a")])
+def test_a_robot_of_ones_own_travels_with_its_run(form, name, tmp_path):
+    heavy = load_robot(robot_content("nominal") | {"name": "heavy", "gravity": 9.0})
+    run = read_run(write_run(tmp_path / "here" / "run_01.csv", rows_of(made_up(3.0)), RunMeta(), robot=heavy))
+    assert run.meta.robot_hash == robot_hash(heavy)
+    log = export_run(run, tmp_path / name, form)
+    shutil.rmtree(tmp_path / "here")
+    (imported,) = import_log(log, tmp_path / "there")
+    assert robot_of(read_run(imported.path)) == heavy
+    convert(imported.path, tmp_path / "elsewhere" / "run_01.parquet")
+    assert robot_of(read_run(tmp_path / "elsewhere" / "run_01.parquet")) == heavy

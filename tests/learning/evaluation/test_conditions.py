@@ -5,10 +5,10 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.learning.evaluation import Condition, Subject, identity, play, read_subjects, work
-from wlr_gym.learning.evaluation import subjects as subjects_module
 from wlr_gym.learning.evaluation.conditions import BLOCK
 from wlr_gym.learning.evaluation.subjects import make_player
 from wlr_gym.learning.evaluation.sweeps import SWEEPS, read_sweep, sweeps_for
+from wlr_gym.policy import sources as sources_module
 
 ID = "WLR-Velocity-v0"
 SHORT = {"episode_length": 0.2}
@@ -19,7 +19,7 @@ SUBJECTS = read_subjects(["idle=do_nothing", "constant_command"])
 
 def environments(monkeypatch, **own):
     """Let subjects need environments of their own."""
-    monkeypatch.setattr(subjects_module, "policy_environment", lambda source: own.get(str(source), {}))
+    monkeypatch.setattr(sources_module, "policy_environment", lambda source: own.get(str(source), {}))
 
 
 def test_every_subject_plays_every_condition_with_the_same_episodes(monkeypatch):

@@ -15,6 +15,7 @@ from wlr_gym.data.logs.messages import JOINT_STATES, PLACES, RUN, read_content, 
 from wlr_gym.data.logs.open import quiet, read_logs
 from wlr_gym.data.logs.topics import LOG, Log, Share
 from wlr_gym.data.simulation_record import Simulation
+from wlr_gym.robot import Robot, load_robot
 
 Array = NDArray[np.float64]
 
@@ -26,12 +27,14 @@ class ExportedRun:
     Attributes:
         table: columns by name, (rows,).
         meta, simulation: what stood beside it.
+        robot: whose run it is, where it travelled by content.
         notes: what is odd about the file.
     """
 
     table: dict[str, Array]
     meta: RunMeta
     simulation: Simulation | None
+    robot: Robot | None
     notes: tuple[str, ...]
 
 
@@ -67,7 +70,8 @@ def _run(log: Log) -> ExportedRun:
     meta = parse_config(RunMeta, content["meta"], f"{log.name}, topic '{RUN}', meta")
     record = content["simulation"]
     simulation = parse_config(Simulation, record, f"{log.name}, topic '{RUN}', simulation") if record else None
-    return ExportedRun(table, meta, simulation, log.notes)
+    robot = load_robot(content["robot"]) if content.get("robot") else None
+    return ExportedRun(table, meta, simulation, robot, log.notes)
 
 
 def _column(log: Log, column: str, times: NDArray[np.int64]) -> Array:

@@ -166,7 +166,7 @@ def _import_own(log: Path, out: Path, suffix: str, tell: Share) -> ImportedRun:
     _check_new(Log(log, {}), record, out)
     path = next_run(out, suffix)
     findings = tuple(check_table(run.table, str(log)))
-    write_run(path, run.table, run.meta, run.simulation)
+    write_run(path, run.table, run.meta, run.simulation, run.robot)
     imported = ImportedRun(path, str(log), 0, (), findings, run.notes)
     _write_record(out, record | {path.stem: _entry(imported)})
     return imported

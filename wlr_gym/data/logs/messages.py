@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CAMERA, COLUMNS, RunMeta
 from wlr_gym.data.simulation_record import Simulation
-from wlr_gym.robot import JOINTS, LEGS, WHEELS
+from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, robot_content
 
 Array = NDArray[np.float64]
 
@@ -108,9 +108,15 @@ def seconds(time: int, offset: int = 0) -> float:
 
 
 def run_message(
-    columns: Sequence[str], time: int, offset: int, meta: RunMeta, simulation: Simulation | None = None, name: str = "run"
+    columns: Sequence[str],
+    time: int,
+    offset: int,
+    meta: RunMeta,
+    simulation: Simulation | None = None,
+    name: str = "run",
+    robot: Robot | None = None,
 ) -> Sent:
-    """Return the message that a run begins with."""
+    """Return the message that a run begins with; ``robot`` travels by its content, where none that ships is meant."""
     content = {
         "layout": LAYOUT,
         "name": name,
@@ -118,7 +124,7 @@ def run_message(
         "clock_offset": offset,
         "meta": meta.model_dump(mode="json", exclude_none=True),
         "simulation": simulation.model_dump(mode="json") if simulation else None,
-    }
+    } | ({} if robot is None else {"robot": robot_content(robot)})
     return sent(RUN, STRING, time, make(STRING, data=json.dumps(content)))
 
 

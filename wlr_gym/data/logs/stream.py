@@ -14,6 +14,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import COMMANDS, RunMeta
 from wlr_gym.data.logs.messages import clock_offset, definition, nanoseconds, row_messages, run_message
 from wlr_gym.data.logs.write import McapSink
+from wlr_gym.data.robot_file import is_shipped
+from wlr_gym.robot import Robot
 
 #: Rows that may wait to be written: 20 s at 50 Hz. Beyond, rows are left out: whoever makes them never waits.
 WAITING = 1000
@@ -34,6 +36,7 @@ class McapStream:
         path: a new file.
         columns: names of the channels of each row, without ``t``.
         meta: of the run.
+        robot: whose run it is.
 
     Attributes:
         left_out: rows that came while too many waited.
@@ -43,8 +46,9 @@ class McapStream:
         InputError: the file is there, or cannot be made.
     """
 
-    def __init__(self, path: Path, columns: Sequence[str], meta: RunMeta) -> None:
+    def __init__(self, path: Path, columns: Sequence[str], meta: RunMeta, robot: Robot | None = None) -> None:
         self.path, self.columns, self.meta = path, tuple(columns), meta
+        self._robot = None if robot is None or is_shipped(robot) else robot
         self.left_out = 0
         self.trouble = ""
         self._offset: int | None = None
@@ -115,7 +119,14 @@ class McapStream:
         if self._offset is None:
             self._offset = clock_offset(t)
             self._sink.add(
-                run_message(["t", *self.columns], nanoseconds(t, self._offset), self._offset, self.meta, name=self.path.stem)
+                run_message(
+                    ["t", *self.columns],
+                    nanoseconds(t, self._offset),
+                    self._offset,
+                    self.meta,
+                    name=self.path.stem,
+                    robot=self._robot,
+                )
             )
         for message in row_messages(dict(zip(self.columns, values, strict=True)), nanoseconds(t, self._offset)):
             self._sink.add(message)

@@ -7,19 +7,18 @@ from collections.abc import Iterable
 
 from wlr_gym.base.errors import unknown_name
 from wlr_gym.data.format import COLUMNS
-from wlr_gym.physics.servo import REGISTER_UNITS, current_law, effort_counts
+from wlr_gym.physics.servo import current_law, effort_counts
 from wlr_gym.robot import JOINTS, Robot
 
 _TURN = 2.0 * math.pi
 _RPM = _TURN / 60.0
 _G = 9.80665
-_COUNTS = REGISTER_UNITS["XM540-W150-R"]
 
-#: SI unit -> unit -> factor. ``count`` is a count of a Dynamixel register.
+#: SI unit -> unit -> factor. ``count`` is a count of a Dynamixel register of the X series; see :func:`factor`.
 FACTORS: dict[str, dict[str, float]] = {
-    "rad": {"rad": 1.0, "deg": math.radians(1.0), "turn": _TURN, "count": _COUNTS["position"].per_count},
+    "rad": {"rad": 1.0, "deg": math.radians(1.0), "turn": _TURN, "count": _TURN / 4096},
     "rad/s": {
-        "rad/s": 1.0, "deg/s": math.radians(1.0), "rpm": _RPM, "turn/s": _TURN, "count": _COUNTS["velocity"].per_count,
+        "rad/s": 1.0, "deg/s": math.radians(1.0), "rpm": _RPM, "turn/s": _TURN, "count": 0.229 * _RPM,
     },
     "N m": {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2},
     "m/s2": {"m/s2": 1.0, "g": _G, "mg": _G * 1e-3},
@@ -37,7 +36,7 @@ def units_of(column: str) -> Iterable[str]:
 
 
 def factor(column: str, unit: str | None, robot: Robot, where: str) -> float:
-    """Return what one ``unit`` of a column is in SI units; None = it is in SI units.
+    """Return what one ``unit`` of a column is in SI units, a count as the robot's encoders count; None = it is in SI units.
 
     Raises:
         InputError: no unit of this column.
@@ -45,6 +44,10 @@ def factor(column: str, unit: str | None, robot: Robot, where: str) -> float:
     si = COLUMNS[column].unit
     if unit is None:
         return 1.0
+    encoder = robot.sensors.encoder
+    of_encoder = {"rad": encoder.position, "rad/s": encoder.velocity}.get(si, 0.0)
+    if unit == "count" and of_encoder > 0.0:
+        return of_encoder
     if unit in FACTORS[si]:
         return FACTORS[si][unit]
     if si != "N m" or unit not in CURRENTS:

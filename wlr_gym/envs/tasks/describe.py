@@ -7,10 +7,11 @@ from typing import Any
 
 from wlr_gym.envs.tasks.entries import AreaConfig, EventConfig
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
+from wlr_gym.envs.tasks.scaling import QUANTITIES, scaled_numbers
 from wlr_gym.envs.tasks.task import ObservationColumn, Task
 from wlr_gym.envs.tasks.task_config import TaskConfig
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
-from wlr_gym.robot import robot_hash, servo_hash
+from wlr_gym.robot import Robot, load_robot, robot_content, robot_hash, servo_hash
 
 
 def describe(task: Task) -> str:
@@ -187,18 +188,45 @@ def _area(area: AreaConfig) -> str:
     return "area " + ", ".join(f"{name} {_span(limits)} m" for name, limits in area if limits is not None)
 
 
+def describe_scaling(written: TaskConfig, robot: Robot) -> str:
+    """Return the table of a task's numbers that follow the robot: as written for the task's own one, by which rule, and now."""
+    reference = load_robot(written.robot)
+    rows = [
+        (number.place, number.rule, _numbers(number.before), _numbers(number.after))
+        for number in scaled_numbers(written.model_dump(), written.scaling, robot, reference)
+    ]
+    used = [name for name in QUANTITIES if any(name in rule.replace("*", " ").split() for rule in written.scaling.values())]
+    quantities = [
+        (name, QUANTITIES[name].unit, *(f"{QUANTITIES[name].of(one):.4g}" for one in (reference, robot)), QUANTITIES[name].doc)
+        for name in used
+    ]
+    return "\n".join(
+        [
+            f"**Follows the robot** by the rules of the task's file: number for {robot.name} = number for {reference.name} x "
+            "what the rule says of the one over the other, to three digits",
+            *table(("number", "rule", reference.name, robot.name), rows),
+            *table(("quantity", "unit", reference.name, robot.name, "meaning"), quantities),
+        ]
+    )
+
+
+def _numbers(value: Any) -> str:
+    return f"[{', '.join(f'{number:g}' for number in value)}]" if isinstance(value, list) else f"{value:g}"
+
+
 def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
     """Return what a policy must be fed and what its output means, as plain JSON types.
 
-    Keys: task, robot (name, hashes of its servos and of all its numbers), control_period, episode_length, observation (one
-    entry per number, in order: name, source, element, unit, frame, offset, scale, limit, lag, device), observer (settings of
-    the slip observer; None where no term needs it), latency, action (one entry per number: joint, quantity, unit, centre,
-    scale, low, high), commands and randomization.
+    Keys: task, robot (name, hashes of its servos and of all its numbers; of another robot than ``nominal`` also its
+    ``description``, every number of it), control_period, episode_length, observation (one entry per number, in order: name,
+    source, element, unit, frame, offset, scale, limit, lag, device), observer (settings of the slip observer; None where no
+    term needs it), latency, action (one entry per number: joint, quantity, unit, centre, scale, low, high), commands and
+    randomization.
     """
     config = task.config
     return {
         "task": config.name,
-        "robot": {"name": task.robot.name, "servo": servo_hash(task.robot), "hash": robot_hash(task.robot)},
+        "robot": _contract_robot(task.robot),
         "control_period": config.control_period,
         "episode_length": config.episode_length,
         "observation": [_contract_column(column) for column in task.policy],
@@ -210,6 +238,11 @@ def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
         },
         "randomization": randomization,
     }
+
+
+def _contract_robot(robot: Robot) -> dict[str, Any]:
+    known: dict[str, Any] = {"name": robot.name, "servo": servo_hash(robot), "hash": robot_hash(robot)}
+    return known if robot == load_robot() else known | {"description": robot_content(robot)}
 
 
 def _contract_column(column: ObservationColumn) -> dict[str, Any]:

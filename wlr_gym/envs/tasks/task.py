@@ -21,7 +21,7 @@ from wlr_gym.envs.tasks.terms import (
     TERMINATIONS,
     ObservationTerm,
 )
-from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
+from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, RobotSource, load_robot
 
 
 @dataclass(frozen=True)
@@ -125,9 +125,12 @@ class Task:
         return max(1, round(self.config.episode_length / self.config.control_period))
 
 
-def load_task(source: str | Path | Mapping[str, Any], robot: Robot, overrides: Mapping[str, Any] | None = None) -> Task:
-    """Load a task for a robot; see :func:`read_task`."""
-    return build_task(read_task(source, overrides), robot)
+def load_task(
+    source: str | Path | Mapping[str, Any], robot: RobotSource | None = None, overrides: Mapping[str, Any] | None = None
+) -> Task:
+    """Load a task for a robot, its numbers scaled for it; see :func:`read_task`. None = the task's own robot."""
+    chosen = load_robot(read_task(source, overrides).robot if robot is None else robot)
+    return build_task(read_task(source, overrides, chosen), chosen)
 
 
 def build_task(config: TaskConfig, robot: Robot) -> Task:

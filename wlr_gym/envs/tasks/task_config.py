@@ -10,7 +10,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.paths import named_in
 from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_config
+from wlr_gym.envs.tasks.scaling import check_rule, scaled
 from wlr_gym.envs.tasks.signals import signals_of
 from wlr_gym.envs.tasks.terms import (
     COMMANDS,
@@ -22,6 +24,7 @@ from wlr_gym.envs.tasks.terms import (
     TERMINATIONS,
     ScalarTerm,
 )
+from wlr_gym.robot import Robot, load_robot
 
 #: Group of a task's data -> what its terms are called, and those there are.
 _TERMS: dict[str, tuple[str, Mapping[str, Any]]] = {
@@ -121,7 +124,8 @@ class TaskConfig(SettingsModel):
 
     An episode is a success when no termination term ended it and every measure named in ``success`` stays within its limits.
     ``summary`` opens the environment's documentation, ``history`` closes it: version of the id -> what changed. The last
-    version is the present one.
+    version is the present one. ``robot`` is the one that the numbers are written for; ``scaling`` says how they follow another:
+    place of a number -> rule, see :mod:`wlr_gym.envs.tasks.scaling`.
     """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
@@ -142,19 +146,25 @@ class TaskConfig(SettingsModel):
     measures: dict[str, dict[str, float]] = Field(default={})
     success: dict[str, SuccessConfig] = Field(default={})
     curriculum: CurriculumConfig = CurriculumConfig()
+    scaling: dict[str, str] = Field(default={})
 
 
-def read_task(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> TaskConfig:
+def read_task(
+    source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None, robot: Robot | None = None
+) -> TaskConfig:
     """Read a task and check every name and number in it.
 
     Args:
         source: name in ``configs/task/``, path of a YAML file, or a mapping with the same keys.
         overrides: nested mapping laid over it; a term set to None is removed, if it is there.
+        robot: that the numbers of the file are scaled for; overrides hold as they are given. None = as they are written.
 
     Raises:
         InputError: unknown or wrong key, term, parameter or value, with the nearest valid name.
     """
     data, where = _task_data(source)
+    if robot is not None:
+        data = _for_robot(data, (overrides or {}).get("scaling"), robot, where)
     if overrides:
         where = f"{where} with overrides"
         _check_names(overrides, where)
@@ -169,7 +179,19 @@ def read_task(source: str | Path | Mapping[str, Any], overrides: Mapping[str, An
         if name not in config.measures:
             raise unknown_name("measure", name, config.measures, f"{where}: success")
     _check_commands(config, where)
+    for place, rule in config.scaling.items():
+        check_rule(place, rule, where)
     return config
+
+
+def _for_robot(data: Any, changed_rules: Any, robot: Robot, where: str) -> Any:
+    """Return a task file's content with its numbers for ``robot``, by its rules and those laid over them."""
+    written = parse_config(TaskConfig, data, where)
+    rules = overlay(written.scaling, changed_rules if isinstance(changed_rules, Mapping) else {})
+    for place, rule in rules.items():
+        check_rule(place, rule, where)
+    reference = load_robot(named_in(where, written.robot))
+    return scaled(data, rules, robot, reference, where)
 
 
 def _task_data(source: Any) -> tuple[Any, str]:

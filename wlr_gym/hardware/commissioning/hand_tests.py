@@ -43,7 +43,7 @@ def _sign(stand: Stand, person: Person, joint: str) -> int:
         before = _counts(stand)
         person.turn(joint, _LEG_TURN if joint in LEGS else _WHEEL_TURN)
         try:
-            return find_sign(joint, before, _counts(stand))
+            return find_sign(joint, before, _counts(stand), stand.servos.table(joint).counts.turn)
         except InputError as error:
             reason = str(error)
     raise TroubleError(reason)

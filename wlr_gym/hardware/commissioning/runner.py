@@ -172,7 +172,7 @@ class Commissioning:
         if not table:
             return ""
         try:
-            return write_run(next_run(self._folder, ".csv"), table, self._meta).name
+            return write_run(next_run(self._folder, ".csv"), table, self._meta, robot=self._robot).name
         except InputError:
             return ""
 

@@ -39,8 +39,6 @@ LARGEST_LEAN, LEAN_SPEED = 0.12, 0.5
 LOW_PWM = 0.2
 #: Part of the stall torque above which a motor that should turn freely is blocked, and rows in a row.
 BLOCKED, BLOCKED_ROWS = 0.4, 3
-#: Counts of the whole supply.
-_FULL_PWM = 885
 #: Times to switch off servos that do not confirm it, and s between them.
 _OFF_TRIES, _OFF_PAUSE = 20, 0.05
 #: s beyond its waits that a stand is busy between two signs of life; and while it switches off.
@@ -282,14 +280,16 @@ class Stand:
 
     def weaken(self, wheel: str) -> float:
         """Let a motor have a small part of the supply only; return the part."""
-        count = round(LOW_PWM * _FULL_PWM)
+        full = self.servos.table(wheel).counts.full_pwm
+        count = round(LOW_PWM * full)
         self.servos.set(wheel, "goal_pwm", count)
-        return count / _FULL_PWM
+        return count / full
 
     def pwm(self) -> Array:
         """Return the part of the supply on each motor (8,), -1 to 1 in the joints' directions; NaN without an answer."""
         counts = self.servos.get_all("present_pwm")
-        return np.array([counts.get(joint, np.nan) * self.hardware.joints[joint].sign / _FULL_PWM for joint in JOINTS])
+        found = np.array([counts.get(joint, np.nan) for joint in JOINTS], np.float64)
+        return self.servos.joint_map.voltage_share(found)
 
     def load(self, effort: Array) -> Array:
         """Return efforts (..., 8) in N m as parts of the stall torque."""

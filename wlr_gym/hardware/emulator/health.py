@@ -37,20 +37,21 @@ class Health:
         """Forget how long the overload has lasted."""
         self._overload_time = 0.0
 
-    def advance(self, step: float, shaft: Shaft, limit: Callable[[str], int]) -> int:
+    def advance(self, step: float, shaft: Shaft, limit: Callable[[str], int], volt: float) -> int:
         """Let ``step`` seconds pass; return the bits of Hardware Error Status that hold now.
 
         Args:
             step: s.
             shaft: load and supply.
             limit: item name -> count.
+            volt: V per count of the supply.
         """
         load = abs(shaft.load)
         equilibrium = AMBIENT + HEATING * load * load
         self.temperature += step * ((equilibrium - self.temperature) / THERMAL_TIME + self.heating_rate)
         self._overload_time = self._overload_time + step if load > LARGEST_LOAD else 0.0
         error = 0
-        if not limit("min_voltage_limit") <= round(shaft.voltage * 10) <= limit("max_voltage_limit"):
+        if not limit("min_voltage_limit") <= round(shaft.voltage / volt) <= limit("max_voltage_limit"):
             error |= INPUT_VOLTAGE
         if self.temperature > limit("temperature_limit"):
             error |= OVERHEATING

@@ -14,6 +14,7 @@ from wlr_gym.hardware.emulator.coupling import PlantCoupling
 from wlr_gym.hardware.emulator.faults import Fault, FaultBoard, parse_fault
 from wlr_gym.hardware.emulator.line import BusLine, Emission, LineTiming
 from wlr_gym.hardware.emulator.servo import FIRMWARE, EmulatedServo
+from wlr_gym.hardware.fit import check_fit
 from wlr_gym.hardware.imu.frames import ImuFrame, encode_frame
 from wlr_gym.hardware.imu.reading import Conversion, Counts
 from wlr_gym.physics.plants import make_plant
@@ -91,6 +92,7 @@ class Machine:
         state: PlantState | None = None,
     ) -> None:
         self.options: MachineOptions = options or MachineOptions()
+        check_fit(robot, hardware)
         self.robot = robot
         self.hardware = hardware
         self.plant: Plant = plant or make_plant(self.options.backend, robot, 1, self.options.plant_options(), forces)
@@ -121,7 +123,8 @@ class Machine:
     def _make_servo(self, joint: str) -> EmulatedServo:
         bus = next(bus for bus in self.hardware.buses.values() if joint in bus.joints)
         ours = {"id": self.robot.dynamixel_ids[joint], "baud_rate": BAUD_RATES.index(bus.baud_rate), **bus.eeprom}
-        return EmulatedServo(joint, load_table(bus.model), {} if self.options.factory else ours, self.options.firmware)
+        table = load_table(bus.model).at(self.robot.servo.supply_voltage)
+        return EmulatedServo(joint, table, {} if self.options.factory else ours, self.options.firmware)
 
     @property
     def places(self) -> tuple[str, ...]:

@@ -10,15 +10,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from wlr_gym.hardware.dynamixel.tables import POSITION_MODE, PWM_MODE
-from wlr_gym.hardware.emulator.registers import EXTENDED_RANGE, Registers
+from wlr_gym.hardware.dynamixel.tables import POSITION_MODE, PWM_MODE, ControlTable
+from wlr_gym.hardware.emulator.registers import Registers
 
-#: Counts per turn.
-TURN = 4096
-#: Homing Offset that acts in position mode, counts.
-HOMING_IN_POSITION_MODE = 1024
-#: Goal PWM that is the whole supply, counts.
-FULL_PWM = 885
+#: Part of a turn by which Homing Offset acts in position mode.
+HOMING_IN_POSITION_MODE = 0.25
 
 
 @dataclass
@@ -103,7 +99,7 @@ class EncoderFrame:
     """From the encoder's frame to Present Position: direction, turns counted, Homing Offset.
 
     Args:
-        unit: rad per count.
+        table: of the servo.
 
     Attributes:
         direction: 1, or -1 where Drive Mode reverses it.
@@ -112,30 +108,31 @@ class EncoderFrame:
     #: Items that decide what Present Position counts from, and which way.
     ITEMS = ("drive_mode", "operating_mode", "homing_offset")
 
-    def __init__(self, unit: float) -> None:
+    def __init__(self, table: ControlTable) -> None:
         self.direction = 1
-        self._unit = unit
+        self._unit, self._turn = table.per_count("present_position"), table.counts.turn
+        self._homing_limits = round(HOMING_IN_POSITION_MODE * self._turn), table.extended_range
         self._homing = 0
         self._turns = 0
 
     def update(self, registers: Registers) -> None:
         """Take direction and offset from :attr:`ITEMS`."""
         in_position_mode = registers.get("operating_mode") == POSITION_MODE
-        limit = HOMING_IN_POSITION_MODE if in_position_mode else EXTENDED_RANGE
+        limit = self._homing_limits[0 if in_position_mode else 1]
         self.direction = -1 if registers.get("drive_mode") & 1 else 1
         self._homing = max(-limit, min(limit, registers.get("homing_offset")))
 
     def start_turn_count(self, position: float) -> None:
         """Present Position becomes the absolute angle within one turn (plus Homing Offset)."""
-        self._turns = self._raw_count(position) // TURN
+        self._turns = self._raw_count(position) // self._turn
 
     def count(self, position: float) -> int:
         """Return Present Position at a position (rad)."""
-        return self._raw_count(position) - TURN * self._turns + self._homing
+        return self._raw_count(position) - self._turn * self._turns + self._homing
 
     def position(self, count: int) -> float:
         """Return the position (rad) of a Goal Position."""
-        return self.direction * (count - self._homing + TURN * self._turns) * self._unit
+        return self.direction * (count - self._homing + self._turn * self._turns) * self._unit
 
     def _raw_count(self, position: float) -> int:
         return self.direction * round(position / self._unit)
@@ -155,7 +152,7 @@ def motor_drive(registers: Registers, frame: EncoderFrame, profile_start: float,
     goal = frame.position(get("goal_position"))
     velocity, acceleration = _profile(registers, abs(goal - profile_start))
     mode = get("operating_mode")
-    pwm = get("goal_pwm") / FULL_PWM
+    pwm = get("goal_pwm") / registers.table.counts.full_pwm
     has_current = "goal_current" in registers.table.items
     return MotorDrive(
         on=bool(get("torque_enable")) and is_powered,

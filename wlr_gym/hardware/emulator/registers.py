@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from wlr_gym.hardware.dynamixel.protocol import Error
 from wlr_gym.hardware.dynamixel.tables import POSITION_MODE, TABLE_SIZE, ControlTable, Item
 
-#: Turns that extended position mode allows, in counts.
-EXTENDED_RANGE = 1_048_575
 GOAL_REGISTERS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
 
 
@@ -137,7 +135,7 @@ class Registers:
         if item.name == "operating_mode":
             return Error.NONE if count in self.table.operating_modes else Error.DATA_RANGE
         if item.name == "goal_position" and self.get("operating_mode") != POSITION_MODE:
-            return Error.NONE if abs(count) <= EXTENDED_RANGE else Error.DATA_RANGE
+            return Error.NONE if abs(count) <= self.table.extended_range else Error.DATA_RANGE
         if not self._bound(item.low) <= count <= self._bound(item.high):
             return Error.DATA_LIMIT if isinstance(item.high, str) else Error.DATA_RANGE
         return Error.NONE

@@ -20,7 +20,7 @@ from wlr_gym.hardware.dynamixel.tables import (
     Item,
 )
 from wlr_gym.hardware.emulator.health import Health
-from wlr_gym.hardware.emulator.motion import FULL_PWM, EncoderFrame, MotorDrive, Shaft, ShaftEncoder, motor_drive
+from wlr_gym.hardware.emulator.motion import EncoderFrame, MotorDrive, Shaft, ShaftEncoder, motor_drive
 from wlr_gym.hardware.emulator.registers import GOAL_REGISTERS, Registers
 
 # Not in the e-manual: chosen.
@@ -58,12 +58,12 @@ class EmulatedServo:
         self.name = name
         self.table = table
         self.firmware = firmware
-        self.shaft: Shaft = Shaft()
+        self.shaft: Shaft = Shaft(voltage=table.supply)
         self.encoder: ShaftEncoder = ShaftEncoder()
         self.health: Health = Health()
         self.dead = False
         self._drive: MotorDrive | None = None
-        self._frame = EncoderFrame(table.per_count("present_position"))
+        self._frame = EncoderFrame(table)
         self.registers: Registers = Registers(table, self._make_present_values(), self._register_changed)
         self._get = self.registers.get
         self.set = self.registers.set
@@ -279,7 +279,7 @@ class EmulatedServo:
         limit = self._get("bus_watchdog")
         if limit > 0 and self._get("torque_enable") and self._since_packet > limit * _WATCHDOG_UNIT:
             self._watchdog_stop()
-        if error := self.health.advance(step, self.shaft, self._get):
+        if error := self.health.advance(step, self.shaft, self._get, self.table.counts.voltage):
             self.raise_error(error)
 
     def pause(self, duration: float) -> None:
@@ -311,17 +311,17 @@ class EmulatedServo:
     def _make_present_values(self) -> dict[str, Callable[[], int]]:
         """How to work out the items that the servo itself keeps up to date; done when they are read."""
         si, shaft = self.table.per_count, self.shaft
-        effort = "present_current" if "present_current" in self.table.items else "present_load"
-        speed = si("present_velocity")
+        effort, full_pwm = self.table.effort, self.table.counts.full_pwm
+        speed, volt = si("present_velocity"), self.table.counts.voltage
         return {
             "realtime_tick": lambda: int(self._clock * 1000 + 1e-6) % 32768,
-            "present_pwm": lambda: self._frame.direction * round(shaft.pwm * FULL_PWM),
+            "present_pwm": lambda: self._frame.direction * round(shaft.pwm * full_pwm),
             effort: lambda: self._frame.direction * shaft.effort,
             "present_velocity": lambda: self._frame.direction * round(shaft.velocity / speed),
             "present_position": lambda: self._frame.count(shaft.position),
             "velocity_trajectory": lambda: self._frame.direction * round(shaft.reference()[1] / speed),
             "position_trajectory": lambda: self._frame.count(shaft.reference()[0]),
-            "present_input_voltage": lambda: max(0, round(shaft.voltage * 10)),
+            "present_input_voltage": lambda: max(0, round(shaft.voltage / volt)),
             "present_temperature": lambda: round(self.health.temperature),
             "moving": lambda: int(abs(round(shaft.velocity / speed)) > self._get("moving_threshold")),
             "moving_status": self._moving_status,

@@ -144,10 +144,16 @@ def _check_servo(servos: Servos, robot: Robot, hardware: Hardware, joint: str) -
 def _check_state(servos: Servos, hardware: Hardware, bus: Bus, joint: str) -> Iterator[Check]:
     voltage = servos.get(joint, "present_input_voltage")
     low, high = expected_count(bus, "min_voltage_limit"), expected_count(bus, "max_voltage_limit")
-    low = max(low, math.ceil(10.0 * hardware.safety.low_voltage - 1e-9))  # below it the run would stop at once
+    volt = load_table(bus.model).counts.voltage
+    low = max(low, math.ceil(hardware.safety.low_voltage / volt - 1e-9))  # below it the run would stop at once
     remedy = "Charge the battery, or check supply and cables; power should be fed in on both sides of a long chain."
     yield Check(
-        joint, "supply", low <= voltage <= high, f"{voltage / 10:.1f} V", f"{low / 10:.1f} to {high / 10:.1f} V", remedy
+        joint,
+        "supply",
+        low <= voltage <= high,
+        f"{voltage * volt:.1f} V",
+        f"{low * volt:.1f} to {high * volt:.1f} V",
+        remedy,
     )
     temperature = servos.get(joint, "present_temperature")
     yield Check(joint, "temperature", temperature < WARM, f"{temperature} degC", f"below {WARM} degC", "Let it cool down.")

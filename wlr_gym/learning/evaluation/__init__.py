@@ -17,7 +17,7 @@ from wlr_gym.learning.evaluation.learning_curve import read_curve
 from wlr_gym.learning.evaluation.metrics import Metric, Played, metrics_of, summarise
 from wlr_gym.learning.evaluation.rollout import Measure, Rollout, make_core, measures_of, roll_out, start_episodes
 from wlr_gym.learning.evaluation.statistics import Estimate
-from wlr_gym.learning.evaluation.subjects import Subject, identity, make_player, read_subjects
+from wlr_gym.learning.evaluation.subjects import Subject, common_robot, identity, make_player, read_subjects
 from wlr_gym.learning.evaluation.sweeps import Sweep, read_sweep, sweeps_for
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "Rollout",
     "Subject",
     "Sweep",
+    "common_robot",
     "comparison_rows",
     "identity",
     "make_core",

@@ -94,11 +94,7 @@ class EpisodeRecorder:
             formulas=[effect.content() for effect in core.patch.effects if effect.name not in EFFECTS],
             start=self._start,
         )
-        return write_run(path, table, RunMeta(robot=self._robot(), profile=self._profile(), notes=notes), simulation)
-
-    def _robot(self) -> str:
-        given = self.core.settings.robot
-        return str(Path(given).resolve()) if isinstance(given, str | Path) and Path(given).suffix else self.core.task.robot.name
+        return write_run(path, table, RunMeta(profile=self._profile(), notes=notes), simulation, core.task.robot)
 
     def _profile(self) -> Profile:
         parameters = Parameters(self._parameters[None])

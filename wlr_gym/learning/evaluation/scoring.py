@@ -13,10 +13,11 @@ from wlr_gym.envs.tasks.describe import contract
 from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card
 from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, play, work
 from wlr_gym.learning.evaluation.rollout import Rollout
-from wlr_gym.learning.evaluation.subjects import Source, Subject, identity, read_subjects
+from wlr_gym.learning.evaluation.subjects import Source, Subject, common_robot, identity, read_subjects
 from wlr_gym.learning.evaluation.sweeps import read_sweep
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.policy import make_policy, trained_environment
+from wlr_gym.robot import RobotSource, load_robot, robot_hash
 
 BACKENDS = ("gibbs_appell", "mujoco")
 #: What a policy is compared with where nothing is chosen, as far as it fits the task.
@@ -62,8 +63,9 @@ def evaluate(
         other_episodes: in the second simulator.
         sweeps: names of sweeps (:func:`wlr_gym.learning.evaluation.sweeps_for` lists those that suit a task).
         sweep_episodes: per point of a sweep.
-        randomization, robot, effects, threads: of the environment; see
-            :class:`wlr_gym.envs.settings.EnvironmentOptions`. None = the task's.
+        randomization, effects, threads: of the environment; see :class:`wlr_gym.envs.settings.EnvironmentOptions`. None = the
+            task's.
+        robot: that all drive; None = the one that the first trained policy was made for, else the task's.
         tell: called with what is being played and the share that was done since, of 1.
         watch: called with the episodes of every block once they were played.
 
@@ -85,9 +87,10 @@ def evaluate(
     task = task_name_of(environment)
     patch = load_patch(effects)
     main, *others = BACKENDS if backend == "both" else (backend,)
+    subjects = read_subjects([policy, *(fitting_baselines(environment) if baselines is None else baselines)])
+    robot = common_robot(subjects) if robot is None else robot
     keywords: dict[str, Any] = {"randomization": randomization, "robot": robot, "effects": patch}
     keywords |= {"backend": main, "threads": threads}
-    subjects = read_subjects([policy, *(fitting_baselines(environment) if baselines is None else baselines)])
     chosen = tuple(read_sweep(name, task) for name in dict.fromkeys(sweeps))
     conditions = [Condition(MAIN, keywords, episodes=episodes, blocks=seeds)]
     for sweep in chosen:
@@ -98,7 +101,7 @@ def evaluate(
     results = play(environment, subjects, conditions, seed, lambda text, done: tell(text, done / total), watch)
     said = {
         "environment": environment, "backend": main, "episodes": f"{episodes} x {seeds} seeds", "first seed": seed,
-        "randomization": randomization or "the task's", "robot": robot or "the task's", "effects": patch.summary(),
+        "randomization": randomization or "the task's", "robot": _named(robot), "effects": patch.summary(),
     }  # fmt: skip
     training_seeds = {subject.name: subject.seeds for subject in subjects if subject.seeds}
     if training_seeds:
@@ -107,6 +110,14 @@ def evaluate(
         said |= {"second simulator": f"{others[0]}, {fewer} episodes"}
     said |= {"sweeps": f"{sweep_episodes} episodes per point"} if chosen else {}
     return Card(results, chosen, said, {subject.name: identity(subject) for subject in subjects}, training_seeds)
+
+
+def _named(robot: RobotSource | None) -> str:
+    """Return a robot's name and fingerprint."""
+    if robot is None:
+        return "the task's"
+    loaded = load_robot(robot)
+    return f"{loaded.name}, {robot_hash(loaded)}"
 
 
 def fitting_baselines(environment: str, names: Sequence[str] = BASELINES) -> tuple[str, ...]:

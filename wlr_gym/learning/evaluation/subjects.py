@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.settings import merge_changes
 from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.learning.evaluation.training_seeds import by_seed, common_name, expand
-from wlr_gym.policy import agent_names, find_policy, load_agent_config, make_policy, policy_environment
+from wlr_gym.policy import agent_names, environment_for, find_policy, load_agent_config, make_policy, policy_environment
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
@@ -99,16 +98,22 @@ def _identity(source: str) -> str:
     return digest.hexdigest()
 
 
+def common_robot(subjects: Sequence[Subject]) -> Any:
+    """Return the robot that all subjects drive, by content: that of the first trained policy with one; None = the task's own.
+
+    Agents drive any robot, and a policy of another robot than the others' is refused by its contract.
+    """
+    sources = [source for subject in subjects for source in subject.sources if source not in agent_names()]
+    return next((robot for source in sources if (robot := policy_environment(source).get("robot")) is not None), None)
+
+
 def make_player(environment: str, source: str | Path, episodes: int, keywords: Mapping[str, Any]) -> tuple[Core, Policy]:
     """Return a core that feeds a policy what it was trained on, under the conditions of ``keywords``, and the policy.
 
     Raises:
         InputError: unknown environment, policy or keyword, or a policy that does not fit the environment.
     """
-    own = dict(policy_environment(source))
-    if isinstance(own.get("task"), Mapping) and isinstance(keywords.get("task"), Mapping):
-        own["task"] = merge_changes(keywords["task"], own["task"])
-    core = make_core(environment, episodes, {**keywords, **own})
+    core = make_core(environment, episodes, environment_for(source, keywords))
     try:
         return core, make_policy(source, core.contract())
     except BaseException:

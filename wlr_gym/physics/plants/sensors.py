@@ -21,7 +21,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import normals4, stream_number, words4
 from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Channel, Layout, PlantOptions
-from wlr_gym.physics.servo import REGISTER_UNITS, effort_counts
+from wlr_gym.physics.servo import effort_counts
 from wlr_gym.robot import FIRST_WHEEL, JOINTS, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameter_table import SPECS, XYZ
 from wlr_gym.robot.parameters import Parameters
@@ -330,7 +330,7 @@ def _settings(robot: Robot, options: PlantOptions) -> Array:
     settings[_NOISY] = 1.0
     settings[_POSITION_COUNT] = sensors.encoder.position
     settings[_VELOCITY_COUNT] = sensors.encoder.velocity
-    settings[_VOLT_COUNT] = REGISTER_UNITS["XM540-W150-R"]["voltage"].per_count
+    settings[_VOLT_COUNT] = sensors.volt_count
     settings[_EFFORT_COUNTS : _EFFORT_COUNTS + len(JOINTS)] = effort_counts(robot)
     settings[_VOLT_NOISE] = sensors.volt_noise
     settings[_GYRO_NOISE] = sensors.imu.gyro_noise

@@ -90,11 +90,11 @@ def _told(drivers: tuple[str, ...]) -> str:
 def _deploy(demo: Demo, patch: Any, seed: int) -> None:
     from wlr_gym.hardware.deployment import deploy
     from wlr_gym.learning.evaluation import make_core
-    from wlr_gym.policy import make_policy, policy_environment
+    from wlr_gym.policy import environment_for, make_policy
 
     hardware = {"emulated": True, "log": demo.measured, "effects": patch}
     keywords = {"backend": "dynamixel", "robot": "nominal", "hardware": hardware, "episode_length": demo.run_seconds}
-    core = make_core(ENVIRONMENT, 1, keywords | policy_environment(POLICY))
+    core = make_core(ENVIRONMENT, 1, environment_for(POLICY, keywords))
     try:
         ended = deploy(core, make_policy(POLICY, core.contract()), seed)
     finally:

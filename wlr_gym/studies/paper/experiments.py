@@ -20,12 +20,12 @@ from wlr_gym.data.excitations import Motion
 from wlr_gym.data.format import Profile, RunMeta
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.run_states import standing_at
+from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.physics.plants import REAL, SIMULATORS, check_backend, make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, Sensors
 from wlr_gym.physics.plants.forces import Force
 from wlr_gym.physics.plants.robot_options import RobotOptions
 from wlr_gym.physics.plants.sensors import rotation
-from wlr_gym.physics.servo import from_register
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import no_slip_error
@@ -39,9 +39,9 @@ WHEEL_ACCELERATION_COUNTS = 1
 LEG_SPEED_COUNTS = 15
 TURNS = 4
 #: rad/s, rad/s2, rad/s.
-WHEEL_SPEED = from_register("XL430-W250-T", "profile_velocity", WHEEL_SPEED_COUNTS)
-WHEEL_ACCELERATION = from_register("XL430-W250-T", "profile_acceleration", WHEEL_ACCELERATION_COUNTS)
-LEG_SPEED = from_register("XM540-W150-R", "profile_velocity", LEG_SPEED_COUNTS)
+WHEEL_SPEED = load_table("XL430-W250-T").per_count("profile_velocity") * WHEEL_SPEED_COUNTS
+WHEEL_ACCELERATION = load_table("XL430-W250-T").per_count("profile_acceleration") * WHEEL_ACCELERATION_COUNTS
+LEG_SPEED = load_table("XM540-W150-R").per_count("profile_velocity") * LEG_SPEED_COUNTS
 PROFILE = Profile(wheel_acceleration=WHEEL_ACCELERATION, leg_velocity=LEG_SPEED, leg_acceleration=0.0)
 #: s per tick; s of rest before the commands, in which the robot settles on its gears, and after the wheels stopped.
 PERIOD = 0.02
