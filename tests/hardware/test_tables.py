@@ -4,6 +4,7 @@ import importlib.util
 import math
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -240,7 +241,7 @@ def test_an_emulated_servo_counts_as_its_file_says(tmp_path):
 
 def test_counts_of_a_robot_are_those_of_its_servos(tmp_path):
     own_servo(tmp_path, counts={"turn": 16384, "full_pwm": 2009})
-    hardware = load_hardware().model_dump(mode="json") | {"robot": None}
+    hardware: dict[str, Any] = load_hardware().model_dump(mode="json") | {"robot": None}
     hardware["buses"]["legs"]["model"] = "mine.yaml"
     hardware["joints"]["leg_lf"]["zero"] = 8192
     (tmp_path / "hardware.yaml").write_text(yaml.safe_dump(hardware))

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -37,7 +38,7 @@ def policy(tmp_path):
     folder.mkdir(parents=True)
     settings = with_robot({"environment": {"task": TASK}, "yaw_rate_p": 3.0}, HEAVY)
     environment = contract(load_task("velocity", HEAVY, TASK), {})
-    pid = PidConfig(yaw_rate_p=3.0, environment=settings["environment"]).model_dump(mode="json")
+    pid = PidConfig.model_validate({"yaw_rate_p": 3.0, "environment": settings["environment"]}).model_dump(mode="json")
     write_contract(folder, "pid", pid, environment, {"environment": "WLR-Velocity-v0"})
     return folder.parent
 
@@ -81,7 +82,8 @@ def test_what_is_compared_drives_one_robot(policy):
 def test_controllers_take_the_environments_robot():
     environment = contract(load_task("velocity", HEAVY), {})
     assert known_robot(environment, None, "pid") == load_robot(HEAVY)
-    assert make_policy("pid", environment).chassis.robot == load_robot(HEAVY)
+    pid: Any = make_policy("pid", environment)
+    assert pid.chassis.robot == load_robot(HEAVY)
     with pytest.raises(InputError, match=r"agent 'pid': robot 'wlr-nominal' is not the environment's \('heavy'\)"):
         known_robot(environment, "nominal", "pid")
     old = copy.deepcopy(environment)
