@@ -171,7 +171,7 @@ def test_contract_names_the_task_robot_and_randomization(fake):
         ({"physics_step": 0.003}, "does not divide"),
         ({"episode_length": "20"}, "episode_length = '20': expected a time"),
         ({"physics_step": "a"}, "physics_step = 'a': expected a time"),
-        ({"robot": 3}, "robot = 3: expected a name, a path or a Robot"),
+        ({"robot": 3}, "robot = 3: expected a name, a path, a mapping or a Robot"),
         ({"threads": 1.5}, "threads = 1.5: expected a whole number"),
         ({"threads": True}, "threads = True: expected a whole number"),
         ({"backend": None}, "backend = None: expected a name"),

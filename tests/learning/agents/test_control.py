@@ -173,7 +173,7 @@ def test_an_observation_that_is_needed_is_named(contracts):
 
 def test_another_robot_is_refused(contracts):
     other = {**contracts["Velocity"], "robot": {"name": "other", "hash": "0"}}
-    with pytest.raises(InputError, match="robot 'nominal' is not the environment's"):
+    with pytest.raises(InputError, match="robot 'wlr-nominal' is not the environment's"):
         make_policy("pid", other)
 
 
