@@ -15,8 +15,8 @@ FLAGS = (
     "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--window-size=1280,720", "--remote-debugging-port=0",
 )  # fmt: skip
-#: s.
-PATIENCE = 60.0
+#: s: only a hang takes so long, however slow a picture without a graphics card is.
+PATIENCE = 300.0
 
 
 def chromium():
