@@ -1,5 +1,7 @@
 """A small sweep, trials that wait in mid-run, and how a trial is compared with the same training run alone."""
 
+import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,16 @@ SETTINGS: dict[str, Any] = {
 def checkpoints(out: Path) -> set[Path]:
     """Return the checkpoints of all trials of a sweep."""
     return set(out.glob("trials/*/checkpoints/step_*"))
+
+
+def trials_at_work(hold: Path) -> int:
+    """Return how many processes of trials that know the file ``hold`` there are on this machine (Linux)."""
+    found = 0
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has just ended
+            is_trial = b"wlr_gym.learning.sweep.trial" in (process / "cmdline").read_bytes()
+            found += is_trial and os.fsencode(hold) in (process / "environ").read_bytes()
+    return found
 
 
 def weights(folder: Path) -> dict[str, Any]:
