@@ -153,18 +153,28 @@ def compile_scores(task: Task) -> TermKernel:
     stores |= {f"term.{name}": f"terms[{k}]" for k, name in enumerate(task.rewards)}
     stores |= {f"measure.{name}": f"measures[{k}]" for k, name in enumerate(task.measures)}
     outputs = expressions(task, Graph().input)
-    return _compile(task, "evaluation", outputs, stores, _SCORES_HEAD, _SCORES_TAIL)
+    written = {name: f"numbers_of({name}[i])" for name in ("terms", "over", "measures")} | {
+        "total": "numbers_of(total)",
+        "i": "i",
+    }
+    return _compile(task, "evaluation", outputs, stores, written, _SCORES_HEAD, _SCORES_TAIL)
 
 
 def compile_computed(task: Task) -> TermKernel:
     """Trace and compile the computed observations of a task."""
     outputs = computed_expressions(task, Graph().input)
     stores = {element: f"computed[{k}]" for k, element in enumerate(task.computed)}
-    return _compile(task, "computation", outputs, stores, _COMPUTED_HEAD, ())
+    return _compile(task, "computation", outputs, stores, {}, _COMPUTED_HEAD, ())
 
 
 def _compile(
-    task: Task, kind: str, outputs: Mapping[str, Value], stores: Mapping[str, str], head: Sequence[str], tail: Sequence[str]
+    task: Task,
+    kind: str,
+    outputs: Mapping[str, Value],
+    stores: Mapping[str, str],
+    written: Mapping[str, str],
+    head: Sequence[str],
+    tail: Sequence[str],
 ) -> TermKernel:
     columns = matrix_columns(task)
     numbers: dict[str, int] = {}
@@ -176,17 +186,15 @@ def _compile(
         return f"numbers[{numbers.setdefault(name, len(numbers))}]"
 
     lines = emit(outputs, load, lambda name, value: f"{stores[name]} = {value}", "")
-    block = straight_line_source("terms_of_robot", [*_ROWS, "total", "numbers", "i"], lines)
-    rows = ", ".join(f"numbers_of({name}[i])" for name in _ROWS)
-    call = f"        terms_of_robot({rows}, numbers_of(total), numbers_of(numbers), i)"
+    arguments = {name: f"numbers_of({name}[i])" for name in MATRICES} | {"numbers": "numbers_of(numbers)"} | dict(written)
+    block = straight_line_source("terms_of_robot", list(arguments), lines)
+    call = f"        terms_of_robot({', '.join(arguments.values())})"
     source = "\n".join([*block, "", _DECORATOR, *head, call, *tail, ""])
     name = task.config.name
     module = load_module(f"{kind}_{name}", source, f"wlr_gym: compiling the {kind} of task '{name}' (once)")
     return TermKernel(module.run, np.array([number(task, name) for name in numbers], dtype=np.float64))
 
 
-#: Matrices that have a row per robot in a kernel; of a row that no term reads nothing is asked.
-_ROWS = (*MATRICES, "terms", "over", "measures")
 _DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
 _UNPACK = f"    {', '.join(MATRICES)} = signals"
 _SCORES_HEAD = (
@@ -215,8 +223,6 @@ _SCORES_TAIL = (
 _COMPUTED_HEAD = (
     "def run(active, signals, numbers):",
     _UNPACK,
-    "    terms = over = measures = computed",
-    "    total = numbers",
     "    for i in range(computed.shape[0]):",
     "        if not active[i]:",
     "            continue",

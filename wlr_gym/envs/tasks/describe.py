@@ -7,7 +7,7 @@ from typing import Any
 
 from wlr_gym.envs.tasks.entries import AreaConfig, EventConfig
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
-from wlr_gym.envs.tasks.scaling import QUANTITIES, scaled_numbers
+from wlr_gym.envs.tasks.scaling import QUANTITIES, quantities_of, scaled_numbers
 from wlr_gym.envs.tasks.task import ObservationColumn, Task
 from wlr_gym.envs.tasks.task_config import TaskConfig
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
@@ -195,7 +195,8 @@ def describe_scaling(written: TaskConfig, robot: Robot) -> str:
         (number.place, number.rule, _numbers(number.before), _numbers(number.after))
         for number in scaled_numbers(written.model_dump(), written.scaling, robot, reference)
     ]
-    used = [name for name in QUANTITIES if any(name in rule.replace("*", " ").split() for rule in written.scaling.values())]
+    asked = set[str]().union(*map(quantities_of, written.scaling.values()))
+    used = [name for name in QUANTITIES if name in asked]
     quantities = [
         (name, QUANTITIES[name].unit, *(f"{QUANTITIES[name].of(one):.4g}" for one in (reference, robot)), QUANTITIES[name].doc)
         for name in used

@@ -37,11 +37,13 @@ def _drive(robot: Robot) -> float:
     return 4.0 * robot.servo.wheel.stall_torque / (robot.wheel.radius * robot.total_mass)
 
 
+def _top_speed(robot: Robot) -> float:
+    return robot.servo.wheel.no_load_speed * robot.wheel.radius
+
+
 QUANTITIES: dict[str, RobotQuantity] = {
     "wheel_speed": RobotQuantity("rad/s", "no-load speed of the wheels", lambda r: r.servo.wheel.no_load_speed),
-    "top_speed": RobotQuantity(
-        "m/s", "no-load speed times wheel radius", lambda r: r.servo.wheel.no_load_speed * r.wheel.radius
-    ),
+    "top_speed": RobotQuantity("m/s", "no-load speed times wheel radius", _top_speed),
     "leg_speed": RobotQuantity("rad/s", "no-load speed of the legs", lambda r: r.servo.leg.no_load_speed),
     "leg_torque": RobotQuantity("N m", "stall torque of the legs", lambda r: r.servo.leg.stall_torque),
     "wheel_torque": RobotQuantity("N m", "stall torque of the wheels", lambda r: r.servo.wheel.stall_torque),
@@ -55,9 +57,7 @@ QUANTITIES: dict[str, RobotQuantity] = {
         lambda r: min(r.ground.mu_x * r.gravity, _drive(r)),
     ),
     "weight": RobotQuantity("N", "mass times gravity", lambda r: r.total_mass * r.gravity),
-    "power": RobotQuantity(
-        "W", "weight times top speed", lambda r: r.total_mass * r.gravity * r.servo.wheel.no_load_speed * r.wheel.radius
-    ),
+    "power": RobotQuantity("W", "weight times top speed", lambda r: r.total_mass * r.gravity * _top_speed(r)),
 }
 
 
@@ -99,6 +99,11 @@ def _factors(place: str, rule: str, where: str) -> dict[str, int]:
     for name, sign in zip(names, ["*", *signs], strict=True):
         exponents[name] = exponents.get(name, 0) + (1 if sign == "*" else -1)
     return exponents
+
+
+def quantities_of(rule: str) -> set[str]:
+    """Return the names of the quantities that a checked rule goes by."""
+    return set(_factors("", rule, "")) & set(QUANTITIES)
 
 
 def ratio(rule: str, robot: Robot, reference: Robot) -> float:
