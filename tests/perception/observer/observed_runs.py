@@ -84,13 +84,15 @@ def climbing_setpoints(robot: Robot, ticks: int, count: int, rng: np.random.Gene
     return setpoints
 
 
+#: Floors that no task has: friction drawn anew, all over the floor, every 1.5 to 3 s.
+FLOORS = {"changing": {"name": "changing", "base": "slippery", "events": {"floor_friction": {"when": "interval", "interval": [1.5, 3.0]}}}}
 DRIVES = {"climb": climbing_setpoints, "commands": commanded_setpoints, "excitation": excited_setpoints}
 
 
 def simulate(backend: str, floor: str, drive: str, count: int, seconds: float, seed: int = 0, **parameters: float) -> Runs:
     """Drive ``count`` robots drawn from a randomisation; ``parameters``: elements set after it, '.' written as '__'."""
     robot = load_robot("nominal")
-    randomization = load_randomization(floor, robot)
+    randomization = load_randomization(FLOORS.get(floor, floor), robot)
     plant = make_plant(backend, robot, count, PlantOptions(control_period=PERIOD))
     ticks, seeds = round(seconds / PERIOD), spawn_seeds(seed, count, "observed")
     occurrences = np.zeros((count, len(randomization.intervals)), np.int64)
@@ -117,6 +119,22 @@ def simulate(backend: str, floor: str, drive: str, count: int, seconds: float, s
             plant.set_parameters(draw(tick + 1))
     plant.close()
     return Runs(robot, np.array(sensors), np.array(truth))
+
+
+def play(policy: str, floor: str, count: int, seconds: float, seed: int = 0, backend: str = "gibbs_appell") -> Runs:
+    """Let a shipped policy drive ``count`` robots drawn from a randomisation; it sees what its task has it see."""
+    from wlr_gym.learning.evaluation.rollout import start_episodes
+    from wlr_gym.learning.evaluation.subjects import make_player
+
+    core, agent = make_player("WLR-Velocity-v0", policy, count, {"randomization": floor, "backend": backend})
+    start_episodes(core, agent, 1000 * seed)
+    sensors, truth = [core.sensors.values.copy()], [core.plant.truth().values.copy()]
+    for _ in range(round(seconds / PERIOD)):
+        core.step(agent.act(core.observation), core.everyone)
+        sensors.append(core.sensors.values.copy())
+        truth.append(core.plant.truth().values.copy())
+    core.close()
+    return Runs(load_robot("nominal"), np.array(sensors), np.array(truth))
 
 
 def observe(runs: Runs, camera: bool) -> Array:
