@@ -81,6 +81,12 @@ SENSOR_LAYOUT = Layout(
         Channel("imu_age", (), "s", "time since the IMU was read"),
         Channel("camera_age", (), "s", "time since the shown camera frame was exposed"),
         Channel("camera_is_new", (), "-", "1 when this tick delivered a new camera frame, else 0"),
+        Channel(
+            "flow", ("x", "y"), "rad/s", "turn of the floor below the flow sensor: v_x/h - w_y, v_y/h + w_x; last valid reading"
+        ),
+        Channel("flow_quality", (), "-", "surface quality of the flow sensor over its maximum; 0 = no valid reading"),
+        Channel("flow_age", (), "s", "time since the shown flow's interval ended"),
+        Channel("flow_is_new", (), "-", "1 when this tick delivered a new valid flow reading, else 0"),
     )
 )
 
