@@ -13,10 +13,12 @@ from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 
 #: Squared normalised innovation beyond which a frame is refused.
 GATE = 20.0
-#: s: refused frames that are all off by the same for so long say that the camera has been moved.
+#: s: refused frames that are off by the same for so long say that the camera has been moved.
 _PATIENCE = 0.25
+#: s: frames that steadily move away for so long say that the robot does, whatever wheels and IMU say.
+_LONG_PATIENCE = 0.5
 #: m, rad: what counts as the same.
-_SAME = 0.01
+_SAME = 0.006
 _SAME_YAW = 0.03
 #: s without a frame after which nothing is said about the last one.
 _SILENCE = 0.5
@@ -32,8 +34,8 @@ def see_camera(robot: Any, sensors: Any, r: Any) -> None:
 
     Frames come in two ways: as they are, and in the frame of a camera that has been moved (``r.anchor``). A frame that fits
     neither is refused. When frames have been off by the same for a while, it is the camera that has been moved: a robot does
-    not jump. The estimate then stays, and only motion is learned from the camera. A frame that repeats the last one to the
-    last bit is no new picture.
+    not jump. The estimate then stays, and only motion is learned from the camera. When they steadily move away, it is the
+    robot that slides. A frame that repeats the last one to the last bit is no new picture.
     """
     r.frame_time += robot.period
     x, y, yaw = sensors[_CAMERA], sensors[_CAMERA + 1], sensors[_CAMERA + 2]
@@ -114,15 +116,31 @@ def _believe(robot: Any, age: float, dx: float, dy: float, dyaw: float, r: Any) 
 def _refuse(
     x: float, y: float, yaw: float, then_x: float, then_y: float, then_yaw: float, dx: float, dy: float, dyaw: float, r: Any
 ) -> None:
-    """Count for how long frames have been off by the same; from then on they are seen from where the camera is now."""
-    same = abs(dx - r.off[0]) < _SAME and abs(dy - r.off[1]) < _SAME and abs(dyaw - r.off[2]) < _SAME_YAW
-    if r.refused == 0.0 or not same:
+    """Follow how refused frames are off: by the same, then the camera has been moved; or steadily moving away."""
+    if r.refused == 0.0:
+        r.first_off[0], r.first_off[1], r.first_off[2] = dx, dy, dyaw
         r.off[0], r.off[1], r.off[2] = dx, dy, dyaw
         r.refused = 1e-9
         return
+    before = r.refused
     r.refused += r.frame_time
-    if r.refused >= _PATIENCE:
+    ahead = r.frame_time / before if before > r.frame_time else 0.0
+    jump_x = dx - r.off[0] - ahead * (r.off[0] - r.first_off[0])
+    jump_y = dy - r.off[1] - ahead * (r.off[1] - r.first_off[1])
+    if abs(jump_x) > _SAME or abs(jump_y) > _SAME or abs(dyaw - r.off[2]) > _SAME_YAW:
+        r.refused = 0.0
+        return
+    r.off[0], r.off[1], r.off[2] = dx, dy, dyaw
+    moved = max(abs(dx - r.first_off[0]), abs(dy - r.first_off[1]))
+    if r.refused >= _PATIENCE and moved < _SAME:
         turned = then_yaw - yaw
         c, s = math.cos(turned), math.sin(turned)
         r.anchor[0], r.anchor[1], r.anchor[2] = then_x - c * x + s * y, then_y - s * x - c * y, turned
+        r.refused = 0.0
+    elif r.refused >= _LONG_PATIENCE:
+        for k in range(2):
+            p = r.covariance[k]
+            p[0, 0] += dx * dx + dy * dy
+            p[1, 1] += (moved / r.refused) ** 2
+        r.doubt = moved / r.refused
         r.refused = 0.0

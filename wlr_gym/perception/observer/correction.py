@@ -12,6 +12,10 @@ from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 
 #: m/s: noise of a wheel's rolling speed from step to step.
 _QUIET = 0.0005
+#: Squared normalised innovation beyond which what all wheels say counts for less: they have jumped away from the IMU.
+_GATE = 16.0
+#: s: how long the wheels are doubted once a camera has contradicted them and no longer does.
+_DOUBT = 3.0
 #: Relative error of one wheel's radius.
 RADIUS = 0.005
 #: m/s: slip below which a wheel counts as gripping.
@@ -35,9 +39,9 @@ def guess_velocity(r: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def see_rolling(r: Any) -> None:
+def see_rolling(robot: Any, r: Any) -> None:
     """Take in how the wheels roll, each as far as it is trusted: their weighted mean is a measurement of the velocity."""
-    speed = 0.0
+    speed, share = 0.0, 1.0 - robot.period / _DOUBT
     for i in range(4):
         speed += 0.25 * r.rolling[i, 0]
     for k in range(2):
@@ -46,8 +50,12 @@ def see_rolling(r: Any) -> None:
             lead = r.lead[i] if k == 0 else 0.0
             precision += r.trust[i, k]
             moment += r.trust[i, k] * (r.rolling[i, k] - r.velocity[k] - lead)
-        variance = 1.0 / precision + _QUIET**2 + (0.5 * RADIUS * speed) ** 2
-        correct(r, k, moment / precision, kalman.see_velocity(r.covariance[k], 0.0, r.column) + variance)
+        innovation = moment / precision
+        if abs(innovation) < 0.5 * r.doubt:
+            r.doubt *= share
+        variance = 1.0 / precision + _QUIET**2 + (0.5 * RADIUS * speed) ** 2 + r.doubt**2
+        total = kalman.see_velocity(r.covariance[k], 0.0, r.column) + variance
+        correct(r, k, innovation, max(total, innovation * innovation / _GATE))
 
 
 @njit(cache=True, nogil=True)

@@ -12,12 +12,14 @@ from wlr_gym.perception.observer.correction import correct
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 
 # What the sensor's scale and mounting are taken for, 1 sigma.
-SCALE = 0.05
+SCALE = 0.03
 ROTATION = 0.03
 #: Squared normalised innovation beyond which a reading is refused.
 GATE = 16.0
 #: s of refused readings, moving as the IMU says, after which it is the estimate that may be wrong.
 _PATIENCE = 0.5
+#: Readings in a row, the same to the last bit, after which the sensor counts as stuck.
+_REPEATS = 8.0
 #: s without a reading after which nothing is said about the last one.
 _SILENCE = 0.5
 #: m: shortest distance from lens to floor that is taken for one.
@@ -38,7 +40,8 @@ def see_flow(robot: Any, sensors: Any, r: Any) -> None:
         if r.flow_time > _SILENCE:
             r.flow_off = r.flow_rejected = r.flow_refused = 0.0
         return
-    repeated = x == r.reading[0] and y == r.reading[1]
+    r.repeats = r.repeats + 1.0 if x == r.reading[0] and y == r.reading[1] else 0.0
+    stuck = r.repeats >= _REPEATS
     r.reading[0], r.reading[1] = x, y
     mean_x, mean_y, height = _seen_velocity(robot, x, y, r)
     if height < _LEAST_HEIGHT:
@@ -47,17 +50,17 @@ def see_flow(robot: Any, sensors: Any, r: Any) -> None:
     poor = max(robot.flow_quality / max(r.seen[_QUALITY], 1e-3), 1.0)
     noise = (height * poor * robot.flow_noise) ** 2
     blur = (poor * robot.flow_speed_noise) ** 2
-    off = 0.0
+    off, ahead = 0.0, r.velocity[0] - age * r.kick[0]
     for k in range(2):
         mean = mean_x if k == 0 else mean_y
         r.flow_variance[k] = noise + blur * mean * mean
         r.flow_error[k] = mean - (r.velocity[k] - age * r.kick[k])
-        spread = kalman.see_flow(r.covariance[k], age, mean_x, r.column)
+        spread = kalman.see_flow(r.covariance[k], age, ahead, r.column)
         off = max(off, r.flow_error[k] ** 2 / (spread + r.flow_variance[k]))
     r.flow_off = math.sqrt(off)
-    if off > GATE:
-        r.flow_rejected = 1.0
-        r.flow_refused = 0.0 if repeated else r.flow_refused + min(r.flow_time, 2.0 * robot.period)
+    if off > GATE or stuck:
+        r.flow_rejected = 1.0 if off > 1.0 else 0.0
+        r.flow_refused = 0.0 if stuck else r.flow_refused + min(r.flow_time, 2.0 * robot.period)
         if r.flow_refused > _PATIENCE:
             for k in range(2):
                 r.covariance[k, 1, 1] += r.flow_error[k] ** 2
@@ -65,14 +68,14 @@ def see_flow(robot: Any, sensors: Any, r: Any) -> None:
     else:
         r.flow_rejected = r.flow_refused = 0.0
         for k in range(2):
-            total = kalman.see_flow(r.covariance[k], age, mean_x, r.column) + r.flow_variance[k]
+            total = kalman.see_flow(r.covariance[k], age, ahead, r.column) + r.flow_variance[k]
             correct(r, k, r.flow_error[k], total)
     r.flow_time = 0.0
 
 
 @njit(cache=True, nogil=True)
 def _seen_velocity(robot: Any, x: float, y: float, r: Any) -> Any:
-    """Return the velocity of the body origin along heading and left that a reading says, and the lens's distance to the floor."""
+    """Return the body origin's velocity along heading and left by a reading, and the lens's distance to the floor."""
     n, lens = r.normal, robot.lens
     floor, carried, rise = 0.0, 1e-12, 0.0
     for i in range(4):

@@ -1,7 +1,8 @@
 """Kalman filter of one horizontal direction: position, velocity, leak of the accelerometer, error of the flow sensor.
 
-x = (p, v, l, e): p' = v; v' = a - l with the measured acceleration a; l, what leaks into the accelerometer (bias, and gravity on a
-slope that is not known), a random walk; e, ahead the scale of the optical flow less 1, to the side its rotation. Covariances only: the means live in frames that turn, see ``prediction.py``.
+x = (p, v, l, e): p' = v; v' = a - l with the measured acceleration a; l, what leaks into the accelerometer (bias, and
+gravity on a slope that is not known), a random walk; e, ahead the scale of the optical flow less 1, to the side its
+rotation. Covariances only: the means live in frames that turn, see ``prediction.py``.
 """
 
 from __future__ import annotations

@@ -120,9 +120,9 @@ def spread(robot: Any, r: Any) -> None:
         square += 0.25 * r.seen[_LEG_RATE + i] ** 2
     r.legs = math.sqrt(square)
     # how bias and slope share what the accelerometer read at first is a guess, which shows as the robot turns
+    guess = (robot.leak_turn * r.guess * r.turned) ** 2
     r.inclined = min(1.0, (r.slope[0] ** 2 + r.slope[1] ** 2) / robot.accel_bias**2)
-    guess = robot.leak_turn * robot.accel_bias * r.turned
-    wander = (robot.leak_wander**2 + robot.leak_legs**2 * square) * dt + guess * guess * (0.3 + 0.7 * r.inclined)
+    wander = (robot.leak_wander**2 + robot.leak_legs**2 * square) * dt + guess
     shaken = (robot.alias * r.shaken) ** 2 + robot.velocity_legs**2 * square
     velocity_noise = dt * dt * (robot.accel_noise**2 + r.wander[0] * shaken)
     for k in range(2):

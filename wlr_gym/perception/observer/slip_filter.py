@@ -13,8 +13,8 @@ from typing import Any
 from numba import njit
 
 from wlr_gym.perception.observer import kalman
-from wlr_gym.perception.observer.contacts import LEAST_LOAD, carry, look, pull
 from wlr_gym.perception.observer.camera import see_camera
+from wlr_gym.perception.observer.contacts import LEAST_LOAD, carry, look, pull
 from wlr_gym.perception.observer.correction import RADIUS, guess_velocity, see_rest, see_rolling
 from wlr_gym.perception.observer.flow import ROTATION, SCALE, see_flow
 from wlr_gym.perception.observer.layout import ESTIMATE_LAYOUT
@@ -70,10 +70,11 @@ def _start(robot: Any, sensors: Any, r: Any) -> None:
     r.seen[_ACCEL + 2] = robot.gravity
     _take(sensors, r)
     r.tick = r.yaw = r.turned = r.gyro_bias = r.demand = r.shaken = r.legs = 0.0
-    r.camera_off = r.camera_rejected = r.refused = r.frame_time = 0.0
-    r.flow_off = r.flow_rejected = r.flow_refused = r.flow_time = 0.0
+    r.camera_off = r.camera_rejected = r.refused = r.frame_time = r.doubt = 0.0
+    r.flow_off = r.flow_rejected = r.flow_refused = r.flow_time = r.repeats = 0.0
     r.anchor[:] = 0.0
     r.off[:] = 0.0
+    r.first_off[:] = 0.0
     r.frame[:] = math.nan
     r.reading[:] = math.nan
     r.lens[:] = 0.0
@@ -93,6 +94,7 @@ def _start(robot: Any, sensors: Any, r: Any) -> None:
     r.traction[:] = 0.0
     carry(robot, r)
     r.covariance[:] = 0.0
+    r.guess = math.sqrt(r.force[0] ** 2 + r.force[1] ** 2)
     for k in range(2):
         total = r.force[k]
         bias = total / (1.0 + (total / (3.0 * robot.accel_bias)) ** 4)  # more than that is a slope
@@ -130,7 +132,7 @@ def _advance(robot: Any, sensors: Any, r: Any, work: Any) -> None:
         guess_velocity(r)
     gather(robot, r, work)
     judge(robot, r, work)
-    see_rolling(r)
+    see_rolling(robot, r)
     see_camera(robot, sensors, r)
     see_flow(robot, sensors, r)
     see_rest(robot, r)

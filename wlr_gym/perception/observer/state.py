@@ -18,7 +18,7 @@ _ROUNDING = 12.0**-0.5
 
 
 def constants(robot: Robot, period: float, camera: bool) -> NDArray[np.void]:
-    """Return the robot as its file describes it and its sensors' errors, one record (1,), with the learned weights of ``trust.py``.
+    """Return one record (1,): the robot as its file describes it, its sensors' errors, the learned weights of ``trust.py``.
 
     Args:
         period: s between two readings.
@@ -75,6 +75,7 @@ def state_type(history: int) -> np.dtype[Any]:
         "turned": (),  # over the step
         "velocity": (2,),
         "leak": (2,),  # of the accelerometer, m/s2
+        "guess": (),  # what the accelerometer read along the floor at first, m/s2
         "slope": (2,),  # gravity along the floor, m/s2
         "covariance": (2, kalman.SIZE, kalman.SIZE),
         "yaw_covariance": (3,),  # yaw, yaw with bias, bias
@@ -92,14 +93,17 @@ def state_type(history: int) -> np.dtype[Any]:
         "legs": (),  # rms rate of the legs, rad/s
         # camera and flow
         "anchor": (3,),  # pose of the camera's start frame in the start frame: it has been moved
+        "first_off": (3,),  # by how much the first of the refused frames in a row was off, start frame
         "off": (3,),  # by how much the last refused frame was off, start frame
         "refused": (),  # s over which frames have been off by the same
+        "doubt": (),  # m/s: the camera has contradicted the wheels by so much
         "frame": (3,),  # last frame's pose
         "camera_off": (),  # normalised innovation of the last frame, 0 when there has been none for a while
         "camera_rejected": (),
         "frame_time": (),  # s since the last frame
         "lens": (2,),  # true over measured flow less 1, and the flow sensor's rotation (rad)
         "reading": (2,),  # last flow reading
+        "repeats": (),  # readings that were the same as the last
         "flow_error": (2,),  # m/s
         "flow_variance": (2,),
         "flow_off": (),

@@ -2,9 +2,10 @@
 
 Every wheel has a memory of its own. It sees what the physics of contact says about its slip (by how much it rolls off the
 estimate, its traction over its load, their signs against each other and against the acceleration, jumps) and what its side's
-other wheel and all wheels remember. All of it stays the same when the robot is mirrored or turned round. It says with which precision
-(1/variance, along heading and left) the wheel's rolling counts as a measurement of the velocity, and by how much a wheel that
-pulls rolls ahead. Trained on simulated runs of the nominal robot with the filter's own likelihood: ``tests/perception/observer/train_trust.py``.
+other wheel and all wheels remember. All of it stays the same when the robot is mirrored or turned round. It says with which
+precision (1/variance, along heading and left) the wheel's rolling counts as a measurement of the velocity, and by how much a
+wheel that pulls rolls ahead. Trained on simulated runs of the nominal robot with the filter's own likelihood, by
+``tests/perception/observer/train_trust.py``.
 """
 
 from __future__ import annotations
@@ -103,8 +104,10 @@ def gather(robot: Any, r: Any, work: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def judge(robot: Any, r: Any, work: Any) -> None:
-    """Advance the wheels' memories by what they see; find ``r.trust`` (4, 2), precision of their rolling, s2/m2, ``r.lead`` (4,), by how
-    much each rolls ahead, m/s, and ``r.wander`` (2,), what the filter's noises are multiplied with in the next step.
+    """Advance the wheels' memories by what they see.
+
+    Finds ``r.trust`` (4, 2), precision of their rolling, s2/m2; ``r.lead`` (4,), by how much each rolls ahead, m/s; and
+    ``r.wander`` (2,), what the filter's noises of velocity and leak are multiplied with in the next step.
     """
     _share(robot, r, work)
     weights, seen, total, common = robot.gate, work.seen_by, work.sum, work.common
