@@ -57,10 +57,14 @@ def read_recordings(
     columns = None if wanted is None else wanted.get(TABLE, ())
     if (path / INFO).is_file():
         yield from read_lerobot(path, columns, tell)
-    elif path.suffix.lower() in (".csv", ".parquet"):
+    elif _is_table(path):
         yield read_table(path, columns, most, tell)
     else:
         yield _gathered(path, _reader(path), wanted, most, tell)
+
+
+def _is_table(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() in (".csv", ".parquet")
 
 
 def _reader(path: Path) -> Callable[..., Iterator[Message]]:
@@ -120,6 +124,6 @@ def first_messages(path: str | Path) -> Iterator[Message]:
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; expected {_KINDS}")
-    if path.suffix.lower() in (".csv", ".parquet") or (path / INFO).is_file():
+    if _is_table(path) or (path / INFO).is_file():
         return iter(())
     return _reader(path)(path, lambda topic: True, [], quiet)
