@@ -20,7 +20,7 @@ from foreign_logs import (
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import read_run
-from wlr_gym.data.logs import import_log, read_logs, suggest_map
+from wlr_gym.data.logs import import_log, suggest_map
 from wlr_gym.data.logs.messages import definition, make, typestore
 from wlr_gym.robot import JOINTS, LEGS
 
@@ -53,8 +53,9 @@ def check_right(imported, right):
 
 @pytest.mark.parametrize("write", [write_mcap, write_rosbag2, write_rosbag1])
 def test_a_bag_without_a_message_is_refused(tmp_path, write):
-    with pytest.raises(InputError, match=r"a.bag: no message that can be read"):
-        suggest_map(write(tmp_path / "a.bag" if write is not write_mcap else tmp_path / "a.bag.mcap", []))
+    """Whatever a folder is called: ``a.bag`` may be one of rosbag2."""
+    with pytest.raises(InputError, match=r"a.\w+: no message that can be read"):
+        suggest_map(write(tmp_path / ("a.mcap" if write is write_mcap else "a.bag"), []))
 
 
 def write_channels(path, messages):
@@ -146,7 +147,7 @@ def test_joints_without_names_are_no_servos_and_go_by_place(messages, right, tmp
     assert np.allclose(read_run(imported.path)["pos_leg_rf"], right["pos_leg_rf"])
 
 
-@pytest.mark.parametrize("namespace", ["/robot_1", "robot_1", "/robot_1/"])
+@pytest.mark.parametrize("namespace", ["/robot_1", "robot_1/"])
 def test_a_namespace_is_a_whole_word(messages, known, tmp_path, namespace):
     both = [
         (time, f"/robot_{robot}{topic}", kind, message)

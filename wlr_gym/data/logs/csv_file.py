@@ -66,7 +66,7 @@ def csv_frames(path: Path, notes: list[str], tell: Share) -> Iterator[tuple[pand
                 tell(min(file.tell() / size, 1.0))
         if before is not None and _is_cut(path, dialect):
             notes.append(f"the last row was cut off: left out (row {int(before.index[-1])})")
-            before = before[:-1]
+            before = before.iloc[:-1]
         if before is not None and len(before):
             yield before, dialect.decimal
     except (OSError, ValueError, pandas.errors.ParserError, pandas.errors.EmptyDataError) as error:

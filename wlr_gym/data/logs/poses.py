@@ -19,7 +19,7 @@ ANGLES = ("yaw", "pitch", "roll", "tilt")
 
 
 def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, where: str) -> tuple[Times, Array]:
-    """Return times (ns) and one angle (rad) of a quaternion: ``<its field>.yaw``, ``.pitch``, ``.roll``; ``.tilt`` is from upright.
+    """Return times (ns) and an angle (rad) of a quaternion: ``yaw``, ``pitch``, ``roll``, or ``tilt`` off upright.
 
     Lost frames, whose quaternion is no rotation, are left out.
 

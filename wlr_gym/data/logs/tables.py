@@ -139,7 +139,7 @@ class _Reading:
             row = known.index[int(np.argmin(known))]
             self.first_timeless = self.first_timeless or f"first row {row}: '{self.time}' is '{str(column[row])[:40]}'"
             self.timeless += int((~known).sum())
-            frame, column, found = frame[known], column[known], found[known]
+            frame, column, found = frame.loc[known], column[known], found[known]
         if self.step == _DATES:
             return frame, found.astype("datetime64[ns]").astype("int64").to_numpy()
         column = pandas.to_numeric(column)  # whole numbers stay whole
