@@ -139,7 +139,7 @@ def _length_unit(look: LogSignals, t: Array, x: Array, y: Array) -> str:
     vx, vy = smoothed(t, x)[2], smoothed(t, y)[2]
     speed = float(np.quantile(np.hypot(vx, vy), 0.95))
     units = FACTORS["m"]
-    return "m" if speed < 4.0 * fastest else "cm" if speed * units["cm"] > 0.3 * fastest else "mm"
+    return "m" if speed < 4.0 * fastest else "cm" if 0.3 * fastest < speed * units["cm"] < 2.0 * fastest else "mm"
 
 
 def _upright(look: LogSignals) -> None:
