@@ -36,8 +36,8 @@ class ImportOptions:
     out: Path | None = None
     """Folder for the runs; made if it is not there."""
     split: float | None = None
-    """Cut recordings into runs of about so many seconds, where the robot is quietest; default: only those of more than 600 s, or
-    of 2 million numbers."""
+    """Cut recordings into runs of about so many seconds, where the robot is quietest; default: only those of more than 600 s,
+    or of 2 million numbers."""
     robot: str | None = None
     """Robot file or config name; default: the one that the map's meta names, else the nominal one."""
     format: Literal["parquet", "csv"] = "parquet"

@@ -173,7 +173,7 @@ def test_read_logs_is_the_same_from_memory_and_from_disk(messages, tmp_path, req
     (other,) = read_logs(log)
     assert set(one.topics) == set(other.topics)
     for name, topic in one.topics.items():
-        assert np.array_equal(topic.stamped, other.topics[name].stamped)
+        assert np.array_equal(topic.clock("header"), other.topics[name].clock("header"))
         for field, (rows, values) in topic.fields.items():
             assert np.array_equal(rows, other.topics[name].fields[field][0])
             assert np.array_equal(values, other.topics[name].fields[field][1], equal_nan=True)

@@ -1,6 +1,7 @@
 """What Foxglove and PlotJuggler need of an exported file, by others' readers: mcap, rosbags and, where it is, mcap_ros2."""
 
 import xml.etree.ElementTree as ElementTree
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ def messages(path):
     found = {}
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
             store = get_typestore(Stores.EMPTY)
             store.register(get_types_from_msg(schema.data.decode(), schema.name))
             found.setdefault(channel.topic, []).append((message.log_time, store.deserialize_cdr(message.data, schema.name)))
@@ -93,19 +95,26 @@ def test_frames_make_one_tree_that_the_robots_links_are_in(messages):
     assert shown == {"floor"}
 
 
+def of(element, tag, name):
+    """Return an attribute of an element's child."""
+    child = element.find(tag)
+    assert child is not None
+    return str(child.get(name))
+
+
 def test_a_link_is_where_the_urdf_puts_it(messages, run):
     """By the origins and axes in the URDF itself: a joint's rotation about its axis, after its origin."""
     robot = ElementTree.fromstring(messages["/robot_description"][0][1].data)
-    joints = {one.find("child").get("link"): one for one in robot.findall("joint")}
+    joints = {of(one, "child", "link"): one for one in robot.findall("joint")}
     time, message = next(one for one in messages["/tf"][40:] if len(one[1].transforms) > 1)
     row = [at for at, _ in messages["/joint_states"]].index(time)
     moved = {one.child_frame_id: one for one in message.transforms}
     for joint in (*LEGS, *WHEELS):
         one, described = moved[f"{joint}_link"], joints[f"{joint}_link"]
-        assert described.find("axis").get("xyz") == "0 1 0"
-        assert described.find("parent").get("link") == one.header.frame_id
+        assert of(described, "axis", "xyz") == "0 1 0"
+        assert of(described, "parent", "link") == one.header.frame_id
         place = one.transform.translation
-        assert np.allclose([place.x, place.y, place.z], [float(v) for v in described.find("origin").get("xyz").split()])
+        assert np.allclose([place.x, place.y, place.z], [float(v) for v in of(described, "origin", "xyz").split()])
         turn, angle = one.transform.rotation, run[f"pos_{joint}"][row]
         assert 2 * np.arctan2(turn.y, turn.w) == pytest.approx(np.arctan2(np.sin(angle / 2), np.cos(angle / 2)) * 2)
     leg = moved["leg_lf_link"].transform.rotation
@@ -124,7 +133,7 @@ def test_rosbags_opens_the_bag_and_finds_all_topics(run, messages, tmp_path):
         }
         (connection,) = [one for one in reader.connections if one.topic == "/joint_states"]
         _, time, data = next(iter(reader.messages(connections=[connection])))
-        message = reader.deserialize(data, connection.msgtype)
+        message: Any = reader.deserialize(data, connection.msgtype)
         assert time == messages["/joint_states"][0][0]
         assert np.array_equal(message.position, messages["/joint_states"][0][1].position)
 

@@ -87,8 +87,8 @@ def import_log(
         map: what topics and fields mean: a map, what a map file says, or its path. None = the one in ``out``, else proposed; a
             run of ours needs none.
         robot: that the runs are of: name or file; None = as the map's ``meta`` says, else the nominal one.
-        split: s; a recording becomes runs of about this length, cut where the robot is quietest. None = one run, or several of a
-            recording that is longer than memory (:data:`wlr_gym.data.logs.parts.LONGEST`).
+        split: s; a recording becomes runs of about this length, cut where the robot is quietest. None = one run, of long
+            recordings several (:data:`wlr_gym.data.logs.parts.LONGEST`).
         suffix: format of the runs.
         tell: called with the share that was read.
 
