@@ -1,5 +1,6 @@
 """Logs that are longer than memory come in part by part: the rows of all parts are those of the log as a whole."""
 
+import copy
 import tracemalloc
 from contextlib import closing
 from pathlib import Path
@@ -12,6 +13,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data import read_run
 from wlr_gym.data.logs import LogMap, import_log, read_logs, suggest_map
 from wlr_gym.data.logs.map import resolve
+from wlr_gym.data.logs.messages import make
 from wlr_gym.data.logs.parts import runs_of
 from wlr_gym.data.logs.recording import Recording
 from wlr_gym.data.logs.rows import wanted_fields
@@ -54,7 +56,7 @@ def test_parts_are_the_whole(messages, known, tmp_path, request):
     shares = []
     parts = import_log(write_mcap(tmp_path / "b.mcap", messages), tmp_path / "parts", known, tell=shares.append)
     assert len(parts) == 4
-    assert parts[0].notes[0] == "cut into runs of about 4 s, where the robot is quietest"
+    assert parts[0].notes[0] == "cut into 4 parts, where the robot is quietest"
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     expected, found = rows_of_all([whole]), rows_of_all(parts)
@@ -103,13 +105,24 @@ def test_a_channel_that_is_silent_all_the_while_has_no_values_there(messages, kn
 
 def test_a_part_without_rows_is_left_out_and_said(messages, known, tmp_path, small):
     start = messages[0][0]
-    kept = [one for one in messages if one[1] != "/chassis/joints" or not 3.5 < (one[0] - start) * 1e-9 < 13.0]
+    kept = [one for one in messages if one[1] != "/chassis/target" or (one[0] - start) * 1e-9 > 13.0]
     parts = import_log(write_mcap(tmp_path / "a.mcap", kept), tmp_path / "runs", known)
-    notes = [note for one in parts for note in one.notes]
-    assert any("s on: no run: topic '/chassis/joints': 0 messages" in note for note in notes)
-    table = rows_of_all(parts)
-    assert table["t"][-1] > 15.0
-    assert not ((table["t"] > 3.6) & (table["t"] < 12.9)).any()
+    assert len(parts) == 1
+    assert any("s on: no run: setpoints and positions are never known together" in note for note in parts[0].notes)
+    assert read_run(parts[0].path)["t"][-1] == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_hole_and_a_stray_header_leave_the_parts_as_they_are(messages, known, tmp_path, small):
+    start = messages[0][0]
+    kept = copy.deepcopy([one for one in messages if not 3.5 < (one[0] - start) * 1e-9 < 9.0])
+    stray = next(message for _, topic, _, message in kept[200:] if topic == "/chassis/joints")
+    stray.header.stamp = make("builtin_interfaces/msg/Time", sec=0, nanosec=0)
+    parts = import_log(write_mcap(tmp_path / "a.mcap", kept), tmp_path / "runs", known)
+    assert len(parts) in (3, 4)
+    runs = [read_run(one.path) for one in parts]
+    assert sum(len(run["t"]) for run in runs) == pytest.approx(525, abs=5)
+    assert max(len(run["t"]) for run in runs) < 300
+    assert any("its times go back 1 times" in note for one in parts for note in one.notes)
 
 
 def test_split_cuts_parts_further_and_may_ask_for_longer_ones(messages, known, tmp_path, small):

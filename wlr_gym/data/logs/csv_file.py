@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pandas
 
 #: Rows that are read at a time.
-ROWS = 50_000
+ROWS = 8192
 #: First bytes of a file -> its encoding.
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"),

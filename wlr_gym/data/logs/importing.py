@@ -204,12 +204,14 @@ def _make_runs(
     for recording in read_recordings(log, wanted_fields(resolved), tell=progress.reading):
         with closing(recording):
             check_new(recording)
+            runs: list[ImportedRun] = []
             for made in runs_of(recording, found, resolved, split, progress.making):
                 number += 1
                 findings = _check(made, recording.name, resolved)
                 path = write_run(folder / f"{number}{suffix}", made.table)
                 write_samples(samples_of(path), made)
-                yield ImportedRun(path, recording.name, made.origin, made.facts, findings, (*recording.notes, *made.notes))
+                runs.append(ImportedRun(path, recording.name, made.origin, made.facts, findings, made.notes))
+            yield from (replace(one, notes=(*recording.notes, *one.notes)) for one in runs)
     tell(1.0)
 
 

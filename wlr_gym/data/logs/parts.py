@@ -32,7 +32,7 @@ def runs_of(
     """Yield the runs that a map makes of a recording.
 
     One, or of one that is longer than :data:`LONGEST`, or has more than :data:`NUMBERS`, several; with ``split``, runs of about
-    so many seconds, none of them across a hole.
+    so many seconds, none of them across a hole. What is to be said of all of them goes into the recording's notes.
 
     Raises:
         InputError: what :func:`wlr_gym.data.logs.rows.make_run` raises; parts without rows are left out, and said.
@@ -42,20 +42,20 @@ def runs_of(
     if len(edges) < 3:
         yield from _parts(make_run(recording.whole(), found, resolved), split)
         return
-    play, start, begin = round(_PLAY * (edges[1] - edges[0])), edges[0], edges[0]
-    notes, refused = [f"cut into runs of about {(edges[1] - start) * 1e-9:.0f} s, where the robot is quietest"], 0
+    recording.notes.append(f"cut into {len(edges) - 1} parts, where the robot is quietest")
+    start, begin, refused = edges[0], edges[0], 0
     for k, edge in enumerate(edges[1:], 1):
         here = f"{(begin - start) * 1e-9:.0f} s on: "
+        play = round(_PLAY * min(edge - edges[k - 1], edges[k + 1] - edge)) if k + 1 < len(edges) else 0
         try:
-            made, begin = _part_until(recording, found, resolved, (begin, edge), play if edge != edges[-1] else 0)
+            made, begin = _part_until(recording, found, resolved, (begin, edge), play)
         except NoRowsError as error:
             refused, begin = refused + 1, edge
             if refused == len(edges) - 1:
                 raise
-            notes.append(f"{here}no run: {str(error).partition(': ')[2]}")
+            recording.notes.append(f"{here}no run: {str(error).partition(': ')[2]}")
         else:
-            yield from _parts(replace(made, notes=(*notes, *(here + note for note in made.notes))), split)
-            notes = []
+            yield from _parts(replace(made, notes=tuple(here + note for note in made.notes)), split)
         tell(k / (len(edges) - 1))
 
 
@@ -79,11 +79,14 @@ def _edges(recording: Recording, found: LogMap, resolved: Mapping[str, Resolved]
     if rows not in recording:
         return []
     clock = found.use(rows)
-    first, last = (at + round(clock.offset * 1e9) for at in recording.span(rows, clock.use))
-    seconds = (last - first) * 1e-9
+    spans = recording.spans(rows, clock.use)
+    seconds = len(spans) * float(np.median([last - first for first, last in spans])) * 1e-9  # whatever a stray header says
     longest = max(min(LONGEST, seconds * NUMBERS / max(recording.numbers, 1)), split or 0.0)
-    count = math.ceil(seconds / longest) if longest > 0.0 else 1
-    return [first + round(k * (last - first) / count) for k in range(count)] + [last + 1]
+    count = min(math.ceil(seconds / longest), len(spans)) if longest > 0.0 else 1
+    begins = sorted({first for first, _ in spans})
+    inner = [begins[k * len(begins) // count] for k in range(1, count)]
+    edges = sorted({begins[0], *inner, max(last for _, last in spans) + 1})
+    return [edge + round(clock.offset * 1e9) for edge in edges]
 
 
 def _between(recording: Recording, found: LogMap, begin: int, end: int) -> Log:

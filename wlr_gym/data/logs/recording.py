@@ -81,10 +81,9 @@ class Recording:
         """Whether no message was kept."""
         return not self._blocks
 
-    def span(self, name: str, use: str) -> tuple[int, int]:
-        """Return when the messages of a topic begin and end, ns by ``header`` or ``log``."""
-        spans = [block.spans[self._clock(name, use)] for block in self._blocks[name]]
-        return min(first for first, _ in spans), max(last for _, last in spans)
+    def spans(self, name: str, use: str) -> list[tuple[int, int]]:
+        """Return when each block of a topic begins and ends, ns by ``header`` or ``log``."""
+        return [block.spans[self._clock(name, use)] for block in self._blocks[name]]
 
     def whole(self) -> Log:
         """Return all of it."""
