@@ -15,8 +15,8 @@ from wlr_gym.data.logs import LogMap, import_log, read_logs, suggest_map
 from wlr_gym.data.logs.map import resolve
 from wlr_gym.data.logs.messages import make
 from wlr_gym.data.logs.parts import runs_of
-from wlr_gym.data.logs.recording import Recording
 from wlr_gym.data.logs.rows import wanted_fields
+from wlr_gym.data.logs.topic_store import TopicStore
 from wlr_gym.data.logs.topics import Topic
 from wlr_gym.robot import WHEELS, load_robot
 
@@ -36,7 +36,7 @@ def small(monkeypatch):
     """As if memory were small: parts of about 4 s, blocks of some messages, all of them on disk."""
     monkeypatch.setattr("wlr_gym.data.logs.parts.NUMBERS", 12_000)
     monkeypatch.setattr("wlr_gym.data.logs.open.BLOCK", 40)
-    monkeypatch.setattr("wlr_gym.data.logs.recording.IN_MEMORY", 10_000)
+    monkeypatch.setattr("wlr_gym.data.logs.topic_store.IN_MEMORY", 10_000)
 
 
 def rows_of_all(imported):
@@ -163,7 +163,7 @@ def test_memory_does_not_grow_with_length(small, known, monkeypatch):
     def peak(blocks):
         tracemalloc.start()
         try:
-            with closing(Recording(Path("a"))) as recording:
+            with closing(TopicStore(Path("a"))) as recording:
                 for k in range(blocks):
                     times = np.array([ns(0.02 * (500 * k + row)) for row in range(500)])
                     for name, names in fields.items():

@@ -24,9 +24,9 @@ from wlr_gym.data.logs.map import LogMap, Resolved, map_text, read_map, resolve
 from wlr_gym.data.logs.messages import RUN
 from wlr_gym.data.logs.open import first_messages, quiet, read_logs, read_recordings
 from wlr_gym.data.logs.parts import runs_of, write_samples
-from wlr_gym.data.logs.recording import Recording
 from wlr_gym.data.logs.rows import ChannelFact, MadeRun, wanted_fields
 from wlr_gym.data.logs.suggest import MOST, Proposal, propose
+from wlr_gym.data.logs.topic_store import TopicStore
 from wlr_gym.data.logs.topics import Log, Share
 from wlr_gym.data.record import next_run
 from wlr_gym.data.write import check_meta, write_meta, write_run
@@ -195,7 +195,7 @@ def _make_runs(
     split: float | None,
     suffix: str,
     folder: Path,
-    check_new: Callable[[Recording], None],
+    check_new: Callable[[TopicStore], None],
     tell: Share,
 ) -> Iterator[ImportedRun]:
     """Yield the runs that a log makes, written into ``folder``; as much of it is in memory as a run needs."""
@@ -268,7 +268,7 @@ def _read_record(out: Path) -> dict[str, Any]:
     return record
 
 
-def _check_new(log: Log | Recording, record: Mapping[str, Any], out: Path) -> None:
+def _check_new(log: Log | TopicStore, record: Mapping[str, Any], out: Path) -> None:
     source = Log(log.path.resolve(), {}, part=log.part).name
     for run, entry in record.items():
         if isinstance(entry, dict) and entry.get("log") == source:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.logs.recording import Recording
 from wlr_gym.data.logs.tables import TABLE, numeric_topic
+from wlr_gym.data.logs.topic_store import TopicStore
 from wlr_gym.data.logs.topics import LONGEST, Share, cannot_read
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ INFO = Path("meta") / "info.json"
 _INDEX = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 
 
-def read_lerobot(folder: Path, wanted: Collection[str] | None, tell: Share) -> Iterator[Recording]:
+def read_lerobot(folder: Path, wanted: Collection[str] | None, tell: Share) -> Iterator[TopicStore]:
     """Yield the episodes of a LeRobot data set of version 3, each as one table.
 
     A feature of several numbers gives one field for each: ``action[left_wheel]`` where ``meta/info.json`` names them, else
@@ -47,7 +47,7 @@ def read_lerobot(folder: Path, wanted: Collection[str] | None, tell: Share) -> I
         if missing:
             raise InputError(f"{file}: column '{min(missing)}' is missing")
         for episode, rows in frame.groupby("episode_index", sort=True):
-            recording = Recording(folder, f"episode {episode}")
+            recording = TopicStore(folder, f"episode {episode}")
             recording.known.add(TABLE)
             recording.notes += [f"pictures are not read: {', '.join(videos)}"] if videos else []
             times = np.round(rows["timestamp"].to_numpy(np.float64) * 1e9).astype(np.int64)

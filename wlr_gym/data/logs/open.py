@@ -9,8 +9,8 @@ from pathlib import Path
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.logs import bags, mcap_file
 from wlr_gym.data.logs.lerobot import INFO, read_lerobot
-from wlr_gym.data.logs.recording import BLOCK, Recording
 from wlr_gym.data.logs.tables import TABLE, read_table
+from wlr_gym.data.logs.topic_store import BLOCK, TopicStore
 from wlr_gym.data.logs.topics import Collector, Log, Message, Share
 
 #: Topic -> fields that are read; None = all topics and all their fields.
@@ -41,7 +41,7 @@ def read_logs(path: str | Path, wanted: Wanted | None = None, most: int | None =
 
 def read_recordings(
     path: str | Path, wanted: Wanted | None = None, most: int | None = None, tell: Share = quiet
-) -> Iterator[Recording]:
+) -> Iterator[TopicStore]:
     """Yield what a file or folder holds, as :func:`read_logs`, in bounded memory. Close each.
 
     Messages are read one after the other, and of each only its numbers are kept.
@@ -81,8 +81,8 @@ def _reader(path: Path) -> Callable[..., Iterator[Message]]:
 
 def _gathered(
     path: Path, read: Callable[..., Iterator[Message]], wanted: Wanted | None, most: int | None, tell: Share
-) -> Recording:
-    recording = Recording(path)
+) -> TopicStore:
+    recording = TopicStore(path)
     collectors: dict[str, Collector] = {}
     counts: dict[str, int] = {}
     kinds: dict[str, str] = {}

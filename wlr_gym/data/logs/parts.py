@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from wlr_gym.data.logs.map import LogMap, Resolved
-from wlr_gym.data.logs.recording import Recording
 from wlr_gym.data.logs.rows import MadeRun, NoRowsError, Samples, check_sources, make_run, rows_topic
+from wlr_gym.data.logs.topic_store import TopicStore
 from wlr_gym.data.logs.topics import Log, Share
 from wlr_gym.robot import JOINTS, WHEELS
 
@@ -27,7 +27,7 @@ _HOLE, _LEAST_HOLE, _LEAST_PIECE = 5.0, 0.5, 1.0
 
 
 def runs_of(
-    recording: Recording, found: LogMap, resolved: Mapping[str, Resolved], split: float | None, tell: Share
+    recording: TopicStore, found: LogMap, resolved: Mapping[str, Resolved], split: float | None, tell: Share
 ) -> Iterator[MadeRun]:
     """Yield the runs that a map makes of a recording.
 
@@ -60,7 +60,7 @@ def runs_of(
 
 
 def _part_until(
-    recording: Recording, found: LogMap, resolved: Mapping[str, Resolved], span: tuple[int, int], play: int
+    recording: TopicStore, found: LogMap, resolved: Mapping[str, Resolved], span: tuple[int, int], play: int
 ) -> tuple[MadeRun, int]:
     """Return the rows of a span (ns), its end moved by up to ``play`` to where the robot is quiet, and that end."""
     begin, edge = span
@@ -73,7 +73,7 @@ def _part_until(
     return _part(made, 0, last), made.origin + round(float(t[last]) * 1e9)
 
 
-def _edges(recording: Recording, found: LogMap, resolved: Mapping[str, Resolved], split: float | None) -> list[int]:
+def _edges(recording: TopicStore, found: LogMap, resolved: Mapping[str, Resolved], split: float | None) -> list[int]:
     """Return where parts begin and end, ns on the common clock; none where the recording is a part itself."""
     rows = rows_topic(found, resolved)
     if rows not in recording:
@@ -89,7 +89,7 @@ def _edges(recording: Recording, found: LogMap, resolved: Mapping[str, Resolved]
     return [edge + round(clock.offset * 1e9) for edge in edges]
 
 
-def _between(recording: Recording, found: LogMap, begin: int, end: int) -> Log:
+def _between(recording: TopicStore, found: LogMap, begin: int, end: int) -> Log:
     def when(topic: str) -> tuple[str, int, int]:
         clock = found.use(topic)
         offset = round(clock.offset * 1e9)

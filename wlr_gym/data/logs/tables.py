@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.logs.csv_file import ROWS, csv_frames
-from wlr_gym.data.logs.recording import Recording
+from wlr_gym.data.logs.topic_store import TopicStore
 from wlr_gym.data.logs.topics import Share, Topic, cannot_read
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ _BY_SIZE, _BY_NAME = (5e5, 5e8), (1e4, 1e10)
 _DATES = 0
 
 
-def read_table(path: Path, wanted: Collection[str] | None, most: int | None, tell: Share) -> Recording:
+def read_table(path: Path, wanted: Collection[str] | None, most: int | None, tell: Share) -> TopicStore:
     """Read a CSV or Parquet file: one topic, whose fields are the columns that hold numbers.
 
     Args:
@@ -42,7 +42,7 @@ def read_table(path: Path, wanted: Collection[str] | None, most: int | None, tel
     Raises:
         InputError: not such a file, no column of times, or times that go back.
     """
-    recording = Recording(path)
+    recording = TopicStore(path)
     recording.known.add(TABLE)
     reading = _Reading(path)
     try:

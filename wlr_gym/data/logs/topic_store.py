@@ -28,7 +28,7 @@ class _Block(NamedTuple):
     spans: dict[str, tuple[int, int]]
 
 
-class Recording:
+class TopicStore:
     """One recording, as blocks of its topics. ``close`` it: its temporary file goes with it.
 
     Args:
