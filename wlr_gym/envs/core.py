@@ -203,6 +203,7 @@ class Core:
         self.commands.begin(mask, self.episodes.seeds)
         if held_commands:
             self.commands.hold(rows, held_commands)
+        self.computed[rows] = 0.0
         self._observe(mask, self._signals(), first=True)
 
     def set_command(self, values: Mapping[str, float]) -> None:
