@@ -242,6 +242,16 @@ class Core:
         self.sensors = self.plant.step(self.actions.setpoints, self.actions.torque_on)
         return self._finish_step(mask)
 
+    def try_step(self, actions: ArrayLike) -> None:
+        """Advance plant and scores of all robots, and nothing else: for planners, which try what they may not do.
+
+        Raises:
+            InputError: wrong shape, or an action that is not finite or out of [-1, 1]; names robot and joint.
+        """
+        self.actions.take(actions, self.everyone)
+        self.sensors = self.plant.step(self.actions.setpoints, self.actions.torque_on)
+        self._score(self.everyone, self._signals())
+
     def _finish_step(self, mask: Mask) -> bool:
         """Estimate, rewards, ends, new commands and parameters, observation; returns whether an episode ended."""
         if self.observer is not None:
