@@ -134,3 +134,29 @@ def test_the_compiled_network_is_the_one_that_was_trained():
         said += net["output_alike"] @ alike[: trust.CLUES_ALIKE] + net["output_bias"]
         np.testing.assert_allclose(observer._states["memory"][0], memory, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(observer._states["trust"][0], np.exp(np.clip(said[:, :2], 0, 14.5)), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_filter_that_was_trained_is_the_compiled_one():
+    """``train_trust.py`` writes the filter again in torch."""
+    torch = pytest.importorskip("torch")
+    import train_trust
+
+    runs = simulate("gibbs_appell", "slippery", "commands", 4, 2.0, seed=4)
+    d = {name: torch.from_numpy(values) for name, values in train_trust._prepared(runs).items()}
+    net = train_trust.Trust()
+    net.start_from(trust.load_trust())
+    for name, values in net.arrays().items():
+        np.testing.assert_allclose(values, trust.load_trust()[name], rtol=1e-5)
+    never = {f"{name}_{end}": torch.full((4,), 1000) for name in ("camera", "flow") for end in ("on", "off")}
+    zero = torch.zeros(101, 4, 2)
+    sensors = never | {"camera_noise": zero, "flow_noise": zero, "flow_scale": torch.zeros(4)}
+    state, errors, sigmas = train_trust.begin(d, net), [], []
+    with torch.no_grad():
+        for i in range(1, 101):
+            state, error, variance = train_trust.advance(d, i, state, net, sensors)
+            errors.append(error.numpy())
+            sigmas.append(np.sqrt(variance.numpy()))
+    found = observe(runs, camera=False)
+    np.testing.assert_allclose(np.array(errors), error_of(runs, found)[1:], atol=1e-3)
+    np.testing.assert_allclose(np.array(sigmas), estimated(found, "linear_velocity_sigma")[1:], rtol=0.05, atol=1e-4)

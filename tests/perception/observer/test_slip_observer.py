@@ -136,7 +136,7 @@ def test_a_steady_tow_with_locked_wheels_is_not_observable_without_a_camera():
     sigma = estimated(with_camera, "linear_velocity_sigma")[-1, 0, 0]
     assert estimated(with_camera, "linear_velocity_in_body")[-1, 0, 0] == pytest.approx(0.05, abs=2.0 * sigma)
     assert slip_in_truth_order(estimated(with_camera, "slip_velocity"))[-1, 0, :, 0] == pytest.approx(0.05, abs=2.0 * sigma)
-    assert sigma < 7e-3
+    assert sigma < 9e-3
 
 
 def test_a_circle_closes():
@@ -160,7 +160,9 @@ def test_a_circle_closes():
     assert np.abs(estimated(found, "linear_velocity_in_body")[5:, 0, 1]).max() < 3e-3
     assert estimated(found, "yaw")[-1, 0] == pytest.approx(2 * np.pi, abs=0.03)
     half = len(time) // 2
-    assert estimated(found, "position")[half, 0] == pytest.approx([0.0, 2 * speed / rate], abs=0.03)
+    assert estimated(found, "position")[half, 0] == pytest.approx(
+        [0.0, 2 * speed / rate], abs=0.06
+    )  # 12 % of the speed: one sigma
     assert estimated(found, "position")[-1, 0] == pytest.approx([0.0, 0.0], abs=0.015)
 
 
