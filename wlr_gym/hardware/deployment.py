@@ -133,7 +133,7 @@ class LoggedPlant:
     """Returns what a log says the robot read; for a :class:`Core` that is to see again what it saw."""
 
     def __init__(self, core: Core, run: Run) -> None:
-        self.capabilities = core.plant.capabilities
+        self.capabilities, self.parameters = core.plant.capabilities, core.plant.parameters
         self._rows = _sensor_rows(run)
         self._at = 0
 

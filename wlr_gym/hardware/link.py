@@ -1,4 +1,4 @@
-"""What a control loop is connected to: servos, IMU and clock."""
+"""What a control loop is connected to: servos, sensors and clock."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from wlr_gym.hardware.config import Hardware
+from wlr_gym.hardware.flow.driver import Flow, make_flow
 from wlr_gym.hardware.imu.driver import Imu, make_imu
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.hardware.timing import Clock, MonotonicClock
@@ -21,6 +22,7 @@ class Link:
         servos: closed at first.
         imu: closed at first.
         clock: what deadlines and ages are told by.
+        flow: optical-flow sensor, closed at first; None = there is none.
         is_serial: there are real ports, which a watchdog process can open.
         finish: called after closing.
     """
@@ -30,6 +32,7 @@ class Link:
     clock: Clock
     is_serial: bool
     finish: Callable[[], None] = lambda: None
+    flow: Flow | None = None
 
     def open(self) -> None:
         """Open all ports, or none.
@@ -41,12 +44,17 @@ class Link:
             self.servos.open()
             stack.callback(self.servos.close)
             self.imu.open()
+            stack.callback(self.imu.close)
+            if self.flow is not None:
+                self.flow.open()
             stack.pop_all()
 
     def close(self) -> None:
         """Close all ports; servos stay as they are."""
         self.servos.close()
         self.imu.close()
+        if self.flow is not None:
+            self.flow.close()
         self.finish()
 
 
@@ -54,4 +62,5 @@ def serial_link(robot: Robot, hardware: Hardware) -> Link:
     """Return a link over the hardware file's ports."""
     clock = MonotonicClock()
     servos = Servos(robot, hardware, hardware.safety.patience, clock.now)
-    return Link(servos, make_imu(hardware.imu, clock.now), clock, is_serial=True)
+    flow = make_flow(robot, hardware, clock.now)
+    return Link(servos, make_imu(hardware.imu, clock.now), clock, is_serial=True, flow=flow)

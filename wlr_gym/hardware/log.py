@@ -23,7 +23,7 @@ from wlr_gym.base.files import make_output_folder
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, RunMeta
 from wlr_gym.data.logs.stream import McapStream
 from wlr_gym.data.robot_file import note_robot
-from wlr_gym.data.sensor_columns import SENSED, channels
+from wlr_gym.data.sensor_columns import channels, sensed_columns
 from wlr_gym.data.write import write_meta
 from wlr_gym.hardware.safety.state import RobotStatus
 from wlr_gym.hardware.step import StepRecord
@@ -34,9 +34,12 @@ from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS, Robot
 PARTIAL = "partial_"
 #: Phases of the control loop that begin a table, and its kind.
 _TABLES = {"ramp": "ramp", "running": "run"}
-#: Columns of a run on the robot, in their order.
-ROW = [name for name in COLUMNS if name == "t" or name in COMMANDS or (name in SENSED and name not in CAMERA)]
-_ORDER = [("t", *COMMANDS, *SENSED).index(name) for name in ROW]
+
+
+def row_columns(robot: Robot) -> list[str]:
+    """Return the columns of a run on the robot, in their order."""
+    sensed = sensed_columns(robot)
+    return [name for name in COLUMNS if name == "t" or name in COMMANDS or (name in sensed and name not in CAMERA)]
 
 
 def _append(file: io.FileIO, line: str) -> None:
@@ -103,6 +106,9 @@ class RunLog:
         make_output_folder(folder)
         write_meta(folder, note_robot(folder, robot, meta))
         self.folder = folder
+        self.columns = row_columns(robot)
+        self._sensed = sensed_columns(robot)
+        self._order = [("t", *COMMANDS, *self._sensed).index(name) for name in self.columns]
         self.number: int = 1 + max((_number(path) for path in folder.iterdir()), default=0)
         self._tables: dict[str, CsvTable] = {}
         self._current = ""
@@ -123,14 +129,14 @@ class RunLog:
         """Write rows to ``ramp`` or ``run`` from here on."""
         self._current = kind
         if kind not in self._tables:
-            self._tables[kind] = CsvTable(self.folder / f"{self.name(kind)}.csv", ROW)
+            self._tables[kind] = CsvTable(self.folder / f"{self.name(kind)}.csv", self.columns)
 
     def row(self, time: float, sensors: Sensors, setpoints: np.ndarray) -> np.ndarray | None:
         """Write what was read at ``time`` (s) and what was then asked for (NaN = motor off); return a run's row, else None."""
         if not self._current or time <= self._last:  # the readings of an interrupted control step come twice
             return None
         self._last = time
-        values = np.concatenate([[time], setpoints, channels(sensors, 0)])[_ORDER]
+        values = np.concatenate([[time], setpoints, channels(sensors, 0, self._sensed)])[self._order]
         self._tables[self._current].add(values)
         return values if self._current == "run" else None
 
@@ -181,7 +187,7 @@ class RunRecorder:
         log: of the present or last run.
         trouble: why the log cannot be written; empty = it can.
         origin: what wheel angles and the camera's age count from.
-        stream: where rows of the run go besides; it has the columns of :data:`ROW`.
+        stream: where rows of the run go besides; it has the columns of :func:`row_columns`.
     """
 
     def __init__(self, folder: Path | None, meta: RunMeta, clock: Clock, robot: Robot) -> None:
@@ -193,6 +199,7 @@ class RunRecorder:
         self._clock = clock
         self._checks: list[str] = []
         self._rules: frozenset[str] = frozenset()
+        self._flow_trouble = ""
 
     @property
     def run(self) -> Path | None:
@@ -233,6 +240,17 @@ class RunRecorder:
             for rule in rules.keys() - self._rules:
                 self.log.event(status.time, "intervention", rule=rule, row=record.count, **rules[rule])
             self._rules = frozenset(rules)
+            self._note_flow(record)
+
+    def _note_flow(self, record: StepRecord) -> None:
+        """Write an event where optical flow begins to be missing, for a reason, and where it is back."""
+        assert self.log is not None
+        reading = record.status.flow
+        trouble = "" if reading is None else reading.trouble
+        kind = trouble.partition(":")[0]
+        if kind != self._flow_trouble and (kind or (reading is not None and reading.is_new)):
+            self.log.event(record.status.time, "flow", row=record.count, trouble=trouble)
+            self._flow_trouble = kind
 
     def policy(self, names: list[str], values: np.ndarray) -> None:
         """Write what the policy was commanded and answered for the row that comes next."""
@@ -286,7 +304,10 @@ def sensors_of(status: RobotStatus, origin: RunOrigin) -> Sensors:
     sensors.gyro[0], sensors.accelerometer[0] = status.gyro, status.accelerometer
     sensors.supply_voltage[0] = np.mean(status.voltage)
     sensors.joint_age[0], sensors.imu_age[0] = status.silence.max(), status.imu_silence
-    sensors.camera_age[0] = status.time - origin.time
+    sensors.camera_age[0] = sensors.flow_age[0] = status.time - origin.time
+    if status.flow is not None:
+        sensors.flow[0], sensors.flow_quality[0] = status.flow.flow, status.flow.quality
+        sensors.flow_age[0], sensors.flow_is_new[0] = status.flow.age, status.flow.is_new
     return sensors
 
 

@@ -20,6 +20,7 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import asdict
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -115,7 +116,7 @@ class ControlLoop:
         self.recorder: RunRecorder = RunRecorder(log, meta, link.clock, robot)
         self._link, self._is_open = link, False
         self._limiter = CommandLimiter(link.servos, robot, hardware, link.clock, period, dry_run, meta.profile)
-        self._step = ControlStep(self._limiter, link.imu, self.operator, self.pacer)
+        self._step = ControlStep(self._limiter, link.imu, self.operator, self.pacer, link.flow)
         self._guard = Guard(robot, hardware, watchdog and link.is_serial and not dry_run)
 
     def __enter__(self) -> ControlLoop:
@@ -144,8 +145,10 @@ class ControlLoop:
         return sensors_of(self._step.known, self.recorder.origin)
 
     def statistics(self) -> dict[str, Any]:
-        """Return ticks, missed ones, percentiles of the timing (ms), and the command limiter's interventions."""
-        return {**self.pacer.statistics(), "interventions": dict(self.interventions)}
+        """Return ticks, missed ones, percentiles of the timing (ms), the command limiter's interventions, and what came of the
+        optical-flow sensor, where there is one."""
+        flow = {} if self._link.flow is None else {"flow": asdict(self._link.flow.statistics)}
+        return {**self.pacer.statistics(), "interventions": dict(self.interventions), **flow}
 
     # ---- start-up ----
 

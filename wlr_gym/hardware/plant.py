@@ -69,6 +69,7 @@ class RobotPlant:
             description = description.model_copy(update={"safety": safety})
         if link is None:
             link = _link(robot, description, chosen, self.options)
+        self.parameters["flow.present"] = link.flow is not None
         self.loop: ControlLoop = ControlLoop(
             robot,
             description,

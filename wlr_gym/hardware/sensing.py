@@ -1,4 +1,4 @@
-"""Reads servos and IMU, and keeps what was last known of a joint or sensor that does not answer."""
+"""Reads servos, IMU and optical flow, and keeps what was last known of a joint or sensor that does not answer."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from wlr_gym.hardware.flow.driver import Flow
+from wlr_gym.hardware.flow.supervision import FlowSupervision
 from wlr_gym.hardware.imu.driver import Imu, ImuReading
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
 from wlr_gym.hardware.imu.reading import ImuGoneError
@@ -37,15 +39,17 @@ class Sensing:
         imu: of the robot; open.
         clock: of the run.
         period: s of a control step.
+        flow: optical-flow sensor, open; None = there is none.
 
     Attributes:
         count: readings of the joints since :meth:`first`.
     """
 
-    def __init__(self, limiter: CommandLimiter, imu: Imu, clock: Clock, period: float) -> None:
+    def __init__(self, limiter: CommandLimiter, imu: Imu, clock: Clock, period: float, flow: Flow | None = None) -> None:
         self.count = 0
         self._broken = 0  # packets until all joints answered last
         self._limiter, self._imu, self._clock, self._period = limiter, imu, clock, period
+        self._flow = None if flow is None else FlowSupervision(flow, limiter.robot)
 
     def first(self) -> RobotStatus:
         """Wait for the IMU; read everything once.
@@ -77,6 +81,7 @@ class Sensing:
             accelerometer=reading.accelerometer,
             imu_silence=reading.age,
             up=up,
+            flow=None if self._flow is None else self._flow.first(),
         )
 
     def _first_imu_reading(self) -> ImuReading:
@@ -114,8 +119,9 @@ class Sensing:
             reading = self._imu.read()
         except ImuGoneError:
             reading = None
+        flow = None if self._flow is None else self._flow.next(status.position, status.velocity, before.gyro, elapsed)
         if reading is None:
-            return replace(status, lost=lost, imu_silence=before.imu_silence + elapsed)
+            return replace(status, lost=lost, imu_silence=before.imu_silence + elapsed, flow=flow)
         return replace(
             status,
             lost=lost,
@@ -123,6 +129,7 @@ class Sensing:
             accelerometer=reading.accelerometer,
             imu_silence=reading.age,
             up=next_up(before.up, reading.gyro, reading.accelerometer, elapsed),
+            flow=flow,
         )
 
     def _next_joints(self, before: RobotStatus, now: float) -> RobotStatus:

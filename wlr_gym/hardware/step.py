@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.hardware.flow.driver import Flow
 from wlr_gym.hardware.imu.driver import Imu
 from wlr_gym.hardware.operator import Operator
 from wlr_gym.hardware.safety.limiter import CommandLimiter
@@ -44,16 +45,17 @@ class ControlStep:
         imu: of the robot.
         operator: what is asked for; served in the spare time.
         pacer: deadlines and statistics.
+        flow: optical-flow sensor of the robot; None = there is none.
 
     Attributes:
         status: what was last read; None = nothing yet.
     """
 
-    def __init__(self, limiter: CommandLimiter, imu: Imu, operator: Operator, pacer: Pacer) -> None:
+    def __init__(self, limiter: CommandLimiter, imu: Imu, operator: Operator, pacer: Pacer, flow: Flow | None = None) -> None:
         self.status: RobotStatus | None = None
         self._limiter, self._operator, self._pacer = limiter, operator, pacer
         self._clock = pacer.clock
-        self._sensing = Sensing(limiter, imu, pacer.clock, pacer.period)
+        self._sensing = Sensing(limiter, imu, pacer.clock, pacer.period, flow)
         self._idle = 0.0
         self._read_at = 0.0
 

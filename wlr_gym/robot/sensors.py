@@ -51,8 +51,8 @@ class FlowSensor(SettingsModel):
         field_of_view: full angle (rad), seen by a row of ``pixels``.
         counts_per_pixel: counts of motion per pixel of shift; not in the data sheet, found by others on the chip.
         rate: frames per second.
-        noise: 1 sigma of one reading at rest on good texture (counts) [chosen].
-        speed_noise: further 1 sigma, share of what is counted [chosen].
+        noise: 1 sigma of one frame's counts at rest on good texture [chosen]; frames are independent.
+        speed_noise: further 1 sigma, share of the frame's counts [chosen].
         quality, quality_noise: surface quality on good texture, share of the register's range, and its 1 sigma [chosen].
         least_quality: below it a reading is not valid: 0x19 of 255.
         least_height: shortest distance to the floor at which it works (m).
@@ -64,8 +64,8 @@ class FlowSensor(SettingsModel):
     pixels: int = Field(35, ge=1)
     counts_per_pixel: float = Field(10.0, gt=0)
     rate: float = Field(121.0, gt=0)
-    noise: float = Field(1.0, ge=0)
-    speed_noise: float = Field(0.02, ge=0)
+    noise: float = Field(0.65, ge=0)
+    speed_noise: float = Field(0.03, ge=0)
     quality: float = Field(0.35, gt=0, le=1)
     quality_noise: float = Field(0.03, ge=0)
     least_quality: float = Field(0.098, ge=0, le=1)
@@ -95,8 +95,8 @@ class SensorSet(SettingsModel):
 
     @property
     def flow_noise(self) -> float:
-        """1 sigma of one optical-flow reading at rest on good texture (rad/s); 0 where no sensor is fitted."""
-        return 0.0 if self.flow is None else self.flow.noise * self.flow.count * self.control_rate
+        """1 sigma of an optical-flow reading of one control period, at rest on good texture (rad/s); 0 without a sensor."""
+        return 0.0 if self.flow is None else self.flow.noise * self.flow.count * (self.flow.rate * self.control_rate) ** 0.5
 
     @property
     def has_flow(self) -> float:

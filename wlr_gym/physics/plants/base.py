@@ -68,10 +68,7 @@ SENSOR_LAYOUT = Layout(
         Channel("joint_position", JOINTS, "rad", "encoder; wheels relative to their leg, unwrapped, zero at the run's start"),
         Channel("joint_velocity", JOINTS, "rad/s", "the servo's own velocity reading"),
         Channel(
-            "joint_effort",
-            JOINTS,
-            "N m",
-            "motor current (legs) or load (wheels) times the nominal torque constant, before gear friction",
+            "joint_effort", JOINTS, "N m", "current (legs), load (wheels) times nominal torque constant, before gear friction"
         ),
         Channel("gyro", XYZ, "rad/s", "body frame"),
         Channel("accelerometer", XYZ, "m/s2", "body frame, specific force (+9.81 on z at rest)"),

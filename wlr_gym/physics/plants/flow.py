@@ -199,19 +199,19 @@ def _read(seed: Any, tick: int, period: float, place: Any, settings: Any, state:
         return 0.0
     poorness = max(settings[_MEAN_QUALITY] / quality, 1.0)
     c, s = math.cos(state[_MOUNT_YAW]), math.sin(state[_MOUNT_YAW])
-    count = settings[_COUNT]
-    state[_SHOWN] = _counted(state[_SCALE] * (c * x + s * y), interval, count, n0, poorness, settings)
-    state[_SHOWN + 1] = _counted(state[_SCALE] * (c * y - s * x), interval, count, n1, poorness, settings)
+    state[_SHOWN] = _counted(state[_SCALE] * (c * x + s * y), interval, frames, n0 * poorness, settings)
+    state[_SHOWN + 1] = _counted(state[_SCALE] * (c * y - s * x), interval, frames, n1 * poorness, settings)
     state[_QUALITY] = quality
     state[_END] = end
     return 1.0
 
 
 @njit(cache=True, nogil=True)
-def _counted(flow: float, interval: float, count: float, normal: float, poorness: float, settings: Any) -> float:
-    """Return ``flow`` (rad/s) with noise, in whole counts over its interval; a count of 0 leaves it as it is."""
+def _counted(flow: float, interval: float, frames: int, normal: float, settings: Any) -> float:
+    """Return ``flow`` (rad/s) with the noise of its frames, in whole counts; without a count it stays as it is."""
+    count = settings[_COUNT]
     if count <= 0.0:
         return flow
     counts = flow * interval / count
-    spread = math.hypot(settings[_NOISE], settings[_SPEED_NOISE] * counts) * poorness
+    spread = math.sqrt(frames) * math.hypot(settings[_NOISE], settings[_SPEED_NOISE] * counts / frames)
     return (np.rint(counts + spread * normal) + 0.0) * count / interval
