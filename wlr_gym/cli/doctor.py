@@ -1,4 +1,4 @@
-"""Look at a robot before it drives: ports, adapters, every servo, bus speed, IMU, and whether a policy fits. Moves nothing.
+"""Look at a robot before it drives: ports, adapters, servos, bus speed, IMU, flow sensor, and whether a policy fits. Moves nothing.
 
 Names the first thing that is wrong and what to do about it. Exit code 0: nothing stands against driving; 1: something does.
 """
@@ -83,7 +83,7 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
     from wlr_gym.hardware.loop import TIMED_READS
     from wlr_gym.hardware.safety import preflight
 
-    ports = preflight.open_ports(link.servos, link.imu, hardware)
+    ports = preflight.open_ports(link.servos, link.imu, hardware, link.flow)
     found = ports if options.emulated else ports + preflight.check_latency_timers(hardware)
     open_here = {check.where for check in ports if check.ok}
     buses = [name for name in hardware.buses if name in open_here]
@@ -104,6 +104,8 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
         found.append(preflight.Check("robot", "bus", False, str(error), "a bus that stays", "Check plugs and supply."))
     if "imu" in open_here:
         found += preflight.check_imu(link.imu, hardware.imu, link.clock)
+    if "flow" in open_here and link.flow is not None and hardware.flow is not None:
+        found += preflight.check_flow(link.flow, hardware.flow, link.clock)
     return found
 
 

@@ -243,13 +243,14 @@ class RunRecorder:
             self._note_flow(record)
 
     def _note_flow(self, record: StepRecord) -> None:
-        """Write an event where optical flow begins to be missing, for a reason, and where it is back."""
+        """Write an event where optical flow begins to be missing, for a reason, or is odd, and where it is well again."""
         assert self.log is not None
         reading = record.status.flow
-        trouble = "" if reading is None else reading.trouble
-        kind = trouble.partition(":")[0]
-        if kind != self._flow_trouble and (kind or (reading is not None and reading.is_new)):
-            self.log.event(record.status.time, "flow", row=record.count, trouble=trouble)
+        if reading is None or not (reading.trouble or reading.is_new):
+            return
+        kind = (reading.trouble or reading.note).partition(":")[0]
+        if kind != self._flow_trouble:
+            self.log.event(record.status.time, "flow", row=record.count, trouble=reading.trouble, note=reading.note)
             self._flow_trouble = kind
 
     def policy(self, names: list[str], values: np.ndarray) -> None:

@@ -56,6 +56,7 @@ class FlowReading:
         age: s since the end of the valid one's interval.
         is_new: whether this control step brought a valid one.
         trouble: why there is none; empty = there is, or none was due.
+        note: what is odd about it; empty = nothing.
     """
 
     flow: Array
@@ -63,6 +64,7 @@ class FlowReading:
     age: float
     is_new: bool
     trouble: str = ""
+    note: str = ""
 
 
 @dataclass

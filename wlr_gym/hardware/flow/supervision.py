@@ -18,7 +18,7 @@ from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 Array = NDArray[np.float64]
 
 #: m that is compared at a time.
-WAY = 0.2
+WAY = 0.05
 #: rad/s of yaw up to which the way counts: then all wheels roll alike.
 STRAIGHT = 0.3
 #: m/s from which it counts.
@@ -61,23 +61,19 @@ class FlowSupervision:
     Args:
         flow: open.
         robot: whose it is.
-
-    Attributes:
-        note: what is odd and no dropout; empty = nothing.
     """
 
     def __init__(self, flow: Flow, robot: Robot) -> None:
         self._flow, self._robot = flow, robot
         assert robot.sensors.flow is not None
         self._lens = np.array(robot.sensors.flow.position)
-        self.note = ""
         self._seen = np.zeros(2)
         self._rolled = 0.0
-        self._verdict = ""
+        self._verdict = self._note = ""
 
     def first(self) -> FlowReading:
         """Read while the robot stands; what was thought before is forgotten."""
-        self._seen, self._rolled, self._verdict, self.note = np.zeros(2), 0.0, "", ""
+        self._seen, self._rolled, self._verdict, self._note = np.zeros(2), 0.0, "", ""
         return self._flow.read()
 
     def next(self, position: Array, velocity: Array, gyro: Array, elapsed: float) -> FlowReading:
@@ -100,7 +96,7 @@ class FlowSupervision:
             if self._rolled > WAY:
                 self._judge()
         if not self._verdict:
-            return reading
+            return replace(reading, note=self._note) if self._note else reading
         refused = self._flow.statistics.refused
         kind = self._verdict.partition(":")[0]
         refused[kind] = refused.get(kind, 0) + 1
@@ -111,7 +107,7 @@ class FlowSupervision:
         ratio = math.hypot(float(self._seen[0]), float(self._seen[1])) / self._rolled
         turn = math.atan2(float(self._seen[1]), float(self._seen[0]))
         self._seen, self._rolled = np.zeros(2), 0.0
-        self.note = "" if RATIO[0] < ratio < RATIO[1] else f"way: {ratio:.2f} of the wheels' (slip, or a wrong scale)"
+        self._note = "" if RATIO[0] < ratio < RATIO[1] else f"way: {ratio:.2f} of the wheels' (slip, or a wrong scale)"
         is_seen = ratio > 0.3  # of wheels that spin in place the flow has no direction
         if is_seen:
             turned = abs(turn) > LARGEST_TURN
