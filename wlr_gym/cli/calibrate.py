@@ -1,4 +1,4 @@
-"""Calibrate what measures: the robot's ``joints``, ``imu``, ``flow``, a ``camera``; ``targets`` are the sheets to print for it."""
+"""Calibrate what measures: the robot's ``joints``, ``imu``, ``flow``, a ``camera``; ``targets`` are its sheets to print."""
 
 from __future__ import annotations
 

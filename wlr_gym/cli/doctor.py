@@ -1,4 +1,4 @@
-"""Look at a robot before it drives: ports, adapters, servos, bus speed, IMU, flow sensor, and whether a policy fits. Moves nothing.
+"""Look at a robot before it drives: ports, adapters, servos, bus speed, sensors, and whether a policy fits. Moves nothing.
 
 Names the first thing that is wrong and what to do about it. Exit code 0: nothing stands against driving; 1: something does.
 """

@@ -2,7 +2,7 @@
 
 The chip adds up motion until it is read, and takes 121 frames per second. Read once per control step, one reading would hold
 the motion of two frames and the next of three, which no reader can tell apart; so a thread polls faster than the frames, and
-notes when motion came.
+counts them by the time since motion came last.
 """
 
 from __future__ import annotations
@@ -230,7 +230,8 @@ class ChipPoller:
             if self._failures >= PATIENCE:
                 self._gone = f"no port: {self._port.port} is gone ({error})"
             return
-        now = self._clock()
-        if moved or now - self._frame_at >= 1.0 / self._sensor.rate:
-            self._motions.append(Motion(x, y, now - self._frame_at, quality, shutter, now))
+        now, rate = self._clock(), self._sensor.rate
+        if moved or now - self._frame_at >= 1.0 / rate:
+            frames = max(1, round((now - self._frame_at) * rate))  # the chip's time is not the polls'
+            self._motions.append(Motion(x, y, frames / rate, quality, shutter, now))
             self._frame_at = now

@@ -17,15 +17,17 @@ from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 
 Array = NDArray[np.float64]
 
-#: m that is compared at a time.
-WAY = 0.05
+#: m after which the flow's direction is compared, and its size.
+WAY, LONG_WAY = 0.05, 0.25
 #: rad/s of yaw up to which the way counts: then all wheels roll alike.
 STRAIGHT = 0.3
 #: m/s from which it counts.
 LEAST_SPEED = 0.05
 #: rad between flow and the wheels' heading beyond which the sensor is turned.
 LARGEST_TURN = 0.6
-#: Way seen over the wheels' way outside which scale or slip is told.
+#: Way seen over the wheels' way below which it has no direction: wheels that spin in place.
+LEAST_RATIO = 0.3
+#: The same outside which scale or slip is told.
 RATIO = (0.85, 1.15)
 
 
@@ -55,6 +57,24 @@ def wheel_velocity(robot: Robot, wheels: Array) -> float:
     return robot.wheel.radius * float(np.mean(wheels))
 
 
+class _Way:
+    """What was seen (2,) and rolled, m."""
+
+    def __init__(self) -> None:
+        self.x = self.y = self.rolled = 0.0
+
+    def add(self, seen: Array, rolled: float) -> None:
+        self.x, self.y, self.rolled = self.x + float(seen[0]), self.y + float(seen[1]), self.rolled + rolled
+
+    @property
+    def turn(self) -> float:
+        return math.atan2(self.y, self.x)
+
+    @property
+    def ratio(self) -> float:
+        return math.hypot(self.x, self.y) / self.rolled
+
+
 class FlowSupervision:
     """Reads the flow sensor, and takes what it says for a dropout while it contradicts wheels and gyroscope.
 
@@ -67,13 +87,15 @@ class FlowSupervision:
         self._flow, self._robot = flow, robot
         assert robot.sensors.flow is not None
         self._lens = np.array(robot.sensors.flow.position)
-        self._seen = np.zeros(2)
-        self._rolled = 0.0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._way, self._long_way = _Way(), _Way()
         self._verdict = self._note = ""
 
     def first(self) -> FlowReading:
         """Read while the robot stands; what was thought before is forgotten."""
-        self._seen, self._rolled, self._verdict, self._note = np.zeros(2), 0.0, "", ""
+        self._forget()
         return self._flow.read()
 
     def next(self, position: Array, velocity: Array, gyro: Array, elapsed: float) -> FlowReading:
@@ -91,10 +113,10 @@ class FlowSupervision:
         if abs(gyro[2]) < STRAIGHT and abs(rolling) > LEAST_SPEED:
             height = lens_height(self._robot, position[LEG_SLICE])
             way = elapsed * math.copysign(1.0, rolling)
-            self._seen += way * floor_velocity(reading.flow, gyro, height, self._lens)
-            self._rolled += way * rolling
-            if self._rolled > WAY:
-                self._judge()
+            seen = way * floor_velocity(reading.flow, gyro, height, self._lens)
+            self._way.add(seen, way * rolling)
+            self._long_way.add(seen, way * rolling)
+            self._judge()
         if not self._verdict:
             return replace(reading, note=self._note) if self._note else reading
         refused = self._flow.statistics.refused
@@ -103,12 +125,16 @@ class FlowSupervision:
         return replace(reading, quality=0.0, is_new=False, trouble=self._verdict)
 
     def _judge(self) -> None:
-        """Compare the way seen with the way rolled, and begin anew."""
-        ratio = math.hypot(float(self._seen[0]), float(self._seen[1])) / self._rolled
-        turn = math.atan2(float(self._seen[1]), float(self._seen[0]))
-        self._seen, self._rolled = np.zeros(2), 0.0
-        self._note = "" if RATIO[0] < ratio < RATIO[1] else f"way: {ratio:.2f} of the wheels' (slip, or a wrong scale)"
-        is_seen = ratio > 0.3  # of wheels that spin in place the flow has no direction
-        if is_seen:
-            turned = abs(turn) > LARGEST_TURN
-            self._verdict = f"turned: {math.degrees(turn):.0f} deg against the wheels; see wlr calibrate flow" if turned else ""
+        """Compare the ways seen with the ways rolled; each begins anew then."""
+        if self._way.rolled > WAY:
+            turn, ratio = self._way.turn, self._way.ratio
+            self._way = _Way()
+            if ratio > LEAST_RATIO:
+                turned = abs(turn) > LARGEST_TURN
+                self._verdict = (
+                    f"turned: {math.degrees(turn):.0f} deg against the wheels; see wlr calibrate flow" if turned else ""
+                )
+        if self._long_way.rolled > LONG_WAY:
+            ratio = self._long_way.ratio
+            self._long_way = _Way()
+            self._note = "" if RATIO[0] < ratio < RATIO[1] else f"way: {ratio:.2f} of the wheels' (slip, or a wrong scale)"

@@ -51,6 +51,8 @@ _MEAN_QUALITY, _QUALITY_NOISE, _LEAST_QUALITY, _LEAST_HEIGHT, _GREATEST_RATE = 7
 CELL = 0.2
 #: Whole cells added, so that their numbers are positive near the start.
 _CELLS = 1 << 20
+#: Share of the texture below which its noise grows no more.
+_LEAST_TEXTURE = 0.1
 #: Of the body's z axis on the floor's normal: below it the sensor does not look at the floor.
 _LEAST_COSINE = 0.2
 _NOISE_STREAM = stream_number("flow")
@@ -197,7 +199,7 @@ def _read(seed: Any, tick: int, period: float, place: Any, settings: Any, state:
     if lost or too_fast or distance < settings[_LEAST_HEIGHT] or distance == 0.0 or quality < settings[_LEAST_QUALITY]:
         state[_QUALITY] = 0.0
         return 0.0
-    poorness = max(settings[_MEAN_QUALITY] / quality, 1.0)
+    poorness = 1.0 / max(texture, _LEAST_TEXTURE)
     c, s = math.cos(state[_MOUNT_YAW]), math.sin(state[_MOUNT_YAW])
     state[_SHOWN] = _counted(state[_SCALE] * (c * x + s * y), interval, frames, n0 * poorness, settings)
     state[_SHOWN + 1] = _counted(state[_SCALE] * (c * y - s * x), interval, frames, n1 * poorness, settings)
