@@ -161,6 +161,7 @@ def test_readings_are_over_the_frames_own_time_whatever_the_control_steps_cut():
         if clock.time - start >= (frame + 1) / SENSOR.rate:
             frame += 1
             chip.move(11, -4)
+            chip.quality = 90 + frame % 2
         poller.poll()
         if poll % 6 == 0:  # 50.4 Hz: two or three frames
             readings.append(poller.read())

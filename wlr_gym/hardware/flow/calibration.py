@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.read import Run
 from wlr_gym.hardware.config import FlowCalibration
-from wlr_gym.hardware.flow.supervision import STRAIGHT, floor_velocity, lens_height, wheel_velocity
+from wlr_gym.hardware.flow.supervision import floor_velocity, lens_height, wheel_velocity
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 
 Array = NDArray[np.float64]
 
+#: rad/s of yaw up to which a row counts: then all wheels roll alike.
+STRAIGHT = 0.3
 #: s of a window whose ways are compared.
 WINDOW = 0.2
 #: m that must be driven in all; m that a window must hold.

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 
 #: m after which the flow's direction is compared, and its size.
 WAY, LONG_WAY = 0.05, 0.25
-#: rad/s of yaw up to which the way counts: then all wheels roll alike.
-STRAIGHT = 0.3
+#: rad/s of yaw up to which the way counts: in tight turns wheels slip sideways.
+LARGEST_YAW_RATE = 1.0
 #: m/s from which it counts.
 LEAST_SPEED = 0.05
 #: rad between flow and the wheels' heading beyond which the sensor is turned.
@@ -110,7 +110,7 @@ class FlowSupervision:
         if not reading.is_new:
             return reading
         rolling = wheel_velocity(self._robot, velocity[WHEEL_SLICE])
-        if abs(gyro[2]) < STRAIGHT and abs(rolling) > LEAST_SPEED:
+        if abs(gyro[2]) < LARGEST_YAW_RATE and abs(rolling) > LEAST_SPEED:
             height = lens_height(self._robot, position[LEG_SLICE])
             way = elapsed * math.copysign(1.0, rolling)
             seen = way * floor_velocity(reading.flow, gyro, height, self._lens)
