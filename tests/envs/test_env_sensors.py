@@ -1,7 +1,11 @@
 """Sensors present or absent as data of the task: drawn per episode from streams of their own, told to the policy."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks import describe, load_task
@@ -11,6 +15,7 @@ from wlr_gym.policy import needs_camera
 
 TERMS = {"camera_present": {}, "flow_present": {}, "flow": {"scale": 0.2}, "flow_quality": {}}
 BOTH = {"sensors": {"camera": 0.5, "flow": 0.5}, "observations": TERMS}
+PAGE = Path(__file__).parents[2] / "docs" / "optical_flow.md"
 
 
 def core_of(task, count=8, backend="gibbs_appell", seed=0, **settings):
@@ -67,6 +72,10 @@ def test_drawing_presence_shifts_no_other_draw():
             core.step(np.full((core.count, 8), 0.2), core.everyone)
     np.testing.assert_array_equal(plain.observation, always.observation)
     np.testing.assert_array_equal(plain.parameters.values, always.parameters.values)
+
+
+def test_the_page_says_what_is_tried_here():
+    assert yaml.safe_load(re.findall("```yaml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)[0]) == BOTH
 
 
 def test_a_user_can_say_who_has_what():

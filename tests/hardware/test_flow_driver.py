@@ -1,11 +1,14 @@
 """The optical-flow sensor's chip, stream and readings, against a chip written from the data sheet; its calibration."""
 
+import re
 import struct
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -366,6 +369,13 @@ def test_hardware_file_names_the_sensor_and_the_robot_must_have_one():
         with_ports(load_hardware("nominal"), {"flow": "x"})
     with pytest.raises(ValueError, match=r"expected one of the chip's x and one of its y"):
         hardware_with(axes=["x", "-x"])
+
+
+def test_the_pages_hardware_files_are_read():
+    page = (Path(__file__).parents[2] / "docs" / "optical_flow.md").read_text(encoding="utf-8")
+    lines = re.findall("```yaml\n(.*?)```", page, re.S)[1].splitlines()
+    stream, chip = (hardware_with(**yaml.safe_load(line)["flow"]).flow for line in lines)
+    assert (stream.driver, chip.driver) == ("stream", "spi")
 
 
 # ---- calibration ----------------------------------------------------------------------------------------------------
