@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from wlr_gym.base.errors import InputError
@@ -17,9 +17,9 @@ from wlr_gym.hardware.config import FlowCalibration, FlowPort, Hardware, load_ha
 from wlr_gym.hardware.fit import check_fit
 from wlr_gym.hardware.flow import pmw3901
 from wlr_gym.hardware.flow.calibration import calibrate_flow
-from wlr_gym.hardware.flow.frames import SIZE, FlowFrame, FrameParser, encode_frame
+from wlr_gym.hardware.flow.frames import SIZE, FlowFrame, FlowFrameParser, encode_frame
 from wlr_gym.hardware.flow.pmw3901 import ChipPoller, Pmw3901
-from wlr_gym.hardware.flow.reading import FROZEN, Conversion, FlowReader, Motion
+from wlr_gym.hardware.flow.reading import FROZEN, CountedMotion, FlowConversion, FlowReader
 from wlr_gym.hardware.flow.stream import FlowStream
 from wlr_gym.robot import JOINTS, load_robot
 
@@ -232,10 +232,10 @@ def test_a_frame_is_twenty_bytes_and_reads_back():
     raw = encode_frame(frame(7, x=-32768, y=32767))
     assert len(raw) == SIZE == 20
     assert raw[:2] == b"\xa5\xf1"
-    assert FrameParser().feed(raw) == [frame(7, x=-32768, y=32767)]
+    assert FlowFrameParser().feed(raw) == [frame(7, x=-32768, y=32767)]
 
 
-@settings(max_examples=40)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(st.binary(max_size=60), st.integers(0, 19), st.integers(0, 159), st.lists(st.integers(1, 9), max_size=8))
 def test_noise_costs_no_more_than_the_frames_it_hits(noise, cut, bit, sizes):
     good = [frame(k) for k in range(1, 7)]
@@ -243,7 +243,7 @@ def test_noise_costs_no_more_than_the_frames_it_hits(noise, cut, bit, sizes):
     broken = bytearray(raws[2])
     broken[bit // 8] ^= 1 << bit % 8
     stream = noise + raws[0] + raws[1] + bytes(broken) + raws[3][:cut] + noise + raws[4] + raws[5]
-    parser, found = FrameParser(), []
+    parser, found = FlowFrameParser(), []
     for size in [*sizes, 7] * (len(stream) + 1):
         found += parser.feed(stream[:size])
         stream = stream[size:]
@@ -312,7 +312,7 @@ def test_stream_counts_lost_frames_once():
 
 
 def motion(**changes):
-    return replace(Motion(5, -2, 1 / 121, 90, 0x0400, 10.0), **changes)
+    return replace(CountedMotion(5, -2, 1 / 121, 90, 0x0400, 10.0), **changes)
 
 
 @pytest.mark.parametrize(
@@ -343,8 +343,8 @@ def test_counts_that_never_change_are_frozen_and_a_floor_at_rest_is_not():
 @pytest.mark.parametrize("axes", [("x", "y"), ("-y", "-x"), ("y", "x"), ("-x", "y")])
 def test_axes_scale_and_mounting_are_taken_off(axes):
     port = PORT.model_copy(update={"axes": axes})
-    chip = Conversion(port, SENSOR)
-    calibrated = Conversion(port.model_copy(update={"calibration": FlowCalibration(scale=1.1, mount_yaw=0.3)}), SENSOR)
+    chip = FlowConversion(port, SENSOR)
+    calibrated = FlowConversion(port.model_copy(update={"calibration": FlowCalibration(scale=1.1, mount_yaw=0.3)}), SENSOR)
     true = np.array([2.0, -0.7])
     c, s = np.cos(0.3), np.sin(0.3)
     counts = chip.counts(1.1 * np.array([[c, s], [-s, c]]) @ true, 1.0)

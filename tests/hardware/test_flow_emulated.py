@@ -1,4 +1,4 @@
-"""The optical-flow sensor of the emulated robot: the chip's stream to the sensors of the plant, faults, logs, commands."""
+"""The optical-flow sensor of the emulated robot: from the plant to the control loop, faults, docs/optical_flow.md's commands."""
 
 import json
 

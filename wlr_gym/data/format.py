@@ -97,6 +97,7 @@ _TABLE: list[Column] = [
         for axis, law in (("x", "v_x/h - w_y"), ("y", "v_y/h + w_x"))
     ],
     Column("flow_quality", "flow_quality", "-", f"surface quality of the flow sensor, 0 to 1; {_NO_READING}", may_be_nan=True),
+    Column("flow_age", "flow_age", "s", "time since the interval of the last valid flow reading ended"),
 ]
 
 #: All columns by name, in the order files are written.
@@ -104,7 +105,7 @@ COLUMNS: dict[str, Column] = {column.name: column for column in _TABLE}
 REQUIRED = tuple(name for name, column in COLUMNS.items() if column.required)
 COMMANDS = tuple(f"cmd_{joint}" for joint in JOINTS)
 #: Of an optical-flow sensor, where there is one.
-FLOW = ("flow_x", "flow_y", "flow_quality")
+FLOW = ("flow_x", "flow_y", "flow_quality", "flow_age")
 #: What the robot measured and a replay predicts: everything but the clock, the commands and optical flow.
 CHANNELS = tuple(name for name in COLUMNS if name != "t" and name not in (*COMMANDS, *FLOW))
 CAMERA = ("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch")

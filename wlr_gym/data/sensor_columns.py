@@ -32,5 +32,6 @@ def channels(sensors: Sensors, robot: int, columns: tuple[str, ...] = SENSED) ->
     always = [*joints, sensors.gyro[robot], sensors.accelerometer[robot], camera, [sensors.supply_voltage[robot]]]
     if len(columns) == len(SENSED):
         return np.concatenate(always)
-    flow = [*sensors.flow[robot], sensors.flow_quality[robot]] if sensors.flow_is_new[robot] else np.full(len(FLOW), np.nan)
-    return np.concatenate([*always, flow])
+    is_new = bool(sensors.flow_is_new[robot])
+    flow = [*sensors.flow[robot], sensors.flow_quality[robot]] if is_new else np.full(len(FLOW) - 1, np.nan)
+    return np.concatenate([*always, flow, [sensors.flow_age[robot]]])

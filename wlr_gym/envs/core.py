@@ -18,7 +18,7 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.envs.actions import Actions
 from wlr_gym.envs.commands import Commands
 from wlr_gym.envs.episodes import Episodes
-from wlr_gym.envs.measured import measurable, measured_truth
+from wlr_gym.envs.measured import measurable, measured_truth, require_flow
 from wlr_gym.envs.observation import ObservationPipeline
 from wlr_gym.envs.randomized_robots import RandomizedRobots
 from wlr_gym.envs.settings import Settings
@@ -97,6 +97,8 @@ class Core:
             sensor_noise=settings.is_real or self.randomization.config.sensor_noise,
         )
         self.plant = plants.make_plant(settings.backend, robot, self.count, options, self.patch.forces, settings.robot_options)
+        if settings.is_real:
+            require_flow(self.task, bool(self.plant.parameters["flow.present"][0]))
         self.limit: int = self.task.episode_steps
         self.dictionary: bool = settings.observation == "dict"
         self.observer: SlipObserver | None = None

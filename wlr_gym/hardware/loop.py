@@ -20,7 +20,6 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -145,10 +144,8 @@ class ControlLoop:
         return sensors_of(self._step.known, self.recorder.origin)
 
     def statistics(self) -> dict[str, Any]:
-        """Return ticks, missed ones, percentiles of the timing (ms), the command limiter's interventions, and what came of the
-        optical-flow sensor, where there is one."""
-        flow = {} if self._link.flow is None else {"flow": asdict(self._link.flow.statistics)}
-        return {**self.pacer.statistics(), "interventions": dict(self.interventions), **flow}
+        """Return ticks, missed ones, percentiles of the timing (ms), the limiter's interventions, what came of optical flow."""
+        return {**self.pacer.statistics(), "interventions": dict(self.interventions), **self._step.flow_statistics()}
 
     # ---- start-up ----
 

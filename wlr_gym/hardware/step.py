@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,7 @@ class ControlStep:
         self._limiter, self._operator, self._pacer = limiter, operator, pacer
         self._clock = pacer.clock
         self._sensing = Sensing(limiter, imu, pacer.clock, pacer.period, flow)
+        self._flow = flow
         self._idle = 0.0
         self._read_at = 0.0
 
@@ -69,6 +71,10 @@ class ControlStep:
         if self.status is None:
             raise InputError("the robot has not been started")
         return self.status
+
+    def flow_statistics(self) -> dict[str, Any]:
+        """Return what came of the optical-flow sensor, under its name; empty = there is none."""
+        return {} if self._flow is None else {"flow": asdict(self._flow.statistics)}
 
     def first(self) -> None:
         """Read everything, with torque off.

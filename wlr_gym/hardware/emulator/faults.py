@@ -50,7 +50,7 @@ FAULTS: dict[str, FaultKind] = {
     "limit_changed": FaultKind("something else holds the servo's Goal PWM at this", 200, "counts"),
     "duplicate_id": FaultKind("a second servo with the same id answers at the same time: both answers are garbled"),
     "imu_frozen": FaultKind("the chip repeats its values; the microcontroller numbers and stamps them anew"),
-    "flow_texture": FaultKind("the floor has no texture: the flow sensor's surface quality is this", 8, "of 255"),
+    "flow_texture": FaultKind("the floor has no texture: the flow sensor's surface quality is this", 8, "counts"),
     "flow_frozen": FaultKind("the flow sensor repeats its counts"),
     "flow_scale": FaultKind("the flow sensor counts this much", 1.2, "of the true flow"),
     "flow_turned": FaultKind("the flow sensor has turned on the body", 1.5708, "rad"),

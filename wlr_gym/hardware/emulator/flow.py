@@ -10,7 +10,7 @@ from wlr_gym.hardware.config import FlowPort
 from wlr_gym.hardware.emulator.faults import FaultBoard
 from wlr_gym.hardware.emulator.line import Emission
 from wlr_gym.hardware.flow.frames import FlowFrame, encode_frame
-from wlr_gym.hardware.flow.reading import FULL_QUALITY, Conversion
+from wlr_gym.hardware.flow.reading import FULL_QUALITY, FlowConversion
 from wlr_gym.physics.plants.base import Sensors
 from wlr_gym.robot.sensors import FlowSensor
 
@@ -31,7 +31,7 @@ class EmulatedFlow:
     """
 
     def __init__(self, port: FlowPort, sensor: FlowSensor, faults: FaultBoard, tick: float) -> None:
-        self._convert = Conversion(port.model_copy(update={"calibration": type(port.calibration)()}), sensor)
+        self._convert = FlowConversion(port.model_copy(update={"calibration": type(port.calibration)()}), sensor)
         self._sensor, self._faults, self._tick = sensor, faults, tick
         self._frames = 0
         self._sent_at = 0.0

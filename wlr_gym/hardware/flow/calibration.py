@@ -120,7 +120,8 @@ def _windows(seen: Array, rolled: Array, t: Array) -> Array:
     step = np.gradient(t)
     ways = np.where(known[:, None], np.column_stack([seen, rolled]), 0.0) * step[:, None]
     window = ((t - t[0]) / WINDOW).astype(int)
-    sums = np.stack([np.bincount(window, ways[:, k]) for k in range(3)], axis=1)
+    sums = np.zeros((window[-1] + 1, 3))
+    np.add.at(sums, window, ways)
     return sums[np.abs(sums[:, 2]) > LEAST_WINDOW]
 
 

@@ -45,7 +45,7 @@ def encode_frame(frame: FlowFrame) -> bytes:
     return sealed(_LAYOUT.pack(SYNC, frame.sequence & 0xFFFF, frame.microseconds & 0xFFFFFFFF, *numbers))
 
 
-class FrameParser:
+class FlowFrameParser:
     """Reads the frames of a stream.
 
     Attributes:

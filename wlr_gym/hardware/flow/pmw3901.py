@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import FlowPort
-from wlr_gym.hardware.flow.reading import FlowReader, FlowReading, FlowStatistics, Motion
+from wlr_gym.hardware.flow.reading import CountedMotion, FlowReader, FlowReading, FlowStatistics
 from wlr_gym.hardware.flow.spi import SpiBus, SpiDevice
 from wlr_gym.robot.sensors import FlowSensor
 
@@ -154,7 +154,7 @@ class ChipPoller:
     ) -> None:
         self._port, self._sensor, self._clock, self._make_bus, self._sleep = port, sensor, clock, make_bus, sleep
         self._reader = FlowReader(port, sensor, clock())
-        self._motions: deque[Motion] = deque(maxlen=256)
+        self._motions: deque[CountedMotion] = deque(maxlen=256)
         self._bus: SpiBus | None = None
         self._thread: threading.Thread | None = None
         self._over = threading.Event()
@@ -233,5 +233,5 @@ class ChipPoller:
         now, rate = self._clock(), self._sensor.rate
         if moved or now - self._frame_at >= 1.0 / rate:
             frames = max(1, round((now - self._frame_at) * rate))  # the chip's time is not the polls'
-            self._motions.append(Motion(x, y, frames / rate, quality, shutter, now))
+            self._motions.append(CountedMotion(x, y, frames / rate, quality, shutter, now))
             self._frame_at = now

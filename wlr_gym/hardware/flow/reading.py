@@ -28,7 +28,7 @@ class FlowGoneError(ConnectionError):
 
 
 @dataclass(frozen=True)
-class Motion:
+class CountedMotion:
     """What the chip counted from one of its frames to a later one.
 
     Attributes:
@@ -52,7 +52,7 @@ class FlowReading:
 
     Attributes:
         flow: (2,) rad/s along body x and y, the last valid one: v_x/h - w_y, v_y/h + w_x.
-        quality: surface quality, 0 to 1; 0 = the last reading was not valid.
+        quality: surface quality, 0 to 1; 0 = no valid reading in this control step.
         age: s since the end of the valid one's interval.
         is_new: whether this control step brought a valid one.
         trouble: why there is none; empty = there is, or none was due.
@@ -82,7 +82,7 @@ class FlowStatistics:
     refused: dict[str, int] = field(default_factory=dict)
 
 
-class Conversion:
+class FlowConversion:
     """Counts to calibrated flow along the body's axes, and back.
 
     Args:
@@ -123,13 +123,13 @@ class FlowReader:
 
     def __init__(self, port: FlowPort, sensor: FlowSensor, now: float) -> None:
         self.statistics = FlowStatistics()
-        self._convert, self._sensor = Conversion(port, sensor), sensor
-        self._flow, self._quality = np.zeros(2), 0.0
+        self._convert, self._sensor = FlowConversion(port, sensor), sensor
+        self._flow = np.zeros(2)
         self._end = self._last_frame = now
         self._seen: tuple[int, int, int, int] | None = None
         self._repeats = 0
 
-    def read(self, motions: Sequence[Motion], now: float, gone: str = "") -> FlowReading:
+    def read(self, motions: Sequence[CountedMotion], now: float, gone: str = "") -> FlowReading:
         """Return the reading of a control step: the mean over what came since the last one.
 
         Args:
@@ -144,22 +144,21 @@ class FlowReader:
         if good:
             interval = sum(motion.interval for motion in good)
             self._flow = self._convert.flow(sum(m.x for m in good), sum(m.y for m in good), interval)
-            self._quality = good[-1].quality / FULL_QUALITY
             self._end = good[-1].end
             self.statistics.readings += 1
-            return FlowReading(self._flow, self._quality, max(0.0, now - self._end), is_new=True)
+            quality = good[-1].quality / FULL_QUALITY
+            return FlowReading(self._flow, quality, max(0.0, now - self._end), is_new=True)
         trouble = gone or next((fault for _, fault in reversed(faults) if fault), "") or self._silence(now)
         if trouble:
-            self._quality = 0.0
             kind = trouble.partition(":")[0]
             self.statistics.refused[kind] = self.statistics.refused.get(kind, 0) + 1
-        return FlowReading(self._flow, self._quality, max(0.0, now - self._end), is_new=False, trouble=trouble)
+        return FlowReading(self._flow, 0.0, max(0.0, now - self._end), is_new=False, trouble=trouble)
 
     def _silence(self, now: float) -> str:
         silent = now - self._last_frame
         return f"silent: no frame for {silent:.1f} s" if silent > SILENCE else ""
 
-    def _fault(self, motion: Motion) -> str:
+    def _fault(self, motion: CountedMotion) -> str:
         """Return why what was counted is not valid; empty = it is."""
         seen = (motion.x, motion.y, motion.quality, motion.shutter)
         self._repeats = self._repeats + 1 if seen == self._seen and (motion.x or motion.y) else 0

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from wlr_gym.base.errors import require_package
 from wlr_gym.hardware.config import FlowPort
-from wlr_gym.hardware.flow.frames import FlowFrame, FrameParser
-from wlr_gym.hardware.flow.reading import FlowReader, FlowReading, FlowStatistics, Motion
+from wlr_gym.hardware.flow.frames import FlowFrame, FlowFrameParser
+from wlr_gym.hardware.flow.reading import CountedMotion, FlowReader, FlowReading, FlowStatistics
 from wlr_gym.hardware.framing import Device, StreamClock, drained
 from wlr_gym.hardware.ports import open_serial
 from wlr_gym.robot.sensors import FlowSensor
@@ -49,7 +49,7 @@ class FlowStream:
         self._reset()
 
     def _reset(self) -> None:
-        self._parser = FrameParser()
+        self._parser = FlowFrameParser()
         self._frame_clock = StreamClock()
         self._reader = FlowReader(self._port, self._sensor, self._clock())
         self._emptied_at = self._clock()
@@ -85,7 +85,7 @@ class FlowStream:
         is_recent, self._emptied_at = now - self._emptied_at <= RECENT, now
         return self._reader.read(self._motions(frames, now, is_recent), now, self._gone)
 
-    def _motions(self, frames: list[FlowFrame], now: float, is_recent: bool) -> list[Motion]:
+    def _motions(self, frames: list[FlowFrame], now: float, is_recent: bool) -> list[CountedMotion]:
         if not frames:
             return []
         last = frames[-1].microseconds
@@ -94,7 +94,7 @@ class FlowStream:
             return []
         ends = [now - age - ((last - frame.microseconds) % 2**32) * 1e-6 for frame in frames]
         return [
-            Motion(frame.x, frame.y, frame.interval * 1e-6, frame.quality, frame.shutter, end)
+            CountedMotion(frame.x, frame.y, frame.interval * 1e-6, frame.quality, frame.shutter, end)
             for frame, end in zip(frames, ends, strict=True)
         ]
 

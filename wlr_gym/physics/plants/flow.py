@@ -185,6 +185,7 @@ def _read(seed: Any, tick: int, period: float, place: Any, settings: Any, state:
     if frames == 0:
         state[_CARRIED] += shift_x
         state[_CARRIED + 1] += shift_y
+        state[_QUALITY] = 0.0
         return 0.0
     end = (frame + phase) / rate
     part = end / period - (tick - 1)
