@@ -8,10 +8,11 @@ import pytest
 import yaml
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs.tasks import describe, load_task
+from wlr_gym.envs.tasks import describe, load_randomization, load_task
 from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.policy import needs_camera
+from wlr_gym.robot import load_robot
 
 TERMS = {"camera_present": {}, "flow_present": {}, "flow": {"scale": 0.2}, "flow_quality": {}}
 BOTH = {"sensors": {"camera": 0.5, "flow": 0.5}, "observations": TERMS}
@@ -82,6 +83,17 @@ def test_a_user_can_say_who_has_what():
     core = core_of(BOTH, robot="flow")
     core.begin_episodes(core.everyone, {"parameters": {"camera.present": 0.0, "flow.present": 1.0}})
     np.testing.assert_array_equal(columns(core, "camera_present", "flow_present"), np.tile([0.0, 1.0], (8, 1)))
+
+
+def test_the_preset_draws_what_is_wrong_with_the_sensor():
+    draws = load_randomization("flow", load_robot("flow"))
+    seeds = np.arange(200, dtype=np.uint64)
+    drawn = draws.parameters(seeds, seeds)
+    for name, low, high in (("scale", 0.96, 1.04), ("mount_yaw", -0.06, 0.06), ("dropout", 0.0, 0.1), ("poor_floor", 0.0, 0.3)):
+        values = drawn[f"flow.{name}"]
+        assert low <= values.min() < values.max() <= high
+    plain = load_randomization("nominal", load_robot("flow")).parameters(seeds, seeds)
+    np.testing.assert_array_equal(plain["ground.mu_x"], drawn["ground.mu_x"])
 
 
 def test_a_sensor_that_fails_within_an_episode_is_told():

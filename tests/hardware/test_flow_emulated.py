@@ -1,4 +1,4 @@
-"""The optical-flow sensor of the emulated robot: from the plant to the control loop, faults, docs/optical_flow.md's commands."""
+"""The optical-flow sensor of the emulated robot: plant to control loop, faults; the commands of docs/optical_flow.md."""
 
 import json
 
@@ -8,10 +8,12 @@ import pytest
 from wlr_gym.base.paths import find_config
 from wlr_gym.cli import main
 from wlr_gym.data.read import read_run
-from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.config import FlowPort, load_hardware
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link, with_flow_port
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
+from wlr_gym.hardware.emulator.server import Server
+from wlr_gym.hardware.flow.stream import FlowStream
 from wlr_gym.hardware.flow.supervision import floor_velocity, lens_height
 from wlr_gym.hardware.loop import Phase
 from wlr_gym.hardware.plant import RobotPlant
@@ -87,6 +89,20 @@ def test_a_robot_without_the_sensor_reads_nothing_of_it():
         assert "flow" not in plant.loop.statistics()
     finally:
         plant.close()
+
+
+def test_frames_come_over_a_port_of_their_own():
+    pytest.importorskip("serial")
+    machine = Machine(ROBOT, HARDWARE, MachineOptions(tick=0.002, timing=NO_TIME))
+    with Server(machine, real_time=False) as server:
+        stream = FlowStream(FlowPort(port=server.ports["flow"]), ROBOT.sensors.flow, lambda: machine.time)
+        stream.open()
+        server.advance(0.06)
+        reading = stream.read()
+        stream.close()
+    machine.close()
+    assert reading.is_new
+    assert stream.statistics.errors == 0
 
 
 @pytest.mark.slow
