@@ -216,11 +216,10 @@ def _gamepads(options: DeployOptions, core: Core, loop: ControlLoop, console: Co
 def _stream(path: Path | None, loop: ControlLoop, stack: contextlib.ExitStack) -> McapStream | None:
     """Return what writes the run into an MCAP file while it goes on, or None."""
     from wlr_gym.data.logs.stream import McapStream
-    from wlr_gym.hardware.log import ROW
 
     if path is None:
         return None
-    loop.recorder.stream = stack.enter_context(McapStream(path, ROW[1:], loop.recorder.meta, loop.robot))
+    loop.recorder.stream = stack.enter_context(McapStream(path, loop.recorder.columns[1:], loop.recorder.meta, loop.robot))
     return loop.recorder.stream
 
 

@@ -89,6 +89,7 @@ _TABLE: list[Column] = [
     Column("cam_yaw", "cam_yaw", "rad", "vision heading in the floor frame; NaN without a new frame", may_be_nan=True),
     Column("cam_z", "cam_z", "m", "side view: height of the marker's centre; NaN without a new frame", may_be_nan=True),
     Column("cam_pitch", "cam_pitch", "rad", "side view: pitch, nose down positive; NaN without a new frame", may_be_nan=True),
+    Column("cam_age", "cam_age", "s", "age of the last vision pose when the row's sensors were read; live cameras only"),
     Column("volt", "volt", "V", "supply voltage"),
 ]
 
@@ -96,8 +97,8 @@ _TABLE: list[Column] = [
 COLUMNS: dict[str, Column] = {column.name: column for column in _TABLE}
 REQUIRED = tuple(name for name, column in COLUMNS.items() if column.required)
 COMMANDS = tuple(f"cmd_{joint}" for joint in JOINTS)
-#: What the robot measured: everything but the clock and the commands.
-CHANNELS = tuple(name for name in COLUMNS if name != "t" and name not in COMMANDS)
+#: What the robot measured: everything but clocks and commands.
+CHANNELS = tuple(name for name in COLUMNS if name not in ("t", "cam_age", *COMMANDS))
 CAMERA = ("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch")
 ANGLES_OF_THE_BODY = ("cam_yaw", "cam_pitch")
 

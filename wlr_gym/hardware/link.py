@@ -5,7 +5,11 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
+from wlr_gym.hardware.camera.config import CameraFile
+from wlr_gym.hardware.camera.live import LiveCamera
+from wlr_gym.hardware.camera.reading import CameraReader
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.imu.driver import Imu, make_imu
 from wlr_gym.hardware.servos import Servos
@@ -23,6 +27,7 @@ class Link:
         clock: what deadlines and ages are told by.
         is_serial: there are real ports, which a watchdog process can open.
         finish: called after closing.
+        camera: above the floor; None = there is none.
     """
 
     servos: Servos
@@ -30,6 +35,7 @@ class Link:
     clock: Clock
     is_serial: bool
     finish: Callable[[], None] = lambda: None
+    camera: CameraReader | None = None
 
     def open(self) -> None:
         """Open all ports, or none.
@@ -41,17 +47,30 @@ class Link:
             self.servos.open()
             stack.callback(self.servos.close)
             self.imu.open()
+            stack.callback(self.imu.close)
+            if self.camera is not None:
+                self.camera.open()
             stack.pop_all()
 
     def close(self) -> None:
         """Close all ports; servos stay as they are."""
         self.servos.close()
         self.imu.close()
+        if self.camera is not None:
+            self.camera.close()
         self.finish()
 
 
-def serial_link(robot: Robot, hardware: Hardware) -> Link:
-    """Return a link over the hardware file's ports."""
+def serial_link(robot: Robot, hardware: Hardware, camera: CameraFile | None = None, poses: Path | None = None) -> Link:
+    """Return a link over the hardware file's ports.
+
+    Args:
+        robot: the robot.
+        hardware: wiring and mounting.
+        camera: above the floor; None = there is none.
+        poses: where an emulated robot writes its true pose, for a camera that films it by rendering; None = a real camera.
+    """
     clock = MonotonicClock()
     servos = Servos(robot, hardware, hardware.safety.patience, clock.now)
-    return Link(servos, make_imu(hardware.imu, clock.now), clock, is_serial=True)
+    eye = None if camera is None else LiveCamera(camera, robot, poses)
+    return Link(servos, make_imu(hardware.imu, clock.now), clock, is_serial=True, camera=eye)

@@ -35,6 +35,7 @@ from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.log import RunRecorder, origin_of, sensors_of
 from wlr_gym.hardware.operator import Operator
 from wlr_gym.hardware.ramp import legs_away, make_ramp, ramp_speed, start_pose
+from wlr_gym.hardware.safety.camera import camera_statistics
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.rules import resting
 from wlr_gym.hardware.safety.state import REQUESTS, Level, RobotStatus, Verdict
@@ -112,10 +113,10 @@ class ControlLoop:
         self.clock: Clock = link.clock
         self.operator: Operator = Operator(link.clock)
         self.pacer: Pacer = Pacer(link.clock, period)
-        self.recorder: RunRecorder = RunRecorder(log, meta, link.clock, robot)
+        self.recorder: RunRecorder = RunRecorder(log, meta, link.clock, robot, has_camera=link.camera is not None)
         self._link, self._is_open = link, False
         self._limiter = CommandLimiter(link.servos, robot, hardware, link.clock, period, dry_run, meta.profile)
-        self._step = ControlStep(self._limiter, link.imu, self.operator, self.pacer)
+        self._step = ControlStep(self._limiter, link, self.operator, self.pacer)
         self._guard = Guard(robot, hardware, watchdog and link.is_serial and not dry_run)
 
     def __enter__(self) -> ControlLoop:
@@ -145,7 +146,8 @@ class ControlLoop:
 
     def statistics(self) -> dict[str, Any]:
         """Return ticks, missed ones, percentiles of the timing (ms), and the command limiter's interventions."""
-        return {**self.pacer.statistics(), "interventions": dict(self.interventions)}
+        camera = {} if self._step.camera is None else {"camera": camera_statistics(self._step.camera)}
+        return {**self.pacer.statistics(), "interventions": dict(self.interventions), **camera}
 
     # ---- start-up ----
 
@@ -171,6 +173,7 @@ class ControlLoop:
                 self.recorder.new_run()
             self._enter(Phase.RAMP)
             self._follow_ramp(target)
+            self._step.begin_run()
             self.recorder.origin = origin_of(self._step.known)
             self._enter(Phase.RUNNING)
         return self._step.known

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.data.format import RunMeta
+from wlr_gym.hardware.camera.config import load_camera_file
 from wlr_gym.hardware.config import Hardware, load_hardware, with_ports
 from wlr_gym.hardware.link import Link, serial_link
 from wlr_gym.hardware.loop import ControlLoop
@@ -163,8 +164,9 @@ class RobotPlant:
 
 
 def _link(robot: Robot, hardware: Hardware, chosen: RobotOptions, options: PlantOptions) -> Link:
+    camera = None if chosen.camera is None else load_camera_file(chosen.camera)
     if not chosen.emulated:
-        return serial_link(robot, hardware)
+        return serial_link(robot, hardware, camera, chosen.poses)
     from wlr_gym.hardware.emulator.link import emulated_robot  # with the simulators, which a real robot does not need
 
-    return emulated_robot(robot, hardware, chosen.effects, sensor_noise=options.sensor_noise)
+    return emulated_robot(robot, hardware, chosen.effects, sensor_noise=options.sensor_noise, camera=camera)

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.hardware.imu.driver import Imu
+from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.operator import Operator
+from wlr_gym.hardware.safety.camera import CameraWatch
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.rules import Decision
 from wlr_gym.hardware.safety.state import Level, RobotStatus
@@ -41,7 +42,7 @@ class ControlStep:
 
     Args:
         limiter: decides, limits and writes.
-        imu: of the robot.
+        link: its IMU and camera are read.
         operator: what is asked for; served in the spare time.
         pacer: deadlines and statistics.
 
@@ -49,11 +50,11 @@ class ControlStep:
         status: what was last read; None = nothing yet.
     """
 
-    def __init__(self, limiter: CommandLimiter, imu: Imu, operator: Operator, pacer: Pacer) -> None:
+    def __init__(self, limiter: CommandLimiter, link: Link, operator: Operator, pacer: Pacer) -> None:
         self.status: RobotStatus | None = None
         self._limiter, self._operator, self._pacer = limiter, operator, pacer
         self._clock = pacer.clock
-        self._sensing = Sensing(limiter, imu, pacer.clock, pacer.period)
+        self._sensing = Sensing(limiter, link.imu, pacer.clock, pacer.period, link.camera)
         self._idle = 0.0
         self._read_at = 0.0
 
@@ -67,6 +68,17 @@ class ControlStep:
         if self.status is None:
             raise InputError("the robot has not been started")
         return self.status
+
+    @property
+    def camera(self) -> CameraWatch | None:
+        """What judges the camera's readings; None = there is none."""
+        return self._sensing.watch
+
+    def begin_run(self) -> None:
+        """Let a run begin: the camera's poses count from here."""
+        if self.camera is not None:
+            self.camera.begin_run()
+            self.status = replace(self.known, camera=self.camera.status)
 
     def first(self) -> None:
         """Read everything, with torque off.

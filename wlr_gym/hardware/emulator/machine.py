@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -75,6 +75,7 @@ class Machine:
         coupling: of the servos and the plant.
         lines: bus name -> line.
         faults: what is wrong right now.
+        watchers: called at the end of every tick (what looks at the robot from outside: a camera).
 
     Raises:
         InputError: a plant of another size or period.
@@ -104,6 +105,7 @@ class Machine:
         self.time = 0.0
         self.ticks = 0
         self.faults: FaultBoard = FaultBoard(self.options.seed)
+        self.watchers: list[Callable[[], None]] = []
         self._imu_output: list[Emission] = []
         self._imu = Conversion(hardware.imu)
         self._frames = 0
@@ -129,7 +131,7 @@ class Machine:
     @property
     def places(self) -> tuple[str, ...]:
         """Names a fault may be at."""
-        return (*JOINTS, *self.hardware.buses, "imu")
+        return (*JOINTS, *self.hardware.buses, "imu", "camera")
 
     def close(self) -> None:
         """Release the plant."""
@@ -154,6 +156,8 @@ class Machine:
         self.time = self.ticks * tick
         while self.time >= (self._frames + 1) / self.hardware.imu.rate - 1e-9:
             self._read_imu()
+        for watcher in self.watchers:
+            watcher()
 
     def pause(self, duration: float) -> None:
         """Let ``duration`` s pass in which nothing happens (a busy computer): quartzes do not stop, so all clocks go on."""
