@@ -194,9 +194,7 @@ class RunRecorder:
         stream: where rows of the run go besides; it has these columns.
     """
 
-    def __init__(
-        self, folder: Path | None, meta: RunMeta, clock: Clock, robot: Robot, has_camera: bool = False
-    ) -> None:
+    def __init__(self, folder: Path | None, meta: RunMeta, clock: Clock, robot: Robot, has_camera: bool = False) -> None:
         self.folder, self.meta, self._robot, self._has_camera = folder, meta, robot, has_camera
         self.columns = row_columns(has_camera)
         self.log: RunLog | None = None

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 #: Poses that the ring holds.
 LENGTH = 512
-#: Numbers of a row: time, position, quaternion (w, x, y, z), legs, then one per kind of fault (its value plus 1; 0 = it is not).
+#: Numbers of a row: time, position, quaternion (w, x, y, z), legs; then per kind of fault its value plus 1, 0 = it is not.
 _POSE = 12
 FAULT_COLUMNS = 16
 _ROW = _POSE + FAULT_COLUMNS

@@ -1,7 +1,7 @@
 """The process that takes frames and finds poses in them: ``python -m wlr_gym.hardware.camera.process``.
 
-It reads one line of JSON (camera, robot, files), answers ``ready`` once the camera gives a frame, or ``error: why``, and writes a
-reading for each frame into the slot until its standard input ends. A process of its own: neither a slow picture nor a driver
+It reads one line of JSON (camera, robot, files), answers ``ready`` once the camera gives a frame, or ``error: why``, and writes
+a reading for each frame into the slot until its standard input ends. A process of its own: neither a slow picture nor a driver
 that hangs can hold up a control step, and it runs at a lower priority than the loop.
 """
 
@@ -109,7 +109,7 @@ def rendered_frames(file: CameraFile, robot: Robot, feed: PoseFeed) -> Iterator[
 
 
 def frames_of_film(path: Path, rate: float) -> Iterator[Taken | None]:
-    """Yield the pictures of a recorded film (an array (frames, H, W) of grey levels) again and again, at a pace; for benches."""
+    """Yield the pictures of a recorded film (an array (frames, H, W) of grey levels) over and over, at a pace; for benches."""
     import numpy as np
 
     film = np.load(path, mmap_mode="r")

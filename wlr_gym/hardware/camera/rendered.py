@@ -1,6 +1,6 @@
 """Frames of an emulated robot, rendered from its true pose, and what can go wrong with a camera.
 
-Nothing but pictures, their time stamps and their arrival leaves this module; the pose is found by the detector, as on the robot.
+Nothing but pictures, their time stamps and their arrival leaves this module; the detector finds the pose, as on the robot.
 """
 
 from __future__ import annotations

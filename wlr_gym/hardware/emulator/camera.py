@@ -1,4 +1,4 @@
-"""A camera over an emulated robot in emulated time: frames arrive exactly when they should, and the same run gives the same bits."""
+"""A camera over an emulated robot in emulated time: frames arrive exactly when they should; a run gives the same bits again."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class CameraStatus:
     """What the camera says.
 
     Attributes:
-        pose: (3,) x, y (m) and yaw (rad, unwrapped) of the body that was believed last, from the start pose; 0 before the first.
+        pose: (3,) x, y (m) and yaw (rad, unwrapped) that was believed last, from the start pose; 0 before the first.
         time: s at which it was exposed; the run's start before the first.
         is_new: it came in this control step.
         reason: why no pose comes; empty = nothing is wrong.
