@@ -54,7 +54,7 @@ _INSTANTS = 2
 #: m around the middle of the floor where clutter lies.
 _CLUTTER_AREA = (2.0, 1.2)
 #: m, where the other sheet lies.
-_DECOY = (0.5, 0.45)
+_DECOY = (0.35, 0.35)
 
 #: Name of a fault -> its value while it holds, else None.
 Faults = Callable[[str], float | None]
@@ -112,6 +112,10 @@ class RenderedCamera:
         """Render the frame of an exposure that shows the robot at :meth:`instants`."""
         if self._last is not None and self._faults("camera_frozen") is not None:
             return self._last
+        if self._faults("camera_covered") is not None:
+            noise = np.random.default_rng([self.file.emulated.seed, 3, exposure.number])
+            shape = self.file.calibration.height, self.file.calibration.width
+            return np.clip(np.rint(noise.normal(12.0, 2.0, shape)), 0, 255).astype(np.uint8)
         plate = self._plate()
         parts = [*robot_facets(self.robot, poses[0].legs), plate]
         moving = [[facet.moved(at.position, at.rotation) for facet in parts] for at in map(scene_pose, poses)]
@@ -119,7 +123,7 @@ class RenderedCamera:
         blur = self._faults("camera_blurred")
         look = Look(blur=scene.blur if blur is None else blur, noise=scene.noise)
         image = self.renderer().frame(moving, look, hash_seed(scene.seed, exposure.number))
-        self._last = self._spoilt(image, exposure.number)
+        self._last = self._spoilt(image)
         return self._last
 
     def renderer(self) -> Renderer:
@@ -147,11 +151,8 @@ class RenderedCamera:
             circles[:, :2] *= -1.0
         return replace(plate, circles=circles)
 
-    def _spoilt(self, image: Image, number: int) -> Image:
+    def _spoilt(self, image: Image) -> Image:
         """What the faults do to the picture itself."""
-        if self._faults("camera_covered") is not None:
-            noise = np.random.default_rng([self.file.emulated.seed, 3, number]).normal(12.0, 2.0, image.shape)
-            return np.clip(np.rint(noise), 0, 255).astype(np.uint8)
         if self._faults("camera_glare") is not None:
             image = _glaring(image)
         if self._faults("camera_mirrored") is not None:

@@ -33,9 +33,9 @@ MEMORY = 1.2
 _AGAINST = (0.15, 0.5, 1.0)
 # How far a true pose may differ from what gyroscope, wheels and legs say; chosen on simulated drives (docs/camera.md).
 #: rad: at once, per s, and of what was turned.
-_TURN = (0.015, 0.03, 0.03)
+_TURN = (0.015, 0.02, 0.02)
 #: m: at once, and per s of sliding along and across.
-_ALONG, _ACROSS = (0.006, 0.08), (0.006, 0.10)
+_ALONG, _ACROSS = (0.004, 0.02), (0.004, 0.08)
 #: s for which a body may go on as its wheels went before.
 _COAST = 0.4
 #: m between the body's height and that of its legs.
@@ -45,9 +45,9 @@ _DOUBTED = 3
 #: s for which poses must agree before they are believed: at the start and after a gap; after contradictions, each time twice
 #: as long, up to the last.
 _AGREES, _AGREES_AGAIN, _LONGEST = 0.12, 0.5, 8.0
-#: m and rad, and both per s of a gap, by which the pose may differ from dead reckoning after it; beyond, the camera's frame is
-#: taken to have moved, and the pose goes on from dead reckoning.
-_GAP = ((0.05, 0.15), (0.03, 0.03))
+#: m and rad, and both per s of a gap, by which the pose may differ from dead reckoning after it; beyond, and after
+#: contradictions, the camera's frame is taken to have moved, and the pose goes on from dead reckoning.
+_GAP = ((0.03, 0.1), (0.03, 0.03))
 #: Least sum of squared changes of the yaw rate (rad/s)^2 from which the lag of the pictures is known.
 _LEAST_TURNS = 3.0
 
@@ -250,11 +250,11 @@ class CameraWatch:
 
     def _trust(self, seen: _Seen) -> None:
         """Believe the camera, at the start or again."""
-        self._doubts = 0
+        was_doubted, self._doubts = self._doubts >= _DOUBTED, 0
         self._believed = deque([*self._agreeing][-32:], maxlen=64)
         self._agreeing.clear()
         known = self._at(seen.time)
-        if self._frame is not None:
+        if self._frame is not None and not was_doubted:
             gap = seen.time - self.status.time
             shown = self._shown(seen.pose)
             off = math.hypot(*(shown[:2] - known[:2])), abs(math.remainder(shown[2] - known[2], 2 * math.pi))
