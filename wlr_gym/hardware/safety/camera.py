@@ -32,8 +32,8 @@ MEMORY = 1.2
 #: Ages (s) of believed poses that a new one is held against, besides the last.
 _AGAINST = (0.15, 0.5, 1.0)
 # How far a true pose may differ from what gyroscope, wheels and legs say; chosen on simulated drives (docs/camera.md).
-#: rad: at once, per s, and of what was turned.
-_TURN = (0.015, 0.02, 0.02)
+#: rad: at once, per s, of what was turned, and per rad/s by which the yaw rate has changed (a lag of the pictures, s).
+_TURN = (0.015, 0.02, 0.02, 0.06)
 #: m: at once, and per s of sliding along and across.
 _ALONG, _ACROSS = (0.004, 0.02), (0.004, 0.08)
 #: s for which a body may go on as its wheels went before.
@@ -49,7 +49,9 @@ _AGREES, _AGREES_AGAIN, _LONGEST = 0.12, 0.5, 8.0
 #: contradictions, the camera's frame is taken to have moved, and the pose goes on from dead reckoning.
 _GAP = ((0.03, 0.1), (0.03, 0.03))
 #: Least sum of squared changes of the yaw rate (rad/s)^2 from which the lag of the pictures is known.
-_LEAST_TURNS = 3.0
+_LEAST_TURNS = 2.0
+#: s, 1 sigma, from which on the lag is allowed for, and what is the most of it.
+_LAG_SIGMA, _LARGEST_LAG = 0.004, 0.15
 
 # Reasons of its own; the others are those of MEANINGS.
 STALLED = "no frame comes"
@@ -62,13 +64,18 @@ CONTRADICTIONS = ("contradicts the gyroscope", "contradicts the wheels", "contra
 
 
 class _Seen(NamedTuple):
-    """A pose in the floor frame, and what the robot's own sensors counted until then: turn, way along (least, most)."""
+    """A pose in the floor frame; what the robot's own sensors counted until then: turn, way along (least, most); the yaw rate.
+
+    ``stamped`` is the time that the reading names; ``time`` allows for the pictures' lag, as far as it is known.
+    """
 
     time: float
+    stamped: float
     pose: Array
     turn: float
     least: float
     most: float
+    rate: float
 
 
 class CameraWatch:
@@ -98,7 +105,9 @@ class CameraWatch:
         self._frame: tuple[float, float, float] | None = None  # turn and shift from the floor frame to the run's
         self._doubts, self._agree_time = 0, _AGREES_AGAIN
         self._began, self._heard, self._last_time = 0.0, -math.inf, -math.inf
-        self._lag = [0.0, 0.0, 0.0, 0]  # sums of squared rates, of products, of squared errors; count
+        self._lag = [0.0, 0.0, 0.0, 0]  # sums of squared changes of the rate, of products, of squared errors; count
+        self._offset = 0.0
+        self._filter_delay = 1.0 / (2.0 * math.pi * robot.sensors.imu.bandwidth)
 
     @property
     def rate(self) -> float:
@@ -149,10 +158,11 @@ class CameraWatch:
         if is_new:
             assert reading is not None
             pose = self._shown(reading.pose[[0, 1, 3]])
-            self._correct(reading.time, pose)
+            exposed = self._believed[-1].time
+            self._correct(exposed, pose)
             self.poses += 1
-            self.latencies.append(now - reading.time)
-            self.status = CameraStatus(pose, reading.time, True, "", False)
+            self.latencies.append(now - exposed)
+            self.status = CameraStatus(pose, exposed, True, "", False)
         else:
             self.status = CameraStatus(self.status.pose, self.status.time, False, reason, is_wrong)
         return self.status
@@ -208,8 +218,9 @@ class CameraWatch:
         if max(sigma[0], sigma[1]) > LARGEST_SIGMA[0] or sigma[3] > LARGEST_SIGMA[1]:
             return UNCERTAIN
         self._last_time = reading.time
-        known = self._at(reading.time)
-        seen = _Seen(reading.time, reading.pose[[0, 1, 3]], *known[3:6])
+        moment = reading.time - self._offset
+        known = self._at(moment)
+        seen = _Seen(moment, reading.time, reading.pose[[0, 1, 3]], *known[3:6], self._rate(moment))
         if abs(reading.pose[2] - known[6]) > _HEIGHT:
             return self._doubt(CONTRADICTIONS[2], seen)
         return self._judge_motion(seen, now)
@@ -299,15 +310,17 @@ class CameraWatch:
     # ---- the lag of the pictures ----
 
     def _note_lag(self, seen: _Seen) -> None:
-        """Hold how the camera's yaw trails the gyroscope's against how the rate of turning changes."""
+        """Hold how the camera's yaw trails the gyroscope's against how the rate of turning changes; allow for what is found."""
         before = next((other for other in reversed(self._believed) if other.time < seen.time - _AGAINST[0]), None)
         if before is None:
             return
-        rates = [self._rate(seen.time), self._rate(before.time)]
-        change = rates[0] - rates[1]
-        error = math.remainder(seen.pose[2] - before.pose[2], 2 * math.pi) - (seen.turn - before.turn)
+        change = self._rate(seen.stamped) - self._rate(before.stamped)
+        turned = self._at(seen.stamped)[3] - self._at(before.stamped)[3]
+        error = math.remainder(seen.pose[2] - before.pose[2] - turned, 2 * math.pi)
         for k, value in enumerate((change**2, -change * error, error**2, 1)):
             self._lag[k] += value
+        if (lag := self.lag) is not None and lag[1] < _LAG_SIGMA:
+            self._offset = min(max(lag[0], 0.0), _LARGEST_LAG)
 
     def _rate(self, time: float) -> float:
         """Yaw rate (rad/s) of the gyroscope at a time."""
@@ -323,8 +336,8 @@ class CameraWatch:
         squares, products, errors, count = self._lag
         if squares < _LEAST_TURNS:
             return None
-        lag = products / squares
-        return lag, math.sqrt(max(errors - lag * products, 0.0) / max(count - 1, 1) / squares) + 1e-4
+        lag = products / squares + self._filter_delay
+        return lag, math.sqrt(max(errors - products**2 / squares, 0.0) / max(count - 1, 1) / squares) + 1e-4
 
 
 def camera_statistics(watch: CameraWatch) -> dict[str, Any]:
@@ -352,7 +365,7 @@ def _contradiction(seen: _Seen, others: deque[_Seen]) -> str:
         due = next(ages, math.inf)
         turned = seen.turn - other.turn
         error = math.remainder(seen.pose[2] - other.pose[2] - turned, 2 * math.pi)
-        if abs(error) > _TURN[0] + _TURN[1] * gap + _TURN[2] * abs(turned):
+        if abs(error) > _TURN[0] + _TURN[1] * gap + _TURN[2] * abs(turned) + _TURN[3] * abs(seen.rate - other.rate):
             return CONTRADICTIONS[0]
         middle = other.pose[2] + turned / 2
         dx, dy = (seen.pose[:2] - other.pose[:2]).tolist()
