@@ -1,4 +1,4 @@
-"""An emulated robot under an emulated camera, in emulated time, and what its control loop believed of the camera beside the truth."""
+"""An emulated robot under an emulated camera, in emulated time, and what its control loop believed beside the truth."""
 
 from __future__ import annotations
 
@@ -34,8 +34,9 @@ class CameraRig:
     """A robot under a camera.
 
     Attributes:
-        machine, link, loop: of the robot. rows: (T, 12) per control step: time; pose that is shown, when it was exposed, whether
-            it is new, whether it is wrong in the loop's eyes; true pose when it was exposed, from the start pose.
+        machine, link, loop: of the robot. truth: time and true x, y, yaw, tick by tick.
+        shown: per control step: time; pose that is shown, when it was exposed, whether it is new, whether it counts as wrong.
+        reasons: why there is no pose, per control step.
     """
 
     def __init__(self, file: CameraFile | None = None, log: Any = None, tick: float = 0.002, **parts: Any) -> None:

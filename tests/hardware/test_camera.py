@@ -106,7 +106,7 @@ def test_a_camera_file_names_what_is_wrong(tmp_path):
     with pytest.raises(InputError, match=r"nowhere\.yaml: no such camera file"):
         load_camera_file(path)
     path.write_text("name: mine\ncalibration: {width: 640, height: 360, focal: [380, 380], centre: [320, 180]}\nrates: 30\n")
-    with pytest.raises(InputError, match="unknown key 'rates'.*rate"):
+    with pytest.raises(InputError, match=r"unknown key 'rates'.*rate"):
         load_camera_file(path)
 
 
@@ -156,6 +156,11 @@ class Motion:
         return math.hypot(*(status.pose[:2] - [c * true[0] + s * true[1], c * true[1] - s * true[0]]))
 
 
+def moved(x=0.0, y=0.0, yaw=0.0):
+    """A camera that shows everything somewhere else."""
+    return lambda pose: pose + np.array([x, y, yaw])
+
+
 def test_poses_are_shown_from_the_start_with_their_age():
     motion = Motion()
     motion.begin()
@@ -173,7 +178,7 @@ def test_a_slipping_robot_is_believed():
     motion = Motion()
     motion.begin()
     for k in range(100):
-        status = motion.step(speed=0.03, wheels=0.2, shown=lambda p, k=k: p + [-0.03 * 0.02 * k, 0.04 * 0.02 * k, 0.0])
+        status = motion.step(speed=0.03, wheels=0.2, shown=moved(-0.03 * 0.02 * k, 0.04 * 0.02 * k))
         assert not status.is_wrong
         assert status.reason == ""
 
@@ -193,7 +198,7 @@ def against(shown, seconds=1.0, speed=0.1, turn=0.0, **keywords):
 
 
 def test_a_pose_that_jumps_is_wrong_and_the_run_goes_on_from_dead_reckoning():
-    reasons, believed, motion = against(lambda p: p + [0.3, 0.0, 0.0], seconds=3.0)
+    reasons, believed, motion = against(moved(0.3), seconds=3.0)
     assert reasons[1] in rules.CONTRADICTIONS
     assert believed == 0.0
     assert reasons[-1] == ""  # believed again, for how it moves
@@ -201,7 +206,7 @@ def test_a_pose_that_jumps_is_wrong_and_the_run_goes_on_from_dead_reckoning():
 
 
 def test_a_turn_that_the_gyroscope_does_not_know_is_wrong():
-    reasons, _, _ = against(lambda p: p + [0.0, 0.0, 0.1])
+    reasons, _, _ = against(moved(yaw=0.1))
     assert rules.CONTRADICTIONS[0] in reasons
 
 

@@ -89,8 +89,8 @@ _TABLE: list[Column] = [
     Column("cam_yaw", "cam_yaw", "rad", "vision heading in the floor frame; NaN without a new frame", may_be_nan=True),
     Column("cam_z", "cam_z", "m", "side view: height of the marker's centre; NaN without a new frame", may_be_nan=True),
     Column("cam_pitch", "cam_pitch", "rad", "side view: pitch, nose down positive; NaN without a new frame", may_be_nan=True),
-    Column("cam_age", "cam_age", "s", "age of the last vision pose when the row's sensors were read; live cameras only"),
     Column("volt", "volt", "V", "supply voltage"),
+    Column("cam_age", "cam_age", "s", "age of the last vision pose when the row's sensors were read; live cameras only"),
 ]
 
 #: All columns by name, in the order files are written.

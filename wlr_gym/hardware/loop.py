@@ -35,7 +35,6 @@ from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.log import RunRecorder, origin_of, sensors_of
 from wlr_gym.hardware.operator import Operator
 from wlr_gym.hardware.ramp import legs_away, make_ramp, ramp_speed, start_pose
-from wlr_gym.hardware.safety.camera import camera_statistics
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.rules import resting
 from wlr_gym.hardware.safety.state import REQUESTS, Level, RobotStatus, Verdict
@@ -146,8 +145,7 @@ class ControlLoop:
 
     def statistics(self) -> dict[str, Any]:
         """Return ticks, missed ones, percentiles of the timing (ms), and the command limiter's interventions."""
-        camera = {} if self._step.camera is None else {"camera": camera_statistics(self._step.camera)}
-        return {**self.pacer.statistics(), "interventions": dict(self.interventions), **camera}
+        return {**self.pacer.statistics(), "interventions": dict(self.interventions), **self._step.camera_statistics()}
 
     # ---- start-up ----
 
@@ -173,8 +171,7 @@ class ControlLoop:
                 self.recorder.new_run()
             self._enter(Phase.RAMP)
             self._follow_ramp(target)
-            self._step.begin_run()
-            self.recorder.origin = origin_of(self._step.known)
+            self.recorder.origin = origin_of(self._step.begin_run())
             self._enter(Phase.RUNNING)
         return self._step.known
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.operator import Operator
-from wlr_gym.hardware.safety.camera import CameraWatch
+from wlr_gym.hardware.safety.camera import camera_statistics
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.rules import Decision
 from wlr_gym.hardware.safety.state import Level, RobotStatus
@@ -69,16 +70,17 @@ class ControlStep:
             raise InputError("the robot has not been started")
         return self.status
 
-    @property
-    def camera(self) -> CameraWatch | None:
-        """What judges the camera's readings; None = there is none."""
-        return self._sensing.watch
+    def camera_statistics(self) -> dict[str, Any]:
+        """Return what came of the camera, under its name; empty = there is none."""
+        watch = self._sensing.watch
+        return {} if watch is None else {"camera": camera_statistics(watch)}
 
-    def begin_run(self) -> None:
-        """Let a run begin: the camera's poses count from here."""
-        if self.camera is not None:
-            self.camera.begin_run()
-            self.status = replace(self.known, camera=self.camera.status)
+    def begin_run(self) -> RobotStatus:
+        """Let a run begin: the camera's poses count from here. Return what is known."""
+        if (watch := self._sensing.watch) is not None:
+            watch.begin_run()
+            self.status = replace(self.known, camera=watch.status)
+        return self.known
 
     def first(self) -> None:
         """Read everything, with torque off.

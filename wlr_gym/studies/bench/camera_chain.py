@@ -1,4 +1,4 @@
-"""The whole chain in emulated time: servo protocol, rendered frames, detector, observer, policy; beside the simulator's own sensors.
+"""The whole chain in emulated time: servo protocol, rendered frames, detector, observer, policy; beside the simulator.
 
 Every episode has the robot, floor and commands that a simulated episode of the same seed has, so the two are paired.
 """
