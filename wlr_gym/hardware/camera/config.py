@@ -44,7 +44,8 @@ class CameraFile(SettingsModel):
 
     Attributes:
         name: of it.
-        device: number of the camera (0 = /dev/video0), or its path.
+        device: number of the camera (0 = /dev/video0), or its path; a path that ends in ``.npy`` is a recorded film, an array
+            (frames, H, W) of grey levels that is shown over and over.
         calibration: file of ``wlr calibrate camera``, seen from this file first, or its content.
         body, floor: markers on the robot and on the floor: files, seen from this file first, or names in ``configs/vision/``.
         rate: frames per second that are asked for.
@@ -60,6 +61,11 @@ class CameraFile(SettingsModel):
     rate: float = Field(default=30.0, gt=1.0, le=500.0)
     delay: float = Field(default=0.0, ge=0.0, le=0.2)
     emulated: EmulatedScene = EmulatedScene()
+
+    @property
+    def is_film(self) -> bool:
+        """Whether it is a recorded film."""
+        return isinstance(self.device, str) and self.device.endswith(".npy")
 
 
 def load_camera_file(source: str | Path | CameraFile) -> CameraFile:

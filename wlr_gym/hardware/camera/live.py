@@ -26,14 +26,14 @@ class LiveCamera:
 
     Args:
         file: the camera. robot: what it films where it is an emulated one.
-        feed: file with the poses of an emulated robot, which is filmed by rendering. film: file with recorded pictures.
+        feed: file with the poses of an emulated robot, which is filmed by rendering.
 
     Attributes:
         process: None = not open.
         stamps: whose time stamps count: ``driver``, ``driver's own clock`` or ``arrival``.
     """
 
-    def __init__(self, file: CameraFile, robot: Robot, feed: Path | None = None, film: Path | None = None) -> None:
+    def __init__(self, file: CameraFile, robot: Robot, feed: Path | None = None) -> None:
         self.file = file
         self.process: subprocess.Popen[bytes] | None = None
         self.stamps = ""
@@ -41,7 +41,6 @@ class LiveCamera:
             "camera": file.model_dump(mode="json"),
             "robot": robot.model_dump(mode="json"),
             "feed": None if feed is None else str(feed),
-            "film": None if film is None else str(film),
         }
         self._stack = contextlib.ExitStack()
         self._slot: Slot | None = None

@@ -108,11 +108,19 @@ def rendered_frames(file: CameraFile, robot: Robot, feed: PoseFeed) -> Iterator[
         number = max(number + 1, int(time.monotonic() * file.rate))
 
 
-def frames_of_film(path: Path, rate: float) -> Iterator[Taken | None]:
-    """Yield the pictures of a recorded film (an array (frames, H, W) of grey levels) over and over, at a pace; for benches."""
+def frames_of_film(file: CameraFile) -> Iterator[Taken | None]:
+    """Yield the pictures of a recorded film over and over, at the camera's rate.
+
+    Raises:
+        InputError: it cannot be read.
+    """
     import numpy as np
 
-    film = np.load(path, mmap_mode="r")
+    rate = file.rate
+    try:
+        film = np.load(Path(str(file.device)))
+    except (OSError, ValueError) as error:
+        raise InputError(f"camera {file.device}: no film: {error}") from None
     number = int(time.monotonic() * rate) + 1
     while True:
         if (wait := number / rate - time.monotonic()) > 0.0:
@@ -155,10 +163,10 @@ def main() -> int:
         cv2.setNumThreads(1)
         file = CameraFile.model_validate(spec["camera"])
         slot = Slot(Path(spec["slot"]), SIZE)
-        if spec.get("feed"):
+        if file.is_film:
+            frames = frames_of_film(file)
+        elif spec.get("feed"):
             frames = rendered_frames(file, Robot.model_validate(spec["robot"]), PoseFeed(Path(spec["feed"])))
-        elif spec.get("film"):
-            frames = frames_of_film(Path(spec["film"]), file.rate)
         else:
             frames = frames_of_device(file)
         serve(frames, file, slot)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,17 +68,6 @@ class CameraReader(Protocol):
     def trouble(self) -> str:
         """Why no reading will come any more; empty = nothing is known of that."""
         ...
-
-
-class ReaderOptions(NamedTuple):
-    """What a camera process is told on its command line.
-
-    Attributes:
-        slot: file that readings go into. feed: file with an emulated robot's poses, empty = a real camera.
-    """
-
-    slot: str
-    feed: str = ""
 
 
 def reading_of(sample: Sample, number: int, arrival: float, found: float) -> CameraReading:

@@ -87,7 +87,7 @@ class CameraWatch:
     Attributes:
         status: what is known now.
         frames, poses: readings that came, and those of them that were believed. reasons: of all others.
-        latencies: s from exposure to the control step, of believed ones.
+        latencies: s from exposure to the control step, of believed ones. work: s from a picture to its pose, of all.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -98,6 +98,7 @@ class CameraWatch:
         self.frames = self.poses = 0
         self.reasons: Counter[str] = Counter()
         self.latencies: list[float] = []
+        self.work: list[float] = []
         self._motion: deque[tuple[float, ...]] = deque()  # time, x, y, yaw (dead reckoning), turn, least, most, height
         self._speeds: deque[tuple[float, float, float]] = deque()
         self._believed: deque[_Seen] = deque(maxlen=64)
@@ -147,6 +148,7 @@ class CameraWatch:
         if reading is not None:
             self._heard = now
             self.frames += 1
+            self.work.append(reading.found - reading.arrival)
             self._began = now if self.frames == 1 else self._began
             reason = self._judge(reading, now)
             is_new = not reason
@@ -341,12 +343,12 @@ class CameraWatch:
 
 
 def camera_statistics(watch: CameraWatch) -> dict[str, Any]:
-    """Return what came of a camera: frames, poses, rate (1/s), latency (ms), the pictures' lag (ms), frames without a pose by
-    reason."""
+    """Return what came of a camera: frames, poses, rate (1/s), times (ms), and frames without a pose by reason."""
     found: dict[str, Any] = {"frames": watch.frames, "poses": watch.poses, "rate": round(watch.rate, 2)}
-    if watch.latencies:
-        points = np.percentile(1e3 * np.array(watch.latencies), (50, 95, 99, 100)).round(3).tolist()
-        found["latency"] = dict(zip(("p50", "p95", "p99", "max"), points, strict=True))
+    for name, seconds in (("latency", watch.latencies), ("work", watch.work)):
+        if seconds:
+            points = np.percentile(1e3 * np.array(seconds), (50, 95, 99, 100)).round(3).tolist()
+            found[name] = dict(zip(("p50", "p95", "p99", "max"), points, strict=True))
     if (lag := watch.lag) is not None:
         found["lag"] = {"ms": round(1e3 * lag[0], 2), "std": round(1e3 * lag[1], 2)}
     return {**found, "without_pose": dict(watch.reasons)}

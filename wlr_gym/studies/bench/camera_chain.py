@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.envs.core import Core
 from wlr_gym.envs.tasks.success import limits_of, tracking_error
+from wlr_gym.envs.tasks.terms.geometry import yaw_of
 from wlr_gym.hardware.camera.config import CameraFile, load_camera_file
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
@@ -40,6 +41,7 @@ class ChainDrive:
 
     Attributes:
         time: (T,) s. command: (T, C). sensors: (T, SENSOR_LAYOUT.width). truth: (T, TRUTH_LAYOUT.width).
+        start: (3,) true x, y (m) and yaw (rad) at the run's start.
         estimate: (T, W) of the observer. reasons: (T,) why there is no camera pose; empty = nothing is wrong.
         reason: why the drive ended. errors: measure -> rms over the episode, SI units. camera: statistics of the loop.
     """
@@ -48,6 +50,7 @@ class ChainDrive:
     command: Array
     sensors: Array
     truth: Array
+    start: Array
     estimate: Array
     reasons: tuple[str, ...]
     reason: str
@@ -57,6 +60,14 @@ class ChainDrive:
     def sensed(self, name: str) -> Array:
         """Return a channel of the sensors, (T,) or (T, size)."""
         return SENSOR_LAYOUT.view(self.sensors, name)
+
+    def true_pose(self) -> Array:
+        """Return the true x, y, yaw (T, 3) from the start pose; yaw unwrapped."""
+        position, quaternion = self.true("position"), self.true("quaternion")
+        dx, dy = (position[:, :2] - self.start[:2]).T
+        cosine, sine = np.cos(self.start[2]), np.sin(self.start[2])
+        yaw = np.unwrap(np.concatenate([self.start[2:], yaw_of(*quaternion.T)]))[1:] - self.start[2]
+        return np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx, yaw], axis=1)
 
     def true(self, name: str) -> Array:
         """Return a channel of the truth, (T,) or (T, size)."""
@@ -156,9 +167,11 @@ def _watched(core: Core, machine: Machine, setting: ChainSetting, seed: int) -> 
     policy.reset(core.everyone)
     rows: list[tuple[Array, ...]] = []
     reasons: list[str] = []
+    began = np.zeros(3)
     try:
         core.begin_episodes(core.everyone)
-        start = machine.time
+        start, before = machine.time, machine.plant.truth()
+        began = np.array([*before.position[0, :2], yaw_of(*before.quaternion[0])])
         for fault in setting.faults:
             machine.inject(fault)
         while not (core.terminated[0] or core.truncated[0]):
@@ -175,7 +188,7 @@ def _watched(core: Core, machine: Machine, setting: ChainSetting, seed: int) -> 
     time, command, sensors, truth, estimate = (np.array(column) for column in zip(*rows, strict=True))
     names = core.task.commands
     return ChainDrive(
-        time[:, 0], command, sensors, truth, estimate, tuple(reasons), loop.reason,
+        time[:, 0], command, sensors, truth, began, estimate, tuple(reasons), loop.reason,
         _errors(truth, dict(zip(names, command.T, strict=True))), loop.statistics().get("camera", {}),
     )  # fmt: skip
 
