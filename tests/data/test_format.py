@@ -52,7 +52,7 @@ def findings_of(table: dict[str, np.ndarray], kind: str) -> dict[str, tuple[int,
 
 def test_a_real_run_is_read_and_only_its_gaps_are_reported():
     run = read_run(DATA / "run_01.parquet")
-    assert list(run.table.columns) == [name for name in COLUMNS if name not in FLOW]
+    assert list(run.table.columns) == [name for name in COLUMNS if name not in ("cam_age", *FLOW)]
     assert len(run.table) == 300
     assert run.meta.profile.leg_velocity == pytest.approx(1.438849)
     assert {finding.kind for finding in run.findings} <= {"gap"}

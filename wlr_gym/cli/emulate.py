@@ -38,6 +38,7 @@ class EmulateOptions(PatchOption):
         firmware: version the servos report; fast reads need 45.
         seed: of sensor noise and faults.
         seconds: stop after this long; 0 = run until Ctrl-C.
+        poses: file that the true pose goes into, for a camera that films by rendering (wlr deploy --camera).
     """
 
     backend: str = "gibbs_appell"
@@ -54,6 +55,7 @@ class EmulateOptions(PatchOption):
     firmware: int = 45
     seed: int = 0
     seconds: float = 0.0
+    poses: Path | None = None
 
 
 def run(options: EmulateOptions) -> int:
@@ -64,6 +66,7 @@ def run(options: EmulateOptions) -> int:
     """
     from wlr_gym.hardware.config import load_hardware
     from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
+    from wlr_gym.hardware.emulator.camera import FeedWriter
     from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
     from wlr_gym.hardware.emulator.link import with_flow_port
     from wlr_gym.physics.effects import apply_patch
@@ -91,6 +94,8 @@ def run(options: EmulateOptions) -> int:
     for fault in options.fault:
         machine.inject(fault)
     with Server(machine, real_time=not options.stepped, links=options.links, control=options.control) as server:
+        if options.poses is not None:
+            machine.watchers.append(FeedWriter(machine, options.poses, lambda: server.origin))
         _print_ports(server, options.links)
         try:
             _take_commands(server, options.seconds)

@@ -92,6 +92,7 @@ _TABLE: list[Column] = [
     Column("cam_z", "cam_z", "m", "side view: height of the marker's centre; NaN without a new frame", may_be_nan=True),
     Column("cam_pitch", "cam_pitch", "rad", "side view: pitch, nose down positive; NaN without a new frame", may_be_nan=True),
     Column("volt", "volt", "V", "supply voltage"),
+    Column("cam_age", "cam_age", "s", "age of the last vision pose when the row's sensors were read; live cameras only"),
     *[
         Column(f"flow_{axis}", "flow", "rad/s", f"optical flow along body {axis}, {law}; {_NO_READING}", may_be_nan=True)
         for axis, law in (("x", "v_x/h - w_y"), ("y", "v_y/h + w_x"))
@@ -106,8 +107,8 @@ REQUIRED = tuple(name for name, column in COLUMNS.items() if column.required)
 COMMANDS = tuple(f"cmd_{joint}" for joint in JOINTS)
 #: Of an optical-flow sensor, where there is one.
 FLOW = ("flow_x", "flow_y", "flow_quality", "flow_age")
-#: What the robot measured and a replay predicts: everything but the clock, the commands and optical flow.
-CHANNELS = tuple(name for name in COLUMNS if name != "t" and name not in (*COMMANDS, *FLOW))
+#: What the robot measured and a replay predicts: everything but clocks, commands and optical flow.
+CHANNELS = tuple(name for name in COLUMNS if name not in ("t", "cam_age", *COMMANDS, *FLOW))
 CAMERA = ("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch")
 ANGLES_OF_THE_BODY = ("cam_yaw", "cam_pitch")
 

@@ -17,6 +17,8 @@ SENSED = (
     *(f"{kind}_{axis}" for kind in ("gyro", "acc") for axis in "xyz"),
     *("cam_x", "cam_y", "cam_yaw", "volt"),
 )
+#: Besides, of a robot with a live camera.
+LIVE_CAMERA = ("cam_age",)
 
 
 def sensed_columns(robot: Robot) -> tuple[str, ...]:

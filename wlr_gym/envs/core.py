@@ -84,7 +84,7 @@ class Core:
         self.unmeasured: tuple[str, ...] = ()
         self.task = make_task(task_name, settings)
         if settings.is_real:
-            self.task, self.unmeasured = measurable(self.task)
+            self.task, self.unmeasured = measurable(self.task, settings.has_camera)
         config, robot = self.task.config, self.task.robot
         chosen = config.randomization if settings.randomization is None else settings.randomization
         self.randomization = load_randomization("none" if settings.is_real else chosen, robot)

@@ -160,6 +160,8 @@ def _sensor_rows(run: Run) -> list[Sensors]:
     values[:, SENSOR_LAYOUT.slices["supply_voltage"]] = run["volt"][:, None]
     if "flow_age" in run:
         _fill_flow(values, run)
+    if "cam_age" in run:
+        _fill_camera(values, run)
     return [Sensors(row[None]) for row in values]
 
 
@@ -172,6 +174,16 @@ def _fill_flow(values: NDArray[np.float64], run: Run) -> None:
     values[:, SENSOR_LAYOUT.slices["flow_quality"]] = np.where(is_new, seen[:, 2], 0.0)[:, None]
     values[:, SENSOR_LAYOUT.slices["flow_age"]] = run["flow_age"][:, None]
     values[:, SENSOR_LAYOUT.slices["flow_is_new"]] = is_new[:, None]
+
+
+def _fill_camera(values: NDArray[np.float64], run: Run) -> None:
+    """Write what a run says of its camera into its sensors; a pose is held until the next."""
+    seen = np.stack([run["cam_x"], run["cam_y"], run["cam_yaw"]], axis=1)
+    is_new = np.isfinite(seen[:, 0])
+    last = np.maximum.accumulate(np.where(is_new, np.arange(len(seen)), -1))
+    values[:, SENSOR_LAYOUT.slices["camera_pose"]] = np.where(last[:, None] >= 0, seen[last], 0.0)
+    values[:, SENSOR_LAYOUT.slices["camera_age"]] = run["cam_age"][:, None]
+    values[:, SENSOR_LAYOUT.slices["camera_is_new"]] = is_new[:, None]
 
 
 def read_policy_log(run: Path) -> dict[str, NDArray[np.float64]]:

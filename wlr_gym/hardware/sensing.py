@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from wlr_gym.hardware.camera.reading import CameraReader
 from wlr_gym.hardware.flow.driver import Flow
 from wlr_gym.hardware.flow.supervision import FlowSupervision
 from wlr_gym.hardware.imu.driver import Imu, ImuReading
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
 from wlr_gym.hardware.imu.reading import ImuGoneError
+from wlr_gym.hardware.safety.camera import CameraWatch
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.rules import VERTICAL_BAND, next_up, tilt_of
 from wlr_gym.hardware.safety.state import Mask, RobotStatus
@@ -39,13 +41,25 @@ class Sensing:
         imu: of the robot; open.
         clock: of the run.
         period: s of a control step.
+        camera: above the floor; None = there is none.
         flow: optical-flow sensor, open; None = there is none.
 
     Attributes:
         count: readings of the joints since :meth:`first`.
+        watch: judges the camera's readings; None = there is none.
     """
 
-    def __init__(self, limiter: CommandLimiter, imu: Imu, clock: Clock, period: float, flow: Flow | None = None) -> None:
+    def __init__(
+        self,
+        limiter: CommandLimiter,
+        imu: Imu,
+        clock: Clock,
+        period: float,
+        camera: CameraReader | None = None,
+        flow: Flow | None = None,
+    ) -> None:
+        self._camera = camera
+        self.watch: CameraWatch | None = None if camera is None else CameraWatch(limiter.robot)
         self.count = 0
         self._broken = 0  # packets until all joints answered last
         self._limiter, self._imu, self._clock, self._period = limiter, imu, clock, period
@@ -106,7 +120,16 @@ class Sensing:
         return up
 
     def next(self, before: RobotStatus) -> RobotStatus:
-        """Read servos and IMU; what does not answer stays as it was, and its silence grows."""
+        """Read servos, IMU and camera; what does not answer stays as it was, and its silence grows."""
+        status = self._next_joints_and_imu(before)
+        if self._camera is None or self.watch is None:
+            return status
+        now = self._clock.now()
+        joints = (status.position, status.velocity)
+        seen = self.watch.next(now, joints, status.gyro, self._camera.read(now), self._camera.trouble)
+        return replace(status, camera=seen)
+
+    def _next_joints_and_imu(self, before: RobotStatus) -> RobotStatus:
         now = self._clock.now()
         elapsed = now - before.time
         lost = ""

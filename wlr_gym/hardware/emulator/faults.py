@@ -1,8 +1,8 @@
 """Faults on command: what can go wrong on the bus, in a servo and at the supply.
 
 A fault is one line of text: ``KIND [WHERE ...] [probability=P] [value=X] [after=S] [duration=S]``, for example
-``drop wheels probability=0.01`` or ``dead leg_lf after=2 duration=0.5``. WHERE is a joint, a bus, ``imu`` or ``flow``; none =
-everywhere.
+``drop wheels probability=0.01`` or ``dead leg_lf after=2 duration=0.5``. WHERE is a joint, a bus, ``imu``, ``flow`` or
+``camera``; none = everywhere.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS
 
 
 class FaultKind(NamedTuple):
@@ -56,6 +57,7 @@ FAULTS: dict[str, FaultKind] = {
     "flow_turned": FaultKind("the flow sensor has turned on the body", 1.5708, "rad"),
     "flow_saturated": FaultKind("the flow sensor counts this much in every frame", 120, "counts"),
     "imu_stale": FaultKind("the microcontroller sends the same frame again and again"),
+    **{name: FaultKind(*what) for name, what in CAMERA_FAULTS.items()},
 }
 _REPLY_FAULTS = ("drop", "delay", "late", "flip", "truncate", "noise", "duplicate_id")
 #: Bytes of an answer before the error byte, which are the same in both of two servos with one id.
@@ -69,7 +71,7 @@ class Fault:
 
     Attributes:
         kind: key of :data:`FAULTS`.
-        where: joints, buses, ``imu`` or ``flow``; empty = everywhere.
+        where: joints, buses, ``imu``, ``flow`` or ``camera``; empty = everywhere.
         probability: chance per packet, for faults that hit bytes.
         value: see :data:`FAULTS`.
         after: s from when it was asked for until it starts.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from wlr_gym.base.errors import require_package
+from wlr_gym.hardware.camera.config import CameraFile
 from wlr_gym.hardware.config import FlowPort, Hardware
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
@@ -15,8 +16,12 @@ from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 
 
-def emulated_link(machine: Machine) -> Link:
+def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
     """Return a link to an emulated robot in this process and in emulated time: the same bits each time.
+
+    Args:
+        machine: the robot.
+        camera: above its floor; None = there is none.
 
     Raises:
         MissingPackageError: dynamixel-sdk is not installed.
@@ -34,10 +39,16 @@ def emulated_link(machine: Machine) -> Link:
         lambda port, baud_rate, patience: MemoryPort(world, names[port], baud_rate, patience),
     )
     flow, sensor = hardware.flow, machine.robot.sensors.flow
-    stream = None
+    stream = eye = None
     if flow is not None and sensor is not None:
         stream = FlowStream(flow, sensor, world.now, lambda _: StreamDevice(world, "flow"))
-    return Link(servos, MemoryImu(world, hardware.imu), world, is_serial=False, finish=machine.close, flow=stream)
+    if camera is not None:
+        from wlr_gym.hardware.emulator.camera import EmulatedCamera
+
+        require_package("cv2", "vision")
+        eye = EmulatedCamera(machine, camera)
+    imu = MemoryImu(world, hardware.imu)
+    return Link(servos, imu, world, is_serial=False, finish=machine.close, flow=stream, camera=eye)
 
 
 def with_flow_port(robot: Robot, hardware: Hardware) -> Hardware:
@@ -47,7 +58,14 @@ def with_flow_port(robot: Robot, hardware: Hardware) -> Hardware:
     return hardware.model_copy(update={"flow": FlowPort(port="emulated")})
 
 
-def emulated_robot(robot: Robot, hardware: Hardware, effects: Source = None, *, sensor_noise: bool = True) -> Link:
+def emulated_robot(
+    robot: Robot,
+    hardware: Hardware,
+    effects: Source = None,
+    *,
+    sensor_noise: bool = True,
+    camera: CameraFile | None = None,
+) -> Link:
     """Return a link to a new emulated robot whose lines and adapters take no time.
 
     Args:
@@ -55,6 +73,7 @@ def emulated_robot(robot: Robot, hardware: Hardware, effects: Source = None, *, 
         hardware: wiring and mounting.
         effects: what the emulated robot has that its file does not say.
         sensor_noise: of the simulator behind it.
+        camera: above its floor; None = there is none.
 
     Raises:
         InputError: effects that cannot be read or that this robot cannot have.
@@ -63,4 +82,4 @@ def emulated_robot(robot: Robot, hardware: Hardware, effects: Source = None, *, 
     options = MachineOptions(timing=NO_TIME, sensor_noise=sensor_noise)
     parameters = apply_patch(patch, Parameters.nominal(robot))
     hardware = with_flow_port(robot, hardware)
-    return emulated_link(Machine(robot, hardware, options, parameters=parameters, forces=patch.forces))
+    return emulated_link(Machine(robot, hardware, options, parameters=parameters, forces=patch.forces), camera)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -76,6 +76,7 @@ class Machine:
         coupling: of the servos and the plant.
         lines: bus name -> line.
         faults: what is wrong right now.
+        watchers: called at the end of every tick (what looks at the robot from outside: a camera).
 
     Raises:
         InputError: a plant of another size or period.
@@ -105,6 +106,7 @@ class Machine:
         self.time = 0.0
         self.ticks = 0
         self.faults: FaultBoard = FaultBoard(self.options.seed)
+        self.watchers: list[Callable[[], None]] = []
         self._imu_output: list[Emission] = []
         self._flow_output: list[Emission] = []
         self._flow = self._make_flow()
@@ -141,7 +143,7 @@ class Machine:
     @property
     def places(self) -> tuple[str, ...]:
         """Names a fault may be at."""
-        return (*JOINTS, *self.hardware.buses, *self.sensors)
+        return (*JOINTS, *self.hardware.buses, *self.sensors, "camera")
 
     def close(self) -> None:
         """Release the plant."""
@@ -168,6 +170,8 @@ class Machine:
             self._read_imu()
         if self._flow is not None:
             self._flow_output += self._flow.step(self.time, self._paused, self.coupling.sensors)
+        for watcher in self.watchers:
+            watcher()
 
     def pause(self, duration: float) -> None:
         """Let ``duration`` s pass in which nothing happens (a busy computer): quartzes do not stop, so all clocks go on."""

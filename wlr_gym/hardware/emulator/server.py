@@ -147,6 +147,11 @@ class Server:
         """Bus name, ``imu`` or ``flow`` -> path to open; changes when an adapter was unplugged and is back."""
         return {name: port.path for name, port in self._ports.items()}
 
+    @property
+    def origin(self) -> float:
+        """This computer's monotonic clock minus emulated time, s; grows when emulated time slips."""
+        return self._origin
+
     # ---- life ----
 
     def __enter__(self) -> Server:
