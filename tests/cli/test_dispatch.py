@@ -128,3 +128,9 @@ def test_an_emulator_of_its_own_process_imports_the_same(monkeypatch):
     with pytest.raises(OSError, match="today"), deploy._emulator(deploy.DeployOptions("pid", emulated=True), Console()):
         pass
     assert asked[3:6] == ["--import", "mine", "emulate"]
+
+
+def test_an_option_given_twice_is_refused(capsys):
+    """The parser would take the last one and drop the others without a word."""
+    assert cli.main(["train", "WLR-Velocity-v0", "--set", "total_steps=1000", "--set", "seed=1"]) == 2
+    assert "--set is given twice; all its values go behind one: --set FIRST SECOND" in capsys.readouterr().err

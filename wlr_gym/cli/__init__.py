@@ -100,9 +100,17 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
 
 
 def parse(name: str, arguments: Sequence[str]) -> Any:
-    """Return the options of one command; SystemExit after ``--help`` and arguments that do not parse."""
+    """Return the options of one command; SystemExit after ``--help`` and arguments that do not parse.
+
+    Raises:
+        InputError: an option given twice, of which the parser would drop all but the last.
+    """
     import tyro
 
+    given = [word.partition("=")[0] for word in arguments if word.startswith("--")]
+    for option in given:
+        if given.count(option) > 1:
+            raise InputError(f"wlr {name}: {option} is given twice; all its values go behind one: {option} FIRST SECOND")
     module = _module(name)
     kind = getattr(module, f"{name.capitalize()}Options")
     return tyro.cli(kind, prog=f"wlr {name}", description=module.__doc__, args=list(arguments))

@@ -57,7 +57,7 @@ from wlr_gym.render.video import check_video
 from wlr_gym.robot import robot_content
 
 #: With --full.
-FULL_BASELINES = ("do_nothing", "constant_command", "pid", "slip_compensating")
+FULL_BASELINES = ("do_nothing", "constant_command", "pid", "slip_compensating_no_camera", "slip_compensating")
 EPISODES = 64
 FULL_EPISODES = 256
 SEEDS = 1

@@ -36,7 +36,8 @@ class ImportOptions:
     out: Path | None = None
     """Folder for the runs; made if it is not there."""
     split: float | None = None
-    """Cut long recordings into runs of about so many seconds, where the robot is quietest."""
+    """Cut recordings into runs of about so many seconds, where the robot is quietest; default: only those of more than 600 s,
+    or of 2 million numbers."""
     robot: str | None = None
     """Robot file or config name; default: the one that the map's meta names, else the nominal one."""
     format: Literal["parquet", "csv"] = "parquet"
@@ -159,8 +160,8 @@ def _print_costs(columns: set[str], console: Console) -> None:
 
 def _report(imported: Sequence[ImportedRun], console: Console) -> None:
     first = imported[0]
-    for note in first.notes:
-        console.print(f"{first.source}: {note}", style="yellow", markup=False)
+    for source, note in dict.fromkeys((one.source, note) for one in imported for note in one.notes):
+        console.print(f"{source}: {note}", style="yellow", markup=False)
     if first.facts:
         console.print(_facts_table(first))
         _print_costs({fact.column for fact in first.facts}, console)

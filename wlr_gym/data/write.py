@@ -65,13 +65,23 @@ def write_meta(folder: str | Path, meta: RunMeta) -> Path:
         InputError: the one that is there says something else (it holds for all runs of the folder).
     """
     path = Path(folder) / META_FILE
+    check_meta(folder, meta)
     if path.is_file():
-        if read_meta(folder) != meta:
-            raise InputError(f"{path}: says something else than the meta data of the new run; write it to another folder")
         return path
     text = yaml.safe_dump(meta.model_dump(mode="json", exclude_none=True), sort_keys=False, allow_unicode=True)
     write_text(path, text)
     return path
+
+
+def check_meta(folder: str | Path, meta: RunMeta) -> None:
+    """Refuse to write meta data where there are others.
+
+    Raises:
+        InputError: the ``meta.yaml`` that is there says something else (it holds for all runs of the folder).
+    """
+    path = Path(folder) / META_FILE
+    if path.is_file() and read_meta(folder) != meta:
+        raise InputError(f"{path}: says something else than the meta data of the new run; write it to another folder")
 
 
 def _write_csv(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:

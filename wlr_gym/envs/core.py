@@ -203,6 +203,7 @@ class Core:
         self.commands.begin(mask, self.episodes.seeds)
         if held_commands:
             self.commands.hold(rows, held_commands)
+        self.computed[rows] = 0.0
         self._observe(mask, self._signals(), first=True)
 
     def set_command(self, values: Mapping[str, float]) -> None:
@@ -240,6 +241,16 @@ class Core:
         self.actions.take(actions, mask)
         self.sensors = self.plant.step(self.actions.setpoints, self.actions.torque_on)
         return self._finish_step(mask)
+
+    def try_step(self, actions: ArrayLike) -> None:
+        """Advance plant and scores of all robots, and nothing else: for planners, which try what they may not do.
+
+        Raises:
+            InputError: wrong shape, or an action that is not finite or out of [-1, 1]; names robot and joint.
+        """
+        self.actions.take(actions, self.everyone)
+        self.sensors = self.plant.step(self.actions.setpoints, self.actions.torque_on)
+        self._score(self.everyone, self._signals())
 
     def _finish_step(self, mask: Mask) -> bool:
         """Estimate, rewards, ends, new commands and parameters, observation; returns whether an episode ended."""

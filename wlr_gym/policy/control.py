@@ -140,11 +140,10 @@ class SearchConfig(SettingsModel):
     episodes: int = Field(default=256, gt=0)
 
 
-class PidConfig(SettingsModel):
-    """Settings. Gains without a unit unless named.
+class PidGains(SettingsModel):
+    """Gains of the feedback; without a unit unless named.
 
     Attributes:
-        robot: whose geometry is used; None = the environment's. Another one than the environment's is refused.
         steering: wheel speed difference over what rolling alone needs for the wanted yaw rate.
         yaw_rate_p: on the error of the gyro's yaw rate. yaw_rate_i: on its integral, 1/s.
         velocity_p: on the error of the estimated forward velocity. velocity_i: on its integral, 1/s.
@@ -152,12 +151,8 @@ class PidConfig(SettingsModel):
         uphill: yaw rate per specific force to the left, rad s/m: turns the robot uphill on a slope.
         legs_inward: rad by which the legs reach under the body: a shorter wheelbase turns with less slip.
         integral_limit: bound of the corrections by integrals, m/s and rad/s.
-        tasks: task name -> settings that differ there.
-        environment: keywords of the environment.
-        seed: of the first episode of the search. search: how it is made.
     """
 
-    robot: str | None = None
     steering: float = Field(1.0, ge=0)
     yaw_rate_p: float = Field(0.0, ge=0)
     yaw_rate_i: float = Field(0.0, ge=0)
@@ -168,6 +163,19 @@ class PidConfig(SettingsModel):
     uphill: float = Field(0.0, ge=0)
     legs_inward: float = Field(0.0, ge=-0.4, le=0.4)
     integral_limit: float = Field(0.2, gt=0)
+
+
+class PidConfig(PidGains):
+    """Settings: the gains, and
+
+    Attributes:
+        robot: whose geometry is used; None = the environment's. Another one than the environment's is refused.
+        tasks: task name -> settings that differ there.
+        environment: keywords of the environment.
+        seed: of the first episode of the search. search: how it is made.
+    """
+
+    robot: str | None = None
     tasks: dict[str, dict[str, float]] = Field(default_factory=dict)
     environment: dict[str, Any] = Field(default_factory=dict)
     seed: int = Field(0, ge=0)

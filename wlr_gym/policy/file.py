@@ -18,7 +18,7 @@ FORMAT = 1
 CONTRACT_FILE = "contract.json"
 #: Keys of an environment's contract that a policy depends on. The others (randomisation, commands, latency) are recorded only:
 #: a policy may be tried under conditions it was not trained in.
-BINDING = ("robot", "control_period", "observation", "observer", "action")
+BINDING = ("robot", "control_period", "observation", "observer", "controller", "action")
 #: Of those, what differs by conditions or by name and not by meaning; what matters of a robot's description is in its hash.
 CONDITIONS = ("observation.noise", "observation.bias", "observation.sensor_noise", "robot.name", "robot.description")
 #: What an absent key means. A key that contracts get later is listed here with what went without saying before, so that older
@@ -30,6 +30,7 @@ DEFAULTS = {
     "observation.device": "",
     "observer": None,
     "observer.camera": True,
+    "controller": None,
 }
 _INDEX = re.compile(r"\[\d+\]")
 

@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from wlr_gym.policy.control import ESTIMATED_FORWARD, Array, Pid, PidConfig
+from wlr_gym.policy.control import ESTIMATED_FORWARD, Array, Pid, PidConfig, PidGains
 from wlr_gym.robot import WHEELS, Robot
 
 
-class SlipCompensatingConfig(PidConfig):
-    """Settings: those of ``pid``, and
+class SlipGains(PidGains):
+    """Gains: those of ``pid``, and
 
     Attributes:
         slip_limit: of a wheel along its heading, beyond a skid turn's, m/s.
@@ -37,6 +37,10 @@ class SlipCompensatingConfig(PidConfig):
     load_shift: float = Field(0.0, ge=0)
     load_shift_time: float = Field(0.5, gt=0)
     largest_shift: float = Field(0.14, ge=0, lt=0.3)
+
+
+class SlipCompensatingConfig(SlipGains, PidConfig):
+    """Settings: the gains, and those of ``pid``."""
 
 
 class SlipCompensating(Pid):

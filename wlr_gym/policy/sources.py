@@ -14,7 +14,7 @@ from wlr_gym.policy.file import CONTRACT_FILE, check_contract, read_contract
 from wlr_gym.policy.onnx_file import SUFFIX, open_policy
 
 #: Of a task's settings, what decides which numbers a policy is fed and what its own mean. The others are conditions.
-FED = ("observations", "observer", "action", "control_period")
+FED = ("observations", "observer", "controller", "action", "control_period")
 
 
 @runtime_checkable

@@ -6,7 +6,7 @@ from pathlib import Path
 import yaml
 
 from wlr_gym.base.settings import parse_config
-from wlr_gym.data.logs.display import POSE, SLIP, TRANSFORMS
+from wlr_gym.data.logs.display import DESCRIPTION, POSE, SLIP, TRANSFORMS
 from wlr_gym.data.logs.map import LogMap, resolve
 from wlr_gym.data.logs.messages import CAMERA_TOPIC, COMMANDS, IMU, JOINT_STATES, RUN, SUPPLY
 from wlr_gym.data.logs.units import CURRENTS, FACTORS
@@ -36,4 +36,4 @@ def test_its_units_are_those_of_the_code():
 def test_its_topics_are_those_of_the_code():
     table = PAGE[PAGE.index("| topic | type |") : PAGE.index("### While the robot runs")]
     named = set(re.findall(r"`(/[\w/]+)`", table))
-    assert named == {RUN, JOINT_STATES, COMMANDS, IMU, SUPPLY, CAMERA_TOPIC, POSE, TRANSFORMS, SLIP}
+    assert named == {RUN, JOINT_STATES, COMMANDS, IMU, SUPPLY, CAMERA_TOPIC, POSE, TRANSFORMS, SLIP, DESCRIPTION}

@@ -1,4 +1,4 @@
-"""Memory of reading: what the map does not ask for costs nothing, however long; what it asks for, 8 bytes per number."""
+"""Memory of reading: what the map does not ask for costs nothing, however long; test_long_logs.py has what it asks for."""
 
 import tracemalloc
 

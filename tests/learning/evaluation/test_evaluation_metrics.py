@@ -114,3 +114,33 @@ def test_blocks_are_stacked():
     kept = summarise([rollout(), rollout(measured=measured(0.02))])
     assert kept.pairs["velocity_error"].shape == (1, 2, EPISODES, 2)
     np.testing.assert_allclose(kept.pairs["velocity_error"][0, :, :, 0].mean(axis=1), [0.0, 0.02])
+
+
+def test_median_and_tail_of_the_tracking_error():
+    reached = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 4.0])
+    card = score(rollout(episodes=10, measured=measured(0.02 * reached, 0.06 * reached, episodes=10)))
+    assert card["tracking_error"].mean == pytest.approx(0.85)
+    assert card["tracking_error_median"].mean == pytest.approx(0.5)
+    assert card["tracking_error_p90"].mean == pytest.approx(0.9)
+    assert 0.15 < card["tracking_error_median"].low < 0.5 < card["tracking_error_median"].high < 0.85
+
+
+def test_steady_and_transient_parts():
+    """The error is 2 in the first 2 s and after a change of command, else 1; both parts together are the whole."""
+    ticks, change = 400, 200
+    since = np.concatenate([np.arange(change), np.arange(ticks - change)]) * PERIOD
+    size = np.where(since < 2.0, 2.0, 1.0)
+    command = np.zeros((ticks, EPISODES, 2))
+    command[change:, :, 1] = 0.3
+    errors = measured(0.0, ticks=ticks)
+    errors[:, :, 0], errors[:, :, 1] = 0.02 * size[:, None], 0.06 * size[:, None]
+    card = score(rollout(ticks=ticks, command=command, measured=errors))
+    assert card["tracking_error_transient"].mean == pytest.approx(2.0)
+    assert card["tracking_error_steady"].mean == pytest.approx(1.0)
+    assert card["tracking_error"].mean == pytest.approx(np.sqrt((4.0 + 1.0) / 2))
+
+
+def test_an_episode_without_a_steady_part():
+    card = score(rollout(measured=measured(0.02, 0.06)))
+    assert np.isnan(card["tracking_error_steady"].mean)
+    assert card["tracking_error_transient"].mean == pytest.approx(1.0)

@@ -58,3 +58,18 @@ def test_nothing_over_nothing_is_nothing():
 def test_the_same_resamples_every_time():
     values = pairs(np.random.default_rng(0).normal(size=(3, 20)))
     assert Bootstrap(3, 20).mean(values) == Bootstrap(3, 20).mean(values)
+
+
+def test_quantiles_of_resampled_episodes():
+    """Against numpy's own quantile of repeated episodes, for every resample."""
+    values = np.random.default_rng(0).lognormal(0.0, 1.0, (2, 3, 20))
+    resampling = Bootstrap(3, 20)
+    found = resampling.scores(pairs(values), 0.9)
+    for row in (0, 1, 77, 2000):
+        counts = np.ones(60) if row == 0 else resampling._weights[row - 1]
+        for seed in range(2):
+            repeated = np.repeat(values[seed].ravel(), counts.astype(int))
+            assert found[row, seed] == np.quantile(repeated, 0.9, method="inverted_cdf")
+    assert resampling.mean(pairs(values), 0.5).mean == pytest.approx(
+        np.mean([np.quantile(values[seed], 0.5, method="inverted_cdf") for seed in range(2)])
+    )

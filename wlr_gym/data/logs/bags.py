@@ -51,7 +51,7 @@ def _mcap_files(path: Path) -> list[Path]:
 
 
 def _by_rosbags(path: Path, wants: Callable[[str], bool], notes: list[str], tell: Share) -> Iterator[Message]:
-    what = "rosbag1" if path.suffix == ".bag" else "rosbag2"
+    what = "rosbag1" if _is_rosbag1(path) else "rosbag2"
     try:
         reader = _open(path)
     except Exception as error:  # of four libraries: sqlite, YAML, MCAP, rosbags
@@ -90,9 +90,13 @@ def _open(path: Path) -> Any:
         if len(files) != 1:
             raise ValueError(f"no {METADATA}, and {len(files)} .db3 files: name one of them")
         path = files[0]
-    reader = Reader1(path) if path.suffix == ".bag" else Reader2(path)
+    reader = Reader1(path) if _is_rosbag1(path) else Reader2(path)
     reader.open()
     return reader
+
+
+def _is_rosbag1(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() == ".bag"
 
 
 def _hint(error: Exception) -> str:

@@ -48,9 +48,12 @@ def find_candidates(
         names: name in the log -> joint, where it is known.
 
     Raises:
-        InputError: the log holds two robots, or two joints of one name.
+        InputError: the log holds two robots, or two joints of one name, or nothing in the namespace.
     """
-    topics = [topic for name, topic in log.topics.items() if namespace is None or name.startswith(namespace)]
+    topics = [topic for name, topic in log.topics.items() if namespace is None or in_namespace(name, namespace)]
+    if not topics:
+        roots = ", ".join(dict.fromkeys(_root(name) for name in log.topics))
+        raise InputError(f"{log.name}: namespace '{namespace}': no topic is in it; topics are in {roots}")
     found: dict[str, list[FieldCandidate]] = {}
     for topic in topics:
         for candidate in _of_topic(topic, robot, names or {}):
@@ -84,7 +87,7 @@ def _of_topic(topic: Topic, robot: Robot, names: Mapping[str, str]) -> Iterator[
 def _joint(topic: Topic, field: str, robot: Robot, names: Mapping[str, str]) -> Iterator[FieldCandidate]:
     name = _bracket(field)
     facts, of_topic = read_name(name or field), read_name(topic.name)
-    joint = names.get(name or "") or _which(facts, of_topic, name, robot)
+    joint = names.get(name or "") or _which(facts, of_topic, None if is_unnamed(topic, field) else name, robot)
     known = joint is not None and joint in names.values() and name not in names
     if joint is None or known:  # the map names another one for this joint
         return
@@ -97,6 +100,11 @@ def _joint(topic: Topic, field: str, robot: Robot, names: Mapping[str, str]) -> 
             yield FieldCandidate(f"cmd_{joint}", topic.name, field, name, outside.unit or facts.unit)
     elif quantity is not None:
         yield FieldCandidate(f"{quantity}_{joint}", topic.name, field, name, outside.unit or facts.unit)
+
+
+def is_unnamed(topic: Topic, field: str) -> bool:
+    """Whether a field is an element of a list without names: a number is its place then, and no servo's."""
+    return bool(re.search(r"\[\d+\]$", field)) and f"{field[: field.rindex('[')]}[0]" in topic.fields
 
 
 def _which(facts: NameFacts, of_topic: NameFacts, name: str | None, robot: Robot) -> str | None:
@@ -149,8 +157,10 @@ def _pose(topic: Topic) -> Iterator[FieldCandidate]:
                 yield FieldCandidate("cam_yaw", topic.name, f"{turn}.yaw")
                 return
     headings = [field for field in topic.fields if (_says(field, _HEADING) or field == "theta") and "rate" not in field]
+    turns = [field[:-1] for field in topic.fields if field.endswith("w") and _has(topic, f"{field[:-1]}x", "x", "xyz")]
+    headings = headings or [f"{turn.rstrip('._')}.yaw" for turn in turns]
     places = [field for field in topic.fields if _axis_of(field)[1] == "x" and _has(topic, field, "x", "xy")]
-    places = [field for field in places if not _vector_word(field)]
+    places = [field for field in places if not _vector_word(field) and field[:-1] not in turns]
     if headings and places:
         x = places[0]
         yield FieldCandidate("cam_x", topic.name, x, unit=read_name(x).unit)
@@ -208,6 +218,11 @@ def _check_one_robot(log: Log, found: Mapping[str, list[FieldCandidate]], namesp
                 f"{log.name}: two robots: topics {', '.join(sorted({one.topic for one in candidates}))} each have the {joint}; "
                 f"say which in the map: namespace: {twins[0]}  (or {', '.join(twins[1:])})"
             )
+
+
+def in_namespace(topic: str, namespace: str) -> bool:
+    """Whether a topic is in a namespace: ``/robot_10/imu`` is not in ``/robot_1``."""
+    return f"/{topic.strip('/')}/".startswith(f"/{namespace.strip('/')}/")
 
 
 def _root(topic: str) -> str:

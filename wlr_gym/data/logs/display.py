@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.body_pose import quaternion
-from wlr_gym.data.logs.messages import BODY, FLOOR, Sent, header, make, sent
+from wlr_gym.data.logs.messages import BODY, FLOOR, STRING, Sent, header, make, sent
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import robot_of
 from wlr_gym.data.run_states import has_camera, measured_state
 from wlr_gym.physics.plants.base import standing_state
 from wlr_gym.physics.plants.sensors import rotation
-from wlr_gym.robot import CORNER_NAMES, CORNER_SIGNS, CORNERS, JOINTS, LEG_SLICE
+from wlr_gym.robot import CORNER_NAMES, CORNER_SIGNS, CORNERS, JOINTS, LEG_SLICE, LEGS, WHEELS, Robot
+from wlr_gym.robot.interchange.urdf import urdf_text
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import contact_slip_velocity
 
 Array = NDArray[np.float64]
 
-POSE, TRANSFORMS, SLIP = "/pose", "/tf", "/slip"
+POSE, TRANSFORMS, SLIP, DESCRIPTION = "/pose", "/tf", "/slip", "/robot_description"
+#: Link of the URDF that is the body.
+BASE = "base_link"
 POSE_TYPE, TRANSFORM_TYPE, MARKER_TYPE = (
     "geometry_msgs/msg/PoseStamped",
     "tf2_msgs/msg/TFMessage",
@@ -33,23 +38,45 @@ _COLOUR = (0.9, 0.1, 0.1, 1.0)
 
 
 def display_messages(run: Run, times: list[int]) -> dict[int, list[Sent]]:
-    """Return what is shown by the row's time (ns); nothing for a run without a camera's pose.
+    """Return what is shown by the row's time (ns).
 
-    ``/pose`` is what the camera saw, frame by frame. ``/tf`` and ``/slip`` come from the smoothed motion of camera, encoders
-    and gyroscope, :data:`RATE` times a second: the slip velocity of each wheel's contact point over the floor.
+    ``/robot_description`` is the robot as URDF, and ``/tf`` has where its links are, by the joints' angles. With a camera's
+    pose, ``/pose`` is what it saw, frame by frame; and where the body is (``/tf``), and the slip velocity of each wheel's
+    contact point over the floor (``/slip``), come from the smoothed motion of camera, encoders and gyroscope. All but ``/pose``
+    are sent :data:`RATE` times a second.
     """
-    if not has_camera(run):
-        return {}
     shown: dict[int, list[Sent]] = {}
-    for row in np.flatnonzero(np.isfinite(run["cam_x"]) & np.isfinite(run["cam_yaw"])):
-        shown.setdefault(times[row], []).append(_camera_pose(run, int(row), times[row]))
+    if has_camera(run):
+        for row in np.flatnonzero(np.isfinite(run["cam_x"]) & np.isfinite(run["cam_yaw"])):
+            shown.setdefault(times[row], []).append(_camera_pose(run, int(row), times[row]))
     if not all(np.isfinite(run[f"pos_{joint}"]).all() for joint in JOINTS):
         return shown  # no run that a reader takes: its channels go out all the same
     step = max(round(1.0 / RATE / float(np.median(np.diff(run["t"])))), 1)
     rows = np.arange(0, len(times), step)
-    for row, message in zip(rows, _motion(run, rows, [times[row] for row in rows]), strict=True):
-        shown.setdefault(times[row], []).extend(message)
+    robot = robot_of(run)
+    text = make(STRING, data=urdf_text(robot))
+    shown.setdefault(times[0], []).append(sent(DESCRIPTION, STRING, times[0], text))
+    motion = _motion(run, robot, rows, [times[row] for row in rows]) if has_camera(run) else [[] for _ in rows]
+    angles = np.stack([run[f"pos_{joint}"][rows] for joint in JOINTS], axis=1)
+    for row, moved, links in zip(rows, motion, _links(robot, angles, [times[row] for row in rows]), strict=True):
+        shown.setdefault(times[row], []).extend([links, *moved])
     return shown
+
+
+def _links(robot: Robot, angles: Array, times: list[int]) -> Iterator[Sent]:
+    """Yield where the links of the URDF are: body, then each leg at its hip and its wheel at the leg's end, turned about y."""
+    numbers = Parameters.nominal(robot)
+    hips = numbers["hip.position"][0] * np.array([(*sign, 1.0) for sign in CORNER_SIGNS])
+    length = numbers["leg.length"][0]
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    turns = np.stack([np.cos(angles / 2), 0 * angles, np.sin(angles / 2), 0 * angles], axis=-1)
+    for time, turn in zip(times, turns, strict=True):
+        links = [_transform(time, BODY, BASE, np.zeros(3), level)]
+        for corner, (leg, wheel) in enumerate(zip(LEGS, WHEELS, strict=True)):
+            links.append(_transform(time, BASE, f"{leg}_link", hips[corner], turn[corner]))
+            end = np.array([length[corner], 0.0, 0.0])
+            links.append(_transform(time, f"{leg}_link", f"{wheel}_link", end, turn[len(LEGS) + corner]))
+        yield _transforms(time, links)
 
 
 def _camera_pose(run: Run, row: int, time: int) -> Sent:
@@ -59,8 +86,7 @@ def _camera_pose(run: Run, row: int, time: int) -> Sent:
     return sent(POSE, POSE_TYPE, time, make(POSE_TYPE, header=header(time, FLOOR), pose=_pose(place, turn)))
 
 
-def _motion(run: Run, rows: NDArray[np.intp], times: list[int]) -> list[list[Sent]]:
-    robot = robot_of(run)
+def _motion(run: Run, robot: Robot, rows: NDArray[np.intp], times: list[int]) -> list[list[Sent]]:
     many = Parameters(np.repeat(Parameters.nominal(robot).values, len(rows), axis=0))
     state = measured_state(run, run["t"][rows], standing_state(robot, many), many)
     slip = contact_slip_velocity(
@@ -71,7 +97,7 @@ def _motion(run: Run, rows: NDArray[np.intp], times: list[int]) -> list[list[Sen
     headings = np.stack([np.stack([np.cos(yaw), np.sin(yaw)], -1), np.stack([-np.sin(yaw), np.cos(yaw)], -1)], axis=1)
     over_floor = np.einsum("nwk,nkj->nwj", slip, headings)
     return [
-        [_transform(time, position, turn), _markers(time, foot, arrow)]
+        [_transforms(time, [_transform(time, FLOOR, BODY, position, turn)]), _markers(time, foot, arrow)]
         for time, position, turn, foot, arrow in zip(times, state.position, state.quaternion, feet, over_floor, strict=True)
     ]
 
@@ -96,13 +122,16 @@ def _quaternion(turn: Array) -> object:
     return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
-def _transform(time: int, position: Array, turn: Array) -> Sent:
+def _transform(time: int, frame: str, child: str, position: Array, turn: Array) -> object:
     x, y, z = map(float, position)
     moved = make(
         "geometry_msgs/msg/Transform", translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z), rotation=_quaternion(turn)
     )
-    one = make("geometry_msgs/msg/TransformStamped", header=header(time, FLOOR), child_frame_id=BODY, transform=moved)
-    return sent(TRANSFORMS, TRANSFORM_TYPE, time, make(TRANSFORM_TYPE, transforms=[one]))
+    return make("geometry_msgs/msg/TransformStamped", header=header(time, frame), child_frame_id=child, transform=moved)
+
+
+def _transforms(time: int, transforms: list[object]) -> Sent:
+    return sent(TRANSFORMS, TRANSFORM_TYPE, time, make(TRANSFORM_TYPE, transforms=transforms))
 
 
 def _markers(time: int, feet: Array, arrows: Array) -> Sent:

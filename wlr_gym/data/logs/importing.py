@@ -3,36 +3,38 @@
 from __future__ import annotations
 
 import itertools
+import os
 import re
-from collections.abc import Iterator, Mapping
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, replace_file, write_text
+from wlr_gym.base.files import make_output_folder, write_text
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.data.check import Finding, check_table
-from wlr_gym.data.format import RunMeta
 from wlr_gym.data.logs.exported import read_exported
 from wlr_gym.data.logs.map import LogMap, Resolved, map_text, read_map, resolve
 from wlr_gym.data.logs.messages import RUN
-from wlr_gym.data.logs.open import first_messages, quiet, read_logs
-from wlr_gym.data.logs.rows import ChannelFact, MadeRun, Samples, make_run, wanted_fields
+from wlr_gym.data.logs.open import first_messages, quiet, read_logs, read_recordings
+from wlr_gym.data.logs.parts import runs_of, write_samples
+from wlr_gym.data.logs.rows import ChannelFact, MadeRun, wanted_fields
 from wlr_gym.data.logs.suggest import MOST, Proposal, propose
+from wlr_gym.data.logs.topic_store import TopicStore
 from wlr_gym.data.logs.topics import Log, Share
 from wlr_gym.data.record import next_run
-from wlr_gym.data.write import write_run
-from wlr_gym.robot import JOINTS, WHEELS, load_robot
+from wlr_gym.data.write import check_meta, write_meta, write_run
+from wlr_gym.robot import load_robot
 
 MAP_FILE, RECORD_FILE = "map.yaml", "import.yaml"
-#: Share of a part's length by which a cut may be moved to where the robot is quieter.
-_PLAY = 0.25
-#: Usual steps, and s, from which on what is between two rows is a hole; s below which a piece between holes is no run.
-_HOLE, _LEAST_HOLE, _LEAST_PIECE = 5.0, 0.5, 1.0
+#: Share of an import that reading the log takes.
+_READING = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +87,8 @@ def import_log(
         map: what topics and fields mean: a map, what a map file says, or its path. None = the one in ``out``, else proposed; a
             run of ours needs none.
         robot: that the runs are of: name or file; None = as the map's ``meta`` says, else the nominal one.
-        split: s; a long recording becomes runs of about this length, cut where the robot is quietest.
+        split: s; a recording becomes runs of about this length, cut where the robot is quietest. None = one run, of long
+            recordings several (:data:`wlr_gym.data.logs.parts.LONGEST`).
         suffix: format of the runs.
         tell: called with the share that was read.
 
@@ -112,21 +115,17 @@ def import_log(
     meta = map.meta.model_copy(update={"robot": map.meta.robot or robot or chosen.name})
     resolved = resolve(map, chosen, "map")
     check_map_file(out / MAP_FILE, map)
-    record, made = _read_record(out), list[_Made]()
-    for found in read_logs(log, wanted_fields(resolved), tell=tell):
-        _check_new(found, record, out)
-        whole = make_run(found, map, resolved)
-        findings = [_check(part, found.name, resolved) for part in _parts(whole, split)]
-        made.append(_Made(Log(found.path, {}, found.notes, found.part), whole, findings))
-        del found  # what was read goes before the next is
-    if not made:
-        raise InputError(f"{log}: nothing in it")
-    make_output_folder(out)
-    write_map(out / MAP_FILE, map)
-    imported = []
-    for one in made:
-        for part, findings in zip(_parts(one.whole, split), one.findings, strict=True):  # cut again: parts are not kept
-            imported.append(_write(one.log, part, findings, meta, out, suffix))
+    check_meta(out, meta)
+    record = _read_record(out)
+    with _beside(out) as folder:
+        made = list(_make_runs(log, map, resolved, split, suffix, folder, lambda one: _check_new(one, record, out), tell))
+        if not made:
+            raise InputError(f"{log}: nothing in it")
+        write_map(out / MAP_FILE, map)
+        write_meta(out, meta)
+        imported = []
+        for one in made:
+            imported.append(_moved(one, next_run(out, suffix)))
             record[imported[-1].path.stem] = _entry(imported[-1])
             _write_record(out, record)  # with each run: whatever stops this, it knows all that are there
     return imported
@@ -175,13 +174,71 @@ def _import_own(log: Path, out: Path, suffix: str, tell: Share) -> ImportedRun:
 # ---- one run ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Made:
-    """A recording that can be written: its log without the messages, and of each part what is odd about it."""
+@contextmanager
+def _beside(out: Path) -> Iterator[Path]:
+    """Yield a folder in which runs wait until all of them are there; of an import that is refused nothing is left."""
+    new = not out.exists()
+    make_output_folder(out)
+    try:
+        with tempfile.TemporaryDirectory(dir=out, prefix=".import-") as folder:
+            yield Path(folder)
+    except BaseException:
+        if new:
+            shutil.rmtree(out, ignore_errors=True)
+        raise
 
-    log: Log
-    whole: MadeRun
-    findings: list[tuple[Finding, ...]]
+
+def _make_runs(
+    log: Path,
+    found: LogMap,
+    resolved: Mapping[str, Resolved],
+    split: float | None,
+    suffix: str,
+    folder: Path,
+    check_new: Callable[[TopicStore], None],
+    tell: Share,
+) -> Iterator[ImportedRun]:
+    """Yield the runs that a log makes, written into ``folder``; as much of it is in memory as a run needs."""
+    progress = _Progress(tell)
+    number = 0
+    for recording in read_recordings(log, wanted_fields(resolved), tell=progress.reading):
+        with closing(recording):
+            check_new(recording)
+            runs: list[ImportedRun] = []
+            for made in runs_of(recording, found, resolved, split, progress.making):
+                number += 1
+                findings = _check(made, recording.name, resolved)
+                path = write_run(folder / f"{number}{suffix}", made.table)
+                write_samples(samples_of(path), made)
+                runs.append(ImportedRun(path, recording.name, made.origin, made.facts, findings, made.notes))
+            yield from (replace(one, notes=(*recording.notes, *one.notes)) for one in runs)
+    tell(1.0)
+
+
+class _Progress:
+    """Shares of an import: most of it is reading."""
+
+    def __init__(self, tell: Share) -> None:
+        self._tell, self._read = tell, 0.0
+
+    def reading(self, share: float) -> None:
+        self._read = max(self._read, share)
+        self._tell(_READING * self._read)
+
+    def making(self, share: float) -> None:
+        self._tell(_READING * self._read + (1.0 - _READING) * share * self._read)
+
+
+def samples_of(run: Path) -> Path:
+    """Return where the samples of an imported run are."""
+    return run.with_name(f"{run.stem}.samples.parquet")
+
+
+def _moved(run: ImportedRun, path: Path) -> ImportedRun:
+    """Move a run to its place, and its samples before it."""
+    os.replace(samples_of(run.path), samples_of(path))
+    os.replace(run.path, path)
+    return replace(run, path=path)
 
 
 def _check(made: MadeRun, name: str, resolved: Mapping[str, Resolved]) -> tuple[Finding, ...]:
@@ -191,13 +248,6 @@ def _check(made: MadeRun, name: str, resolved: Mapping[str, Resolved]) -> tuple[
         raise InputError(_with_source(str(error), resolved)) from None
 
 
-def _write(log: Log, made: MadeRun, findings: tuple[Finding, ...], meta: RunMeta, out: Path, suffix: str) -> ImportedRun:
-    path = next_run(out, suffix)
-    write_run(path, made.table, meta)
-    replace_file(path.with_name(f"{path.stem}.samples.parquet"), lambda temporary: _write_samples(temporary, made.samples))
-    return ImportedRun(path, log.name, made.origin, made.facts, findings, (*log.notes, *made.notes))
-
-
 def _with_source(text: str, resolved: Mapping[str, Resolved]) -> str:
     """Return a message about a column with the topic and field that it came from."""
     found = re.search(r"column '(\w+)'", text)
@@ -205,75 +255,6 @@ def _with_source(text: str, resolved: Mapping[str, Resolved]) -> str:
     if source is None:
         return text
     return f"{text} (from topic '{source.topic}', field '{source.field}', read as {source.unit}: check its unit in the map)"
-
-
-def _write_samples(path: Path, samples: Mapping[str, Samples]) -> None:
-    """Write every sample at its own time: channel, t (s, the run's clock), value (SI units)."""
-    import pyarrow
-    import pyarrow.parquet
-
-    schema = pyarrow.schema([("channel", pyarrow.string()), ("t", pyarrow.float64()), ("value", pyarrow.float64())])
-    with pyarrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-        for name, one in samples.items():
-            columns = [pyarrow.array([name] * len(one.t)), pyarrow.array(one.t), pyarrow.array(one.values)]
-            writer.write_table(pyarrow.table(columns, schema=schema))
-
-
-# ---- long recordings -------------------------------------------------------------------------------------------------
-
-
-def _parts(made: MadeRun, split: float | None) -> Iterator[MadeRun]:
-    """Yield a recording whole, or in parts of about ``split`` seconds, none of them across a hole."""
-    if split is None:
-        yield made
-        return
-    t = made.table["t"]
-    holes = np.flatnonzero(np.diff(t) > max(_HOLE * float(np.median(np.diff(t))), _LEAST_HOLE)) + 1
-    pieces = list(itertools.pairwise([0, *holes.tolist(), len(t)]))
-    kept = [(first, last) for first, last in pieces if t[last - 1] - t[first] >= _LEAST_PIECE] or pieces
-    if len(kept) < len(pieces):
-        text = f"{len(pieces) - len(kept)} pieces between holes are shorter than {_LEAST_PIECE:g} s and are left out"
-        made = replace(made, notes=(*made.notes, text))
-    for first, last in kept:
-        piece = made if len(pieces) == 1 else _part(made, first, last)
-        edges = [0, *_cuts(piece, split), len(piece.table["t"])]
-        for begin, end in itertools.pairwise(edges):
-            yield piece if len(edges) == 2 else _part(piece, begin, end)
-
-
-def _cuts(made: MadeRun, split: float) -> list[int]:
-    """Return the rows that begin the second part of a recording without holes, and those after it."""
-    whole = float(made.table["t"][-1])
-    count = max(round(whole / split), 1)
-    return [_quiet_row(made, k * whole / count, whole / count) for k in range(1, count)]
-
-
-def _quiet_row(made: MadeRun, middle: float, length: float) -> int:
-    """Return the row near a time at which the joints are asked to move least."""
-    t = made.table["t"]
-    rows = np.flatnonzero(np.abs(t - middle) <= _PLAY * length)
-    motion = np.zeros(len(t))
-    for joint in JOINTS:
-        motion += np.abs(np.gradient(made.table[f"pos_{joint}"], t))
-    width = max(int(0.3 / float(np.median(np.diff(t)))), 1)
-    smooth = np.convolve(motion, np.ones(width) / width, mode="same")
-    cost = smooth[rows] + 0.01 * np.abs(t[rows] - middle) / length
-    return int(rows[np.argmin(cost)])
-
-
-def _part(made: MadeRun, first: int, last: int) -> MadeRun:
-    table = {name: values[first:last].copy() for name, values in made.table.items()}
-    begin, end = float(table["t"][0]), float(table["t"][-1])
-    samples = {}
-    for name, one in made.samples.items():
-        inside = (one.t >= begin - 0.1) & (one.t <= end + 0.1)
-        samples[name] = Samples(one.t[inside] - begin, one.values[inside])
-    for wheel in (f"pos_{wheel}" for wheel in WHEELS):  # wheels count from the run's start
-        start = table[wheel][0]
-        table[wheel] -= start
-        samples[wheel] = Samples(samples[wheel].t, samples[wheel].values - start)
-    table["t"] -= begin
-    return replace(made, table=table, samples=samples, origin=made.origin + round(begin * 1e9))
 
 
 # ---- the record of what was imported ---------------------------------------------------------------------------------
@@ -287,8 +268,8 @@ def _read_record(out: Path) -> dict[str, Any]:
     return record
 
 
-def _check_new(log: Log, record: Mapping[str, Any], out: Path) -> None:
-    source = Log(log.path.resolve(), {}, (), log.part).name
+def _check_new(log: Log | TopicStore, record: Mapping[str, Any], out: Path) -> None:
+    source = Log(log.path.resolve(), {}, part=log.part).name
     for run, entry in record.items():
         if isinstance(entry, dict) and entry.get("log") == source:
             hint = f"remove it, and its entry in {RECORD_FILE}, or name another folder"

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.logs import bags, mcap_file
-from wlr_gym.data.logs.tables import LEROBOT_INFO, read_lerobot, read_table
+from wlr_gym.data.logs.lerobot import INFO, read_lerobot
+from wlr_gym.data.logs.tables import TABLE, read_table
+from wlr_gym.data.logs.topic_store import BLOCK, TopicStore
 from wlr_gym.data.logs.topics import Collector, Log, Message, Share
 
 #: Topic -> fields that are read; None = all topics and all their fields.
@@ -20,9 +23,7 @@ def quiet(share: float) -> None:
 
 
 def read_logs(path: str | Path, wanted: Wanted | None = None, most: int | None = None, tell: Share = quiet) -> Iterator[Log]:
-    """Yield what a file or folder holds: one recording, or the episodes of a LeRobot data set.
-
-    Messages are read one after the other, and of each only its numbers are kept.
+    """Yield what a file or folder holds, in memory: one recording, or the episodes of a LeRobot data set.
 
     Args:
         path: what was recorded.
@@ -33,17 +34,37 @@ def read_logs(path: str | Path, wanted: Wanted | None = None, most: int | None =
     Raises:
         InputError: no such file, or one that cannot be read.
     """
+    for recording in read_recordings(path, wanted, most, tell):
+        with closing(recording):
+            yield recording.whole()
+
+
+def read_recordings(
+    path: str | Path, wanted: Wanted | None = None, most: int | None = None, tell: Share = quiet
+) -> Iterator[TopicStore]:
+    """Yield what a file or folder holds, as :func:`read_logs`, in bounded memory. Close each.
+
+    Messages are read one after the other, and of each only its numbers are kept.
+
+    Raises:
+        InputError: no such file, or one that cannot be read.
+    """
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; expected {_KINDS}")
     if path.is_file() and path.stat().st_size == 0:
         raise InputError(f"{path}: empty file")
-    if (path / LEROBOT_INFO).is_file():
-        yield from read_lerobot(path, tell)
-    elif path.suffix.lower() in (".csv", ".parquet"):
-        yield read_table(path, tell)
+    columns = None if wanted is None else wanted.get(TABLE, ())
+    if (path / INFO).is_file():
+        yield from read_lerobot(path, columns, tell)
+    elif _is_table(path):
+        yield read_table(path, columns, most, tell)
     else:
         yield _gathered(path, _reader(path), wanted, most, tell)
+
+
+def _is_table(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() in (".csv", ".parquet")
 
 
 def _reader(path: Path) -> Callable[..., Iterator[Message]]:
@@ -58,28 +79,40 @@ def _reader(path: Path) -> Callable[..., Iterator[Message]]:
     raise InputError(f"{path}: '{path.suffix}' files are not read; expected {_KINDS}")
 
 
-def _gathered(path: Path, read: Callable[..., Iterator[Message]], wanted: Wanted | None, most: int | None, tell: Share) -> Log:
+def _gathered(
+    path: Path, read: Callable[..., Iterator[Message]], wanted: Wanted | None, most: int | None, tell: Share
+) -> TopicStore:
+    recording = TopicStore(path)
     collectors: dict[str, Collector] = {}
-    notes: list[str] = []
-    known: set[str] = set()
+    counts: dict[str, int] = {}
+    kinds: dict[str, str] = {}
+    topics = None if wanted is None else {name.partition(" (")[0] for name in wanted}
 
     def wants(topic: str) -> bool:
-        known.add(topic)
-        if wanted is not None and topic not in wanted:
-            return False
-        return topic not in collectors or not collectors[topic].full
+        recording.known.add(topic)
+        return (topics is None or topic in topics) and (most is None or counts.get(topic, 0) < most)
 
-    for message in read(path, wants, notes, tell):
-        if message.topic not in collectors:
-            fields = None if wanted is None else wanted[message.topic]
-            collectors[message.topic] = Collector(message.kind, fields, most)
-        if not collectors[message.topic].full:
-            collectors[message.topic].add(message)
-    if not collectors and wanted is None:
-        raise InputError(f"{path}: no message that can be read{''.join('; ' + note for note in notes)}")
-    return Log(
-        path, {name: collector.topic(name) for name, collector in collectors.items()}, tuple(notes), known=frozenset(known)
-    )
+    try:
+        for message in read(path, wants, recording.notes, tell):
+            same = kinds.setdefault(message.topic, message.kind) == message.kind
+            name = message.topic if same else f"{message.topic} ({message.kind})"
+            if (wanted is not None and name not in wanted) or (most is not None and counts.get(name, 0) >= most):
+                continue
+            if name not in collectors:
+                collectors[name] = Collector(message.kind, None if wanted is None else wanted[name])
+            collectors[name].add(message)
+            counts[name] = counts.get(name, 0) + 1
+            if len(collectors[name]) == BLOCK:
+                recording.add(collectors.pop(name).topic(name))
+        for name, collector in collectors.items():
+            recording.add(collector.topic(name))
+        recording.notes += [f"two types on one topic: the second is '{name}'" for name in counts if name not in kinds]
+        if recording.empty and wanted is None:
+            raise InputError(f"{path}: no message that can be read{''.join('; ' + note for note in recording.notes)}")
+    except BaseException:
+        recording.close()
+        raise
+    return recording
 
 
 def first_messages(path: str | Path) -> Iterator[Message]:
@@ -91,6 +124,6 @@ def first_messages(path: str | Path) -> Iterator[Message]:
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; expected {_KINDS}")
-    if path.suffix.lower() in (".csv", ".parquet") or (path / LEROBOT_INFO).is_file():
+    if _is_table(path) or (path / INFO).is_file():
         return iter(())
     return _reader(path)(path, lambda topic: True, [], quiet)

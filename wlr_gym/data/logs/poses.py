@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,11 +15,11 @@ Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 #: Angles that can be taken of a quaternion.
-ANGLES = ("yaw", "pitch", "roll")
+ANGLES = ("yaw", "pitch", "roll", "tilt")
 
 
 def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, where: str) -> tuple[Times, Array]:
-    """Return times (ns) and one angle (rad) of a quaternion: ``<its field>.yaw``, ``.pitch`` or ``.roll``.
+    """Return times (ns) and an angle (rad) of a quaternion: ``yaw``, ``pitch``, ``roll``, or ``tilt`` off upright.
 
     Lost frames, whose quaternion is no rotation, are left out.
 
@@ -43,6 +44,7 @@ def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, w
         "yaw": np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
         "pitch": np.arcsin(np.clip(2 * (w * y - x * z), -1, 1)),
         "roll": np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        "tilt": np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)),
     }
     values = angles[angle]
     return at, np.unwrap(values) if angle == "yaw" else values
@@ -62,6 +64,24 @@ def lost_frames(topic: Topic, field: str, use: str, where: str) -> Times:
 
 def _rotations(topic: Topic, stem: str, use: str, where: str) -> tuple[Times, Array, NDArray[np.bool_]]:
     """Return times, quaternions (n, 4), and which of them are no rotations."""
-    parts = [topic.series(f"{stem}.{part}", use, where) for part in "wxyz"]
+    names = next((names for names in _quaternions(stem) if names[0] in topic.fields), _quaternions(stem)[0])
+    parts = [topic.series(name, use, where) for name in names]
     quaternion = np.stack([values for _, values in parts], axis=1)
     return parts[0][0], quaternion, ~(np.linalg.norm(quaternion, axis=1) >= 0.5)
+
+
+def quaternion_names(stem: str) -> set[str]:
+    """Return the names that the parts of a quaternion may have."""
+    return {name for names in _quaternions(stem) for name in names}
+
+
+def _quaternions(stem: str) -> list[list[str]]:
+    """Return names of w, x, y and z of a quaternion.
+
+    Of ``q`` they are ``q.w``, or in tables ``q_w`` or ``qw``; a list without names says its order: ``q[xyzw]`` has its w in
+    ``q[3]``.
+    """
+    ordered = re.fullmatch(r"(.*)\[([wxyz]{4})\]", stem)
+    if ordered and sorted(ordered.group(2)) == list("wxyz"):
+        return [[f"{ordered.group(1)}[{ordered.group(2).index(part)}]" for part in "wxyz"]]
+    return [[f"{stem}{joint}{part}" for part in "wxyz"] for joint in (".", "_", "")]

@@ -11,17 +11,14 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, REQUIRED
 from wlr_gym.data.logs.map import LogMap, Resolved
-from wlr_gym.data.logs.poses import ANGLES, lost_frames, pose_angle
+from wlr_gym.data.logs.poses import ANGLES, lost_frames, pose_angle, quaternion_names
+from wlr_gym.data.logs.takes import TAKES, bridged, hole
 from wlr_gym.data.logs.topics import LOG, Log
 from wlr_gym.robot import JOINTS, WHEELS
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 
-#: Usual steps between a channel's samples beyond which nothing is said of what lies between.
-_HOLE = 5.0
-#: s; holes up to this are bridged whatever the channel's rate.
-_SHORT = 0.1
 #: ns; channels that begin or end within this of the others shorten the run.
 _END = 1_000_000_000
 #: Rates of joints' messages from which on not every one makes a row, Hz.
@@ -85,30 +82,46 @@ def wanted_fields(resolved: Mapping[str, Resolved]) -> dict[str, set[str]]:
     wanted: dict[str, set[str]] = {}
     for source in resolved.values():
         stem, _, last = source.field.rpartition(".")
-        angles = {f"{stem}.{part}" for part in "wxyz"} if last in ANGLES else set()
-        wanted.setdefault(source.topic, set()).update({source.field} | angles)
+        wanted.setdefault(source.topic, set()).update({source.field}, quaternion_names(stem) if last in ANGLES else ())
     return wanted
 
 
-def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeRun:
+class NoRowsError(InputError):
+    """Nowhere, or nowhere between the times that were asked for, is there all that a row needs."""
+
+
+def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved], between: tuple[int, int] | None = None) -> MadeRun:
     """Return the run that a map makes of a log.
 
     Every message of one topic makes a row, at its true time; a channel with a sample at that time has it as it is. Of the
     others the map says how rows get a value. Nothing is brought to a raster.
 
+    Args:
+        log: what was recorded.
+        found: the map.
+        resolved: what it means for each channel.
+        between: ns; rows from the first to before the second only: what the log has around them says what holds at their ends,
+            and channels that are unknown all that time are left out. None = all.
+
     Raises:
-        InputError: a required channel, a topic or a field is missing, or no two rows have all that a row needs.
+        InputError: a required channel, a topic or a field is missing.
+        NoRowsError: no two rows have all that a row needs.
     """
-    missing = [name for name in REQUIRED if name != "t" and name not in resolved]
-    if missing:
-        raise InputError(f"{log.name}: no source for {', '.join(missing)}: {_MISSING[missing[0].partition('_')[0]]}")
+    check_sources(log.name, resolved)
     lost = _lost(log, found, resolved)
     series: dict[str, tuple[Times, Array]] = {}
+    odd = [*_odd_times(log, found, resolved, between), *_said_lost(lost, found, between)]
     for column, source in resolved.items():
         at, values = _series(log, found, source, lost)
+        if len(at) < 2:
+            text = f"topic '{source.topic}', field '{source.field}': {len(at)} samples, expected at least 2"
+            if between is None or column in REQUIRED:
+                raise NoRowsError(f"{log.name}: channel '{column}': {text}")
+            odd.append(f"'{column}' is left out: {text}")
+            continue
         series[column] = (_known(at, series.values()), values)
-    odd = [*_repeated(log, found, resolved), *(f"topic '{name}': {_frames(len(at))} left out" for name, at in lost.items())]
-    times, notes = _row_times(log, found, resolved, series)
+    resolved = {column: source for column, source in resolved.items() if column in series}
+    times, notes = _row_times(log, found, resolved, series, between)
     times, more = _complete(times, series, resolved, log)
     origin = int(times[0])
     period = float(np.median(np.diff(times))) * 1e-9
@@ -128,6 +141,17 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeR
     notes = [*odd, *notes, *more, *_silent(times, series, resolved)]
     table = {name: table[name] for name in COLUMNS if name in table}
     return MadeRun(table, samples, tuple(facts), origin, tuple(notes))
+
+
+def check_sources(log: str, resolved: Mapping[str, Resolved]) -> None:
+    """Refuse a map that lacks a required channel.
+
+    Raises:
+        InputError: naming the log and the channels, and what they are for.
+    """
+    missing = [name for name in REQUIRED if name != "t" and name not in resolved]
+    if missing:
+        raise InputError(f"{log}: no source for {', '.join(missing)}: {_MISSING[missing[0].partition('_')[0]]}")
 
 
 def _known(at: Times, series: Iterable[tuple[Times, Array]]) -> Times:
@@ -154,19 +178,37 @@ def _lost(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> dict[str
     return {yaw.topic: at} if len(at) else {}
 
 
-def _frames(count: int) -> str:
-    return f"{count} lost frame{'s are' if count > 1 else ' is'}"
+def _said_lost(lost: Mapping[str, Times], found: LogMap, between: tuple[int, int] | None) -> Iterator[str]:
+    for name, at in lost.items():
+        count = len(_within(at, found, name, between))
+        if count:
+            yield f"topic '{name}': {count} lost frame{'s are' if count > 1 else ' is'} left out"
 
 
-def _repeated(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> Iterator[str]:
-    """Say of which topics messages have the time of the one before: only the later one counts."""
+def _within(at: Times, found: LogMap, topic: str, between: tuple[int, int] | None) -> Times:
+    """Return those of a topic's times (ns, its own clock) that are in a span of the common clock."""
+    if between is None:
+        return at
+    moved = at + round(found.use(topic).offset * 1e9)
+    return at[(moved >= between[0]) & (moved < between[1])]
+
+
+def _odd_times(log: Log, found: LogMap, resolved: Mapping[str, Resolved], between: tuple[int, int] | None) -> Iterator[str]:
+    """Say of which topics messages have the time of the one before, of which only the later counts, or go back in time."""
     for name in dict.fromkeys(source.topic for source in resolved.values()):
         topic = log.topic(name)
         use = found.use(name).use
-        count = _repetitions(topic.clock(use))
-        hint = f": in the map, clocks: {{{name}: {{use: log}}}}" if use != LOG and _repetitions(topic.received) < count else ""
+        times = _within(topic.clock(use), found, name, between)
+        count = _repetitions(times)
+        received = _repetitions(topic.received) if between is None else 0
+        hint = f": in the map, clocks: {{{name}: {{use: log}}}}" if use != LOG and received < count else ""
         if count:
-            yield f"topic '{name}': {count} of {len(topic.received)} messages repeat a time and are left out{hint}"
+            yield f"topic '{name}': {count} of {len(times)} messages repeat a time and are left out{hint}"
+        back = np.diff(times)
+        if (back < 0).any():
+            much = f"{(back < 0).sum()} times, by up to {-back.min() * 1e-9:.3g} s"
+            restarted = "; a clock that began anew mixes two recordings: 'use: log'" if back.min() < -1e9 and use != LOG else ""
+            yield f"topic '{name}': its times go back {much}: sorted by time{restarted}"
 
 
 def _repetitions(times: Times) -> int:
@@ -190,8 +232,6 @@ def _series(log: Log, found: LogMap, source: Resolved, lost: Mapping[str, Times]
         keep &= np.isfinite(raw)
     if not keep.all():
         at, raw = at[keep], raw[keep]
-    if len(at) < 2:
-        raise InputError(f"{where}: topic '{source.topic}', field '{source.field}': {len(at)} samples, expected at least 2")
     values = source.factor * raw
     if source.column in (f"pos_{joint}" for joint in JOINTS):
         values = _without_wraps(values, at)
@@ -205,16 +245,28 @@ def _without_wraps(values: Array, at: Times) -> Array:
     return np.unwrap(values) if wraps.any() and np.ptp(values) < 2.2 * np.pi else values
 
 
+def rows_topic(found: LogMap, resolved: Mapping[str, Resolved]) -> str:
+    """Return the topic whose messages make the rows."""
+    return found.rows or resolved[f"pos_{JOINTS[0]}"].topic
+
+
 def _row_times(
-    log: Log, found: LogMap, resolved: Mapping[str, Resolved], series: Mapping[str, tuple[Times, Array]]
+    log: Log,
+    found: LogMap,
+    resolved: Mapping[str, Resolved],
+    series: Mapping[str, tuple[Times, Array]],
+    between: tuple[int, int] | None,
 ) -> tuple[Times, list[str]]:
-    rows = found.rows or resolved[f"pos_{JOINTS[0]}"].topic
+    rows = rows_topic(found, resolved)
     of_rows = [series[column][0] for column, source in resolved.items() if source.topic == rows]
     if not of_rows:
         raise InputError(f"{log.name}: rows = '{rows}': no channel comes from that topic")
-    times = max(of_rows, key=len)[:: found.every]
+    times = max(of_rows, key=len)
+    if between is not None:
+        times = times[(times >= between[0]) & (times < between[1])]
+    times = times[:: found.every]
     if len(times) < 2:
-        raise InputError(f"{log.name}: topic '{rows}': {len(times)} messages; a run has at least 2")
+        raise NoRowsError(f"{log.name}: topic '{rows}': {len(times)} messages; a run has at least 2")
     rate = 1e9 / float(np.median(np.diff(times)))
     if rate > _QUICK:
         return times, [f"rows come {rate:.0f} times a second, from topic '{rows}': 'every: {round(rate / 50)}' takes 50"]
@@ -245,7 +297,7 @@ def _complete(
         spans = [
             f"{name} from {series[name][0][0] * 1e-9:.3f} to {series[name][0][-1] * 1e-9:.3f} s" for name in REQUIRED[1::8]
         ]
-        raise InputError(f"{log.name}: setpoints and positions are never known together ({'; '.join(spans)}): check 'clocks'")
+        raise NoRowsError(f"{log.name}: setpoints and positions are never known together ({'; '.join(spans)}): check 'clocks'")
     notes = [
         *_cut(times[times < first], "beginning", max(begins, key=lambda name: begins[name]), resolved, half),
         *_cut(times[times > last], "end", min(ends, key=lambda name: ends[name], default=""), resolved, half),
@@ -266,13 +318,13 @@ def _without_holes(
     """Return the rows at which all angles are known: where another topic than the rows' is silent, some are not."""
     notes, keep = [], np.ones(len(times), bool)
     for name in (one for one in REQUIRED if one in series and resolved[one].take == "interpolate"):
-        missing = keep & ~_bridged(times, series[name][0])
+        missing = keep & ~bridged(times, series[name][0])
         keep &= ~missing
         if missing.any():
             text = f"'{name}' (topic '{resolved[name].topic}') has a hole there"
             notes.append(f"{missing.sum()} rows ({missing.sum() * 2e-9 * half:.1f} s) are left out: {text}")
     if keep.sum() < 2:
-        raise InputError(f"{log.name}: no two rows have all that a row needs: {'; '.join(notes)}")
+        raise NoRowsError(f"{log.name}: no two rows have all that a row needs: {'; '.join(notes)}")
     return times[keep], notes
 
 
@@ -283,7 +335,7 @@ def _silent(times: Times, series: Mapping[str, tuple[Times, Array]], resolved: M
     for name in (one for one in series if resolved[one].take == "hold" and resolved[one].topic not in said):
         at = series[name][0]
         age = times - at[np.clip(np.searchsorted(at, times + round(0.5 * step), side="right") - 1, 0, len(at) - 1)]
-        held = age > max(_HOLE * float(np.median(np.diff(at))), _SHORT * 1e9)
+        held = age > hole(at)
         if held.any():
             said.add(resolved[name].topic)
             text = f"its last message is held over {held.sum()} rows ({held.sum() * step * 1e-9:.1f} s)"
@@ -299,68 +351,9 @@ def _taken(times: Times, at: Times, values: Array, source: Resolved, period: flo
     if exact.all():
         result, how, moved = values[place], "as recorded", 0.0
     else:
-        take = {"interpolate": _interpolated, "hold": _held, "nearest": _nearest, "frames": _framed}[source.take]
+        take, how = TAKES[source.take]
         result, moved = take(times, at, values, period)
-        result, how = np.where(exact, values[place], result), _HOW[source.take]
+        result = np.where(exact, values[place], result)
     rate = 1e9 / float(np.median(np.diff(at)))
     known = float(np.isfinite(result).mean())
     return result, ChannelFact(source.column, source.topic, source.field, source.unit, rate, how, moved, known)
-
-
-_HOW = {
-    "interpolate": "interpolated",
-    "hold": "held at mid-step",
-    "nearest": "nearest sample",
-    "frames": "next to frames",
-}
-
-
-def _interpolated(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
-    after = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
-    width = (at[after] - at[after - 1]).astype(np.float64)
-    share = (times - at[after - 1]) / width
-    result = values[after - 1] + share * (values[after] - values[after - 1])
-    return np.where(_bridged(times, at), result, np.nan), _rms(np.minimum(np.abs(share), np.abs(1.0 - share)) * width)
-
-
-def _bridged(times: Times, at: Times) -> NDArray[np.bool_]:
-    """Whether the samples before and after each time say what was between them; a sample at the time itself does."""
-    after = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
-    usual = float(np.median(np.diff(at)))
-    width = (at[after] - at[after - 1]).astype(np.float64)
-    share = (times - at[after - 1]) / width
-    edge = 0.5 * usual / width  # the first and last half step are read off the line
-    inside = (share >= -edge) & (share <= 1.0 + edge) & (width <= max(_HOLE * usual, _SHORT * 1e9))
-    return inside | (at[after] == times) | (at[after - 1] == times)
-
-
-def _held(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
-    middle = times + round(0.5e9 * period)
-    place = np.clip(np.searchsorted(at, middle, side="right") - 1, 0, len(at) - 1)
-    return values[place], _rms((at[place] - times)[np.abs(at[place] - times) < 1e9 * period])
-
-
-def _nearest(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
-    place = _next_to(times, at)
-    distance = np.abs(at[place] - times)
-    usual = float(np.median(np.diff(at)))
-    return np.where(distance <= max(_HOLE * usual, _SHORT * 1e9), values[place], np.nan), _rms(distance)
-
-
-def _framed(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
-    """Each frame goes to the row next to it, moved along the line to the next frame; the other rows get none."""
-    inside = (at >= times[0] - 0.5e9 * period) & (at <= times[-1] + 0.5e9 * period)
-    rows = np.unique(_next_to(at[inside], times))
-    result = np.full(len(times), np.nan)
-    result[rows] = _interpolated(times[rows], at, values, period)[0]
-    distance = np.abs(times[rows] - at[_next_to(times[rows], at)])
-    return result, _rms(distance)
-
-
-def _next_to(times: Times, at: Times) -> NDArray[np.intp]:
-    after = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
-    return after - ((times - at[after - 1]) < (at[after] - times))
-
-
-def _rms(nanoseconds: NDArray[np.generic]) -> float:
-    return float(np.sqrt(np.mean(np.square(nanoseconds.astype(np.float64))))) * 1e-9 if len(nanoseconds) else 0.0

@@ -23,6 +23,8 @@ WINDOW = 0.5
 _GROSS = 0.1
 #: Share of headers not later than the one before, from which on they are no times.
 _NO_TIMES = 0.02
+#: ns; a header that is so much before the one before comes from a clock that began anew.
+_ANEW = -1_000_000_000
 #: Words for how sure a proposal is.
 SURE, LIKELY, GUESS = "sure", "likely", "guess"
 
@@ -136,7 +138,7 @@ def behind(log: Log, name: str) -> float | None:
     if topic.stamped is None or len(topic.stamped) < 2:
         return None
     steps = np.diff(topic.stamped)
-    if (steps <= 0).mean() > _NO_TIMES:
+    if (steps <= 0).mean() > _NO_TIMES or steps.min() < _ANEW:
         return None
     return float(np.median(topic.received - topic.stamped)) * 1e-9
 

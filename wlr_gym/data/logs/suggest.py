@@ -11,7 +11,7 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config
 from wlr_gym.data.format import CAMERA, COLUMNS
-from wlr_gym.data.logs.candidates import FieldCandidate, find_candidates
+from wlr_gym.data.logs.candidates import FieldCandidate, find_candidates, is_unnamed
 from wlr_gym.data.logs.clocks import set_clocks
 from wlr_gym.data.logs.map import GROUPS, ChannelSource, JointSource, LogMap, combine
 from wlr_gym.data.logs.signals import GUESS, SURE, LogSignals, Reason, roughly_one_clock
@@ -19,7 +19,7 @@ from wlr_gym.data.logs.suggest_body import find_imu, find_pose, wheel_motion
 from wlr_gym.data.logs.suggest_joints import JointFindings, find_joints
 from wlr_gym.data.logs.suggest_wheels import find_sides
 from wlr_gym.data.logs.topics import Log
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.robot.parameter_table import XYZ
 
 #: Messages per topic that are looked at: 100 s of an IMU at 200 Hz.
@@ -54,6 +54,7 @@ def propose(log: Log, robot: Robot, given: Mapping[str, Any] | None = None) -> P
     given = dict(given or {})
     known = parse_config(LogMap, given, "map")
     look = _look(log, robot, known)
+    _unnamed(look)
     body = find_pose(look)
     joints = find_joints(look, body)
     if body is None:
@@ -86,6 +87,16 @@ def _look(log: Log, robot: Robot, known: LogMap) -> LogSignals:
     return LogSignals(log, robot, chosen, known, clocks)
 
 
+def _unnamed(look: LogSignals) -> None:
+    """Say which lists have as many elements as a robot has joints of a kind, but no names."""
+    for name, topic in look.log.topics.items():
+        stems = {field.rpartition("[")[0] for field in topic.fields if is_unnamed(topic, field)}
+        long = [stem for stem in sorted(stems) if any(f"{stem}[{len(LEGS) - 1}]" == field for field in topic.fields)]
+        if long and not any(one.topic == name and one.column.partition("_")[2] in JOINTS for one in look.chosen.values()):
+            text = f"topic '{name}': {', '.join(long)} have no names: say in the map which is which, by place"
+            look.note("joints", GUESS, f"{text}: joints: {{{JOINTS[0]}: '0', ...}}")
+
+
 def _leave_out_short(log: Log, chosen: dict[str, FieldCandidate]) -> None:
     """Leave out motions that are too short to be compared.
 
@@ -94,7 +105,7 @@ def _leave_out_short(log: Log, chosen: dict[str, FieldCandidate]) -> None:
     """
     for column, one in list(chosen.items()):
         received = log.topics[one.topic].received
-        seconds = float(received[-1] - received[0]) * 1e-9 if len(received) else 0.0
+        seconds = float(np.ptp(received)) * 1e-9 if len(received) else 0.0
         if seconds >= _SHORTEST or column.startswith(("cmd_", "volt")):
             continue
         if column.startswith("pos_"):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.data.logs.align import Lag, find_lag
 from wlr_gym.data.logs.map import TopicClock
+from wlr_gym.data.logs.poses import pose_angle
 from wlr_gym.data.logs.signals import (
     GUESS,
     LIKELY,
@@ -35,6 +36,8 @@ _SMOOTH = 0.2
 _TURN_SPEED, _SWING, _AROUND = 0.02, 0.05, 0.3
 #: s; an IMU's clock that is off by more is moved before axes are looked for.
 _ROUGH = 0.1
+#: rad; a robot that drives is not tilted by so much.
+_TILTED = 1.0
 #: How much a gyroscope turns of what wheels or pose say: wheels slip in turns.
 _AS_MUCH = (0.12, 3.0)
 #: m/s2; standing readings whose length is off by more than this share are in no unit that is known.
@@ -95,10 +98,25 @@ def find_pose(look: LogSignals) -> BodyMotion | None:
     look.note(
         "cam", SURE if by_name else LIKELY, f"topic '{topic}', in {unit} by how fast the robot can be{_said_lost(look, topic)}"
     )
+    _said_tilt(look)
     if "odom" in topic.lower() or look.log.topics[topic].kind.endswith("Odometry"):
         text = f"topic '{topic}' may be computed from the wheels: then it is no measurement: take 'cam' out of the map"
         look.note("cam", GUESS, text)
     return BodyMotion(grid, forward, turned)
+
+
+def _said_tilt(look: LogSignals) -> None:
+    """Say where a quaternion lays the robot on its side or back: no run begins so."""
+    chosen = look.chosen["cam_yaw"]
+    topic = look.log.topics[chosen.topic]
+    if chosen.field in topic.fields:
+        return
+    field = f"{chosen.field.rpartition('.')[0]}.tilt"
+    use = look.clocks.get(chosen.topic, TopicClock()).use
+    tilt = float(np.median(pose_angle(topic, field, use, look.frames.get("cam"), look.log.name)[1]))
+    if tilt > _TILTED:
+        text = f"its quaternion tilts the robot by {np.degrees(tilt):.0f} deg in the median: are its parts in another order"
+        look.note("cam_yaw", GUESS, f"topic '{chosen.topic}': {text} (x, y, z, w against w, x, y, z), or is its z not up?")
 
 
 def _said_lost(look: LogSignals, topic: str) -> str:
@@ -121,7 +139,7 @@ def _length_unit(look: LogSignals, t: Array, x: Array, y: Array) -> str:
     vx, vy = smoothed(t, x)[2], smoothed(t, y)[2]
     speed = float(np.quantile(np.hypot(vx, vy), 0.95))
     units = FACTORS["m"]
-    return "m" if speed < 4.0 * fastest else "cm" if speed * units["cm"] > 0.3 * fastest else "mm"
+    return "m" if speed < 4.0 * fastest else "cm" if 0.3 * fastest < speed * units["cm"] < 2.0 * fastest else "mm"
 
 
 def _upright(look: LogSignals) -> None:

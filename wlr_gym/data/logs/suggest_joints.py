@@ -129,14 +129,19 @@ def _wheels_against_body(look: LogSignals, found: JointFindings, motion: BodyMot
 
 
 def _leg_zero(look: LogSignals, found: JointFindings, leg: str) -> None:
-    """Set sign and zero so that the leg stands about where it stands at home, straight down: quarter turns only."""
+    """Set sign and zero so that the leg stands about where it stands at home, straight down: quarter turns only.
+
+    A sign that the user gives stays, and has its zero.
+    """
     column = f"pos_{leg}"
-    if column not in look.chosen or is_given(look, leg):
+    given = look.given.joints[leg].model_fields_set if leg in look.given.joints else set[str]()
+    if column not in look.chosen or "zero" in given:
         return
-    _, values = angle(look, found, leg)
+    known = found.joint_sign.get(leg, 1)
+    values = known * angle(look, found, leg)[1]
     middle, (low, high) = float(np.median(values)), look.robot.leg_limits
     best = None
-    for sign in (1, -1):
+    for sign in (known,) if "sign" in given else (1, -1):
         for quarter in range(-4, 5):
             zero = quarter * np.pi / 2
             moved = sign * (values - zero)

@@ -1,17 +1,19 @@
-"""Read tables as logs: CSV and Parquet with any columns, and the episodes of a LeRobot data set (version 3)."""
+"""Read tables as recordings: CSV and Parquet with any columns, one of them the time."""
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.logs.topics import LONGEST, Log, Share, Topic, cannot_read
+from wlr_gym.data.logs.csv_file import ROWS, csv_frames
+from wlr_gym.data.logs.topic_store import TopicStore
+from wlr_gym.data.logs.topics import Share, Topic, cannot_read
 
 if TYPE_CHECKING:
     import pandas
@@ -24,71 +26,147 @@ _ENDINGS = {"_ns": 1, "_us": 1_000, "_ms": 1_000_000, "_s": 1_000_000_000, "_sec
 _UNITS = {10**9: "s", 10**6: "ms", 10**3: "us", 1: "ns"}
 #: ns; how far rows of a recording are apart: where the size says the unit, and where the name does.
 _BY_SIZE, _BY_NAME = (5e5, 5e8), (1e4, 1e10)
-#: Rows of a CSV file that are read at a time.
-_ROWS = 50_000
-LEROBOT_INFO = Path("meta") / "info.json"
-_LEROBOT_INDEX = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
+#: ``step`` of times that are dates.
+_DATES = 0
 
 
-def read_table(path: Path, tell: Share) -> Log:
+def read_table(path: Path, wanted: Collection[str] | None, most: int | None, tell: Share) -> TopicStore:
     """Read a CSV or Parquet file: one topic, whose fields are the columns that hold numbers.
 
+    Args:
+        path: the file.
+        wanted: columns that are kept; None = all.
+        most: rows that are kept, at least, where there are more; None = all.
+        tell: called with the share that has been read.
+
     Raises:
-        InputError: not such a file, no column of times, or times that do not increase.
+        InputError: not such a file, no column of times, or times that go back.
     """
-    import pandas
+    recording = TopicStore(path)
+    recording.known.add(TABLE)
+    reading = _Reading(path)
+    try:
+        frames = csv_frames(path, recording.notes, tell) if path.suffix.lower() == ".csv" else _parquet_frames(path, tell)
+        for frame, decimal in frames:
+            topic = reading.topic(frame, decimal, wanted)
+            if len(topic.received):
+                recording.add(topic)
+            if most is not None and reading.kept >= most:
+                break
+        if reading.kept < 2:
+            raise InputError(f"{path}: {reading.kept} rows; a recording has at least 2")
+    except BaseException:
+        recording.close()
+        raise
+    recording.notes += reading.notes()
+    return recording
 
-    frame, notes = _read_frame(path, tell)
-    if len(frame) < 2:
-        raise InputError(f"{path}: {len(frame)} rows; a recording has at least 2")
-    name = _time_column([str(column) for column in frame.columns], path)
-    times = _nanoseconds(pandas.Series(frame[name]), name, path)
-    if (np.diff(times) <= 0).any():
-        row = int(np.argmax(np.diff(times) <= 0)) + 1
-        raise InputError(f"{path}: row {row}, column '{name}': times must increase")
-    frame = frame.drop(columns=name)
-    return Log(path, {TABLE: _topic(frame, times)}, tuple(notes))
 
-
-def _read_frame(path: Path, tell: Share) -> tuple[pandas.DataFrame, list[str]]:
-    import pandas
+def _parquet_frames(path: Path, tell: Share) -> Iterator[tuple[pandas.DataFrame, str]]:
+    import pyarrow
+    import pyarrow.parquet
 
     try:
-        if path.suffix.lower() == ".parquet":
-            frame = pandas.read_parquet(path)
-        else:
-            parts, done, size = [], 0, max(path.stat().st_size, 1)
-            for part in pandas.read_csv(path, chunksize=_ROWS, skipinitialspace=True, encoding="utf-8-sig", **_dialect(path)):
-                parts.append(part)
-                done += int(part.memory_usage(index=False).sum())
-                tell(min(done / size, 1.0))
-            frame = pandas.concat(parts, ignore_index=True)
-    except (OSError, ValueError, pandas.errors.ParserError, pandas.errors.EmptyDataError) as error:
-        raise cannot_read(path, path.suffix.lstrip("."), error) from None
-    frame.columns = [str(column).strip() for column in frame.columns]
-    repeated = frame.columns[frame.columns.duplicated()]
-    if len(repeated):
-        raise InputError(f"{path}: column '{repeated[0]}' occurs twice")
-    return frame, _columns_left_out(frame)
+        with pyarrow.parquet.ParquetFile(path) as file:
+            done, total = 0, max(file.metadata.num_rows, 1)
+            for batch in file.iter_batches(batch_size=ROWS):
+                frame = batch.to_pandas()
+                frame = frame.reset_index() if frame.index.name is not None else frame
+                frame.index = range(done, done + len(frame))
+                frame.columns = [str(column).strip() for column in frame.columns]
+                done += len(frame)
+                yield frame, "."
+                tell(done / total)
+    except (OSError, ValueError, pyarrow.ArrowException) as error:
+        raise error if isinstance(error, InputError) else cannot_read(path, "parquet", error) from None
 
 
-def _dialect(path: Path) -> dict[str, Any]:
-    """Return how a CSV file separates: by comma, semicolon or tab; with the latter two, numbers may have a decimal comma."""
-    with path.open(encoding="utf-8-sig") as file:
-        header, first = file.readline(), file.readline()
-    separator = max(",;\t", key=header.count)
-    comma = separator != "," and re.search(r"\d,\d", first) is not None
-    return {"sep": separator, "decimal": "," if comma else "."}
+@dataclass
+class _Reading:
+    """What is known of a table while its rows come in: its column of times and the ns of one unit of it."""
 
+    path: Path
+    time: str = ""
+    step: int = -1
+    kept: int = 0
+    last: int | None = None
+    timeless: int = 0
+    first_timeless: str = ""
+    texts: dict[str, int] | None = None
 
-def _columns_left_out(frame: pandas.DataFrame) -> list[str]:
-    texts = [str(name) for name in frame.columns if frame[name].dtype == object or frame[name].dtype.name in ("str", "string")]
-    texts = [name for name in texts if name.lower() not in TIME_NAMES]
-    return [f"columns that hold no numbers: {', '.join(texts)}; left out"] if texts else []
+    def topic(self, frame: pandas.DataFrame, decimal: str, wanted: Collection[str] | None) -> Topic:
+        """Return some rows as messages.
+
+        Raises:
+            InputError: no column of times, one in no unit that is known, or times that go back.
+        """
+        if not self.time:
+            self.time = _time_column([str(column) for column in frame.columns], self.path)
+        frame, times = self._times(frame, decimal)
+        if len(times):
+            steps = np.diff(times, prepend=times[0] if self.last is None else self.last)
+            if (steps < 0).any():
+                row = int(frame.index[int(np.argmax(steps < 0))])
+                raise InputError(f"{self.path}: row {row}, column '{self.time}': times must increase")
+            self.last = int(times[-1])
+        self.kept += len(times)
+        return numeric_topic(self._numbers(frame.drop(columns=self.time), decimal), times, wanted)
+
+    def notes(self) -> list[str]:
+        """Return what was left out."""
+        texts = [name for name, numbers in (self.texts or {}).items() if not numbers and name.lower() not in TIME_NAMES]
+        mixed = [name for name, numbers in (self.texts or {}).items() if numbers]
+        return [
+            *([f"{self.timeless} rows without a time are left out ({self.first_timeless})"] if self.timeless else []),
+            *([f"columns that hold no numbers: {', '.join(texts)}; left out"] if texts else []),
+            *([f"columns that hold texts beside numbers: {', '.join(mixed)}; the texts are left out"] if mixed else []),
+        ]
+
+    def _times(self, frame: pandas.DataFrame, decimal: str) -> tuple[pandas.DataFrame, NDArray[np.int64]]:
+        """Return the rows that have a time, and their times in ns: comments and repeated names of columns have none."""
+        import pandas
+
+        column: Any = _texts(frame[self.time], decimal)
+        numbers: Any = pandas.to_numeric(column, errors="coerce")
+        if pandas.api.types.is_datetime64_any_dtype(column) or (self.step < 0 and numbers.isna().mean() > 0.5):
+            self.step = _DATES
+        found: Any = _dates(column) if self.step == _DATES else numbers
+        known: Any = found.notna()
+        if not known.any():
+            text = f"'{str(column.iloc[0])[:40]}' is neither a number nor a date"
+            raise InputError(f"{self.path}: row {frame.index[0]}, column '{self.time}': {text}")
+        if not known.all():
+            row = known.index[int(np.argmin(known))]
+            self.first_timeless = self.first_timeless or f"first row {row}: '{self.time}' is '{str(column[row])[:40]}'"
+            self.timeless += int((~known).sum())
+            frame, column, found = frame.loc[known], column[known], found[known]
+        if self.step == _DATES:
+            return frame, found.astype("datetime64[ns]").astype("int64").to_numpy()
+        column = pandas.to_numeric(column)  # whole numbers stay whole
+        if self.step < 0 and len(column) > 1:
+            self.step = _step(self.time, column, self.path)
+        return frame, _nanoseconds(column, max(self.step, 1))
+
+    def _numbers(self, frame: pandas.DataFrame, decimal: str) -> pandas.DataFrame:
+        """Return the columns with their texts as numbers, where they are."""
+        import pandas
+
+        self.texts = self.texts or {}
+        changed: dict[str, Any] = {}
+        for name in frame.columns:
+            if pandas.api.types.is_numeric_dtype(frame[name]) or pandas.api.types.is_datetime64_any_dtype(frame[name]):
+                continue
+            numbers: Any = pandas.to_numeric(_texts(frame[name], decimal), errors="coerce")
+            some = int(numbers.notna().sum())
+            if some:
+                changed[name] = numbers
+            if (numbers.isna() & frame[name].notna()).any() or not some:
+                self.texts[str(name)] = self.texts.get(str(name), 0) + some
+        return frame.assign(**changed) if changed else frame
 
 
 def _time_column(columns: list[str], path: Path) -> str:
-    lowered = {column.lower().split("[")[0].split("(")[0].strip(): column for column in columns}
+    lowered = {column.lower().split("[")[0].split("(")[0].strip(" _"): column for column in reversed(columns)}
     for wanted in TIME_NAMES:
         for ending in ("", *_ENDINGS):
             if wanted + ending in lowered:
@@ -96,18 +174,25 @@ def _time_column(columns: list[str], path: Path) -> str:
     raise InputError(f"{path}: no column of times: expected one of {', '.join(TIME_NAMES)}; it has {', '.join(columns[:12])}")
 
 
-def _nanoseconds(column: pandas.Series, name: str, path: Path) -> Any:
+def _texts(column: Any, decimal: str) -> Any:
+    """Return a column whose texts are as they are where a point is the decimal one; one of numbers or dates as it is."""
     import pandas
 
-    if not pandas.api.types.is_numeric_dtype(column):
-        try:
-            stamps = pandas.to_datetime(column, utc=True, format="ISO8601")
-        except (ValueError, TypeError) as error:
-            raise InputError(f"{path}: column '{name}': neither numbers nor dates: {error}") from None
-        return stamps.dt.tz_localize(None).astype("datetime64[ns]").astype("int64").to_numpy()
-    if column.isna().any():
-        raise InputError(f"{path}: row {int(np.argmax(column.isna()))}, column '{name}': no value")
-    step = _step(name, column, path)
+    if pandas.api.types.is_numeric_dtype(column) or pandas.api.types.is_datetime64_any_dtype(column):
+        return column
+    text = column.astype(str).str.strip()
+    return text.str.replace(",", ".", regex=False) if decimal == "," else text
+
+
+def _dates(column: pandas.Series) -> Any:
+    import pandas
+
+    return pandas.to_datetime(column, utc=True, format="ISO8601", errors="coerce").dt.tz_localize(None)
+
+
+def _nanoseconds(column: pandas.Series, step: int) -> NDArray[np.int64]:
+    import pandas
+
     if pandas.api.types.is_integer_dtype(column):
         return column.to_numpy(np.int64) * step
     values = column.to_numpy(np.float64)
@@ -124,8 +209,8 @@ def _step(name: str, column: pandas.Series, path: Path) -> int:
     lowered = name.lower().replace("[", "_").replace("(", "_").rstrip("])")
     apart = float(np.median(np.abs(np.diff(column.to_numpy(np.float64)))))
     by_name = next((step for ending, step in _ENDINGS.items() if lowered.endswith(ending)), None)
-    if apart == 0.0:  # times that do not increase are refused later
-        return by_name or 10**9
+    if apart == 0.0:  # most times repeat: what is left of them says more
+        apart = float(np.abs(np.diff(np.unique(column.to_numpy(np.float64)))).min(initial=np.inf))
     low, high = _BY_SIZE if by_name is None else _BY_NAME
     step = next((one for one in ([by_name] if by_name else _UNITS) if low <= apart * one < high), None)
     if step is None:
@@ -135,88 +220,15 @@ def _step(name: str, column: pandas.Series, path: Path) -> int:
     return step
 
 
-def _topic(frame: pandas.DataFrame, times: Any) -> Topic:
+def numeric_topic(frame: pandas.DataFrame, times: NDArray[np.int64], wanted: Collection[str] | None) -> Topic:
+    """Return a table's columns that hold numbers as fields; of times (ns) that are given."""
     import pandas
 
     rows = np.arange(len(frame), dtype=np.int64)
     fields = {}
-    for name in frame.columns:
-        if pandas.api.types.is_numeric_dtype(frame[name]):
-            values = frame[name].to_numpy(np.float64, na_value=np.nan)
-            known = np.isfinite(values)
-            fields[str(name)] = (rows[known], values[known])
-    return Topic(TABLE, "table", np.asarray(times, np.int64), None, fields)
-
-
-# ---- LeRobot ---------------------------------------------------------------------------------------------------------
-
-
-def read_lerobot(folder: Path, tell: Share) -> Iterator[Log]:
-    """Yield the episodes of a LeRobot data set of version 3, each as one table.
-
-    A feature of several numbers gives one field for each: ``action[left_wheel]`` where ``meta/info.json`` names them, else
-    ``action[0]``. Videos are left out.
-
-    Raises:
-        InputError: no such data set, or of another version.
-    """
-    import pandas
-
-    info = _info(folder)
-    names = {key: _feature_names(feature) for key, feature in info["features"].items()}
-    videos = [key for key, feature in info["features"].items() if feature.get("dtype") in ("video", "image")]
-    notes = (f"pictures are not read: {', '.join(videos)}",) if videos else ()
-    files = sorted((folder / "data").glob("chunk-*/file-*.parquet"))
-    if not files:
-        raise InputError(f"{folder}: no data/chunk-*/file-*.parquet")
-    for k, file in enumerate(files):
-        try:
-            frame = pandas.read_parquet(file, columns=None)
-        except (OSError, ValueError) as error:
-            raise cannot_read(file, "Parquet", error) from None
-        missing = {"timestamp", "episode_index"} - set(frame.columns)
-        if missing:
-            raise InputError(f"{file}: column '{min(missing)}' is missing")
-        for episode, rows in frame.groupby("episode_index", sort=True):
-            times = np.round(rows["timestamp"].to_numpy(np.float64) * 1e9).astype(np.int64)
-            yield Log(folder, {TABLE: _topic(_flat(rows, names), times)}, notes, f"episode {episode}")
-        tell((k + 1) / len(files))
-
-
-def _info(folder: Path) -> dict[str, Any]:
-    path = folder / LEROBOT_INFO
-    try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise cannot_read(path, "the description of a LeRobot data set", error) from None
-    version = str(info.get("codebase_version", "?"))
-    if not version.startswith("v3"):
-        raise InputError(f"{path}: codebase_version = {version}: expected v3.0; LeRobot has a converter")
-    if not isinstance(info.get("features"), dict):
-        raise InputError(f"{path}: 'features' is missing")
-    return info
-
-
-def _feature_names(feature: dict[str, Any]) -> list[str] | None:
-    names = feature.get("names")
-    if isinstance(names, dict):  # such as {"motors": [...]}
-        names = next((value for value in names.values() if isinstance(value, list)), None)
-    return [str(name) for name in names] if isinstance(names, list) else None
-
-
-def _flat(rows: pandas.DataFrame, names: dict[str, list[str] | None]) -> pandas.DataFrame:
-    import pandas
-
-    columns: dict[str, Any] = {}
-    for key in rows.columns:
-        first = rows[key].iloc[0]
-        if key in _LEROBOT_INDEX or isinstance(first, str | bytes | dict):
-            continue
-        if np.ndim(first) == 0:
-            columns[key] = rows[key].to_numpy(np.float64)
-        elif np.ndim(first) == 1 and len(first) <= LONGEST:
-            values = np.stack(rows[key].to_list()).astype(np.float64)
-            given = names.get(key)
-            labels = given if given and len(given) == values.shape[1] else [str(k) for k in range(values.shape[1])]
-            columns |= {f"{key}[{label}]": values[:, k] for k, label in enumerate(labels)}
-    return pandas.DataFrame(columns)
+    names = [str(name) for name in frame.columns if pandas.api.types.is_numeric_dtype(frame[name])]
+    for name in names if wanted is None else [name for name in names if name in wanted]:
+        values = frame[name].to_numpy(np.float64, na_value=np.nan)
+        known = np.isfinite(values)
+        fields[name] = (rows, values) if known.all() else (rows[known], values[known])
+    return Topic(TABLE, "table", np.asarray(times, np.int64), None, fields, known=frozenset(names))

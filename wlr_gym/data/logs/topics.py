@@ -132,21 +132,18 @@ class Collector:
     Args:
         kind: type of the messages.
         wanted: fields that are kept; None = all.
-        most: messages that are kept; None = all.
     """
 
-    def __init__(self, kind: str, wanted: Collection[str] | None = None, most: int | None = None) -> None:
-        self.kind, self.wanted, self.most = kind, wanted, most
+    def __init__(self, kind: str, wanted: Collection[str] | None = None) -> None:
+        self.kind, self.wanted = kind, wanted
         self._received = array("q")
         self._stamped = array("q")
         self._buffers: dict[str, _Buffer] = {}
         self._text = ""
         self._known: set[str] = set()
 
-    @property
-    def full(self) -> bool:
-        """Whether no more messages are kept."""
-        return self.most is not None and len(self._received) >= self.most
+    def __len__(self) -> int:
+        return len(self._received)
 
     def add(self, message: Message) -> None:
         """Keep a message."""
@@ -165,12 +162,12 @@ class Collector:
     def topic(self, name: str) -> Topic:
         """Return what was gathered; nothing is copied, and nothing may be added any more."""
         received, stamped = _array(self._received, np.int64), _array(self._stamped, np.int64)
-        every = np.arange(len(received))
-        fields = {
-            key: (every[: len(one.values)] if one.rows is None else _array(one.rows, np.int64), _array(one.values, np.float64))
-            for key, one in self._buffers.items()
-        }
-        known = len(stamped) == len(received) and len(stamped) > 0 and bool((stamped > 0).any())
+        every = np.arange(len(received))  # shared by all fields that every message has
+        fields = {}
+        for key, one in self._buffers.items():
+            rows = every if len(one.values) == len(every) else every[: len(one.values)]
+            fields[key] = (rows if one.rows is None else _array(one.rows, np.int64), _array(one.values, np.float64))
+        known = len(stamped) == len(received)
         return Topic(name, self.kind, received, stamped if known else None, fields, self._text, frozenset(self._known))
 
 

@@ -24,7 +24,8 @@ Array = NDArray[np.float64]
 
 
 #: The signals of a control step, a matrix each, float64 and C-contiguous, one row per robot. ``clock`` has the one column
-#: ``time``. ``computed`` holds the computed observations, which rewards, terminations and measures do not read.
+#: ``time``. ``computed`` holds the computed observations, which rewards, terminations and measures do not read; while these
+#: are computed it still holds those of the step before (``remembered``).
 MATRICES = ("sensors", "estimate", "truth", "command", "action", "previous_action", "start", "clock", "computed")
 
 
@@ -91,7 +92,10 @@ def _value(signals: Signals, read: Callable[[str], Value], kind: str, term: Any)
 
 def constants(task: Task) -> Mapping[str, float]:
     """Return the run-time numbers of a task by name, without those of the robot."""
-    values = {"task.control_period": task.config.control_period}
+    config = task.config
+    values = {"task.control_period": config.control_period}
+    values |= {f"task.action.{name}": scale for name, scale in config.action}
+    values |= {f"controller.{name}": gain for name, gain in config.controller or ()}
     groups = (
         ("reward", task.config.rewards, REWARDS),
         ("termination", task.config.terminations, TERMINATIONS),
@@ -125,6 +129,7 @@ def matrix_columns(task: Task) -> dict[str, tuple[str, int]]:
         "previous_action": ("previous_action[{}]", JOINTS),
         "start": ("start[{}]", START),
         "clock": ("{}", ("time",)),
+        "computed": ("remembered.{}", task.computed),
     }
     return {
         pattern.format(element): (matrix, column)

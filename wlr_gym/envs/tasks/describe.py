@@ -221,8 +221,8 @@ def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
     Keys: task, robot (name, hashes of its servos and of all its numbers; of another robot than ``nominal`` also its
     ``description``, every number of it), control_period, episode_length, observation (one entry per number, in order: name,
     source, element, unit, frame, offset, scale, limit, lag, device), observer (settings of the slip observer; None where no
-    term needs it), latency, action (one entry per number: joint, quantity, unit, centre, scale, low, high), commands and
-    randomization.
+    term needs it), controller (gains of the hand-written one, where the task names them), latency, action (one entry per
+    number: joint, quantity, unit, centre, scale, low, high), commands and randomization.
     """
     config = task.config
     return {
@@ -234,6 +234,7 @@ def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
         "observer": config.observer.model_dump(mode="json") if task.needs_observer else None,
         "latency": {device: latency.model_dump(mode="json") for device, latency in config.latency.items()},
         "action": [dict(vars(column)) for column in task.actions],
+        **({} if config.controller is None else {"controller": config.controller.model_dump(mode="json")}),
         "commands": {
             name: {"unit": COMMANDS[name].unit, "range": list(limits)} for name, limits in config.commands.terms.items()
         },

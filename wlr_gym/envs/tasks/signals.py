@@ -76,6 +76,18 @@ class Signals:
         """The action of the step before (zeros in the first)."""
         return [self._read(f"previous_action[{joint}]") for joint in JOINTS]
 
+    def remembered(self, element: str) -> Value:
+        """What a computed observation's element was in the step before; 0 at the start of an episode."""
+        return self._read(f"remembered.{element}")
+
+    def gain(self, name: str) -> Value:
+        """A gain of the task's hand-written controller."""
+        return self._read(f"controller.{name}")
+
+    def task(self, name: str) -> Value:
+        """A number of the task: ``action.leg_scale``."""
+        return self._read(f"task.{name}")
+
     def robot(self, path: str) -> Value:
         """A number of the nominal robot by its dotted path: ``leg.length``."""
         return self._read(f"robot.{path}")

@@ -24,6 +24,7 @@ from wlr_gym.envs.tasks.terms import (
     TERMINATIONS,
     ScalarTerm,
 )
+from wlr_gym.policy.slip_compensating import SlipGains
 from wlr_gym.robot import Robot, load_robot
 
 #: Group of a task's data -> what its terms are called, and those there are.
@@ -125,7 +126,8 @@ class TaskConfig(SettingsModel):
     An episode is a success when no termination term ended it and every measure named in ``success`` stays within its limits.
     ``summary`` opens the environment's documentation, ``history`` closes it: version of the id -> what changed. The last
     version is the present one. ``robot`` is the one that the numbers are written for; ``scaling`` says how they follow another:
-    place of a number -> rule, see :mod:`wlr_gym.envs.tasks.scaling`.
+    place of a number -> rule, see :mod:`wlr_gym.envs.tasks.scaling`. ``controller``: gains of the hand-written controller whose
+    action may be observed.
     """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
@@ -139,6 +141,7 @@ class TaskConfig(SettingsModel):
     commands: CommandsConfig
     latency: dict[Literal["joints", "imu", "camera"], LatencyConfig] = Field(default={})
     observer: ObserverConfig = ObserverConfig()
+    controller: SlipGains | None = None
     observations: dict[str, ObservationConfig]
     privileged: dict[str, PrivilegedConfig] = Field(default={})
     rewards: dict[str, dict[str, float]]
@@ -266,6 +269,8 @@ def _check_commands(config: TaskConfig, where: str) -> None:
     used = [name for name in (*config.observations, *config.privileged) if name in COMPUTED]
     functions |= {f"observation term '{name}'": COMPUTED[name].function for name in used}
     for term, function in functions.items():
+        if config.controller is None and any(name.startswith("controller.") for name in signals_of(function)):
+            raise InputError(f"{where}: {term} needs 'controller', the gains of the controller: {{steering: 2.0, ...}}")
         for command in sorted(name.removeprefix("command.") for name in signals_of(function) if name.startswith("command.")):
             if command not in config.commands.terms:
                 raise InputError(f"{where}: {term} needs the command '{command}', which commands.terms does not give")

@@ -43,14 +43,14 @@ def _bootstrap(played: Played) -> Bootstrap:
 
 def scores_of(played: Played) -> Scores:
     """Return metric -> estimate, mean over training seeds."""
-    resampling, units = _bootstrap(played), {metric.key: metric.unit for metric in metrics_of(played.measures)}
-    return {key: _possible(resampling.mean(pairs), key, units[key]) for key, pairs in played.pairs.items()}
+    resampling = _bootstrap(played)
+    return {m.key: _possible(resampling.mean(played.pairs[m.key], m.quantile), m) for m in metrics_of(played.measures)}
 
 
-def _possible(estimate: Estimate, key: str, unit: str) -> Estimate:
+def _possible(estimate: Estimate, metric: Metric) -> Estimate:
     """Return an estimate without the part of its interval that cannot be: few training seeds that differ give wide ones."""
-    low = estimate.low if key == "reward" else max(estimate.low, min(0.0, estimate.mean))
-    return Estimate(estimate.mean, low, min(estimate.high, 100.0) if unit == "%" else estimate.high)
+    low = estimate.low if metric.key == "reward" else max(estimate.low, min(0.0, estimate.mean))
+    return Estimate(estimate.mean, low, min(estimate.high, 100.0) if metric.unit == "%" else estimate.high)
 
 
 def score(rollout: Rollout) -> Scores:
@@ -70,7 +70,7 @@ def compare(ours: Played, theirs: Played, metrics: Sequence[Metric]) -> Scores:
         if metric.key in BY_DIFFERENCE:
             better[metric.key] = resampling.difference(*((b, a) if metric.less_is_better else (a, b)))
         else:
-            better[metric.key] = resampling.reduction(a, b)
+            better[metric.key] = resampling.reduction(a, b, metric.quantile)
     return better
 
 
@@ -113,8 +113,8 @@ def seed_scores(played: Played, seeds: Sequence[str]) -> SeedScores:
         seed: scores_of(replace(played, pairs={key: own[index : index + 1] for key, own in pairs.items()}))
         for index, seed in enumerate(seeds)
     }
-    enough = len(seeds) >= FEWEST
-    return SeedScores(scores, {key: resampling.interquartile_mean(own) for key, own in pairs.items()} if enough else {})
+    metrics = metrics_of(played.measures) if len(seeds) >= FEWEST else ()
+    return SeedScores(scores, {m.key: resampling.interquartile_mean(pairs[m.key], m.quantile) for m in metrics})
 
 
 @dataclass(frozen=True)

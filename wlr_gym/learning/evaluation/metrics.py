@@ -24,17 +24,32 @@ JITTER_FREQUENCY = 5.0
 WINDOW = 128
 
 
+#: s after the start and after a change of a command in which a motion is not steady yet.
+SETTLING = 2.0
+
+
 @dataclass(frozen=True)
 class Metric:
-    """One row of the card: key, unit, printed digits, whether less is better, meaning."""
+    """One row of the card: key, unit, printed digits, whether less is better, meaning; of episodes the mean, or a quantile."""
 
     key: str
     unit: str
     digits: int
     less_is_better: bool
     doc: str
+    quantile: float | None = None
 
 
+TRACKING = (
+    Metric("tracking_error_median", "-", 3, True, "tracking_error of the episode in the middle", 0.5),
+    Metric("tracking_error_p90", "-", 3, True, "tracking_error that one episode in ten exceeds", 0.9),
+    Metric(
+        "tracking_error_steady", "-", 3, True, f"tracking_error later than {SETTLING:g} s after start and changes of command"
+    ),
+    Metric(
+        "tracking_error_transient", "-", 3, True, f"tracking_error within {SETTLING:g} s after start and changes of command"
+    ),
+)
 GENERAL = (
     Metric("falls", "%", 0, True, "episodes that a termination ended"),
     Metric("slip_speed", "m/s", 4, True, "slip speed, mean over wheels and time"),
@@ -67,6 +82,7 @@ def metrics_of(measures: Sequence[Measure]) -> tuple[Metric, ...]:
             True,
             f"rms over the task's limits of what is reached of each ({', '.join(limits)}); a fall adds {FALL:g}",
         ),
+        *TRACKING,
         *own,
         Metric("success", "%", 0, False, "episodes without a fall and within every limit"),
         *GENERAL,
@@ -131,6 +147,7 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
     active, period = rollout.active, rollout.control_period
     ticks = active.sum(axis=0).astype(np.float64)
     errors = errors_of(rollout.measures, rollout.measured, active)
+    tracking = _tracking(rollout, errors)
     slip = np.linalg.norm(rollout.slip_velocity, axis=-1).mean(axis=-1)
     energy = _sum(rollout.energy, active)
     travel = travelled(rollout)
@@ -142,10 +159,7 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
     ones = np.ones(rollout.episodes)
     values = {
         **{name if kind == "rms" else f"{name}_{kind}": error for (name, kind), error in errors.items()},
-        "tracking_error": (
-            tracking_error(_all_limits(rollout.measures), errors, rollout.fell),
-            ones if has_limits(rollout.measures) else 0.0 * ones,
-        ),
+        **tracking,
         "success": 100.0 * rollout.succeeded,
         "falls": 100.0 * rollout.fell,
         "slip_speed": _sum(slip, active) / ticks,
@@ -159,6 +173,27 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
         "reward": _sum(rollout.reward, active),
     }
     return {key: np.stack(value if isinstance(value, tuple) else (value, ones), axis=1) for key, value in values.items()}
+
+
+def _tracking(rollout: Rollout, errors: dict[Which, Array]) -> dict[str, tuple[Array, Array]]:
+    """Return the tracking error of every episode, whole and in parts: value and weight; weight 0 where there is none."""
+    limits, known = _all_limits(rollout.measures), np.full(rollout.episodes, float(has_limits(rollout.measures)))
+    whole = (tracking_error(limits, errors, rollout.fell), known)
+    parts = {"tracking_error": whole, "tracking_error_median": whole, "tracking_error_p90": whole}
+    steady = is_steady(rollout)
+    for name, chosen in (("steady", rollout.active & steady), ("transient", rollout.active & ~steady)):
+        own = errors_of(rollout.measures, rollout.measured, chosen)
+        parts[f"tracking_error_{name}"] = tracking_error(limits, own, np.zeros_like(rollout.fell)), known * chosen.any(axis=0)
+    return parts
+
+
+def is_steady(rollout: Rollout) -> Mask:
+    """Return in which steps (T, N) neither the start nor a change of a command lies in the last :data:`SETTLING` seconds."""
+    changed = np.ones(rollout.active.shape, bool)
+    changed[1:] = (rollout.command[1:] != rollout.command[:-1]).any(axis=-1)
+    step = np.arange(len(changed))[:, None]
+    last = np.maximum.accumulate(np.where(changed, step, 0), axis=0)
+    return (step - last) * rollout.control_period >= SETTLING
 
 
 def errors_of(measures: Sequence[Measure], measured: Array, active: Mask) -> dict[Which, Array]:

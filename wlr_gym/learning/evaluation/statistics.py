@@ -85,16 +85,29 @@ class Bootstrap:
             weights[np.arange(RESAMPLES), chosen[:, stage]] += counts[:, stage]
         self._weights = weights.reshape(RESAMPLES, -1)
 
-    def scores(self, pairs: Array) -> Array:
+    def scores(self, pairs: Array, quantile: float | None = None) -> Array:
         """Return each training seed's metric (RESAMPLES + 1, T) of numerators and denominators (T, B, N, 2).
 
-        The first row is as measured, the others with resampled episodes.
+        The first row is as measured, the others with resampled episodes. ``quantile``: of the episodes, in place of their mean.
         """
         flat = pairs.reshape(-1, self._weights.shape[1], 2)
+        if quantile is not None:
+            return self._quantiles(flat, quantile)
         columns = flat.transpose(1, 0, 2).reshape(self._weights.shape[1], -1)
         sums = np.concatenate([columns.sum(axis=0, keepdims=True), self._weights @ columns]).reshape(-1, len(flat), 2)
         above, below = sums[:, :, 0], sums[:, :, 1]
         return np.divide(above, below, out=np.full(above.shape, np.nan), where=below > 0)
+
+    def _quantiles(self, flat: Array, quantile: float) -> Array:
+        """Return the smallest values (RESAMPLES + 1, T) that the share ``quantile`` of the episodes does not exceed."""
+        weights = np.concatenate([np.ones((1, flat.shape[1])), self._weights])
+        found = []
+        for own in flat:
+            values = np.divide(own[:, 0], own[:, 1], out=np.full(len(own), np.nan), where=own[:, 1] > 0)
+            order = np.argsort(values)
+            reached = np.cumsum(weights[:, order] * (own[order, 1] > 0), axis=1)
+            found.append(values[order][np.argmax(reached >= quantile * reached[:, -1:] - 1e-9, axis=1)])
+        return np.stack(found, axis=1)
 
     def estimate(
         self,
@@ -102,6 +115,7 @@ class Bootstrap:
         *pairs: Array,
         subjects: Sequence[int] | None = None,
         over_seeds: Callable[[Array], Array] = mean,
+        quantile: float | None = None,
     ) -> Estimate:
         """Return ``function`` of metrics with its interval.
 
@@ -110,9 +124,10 @@ class Bootstrap:
             pairs: numerators and denominators (T, B, N, 2), or (B, N, 2) of one training seed; T may differ.
             subjects: number of the subject that each belongs to; None = all different ones.
             over_seeds: makes one score of those of a subject's training seeds.
+            quantile: of the episodes, in place of their mean.
         """
         numbers = range(len(pairs)) if subjects is None else subjects
-        drawn = [self._draw(pair, number, over_seeds) for pair, number in zip(pairs, numbers, strict=True)]
+        drawn = [self._draw(pair, number, over_seeds, quantile) for pair, number in zip(pairs, numbers, strict=True)]
         several = [draws.seeds for draws in drawn if draws.seeds > 1]
         factor = expansion(min(several, default=1))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -124,28 +139,28 @@ class Bootstrap:
         low, high = np.nanpercentile(np.where(np.isfinite(values), values, np.nan)[1:], (tail, 100.0 - tail))
         return Estimate(float(values[0]), float(low), float(high))
 
-    def _draw(self, pairs: Array, subject: int, over_seeds: Callable[[Array], Array]) -> _Draws:
-        scores = self.scores(pairs)
+    def _draw(self, pairs: Array, subject: int, over_seeds: Callable[[Array], Array], quantile: float | None) -> _Draws:
+        scores = self.scores(pairs, quantile)
         seeds = scores.shape[1]
         chosen = np.random.default_rng([subject, seeds]).integers(0, seeds, (RESAMPLES, seeds))
         chosen = np.concatenate([np.arange(seeds)[None], chosen])
         return _Draws(over_seeds(scores), over_seeds(np.take_along_axis(scores, chosen, axis=1)), seeds)
 
-    def mean(self, pairs: Array) -> Estimate:
+    def mean(self, pairs: Array, quantile: float | None = None) -> Estimate:
         """Return the metric itself, mean over training seeds."""
-        return self.estimate(lambda value: value, pairs)
+        return self.estimate(lambda value: value, pairs, quantile=quantile)
 
-    def interquartile_mean(self, pairs: Array) -> Estimate:
+    def interquartile_mean(self, pairs: Array, quantile: float | None = None) -> Estimate:
         """Return the metric itself, interquartile mean over training seeds (Agarwal et al. 2021)."""
-        return self.estimate(lambda value: value, pairs, over_seeds=interquartile_mean)
+        return self.estimate(lambda value: value, pairs, over_seeds=interquartile_mean, quantile=quantile)
 
     def difference(self, ours: Array, theirs: Array) -> Estimate:
         """Return ours - theirs."""
         return self.estimate(lambda a, b: a - b, ours, theirs)
 
-    def reduction(self, ours: Array, theirs: Array) -> Estimate:
+    def reduction(self, ours: Array, theirs: Array, quantile: float | None = None) -> Estimate:
         """Return by how much ours is smaller than theirs, in % of theirs."""
-        return self.estimate(lambda a, b: 100.0 * (1.0 - a / b), ours, theirs)
+        return self.estimate(lambda a, b: 100.0 * (1.0 - a / b), ours, theirs, quantile=quantile)
 
     def share(self, ours: Array, theirs: Array, our_zero: Array, their_zero: Array, *, subjects: Sequence[int]) -> Estimate:
         """Return ours in % of theirs, each above its own zero; ``subjects`` as for :meth:`estimate`."""

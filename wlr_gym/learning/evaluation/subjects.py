@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.learning.evaluation.rollout import make_core
@@ -17,6 +17,15 @@ from wlr_gym.policy import agent_names, environment_for, find_policy, load_agent
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
     from wlr_gym.policy import Policy
+
+
+@runtime_checkable
+class Planner(Protocol):
+    """A policy that plans on the simulator's own state."""
+
+    def use_simulator(self, core: Core) -> None:
+        """Plan for the robots of ``core``."""
+        ...
 
 
 #: What names one or several policies; see :func:`read_subjects`.
@@ -115,7 +124,10 @@ def make_player(environment: str, source: str | Path, episodes: int, keywords: M
     """
     core = make_core(environment, episodes, environment_for(source, keywords))
     try:
-        return core, make_policy(source, core.contract())
+        policy = make_policy(source, core.contract())
+        if isinstance(policy, Planner):
+            policy.use_simulator(core)
+        return core, policy
     except BaseException:
         core.close()
         raise

@@ -23,7 +23,12 @@ class PpoConfig(SettingsModel):
             left, a small step of the weights is a large one of the policy: then it should have fallen far.
         gamma, gae_lambda, clip_range, entropy_coefficient, value_coefficient, max_gradient_norm: as in Stable-Baselines3.
         target_kl: end the passes of an update early beyond 1.5 times this divergence; None = never.
+        desired_kl: divergence of an update by which the learning rate adapts: lowered above twice of it, raised below half.
+            None = the rate falls as ``final_learning_rate`` says.
         hidden_layers, activation: of the networks of policy and value, which share nothing.
+        normalise: bring the observations to mean 0 and deviation 1, as the untrained policy meets them, inside the network.
+        residual: the network's output times this is added to the action of the task's ``controller``; None = no controller.
+        mirror: learn from the left-right mirror image of every other sample.
         initial_log_std: logarithm of the exploration noise at the start, in actions.
         teacher: agent whose actions the actor learns before PPO starts (``warm_start.py``); None = from nothing.
         evaluate_every: environment steps between scores on held-out episodes (``held_out.py``); 0 = never.
@@ -52,6 +57,10 @@ class PpoConfig(SettingsModel):
     value_coefficient: float = Field(0.5, ge=0)
     max_gradient_norm: float = Field(0.5, gt=0)
     target_kl: float | None = Field(None, gt=0)
+    desired_kl: float | None = Field(None, gt=0)
+    normalise: bool = False
+    residual: float | None = Field(None, gt=0)
+    mirror: bool = False
     hidden_layers: tuple[int, ...] = (64, 64)
     activation: Literal["tanh", "elu", "relu"] = "tanh"
     initial_log_std: float = 0.0

@@ -10,7 +10,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.ppo.config import PpoConfig
-from wlr_gym.learning.ppo.policy import ACTOR, MODEL_FILE, actor, contract_to_start_from
+from wlr_gym.learning.ppo.policy import MODEL_FILE, actor, contract_to_start_from, load_actor
 from wlr_gym.learning.ppo.warm_start import fit_critic
 from wlr_gym.policy import check_contract, find_policy, load_policy
 
@@ -31,7 +31,7 @@ def start_from(model: PPO, env: Sb3VecEnv, config: PpoConfig, source: str | Path
     if place.is_file():
         actor(model.policy).load_state_dict(weights)
     else:
-        model.policy.load_state_dict({name: weights[name] for name in own if name.startswith(ACTOR)}, strict=False)
+        load_actor(model.policy, weights)
     fit_critic(model, env, config, load_policy(source, env.contract()))
 
 

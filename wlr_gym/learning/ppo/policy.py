@@ -20,7 +20,7 @@ from wlr_gym.policy import contract_of
 
 MODEL_FILE = "model.zip"
 #: Settings that make the network.
-NETWORK = ("hidden_layers", "activation")
+NETWORK = ("hidden_layers", "activation", "normalise", "residual")
 #: Logarithm of the exploration noise of a start from a file, which does not say that of each joint. The mean over joints of
 #: what shipped ones had in the end, e**-3.5, costs 5 % of the reward on the legs, and made policies worse; docs/learning.md.
 LOG_STD = -4.6
@@ -72,8 +72,7 @@ def load_policy(folder: Path, contract: Mapping[str, Any]) -> PpoPolicy:
 
     try:
         _, parameters, _ = load_from_zip_file(path, device="cpu", load_data=False)
-        saved = parameters["policy"]  # the critic may see what is not in the contract, and is not needed any more
-        network.load_state_dict({name: saved[name] for name in network.state_dict() if name.startswith(ACTOR)}, strict=False)
+        load_actor(network, parameters["policy"])  # type: ignore[arg-type]
     except Exception as error:  # zip, pickle and torch each raise their own kinds for a broken file
         raise InputError(f"{path}: not a readable model: {error}") from None
     return PpoPolicy(network)
@@ -127,6 +126,17 @@ def contract_to_start_from(source: str | Path) -> Mapping[str, Any]:
     return contract
 
 
+def load_actor(network: Any, saved: Mapping[str, Any]) -> None:
+    """Put the weights that act into a network; the critic may see what is not in the contract, and stays as it is.
+
+    Raises:
+        RuntimeError: other weights, or of other shapes, than the network has.
+    """
+    acting = {name: value for name, value in saved.items() if name.startswith(ACTOR)}
+    own = network.state_dict()
+    network.load_state_dict({name: value for name, value in own.items() if not name.startswith(ACTOR)} | acting, strict=True)
+
+
 def actor(network: Any) -> Any:
     """Return the part of a network that acts, as a torch module: observations (N, D) to actions (N, 8) clipped to [-1, 1]."""
     from torch import nn
@@ -139,12 +149,33 @@ def parse_settings(config: Mapping[str, Any]) -> PpoConfig:
     return parse_config(PpoConfig, dict(config), "agent 'ppo'")
 
 
-def policy_keywords(config: PpoConfig) -> dict[str, Any]:
-    """Return the keywords that make Stable-Baselines3's network the configured one."""
+def policy_class(config: PpoConfig, *, asymmetric: bool) -> Any:
+    """Return the class of the configured network."""
+    from stable_baselines3.common.policies import ActorCriticPolicy
+
+    from wlr_gym.learning.ppo.asymmetric import AsymmetricPolicy
+    from wlr_gym.learning.ppo.layers import LayeredAsymmetricPolicy, LayeredPolicy
+
+    plain, layered = (AsymmetricPolicy, LayeredAsymmetricPolicy) if asymmetric else (ActorCriticPolicy, LayeredPolicy)
+    return layered if _is_layered(config) else plain
+
+
+def policy_keywords(config: PpoConfig, contract: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keywords that make Stable-Baselines3's network the configured one for an environment's contract."""
     from torch import nn
 
     activation = {"tanh": nn.Tanh, "elu": nn.ELU, "relu": nn.ReLU}[config.activation]
-    return {"net_arch": list(config.hidden_layers), "activation_fn": activation, "log_std_init": config.initial_log_std}
+    keywords = {"net_arch": list(config.hidden_layers), "activation_fn": activation, "log_std_init": config.initial_log_std}
+    if not _is_layered(config):
+        return keywords
+    from wlr_gym.learning.ppo.layers import Layers, controller_columns
+
+    columns = () if config.residual is None else controller_columns(contract)
+    return keywords | {"layers": Layers(config.normalise, columns, config.residual or 0.0)}
+
+
+def _is_layered(config: PpoConfig) -> bool:
+    return config.normalise or config.residual is not None
 
 
 def _network(contract: Mapping[str, Any], config: PpoConfig) -> Any:
@@ -153,13 +184,13 @@ def _network(contract: Mapping[str, Any], config: PpoConfig) -> Any:
     require_package("stable_baselines3", "train")
     import torch
     from gymnasium import spaces
-    from stable_baselines3.common.policies import ActorCriticPolicy
 
     high = np.array([column["scale"] * column["limit"] for column in contract["observation"]], dtype=np.float32)
     observation_space = spaces.Box(-high, high, dtype=np.float32)
     action_space = spaces.Box(-1.0, 1.0, (len(contract["action"]),), dtype=np.float32)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        network = ActorCriticPolicy(observation_space, action_space, lambda _: config.learning_rate, **policy_keywords(config))
+        kind = policy_class(config, asymmetric=False)
+        network = kind(observation_space, action_space, lambda _: config.learning_rate, **policy_keywords(config, contract))
     network.set_training_mode(False)
     return network

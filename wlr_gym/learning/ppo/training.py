@@ -20,20 +20,23 @@ import torch
 from gymnasium import spaces
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from stable_baselines3 import PPO
-from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.provenance import provenance, record_provenance, write_yaml
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.ppo import checkpoint
-from wlr_gym.learning.ppo.asymmetric import AsymmetricPolicy
 from wlr_gym.learning.ppo.config import PpoConfig
 from wlr_gym.learning.ppo.curve import Meter, losses
 from wlr_gym.learning.ppo.fine_tuning import start_from
-from wlr_gym.learning.ppo.policy import parse_settings, policy_keywords, with_network_of
+from wlr_gym.learning.ppo.mirror import mirrored_samples, set_mirror
+from wlr_gym.learning.ppo.policy import parse_settings, policy_class, policy_keywords, with_network_of
 from wlr_gym.learning.ppo.training_log import TrainingLog
-from wlr_gym.learning.ppo.warm_start import imitate
+from wlr_gym.learning.ppo.warm_start import gather_scales, imitate
 from wlr_gym.policy import Training, TrainingProgress
+
+#: Factor by which an adapting learning rate changes after an update, and where it stays.
+RATE_STEP, LOWEST_RATE, HIGHEST_RATE = 1.5, 1e-5, 1e-2
 
 
 def run_training(training: Training) -> Path:
@@ -83,6 +86,9 @@ def _begin(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) ->
     if training.resume:
         print(f"{training.folder}: no checkpoint yet; training starts from the beginning", flush=True)
     begin_episodes(model, env, config.seed)
+    if config.normalise and training.init is None:
+        gather_scales(model, env)
+        begin_episodes(model, env, config.seed)
     if training.init is not None:
         start_from(model, env, config, training.init)
     elif config.teacher is not None:
@@ -113,8 +119,9 @@ def learning_rate(config: PpoConfig) -> Callable[[float], float]:
 
 def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
     """Return an untrained Stable-Baselines3 PPO with the configured settings."""
-    return PPO(
-        "MlpPolicy" if isinstance(env.observation_space, spaces.Box) else AsymmetricPolicy,
+    asymmetric = isinstance(env.observation_space, spaces.Dict)
+    model = PPO(
+        policy_class(config, asymmetric=asymmetric),
         env,
         learning_rate=learning_rate(config),
         n_steps=config.steps_per_env,
@@ -127,10 +134,14 @@ def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
         vf_coef=config.value_coefficient,
         max_grad_norm=config.max_gradient_norm,
         target_kl=config.target_kl,
-        policy_kwargs=policy_keywords(config),
+        policy_kwargs=policy_keywords(config, env.contract()),
         seed=config.seed,
         device="cpu",
+        **mirrored_samples(config, asymmetric=asymmetric),
     )
+    if config.mirror:
+        set_mirror(model.rollout_buffer, env)
+    return model
 
 
 @dataclass(frozen=True)
@@ -220,7 +231,11 @@ def update(model: PPO, meter: Meter, config: PpoConfig) -> dict[str, float]:
         model.collect_rollouts(model.env, meter, model.rollout_buffer, n_rollout_steps=config.steps_per_env)
         schedule = config.schedule_steps or config.total_steps
         model._update_current_progress_remaining(min(model.num_timesteps, schedule), schedule)
+        if config.desired_kl is not None:  # the rate is the optimiser's own, which checkpoints keep
+            model.lr_schedule = ConstantSchedule(model.policy.optimizer.param_groups[0]["lr"])
         model.train()
+        if config.desired_kl is not None:
+            adapt_rate(model, config.desired_kl)
     except FloatingPointError as error:
         meter.fail(str(error))
     except ValueError:  # torch refuses a distribution that is not finite
@@ -229,6 +244,16 @@ def update(model: PPO, meter: Meter, config: PpoConfig) -> dict[str, float]:
     if not _healthy(model):
         meter.fail("a weight of the network, or its exploration noise, is not finite")
     return {"steps": model.num_timesteps, **meter.take(), **losses(model.logger.name_to_value)}
+
+
+def adapt_rate(model: PPO, desired_kl: float) -> None:
+    """Change the learning rate by how far the update moved the policy (Schulman et al. 2017, section 4, for the rate)."""
+    divergence = model.logger.name_to_value["train/approx_kl"]
+    group = model.policy.optimizer.param_groups[0]
+    if divergence > 2.0 * desired_kl:
+        group["lr"] = max(group["lr"] / RATE_STEP, LOWEST_RATE)
+    elif divergence < 0.5 * desired_kl:
+        group["lr"] = min(group["lr"] * RATE_STEP, HIGHEST_RATE)
 
 
 def _healthy(model: PPO) -> bool:

@@ -16,6 +16,7 @@ from torch import nn
 
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.ppo.config import PpoConfig
+from wlr_gym.learning.ppo.layers import normalisers
 from wlr_gym.policy import Policy, make_policy
 
 #: 1 sigma of the noise on the controller's actions.
@@ -29,7 +30,26 @@ BATCH_SIZE = 512
 #: At the start; it falls to zero: actions are met within 2 % of their range.
 LEARNING_RATE = 2e-3
 
+#: Control steps over which observations are gathered for their scales.
+GATHERED = 100
+
 Observations = dict[str, NDArray[np.float32]]
+
+
+def gather_scales(model: PPO, env: Sb3VecEnv) -> None:
+    """Let the untrained policy drive, and normalise observations by their mean and deviation there; the steps count."""
+    seen = []
+    for _ in range(GATHERED):
+        observation = model._last_obs
+        seen.append(observation)
+        actions, _ = model.predict(observation, deterministic=False)  # type: ignore[arg-type]
+        model._last_obs = env.step(np.clip(actions, -1.0, 1.0))[0]  # type: ignore[assignment]
+    groups = [_groups(one) for one in seen]
+    rows = {name: torch.as_tensor(np.concatenate([one[name] for one in groups])) for name in groups[0]}
+    for normaliser in normalisers(model.policy):
+        wide = normaliser.mean.shape[0] > rows["policy"].shape[1]
+        normaliser.take(torch.cat(list(rows.values()), dim=1) if wide else rows["policy"])
+    model.num_timesteps += GATHERED * env.num_envs
 
 
 def imitate(model: PPO, env: Sb3VecEnv, config: PpoConfig) -> None:

@@ -5,6 +5,7 @@
 
 from wlr_gym.envs.tasks.terms.commands import COMMANDS
 from wlr_gym.envs.tasks.terms.computed import COMPUTED, computed
+from wlr_gym.envs.tasks.terms.controllers import CONTROLLER
 from wlr_gym.envs.tasks.terms.measures import MEASURES
 from wlr_gym.envs.tasks.terms.observations import POLICY_TERMS, PRIVILEGED_TERMS, ObservationTerm
 from wlr_gym.envs.tasks.terms.rewards import REWARDS
@@ -14,6 +15,7 @@ from wlr_gym.envs.tasks.terms.terminations import TERMINATIONS
 __all__ = [
     "COMMANDS",
     "COMPUTED",
+    "CONTROLLER",
     "MEASURES",
     "POLICY_TERMS",
     "POSITIVE",

@@ -1,0 +1,214 @@
+"""Bags as they come from robots: merged, restarted, renamed, without names. They come in right, or what is odd is said."""
+
+import copy
+
+import numpy as np
+import pytest
+from foreign_logs import (
+    NAMES,
+    POSE,
+    imu,
+    joint_state,
+    lab_messages,
+    made_up,
+    ns,
+    pose,
+    write_mcap,
+    write_rosbag1,
+    write_rosbag2,
+)
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.data import read_run
+from wlr_gym.data.logs import import_log, suggest_map
+from wlr_gym.data.logs.messages import definition, make, typestore
+from wlr_gym.robot import JOINTS, LEGS
+
+
+@pytest.fixture(scope="module")
+def messages():
+    return lab_messages(made_up(8.0))
+
+
+@pytest.fixture(scope="module")
+def known(messages, tmp_path_factory):
+    return suggest_map(write_mcap(tmp_path_factory.mktemp("whole") / "a.mcap", messages)).map
+
+
+@pytest.fixture(scope="module")
+def right(messages, known, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("right")
+    (imported,) = import_log(write_mcap(folder / "a.mcap", messages), folder / "runs", known)
+    return read_run(imported.path)
+
+
+def of_topic(messages, topic):
+    return [message for _, name, _, message in messages if name == topic]
+
+
+def check_right(imported, right):
+    run = read_run(imported.path)
+    assert all(np.array_equal(run[name], right[name], equal_nan=True) for name in map(str, right.table.columns))
+
+
+@pytest.mark.parametrize("write", [write_mcap, write_rosbag2, write_rosbag1])
+def test_a_bag_without_a_message_is_refused(tmp_path, write):
+    """Whatever a folder is called: ``a.bag`` may be one of rosbag2."""
+    with pytest.raises(InputError, match=r"a.\w+: no message that can be read"):
+        suggest_map(write(tmp_path / ("a.mcap" if write is write_mcap else "a.bag"), []))
+
+
+def write_channels(path, messages):
+    """With a channel for each topic and type."""
+    from mcap.writer import Writer
+
+    channels = {}
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for time, topic, kind, message in messages:
+            if (topic, kind) not in channels:
+                schema = writer.register_schema(kind, "ros2msg", definition(kind).encode())
+                channels[topic, kind] = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channels[topic, kind], time, bytes(typestore().serialize_cdr(message, kind)), time)
+        writer.finish()
+    return path
+
+
+def test_two_types_on_one_topic_are_kept_apart_and_said(messages, known, right, tmp_path):
+    poses = [(time, "/xsens/data", POSE, pose(time, 9.0, 9.0, 0.0)) for time, *_ in messages[::40]]
+    path = write_channels(tmp_path / "a.mcap", sorted([*poses, *messages], key=lambda one: one[0]))
+    found = suggest_map(path).map
+    second = "/xsens/data (sensor_msgs/msg/Imu)"
+    assert found.channels["gyro"].topic == second
+    (imported,) = import_log(path, tmp_path / "runs", found)
+    assert f"two types on one topic: the second is '{second}'" in imported.notes
+    run = read_run(imported.path)
+    assert np.allclose(run["gyro_z"], right["gyro_z"])
+    assert np.nanmax(run["cam_x"]) < 1.0
+
+
+def test_a_file_in_another_order_than_time_is_sorted(messages, known, right, tmp_path):
+    order = np.random.default_rng(0).permutation(len(messages))
+    path = write_mcap(tmp_path / "a.mcap", [messages[k] for k in order])
+    assert suggest_map(path).map == known
+    (imported,) = import_log(path, tmp_path / "runs", known)
+    check_right(imported, right)
+
+
+def test_headers_that_go_back_are_said(messages, known, tmp_path):
+    changed = copy.deepcopy(messages)
+    for message in of_topic(changed, "/chassis/joints")[200:203]:
+        stamp = message.header.stamp
+        message.header.stamp = make("builtin_interfaces/msg/Time", sec=stamp.sec - 1, nanosec=stamp.nanosec + 1)
+    (imported,) = import_log(write_mcap(tmp_path / "a.mcap", changed), tmp_path / "runs", known)
+    assert "topic '/chassis/joints': its times go back 1 times, by up to 0.98 s: sorted by time" in imported.notes
+
+
+def test_a_clock_that_began_anew_is_not_used(messages, known, tmp_path):
+    changed = copy.deepcopy(messages)
+    readings = of_topic(changed, "/xsens/data")
+    for message, first in zip(readings[800:], readings[:800], strict=True):
+        message.header.stamp = first.header.stamp
+    path = write_mcap(tmp_path / "a.mcap", changed)
+    found = suggest_map(path).map
+    assert found.clocks["/xsens/data"].use == "log"
+    assert found.channels["gyro"].unit == "deg/s"
+    (imported,) = import_log(path, tmp_path / "runs", known)
+    assert any("a clock that began anew mixes two recordings: 'use: log'" in note for note in imported.notes)
+
+
+def test_joints_in_another_order_in_each_message(messages, known, right, tmp_path):
+    rng, changed = np.random.default_rng(0), copy.deepcopy(messages)
+    for message in [one for topic in ("/chassis/joints", "/chassis/target") for one in of_topic(changed, topic)]:
+        order = rng.permutation(len(message.name))
+        message.name = [message.name[k] for k in order]
+        for field in ("position", "velocity", "effort"):
+            values = getattr(message, field)
+            setattr(message, field, values[order] if len(values) else values)
+    (imported,) = import_log(write_mcap(tmp_path / "a.mcap", changed), tmp_path / "runs", known)
+    check_right(imported, right)
+
+
+def test_joints_without_names_are_no_servos_and_go_by_place(messages, right, tmp_path):
+    changed = copy.deepcopy(messages)
+    for topic in ("/chassis/joints", "/chassis/target"):
+        for message in of_topic(changed, topic):
+            message.name = []
+    path = write_mcap(tmp_path / "a.mcap", changed)
+    found = suggest_map(path)
+    assert not [key for key in found.map.channels if key.startswith(("pos", "cmd"))]
+    (said,) = [one.why for one in found.reasons if one.what == "joints" and "/chassis/joints" in one.why]
+    assert said.endswith(
+        "position, velocity have no names: say in the map which is which, by place: joints: {leg_lf: '0', ...}"
+    )
+    by_place = {joint: str(k) for k, joint in enumerate(reversed(JOINTS))}
+    (imported,) = import_log(path, tmp_path / "runs", suggest_map(path, {"joints": by_place}).map)
+    assert np.allclose(read_run(imported.path)["pos_leg_rf"], right["pos_leg_rf"])
+
+
+@pytest.mark.parametrize("namespace", ["/robot_1", "robot_1/"])
+def test_a_namespace_is_a_whole_word(messages, known, tmp_path, namespace):
+    both = [
+        (time, f"/robot_{robot}{topic}", kind, message)
+        for time, topic, kind, message in messages
+        for robot in (10, 1)
+        if (robot, topic) != (1, "/power")
+    ]
+    path = write_mcap(tmp_path / "a.mcap", both)
+    found = suggest_map(path, {"namespace": namespace}).map
+    assert {source.topic.split("/")[1] for source in found.channels.values()} == {"robot_1"}
+    with pytest.raises(InputError, match="namespace '/robot_2': no topic is in it; topics are in /robot_10, /robot_1"):
+        suggest_map(path, {"namespace": "/robot_2"})
+
+
+def test_a_map_without_the_joints_is_refused(messages, known, tmp_path):
+    path = write_mcap(tmp_path / "a.mcap", [one for one in messages if one[1] != "/chassis/joints"])
+    with pytest.raises(InputError, match=r"a.mcap: no source for pos_leg_lf, .*: the joints' angles"):
+        import_log(path, tmp_path / "runs")
+
+
+def test_a_quaternion_in_another_order_is_said(messages, tmp_path):
+    changed = copy.deepcopy(messages)
+    for message in of_topic(changed, "/mocap/base"):
+        turn = message.pose.orientation
+        turn.x, turn.y, turn.z, turn.w = turn.w, turn.x, turn.y, turn.z
+    (said,) = [one for one in suggest_map(write_mcap(tmp_path / "a.mcap", changed)).reasons if one.what == "cam_yaw"]
+    assert said.sure == "guess"
+    assert "its quaternion tilts the robot by 1" in said.why
+    assert "another order" in said.why
+
+
+def test_lists_with_headers_of_their_own_and_wheels_beside_legs(messages, known, right, tmp_path):
+    """Legs and wheels of two drivers, each a topic with its own names; the wheels' come later and in rpm."""
+    split = []
+    for time, topic, kind, message in messages:
+        if topic not in ("/chassis/joints", "/chassis/target"):
+            split.append((time, topic, kind, message))
+            continue
+        for part, wanted in (("legs", LEGS), ("wheels", JOINTS[4:])):
+            places = [message.name.index(NAMES[joint]) for joint in wanted]
+            scale = 1.0 / 6.0 if part == "wheels" else 1.0
+            velocity, effort = (values[places] if len(values) else values for values in (message.velocity, message.effort))
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            names = [message.name[k] for k in places]
+            one = joint_state(stamp, names, message.position[places], velocity * scale, effort)
+            split.append((time, f"/{part}{topic.removeprefix('/chassis')}", kind, one))
+    path = write_mcap(tmp_path / "a.mcap", split)
+    found = suggest_map(path).map
+    assert found.channels["vel_wheel"].unit == "rpm"
+    (imported,) = import_log(path, tmp_path / "runs", found)
+    run = read_run(imported.path)
+    for joint in JOINTS:
+        assert np.allclose(run[f"vel_{joint}"], right[f"vel_{joint}"]), joint
+
+
+def test_two_imus_the_better_known_is_taken_and_the_other_said(messages, tmp_path):
+    second = [
+        (time, "/camera/imu", "sensor_msgs/msg/Imu", imu(ns(1e-9 * time - 1.76e9), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)))
+        for time, topic, *_ in messages
+        if topic == "/power"
+    ]
+    found = suggest_map(write_mcap(tmp_path / "a.mcap", sorted([*messages, *second], key=lambda one: one[0])))
+    assert found.map.channels["gyro"].topic == "/xsens/data"
+    assert "/camera/imu" in found.unused

@@ -1,0 +1,89 @@
+"""The controller that the environment computes is the agent ``slip_compensating``: two implementations, one law."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.envs.tasks import load_task
+from wlr_gym.learning.evaluation import make_core
+from wlr_gym.policy import Policy, load_agent
+from wlr_gym.robot import JOINTS
+
+PROMPT = {"joints": {"delay": [0.0, 0.0]}, "imu": {"delay": [0.0, 0.0]}}
+#: Every gain at work, none as it ships.
+GAINS = {
+    "steering": 1.7, "yaw_rate_p": 3.0, "yaw_rate_i": 4.0, "velocity_p": 2.0, "velocity_i": 3.0, "lateral": 3.0, "heading": 1.5,
+    "uphill": 0.05, "legs_inward": 0.1, "integral_limit": 0.05, "slip_limit": 0.05, "load_shift": 2.0, "load_shift_time": 0.3,
+}  # fmt: skip
+TASKS = ("velocity", "path", "posture", "slope")
+
+
+def core_with_controller(task: str, count: int = 4):
+    term = f"{task}_controller"
+    changes = {"latency": PROMPT, "controller": GAINS, "observations": {term: {}}}
+    core = make_core(f"WLR-{task.title()}-v0", count, {"task": changes})
+    columns = [k for k, column in enumerate(core.task.policy) if column.term == term]
+    for row in range(count):
+        core.seed(row, row)
+    core.begin_episodes(core.everyone)
+    return core, columns
+
+
+def agent_of(core) -> Policy:
+    policy = load_agent("slip_compensating").make_policy(core.contract(), GAINS)
+    policy.reset(core.everyone)
+    return policy
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_action_is_that_of_the_agent(task):
+    core, columns = core_with_controller(task)
+    agent = agent_of(core)
+    seen = []
+    for _ in range(150):
+        actions = agent.act(core.observation)
+        np.testing.assert_allclose(core.observation[:, columns[: len(JOINTS)]], actions, atol=2e-6)
+        seen.append(actions)
+        core.step(actions, core.everyone)
+    core.close()
+    assert np.ptp(seen, axis=0).max() > 0.1
+
+
+def test_memory_is_of_the_episode_and_in_snapshots():
+    core, columns = core_with_controller("velocity")
+    memory = columns[len(JOINTS) :]
+    first = core.observation[:, memory].copy()
+    for _ in range(40):
+        core.step(core.observation[:, columns[: len(JOINTS)]], core.everyone)
+    assert (np.abs(core.observation[:, memory]) > np.abs(first)).any()
+    for row in range(core.count):
+        core.seed(row, row)
+    core.begin_episodes(core.everyone)
+    np.testing.assert_array_equal(core.observation[:, memory], first)
+    core.close()
+
+
+def test_gains_are_data():
+    """Another gain compiles nothing and acts."""
+    changes = {"controller": {"steering": 0.0}, "observations": {"velocity_controller": {}}}
+    core = make_core("WLR-Velocity-v0", 1, {"task": changes})
+    core.seed(0, 0)
+    core.begin_episodes(core.everyone, {"command": {"linear_velocity_x": 0.0, "yaw_rate": 0.3}})
+    columns = [k for k, column in enumerate(core.task.policy) if column.term == "velocity_controller"]
+    np.testing.assert_allclose(core.observation[0, columns[:8]], 0.0, atol=1e-6)
+    assert core.contract()["controller"]["steering"] == 0.0
+    core.close()
+
+
+def test_controller_needs_gains():
+    with pytest.raises(InputError, match=r"observation term 'velocity_controller' needs 'controller'"):
+        load_task("velocity", None, {"observations": {"velocity_controller": {}}})
+    with pytest.raises(InputError, match="yaw_rate_p"):
+        load_task("velocity", None, {"controller": {"yaw_rate_pp": 1.0}})
+
+
+def test_controller_of_another_task_is_refused():
+    with pytest.raises(InputError, match=r"'path_controller' needs the command 'path_"):
+        load_task("velocity", None, {"controller": {}, "observations": {"path_controller": {}}})

@@ -1,0 +1,132 @@
+"""The hand-written controller as an observation: its action and what it remembers, for a policy that acts on top of it.
+
+The law of the agent ``slip_compensating`` (:mod:`wlr_gym.policy.control`, :mod:`wlr_gym.policy.slip_compensating`), whose gains
+the task's ``controller`` gives. What it remembers is its own value of the step before, so that the policy needs no memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from wlr_gym.envs.tasks.signals import Signals, Value
+from wlr_gym.envs.tasks.terms import references
+from wlr_gym.envs.tasks.terms.computed import computed
+from wlr_gym.envs.tasks.terms.geometry import estimated_pose
+from wlr_gym.physics.codegen import ops
+from wlr_gym.robot import CORNER_SIGNS, JOINTS
+
+#: What the controller remembers: integrals of the errors of yaw rate (rad/s) and forward velocity (m/s), times their gains, and
+#: by how much the front wheels slip more than the rear ones (m/s).
+MEMORY = ("yaw_rate_integral", "velocity_integral", "slip_difference")
+#: Ends the name of a term that holds a controller's action.
+CONTROLLER = "_controller"
+
+_LABELS = (*JOINTS, *MEMORY)
+_UNITS = ", ".join(["-"] * len(JOINTS) + ["rad/s", "m/s", "m/s"])
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the controller is to do.
+
+    Attributes:
+        forward: velocity, m/s. turn: yaw rate, rad/s.
+        legs: angle from home (rad) and rate (rad/s) of each leg.
+    """
+
+    forward: Value
+    turn: Value
+    legs: Sequence[tuple[Value, Value]] = ((0.0, 0.0),) * 4
+
+
+@computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
+def velocity_controller(signals: Signals) -> list[Value]:
+    """Action of the controller that follows the commanded velocity, and what it remembers."""
+    turn = signals.command("yaw_rate") + _steer(signals, 0.0, 0.0)
+    return _feedback(signals, "velocity_controller", Motion(signals.command("linear_velocity_x"), turn))
+
+
+@computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
+def path_controller(signals: Signals) -> list[Value]:
+    """Action of the controller that follows the path, and what it remembers."""
+    forward = signals.command("linear_velocity_x")
+    error = references.path_error(signals, estimated_pose(signals))
+    turn = error.curvature[0] * forward + _steer(signals, error.lateral, error.heading)
+    return _feedback(signals, "path_controller", Motion(forward, turn))
+
+
+@computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
+def posture_controller(signals: Signals) -> list[Value]:
+    """Action of the controller that keeps straight on while the legs move, and what it remembers."""
+    home = signals.robot("home.leg_angle")
+    legs = [(angle - home, rate) for angle, rate in references.leg_references(signals)]
+    return _feedback(signals, "posture_controller", Motion(signals.command("linear_velocity_x"), _course(signals), legs))
+
+
+@computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
+def slope_controller(signals: Signals) -> list[Value]:
+    """Action of the controller that climbs and holds, and what it remembers."""
+    return _feedback(signals, "slope_controller", Motion(references.climb_speed(signals), _course(signals)))
+
+
+def _course(signals: Signals) -> Value:
+    pose = estimated_pose(signals)
+    return _steer(signals, pose.y, pose.yaw)
+
+
+def _steer(signals: Signals, lateral: Value, heading: Value) -> Value:
+    """Yaw rate that leads back to a line, rad/s; on a slope gravity tells which way is up."""
+    leftward_force = signals.sensors("accelerometer")[1]
+    return signals.gain("uphill") * leftward_force - signals.gain("lateral") * lateral - signals.gain("heading") * heading
+
+
+def _feedback(signals: Signals, name: str, motion: Motion) -> list[Value]:
+    gain = signals.gain
+    yaw_rate, velocity = signals.sensors("gyro")[2], signals.estimate("linear_velocity_in_body")[0]
+    yaw_integral, velocity_integral, slip_difference = (signals.remembered(f"{name}[{label}]") for label in MEMORY)
+    error = motion.turn - yaw_rate
+    yaw_integral = _integral(signals, yaw_integral, gain("yaw_rate_i") * error)
+    turn = gain("steering") * motion.turn + gain("yaw_rate_p") * error + yaw_integral
+    error = motion.forward - velocity
+    velocity_integral = _integral(signals, velocity_integral, gain("velocity_i") * error)
+    forward = motion.forward + gain("velocity_p") * error + velocity_integral
+    share = ops.minimum(signals.control_period / gain("load_shift_time"), 1.0)
+    slip_difference = slip_difference + share * (_slip_difference(signals) - slip_difference)
+    hip_x, hip_y = signals.robot("hip_position.x"), signals.robot("hip_position.y")
+    reach = hip_x * hip_x / hip_y
+    allowed = gain("slip_limit") + reach * ops.absolute(turn / ops.maximum(gain("steering"), 1.0))
+    lean = _lean(signals, slip_difference)
+    legs, wheels = [], []
+    for (front, left), (offset, rate) in zip(CORNER_SIGNS, motion.legs, strict=True):
+        side = hip_y * left
+        travel = velocity - yaw_rate * side
+        rolling = ops.clip(forward - turn * side, travel - allowed, travel + allowed)
+        offset = offset + gain("legs_inward") * front + lean
+        legs.append(offset / signals.task("action.leg_scale"))
+        wheels.append(_wheel_rate(signals, rolling, offset, rate) / signals.task("action.wheel_scale"))
+    return [*(ops.clip(action, -1.0, 1.0) for action in legs + wheels), yaw_integral, velocity_integral, slip_difference]
+
+
+def _integral(signals: Signals, value: Value, rate: Value) -> Value:
+    limit = signals.gain("integral_limit")
+    return ops.clip(value + signals.control_period * rate, 0.0 - limit, limit)
+
+
+def _wheel_rate(signals: Signals, rolling: Value, offset: Value, leg_rate: Value) -> Value:
+    """Rate of a wheel against its leg (rad/s) that moves the hip ahead at ``rolling``; see ``Chassis.wheel_rate``."""
+    angle = signals.robot("home.leg_angle") + offset
+    return (rolling - signals.robot("leg.length") * ops.sin(angle) * leg_rate) / signals.robot("wheel.radius") - leg_rate
+
+
+def _slip_difference(signals: Signals) -> Value:
+    slip = signals.estimate("slip_velocity")[0::2]
+    return sum((front * ops.absolute(s) for (front, _), s in zip(CORNER_SIGNS, slip, strict=True)), 0.0) * 0.5
+
+
+def _lean(signals: Signals, slip_difference: Value) -> Value:
+    """Angle (rad) by which all legs lean so that load moves to the axle that slips less; arcsin by arctan2."""
+    bound = signals.gain("largest_shift")
+    shift = ops.clip(0.0 - signals.gain("load_shift") * slip_difference, 0.0 - bound, bound)
+    sine = 2.0 * signals.robot("hip_position.x") * shift / signals.robot("leg.length")
+    return ops.arctan2(sine, ops.sqrt(1.0 - sine * sine))
