@@ -48,7 +48,7 @@ def test_a_tick_missed_in_any_round_counts(monkeypatch):
     """Three rounds of five miss none, so that their median is none."""
     drives = iter([0, 0, 0, 7, 40])
     rest = {"jitter": {"p99": 1.0}, "latency": {"p99": 1.0}}
-    monkeypatch.setattr(bus, "_drive", lambda seconds: {"missed": next(drives), **rest})
+    monkeypatch.setattr(bus, "drive_in_real_time", lambda seconds, words: {"missed": next(drives), **rest})
     missed, late, sent = bus._measure_deadlines(Size(rounds=5))
     assert missed.ours == (47.0,)
     assert not missed.met

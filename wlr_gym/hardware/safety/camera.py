@@ -221,9 +221,9 @@ class CameraWatch:
             return UNCERTAIN
         self._last_time = reading.time
         moment = reading.time - self._offset
-        known = self._at(moment)
-        seen = _Seen(moment, reading.time, reading.pose[[0, 1, 3]], *known[3:6], self._rate(moment))
-        if abs(reading.pose[2] - known[6]) > _HEIGHT:
+        _, _, _, turn, least, most, height = self._at(moment).tolist()
+        seen = _Seen(moment, reading.time, reading.pose[[0, 1, 3]], turn, least, most, self._rate(moment))
+        if abs(reading.pose[2] - height) > _HEIGHT:
             return self._doubt(CONTRADICTIONS[2], seen)
         return self._judge_motion(seen, now)
 

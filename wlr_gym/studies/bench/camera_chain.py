@@ -1,11 +1,12 @@
 """The whole chain in emulated time: servo protocol, rendered frames, detector, observer, policy; beside the simulator.
 
-Every episode has the robot, floor and commands that a simulated episode of the same seed has, so the two are paired.
+Every episode has the robot, floor, place and commands that a simulated episode of the same seed has, so the two are paired. The
+emulated robot starts at rest, the simulated one is put down with some speed: their first second differs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.evaluation.rollout import make_core, roll_out
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, standing_state
 from wlr_gym.physics.plants.robot_options import RobotOptions
 from wlr_gym.policy import environment_for, make_policy
 from wlr_gym.robot.parameters import Parameters
@@ -43,7 +44,7 @@ class ChainDrive:
         time: (T,) s. command: (T, C). sensors: (T, SENSOR_LAYOUT.width). truth: (T, TRUTH_LAYOUT.width).
         start: (3,) true x, y (m) and yaw (rad) at the run's start.
         estimate: (T, W) of the observer. reasons: (T,) why there is no camera pose; empty = nothing is wrong.
-        reason: why the drive ended. errors: measure -> rms over the episode, SI units. camera: statistics of the loop.
+        reason: why the drive ended. camera: statistics of the loop.
     """
 
     time: Array
@@ -54,7 +55,6 @@ class ChainDrive:
     estimate: Array
     reasons: tuple[str, ...]
     reason: str
-    errors: Mapping[str, float]
     camera: Mapping[str, Any]
 
     def sensed(self, name: str) -> Array:
@@ -68,6 +68,13 @@ class ChainDrive:
         cosine, sine = np.cos(self.start[2]), np.sin(self.start[2])
         yaw = np.unwrap(np.concatenate([self.start[2:], yaw_of(*quaternion.T)]))[1:] - self.start[2]
         return np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx, yaw], axis=1)
+
+    def errors(self, skip: float = 0.0) -> dict[str, float]:
+        """Return measure -> rms of the task Velocity without the first ``skip`` s, SI units."""
+        late = self.time > skip
+        speed = self.true("linear_velocity_in_body")[late, 0] - self.command[late, 0]
+        turn = self.true("angular_velocity_in_body")[late, 2] - self.command[late, 1]
+        return {"velocity_error": float(np.sqrt(np.mean(speed**2))), "yaw_rate_error": float(np.sqrt(np.mean(turn**2)))}
 
     def true(self, name: str) -> Array:
         """Return a channel of the truth, (T,) or (T, size)."""
@@ -106,27 +113,32 @@ def simulated_core(setting: ChainSetting, episodes: int) -> Core:
     return make_core(ENVIRONMENT, episodes, environment_for(setting.policy, keywords))
 
 
-def simulated_errors(setting: ChainSetting, episodes: int, first_seed: int) -> Array:
-    """Return the tracking errors (episodes,) in the simulator, with its own camera."""
-    core = simulated_core(setting, episodes)
+def simulated_errors(setting: ChainSetting, seeds: Sequence[int], skip: float = 1.0) -> Array:
+    """Return the tracking errors (episodes,) in the simulator, with its own camera, without the first ``skip`` s."""
+    core = simulated_core(setting, 1)
     try:
-        rollout = roll_out(core, make_policy(setting.policy, core.contract()), first_seed)
-        limits = limits_of(core.task.config)
-        rms = np.sqrt((rollout.measured**2).sum(axis=0, where=rollout.active[:, :, None]) / rollout.active.sum(axis=0)[:, None])
-        errors = {which: rms[:, list(core.task.measures).index(which[0])] for which in limits}
-        return tracking_error(limits, errors, rollout.fell)
+        policy, first = make_policy(setting.policy, core.contract()), round(skip / core.task.config.control_period)
+        found = []
+        for seed in seeds:
+            rollout = roll_out(core, policy, seed)
+            rms = np.sqrt((rollout.measured[first:, 0] ** 2).mean(axis=0))
+            found.append(_tracking(core, dict(zip(core.task.measures, rms, strict=True)), bool(rollout.fell[0])))
+        return np.array(found)
     finally:
         core.close()
 
 
-def chain_errors(setting: ChainSetting, episodes: int, first_seed: int) -> Array:
-    """Return the tracking errors (episodes,) of the whole chain; a run that did not end well counts as a fall."""
-    found = [drive_chain(setting, seed) for seed in range(first_seed, first_seed + episodes)]
+def chain_errors(setting: ChainSetting, seeds: Sequence[int], skip: float = 1.0) -> Array:
+    """Return the tracking errors (episodes,) of the whole chain, without the first ``skip`` s; a run that was stopped fell."""
     core = simulated_core(setting, 1)
-    limits = limits_of(core.task.config)
     core.close()
-    errors = {which: np.array([drive.errors[which[0]] for drive in found]) for which in limits}
-    return tracking_error(limits, errors, np.array([drive.reason != "time is over" for drive in found]))
+    drives = (drive_chain(setting, seed) for seed in seeds)
+    return np.array([_tracking(core, drive.errors(skip), drive.reason != "time is over") for drive in drives])
+
+
+def _tracking(core: Core, rms: Mapping[str, float], fell: bool) -> float:
+    limits = limits_of(core.task.config)
+    return float(tracking_error(limits, {which: np.array([rms[which[0]]]) for which in limits}, np.array([fell]))[0])
 
 
 def drive_chain(setting: ChainSetting, seed: int, log: Path | None = None) -> ChainDrive:
@@ -138,6 +150,7 @@ def drive_chain(setting: ChainSetting, seed: int, log: Path | None = None) -> Ch
     drawn.seed(0, seed)
     drawn.begin_episodes(drawn.everyone)
     parameters = Parameters(drawn.parameters.values.copy())
+    state = _standing(drawn, parameters)
     drawn.close()
     keywords = {"backend": "dynamixel", "hardware": RobotOptions(emulated=True, camera=None), "episode_length": setting.seconds}
     core = make_core(ENVIRONMENT, 1, environment_for(setting.policy, {**keywords, **setting.extra}))
@@ -145,7 +158,8 @@ def drive_chain(setting: ChainSetting, seed: int, log: Path | None = None) -> Ch
     plant = core.plant
     assert isinstance(plant, RobotPlant)
     hardware = plant.loop.hardware
-    machine = Machine(core.task.robot, hardware, MachineOptions(timing=NO_TIME, tick=_TICK, seed=seed), parameters=parameters)
+    options = MachineOptions(timing=NO_TIME, tick=_TICK, seed=seed)
+    machine = Machine(core.task.robot, hardware, options, parameters=parameters, state=state)
     camera = None
     if setting.camera is not None:
         scene = setting.camera.emulated.model_copy(update={"seed": seed})
@@ -155,6 +169,15 @@ def drive_chain(setting: ChainSetting, seed: int, log: Path | None = None) -> Ch
         return _watched(core, machine, setting, seed)
     finally:
         core.close()
+
+
+def _standing(core: Core, parameters: Parameters) -> PlantState:
+    """Return the robot standing where a simulated episode begins, on the same patches of floor, at rest."""
+    state = standing_state(core.task.robot, parameters)
+    yaw = yaw_of(*core.state.quaternion[0])
+    state.position[0, :2] = core.state.position[0, :2]
+    state.quaternion[0] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
+    return state
 
 
 def _watched(core: Core, machine: Machine, setting: ChainSetting, seed: int) -> ChainDrive:
@@ -186,15 +209,7 @@ def _watched(core: Core, machine: Machine, setting: ChainSetting, seed: int) -> 
     except StoppedError:
         pass
     time, command, sensors, truth, estimate = (np.array(column) for column in zip(*rows, strict=True))
-    names = core.task.commands
     return ChainDrive(
         time[:, 0], command, sensors, truth, began, estimate, tuple(reasons), loop.reason,
-        _errors(truth, dict(zip(names, command.T, strict=True))), loop.statistics().get("camera", {}),
+        loop.statistics().get("camera", {}),
     )  # fmt: skip
-
-
-def _errors(truth: Array, commands: Mapping[str, Array]) -> dict[str, float]:
-    """Rms of velocity and yaw rate beyond what was commanded."""
-    speed = TRUTH_LAYOUT.view(truth, "linear_velocity_in_body")[:, 0] - commands["linear_velocity_x"]
-    turn = TRUTH_LAYOUT.view(truth, "angular_velocity_in_body")[:, 2] - commands["yaw_rate"]
-    return {"velocity_error": float(np.sqrt(np.mean(speed**2))), "yaw_rate_error": float(np.sqrt(np.mean(turn**2)))}

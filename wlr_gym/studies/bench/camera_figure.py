@@ -43,7 +43,7 @@ def draw_chain(drive: ChainDrive, path: Path, title: str) -> None:
     axes[4].set_xlabel("time, s")
     blind = np.array([bool(reason) for reason in drive.reasons])
     for axis in axes:
-        axis.fill_between(drive.time, 0, 1, where=blind, transform=axis.get_xaxis_transform(), color="0.9", lw=0)
+        axis.fill_between(drive.time, 0, 1, where=blind, transform=axis.get_xaxis_transform(), color="0.9", lw=0, zorder=0)
         axis.grid(alpha=0.3)
         axis.set_xlim(0, drive.time[-1])
     axes[0].set_title(title)
@@ -66,7 +66,7 @@ def _draw_pose(axis: Any, drive: ChainDrive, k: int, label: str) -> None:
     axis.set_ylabel(label)
     if k == 0:
         axis.plot([], [], color="0.85", lw=8, label="no pose")
-        axis.legend(loc="upper left", ncols=4, fontsize=8)
+        axis.legend(loc="lower left", ncols=4, fontsize=8)
 
 
 def _draw_band(axis: Any, time: Any, values: Any, sigma: Any, label: str) -> None:
