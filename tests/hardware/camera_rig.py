@@ -25,8 +25,8 @@ WRONG = (0.03, 0.05)
 def small_camera(**scene: Any) -> CameraFile:
     """A camera of few pixels, which is quick to render."""
     file = load_camera_file("emulated")
-    lens = file.calibration.model_copy(update={"width": 640, "height": 360, "focal": (380.0, 380.0), "centre": (319.5, 179.5)})
-    set_up = {"height": 1.6, "tilt": 0.0, "clutter": 6, "samples": 3, "noise": 3.0} | scene
+    lens = file.calibration.model_copy(update={"width": 480, "height": 270, "focal": (300.0, 300.0), "centre": (239.5, 134.5)})
+    set_up = {"height": 1.66, "tilt": 0.0, "clutter": 6, "samples": 3, "noise": 3.0} | scene
     return file.model_copy(update={"calibration": lens, "emulated": file.emulated.model_copy(update=set_up)})
 
 

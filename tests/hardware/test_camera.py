@@ -166,7 +166,8 @@ def test_poses_are_shown_from_the_start_with_their_age():
     motion.begin()
     assert not motion.watch.status.is_new
     for _ in range(50):
-        status = motion.step(speed=0.1, turn=0.3)
+        motion.step(speed=0.1, turn=0.3)
+    status = motion.watch.status
     assert status.reason == ""
     assert motion.now - status.time == pytest.approx(0.05, abs=PERIOD)
     assert status.pose[2] == pytest.approx(0.3 * 0.95, abs=0.01)
@@ -276,8 +277,8 @@ def test_after_a_gap_poses_are_believed_again_in_the_same_frame():
     for _ in range(100):
         motion.step(speed=0.1, turn=0.2, shown=False)
     for _ in range(20):
-        status = motion.step(speed=0.1, turn=0.2)
-    assert status.reason == ""
+        motion.step(speed=0.1, turn=0.2)
+    assert motion.watch.status.reason == ""
     assert motion.error() < 1e-6
 
 
@@ -304,9 +305,9 @@ def test_the_lag_of_the_pictures_is_found():
 def test_the_camera_is_part_of_the_run(tmp_path):
     rig = CameraRig(small_camera(dropout=0.1), log=tmp_path)
     rig.loop.start()
-    rig.drive(0.6, FORWARD)
-    rig.machine.inject("camera_covered duration=0.5")
-    rig.drive(0.8, TURN)
+    rig.drive(0.3, FORWARD)
+    rig.machine.inject("camera_covered duration=0.3")
+    rig.drive(0.6, TURN)
     rig.loop.stop()
     errors = rig.errors()
     assert rig.loop.ended_well
@@ -318,12 +319,13 @@ def test_the_camera_is_part_of_the_run(tmp_path):
     is_new = np.isfinite(run["cam_x"])
     assert is_new.sum() >= len(errors) - 1  # the last step's is read after its row; the stop has rows of its own
     assert run["cam_age"][is_new].max() < 0.07
-    assert run["cam_age"].max() > 0.4
+    assert run["cam_age"].max() > 0.3
     events = [event["no_pose"] for event in read_events(tmp_path / "run_01.csv") if event["event"] == "camera"]
     assert "the picture is dark or blank: lens covered?" in events
     rig.loop.close()
 
 
+@pytest.mark.slow
 def test_a_wrong_camera_is_an_intervention_that_stops_nothing():
     rig = CameraRig()
     rig.machine.inject("camera_back_to_front")
@@ -336,6 +338,7 @@ def test_a_wrong_camera_is_an_intervention_that_stops_nothing():
     rig.loop.close()
 
 
+@pytest.mark.slow
 def test_the_same_run_again_gives_the_same_bits():
     shown = []
     for _ in range(2):

@@ -100,6 +100,7 @@ class CameraWatch:
         self.latencies: list[float] = []
         self.work: list[float] = []
         self._motion: deque[tuple[float, ...]] = deque()  # time, x, y, yaw (dead reckoning), turn, least, most, height
+        self._table: Array | None = None
         self._speeds: deque[tuple[float, float, float]] = deque()
         self._believed: deque[_Seen] = deque(maxlen=64)
         self._agreeing: deque[_Seen] = deque(maxlen=512)
@@ -127,7 +128,7 @@ class CameraWatch:
             (t, cosine * (a - x) + sine * (b - y), cosine * (b - y) - sine * (a - x), c - yaw, *rest)
             for t, a, b, c, *rest in self._motion
         )
-        self._frame = None
+        self._frame = self._table = None
         if self._believed:
             self._place(self._believed[-1])
         self.status = CameraStatus(np.zeros(3), time, False, self.status.reason, self.status.is_wrong)
@@ -173,6 +174,7 @@ class CameraWatch:
 
     def _move(self, now: float, position: Array, velocity: Array, gyro: Array) -> None:
         """Go on by dead reckoning."""
+        self._table = None
         reach = self._leg * np.sin(position[LEG_SLICE])
         height = float(reach.mean()) + self._radius - self._hip_height
         rolling = (
@@ -199,9 +201,15 @@ class CameraWatch:
         while self._motion[0][0] < now - MEMORY:
             self._motion.popleft()
 
+    def _rows(self) -> Array:
+        """The motion as an array, made once until it changes."""
+        if self._table is None:
+            self._table = np.array(self._motion)
+        return self._table
+
     def _at(self, time: float) -> Array:
         """What was known at a time: x, y, yaw, turn, least, most, height."""
-        rows = np.array(self._motion)
+        rows = self._rows()
         return np.array([np.interp(time, rows[:, 0], column) for column in rows[:, 1:].T])
 
     # ---- judging ----
@@ -295,14 +303,16 @@ class CameraWatch:
 
     def _correct(self, time: float, pose: Array) -> None:
         """Let dead reckoning go on from a believed pose."""
-        known = self._at(time)
-        turn = pose[2] - known[2]
+        known = self._at(time).tolist()
+        x0, y0, yaw0 = pose.tolist()
+        turn = yaw0 - known[2]
         cosine, sine = math.cos(turn), math.sin(turn)
+        self._table = None
         self._motion = deque(
             (
                 t,
-                pose[0] + cosine * (x - known[0]) - sine * (y - known[1]),
-                pose[1] + sine * (x - known[0]) + cosine * (y - known[1]),
+                x0 + cosine * (x - known[0]) - sine * (y - known[1]),
+                y0 + sine * (x - known[0]) + cosine * (y - known[1]),
                 yaw + turn,
                 *rest,
             )
@@ -326,7 +336,7 @@ class CameraWatch:
 
     def _rate(self, time: float) -> float:
         """Yaw rate (rad/s) of the gyroscope at a time."""
-        rows = np.array(self._motion)
+        rows = self._rows()
         if len(rows) < 2:
             return 0.0
         k = min(max(1, int(np.searchsorted(rows[:, 0], time))), len(rows) - 1)

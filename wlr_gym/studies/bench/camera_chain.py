@@ -7,13 +7,14 @@ emulated robot starts at rest, the simulated one is put down with some speed: th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.errors import require_package
 from wlr_gym.envs.core import Core
 from wlr_gym.envs.tasks.success import limits_of, tracking_error
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
@@ -27,6 +28,7 @@ from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState,
 from wlr_gym.physics.plants.robot_options import RobotOptions
 from wlr_gym.policy import environment_for, make_policy
 from wlr_gym.robot.parameters import Parameters
+from wlr_gym.studies.bench.measure import Measurement, Size
 
 Array = NDArray[np.float64]
 
@@ -34,6 +36,8 @@ Array = NDArray[np.float64]
 ENVIRONMENT = "WLR-Velocity-v0"
 #: s of emulated time per tick.
 _TICK = 0.002
+#: Seed of the first episode.
+_FIRST_SEED = 9000
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +102,38 @@ class ChainSetting:
     seconds: float = 20.0
     faults: tuple[str, ...] = ()
     extra: Mapping[str, Any] = field(default_factory=dict)
+
+
+def measure_camera(size: Size) -> list[Measurement]:
+    """Tracking error of the chain over the simulator's, and with the lens covered after 5 s over a policy without a camera.
+
+    Means over the same episodes, each without its first second.
+    """
+    require_package("cv2", "vision")
+    seeds, seconds = range(_FIRST_SEED, _FIRST_SEED + size(6, 1)), float(size(8, 2))
+    at = 0.625 * seconds
+    camera, covered = _quick(chain_camera()), (f"camera_covered after={at:g}",)
+    rows = []
+    for floor in ("slippery", "ice", "split"):
+        setting = ChainSetting("velocity_slip_aware", floor, camera, seconds)
+        simulated, chain = simulated_errors(setting, seeds), chain_errors(setting, seeds)
+        blind = chain_errors(replace(setting, policy="velocity_slip_aware_no_camera", camera=None), seeds)
+        hidden = chain_errors(replace(setting, faults=covered), seeds)
+        what = f"{floor}, {len(seeds)} episodes of {seconds:g} s: tracking error"
+        ratios = (chain.mean() / simulated.mean(), hidden.mean() / blind.mean())
+        rows += [
+            Measurement("camera", f"{what} of the chain over the simulator's", "-", (float(ratios[0]),), bar=1.1),
+            Measurement("camera", f"{what}, lens covered from {at:g} s on, over a policy without a camera", "-",
+                        (float(ratios[1]),), bar=1.0),
+        ]  # fmt: skip
+    return rows
+
+
+def _quick(file: CameraFile) -> CameraFile:
+    """Return a camera with fewer pixels, nearer to the floor: rendering is what takes the time."""
+    lens = {"width": 640, "height": 360, "focal": (380.0, 380.0), "centre": (319.5, 179.5)}
+    scene = file.emulated.model_copy(update={"height": 2.0, "samples": 3})
+    return file.model_copy(update={"calibration": file.calibration.model_copy(update=lens), "emulated": scene})
 
 
 def chain_camera(latency: float = 0.04, dropout: float = 0.1, **scene: Any) -> CameraFile:
