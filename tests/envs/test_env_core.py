@@ -281,6 +281,7 @@ def random_matrices(task, count=50):
         "previous_action": 8,
         "start": 3,
         "clock": 1,
+        "presence": 2,
     }
     matrices = {name: rng.normal(size=(count, width)) for name, width in widths.items()}
     matrices["computed"] = np.full((count, len(task.computed)), np.nan)

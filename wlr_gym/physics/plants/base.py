@@ -63,16 +63,13 @@ class Layout:
 _WHEEL_XY = tuple(f"{wheel},{axis}" for wheel in WHEELS for axis in ("x", "y"))
 _WHEEL_XYZ = tuple(f"{wheel},{axis}" for wheel in WHEELS for axis in XYZ)
 
+_EFFORT = "motor current (legs) or load (wheels) times the nominal torque constant, before gear friction"
+
 SENSOR_LAYOUT = Layout(
     (
         Channel("joint_position", JOINTS, "rad", "encoder; wheels relative to their leg, unwrapped, zero at the run's start"),
         Channel("joint_velocity", JOINTS, "rad/s", "the servo's own velocity reading"),
-        Channel(
-            "joint_effort",
-            JOINTS,
-            "N m",
-            "motor current (legs) or load (wheels) times the nominal torque constant, before gear friction",
-        ),
+        Channel("joint_effort", JOINTS, "N m", _EFFORT),
         Channel("gyro", XYZ, "rad/s", "body frame"),
         Channel("accelerometer", XYZ, "m/s2", "body frame, specific force (+9.81 on z at rest)"),
         Channel("supply_voltage", (), "V", "at the servos"),

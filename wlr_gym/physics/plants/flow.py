@@ -51,6 +51,8 @@ _MEAN_QUALITY, _QUALITY_NOISE, _LEAST_QUALITY, _LEAST_HEIGHT, _GREATEST_RATE = 7
 CELL = 0.2
 #: Whole cells added, so that their numbers are positive near the start.
 _CELLS = 1 << 20
+#: Share of the texture below which its noise grows no more.
+_LEAST_TEXTURE = 0.1
 #: Of the body's z axis on the floor's normal: below it the sensor does not look at the floor.
 _LEAST_COSINE = 0.2
 _NOISE_STREAM = stream_number("flow")
@@ -183,6 +185,7 @@ def _read(seed: Any, tick: int, period: float, place: Any, settings: Any, state:
     if frames == 0:
         state[_CARRIED] += shift_x
         state[_CARRIED + 1] += shift_y
+        state[_QUALITY] = 0.0
         return 0.0
     end = (frame + phase) / rate
     part = end / period - (tick - 1)
@@ -197,21 +200,21 @@ def _read(seed: Any, tick: int, period: float, place: Any, settings: Any, state:
     if lost or too_fast or distance < settings[_LEAST_HEIGHT] or distance == 0.0 or quality < settings[_LEAST_QUALITY]:
         state[_QUALITY] = 0.0
         return 0.0
-    poorness = max(settings[_MEAN_QUALITY] / quality, 1.0)
+    poorness = 1.0 / max(texture, _LEAST_TEXTURE)
     c, s = math.cos(state[_MOUNT_YAW]), math.sin(state[_MOUNT_YAW])
-    count = settings[_COUNT]
-    state[_SHOWN] = _counted(state[_SCALE] * (c * x + s * y), interval, count, n0, poorness, settings)
-    state[_SHOWN + 1] = _counted(state[_SCALE] * (c * y - s * x), interval, count, n1, poorness, settings)
+    state[_SHOWN] = _counted(state[_SCALE] * (c * x + s * y), interval, frames, n0 * poorness, settings)
+    state[_SHOWN + 1] = _counted(state[_SCALE] * (c * y - s * x), interval, frames, n1 * poorness, settings)
     state[_QUALITY] = quality
     state[_END] = end
     return 1.0
 
 
 @njit(cache=True, nogil=True)
-def _counted(flow: float, interval: float, count: float, normal: float, poorness: float, settings: Any) -> float:
-    """Return ``flow`` (rad/s) with noise, in whole counts over its interval; a count of 0 leaves it as it is."""
+def _counted(flow: float, interval: float, frames: int, normal: float, settings: Any) -> float:
+    """Return ``flow`` (rad/s) with the noise of its frames, in whole counts; without a count it stays as it is."""
+    count = settings[_COUNT]
     if count <= 0.0:
         return flow
     counts = flow * interval / count
-    spread = math.hypot(settings[_NOISE], settings[_SPEED_NOISE] * counts) * poorness
+    spread = math.sqrt(frames) * math.hypot(settings[_NOISE], settings[_SPEED_NOISE] * counts / frames)
     return (np.rint(counts + spread * normal) + 0.0) * count / interval
