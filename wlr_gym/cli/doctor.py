@@ -1,4 +1,4 @@
-"""Look at a robot before it drives: ports, servos, bus speed, IMU, camera, and whether a policy fits. Moves nothing.
+"""Look at a robot before it drives: ports, adapters, servos, bus speed, sensors, and whether a policy fits. Moves nothing.
 
 Names the first thing that is wrong and what to do about it. Exit code 0: nothing stands against driving; 1: something does.
 """
@@ -84,7 +84,7 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
     from wlr_gym.hardware.safety import preflight
     from wlr_gym.hardware.safety.camera_check import check_camera
 
-    ports = preflight.open_ports(link.servos, link.imu, hardware)
+    ports = preflight.open_ports(link.servos, link.imu, hardware, link.flow)
     found = ports if options.emulated else ports + preflight.check_latency_timers(hardware)
     open_here = {check.where for check in ports if check.ok}
     buses = [name for name in hardware.buses if name in open_here]
@@ -105,6 +105,8 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
         found.append(preflight.Check("robot", "bus", False, str(error), "a bus that stays", "Check plugs and supply."))
     if "imu" in open_here:
         found += preflight.check_imu(link.imu, hardware.imu, link.clock)
+    if "flow" in open_here and link.flow is not None and hardware.flow is not None:
+        found += preflight.check_flow(link.flow, hardware.flow, link.clock)
     if link.camera is not None and (file := options.camera_file()) is not None:
         found += check_camera(link.camera, file, link.clock)
     return found

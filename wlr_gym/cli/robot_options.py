@@ -60,8 +60,9 @@ class HardwareOption:
         camera = self.camera_file()
         if self.emulated:
             from wlr_gym.hardware.emulator import Machine
-            from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot
+            from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot, with_flow_port
 
+            hardware = with_flow_port(robot, hardware)
             if patch is None:
                 return emulated_link(Machine(robot, hardware), camera)
             return emulated_robot(robot, hardware, patch, camera=camera)
@@ -97,7 +98,12 @@ class RobotOption(HardwareOption):
         """Return the robot and its hardware, with the ports of ``--port``; see :meth:`load_hardware`."""
         from wlr_gym.robot import load_robot
 
-        return load_robot(self.robot_name(self.robot)), self.load_hardware()
+        robot, hardware = load_robot(self.robot_name(self.robot)), self.load_hardware()
+        if self.emulated:
+            from wlr_gym.hardware.emulator.link import with_flow_port
+
+            hardware = with_flow_port(robot, hardware)
+        return robot, hardware
 
     def link(self, changed: Hardware | None = None) -> Link:
         """Return connections to a robot that does not move, closed; a slow computer is no dead servo then.
@@ -191,7 +197,7 @@ def ask_terminal(text: str, what: str = "calibration") -> str:
 
 
 def port_pairs(words: Sequence[str]) -> dict[str, str]:
-    """Return bus name or ``imu`` -> device of ``--port``.
+    """Return bus name, ``imu`` or ``flow`` -> device of ``--port``.
 
     Raises:
         InputError: a word that is not ``name=value``.

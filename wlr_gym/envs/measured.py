@@ -59,6 +59,18 @@ def measurable(task: Task, has_camera: bool) -> tuple[Task, tuple[str, ...]]:
     return replace(task, config=config, privileged=()), tuple(dict.fromkeys(left_out))
 
 
+def require_flow(task: Task, has_flow: bool) -> None:
+    """Refuse a task that observes optical flow on a robot without the sensor, unless it is one that does without at times.
+
+    Raises:
+        InputError: names the observation.
+    """
+    always = task.config.sensors.flow is None or task.config.sensors.flow >= 1.0
+    for column in task.policy:
+        if column.device == "flow" and always and not has_flow:
+            raise InputError(f"observation '{column.term}': this robot has no optical-flow sensor; see docs/optical_flow.md")
+
+
 def _is_known(function: Callable[..., Any]) -> bool:
     """Whether all signals that a term reads can be measured."""
     return all(name in _KNOWN for name in signals_of(function) if name.startswith(("truth.", "start[")))

@@ -1,4 +1,4 @@
-"""What a control loop is connected to: servos, IMU and clock."""
+"""What a control loop is connected to: servos, sensors and clock."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from wlr_gym.hardware.camera.config import CameraFile
 from wlr_gym.hardware.camera.live import LiveCamera
 from wlr_gym.hardware.camera.reading import CameraReader
 from wlr_gym.hardware.config import Hardware
+from wlr_gym.hardware.flow.driver import Flow, make_flow
 from wlr_gym.hardware.imu.driver import Imu, make_imu
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.hardware.timing import Clock, MonotonicClock
@@ -25,6 +26,7 @@ class Link:
         servos: closed at first.
         imu: closed at first.
         clock: what deadlines and ages are told by.
+        flow: optical-flow sensor, closed at first; None = there is none.
         is_serial: there are real ports, which a watchdog process can open.
         finish: called after closing.
         camera: above the floor; None = there is none.
@@ -35,6 +37,7 @@ class Link:
     clock: Clock
     is_serial: bool
     finish: Callable[[], None] = lambda: None
+    flow: Flow | None = None
     camera: CameraReader | None = None
 
     def open(self) -> None:
@@ -48,6 +51,9 @@ class Link:
             stack.callback(self.servos.close)
             self.imu.open()
             stack.callback(self.imu.close)
+            if self.flow is not None:
+                self.flow.open()
+                stack.callback(self.flow.close)
             if self.camera is not None:
                 self.camera.open()
             stack.pop_all()
@@ -56,6 +62,8 @@ class Link:
         """Close all ports; servos stay as they are."""
         self.servos.close()
         self.imu.close()
+        if self.flow is not None:
+            self.flow.close()
         if self.camera is not None:
             self.camera.close()
         self.finish()
@@ -72,5 +80,6 @@ def serial_link(robot: Robot, hardware: Hardware, camera: CameraFile | None = No
     """
     clock = MonotonicClock()
     servos = Servos(robot, hardware, hardware.safety.patience, clock.now)
+    flow = make_flow(robot, hardware, clock.now)
     eye = None if camera is None else LiveCamera(camera, robot, poses)
-    return Link(servos, make_imu(hardware.imu, clock.now), clock, is_serial=True, camera=eye)
+    return Link(servos, make_imu(hardware.imu, clock.now), clock, is_serial=True, flow=flow, camera=eye)

@@ -144,8 +144,8 @@ class ControlLoop:
         return sensors_of(self._step.known, self.recorder.origin)
 
     def statistics(self) -> dict[str, Any]:
-        """Return ticks, missed ones, percentiles of the timing (ms), and the command limiter's interventions."""
-        return {**self.pacer.statistics(), "interventions": dict(self.interventions), **self._step.camera_statistics()}
+        """Return ticks, missed ones, percentiles of the timing (ms), the limiter's interventions, what camera and flow gave."""
+        return {**self.pacer.statistics(), "interventions": dict(self.interventions), **self._step.sensor_statistics()}
 
     # ---- start-up ----
 

@@ -23,6 +23,9 @@ from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
+#: Elements that say what is connected: whatever is asked for, a robot has what it has.
+_IS_CONNECTED = np.array([element in ("camera.present", "flow.present") for element in ELEMENTS])
+
 
 class RobotPlant:
     """One robot behind the command limiter; see :class:`wlr_gym.physics.plants.base.Plant`.
@@ -70,6 +73,8 @@ class RobotPlant:
             description = description.model_copy(update={"safety": safety})
         if link is None:
             link = _link(robot, description, chosen, self.options)
+        self.parameters["flow.present"] = link.flow is not None
+        self.parameters["camera.present"] = link.camera is not None
         self.loop: ControlLoop = ControlLoop(
             robot,
             description,
@@ -136,7 +141,7 @@ class RobotPlant:
         """
         if len(parameters) != 1:
             raise InputError(f"parameters hold {len(parameters)} robots, the plant 1")
-        different = np.flatnonzero(parameters.values[0] != self.parameters.values[0])
+        different = np.flatnonzero((parameters.values[0] != self.parameters.values[0]) & ~_IS_CONNECTED)
         if len(different):
             raise InputError(
                 f"{ELEMENTS[different[0]]}: parameters of a real robot cannot be set (no randomisation, no effects)"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,7 @@ class ControlStep:
 
     Args:
         limiter: decides, limits and writes.
-        link: its IMU and camera are read.
+        link: its sensors are read.
         operator: what is asked for; served in the spare time.
         pacer: deadlines and statistics.
 
@@ -54,8 +54,8 @@ class ControlStep:
     def __init__(self, limiter: CommandLimiter, link: Link, operator: Operator, pacer: Pacer) -> None:
         self.status: RobotStatus | None = None
         self._limiter, self._operator, self._pacer = limiter, operator, pacer
-        self._clock = pacer.clock
-        self._sensing = Sensing(limiter, link.imu, pacer.clock, pacer.period, link.camera)
+        self._clock, self._flow = pacer.clock, link.flow
+        self._sensing = Sensing(limiter, link.imu, pacer.clock, pacer.period, link.camera, link.flow)
         self._idle = 0.0
         self._read_at = 0.0
 
@@ -70,10 +70,11 @@ class ControlStep:
             raise InputError("the robot has not been started")
         return self.status
 
-    def camera_statistics(self) -> dict[str, Any]:
-        """Return what came of the camera, under its name; empty = there is none."""
-        watch = self._sensing.watch
-        return {} if watch is None else {"camera": camera_statistics(watch)}
+    def sensor_statistics(self) -> dict[str, Any]:
+        """Return what came of camera and optical flow, under their names, of those there are."""
+        watch, flow = self._sensing.watch, self._flow
+        camera = {} if watch is None else {"camera": camera_statistics(watch)}
+        return camera if flow is None else {**camera, "flow": asdict(flow.statistics)}
 
     def begin_run(self) -> RobotStatus:
         """Let a run begin: the camera's poses count from here. Return what is known."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from wlr_gym.base.errors import require_package
 from wlr_gym.hardware.camera.config import CameraFile
-from wlr_gym.hardware.config import Hardware
+from wlr_gym.hardware.config import FlowPort, Hardware
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
+from wlr_gym.hardware.flow.stream import FlowStream
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.physics.effects import apply_patch, load_patch
@@ -26,7 +27,7 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
         MissingPackageError: dynamixel-sdk is not installed.
     """
     require_package("dynamixel_sdk", "robot")
-    from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu, MemoryPort
+    from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu, MemoryPort, StreamDevice
 
     world, hardware = EmulatedWorld(machine), machine.hardware
     names = {bus.port: name for name, bus in hardware.buses.items()}
@@ -37,13 +38,24 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
         world.now,
         lambda port, baud_rate, patience: MemoryPort(world, names[port], baud_rate, patience),
     )
-    eye = None
+    flow, sensor = hardware.flow, machine.robot.sensors.flow
+    stream = eye = None
+    if flow is not None and sensor is not None:
+        stream = FlowStream(flow, sensor, world.now, lambda _: StreamDevice(world, "flow"))
     if camera is not None:
         from wlr_gym.hardware.emulator.camera import EmulatedCamera
 
         require_package("cv2", "vision")
         eye = EmulatedCamera(machine, camera)
-    return Link(servos, MemoryImu(world, hardware.imu), world, is_serial=False, finish=machine.close, camera=eye)
+    imu = MemoryImu(world, hardware.imu)
+    return Link(servos, imu, world, is_serial=False, finish=machine.close, flow=stream, camera=eye)
+
+
+def with_flow_port(robot: Robot, hardware: Hardware) -> Hardware:
+    """Return the hardware with a port for the optical-flow sensor that the robot's file has, where it names none."""
+    if hardware.flow is not None or robot.sensors.flow is None:
+        return hardware
+    return hardware.model_copy(update={"flow": FlowPort(port="emulated")})
 
 
 def emulated_robot(
@@ -69,4 +81,5 @@ def emulated_robot(
     patch = load_patch(effects)
     options = MachineOptions(timing=NO_TIME, sensor_noise=sensor_noise)
     parameters = apply_patch(patch, Parameters.nominal(robot))
+    hardware = with_flow_port(robot, hardware)
     return emulated_link(Machine(robot, hardware, options, parameters=parameters, forces=patch.forces), camera)
