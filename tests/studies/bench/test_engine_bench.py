@@ -37,8 +37,8 @@ def test_another_mujoco_robot_converges_to_the_same_limit(short):
 
 def test_rollout_and_batch_are_the_same_simulation(short):
     chosen, _ = short
-    poses = [prepare(Setting("MuJoCo", 1e-3, call=call, threads=threads), chosen, 1)()[0] for call, threads in
-             (("step", 1), ("rollout", 1), ("rollout", 2))]  # fmt: skip
+    rollouts = [Setting("MuJoCo", 1e-3, call="rollout", threads=threads) for threads in (1, 2)]
+    poses = [prepare(setting, chosen, 1)()[0] for setting in (Setting("MuJoCo", 1e-3), *rollouts)]
     np.testing.assert_array_equal(poses[0], poses[1])
     np.testing.assert_array_equal(poses[0], poses[2])
 
@@ -47,7 +47,7 @@ def test_locked_wheels_slide_as_far_as_the_closed_form_says():
     chosen = [motion for motion in motions(ROBOT) if motion.distance is not None]
     pose, _ = prepare(Setting("engine", 1e-3, iterations=4, contact="own"), chosen, 1)()
     assert len(chosen) == 2
-    np.testing.assert_allclose(np.linalg.norm(pose[:, :2], axis=1), [motion.distance for motion in chosen], rtol=5e-3)
+    np.testing.assert_allclose(np.linalg.norm(pose[:, :2], axis=1), [motion.distance or 0.0 for motion in chosen], rtol=5e-3)
 
 
 def _result(side, step, error, speed, **others):

@@ -69,7 +69,7 @@ def _standard(results: Iterable[EngineResult], call: str, threads: int) -> Engin
 
 
 def _millimetres(value: float | None) -> str:
-    return "lost" if value is None else f"{1e3 * value:.2g} mm" if value < 0.1 else f"{1e3 * value:.0f} mm"
+    return "lost" if value is None else f"{1e3 * value:.3g} mm" if value < 0.1 else f"{1e3 * value:.0f} mm"
 
 
 def lines(report: dict[str, Any]) -> list[str]:
