@@ -281,6 +281,7 @@ def random_matrices(task, count=50):
         "previous_action": 8,
         "start": 3,
         "clock": 1,
+        "presence": 2,
     }
     matrices = {name: rng.normal(size=(count, width)) for name, width in widths.items()}
     matrices["computed"] = np.full((count, len(task.computed)), np.nan)
@@ -300,6 +301,7 @@ def every_reward():
         "measures": {name: {} for name in MEASURES},
         "observations": {name: {} for name in COMPUTED},
         "privileged": {name: {} for name in COMPUTED},
+        "controller": {"velocity_i": 1.0, "load_shift": 1.0, "uphill": 0.1},
     }
 
 
@@ -338,14 +340,16 @@ def test_compiled_rewards_equal_the_same_terms_on_numpy():
 def test_compiled_computed_observations_equal_the_same_terms_on_numpy():
     task = make_task("velocity", Settings(task=every_reward()))
     matrices = random_matrices(task)
+    before = matrices["computed"] = np.random.default_rng(1).normal(0, 0.1, (50, len(task.computed)))
     expected = computed_expressions(task, reader(task, matrices))
-    kernel, computed = compile_computed(task), matrices["computed"]
+    kernel, computed = compile_computed(task), before.copy()
+    matrices["computed"] = computed
     active = np.arange(50) % 2 == 0
     kernel.run(active, signals_in_order(matrices), kernel.numbers)
     for k, name in enumerate(task.computed):
         wanted = np.broadcast_to(expected[name], 50)[active]
         np.testing.assert_allclose(computed[active, k], wanted, rtol=1e-12, atol=1e-12, err_msg=name)
-    assert np.isnan(computed[~active]).all()
+    np.testing.assert_array_equal(computed[~active], before[~active])
 
 
 def value_of(name, parameters=None, **truth):

@@ -95,7 +95,7 @@ def evidence():
             1, "torque_ripple", ("wheel_lf",), {"amplitude": 0.6}, 290.0, 350.0, "implausible", "amplitude ends at its bound"
         ),
     ]  # fmt: skip
-    for k, name in enumerate(EFFECTS):
+    for k, name in enumerate(name for name, effect in EFFECTS.items() if effect.search):
         for place in JOINTS if EFFECTS[name].where == JOINTS else EFFECTS[name].where[:1]:
             score = 200.0 * np.exp(-0.35 * k)
             found.append(

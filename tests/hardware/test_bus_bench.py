@@ -48,7 +48,7 @@ def test_a_tick_missed_in_any_round_counts(monkeypatch):
     """Three rounds of five miss none, so that their median is none."""
     drives = iter([0, 0, 0, 7, 40])
     rest = {"jitter": {"p99": 1.0}, "latency": {"p99": 1.0}}
-    monkeypatch.setattr(bus, "_drive", lambda seconds: {"missed": next(drives), **rest})
+    monkeypatch.setattr(bus, "drive_in_real_time", lambda seconds, words: {"missed": next(drives), **rest})
     missed, late, sent = bus._measure_deadlines(Size(rounds=5))
     assert missed.ours == (47.0,)
     assert not missed.met
@@ -59,9 +59,9 @@ def test_a_drive_that_hangs_is_ended(monkeypatch):
     monkeypatch.setattr(bus, "_DRIVE", "import time; time.sleep(600)")
     monkeypatch.setattr(bus, "_GRACE", 0.0)
     with pytest.raises(RuntimeError, match="not driven to the end within 1 s"):
-        bus._drive(1)
+        bus.drive_in_real_time(1, ["pid"])
 
 
 def test_a_drive_that_does_not_end_well_is_no_measurement():
     with pytest.raises(RuntimeError, match="--seconds 0: expected more than 0"):
-        bus._drive(0)
+        bus.drive_in_real_time(0, ["pid"])

@@ -463,7 +463,7 @@ def test_imu_streams_gravity_at_its_rate():
     machine = make()
     machine.advance(0.1)
     parser = FrameParser()
-    frames = [frame for emission in machine.take_imu_output() for frame in parser.feed(emission.data)]
+    frames = [frame for emission in machine.take_output()["imu"] for frame in parser.feed(emission.data)]
     assert [frame.sequence for frame in frames] == list(range(1, 21))
     assert [b.microseconds - a.microseconds for a, b in pairwise(frames)] == [5000] * 19
     gravity = from_counts(frames[-1].accelerometer, accel_per_count(4))
@@ -563,7 +563,7 @@ def test_same_seed_same_bytes():
         for _ in range(20):
             machine.advance(0.005)
             out += b"".join(e.data for e in machine.lines["legs"].receive(protocol.sync_read(124, 12, LEG_IDS), machine.time))
-        return out + b"".join(e.data for e in machine.take_imu_output())
+        return out + b"".join(e.data for e in machine.take_output()["imu"])
 
     assert run() == run()
 

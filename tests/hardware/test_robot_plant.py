@@ -220,7 +220,7 @@ def test_a_stopped_robot_says_so(env):
         ({"randomization": "wide"}, "a real robot is what it is"),
         ({"effects": "icy_patch"}, "a real robot is what it is"),
         ({"render_mode": "rgb_array"}, "where a real robot stands is not known"),
-        ({"task": {"observations": {"camera_yaw": {}}}}, "no camera of its own"),
+        ({"task": {"observations": {"camera_yaw": {}}}}, "this robot has no camera"),
         ({"hardware": {"emulate": True}}, "unknown field"),
     ],
 )

@@ -20,7 +20,7 @@ from wlr_gym.physics.plants.base import PlantOptions, standing_state
 from wlr_gym.robot.parameters import Parameters
 
 #: Effects that act on the readings alone, which both plants take from the same sensor model.
-ON_SENSORS = ("gyro_bias", "imu_misalignment", "camera_misalignment", "camera_delay")
+ON_SENSORS = ("gyro_bias", "imu_misalignment", "camera_misalignment", "camera_delay", "flow_misalignment")
 DYNAMIC = tuple(name for name in EFFECTS if name not in ON_SENSORS)
 SECONDS = 10.0
 

@@ -36,12 +36,14 @@ MEASUREMENTS = {
     "convergence": "wlr_gym.studies.bench.convergence:measure_convergence",
     "vision": "wlr_gym.studies.bench.vision:measure_vision",
     "bus": "wlr_gym.studies.bench.bus:measure_bus",
+    "perception": "wlr_gym.studies.bench.perception:measure_perception",
+    "camera": "wlr_gym.studies.bench.camera_chain:measure_camera",
     "sysid": "wlr_gym.studies.bench.sysid:measure_sysid",
 }
 #: Measurements with rows of their own kind; each has its list in the report.
 _OWN_ROWS = ("convergence", "vision")
 #: Take long or need packages that few have: only made when named.
-_ON_REQUEST = ("vision", "bus", "learning", "sysid")
+_ON_REQUEST = ("vision", "bus", "camera", "perception", "learning", "sysid")
 #: Its own kind: hours, resumable, with a folder of results. See docs/gap_benchmark.md.
 BLIND_TEST = "gap"
 SCHEMA = 1
@@ -52,7 +54,8 @@ class BenchOptions:
     what: tyro.conf.Positional[tuple[str, ...]] = ()
     """Measurements to make, as with --only."""
     only: tuple[str, ...] = ()
-    """engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, vision, sysid.
+    """engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, camera, perception, vision,
+    sysid.
     gap (the blind test of the gap workflow): alone, with --out"""
     json: Path | None = None
     """File for all numbers."""
@@ -176,7 +179,7 @@ _YES_NO = {True: "yes", False: "NO", None: "-"}
 
 
 def _number(found: dict[str, Any], unit: str) -> str:
-    form = "{median:.2f} [{min:.2f}..{max:.2f}]" if unit == "s" else "{median:,.0f}"
+    form = "{median:.2f} [{min:.2f}..{max:.2f}]" if unit in ("s", "-") else "{median:,.0f}"
     return f"{form.format(**found)} {unit}"
 
 

@@ -1,4 +1,4 @@
-"""Calibrate what measures: the robot's ``joints`` and ``imu``, a ``camera``; ``targets`` are the sheets to print for it."""
+"""Calibrate what measures: the robot's ``joints``, ``imu``, ``flow``, a ``camera``; ``targets`` are its sheets to print."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.cli import OK
+from wlr_gym.cli.calibrate_flow import FlowOptions, calibrate_flow
 from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions, calibrate_imu, calibrate_joints, set_up_servo
 
 
@@ -55,10 +56,11 @@ CalibrateOptions = (
     | Annotated[ServoOptions, tyro.conf.subcommand("servo", description="id and baud rate of a new servo")]
     | Annotated[JointsOptions, tyro.conf.subcommand("joints", description="sign and zero of each servo, by hand")]
     | Annotated[ImuOptions, tyro.conf.subcommand("imu", description="biases, scale and mounting of the IMU")]
+    | Annotated[FlowOptions, tyro.conf.subcommand("flow", description="scale and mounting of the optical-flow sensor")]
 )
 
 
-def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions | ImuOptions) -> int:
+def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions | ImuOptions | FlowOptions) -> int:
     """Do what the sub-command says; 0 when done."""
     if isinstance(options, ServoOptions):
         return set_up_servo(options)
@@ -66,6 +68,8 @@ def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions |
         return calibrate_joints(options)
     if isinstance(options, ImuOptions):
         return calibrate_imu(options)
+    if isinstance(options, FlowOptions):
+        return calibrate_flow(options)
     require_package("cv2", "vision")
     return _targets(options) if isinstance(options, TargetsOptions) else _camera(options)
 

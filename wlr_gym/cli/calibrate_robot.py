@@ -126,7 +126,7 @@ def calibrate_joints(options: JointsOptions, ask: Ask = ask_terminal) -> int:
         if joint not in JOINTS:
             raise unknown_name("joint", joint, JOINTS)
     robot, hardware = options.load()
-    source = _source(options.hardware, options.out)
+    source = source_of(options.hardware, options.out)
     link = options.link()
     try:
         with _dialogue():
@@ -149,8 +149,8 @@ def _calibrate_joints(options: JointsOptions, robot: Robot, hardware: Hardware, 
     for joint, new in mountings.items():
         old = hardware.joints[joint]
         print(f"{joint:9} sign {old.sign:+d} -> {new.sign:+d}, zero {old.zero} -> {new.zero}")
-    note = f"Signs and zeros by wlr calibrate joints, {_today()}: count = zero + sign * angle / (size of a count)."
-    return _save(options.out, source, lambda file: with_mountings(file, mountings), "joints", note, ask)
+    note = f"Signs and zeros by wlr calibrate joints, {today()}: count = zero + sign * angle / (size of a count)."
+    return save_calibration(options.out, source, lambda file: with_mountings(file, mountings), "joints", note, ask)
 
 
 def _require_torque_off(servos: Servos, ask: Ask) -> None:
@@ -208,7 +208,7 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
     if not 0.5 <= options.seconds <= 60.0:
         raise InputError(f"--seconds {options.seconds:g}: expected 0.5 to 60")
     _, hardware = options.load()
-    source = _source(options.hardware, options.out)
+    source = source_of(options.hardware, options.out)
     link = options.link(with_imu_calibration(hardware, ImuCalibration()))
     try:
         with _dialogue():
@@ -217,8 +217,8 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
             calibration = _find_calibration(options, hardware.imu.calibration, link, ask)
         for name, value in calibration.model_dump(exclude_unset=True).items():
             print(f"{name:13} {value}")
-        note = f"IMU calibrated by wlr calibrate imu, {_today()}: mounting * scale * (measured - offset), SI units."
-        return _save(options.out, source, lambda file: with_imu_calibration(file, calibration), "imu", note, ask)
+        note = f"IMU calibrated by wlr calibrate imu, {today()}: mounting * scale * (measured - offset), SI units."
+        return save_calibration(options.out, source, lambda file: with_imu_calibration(file, calibration), "imu", note, ask)
     except _StoppedError:
         return _stopped()
     finally:
@@ -252,7 +252,7 @@ def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, as
             "accel_scale": scale,
             "mounting": mounting,
             "temperature": round(float(np.mean([pose.temperature for pose in poses])), 1),
-            "date": _today(),
+            "date": today(),
         }
     )
 
@@ -309,7 +309,7 @@ def _yes(ask: Ask, text: str) -> bool:
     return _answer(ask, f"{text} [y/N]") in ("y", "yes")
 
 
-def _source(hardware: str, out: Path) -> Path:
+def source_of(hardware: str, out: Path) -> Path:
     """Return the file the hardware comes from; refuse to write over another one."""
     from wlr_gym.base.paths import find_config
 
@@ -321,7 +321,7 @@ def _source(hardware: str, out: Path) -> Path:
     return source
 
 
-def _save(out: Path, source: Path, change: Callable[[Hardware], Hardware], section: str, note: str, ask: Ask) -> int:
+def save_calibration(out: Path, source: Path, change: Callable[[Hardware], Hardware], section: str, note: str, ask: Ask) -> int:
     """Ask, and write the file with what was found: ``change`` is made to what it says, not to ports of the command line."""
     from wlr_gym.hardware.calibration import save_hardware
     from wlr_gym.hardware.config import load_hardware
@@ -338,5 +338,5 @@ def _stopped() -> int:
     return FAILED
 
 
-def _today() -> str:
+def today() -> str:
     return datetime.datetime.now().astimezone().date().isoformat()

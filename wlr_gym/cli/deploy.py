@@ -20,7 +20,7 @@ from rich.console import Console
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import PatchOption, environment_of, pairs
-from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
+from wlr_gym.cli.robot_options import port_pairs, read_camera, wait_for_enter
 
 if TYPE_CHECKING:
     from wlr_gym.data.logs.stream import McapStream
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 _LATE = ("deadlines:", "silence:", "idle:", "watchdog:", "imu: no reading", "no answer from", "NoAnswerError:")
 #: s for which the dead-man button of a gamepad may be let go.
 _PAD_DEADMAN = 0.2
+#: File of an emulated robot's true pose, and its key among the ports.
+_POSES = "poses"
 #: Steps between two looks of the live status.
 _STATUS_TICKS = 10
 
@@ -55,6 +57,8 @@ class DeployOptions(PatchOption):
     """Drive an emulated robot, which is started for the purpose."""
     stepped: bool = False
     """With --emulated: in emulated time, without ports: faster, and the same bits each time."""
+    camera: str | None = None
+    """Camera above the floor: file or name in configs/camera/; over an emulated robot (emulated) its frames are rendered."""
     dry_run: bool = False
     """Do everything but write to the servos: nothing moves."""
     fault: tuple[str, ...] = ()
@@ -101,7 +105,8 @@ def run(options: DeployOptions) -> int:
         ports = port_pairs(options.port)
         if options.emulated and not options.stepped:
             ports |= stack.enter_context(_emulator(options, console, robot))
-        keywords = {"backend": "dynamixel", "hardware": _robot(options, ports), "episode_length": options.seconds}
+        poses = ports.pop(_POSES, None)
+        keywords = {"backend": "dynamixel", "hardware": _robot(options, ports, poses), "episode_length": options.seconds}
         core = make_core(environment, 1, environment_for(options.policy, keywords | {"robot": robot}))
         stack.callback(core.close)
         policy = make_policy(options.policy, core.contract())
@@ -141,6 +146,7 @@ def _check(options: DeployOptions) -> dict[str, float]:
         raise InputError("--realtime: emulated time is not real time; leave out --stepped")
     if options.effects and not options.emulated:
         raise InputError("--effects: a real robot has its own; add --emulated")
+    read_camera(options.camera, options.emulated)
     options.patch()  # a bad one is refused before a robot is started for it
     if options.emulated and options.port:
         raise InputError("--port: the emulated robot brings its own ports")
@@ -183,13 +189,15 @@ def driven_robot(options: DeployOptions) -> Any:
     return made_for if options.hardware == DeployOptions.hardware and not is_same else wired
 
 
-def _robot(options: DeployOptions, ports: dict[str, str]) -> dict[str, Any]:
+def _robot(options: DeployOptions, ports: dict[str, str], poses: str | None) -> dict[str, Any]:
     """Return which robot is driven, and how it is connected."""
     return {
         "hardware": options.hardware,
         "ports": ports,
         "emulated": options.emulated and options.stepped,
         "effects": options.patch() if options.stepped else None,
+        "camera": options.camera,
+        "poses": None if poses is None else Path(poses),
         "dry_run": options.dry_run,
         "log": options.out,
         "deadman": _PAD_DEADMAN if options.deadman is None and options.gamepad is not None else options.deadman,
@@ -216,11 +224,10 @@ def _gamepads(options: DeployOptions, core: Core, loop: ControlLoop, console: Co
 def _stream(path: Path | None, loop: ControlLoop, stack: contextlib.ExitStack) -> McapStream | None:
     """Return what writes the run into an MCAP file while it goes on, or None."""
     from wlr_gym.data.logs.stream import McapStream
-    from wlr_gym.hardware.log import ROW
 
     if path is None:
         return None
-    loop.recorder.stream = stack.enter_context(McapStream(path, ROW[1:], loop.recorder.meta, loop.robot))
+    loop.recorder.stream = stack.enter_context(McapStream(path, loop.recorder.columns[1:], loop.recorder.meta, loop.robot))
     return loop.recorder.stream
 
 
@@ -242,7 +249,7 @@ def _machine_of(loop: ControlLoop) -> Machine:
 
 @contextlib.contextmanager
 def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> Iterator[dict[str, str]]:
-    """Start ``wlr emulate`` as a process of its own; yield its ports."""
+    """Start ``wlr emulate`` as a process of its own; yield its ports, and the file of its poses where a camera needs it."""
     import subprocess
     import tempfile
 
@@ -252,6 +259,8 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
     with tempfile.TemporaryDirectory(prefix="wlr-robot-") as folder:
         links = Path(folder) / "ports"
         words = ["--links", str(links), "--hardware", options.hardware]
+        if options.camera is not None:
+            words += ["--poses", str(Path(folder) / _POSES)]
         if robot is not None:
             write_robot(Path(folder) / "robot.yaml", load_robot(robot))
             words += ["--robot", str(Path(folder) / "robot.yaml")]
@@ -272,7 +281,7 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
             ports = {line.split()[0]: line.split()[1] for line in (process.stdout.readline() for _ in range(3)) if line}
             if len(ports) < 3:
                 raise InputError(f"the emulated robot does not start: {process.stderr.read().strip()}")
-            yield ports
+            yield ports | ({_POSES: str(Path(folder) / _POSES)} if options.camera is not None else {})
         finally:
             process.terminate()
             process.communicate()
@@ -282,8 +291,8 @@ def _say_what_is_not_known(core: Core, console: Console) -> None:
     from wlr_gym.policy import needs_camera
 
     console.print(f"not measured on a robot, and left out: {', '.join(core.unmeasured)}", style="dim")
-    if needs_camera(core.contract()):
-        note = "note: the policy's slip observer had a camera in training; this robot has none: expect worse tracking"
+    if needs_camera(core.contract()) and not core.settings.has_camera:
+        note = "note: the policy's slip observer had a camera in training, and none is named (--camera): expect worse tracking"
         console.print(note, style="yellow")
 
 
@@ -321,6 +330,8 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from wlr_gym.cli.robot_status import camera_line
+
     colour = "green" if result.well else "red"
     console.print(Text.assemble(("ended: ", "bold"), (result.reason, colour)))
     statistics = result.statistics
@@ -333,5 +344,7 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
     console.print(table)
     limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
     console.print(f"command limiter, steps: {limited}")
+    if camera := statistics.get("camera"):
+        console.print(camera_line(camera))
     if result.run is not None:
         console.print(f"written: {result.run}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Look at a robot before it drives: ports, adapters, every servo, bus speed, IMU, and whether a policy fits. Moves nothing.
+"""Look at a robot before it drives: ports, adapters, servos, bus speed, sensors, and whether a policy fits. Moves nothing.
 
 Names the first thing that is wrong and what to do about it. Exit code 0: nothing stands against driving; 1: something does.
 """
@@ -15,7 +15,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.robot_options import RobotOption, wait_for_enter
+from wlr_gym.cli.robot_options import CameraOption, wait_for_enter
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,7 +30,7 @@ _MEND_PASSES = 2
 
 
 @dataclass(frozen=True)
-class DoctorOptions(RobotOption):
+class DoctorOptions(CameraOption):
     """Look at a robot.
 
     Attributes:
@@ -70,7 +70,7 @@ def run(options: DoctorOptions) -> int:
     finally:
         link.close()
     if options.policy is not None:
-        checks += check_policy(options.policy, options.robot_name(options.robot))
+        checks += check_policy(options.policy, options.robot_name(options.robot), options.camera is not None)
     _print(checks, console, options)
     if options.json is not None:
         write_json(options.json, [check._asdict() for check in checks])
@@ -78,12 +78,13 @@ def run(options: DoctorOptions) -> int:
 
 
 def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions, console: Console) -> list[Check]:
-    """Return all checks of ports, adapters, servos, buses and IMU; mends and scans on the way, where that was asked for."""
+    """Return all checks of ports, adapters, servos, buses, IMU and camera; mends and scans where that was asked for."""
     from wlr_gym.hardware.dynamixel.errors import BusGoneError
     from wlr_gym.hardware.loop import TIMED_READS
     from wlr_gym.hardware.safety import preflight
+    from wlr_gym.hardware.safety.camera_check import check_camera
 
-    ports = preflight.open_ports(link.servos, link.imu, hardware)
+    ports = preflight.open_ports(link.servos, link.imu, hardware, link.flow)
     found = ports if options.emulated else ports + preflight.check_latency_timers(hardware)
     open_here = {check.where for check in ports if check.ok}
     buses = [name for name in hardware.buses if name in open_here]
@@ -104,6 +105,10 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
         found.append(preflight.Check("robot", "bus", False, str(error), "a bus that stays", "Check plugs and supply."))
     if "imu" in open_here:
         found += preflight.check_imu(link.imu, hardware.imu, link.clock)
+    if "flow" in open_here and link.flow is not None and hardware.flow is not None:
+        found += preflight.check_flow(link.flow, hardware.flow, link.clock)
+    if link.camera is not None and (file := options.camera_file()) is not None:
+        found += check_camera(link.camera, file, link.clock)
     return found
 
 
@@ -126,8 +131,8 @@ def _mend(link: Link, checks: Sequence[Check], console: Console) -> bool:
     return True
 
 
-def check_policy(source: str, robot: str) -> list[Check]:
-    """Return whether a policy was made for this robot, its observations and its control period, and does without a camera."""
+def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Check]:
+    """Return whether a policy was made for this robot, its observations and its control period, and for its sensors."""
     from wlr_gym.hardware.safety.check import Check
     from wlr_gym.learning.evaluation.rollout import make_core
     from wlr_gym.policy import check_contract, contract_of, environment_for, needs_camera
@@ -144,8 +149,8 @@ def check_policy(source: str, robot: str) -> list[Check]:
     except InputError as error:
         return [Check("policy", "contract", False, str(error), "one that fits", remedy)]
     checks = [Check("policy", "contract", True, f"{policy['agent']}, {policy['environment']['task']}", "", "")]
-    if needs_camera(policy["environment"]):
-        remedy = "Its slip observer goes by wheels and IMU alone: expect worse tracking, or train with observer.camera false."
+    if needs_camera(policy["environment"]) and not has_camera:
+        remedy = "Its slip observer goes by wheels and IMU alone: expect worse tracking. Name the camera (--camera FILE)."
         checks.append(Check("policy", "camera", False, "none on this robot", "the one of its training", remedy, False))
     return checks
 
@@ -201,6 +206,7 @@ def _mend_command(options: DoctorOptions) -> str:
     words += ["--hardware", options.hardware] if options.hardware != "nominal" else []
     words += ["--port", *options.port] if options.port else []
     words += ["--emulated"] if options.emulated else []
+    words += ["--camera", options.camera] if options.camera else []
     return shlex.join([*words, "--mend"])
 
 

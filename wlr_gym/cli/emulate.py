@@ -27,7 +27,7 @@ class EmulateOptions(PatchOption):
         backend: simulator behind the servos.
         robot: robot file or config name.
         hardware: wiring and mounting: file or config name.
-        links: folder for links to the ports with fixed names (one per bus, and imu); made if it is not there.
+        links: folder for links to the ports with fixed names (one per bus, imu, and flow); made if it is not there.
         control: path of a Unix socket that takes command lines.
         fault: faults to start with; may be given several times.
         stepped: time passes only by the command ``step SECONDS``; answers then come at once.
@@ -38,6 +38,7 @@ class EmulateOptions(PatchOption):
         firmware: version the servos report; fast reads need 45.
         seed: of sensor noise and faults.
         seconds: stop after this long; 0 = run until Ctrl-C.
+        poses: file that the true pose goes into, for a camera that films by rendering (wlr deploy --camera).
     """
 
     backend: str = "gibbs_appell"
@@ -54,6 +55,7 @@ class EmulateOptions(PatchOption):
     firmware: int = 45
     seed: int = 0
     seconds: float = 0.0
+    poses: Path | None = None
 
 
 def run(options: EmulateOptions) -> int:
@@ -64,7 +66,9 @@ def run(options: EmulateOptions) -> int:
     """
     from wlr_gym.hardware.config import load_hardware
     from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
+    from wlr_gym.hardware.emulator.camera import FeedWriter
     from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
+    from wlr_gym.hardware.emulator.link import with_flow_port
     from wlr_gym.physics.effects import apply_patch
     from wlr_gym.robot import load_robot
     from wlr_gym.robot.parameters import Parameters
@@ -86,10 +90,12 @@ def run(options: EmulateOptions) -> int:
     hardware, patch = load_hardware(options.hardware), options.patch()
     robot = load_robot(options.robot or hardware.robot or "nominal")
     parameters = apply_patch(patch, Parameters.nominal(robot, 1))
-    machine = Machine(robot, hardware, machine_options, parameters=parameters, forces=patch.forces)
+    machine = Machine(robot, with_flow_port(robot, hardware), machine_options, parameters=parameters, forces=patch.forces)
     for fault in options.fault:
         machine.inject(fault)
     with Server(machine, real_time=not options.stepped, links=options.links, control=options.control) as server:
+        if options.poses is not None:
+            machine.watchers.append(FeedWriter(machine, options.poses, lambda: server.origin))
         _print_ports(server, options.links)
         try:
             _take_commands(server, options.seconds)
@@ -107,7 +113,11 @@ def _print_ports(server: Server, links: Path | None) -> None:
     buses = server.machine.hardware.buses
     for name, path in server.ports.items():
         bus = buses.get(name)
-        text = f"{bus.model}, {bus.baud_rate} bit/s: {', '.join(bus.joints)}" if bus else "frames of the IMU"
+        text = (
+            f"{bus.model}, {bus.baud_rate} bit/s: {', '.join(bus.joints)}"
+            if bus
+            else f"frames of {'the IMU' if name == 'imu' else name}"
+        )
         print(f"{name:8} {links / name if links else path}  {text}", flush=True)
 
 

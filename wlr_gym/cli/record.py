@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import PatchOption
-from wlr_gym.cli.robot_options import RobotOption, confirm
+from wlr_gym.cli.robot_options import CameraOption, confirm
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RecordOptions(RobotOption, PatchOption):
+class RecordOptions(CameraOption, PatchOption):
     """Record runs.
 
     Attributes:
@@ -77,8 +77,8 @@ def run(options: RecordOptions) -> int:
     if options.list:
         _list(console, robot)
         return OK
-    if options.backend not in REAL and (options.emulated or options.port):
-        raise InputError(f"--emulated and --port are about the robot: leave --backend {options.backend} out")
+    if options.backend not in REAL and (options.emulated or options.port or options.camera):
+        raise InputError(f"--emulated, --port and --camera are about the robot: leave --backend {options.backend} out")
     if options.out is None:
         raise InputError("--out: expected a folder for the runs")
     motions = read_motions(options, robot)

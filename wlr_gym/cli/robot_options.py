@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from wlr_gym.data.excitations import Motion
     from wlr_gym.data.format import RunMeta
+    from wlr_gym.hardware.camera.config import CameraFile
     from wlr_gym.hardware.config import Hardware
     from wlr_gym.hardware.link import Link
     from wlr_gym.hardware.plant import RobotPlant
@@ -56,16 +57,24 @@ class HardwareOption:
         Raises:
             InputError: a patch for a real robot.
         """
+        camera = self.camera_file()
         if self.emulated:
             from wlr_gym.hardware.emulator import Machine
-            from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot
+            from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot, with_flow_port
 
-            return emulated_link(Machine(robot, hardware)) if patch is None else emulated_robot(robot, hardware, patch)
+            hardware = with_flow_port(robot, hardware)
+            if patch is None:
+                return emulated_link(Machine(robot, hardware), camera)
+            return emulated_robot(robot, hardware, patch, camera=camera)
         from wlr_gym.hardware.link import serial_link
 
         if patch is not None and patch.effects:
             raise InputError("--effects: a real robot has its own; they are for simulators and the emulated robot")
-        return serial_link(robot, hardware)
+        return serial_link(robot, hardware, camera)
+
+    def camera_file(self) -> CameraFile | None:
+        """Return the camera above the floor; None = the command has none."""
+        return None
 
     def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
         """Return the robot as a plant, torque off; every start is logged in a new run of ``log``."""
@@ -89,7 +98,12 @@ class RobotOption(HardwareOption):
         """Return the robot and its hardware, with the ports of ``--port``; see :meth:`load_hardware`."""
         from wlr_gym.robot import load_robot
 
-        return load_robot(self.robot_name(self.robot)), self.load_hardware()
+        robot, hardware = load_robot(self.robot_name(self.robot)), self.load_hardware()
+        if self.emulated:
+            from wlr_gym.hardware.emulator.link import with_flow_port
+
+            hardware = with_flow_port(robot, hardware)
+        return robot, hardware
 
     def link(self, changed: Hardware | None = None) -> Link:
         """Return connections to a robot that does not move, closed; a slow computer is no dead servo then.
@@ -107,6 +121,33 @@ class RobotOption(HardwareOption):
     def plant(self, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
         """Return the robot as a plant; see :meth:`plant_of`."""
         return self.plant_of(self.load()[0], log, meta, patch)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOption(RobotOption):
+    """Which robot, how it is wired, and which camera sees it."""
+
+    camera: str | None = None
+    """Camera above the floor: file or name in configs/camera/; over an emulated robot, its frames are rendered."""
+
+    def camera_file(self) -> CameraFile | None:
+        """Return the camera of ``--camera``; None = there is none.
+
+        Raises:
+            InputError: unknown or broken file, or an emulated camera for a real robot.
+        """
+        return read_camera(self.camera, self.emulated)
+
+
+def read_camera(source: str | None, is_emulated: bool) -> CameraFile | None:
+    """Return the camera of ``--camera``; see :meth:`CameraOption.camera_file`."""
+    from wlr_gym.hardware.camera.config import load_camera_file
+
+    if source == "emulated" and not is_emulated:
+        raise InputError(
+            "--camera emulated: it films an emulated robot by rendering; add --emulated, or name your camera's file"
+        )
+    return None if source is None else load_camera_file(source)
 
 
 def confirm(motion: Motion, robot: Robot, console: Console) -> None:
@@ -156,7 +197,7 @@ def ask_terminal(text: str, what: str = "calibration") -> str:
 
 
 def port_pairs(words: Sequence[str]) -> dict[str, str]:
-    """Return bus name or ``imu`` -> device of ``--port``.
+    """Return bus name, ``imu`` or ``flow`` -> device of ``--port``.
 
     Raises:
         InputError: a word that is not ``name=value``.

@@ -44,7 +44,8 @@ class RobotView:
             numbers = (f"{column[k]:.2f}" for column in columns)
             table.add_row(joint, *numbers, style="red" if status.silence[k] > 0 else "")
         command = "  ".join(f"{name} {value:+.2f}" for name, value in zip(core.task.commands, core.command[0], strict=True))
-        table.caption = "\n".join([command, supervised(loop, status), self._interventions()])
+        camera = [] if status.camera is None else [camera_state(status)]
+        table.caption = "\n".join([command, supervised(loop, status), *camera, self._interventions()])
         return table
 
     def _interventions(self) -> str:
@@ -76,3 +77,28 @@ def supervised(loop: ControlLoop, status: RobotStatus) -> str:
     if limits.deadman is not None:
         seen.append(f"operator silent {loop.operator.silence:.1f} s (limit {limits.deadman:g})")
     return "  ".join(seen)
+
+
+def camera_state(status: RobotStatus) -> str:
+    """Return what the camera says now."""
+    camera = status.camera
+    assert camera is not None
+    x, y, yaw = camera.pose
+    found = f"camera: x {x:+.3f} m  y {y:+.3f} m  yaw {yaw:+.3f} rad, {1e3 * (status.time - camera.time):.0f} ms old"
+    if not camera.reason:
+        return found
+    return f"{found}; {'wrong: ' if camera.is_wrong else 'no pose: '}{camera.reason}"
+
+
+def camera_line(found: dict[str, Any]) -> str:
+    """Return what came of a camera in a run, from the control loop's statistics."""
+    line = f"camera: {found['frames']} frames, {found['rate']:.1f} per second, {found['poses']} poses"
+    if latency := found.get("latency"):
+        tail = f"(99 %: {latency['p99']:.0f}, max {latency['max']:.0f})"
+        line += f"; from exposure to the control step {latency['p50']:.0f} ms {tail}"
+    if lag := found.get("lag"):
+        line += f"; pictures older than their stamps by {lag['ms']:.0f} +- {lag['std']:.0f} ms, by the gyroscope"
+    reasons = ", ".join(
+        f"{reason} {count}" for reason, count in sorted(found["without_pose"].items(), key=lambda item: -item[1])
+    )
+    return f"{line}; frames without a believed pose: {reasons or 'none'}"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, nearest
-from wlr_gym.data.format import CAMERA, CHANNELS, COLUMNS, REQUIRED
+from wlr_gym.data.format import CAMERA, CHANNELS, COLUMNS, FLOW, REQUIRED
 from wlr_gym.robot import JOINTS, WHEELS
 
 Array = NDArray[np.float64]
@@ -67,6 +67,7 @@ _UNIT_LIMITS = (
     _UnitLimit("vel_leg", 0.95, 25.0, "degrees per second"),
     _UnitLimit("vel_wheel", 0.95, 25.0, "degrees per second"),
     _UnitLimit("gyro", 0.95, 25.0, "degrees per second"),
+    _UnitLimit("flow", 0.95, 25.0, "degrees per second"),
     _UnitLimit("cam_xy", 0.8, 5.0, "millimetres", rate=True),
     _UnitLimit("cam_yaw", 0.8, 25.0, "degrees", rate=True),
     _UnitLimit("cam_pitch", 0.9, math.pi / 2, "degrees"),
@@ -241,7 +242,7 @@ def _gaps(t: Array) -> Iterable[Finding]:
 
 
 def _missing(table: Table) -> Iterable[Finding]:
-    for name in CHANNELS:
+    for name in (*CHANNELS, *FLOW):
         if name not in table:
             continue
         nan = np.isnan(table[name])

@@ -49,6 +49,8 @@ def _joint_columns(kind: str, unit: tuple[str, str], doc: str, **flags: bool) ->
     ]
 
 
+_NO_READING = "NaN without a new valid reading"
+
 _TABLE: list[Column] = [
     Column(
         "t", "t", "s", "host clock when the row's sensors were read; strictly increasing, nominally 20 ms apart", required=True
@@ -90,14 +92,23 @@ _TABLE: list[Column] = [
     Column("cam_z", "cam_z", "m", "side view: height of the marker's centre; NaN without a new frame", may_be_nan=True),
     Column("cam_pitch", "cam_pitch", "rad", "side view: pitch, nose down positive; NaN without a new frame", may_be_nan=True),
     Column("volt", "volt", "V", "supply voltage"),
+    Column("cam_age", "cam_age", "s", "age of the last vision pose when the row's sensors were read; live cameras only"),
+    *[
+        Column(f"flow_{axis}", "flow", "rad/s", f"optical flow along body {axis}, {law}; {_NO_READING}", may_be_nan=True)
+        for axis, law in (("x", "v_x/h - w_y"), ("y", "v_y/h + w_x"))
+    ],
+    Column("flow_quality", "flow_quality", "-", f"surface quality of the flow sensor, 0 to 1; {_NO_READING}", may_be_nan=True),
+    Column("flow_age", "flow_age", "s", "time since the interval of the last valid flow reading ended"),
 ]
 
 #: All columns by name, in the order files are written.
 COLUMNS: dict[str, Column] = {column.name: column for column in _TABLE}
 REQUIRED = tuple(name for name, column in COLUMNS.items() if column.required)
 COMMANDS = tuple(f"cmd_{joint}" for joint in JOINTS)
-#: What the robot measured: everything but the clock and the commands.
-CHANNELS = tuple(name for name in COLUMNS if name != "t" and name not in COMMANDS)
+#: Of an optical-flow sensor, where there is one.
+FLOW = ("flow_x", "flow_y", "flow_quality", "flow_age")
+#: What the robot measured and a replay predicts: everything but clocks, commands and optical flow.
+CHANNELS = tuple(name for name in COLUMNS if name not in ("t", "cam_age", *COMMANDS, *FLOW))
 CAMERA = ("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch")
 ANGLES_OF_THE_BODY = ("cam_yaw", "cam_pitch")
 

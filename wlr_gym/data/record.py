@@ -18,7 +18,7 @@ from wlr_gym.data.format import COMMANDS, Profile, RunMeta
 from wlr_gym.data.read import Run, read_meta
 from wlr_gym.data.replay import held_setpoints, profile_parameters
 from wlr_gym.data.run_states import standing_at
-from wlr_gym.data.sensor_columns import SENSED, channels
+from wlr_gym.data.sensor_columns import channels, sensed_columns
 from wlr_gym.data.simulation_record import Simulation, departures, start_of
 from wlr_gym.data.write import write_meta, write_run
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
@@ -141,7 +141,8 @@ def record_simulation(
     options, seeds = PlantOptions(control_period=motion.period), np.array([seed], np.uint64)
     torque_on = np.isfinite(motion.setpoints)
     plant = make_plant(backend, robot, 1, options, patch.forces)
-    rows = np.empty((len(motion.setpoints), len(SENSED)))
+    columns = sensed_columns(robot)
+    rows = np.empty((len(motion.setpoints), len(columns)))
     try:
         plant.reset(seeds, parameters, state=standing_at(start_setpoints(motion, robot)[None], robot, parameters))
         for _ in range(round(SETTLE / motion.period)):
@@ -149,7 +150,7 @@ def record_simulation(
         start = replace(plant.mechanical_state(), time=np.zeros(1))  # the run begins here
         sensors = plant.reset(seeds, parameters, state=start)
         for tick, setpoints in enumerate(motion.setpoints):
-            rows[tick] = channels(sensors, 0)
+            rows[tick] = channels(sensors, 0, columns)
             on = torque_on[tick : tick + 1]
             sensors = plant.step(np.nan_to_num(setpoints)[None], None if on.all() else on)
     finally:
@@ -166,7 +167,7 @@ def record_simulation(
         start=start_of(start, 0),
     )
     table = {"t": motion.period * np.arange(len(rows)), **dict(zip(COMMANDS, motion.setpoints.T, strict=True))}
-    table |= dict(zip(SENSED, rows.T, strict=True))
+    table |= dict(zip(columns, rows.T, strict=True))
     return write_run(path, table, meta_of(motion, robot, meta), record, robot)
 
 

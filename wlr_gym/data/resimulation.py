@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import COMMANDS
 from wlr_gym.data.read import Run
-from wlr_gym.data.sensor_columns import SENSED, channels
+from wlr_gym.data.sensor_columns import channels, sensed_columns
 from wlr_gym.data.simulation_record import Simulation, simulation_path
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.physics.plants import make_plant
@@ -42,29 +42,29 @@ def simulate_again(run: Run, robot: Robot, backend: str | None = None) -> dict[s
         backend: another plant than the record's.
 
     Returns:
-        The channels of :data:`SENSED`, each (rows,).
+        The channels of the robot's sensors, each (rows,).
 
     Raises:
         InputError: no record beside the run, or one that does not fit the table or the plant.
     """
     rows = [values for _, _, values in simulated_rows(run, robot, backend)]
-    return dict(zip(SENSED, np.array(rows).T, strict=True))
+    return dict(zip(sensed_columns(robot), np.array(rows).T, strict=True))
 
 
 def simulated_rows(run: Run, robot: Robot, backend: str | None = None) -> Iterator[tuple[Parameters, Truth, Array]]:
-    """Yield what :func:`simulate_again` knows at each row of a run: parameters (1), truth (1), channels of :data:`SENSED`."""
+    """Yield what :func:`simulate_again` knows at each row of a run: parameters (1), truth (1), readings."""
     record = _record_of(run)
     names = ("control_period", "physics_step", "precision", "sensor_noise")
     options = PlantOptions(**{name: getattr(record, name) for name in names})
     setpoints = np.stack([run[name] for name in COMMANDS], axis=1)
-    parameters = simulated_parameters(run, robot)
+    parameters, columns = simulated_parameters(run, robot), sensed_columns(robot)
     changes = {change.row: change.parameters for change in record.changes}
     forces = load_patch(record.formulas).forces
     plant = make_plant(record.backend if backend is None else backend, robot, 1, options, forces)
     try:
         sensors = plant.reset(np.array([record.seed], np.uint64), parameters, state=_state(record, run))
         for row, wanted in enumerate(setpoints):
-            yield parameters, plant.truth(), channels(sensors, 0)
+            yield parameters, plant.truth(), channels(sensors, 0, columns)
             if row in changes:
                 _set(parameters, changes[row])
                 plant.set_parameters(parameters)

@@ -18,14 +18,14 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.envs.actions import Actions
 from wlr_gym.envs.commands import Commands
 from wlr_gym.envs.episodes import Episodes
-from wlr_gym.envs.measured import measurable, measured_truth
+from wlr_gym.envs.measured import measurable, measured_truth, require_flow
 from wlr_gym.envs.observation import ObservationPipeline
 from wlr_gym.envs.randomized_robots import RandomizedRobots
 from wlr_gym.envs.settings import Settings
 from wlr_gym.envs.tasks.compiled_terms import Scores, compile_computed, compile_scores
 from wlr_gym.envs.tasks.describe import contract, describe
 from wlr_gym.envs.tasks.randomization import load_randomization
-from wlr_gym.envs.tasks.signals import START
+from wlr_gym.envs.tasks.signals import PRESENCE, START
 from wlr_gym.envs.tasks.task import Task, bounds, load_task
 from wlr_gym.envs.tasks.task_config import RampConfig
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
@@ -84,7 +84,7 @@ class Core:
         self.unmeasured: tuple[str, ...] = ()
         self.task = make_task(task_name, settings)
         if settings.is_real:
-            self.task, self.unmeasured = measurable(self.task)
+            self.task, self.unmeasured = measurable(self.task, settings.has_camera)
         config, robot = self.task.config, self.task.robot
         chosen = config.randomization if settings.randomization is None else settings.randomization
         self.randomization = load_randomization("none" if settings.is_real else chosen, robot)
@@ -97,6 +97,8 @@ class Core:
             sensor_noise=settings.is_real or self.randomization.config.sensor_noise,
         )
         self.plant = plants.make_plant(settings.backend, robot, self.count, options, self.patch.forces, settings.robot_options)
+        if settings.is_real:
+            require_flow(self.task, bool(self.plant.parameters["flow.present"][0]))
         self.limit: int = self.task.episode_steps
         self.dictionary: bool = settings.observation == "dict"
         self.observer: SlipObserver | None = None
@@ -123,7 +125,7 @@ class Core:
         task, count, real = self.task, self.count, self.settings.is_real
         period = task.config.control_period
         self.episodes = Episodes(count)
-        self.robots = RandomizedRobots(task.robot, self.randomization, self.patch, period, count)
+        self.robots = RandomizedRobots(task.robot, self.randomization, self.patch, period, count, task.config.sensors)
         self.actions = Actions(task.actions, count, self.settings.free_wheels)
         self.commands = Commands(task.config, count)
         self.pipeline = ObservationPipeline(
@@ -141,6 +143,7 @@ class Core:
         self._score_buffers = tuple(self.scores)
         self._no_estimate = np.zeros((count, ESTIMATE_LAYOUT.width))
         self.start = np.zeros((count, len(START)))
+        self.presence = np.zeros((count, len(PRESENCE)))
         self.end_time = np.zeros(count)
         self._clock = self.end_time[:, None]
         self.computed = np.zeros((count, len(task.computed)))
@@ -197,6 +200,7 @@ class Core:
 
     def _begin_observing(self, mask: Mask, held_commands: Mapping[int, float]) -> None:
         rows = np.flatnonzero(mask)
+        self._note_presence()
         if self.observer is not None:
             self.observer.reset(mask, self.sensors.values)
         self.pipeline.begin(rows, self.episodes.seeds[rows])
@@ -264,8 +268,15 @@ class Core:
             going_on = mask & ~(self.terminated | self.truncated) if any_done else mask
             if self.robots.change(going_on, self.episodes):
                 self.plant.set_parameters(self.parameters, self.robots.changed)
+                self._note_presence()
         self._observe(mask, signals, first=False)
         return any_done
+
+    def _note_presence(self) -> None:
+        """Note which sensors the robots have now; a real robot's plant knows what is connected."""
+        parameters = self.plant.parameters if self.settings.is_real else self.parameters
+        for column, sensor in enumerate(PRESENCE):
+            self.presence[:, column] = parameters[f"{sensor}.present"] > 0.5
 
     def _signals(self) -> tuple[Array, ...]:
         """What terms and observations read, in the order of ``MATRICES``; what a real robot measures stands for the truth."""
@@ -278,6 +289,7 @@ class Core:
             self.actions.previous,
             self.start,
             self._clock,
+            self.presence,
             self.computed,
         )
 

@@ -35,18 +35,18 @@ def measured_truth(sensors: Sensors) -> Array:
     return truth
 
 
-def measurable(task: Task) -> tuple[Task, tuple[str, ...]]:
+def measurable(task: Task, has_camera: bool) -> tuple[Task, tuple[str, ...]]:
     """Return the task with the rewards, terminations and measures that a robot can measure, and the names of those it cannot.
 
     A robot does not know its speed over the floor, its slip, or the height of its body. The safety rules watch its tilt.
-    The slip observer runs on its sensors, without a camera.
+    The slip observer runs on its sensors, and on the camera's poses where there is one.
 
     Raises:
-        InputError: an observation that needs the true state or the camera.
+        InputError: an observation that needs the true state, or a camera where there is none.
     """
     for column in task.policy:
-        if column.device == "camera":
-            raise InputError(f"observation '{column.term}': the robot has no camera of its own")
+        if column.device == "camera" and not has_camera:
+            raise InputError(f"observation '{column.term}': this robot has no camera; see docs/camera.md")
         if column.source == "truth" or (column.source == "computed" and not _is_known(COMPUTED[column.term].function)):
             raise InputError(f"observation '{column.term}': only a simulator knows the true state")
     kept, left_out = {}, []
@@ -57,6 +57,18 @@ def measurable(task: Task) -> tuple[Task, tuple[str, ...]]:
     kept["success"] = {name: limits for name, limits in task.config.success.items() if name in kept["measures"]}
     config = task.config.model_copy(update=kept)
     return replace(task, config=config, privileged=()), tuple(dict.fromkeys(left_out))
+
+
+def require_flow(task: Task, has_flow: bool) -> None:
+    """Refuse a task that observes optical flow on a robot without the sensor, unless it is one that does without at times.
+
+    Raises:
+        InputError: names the observation.
+    """
+    always = task.config.sensors.flow is None or task.config.sensors.flow >= 1.0
+    for column in task.policy:
+        if column.device == "flow" and always and not has_flow:
+            raise InputError(f"observation '{column.term}': this robot has no optical-flow sensor; see docs/optical_flow.md")
 
 
 def _is_known(function: Callable[..., Any]) -> bool:

@@ -71,7 +71,7 @@ def _observe(mask: Any, first: bool, signals: Any, seeds: Any, steps: Any, table
 @njit(cache=True, nogil=True, error_model="numpy")
 def _read(mask: Any, first: bool, signals: Any, seeds: Any, steps: Any, readings: Any, buffers: Any) -> None:
     """Take the readings into the ring."""
-    sensors, estimate, truth, command, action, _, _, _, computed = signals
+    sensors, estimate, truth, command, action, _, _, _, _, computed = signals
     bias, _, ring, _ = buffers
     depth = ring.shape[1]
     for i in range(len(mask)):
@@ -126,7 +126,7 @@ def _show(mask: Any, steps: Any, shown: Any, buffers: Any) -> None:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _pick(mask: Any, signals: Any, picked: Any, out: Any) -> None:
     """Copy columns of the truth and of what is computed, clipped to a limit and scaled."""
-    _, _, truth, _, _, _, _, _, computed = signals
+    _, _, truth, _, _, _, _, _, _, computed = signals
     for i in range(len(mask)):
         if mask[i]:
             for d in range(len(picked)):

@@ -1,4 +1,5 @@
-"""Parameters and initial states of the robots: what randomisation draws, then the effects, then what the user sets."""
+"""Parameters and initial states of the robots: what randomisation draws, then the effects, then which sensors the task gives
+them, then what the user sets."""
 
 from __future__ import annotations
 
@@ -11,7 +12,9 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import RowStore
 from wlr_gym.envs.episodes import Episodes
+from wlr_gym.envs.tasks.draws import stream_numbers, uniforms
 from wlr_gym.envs.tasks.randomization import DRIFT_PERIOD, Randomization
+from wlr_gym.envs.tasks.task_config import SensorsConfig
 from wlr_gym.physics.effects import Patch, apply_patch
 from wlr_gym.physics.plants.base import PlantState
 from wlr_gym.robot import Robot
@@ -23,6 +26,8 @@ Rows = NDArray[np.intp]
 Seeds = NDArray[np.uint64]
 Counts = NDArray[np.int64]
 
+_AS_THE_ROBOT = SensorsConfig()
+
 
 class RandomizedRobots:
     """Parameters and initial states of N robots.
@@ -33,6 +38,7 @@ class RandomizedRobots:
         patch: effects that are added to it.
         control_period: s.
         count: N.
+        sensors: how often a sensor is present.
 
     Attributes:
         parameters: present parameters of every robot.
@@ -41,9 +47,19 @@ class RandomizedRobots:
         share: of the randomisation that new episodes are drawn with, below 1 early in a curriculum.
     """
 
-    def __init__(self, robot: Robot, randomization: Randomization, patch: Patch, control_period: float, count: int) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        randomization: Randomization,
+        patch: Patch,
+        control_period: float,
+        count: int,
+        sensors: SensorsConfig = _AS_THE_ROBOT,
+    ) -> None:
         self._randomization = randomization
         self._patch = patch
+        self._presence = [(f"{name}.present", share) for name, share in sensors if share is not None]
+        self._presence_streams = stream_numbers(*(name for name, _ in self._presence))
         self._period = control_period
         self.share: float = 1.0
         self._shares = np.ones(count)  # that the present episodes were drawn with
@@ -140,9 +156,12 @@ class RandomizedRobots:
     def _draw(
         self, robot_seeds: Seeds, seeds: Seeds, share: Array, occurrences: Counts | None = None, time: Array | None = None
     ) -> Parameters:
-        """Randomisation of some robots, then the effects."""
+        """Randomisation of some robots, then the effects, then the sensors."""
         robots = self._randomization.parameters(robot_seeds, seeds, occurrences, time, share)
-        return apply_patch(self._patch, robots) if self._patch else robots
+        robots = apply_patch(self._patch, robots) if self._patch else robots
+        for (name, share), drawn in zip(self._presence, uniforms(seeds, self._presence_streams).T, strict=True):
+            robots[name] = drawn < share
+        return robots
 
     def _wait(self, rows: Rows, seeds: Seeds) -> Counts:
         """Control steps (M, intervals) until each interval event strikes some robots next."""

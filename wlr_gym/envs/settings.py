@@ -143,6 +143,12 @@ class Settings:
         return self.backend in REAL
 
     @property
+    def has_camera(self) -> bool:
+        """Whether there is a camera above a real robot."""
+        options = self.robot_options
+        return options is not None and options.camera is not None
+
+    @property
     def robot_options(self) -> RobotOptions | None:
         """Which real robot; None for simulators."""
         return read_robot_options(self.hardware) if self.is_real else None

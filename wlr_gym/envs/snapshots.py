@@ -38,7 +38,12 @@ class Snapshots:
             "observation": core.settings.observation,
         }
         parts = (core.episodes, core.robots, core.actions, core.commands, core.pipeline, core.observer)
-        self._stores: dict[str, RowStore] = {"start": core.start, "end_time": core.end_time, "computed": core.computed}
+        self._stores: dict[str, RowStore] = {
+            "start": core.start,
+            "end_time": core.end_time,
+            "computed": core.computed,
+            "presence": core.presence,
+        }
         self._stores |= {f"score_{name}": values for name, values in core.scores._asdict().items()}
         self._stores |= {name: store for part in parts if part is not None for name, store in part.stores().items()}
 

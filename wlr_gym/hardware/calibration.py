@@ -16,7 +16,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file
 from wlr_gym.base.paths import named_in
 from wlr_gym.base.settings import read_yaml
-from wlr_gym.hardware.config import Hardware, ImuCalibration, Mounting
+from wlr_gym.hardware.config import FlowCalibration, Hardware, ImuCalibration, Mounting
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
 from wlr_gym.robot import JOINTS
 
@@ -245,6 +245,12 @@ def with_imu_calibration(hardware: Hardware, calibration: ImuCalibration) -> Har
     return hardware.model_copy(update={"imu": hardware.imu.model_copy(update={"calibration": calibration})})
 
 
+def with_flow_calibration(hardware: Hardware, calibration: FlowCalibration) -> Hardware:
+    """Return the hardware with another calibration of its optical-flow sensor."""
+    assert hardware.flow is not None
+    return hardware.model_copy(update={"flow": hardware.flow.model_copy(update={"calibration": calibration})})
+
+
 def save_hardware(path: Path, source: Path, hardware: Hardware, section: str, note: str) -> None:
     """Write a hardware file in one step: the source's text with one section replaced, so that comments elsewhere stay.
 
@@ -252,7 +258,7 @@ def save_hardware(path: Path, source: Path, hardware: Hardware, section: str, no
         path: file to write; may be the source.
         source: file the hardware was loaded from.
         hardware: what its section shall say.
-        section: ``joints``, ``imu`` or ``measured``: the only part that is changed.
+        section: ``joints``, ``imu``, ``flow`` or ``measured``: the only part that is changed.
         note: comment for the section.
 
     Raises:

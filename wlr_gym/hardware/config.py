@@ -94,6 +94,47 @@ class ImuPort(SettingsModel):
         return self
 
 
+class FlowCalibration(SettingsModel):
+    """How an optical-flow sensor is mounted, and how much it is off. ``wlr calibrate flow`` writes it.
+
+    Attributes:
+        scale: measured over true flow.
+        mount_yaw: rotation about body z from body to sensor (rad), beyond what ``axes`` says.
+        date: day it was made.
+    """
+
+    scale: float = Field(default=1.0, gt=0.2, lt=5.0)
+    mount_yaw: float = Field(default=0.0, gt=-3.2, lt=3.2)
+    date: str | None = None
+
+
+FlowAxis = Literal["x", "-x", "y", "-y"]
+
+
+class FlowPort(SettingsModel):
+    """The optical-flow sensor: frames from a microcontroller's serial port (``stream``), or the chip on SPI (``spi``).
+
+    Its numbers stand in the robot's file (``sensors.flow``).
+
+    Attributes:
+        port: serial device, or SPI device (``/dev/spidev0.0``).
+        baud_rate: of the stream, bit/s.
+        axes: which of the chip's axes count up when the robot drives along body +x, and along body +y.
+    """
+
+    port: str
+    driver: Literal["stream", "spi"] = "stream"
+    baud_rate: int = Field(default=115200, gt=0)
+    axes: tuple[FlowAxis, FlowAxis] = ("-y", "-x")
+    calibration: FlowCalibration = FlowCalibration()
+
+    @model_validator(mode="after")
+    def _axes_are_two(self) -> FlowPort:
+        if self.axes[0][-1] == self.axes[1][-1]:
+            raise ValueError(f"axes {list(self.axes)}: expected one of the chip's x and one of its y")
+        return self
+
+
 class Mounting(SettingsModel):
     """How a servo sits on its joint: count = zero + sign * angle / count size; ``zero`` is within the servo's turn."""
 
@@ -132,6 +173,7 @@ class Hardware(SettingsModel):
     robot: str | None = None
     buses: dict[str, Bus]
     imu: ImuPort
+    flow: FlowPort | None = None
     joints: dict[str, Mounting]
     gamepad: PadButtons = PadButtons()
     safety: SafetyLimits = SafetyLimits()
@@ -202,14 +244,16 @@ def _with_servo_files(data: Any, where: str) -> Any:
 
 
 def with_ports(hardware: Hardware, ports: dict[str, str]) -> Hardware:
-    """Return the same hardware on other ports: bus name or ``imu`` -> path.
+    """Return the same hardware on other ports: bus name, ``imu`` or ``flow`` -> path.
 
     Raises:
         InputError: a name that is no bus.
     """
-    unknown = set(ports) - set(hardware.buses) - {"imu"}
+    sensors = ["imu"] if hardware.flow is None else ["imu", "flow"]
+    unknown = set(ports) - set(hardware.buses) - {*sensors}
     if unknown:
-        raise InputError(f"no bus '{sorted(unknown)[0]}'; the buses are {', '.join([*hardware.buses, 'imu'])}")
+        raise InputError(f"no bus '{sorted(unknown)[0]}'; the buses are {', '.join([*hardware.buses, *sensors])}")
     buses = {name: bus.model_copy(update={"port": ports.get(name, bus.port)}) for name, bus in hardware.buses.items()}
     imu = hardware.imu.model_copy(update={"port": ports.get("imu", hardware.imu.port)})
-    return hardware.model_copy(update={"buses": buses, "imu": imu})
+    flow = None if hardware.flow is None else hardware.flow.model_copy(update={"port": ports.get("flow", hardware.flow.port)})
+    return hardware.model_copy(update={"buses": buses, "imu": imu, "flow": flow})

@@ -133,7 +133,7 @@ class LoggedPlant:
     """Returns what a log says the robot read; for a :class:`Core` that is to see again what it saw."""
 
     def __init__(self, core: Core, run: Run) -> None:
-        self.capabilities = core.plant.capabilities
+        self.capabilities, self.parameters = core.plant.capabilities, core.plant.parameters
         self._rows = _sensor_rows(run)
         self._at = 0
 
@@ -158,7 +158,32 @@ def _sensor_rows(run: Run) -> list[Sensors]:
         names = [f"{prefix}_{label}" for label in SENSOR_LAYOUT.channels[channel].labels]
         values[:, SENSOR_LAYOUT.slices[channel]] = np.stack([run[name] for name in names], axis=1)
     values[:, SENSOR_LAYOUT.slices["supply_voltage"]] = run["volt"][:, None]
+    if "flow_age" in run:
+        _fill_flow(values, run)
+    if "cam_age" in run:
+        _fill_camera(values, run)
     return [Sensors(row[None]) for row in values]
+
+
+def _fill_flow(values: NDArray[np.float64], run: Run) -> None:
+    """Write what a run says of optical flow into its sensors; a reading is held until the next, its quality is not."""
+    seen = np.stack([run["flow_x"], run["flow_y"], run["flow_quality"]], axis=1)
+    is_new = np.isfinite(seen[:, 0])
+    last = np.maximum.accumulate(np.where(is_new, np.arange(len(seen)), -1))
+    values[:, SENSOR_LAYOUT.slices["flow"]] = np.where(last[:, None] >= 0, seen[last, :2], 0.0)
+    values[:, SENSOR_LAYOUT.slices["flow_quality"]] = np.where(is_new, seen[:, 2], 0.0)[:, None]
+    values[:, SENSOR_LAYOUT.slices["flow_age"]] = run["flow_age"][:, None]
+    values[:, SENSOR_LAYOUT.slices["flow_is_new"]] = is_new[:, None]
+
+
+def _fill_camera(values: NDArray[np.float64], run: Run) -> None:
+    """Write what a run says of its camera into its sensors; a pose is held until the next."""
+    seen = np.stack([run["cam_x"], run["cam_y"], run["cam_yaw"]], axis=1)
+    is_new = np.isfinite(seen[:, 0])
+    last = np.maximum.accumulate(np.where(is_new, np.arange(len(seen)), -1))
+    values[:, SENSOR_LAYOUT.slices["camera_pose"]] = np.where(last[:, None] >= 0, seen[last], 0.0)
+    values[:, SENSOR_LAYOUT.slices["camera_age"]] = run["cam_age"][:, None]
+    values[:, SENSOR_LAYOUT.slices["camera_is_new"]] = is_new[:, None]
 
 
 def read_policy_log(run: Path) -> dict[str, NDArray[np.float64]]:

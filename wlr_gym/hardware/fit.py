@@ -20,8 +20,14 @@ def check_fit(robot: Robot, hardware: Hardware) -> None:
     """Refuse a robot whose servos' numbers are not those of the models that it is wired with.
 
     Raises:
-        InputError: names the first difference: supply voltage, encoder counts, or what the servo reports of its torque.
+        InputError: names the first difference: supply voltage, encoder counts, what the servo reports of its torque, or a
+            sensor that only one of them has.
     """
+    if hardware.flow is not None and robot.sensors.flow is None:
+        raise InputError(
+            f"hardware '{hardware.name}' has an optical-flow sensor, robot '{robot.name}' has not: its file needs a section "
+            "sensors.flow, as in configs/robot/flow.yaml"
+        )
     for name, bus in hardware.buses.items():
         table = load_table(bus.model)
         for joint in bus.joints:

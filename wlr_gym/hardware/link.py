@@ -1,12 +1,17 @@
-"""What a control loop is connected to: servos, IMU and clock."""
+"""What a control loop is connected to: servos, sensors and clock."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
+from wlr_gym.hardware.camera.config import CameraFile
+from wlr_gym.hardware.camera.live import LiveCamera
+from wlr_gym.hardware.camera.reading import CameraReader
 from wlr_gym.hardware.config import Hardware
+from wlr_gym.hardware.flow.driver import Flow, make_flow
 from wlr_gym.hardware.imu.driver import Imu, make_imu
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.hardware.timing import Clock, MonotonicClock
@@ -21,8 +26,10 @@ class Link:
         servos: closed at first.
         imu: closed at first.
         clock: what deadlines and ages are told by.
+        flow: optical-flow sensor, closed at first; None = there is none.
         is_serial: there are real ports, which a watchdog process can open.
         finish: called after closing.
+        camera: above the floor; None = there is none.
     """
 
     servos: Servos
@@ -30,6 +37,8 @@ class Link:
     clock: Clock
     is_serial: bool
     finish: Callable[[], None] = lambda: None
+    flow: Flow | None = None
+    camera: CameraReader | None = None
 
     def open(self) -> None:
         """Open all ports, or none.
@@ -41,17 +50,36 @@ class Link:
             self.servos.open()
             stack.callback(self.servos.close)
             self.imu.open()
+            stack.callback(self.imu.close)
+            if self.flow is not None:
+                self.flow.open()
+                stack.callback(self.flow.close)
+            if self.camera is not None:
+                self.camera.open()
             stack.pop_all()
 
     def close(self) -> None:
         """Close all ports; servos stay as they are."""
         self.servos.close()
         self.imu.close()
+        if self.flow is not None:
+            self.flow.close()
+        if self.camera is not None:
+            self.camera.close()
         self.finish()
 
 
-def serial_link(robot: Robot, hardware: Hardware) -> Link:
-    """Return a link over the hardware file's ports."""
+def serial_link(robot: Robot, hardware: Hardware, camera: CameraFile | None = None, poses: Path | None = None) -> Link:
+    """Return a link over the hardware file's ports.
+
+    Args:
+        robot: the robot.
+        hardware: wiring and mounting.
+        camera: above the floor; None = there is none.
+        poses: where an emulated robot writes its true pose, for a camera that films it by rendering; None = a real camera.
+    """
     clock = MonotonicClock()
     servos = Servos(robot, hardware, hardware.safety.patience, clock.now)
-    return Link(servos, make_imu(hardware.imu, clock.now), clock, is_serial=True)
+    flow = make_flow(robot, hardware, clock.now)
+    eye = None if camera is None else LiveCamera(camera, robot, poses)
+    return Link(servos, make_imu(hardware.imu, clock.now), clock, is_serial=True, flow=flow, camera=eye)

@@ -23,7 +23,7 @@ from wlr_gym.base.files import make_output_folder
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, RunMeta
 from wlr_gym.data.logs.stream import McapStream
 from wlr_gym.data.robot_file import note_robot
-from wlr_gym.data.sensor_columns import SENSED, channels
+from wlr_gym.data.sensor_columns import LIVE_CAMERA, channels, sensed_columns
 from wlr_gym.data.write import write_meta
 from wlr_gym.hardware.safety.state import RobotStatus
 from wlr_gym.hardware.step import StepRecord
@@ -34,9 +34,13 @@ from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS, Robot
 PARTIAL = "partial_"
 #: Phases of the control loop that begin a table, and its kind.
 _TABLES = {"ramp": "ramp", "running": "run"}
-#: Columns of a run on the robot, in their order.
-ROW = [name for name in COLUMNS if name == "t" or name in COMMANDS or (name in SENSED and name not in CAMERA)]
-_ORDER = [("t", *COMMANDS, *SENSED).index(name) for name in ROW]
+
+
+def row_columns(robot: Robot, has_camera: bool) -> list[str]:
+    """Return the columns of a run on the robot, in their order."""
+    given = ("t", *COMMANDS, *sensed_columns(robot), *LIVE_CAMERA)
+    left_out = () if has_camera else (*CAMERA, *LIVE_CAMERA)
+    return [name for name in COLUMNS if name in given and name not in left_out]
 
 
 def _append(file: io.FileIO, line: str) -> None:
@@ -94,15 +98,19 @@ class RunLog:
         folder: made if it is not there; runs are numbered on from those in it.
         meta: written as ``meta.yaml``, with the robot.
         robot: whose runs they are.
+        has_camera: its poses are written, too.
 
     Raises:
         InputError: the folder cannot be written to, or its ``meta.yaml`` says something else.
     """
 
-    def __init__(self, folder: Path, meta: RunMeta, robot: Robot) -> None:
+    def __init__(self, folder: Path, meta: RunMeta, robot: Robot, has_camera: bool = False) -> None:
         make_output_folder(folder)
         write_meta(folder, note_robot(folder, robot, meta))
         self.folder = folder
+        self.columns = row_columns(robot, has_camera)
+        self._sensed = sensed_columns(robot)
+        self._order = [("t", *COMMANDS, *self._sensed, *LIVE_CAMERA).index(name) for name in self.columns]
         self.number: int = 1 + max((_number(path) for path in folder.iterdir()), default=0)
         self._tables: dict[str, CsvTable] = {}
         self._current = ""
@@ -123,14 +131,14 @@ class RunLog:
         """Write rows to ``ramp`` or ``run`` from here on."""
         self._current = kind
         if kind not in self._tables:
-            self._tables[kind] = CsvTable(self.folder / f"{self.name(kind)}.csv", ROW)
+            self._tables[kind] = CsvTable(self.folder / f"{self.name(kind)}.csv", self.columns)
 
     def row(self, time: float, sensors: Sensors, setpoints: np.ndarray) -> np.ndarray | None:
         """Write what was read at ``time`` (s) and what was then asked for (NaN = motor off); return a run's row, else None."""
         if not self._current or time <= self._last:  # the readings of an interrupted control step come twice
             return None
         self._last = time
-        values = np.concatenate([[time], setpoints, channels(sensors, 0)])[_ORDER]
+        values = np.concatenate([[time], setpoints, channels(sensors, 0, self._sensed), sensors.camera_age])[self._order]
         self._tables[self._current].add(values)
         return values if self._current == "run" else None
 
@@ -176,16 +184,19 @@ class RunRecorder:
         meta: of the runs.
         clock: of the runs.
         robot: whose runs they are.
+        has_camera: its poses are logged, too.
 
     Attributes:
+        columns: of a row.
         log: of the present or last run.
         trouble: why the log cannot be written; empty = it can.
         origin: what wheel angles and the camera's age count from.
-        stream: where rows of the run go besides; it has the columns of :data:`ROW`.
+        stream: where rows of the run go besides; it has these columns.
     """
 
-    def __init__(self, folder: Path | None, meta: RunMeta, clock: Clock, robot: Robot) -> None:
-        self.folder, self.meta, self._robot = folder, meta, robot
+    def __init__(self, folder: Path | None, meta: RunMeta, clock: Clock, robot: Robot, has_camera: bool = False) -> None:
+        self.folder, self.meta, self._robot, self._has_camera = folder, meta, robot, has_camera
+        self.columns = row_columns(robot, has_camera)
         self.log: RunLog | None = None
         self.trouble = ""
         self.stream: McapStream | None = None
@@ -193,6 +204,8 @@ class RunRecorder:
         self._clock = clock
         self._checks: list[str] = []
         self._rules: frozenset[str] = frozenset()
+        self._flow_trouble = ""
+        self._camera: str | None = None  # why it gave no pose in the last control step
 
     @property
     def run(self) -> Path | None:
@@ -207,7 +220,7 @@ class RunRecorder:
         if self.log is not None:
             self.log.finish()
         self.trouble = ""
-        self.log = RunLog(self.folder, self.meta, self._robot)
+        self.log = RunLog(self.folder, self.meta, self._robot, self._has_camera)
         self.log.event(self._clock.now(), "checks", found=self._checks)
 
     def phase(self, name: str, reason: str) -> None:
@@ -233,6 +246,27 @@ class RunRecorder:
             for rule in rules.keys() - self._rules:
                 self.log.event(status.time, "intervention", rule=rule, row=record.count, **rules[rule])
             self._rules = frozenset(rules)
+            self._note_camera(record)
+            self._note_flow(record)
+
+    def _note_camera(self, record: StepRecord) -> None:
+        """Write an event where the camera begins to give no pose, for a reason, and where it gives one again."""
+        assert self.log is not None
+        status = record.status
+        if status.camera is not None and status.camera.reason != self._camera:
+            self._camera = status.camera.reason
+            self.log.event(status.time, "camera", row=record.count, no_pose=self._camera or None)
+
+    def _note_flow(self, record: StepRecord) -> None:
+        """Write an event where optical flow begins to be missing, for a reason, or is odd, and where it is well again."""
+        assert self.log is not None
+        reading = record.status.flow
+        if reading is None or not (reading.trouble or reading.is_new):
+            return
+        kind = (reading.trouble or reading.note).partition(":")[0]
+        if kind != self._flow_trouble:
+            self.log.event(record.status.time, "flow", row=record.count, trouble=reading.trouble, note=reading.note)
+            self._flow_trouble = kind
 
     def policy(self, names: list[str], values: np.ndarray) -> None:
         """Write what the policy was commanded and answered for the row that comes next."""
@@ -277,7 +311,7 @@ def origin_of(status: RobotStatus) -> RunOrigin:
 def sensors_of(status: RobotStatus, origin: RunOrigin) -> Sensors:
     """Return what was read as a plant's sensors (1, W); wheels from where they stood at the run's start.
 
-    There is no camera: its pose stays 0 and is never new, its age counts from the start.
+    Without a camera its pose stays 0 and is never new, and its age counts from the start; so it does until the first pose.
     """
     sensors = Sensors(np.zeros((1, SENSOR_LAYOUT.width)))
     sensors.joint_position[0] = status.position
@@ -286,7 +320,13 @@ def sensors_of(status: RobotStatus, origin: RunOrigin) -> Sensors:
     sensors.gyro[0], sensors.accelerometer[0] = status.gyro, status.accelerometer
     sensors.supply_voltage[0] = np.mean(status.voltage)
     sensors.joint_age[0], sensors.imu_age[0] = status.silence.max(), status.imu_silence
-    sensors.camera_age[0] = status.time - origin.time
+    sensors.camera_age[0] = sensors.flow_age[0] = status.time - origin.time
+    if status.flow is not None:
+        sensors.flow[0], sensors.flow_quality[0] = status.flow.flow, status.flow.quality
+        sensors.flow_age[0], sensors.flow_is_new[0] = status.flow.age, status.flow.is_new
+    if (camera := status.camera) is not None:
+        sensors.camera_pose[0], sensors.camera_age[0] = camera.pose, status.time - camera.time
+        sensors.camera_is_new[0] = camera.is_new
     return sensors
 
 

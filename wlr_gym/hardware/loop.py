@@ -112,10 +112,10 @@ class ControlLoop:
         self.clock: Clock = link.clock
         self.operator: Operator = Operator(link.clock)
         self.pacer: Pacer = Pacer(link.clock, period)
-        self.recorder: RunRecorder = RunRecorder(log, meta, link.clock, robot)
+        self.recorder: RunRecorder = RunRecorder(log, meta, link.clock, robot, has_camera=link.camera is not None)
         self._link, self._is_open = link, False
         self._limiter = CommandLimiter(link.servos, robot, hardware, link.clock, period, dry_run, meta.profile)
-        self._step = ControlStep(self._limiter, link.imu, self.operator, self.pacer)
+        self._step = ControlStep(self._limiter, link, self.operator, self.pacer)
         self._guard = Guard(robot, hardware, watchdog and link.is_serial and not dry_run)
 
     def __enter__(self) -> ControlLoop:
@@ -144,8 +144,8 @@ class ControlLoop:
         return sensors_of(self._step.known, self.recorder.origin)
 
     def statistics(self) -> dict[str, Any]:
-        """Return ticks, missed ones, percentiles of the timing (ms), and the command limiter's interventions."""
-        return {**self.pacer.statistics(), "interventions": dict(self.interventions)}
+        """Return ticks, missed ones, percentiles of the timing (ms), the limiter's interventions, what camera and flow gave."""
+        return {**self.pacer.statistics(), "interventions": dict(self.interventions), **self._step.sensor_statistics()}
 
     # ---- start-up ----
 
@@ -171,7 +171,7 @@ class ControlLoop:
                 self.recorder.new_run()
             self._enter(Phase.RAMP)
             self._follow_ramp(target)
-            self.recorder.origin = origin_of(self._step.known)
+            self.recorder.origin = origin_of(self._step.begin_run())
             self._enter(Phase.RUNNING)
         return self._step.known
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.data.format import RunMeta
+from wlr_gym.hardware.camera.config import load_camera_file
 from wlr_gym.hardware.config import Hardware, load_hardware, with_ports
 from wlr_gym.hardware.link import Link, serial_link
 from wlr_gym.hardware.loop import ControlLoop
@@ -21,6 +22,9 @@ from wlr_gym.robot.parameter_table import ELEMENTS
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
+
+#: Elements that say what is connected: whatever is asked for, a robot has what it has.
+_IS_CONNECTED = np.array([element in ("camera.present", "flow.present") for element in ELEMENTS])
 
 
 class RobotPlant:
@@ -69,6 +73,8 @@ class RobotPlant:
             description = description.model_copy(update={"safety": safety})
         if link is None:
             link = _link(robot, description, chosen, self.options)
+        self.parameters["flow.present"] = link.flow is not None
+        self.parameters["camera.present"] = link.camera is not None
         self.loop: ControlLoop = ControlLoop(
             robot,
             description,
@@ -135,7 +141,7 @@ class RobotPlant:
         """
         if len(parameters) != 1:
             raise InputError(f"parameters hold {len(parameters)} robots, the plant 1")
-        different = np.flatnonzero(parameters.values[0] != self.parameters.values[0])
+        different = np.flatnonzero((parameters.values[0] != self.parameters.values[0]) & ~_IS_CONNECTED)
         if len(different):
             raise InputError(
                 f"{ELEMENTS[different[0]]}: parameters of a real robot cannot be set (no randomisation, no effects)"
@@ -163,8 +169,9 @@ class RobotPlant:
 
 
 def _link(robot: Robot, hardware: Hardware, chosen: RobotOptions, options: PlantOptions) -> Link:
+    camera = None if chosen.camera is None else load_camera_file(chosen.camera)
     if not chosen.emulated:
-        return serial_link(robot, hardware)
+        return serial_link(robot, hardware, camera, chosen.poses)
     from wlr_gym.hardware.emulator.link import emulated_robot  # with the simulators, which a real robot does not need
 
-    return emulated_robot(robot, hardware, chosen.effects, sensor_noise=options.sensor_noise)
+    return emulated_robot(robot, hardware, chosen.effects, sensor_noise=options.sensor_noise, camera=camera)

@@ -1,4 +1,4 @@
-"""Reads servos and IMU, and keeps what was last known of a joint or sensor that does not answer."""
+"""Reads servos, IMU and optical flow, and keeps what was last known of a joint or sensor that does not answer."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from wlr_gym.hardware.camera.reading import CameraReader
+from wlr_gym.hardware.flow.driver import Flow
+from wlr_gym.hardware.flow.supervision import FlowSupervision
 from wlr_gym.hardware.imu.driver import Imu, ImuReading
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
 from wlr_gym.hardware.imu.reading import ImuGoneError
+from wlr_gym.hardware.safety.camera import CameraWatch
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.rules import VERTICAL_BAND, next_up, tilt_of
 from wlr_gym.hardware.safety.state import Mask, RobotStatus
@@ -37,15 +41,29 @@ class Sensing:
         imu: of the robot; open.
         clock: of the run.
         period: s of a control step.
+        camera: above the floor; None = there is none.
+        flow: optical-flow sensor, open; None = there is none.
 
     Attributes:
         count: readings of the joints since :meth:`first`.
+        watch: judges the camera's readings; None = there is none.
     """
 
-    def __init__(self, limiter: CommandLimiter, imu: Imu, clock: Clock, period: float) -> None:
+    def __init__(
+        self,
+        limiter: CommandLimiter,
+        imu: Imu,
+        clock: Clock,
+        period: float,
+        camera: CameraReader | None = None,
+        flow: Flow | None = None,
+    ) -> None:
+        self._camera = camera
+        self.watch: CameraWatch | None = None if camera is None else CameraWatch(limiter.robot)
         self.count = 0
         self._broken = 0  # packets until all joints answered last
         self._limiter, self._imu, self._clock, self._period = limiter, imu, clock, period
+        self._flow = None if flow is None else FlowSupervision(flow, limiter.robot)
 
     def first(self) -> RobotStatus:
         """Wait for the IMU; read everything once.
@@ -77,6 +95,7 @@ class Sensing:
             accelerometer=reading.accelerometer,
             imu_silence=reading.age,
             up=up,
+            flow=None if self._flow is None else self._flow.first(),
         )
 
     def _first_imu_reading(self) -> ImuReading:
@@ -101,7 +120,16 @@ class Sensing:
         return up
 
     def next(self, before: RobotStatus) -> RobotStatus:
-        """Read servos and IMU; what does not answer stays as it was, and its silence grows."""
+        """Read servos, IMU and camera; what does not answer stays as it was, and its silence grows."""
+        status = self._next_joints_and_imu(before)
+        if self._camera is None or self.watch is None:
+            return status
+        now = self._clock.now()
+        joints = (status.position, status.velocity)
+        seen = self.watch.next(now, joints, status.gyro, self._camera.read(now), self._camera.trouble)
+        return replace(status, camera=seen)
+
+    def _next_joints_and_imu(self, before: RobotStatus) -> RobotStatus:
         now = self._clock.now()
         elapsed = now - before.time
         lost = ""
@@ -114,8 +142,9 @@ class Sensing:
             reading = self._imu.read()
         except ImuGoneError:
             reading = None
+        flow = None if self._flow is None else self._flow.next(status.position, status.velocity, before.gyro, elapsed)
         if reading is None:
-            return replace(status, lost=lost, imu_silence=before.imu_silence + elapsed)
+            return replace(status, lost=lost, imu_silence=before.imu_silence + elapsed, flow=flow)
         return replace(
             status,
             lost=lost,
@@ -123,6 +152,7 @@ class Sensing:
             accelerometer=reading.accelerometer,
             imu_silence=reading.age,
             up=next_up(before.up, reading.gyro, reading.accelerometer, elapsed),
+            flow=flow,
         )
 
     def _next_joints(self, before: RobotStatus, now: float) -> RobotStatus:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.hardware.imu.driver import Imu
+from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.operator import Operator
+from wlr_gym.hardware.safety.camera import camera_statistics
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.rules import Decision
 from wlr_gym.hardware.safety.state import Level, RobotStatus
@@ -41,7 +43,7 @@ class ControlStep:
 
     Args:
         limiter: decides, limits and writes.
-        imu: of the robot.
+        link: its sensors are read.
         operator: what is asked for; served in the spare time.
         pacer: deadlines and statistics.
 
@@ -49,11 +51,11 @@ class ControlStep:
         status: what was last read; None = nothing yet.
     """
 
-    def __init__(self, limiter: CommandLimiter, imu: Imu, operator: Operator, pacer: Pacer) -> None:
+    def __init__(self, limiter: CommandLimiter, link: Link, operator: Operator, pacer: Pacer) -> None:
         self.status: RobotStatus | None = None
         self._limiter, self._operator, self._pacer = limiter, operator, pacer
-        self._clock = pacer.clock
-        self._sensing = Sensing(limiter, imu, pacer.clock, pacer.period)
+        self._clock, self._flow = pacer.clock, link.flow
+        self._sensing = Sensing(limiter, link.imu, pacer.clock, pacer.period, link.camera, link.flow)
         self._idle = 0.0
         self._read_at = 0.0
 
@@ -67,6 +69,19 @@ class ControlStep:
         if self.status is None:
             raise InputError("the robot has not been started")
         return self.status
+
+    def sensor_statistics(self) -> dict[str, Any]:
+        """Return what came of camera and optical flow, under their names, of those there are."""
+        watch, flow = self._sensing.watch, self._flow
+        camera = {} if watch is None else {"camera": camera_statistics(watch)}
+        return camera if flow is None else {**camera, "flow": asdict(flow.statistics)}
+
+    def begin_run(self) -> RobotStatus:
+        """Let a run begin: the camera's poses count from here. Return what is known."""
+        if (watch := self._sensing.watch) is not None:
+            watch.begin_run()
+            self.status = replace(self.known, camera=watch.status)
+        return self.known
 
     def first(self) -> None:
         """Read everything, with torque off.

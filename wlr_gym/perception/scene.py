@@ -182,7 +182,7 @@ class Renderer:
         if not self.still:
             return
         packed = self._pack([self.still])
-        _cast(self._rays, *packed, whole, samples, self._background)
+        _cast(self._rays, *packed, whole, samples, 0, self._background)
 
     def frame(self, moving: Sequence[Sequence[Facet]], look: Look, seed: int) -> Image:
         """Render one frame.
@@ -194,7 +194,8 @@ class Renderer:
         image = self._background.copy()
         if moving and moving[0]:
             packed = self._pack([[*self.still, *instant] for instant in moving])
-            _cast(self._rays, *packed, self._box([p for instant in moving for p in instant]), self.samples, image)
+            box = self._box([p for instant in moving for p in instant])
+            _cast(self._rays, *packed, box, self.samples, len(self.still), image)
         return develop(image, look, seed)
 
     def _pack(
@@ -326,9 +327,19 @@ def _shade(kind: Any, circles: Any, tags: Any, cells: Any, x: float, y: float) -
 
 @njit(cache=True, nogil=True)
 def _cast(
-    rays: Any, geometry: Any, kinds: Any, boxes: Any, circles: Any, tags: Any, cells: Any, box: Any, samples: Any, image: Any
+    rays: Any,
+    geometry: Any,
+    kinds: Any,
+    boxes: Any,
+    circles: Any,
+    tags: Any,
+    cells: Any,
+    box: Any,
+    samples: Any,
+    first: Any,
+    image: Any,
 ) -> None:
-    """Render the pixels of ``box``; ``geometry`` is (instants, facets, 12).
+    """Render the pixels of ``box`` that may show facet ``first`` or a later one; ``geometry`` is (instants, facets, 12).
 
     A few rays per pixel first; where they differ there is an edge, and samples x samples rays say where.
     """
@@ -341,6 +352,8 @@ def _cast(
                 if boxes[p, 0] <= u < boxes[p, 2] and boxes[p, 1] <= v < boxes[p, 3]:
                     near[count] = p
                     count += 1
+            if count == 0 or near[count - 1] < first:
+                continue
             corners[0], corners[1] = rays[v, u], rays[v, u + 1]
             corners[2], corners[3] = rays[v + 1, u], rays[v + 1, u + 1]
             mean, spread = _pixel(corners, geometry, kinds, circles, tags, cells, near[:count], _FEW, u + 2 * v)

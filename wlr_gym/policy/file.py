@@ -150,5 +150,6 @@ def differences(name: str, mine: Any, theirs: Any) -> Iterator[tuple[str, Any, A
 
 
 def needs_camera(environment: Contract) -> bool:
-    """Whether what a policy is fed rests on camera poses, through the slip observer."""
-    return bool((environment.get("observer") or {}).get("camera"))
+    """Whether what a policy is fed rests on camera poses, through the slip observer, and it never did without."""
+    always = (environment.get("sensors") or {}).get("camera", 1.0) >= 1.0
+    return always and bool((environment.get("observer") or {}).get("camera"))

@@ -18,9 +18,8 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_layers
 from wlr_gym.robot.joints import JOINTS
 from wlr_gym.robot.parameter_table import TABLE, range_in_words, spec_of
+from wlr_gym.robot.sensors import SensorSet, Vector3
 from wlr_gym.robot.tolerance import KEYS, ParameterTolerance, read_tolerances
-
-Vector3 = tuple[float, float, float]
 
 
 class Body(SettingsModel):
@@ -133,50 +132,6 @@ class Ground(SettingsModel):
     slope: float = 0.0
     normal_stiffness: float = Field(gt=0)
     normal_damping: float = Field(ge=0)
-
-
-class Encoder(SettingsModel):
-    """One register count of position (rad) and velocity (rad/s)."""
-
-    position: float = Field(ge=0)
-    velocity: float = Field(ge=0)
-
-
-class EffortSensor(SettingsModel):
-    """1 sigma noise of the torque estimate (N m)."""
-
-    leg_noise: float = Field(ge=0)
-    wheel_noise: float = Field(ge=0)
-
-
-class ImuSensor(SettingsModel):
-    """Bandwidth (Hz), noise per 50 Hz sample and constant bias, 1 sigma (rad/s, m/s2)."""
-
-    bandwidth: float = Field(gt=0)
-    gyro_noise: float = Field(ge=0)
-    accel_noise: float = Field(ge=0)
-    gyro_bias: float = Field(ge=0)
-    accel_bias: float = Field(ge=0)
-
-
-class CameraSensor(SettingsModel):
-    """Frame rate (Hz) and 1 sigma noise of the floor pose (m, rad)."""
-
-    rate: float = Field(gt=0)
-    position_noise: float = Field(ge=0)
-    yaw_noise: float = Field(ge=0)
-
-
-class SensorSet(SettingsModel):
-    """What the robot can measure, and how badly; ``volt_count`` is one register count of the supply (V)."""
-
-    control_rate: float = Field(gt=0)
-    encoder: Encoder
-    effort: EffortSensor
-    volt_noise: float = Field(ge=0)
-    volt_count: float = Field(0.1, ge=0)
-    imu: ImuSensor
-    camera: CameraSensor
 
 
 class Home(SettingsModel):

@@ -4,7 +4,7 @@ The canonical form is one line ``key = value`` per number, sorted, under a title
 its declared default is left out, so that a new field with a default changes the fingerprint of no robot that does not use it.
 Not in it: name, bus addresses, order of joints (there is one only) and tolerances; nor what turns a motor's torque into its
 current and into counts, which changes energy and the rounding of a sensor, but no motion: a policy from ``nominal`` fits
-``emanual``.
+``emanual``; nor an optical-flow sensor: a policy that does not read one fits a robot that has it.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from wlr_gym.robot.description import Robot
 
 #: Of the canonical form; a fingerprint begins with it.
 HASH_FORM = "2"
-#: Keys of a robot file that no simulator reads.
-NOT_SIMULATED = ("name", "joints", "dynamixel_ids", "tolerances")
+#: Keys of a robot file that no motion depends on.
+NOT_MOVING = ("name", "joints", "dynamixel_ids", "tolerances", "sensors.flow")
 #: Keys of a motor that no motion depends on.
 CURRENTS = ("stall_current", "no_load_current", "current_count", "load_count")
 
@@ -44,7 +44,7 @@ def _lines(model: BaseModel, above: str) -> Iterator[str]:
     """Yield ``key = value`` of what differs from its default; the keys of ``above`` come before."""
     for name, field in type(model).model_fields.items():
         value: Any = getattr(model, name)
-        if above + name in NOT_SIMULATED or name in CURRENTS or value == field.get_default(call_default_factory=True):
+        if above + name in NOT_MOVING or name in CURRENTS or value == field.get_default(call_default_factory=True):
             continue
         if isinstance(value, BaseModel):
             yield from _lines(value, f"{above}{name}.")

@@ -184,6 +184,13 @@ TABLE: tuple[ParameterSpec, ...] = (
     fixed("camera.mount_yaw", "rad", low=-0.5, high=0.5, tolerance="camera.mount_yaw", doc="floor frame to start heading"),
     fixed("camera.scale", "-", at=1.0, low=0.5, high=2, doc="measured over true lengths of the camera's floor frame"),
     fixed("camera.delay", "s", low=0, high=0.5, tolerance="camera.delay", doc="age of a vision pose when it is delivered"),
+    fixed("camera.present", "-", at=1.0, low=0, high=1, doc="1 = there is a camera, 0 = there is none"),
+    fixed("camera.dropout", "-", low=0, high=1, doc="share of the camera's frames that never arrive"),
+    stated("flow.present", "-", of=("sensors.has_flow",), low=0, high=1, doc="1 = there is an optical-flow sensor, 0 = none"),
+    fixed("flow.scale", "-", at=1.0, low=0.5, high=2, doc="measured over true optical flow"),
+    fixed("flow.mount_yaw", "rad", low=-3.2, high=3.2, doc="rotation about body z from body to flow sensor"),
+    fixed("flow.dropout", "-", low=0, high=1, doc="share of the flow sensor's readings that are lost, wherever it is"),
+    fixed("flow.poor_floor", "-", low=0, high=1, doc="share of the floor (squares of 0.2 m) that has poor texture"),
 )
 # fmt: on
 

@@ -99,6 +99,7 @@ CHANGES = [
     (("gyro_bias", ["sensor"], {"z": 0.05}), {"imu.gyro_bias[z]": 0.05}),
     (("camera_delay", ["sensor"], {"delay": 0.04}), {"camera.delay": 0.04}),
     (("camera_misalignment", ["sensor"], {"yaw": 0.03, "scale": 1.05}), {"camera.mount_yaw": 0.03, "camera.scale": 1.05}),
+    (("flow_misalignment", ["sensor"], {"yaw": 0.03, "scale": 1.05}), {"flow.mount_yaw": 0.03, "flow.scale": 1.05}),
 ]
 
 

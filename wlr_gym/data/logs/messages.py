@@ -17,21 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.format import CAMERA, COLUMNS, RunMeta
+from wlr_gym.data.format import CAMERA, COLUMNS, FLOW, RunMeta
 from wlr_gym.data.simulation_record import Simulation
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, robot_content
 
 Array = NDArray[np.float64]
 
-RUN, JOINT_STATES, COMMANDS, IMU, SUPPLY, CAMERA_TOPIC = (
-    "/wlr/run", "/joint_states", "/joint_commands", "/imu", "/supply", "/camera",
+RUN, JOINT_STATES, COMMANDS, IMU, SUPPLY, CAMERA_TOPIC, FLOW_TOPIC = (
+    "/wlr/run", "/joint_states", "/joint_commands", "/imu", "/supply", "/camera", "/flow",
 )  # fmt: skip
 STRING, JOINT_STATE, IMU_TYPE = "std_msgs/msg/String", "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
-SUPPLY_TYPE, CAMERA_TYPE = "wlr_gym_msgs/msg/Supply", "wlr_gym_msgs/msg/Camera"
+SUPPLY_TYPE, CAMERA_TYPE, FLOW_TYPE = "wlr_gym_msgs/msg/Supply", "wlr_gym_msgs/msg/Camera", "wlr_gym_msgs/msg/Flow"
 #: Definitions of our own types: units as in docs/run_format.md.
 OWN_TYPES = {
     SUPPLY_TYPE: "std_msgs/Header header\nfloat64 voltage",
     CAMERA_TYPE: "std_msgs/Header header\n" + "\n".join(f"float64 {name.removeprefix('cam_')}" for name in CAMERA),
+    FLOW_TYPE: "std_msgs/Header header\n" + "\n".join(f"float64 {name.removeprefix('flow_')}" for name in FLOW),
 }
 #: Frames: what the robot reads is in the body's, where it is stands in the floor's.
 BODY, FLOOR = "body", "floor"
@@ -139,6 +140,9 @@ def row_messages(row: Mapping[str, float], time: int) -> Iterator[Sent]:
     frame = {name.removeprefix("cam_"): row.get(name, math.nan) for name in CAMERA}
     if not all(map(math.isnan, frame.values())):
         yield sent(CAMERA_TOPIC, CAMERA_TYPE, time, make(CAMERA_TYPE, header=header(time, FLOOR), **frame))
+    flow = {name.removeprefix("flow_"): row.get(name, math.nan) for name in FLOW}
+    if not all(map(math.isnan, flow.values())):
+        yield sent(FLOW_TOPIC, FLOW_TYPE, time, make(FLOW_TYPE, header=header(time, BODY), **flow))
 
 
 def _joint_state(row: Mapping[str, float], time: int) -> Any:
@@ -189,6 +193,7 @@ PLACES: dict[str, tuple[str, str]] = (
     | {f"gyro_{axis}": (IMU, f"angular_velocity.{axis}") for axis in _XYZ}
     | {f"acc_{axis}": (IMU, f"linear_acceleration.{axis}") for axis in _XYZ}
     | {name: (CAMERA_TOPIC, name.removeprefix("cam_")) for name in CAMERA}
+    | {name: (FLOW_TOPIC, name.removeprefix("flow_")) for name in FLOW}
     | {"volt": (SUPPLY, "voltage")}
 )
 

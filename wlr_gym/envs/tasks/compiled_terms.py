@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.envs.tasks.signals import START, Signals, Value
+from wlr_gym.envs.tasks.signals import PRESENCE, START, Signals, Value
 from wlr_gym.envs.tasks.task import Task
 from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 
 
 #: The signals of a control step, a matrix each, float64 and C-contiguous, one row per robot. ``clock`` has the one column
-#: ``time``. ``computed`` holds the computed observations, which rewards, terminations and measures do not read; while these
-#: are computed it still holds those of the step before (``remembered``).
-MATRICES = ("sensors", "estimate", "truth", "command", "action", "previous_action", "start", "clock", "computed")
+#: ``time``; ``presence`` says which sensors there are. ``computed`` holds the computed observations, which rewards,
+#: terminations and measures do not read; while these are computed it still holds those of the step before (``remembered``).
+MATRICES = ("sensors", "estimate", "truth", "command", "action", "previous_action", "start", "clock", "presence", "computed")
 
 
 class Scores(NamedTuple):
@@ -129,6 +129,7 @@ def matrix_columns(task: Task) -> dict[str, tuple[str, int]]:
         "previous_action": ("previous_action[{}]", JOINTS),
         "start": ("start[{}]", START),
         "clock": ("{}", ("time",)),
+        "presence": ("presence[{}]", PRESENCE),
         "computed": ("remembered.{}", task.computed),
     }
     return {

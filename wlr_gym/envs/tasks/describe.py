@@ -43,6 +43,7 @@ def describe(task: Task) -> str:
             *table(_OBSERVATION_HEADER, _observation_rows(task)),
             f'**Privileged observation** (``observation="dict"``): ``Box(({len(task.privileged)},), float32)``',
             *table(("index", "name", "unit", "frame", "scale", "limit"), privileged_rows),
+            *_sensors_text(config),
             f"**Commands** {_timing(config)}",
             *table(("command", "unit", "frame", "range", "largest rate (1/s)", "meaning"), command_rows),
             "**Reward** sum of weight * term * control period",
@@ -59,6 +60,12 @@ def describe(task: Task) -> str:
 def parameters_text(values: dict[str, float], defaults: dict[str, float]) -> str:
     """Return ``width 0.06, ...`` for the parameters of a term."""
     return ", ".join(f"{name} {values.get(name, default):g}" for name, default in defaults.items()) or "-"
+
+
+def _sensors_text(config: TaskConfig) -> list[str]:
+    """Return how often the robots have sensors, where the task says it."""
+    said = [f"{name} with probability {share:g}" for name, share in config.sensors if share is not None]
+    return [f"**Sensors** present per episode: {', '.join(said)}", ""] if said else []
 
 
 def _timing(config: TaskConfig) -> str:
@@ -221,8 +228,9 @@ def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
     Keys: task, robot (name, hashes of its servos and of all its numbers; of another robot than ``nominal`` also its
     ``description``, every number of it), control_period, episode_length, observation (one entry per number, in order: name,
     source, element, unit, frame, offset, scale, limit, lag, device), observer (settings of the slip observer; None where no
-    term needs it), controller (gains of the hand-written one, where the task names them), latency, action (one entry per
-    number: joint, quantity, unit, centre, scale, low, high), commands and randomization.
+    term needs it), controller (gains of the hand-written one, where the task names them), sensors (how often they are present;
+    only where the task says it), latency, action (one entry per number: joint, quantity, unit, centre, scale, low, high),
+    commands and randomization.
     """
     config = task.config
     return {
@@ -232,6 +240,7 @@ def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
         "episode_length": config.episode_length,
         "observation": [_contract_column(column) for column in task.policy],
         "observer": config.observer.model_dump(mode="json") if task.needs_observer else None,
+        **({"sensors": said} if (said := config.sensors.model_dump(mode="json", exclude_none=True)) else {}),
         "latency": {device: latency.model_dump(mode="json") for device, latency in config.latency.items()},
         "action": [dict(vars(column)) for column in task.actions],
         **({} if config.controller is None else {"controller": config.controller.model_dump(mode="json")}),

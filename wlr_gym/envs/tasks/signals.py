@@ -20,6 +20,8 @@ Value = Any  # float, numpy array (N,) or trace node
 
 #: Pose of the body origin where the episode began, floor frame: m, m, rad.
 START = ("x", "y", "yaw")
+#: Sensors that a robot may have or not: 1 or 0.
+PRESENCE = ("camera", "flow")
 
 
 class Signals:
@@ -51,6 +53,10 @@ class Signals:
     def start(self) -> list[Value]:
         """Where the body origin was when the episode began: x, y (m) and yaw (rad) in the floor frame."""
         return [self._read(f"start[{name}]") for name in START]
+
+    def is_present(self, sensor: str) -> Value:
+        """Whether the robot has a sensor of :data:`PRESENCE`: 1 or 0."""
+        return self._read(f"presence[{sensor}]")
 
     @property
     def time(self) -> Value:

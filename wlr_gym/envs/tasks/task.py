@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks.signals import signals_of
 from wlr_gym.envs.tasks.task_config import TaskConfig, read_task
 from wlr_gym.envs.tasks.terms import (
@@ -134,7 +135,16 @@ def load_task(
 
 
 def build_task(config: TaskConfig, robot: Robot) -> Task:
-    """Resolve a checked task for a robot."""
+    """Resolve a checked task for a robot.
+
+    Raises:
+        InputError: the task has optical flow, the robot has not.
+    """
+    if config.sensors.flow and robot.sensors.flow is None:
+        raise InputError(
+            f"sensors.flow = {config.sensors.flow:g}: robot '{robot.name}' has no optical-flow sensor; expected a section "
+            "sensors.flow in its file, as in configs/robot/flow.yaml"
+        )
     policy = tuple(column for name in config.observations for column in _policy_columns(config, robot, name))
     privileged = tuple(column for name in config.privileged for column in _privileged_columns(config, name))
     return Task(config, robot, policy, privileged, _action_columns(config, robot))

@@ -96,6 +96,16 @@ class ObserverConfig(SettingsModel):
     camera: bool = True
 
 
+class SensorsConfig(SettingsModel):
+    """Which sensors the robots have: probability per episode that there is a camera, and an optical-flow sensor.
+
+    Drawn from streams of their own. None = as the robot's file and the randomisation say.
+    """
+
+    camera: float | None = Field(default=None, ge=0, le=1)
+    flow: float | None = Field(default=None, ge=0, le=1)
+
+
 class RampConfig(SettingsModel):
     """Share of a spread: ``start`` in the beginning, rising evenly to 1 after ``steps`` environment steps of all robots."""
 
@@ -139,8 +149,9 @@ class TaskConfig(SettingsModel):
     episode_length: float = Field(gt=0)
     action: ActionConfig
     commands: CommandsConfig
-    latency: dict[Literal["joints", "imu", "camera"], LatencyConfig] = Field(default={})
+    latency: dict[Literal["joints", "imu", "camera", "flow"], LatencyConfig] = Field(default={})
     observer: ObserverConfig = ObserverConfig()
+    sensors: SensorsConfig = SensorsConfig()
     controller: SlipGains | None = None
     observations: dict[str, ObservationConfig]
     privileged: dict[str, PrivilegedConfig] = Field(default={})

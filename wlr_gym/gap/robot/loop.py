@@ -63,7 +63,10 @@ def _loop(function: Any, batch: CompiledTick, schedule: Schedule, tape: Tape) ->
 
 @cache
 def _compiled(signature: Any, batch: Any, schedule: Any, tape: Any) -> Any:
-    """The loop for arguments of these types: one for all engine functions, which are called by their address."""
+    """The loop for arguments of these types: one for all engine functions, which are called by their address.
+
+    numba keeps it with the sensor model compiled in (``measure_rows``), and looks at this file only to tell whether it is old.
+    """
     arguments = (types.FunctionType(signature), batch, schedule, tape, types.int64, types.int64)
     return njit(types.void(*arguments), cache=True, nogil=True)(_ticks)
 

@@ -1,7 +1,8 @@
 """Faults on command: what can go wrong on the bus, in a servo and at the supply.
 
 A fault is one line of text: ``KIND [WHERE ...] [probability=P] [value=X] [after=S] [duration=S]``, for example
-``drop wheels probability=0.01`` or ``dead leg_lf after=2 duration=0.5``. WHERE is a joint, a bus or ``imu``; none = everywhere.
+``drop wheels probability=0.01`` or ``dead leg_lf after=2 duration=0.5``. WHERE is a joint, a bus, ``imu``, ``flow`` or
+``camera``; none = everywhere.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS
 
 
 class FaultKind(NamedTuple):
@@ -49,7 +51,13 @@ FAULTS: dict[str, FaultKind] = {
     "limit_changed": FaultKind("something else holds the servo's Goal PWM at this", 200, "counts"),
     "duplicate_id": FaultKind("a second servo with the same id answers at the same time: both answers are garbled"),
     "imu_frozen": FaultKind("the chip repeats its values; the microcontroller numbers and stamps them anew"),
+    "flow_texture": FaultKind("the floor has no texture: the flow sensor's surface quality is this", 8, "counts"),
+    "flow_frozen": FaultKind("the flow sensor repeats its counts"),
+    "flow_scale": FaultKind("the flow sensor counts this much", 1.2, "of the true flow"),
+    "flow_turned": FaultKind("the flow sensor has turned on the body", 1.5708, "rad"),
+    "flow_saturated": FaultKind("the flow sensor counts this much in every frame", 120, "counts"),
     "imu_stale": FaultKind("the microcontroller sends the same frame again and again"),
+    **{name: FaultKind(*what) for name, what in CAMERA_FAULTS.items()},
 }
 _REPLY_FAULTS = ("drop", "delay", "late", "flip", "truncate", "noise", "duplicate_id")
 #: Bytes of an answer before the error byte, which are the same in both of two servos with one id.
@@ -63,7 +71,7 @@ class Fault:
 
     Attributes:
         kind: key of :data:`FAULTS`.
-        where: joints, buses or ``imu``; empty = everywhere.
+        where: joints, buses, ``imu``, ``flow`` or ``camera``; empty = everywhere.
         probability: chance per packet, for faults that hit bytes.
         value: see :data:`FAULTS`.
         after: s from when it was asked for until it starts.

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from wlr_gym.base.errors import require_package
-from wlr_gym.hardware.config import Hardware
+from wlr_gym.hardware.camera.config import CameraFile
+from wlr_gym.hardware.config import FlowPort, Hardware
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
+from wlr_gym.hardware.flow.stream import FlowStream
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.physics.effects import apply_patch, load_patch
@@ -14,14 +16,18 @@ from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 
 
-def emulated_link(machine: Machine) -> Link:
+def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
     """Return a link to an emulated robot in this process and in emulated time: the same bits each time.
+
+    Args:
+        machine: the robot.
+        camera: above its floor; None = there is none.
 
     Raises:
         MissingPackageError: dynamixel-sdk is not installed.
     """
     require_package("dynamixel_sdk", "robot")
-    from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu, MemoryPort
+    from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu, MemoryPort, StreamDevice
 
     world, hardware = EmulatedWorld(machine), machine.hardware
     names = {bus.port: name for name, bus in hardware.buses.items()}
@@ -32,10 +38,34 @@ def emulated_link(machine: Machine) -> Link:
         world.now,
         lambda port, baud_rate, patience: MemoryPort(world, names[port], baud_rate, patience),
     )
-    return Link(servos, MemoryImu(world, hardware.imu), world, is_serial=False, finish=machine.close)
+    flow, sensor = hardware.flow, machine.robot.sensors.flow
+    stream = eye = None
+    if flow is not None and sensor is not None:
+        stream = FlowStream(flow, sensor, world.now, lambda _: StreamDevice(world, "flow"))
+    if camera is not None:
+        from wlr_gym.hardware.emulator.camera import EmulatedCamera
+
+        require_package("cv2", "vision")
+        eye = EmulatedCamera(machine, camera)
+    imu = MemoryImu(world, hardware.imu)
+    return Link(servos, imu, world, is_serial=False, finish=machine.close, flow=stream, camera=eye)
 
 
-def emulated_robot(robot: Robot, hardware: Hardware, effects: Source = None, *, sensor_noise: bool = True) -> Link:
+def with_flow_port(robot: Robot, hardware: Hardware) -> Hardware:
+    """Return the hardware with a port for the optical-flow sensor that the robot's file has, where it names none."""
+    if hardware.flow is not None or robot.sensors.flow is None:
+        return hardware
+    return hardware.model_copy(update={"flow": FlowPort(port="emulated")})
+
+
+def emulated_robot(
+    robot: Robot,
+    hardware: Hardware,
+    effects: Source = None,
+    *,
+    sensor_noise: bool = True,
+    camera: CameraFile | None = None,
+) -> Link:
     """Return a link to a new emulated robot whose lines and adapters take no time.
 
     Args:
@@ -43,6 +73,7 @@ def emulated_robot(robot: Robot, hardware: Hardware, effects: Source = None, *, 
         hardware: wiring and mounting.
         effects: what the emulated robot has that its file does not say.
         sensor_noise: of the simulator behind it.
+        camera: above its floor; None = there is none.
 
     Raises:
         InputError: effects that cannot be read or that this robot cannot have.
@@ -50,4 +81,5 @@ def emulated_robot(robot: Robot, hardware: Hardware, effects: Source = None, *, 
     patch = load_patch(effects)
     options = MachineOptions(timing=NO_TIME, sensor_noise=sensor_noise)
     parameters = apply_patch(patch, Parameters.nominal(robot))
-    return emulated_link(Machine(robot, hardware, options, parameters=parameters, forces=patch.forces))
+    hardware = with_flow_port(robot, hardware)
+    return emulated_link(Machine(robot, hardware, options, parameters=parameters, forces=patch.forces), camera)

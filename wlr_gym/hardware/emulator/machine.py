@@ -1,8 +1,8 @@
-"""The emulated robot: eight servos and an IMU around any one-robot Plant, in emulated time. No ports, no clock of its own."""
+"""The emulated robot: eight servos and sensors around any one-robot Plant, in emulated time. No ports, no clock of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +12,7 @@ from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, load_table
 from wlr_gym.hardware.emulator.coupling import PlantCoupling
 from wlr_gym.hardware.emulator.faults import Fault, FaultBoard, parse_fault
+from wlr_gym.hardware.emulator.flow import EmulatedFlow
 from wlr_gym.hardware.emulator.line import BusLine, Emission, LineTiming
 from wlr_gym.hardware.emulator.servo import FIRMWARE, EmulatedServo
 from wlr_gym.hardware.fit import check_fit
@@ -58,7 +59,7 @@ class MachineOptions:
 
 
 class Machine:
-    """Eight servos on their lines, an IMU, and a plant.
+    """Eight servos on their lines, an IMU, an optical-flow sensor where robot and wiring have one, and a plant.
 
     Args:
         robot: the robot; its ``dynamixel_ids`` are the servos' ids.
@@ -75,6 +76,7 @@ class Machine:
         coupling: of the servos and the plant.
         lines: bus name -> line.
         faults: what is wrong right now.
+        watchers: called at the end of every tick (what looks at the robot from outside: a camera).
 
     Raises:
         InputError: a plant of another size or period.
@@ -104,7 +106,10 @@ class Machine:
         self.time = 0.0
         self.ticks = 0
         self.faults: FaultBoard = FaultBoard(self.options.seed)
+        self.watchers: list[Callable[[], None]] = []
         self._imu_output: list[Emission] = []
+        self._flow_output: list[Emission] = []
+        self._flow = self._make_flow()
         self._imu = Conversion(hardware.imu)
         self._frames = 0
         self._paused = 0.0
@@ -120,6 +125,15 @@ class Machine:
             for name, bus in hardware.buses.items()
         }
 
+    def _make_flow(self) -> EmulatedFlow | None:
+        port, sensor = self.hardware.flow, self.robot.sensors.flow
+        return None if port is None or sensor is None else EmulatedFlow(port, sensor, self.faults, self.options.tick)
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors that have a port of their own."""
+        return ("imu",) if self._flow is None else ("imu", "flow")
+
     def _make_servo(self, joint: str) -> EmulatedServo:
         bus = next(bus for bus in self.hardware.buses.values() if joint in bus.joints)
         ours = {"id": self.robot.dynamixel_ids[joint], "baud_rate": BAUD_RATES.index(bus.baud_rate), **bus.eeprom}
@@ -129,7 +143,7 @@ class Machine:
     @property
     def places(self) -> tuple[str, ...]:
         """Names a fault may be at."""
-        return (*JOINTS, *self.hardware.buses, "imu")
+        return (*JOINTS, *self.hardware.buses, *self.sensors, "camera")
 
     def close(self) -> None:
         """Release the plant."""
@@ -154,6 +168,10 @@ class Machine:
         self.time = self.ticks * tick
         while self.time >= (self._frames + 1) / self.hardware.imu.rate - 1e-9:
             self._read_imu()
+        if self._flow is not None:
+            self._flow_output += self._flow.step(self.time, self._paused, self.coupling.sensors)
+        for watcher in self.watchers:
+            watcher()
 
     def pause(self, duration: float) -> None:
         """Let ``duration`` s pass in which nothing happens (a busy computer): quartzes do not stop, so all clocks go on."""
@@ -192,10 +210,11 @@ class Machine:
         force, (x, y, z) = self._imu.counts(accelerometer, gyro)
         return force, (x, y, z if self.options.sensor_noise else z + self._frames // IMU_DITHER % 2)
 
-    def take_imu_output(self) -> list[Emission]:
-        """Return the frames sent since the last call."""
-        output, self._imu_output = self._imu_output, []
-        return output
+    def take_output(self) -> dict[str, list[Emission]]:
+        """Return the frames that the sensors sent since the last call, by their ports."""
+        output = {"imu": self._imu_output, "flow": self._flow_output}
+        self._imu_output, self._flow_output = [], []
+        return {name: output[name] for name in self.sensors}
 
     # ---- faults ----
 
@@ -215,7 +234,7 @@ class Machine:
         self._apply_faults()
 
     def plugged(self, port: str) -> bool:
-        """Whether the adapter of a bus, or of the IMU, is in its socket."""
+        """Whether the adapter of a bus, or of a sensor, is in its socket."""
         return self.faults.active(self.time, "unplug", [port]) is None
 
     def _apply_faults(self) -> None:

@@ -27,7 +27,7 @@ class EmulatedWorld:
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
-        self._plugged = dict.fromkeys([*machine.hardware.buses, "imu"], True)
+        self._plugged = dict.fromkeys([*machine.hardware.buses, *machine.sensors], True)
         self._sockets = dict.fromkeys(self._plugged, 0)
         self._due: dict[str, list[tuple[float, int, bytes]]] = {name: [] for name in self._plugged}
         self._sent = 0
@@ -44,7 +44,8 @@ class EmulatedWorld:
     def step(self) -> None:
         """Let one tick pass."""
         self.machine.step()
-        self.queue("imu", self.machine.take_imu_output())
+        for name, emissions in self.machine.take_output().items():
+            self.queue(name, emissions)
         for name, was in self._plugged.items():
             self._plugged[name] = self.machine.plugged(name)
             if was and not self._plugged[name]:
@@ -60,7 +61,7 @@ class EmulatedWorld:
             heapq.heappush(self._due[name], (emission.time, self._sent, emission.data))
 
     def connect(self, name: str) -> int:
-        """Return a connection to the adapter of a bus, or of the IMU.
+        """Return a connection to the adapter of a bus, or of a sensor.
 
         Raises:
             InputError: it is unplugged.
@@ -150,6 +151,30 @@ class MemoryPort(DynamixelPort):
             return self.ser.wait_and_read(seconds)
         except (OSError, AttributeError) as error:
             raise self._lost(error) from None
+
+
+class StreamDevice:
+    """What a sensor's stream uses of ``serial.Serial``.
+
+    Args:
+        world: the robot.
+        name: of the sensor.
+    """
+
+    def __init__(self, world: EmulatedWorld, name: str) -> None:
+        self._world, self._name, self._connection = world, name, world.connect(name)
+
+    def read(self, size: int) -> bytes:
+        """Return what has come."""
+        self._world.require(self._name, self._connection)
+        return self._world.arrived(self._name)
+
+    def reset_input_buffer(self) -> None:
+        """Throw away what has come."""
+        self.read(0)
+
+    def close(self) -> None:
+        """Disconnect."""
 
 
 class MemoryImu(ImuStream):

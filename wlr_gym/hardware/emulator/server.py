@@ -1,4 +1,4 @@
-"""The emulated robot on pseudo-terminals: one for each bus, one for the IMU, and a control socket for faults.
+"""The emulated robot on pseudo-terminals: one for each bus and each sensor, and a control socket for faults.
 
 Linux and macOS. One thread does everything, so emulated time and bytes are in order. On a pseudo-terminal bytes take no time;
 :class:`wlr_gym.hardware.emulator.line.LineTiming` says when answers may appear, and they are held back until then.
@@ -34,7 +34,7 @@ class Port:
     """One pseudo-terminal, of which a client opens the far side.
 
     Args:
-        name: bus name or ``imu``.
+        name: bus name, ``imu`` or ``flow``.
         link: where to put a link of a fixed name to it; None = nowhere.
     """
 
@@ -102,7 +102,7 @@ class Server:
     Args:
         machine: the robot.
         real_time: emulated time follows the clock; False = it passes only in :meth:`advance`.
-        links: folder for links of fixed names (bus names and ``imu``) to the terminals; None = none.
+        links: folder for links of fixed names (bus names, ``imu``, ``flow``) to the terminals; None = none.
         control: path of a Unix socket that takes command lines (see :func:`run_command`); None = none.
 
     Attributes:
@@ -134,7 +134,7 @@ class Server:
         self._origin = 0.0
 
     def _make_ports(self, links: Path | None) -> dict[str, Port]:
-        names = [*self.machine.hardware.buses, "imu"]
+        names = [*self.machine.hardware.buses, *self.machine.sensors]
         try:
             if links is not None:
                 links.mkdir(parents=True, exist_ok=True)
@@ -144,8 +144,13 @@ class Server:
 
     @property
     def ports(self) -> dict[str, str]:
-        """Bus name or ``imu`` -> path to open; changes when an adapter was unplugged and is back."""
+        """Bus name, ``imu`` or ``flow`` -> path to open; changes when an adapter was unplugged and is back."""
         return {name: port.path for name, port in self._ports.items()}
+
+    @property
+    def origin(self) -> float:
+        """This computer's monotonic clock minus emulated time, s; grows when emulated time slips."""
+        return self._origin
 
     # ---- life ----
 
@@ -270,7 +275,8 @@ class Server:
 
     def _step(self) -> None:
         self.machine.step()
-        self._queue("imu", self.machine.take_imu_output())
+        for name, emissions in self.machine.take_output().items():
+            self._queue(name, emissions)
         if self.machine.faults.any or not all(port.plugged for port in self._ports.values()):
             self._replug()
 
@@ -290,7 +296,7 @@ class Server:
         for name in names:
             port, line = self._ports[name], self.machine.lines.get(name)
             data = port.read() if port.plugged else b""
-            if data and line is not None:  # the microcontroller of the IMU takes no orders
+            if data and line is not None:  # the microcontrollers of the sensors take no orders
                 self._slip(ANSWER_LAG)
                 self._queue(name, line.receive(data, self._now(), port.baud_rate()))
 

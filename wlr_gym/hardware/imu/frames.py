@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.hardware.dynamixel.protocol import crc16
+from wlr_gym.hardware.framing import FrameFinder, missing_between, sealed
 
 SYNC = b"\xa5\x5a"
 SIZE = 24
@@ -65,41 +65,32 @@ def encode_frame(frame: ImuFrame) -> bytes:
     """Return a frame as bytes."""
     numbers = (*frame.accelerometer, frame.temperature, *frame.gyroscope)
     body = _LAYOUT.pack(SYNC, frame.sequence & 0xFFFF, frame.microseconds & 0xFFFFFFFF, *numbers)
-    return body + crc16(body).to_bytes(2, "little")
+    return sealed(body)
 
 
 class FrameParser:
-    """Finds frames in a stream; noise costs no more than the frames it hits.
+    """Reads the frames of a stream.
 
     Attributes:
-        crc_errors: frames dropped because their CRC was wrong.
         lost: frames missing between the received ones, by their sequence numbers.
     """
 
     def __init__(self) -> None:
-        self._buffer = bytearray()
+        self._finder = FrameFinder(SYNC, SIZE)
         self._last: int | None = None
-        self.crc_errors = 0
         self.lost = 0
+
+    @property
+    def crc_errors(self) -> int:
+        """Frames dropped because their CRC was wrong."""
+        return self._finder.crc_errors
 
     def feed(self, data: bytes) -> list[ImuFrame]:
         """Take bytes; return the frames they complete."""
-        self._buffer += data
-        frames = []
-        while (place := self._buffer.find(SYNC)) >= 0 and len(self._buffer) >= place + SIZE:
-            raw = bytes(self._buffer[place : place + SIZE])
-            if crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little"):
-                frames.append(self._take(raw))
-                del self._buffer[: place + SIZE]
-            else:
-                self.crc_errors += 1
-                del self._buffer[: place + 1]
-        del self._buffer[: max(0, len(self._buffer) - 2 * SIZE)]  # noise without a start never piles up
-        return frames
+        return [self._take(raw) for raw in self._finder.feed(data)]
 
     def _take(self, raw: bytes) -> ImuFrame:
-        _, sequence, microseconds, ax, ay, az, temperature, gx, gy, gz = _LAYOUT.unpack(raw[:-2])
-        if self._last is not None:
-            self.lost += (sequence - self._last - 1) % 65536 if sequence != self._last else 0  # the same again is none lost
+        _, sequence, microseconds, ax, ay, az, temperature, gx, gy, gz = _LAYOUT.unpack(raw)
+        self.lost += missing_between(self._last, sequence)
         self._last = sequence
         return ImuFrame(sequence, microseconds, (ax, ay, az), temperature, (gx, gy, gz))

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.calibration import ACCEL_REST, GYRO_REST, motion
-from wlr_gym.hardware.config import Bus, Hardware, ImuPort
+from wlr_gym.hardware.config import Bus, FlowPort, Hardware, ImuPort
 from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError, RestlessLineError
 from wlr_gym.hardware.dynamixel.tables import load_table
+from wlr_gym.hardware.flow.driver import Flow
 from wlr_gym.hardware.imu.driver import Imu
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
 from wlr_gym.hardware.imu.reading import ImuGoneError
@@ -43,6 +44,8 @@ _OWN_SHARE = 0.9
 STEPPED = "end other programs, or drive it in emulated time, where nothing is late: wlr deploy --emulated --stepped"
 #: s an IMU is looked at.
 LOOK_TIME = 1.0
+#: rad/s: mean flow below which the floor is at rest: two counts per frame of 121 a second are 0.5.
+FLOW_REST = 0.1
 #: s from emptying the IMU's port until what comes is of now.
 SETTLE_TIME = 0.05
 #: rad/s a calibrated gyroscope may read at rest.
@@ -53,11 +56,14 @@ LARGEST_TILT = math.radians(10.0)
 LARGEST_LENGTH_ERROR = 0.05
 
 
-def open_ports(servos: Servos, imu: Imu, hardware: Hardware) -> list[Check]:
+def open_ports(servos: Servos, imu: Imu, hardware: Hardware, flow: Flow | None = None) -> list[Check]:
     """Open every port that can be opened, and say which could not: a check per port. Who called closes them."""
     checks = []
     ports = {name: (group.open, hardware.buses[name].port) for name, group in servos.groups.items()}
-    for name, (open_port, path) in {**ports, "imu": (imu.open, hardware.imu.port)}.items():
+    ports["imu"] = imu.open, hardware.imu.port
+    if flow is not None and hardware.flow is not None:
+        ports["flow"] = flow.open, hardware.flow.port
+    for name, (open_port, path) in ports.items():
         try:
             open_port()
             checks.append(Check(name, "port", True, path, "", ""))
@@ -314,6 +320,46 @@ def check_imu(imu: Imu, port: ImuPort, clock: Clock, seconds: float = LOOK_TIME)
     found = f"{lost} lost, {errors} broken of {count + lost}"
     checks.append(Check("imu", "losses", lost + errors <= 0.01 * (count + lost), found, "1 % or less", remedy, False))
     return checks + _check_rest(samples)
+
+
+def check_flow(flow: Flow, port: FlowPort, clock: Clock, seconds: float = LOOK_TIME, period: float = 0.02) -> list[Check]:
+    """Listen to the optical-flow sensor of a robot that stands still on its floor.
+
+    Args:
+        flow: open.
+        port: what it should be.
+        clock: what it is timed by.
+        seconds: for how long.
+        period: s between two readings.
+    """
+    flow.read()  # what came before does not count
+    before = flow.statistics.lost, flow.statistics.errors
+    start, count = clock.now(), round(seconds / period)
+    readings = []
+    for tick in range(1, count + 1):
+        clock.wait_until(start + tick * period)
+        readings.append(flow.read())
+    good = [reading for reading in readings if reading.is_new]
+    trouble = next((reading.trouble for reading in reversed(readings) if reading.trouble), "")
+    remedy = "Give it light and a floor with texture, 80 mm or more below it; check its supply, port and wiring."
+    found = f"{len(good)} of {count}" + (f", {trouble}" if trouble else "")
+    checks = [Check("flow", "readings", len(good) >= 0.9 * count, found, "a valid one in 9 of 10 control steps", remedy, False)]
+    if not good:
+        return checks
+    quality = float(np.mean([reading.quality for reading in good]))
+    checks.append(Check("flow", "quality", quality > 0.15, f"{quality:.2f}", "above 0.15", remedy, False))
+    drift = float(np.linalg.norm(np.mean([reading.flow for reading in good], axis=0)))
+    remedy = "Keep the robot still and look again; else something moves in its view."
+    checks.append(Check("flow", "rest", drift < FLOW_REST, f"{drift:.3f} rad/s", f"below {FLOW_REST:g} rad/s", remedy, False))
+    lost, errors = flow.statistics.lost - before[0], flow.statistics.errors - before[1]
+    remedy = "Shorten the cable, keep it away from the motors' supply, check ground."
+    checks.append(
+        Check("flow", "losses", lost + errors <= 0.02 * count, f"{lost} lost, {errors} broken", "2 % or less", remedy, False)
+    )
+    calibrate = "Drive or push it straight on while you record, then run wlr calibrate flow."
+    is_done = port.calibration.date is not None
+    checks.append(Check("flow", "calibration", is_done, port.calibration.date or "never", "a date", calibrate, False))
+    return checks
 
 
 def _check_rest(samples: ImuSamples) -> list[Check]:

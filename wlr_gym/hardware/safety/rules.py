@@ -64,7 +64,7 @@ class Decision(NamedTuple):
         level: what the robot may do.
         setpoints: (8,) rad and rad/s, finite.
         torque_on: (8,) motors that are on.
-        verdicts: findings above DRIVE.
+        verdicts: findings; those at DRIVE change nothing about the setpoints.
         limited: rule -> joints whose setpoints it changed.
         memory: for the next step.
     """
@@ -228,6 +228,8 @@ def judge(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: M
         yield Verdict(Level.STOP, "tilt ahead", f"{lean}, will pass {limits.tilt:g}")
     if limits.deadman is not None and status.operator_silence > limits.deadman:
         yield Verdict(Level.HOLD, "deadman", f"no sign of the operator for {status.operator_silence:.1f} s")
+    if status.camera is not None and status.camera.is_wrong:  # no camera is no finding: estimates go on without
+        yield Verdict(Level.DRIVE, "camera", f"its pose {status.camera.reason}, and is kept back")
     # lost answers make ticks late: the silence is judged then, not the lateness
     if not status.silence.any() and (status.late_ticks >= limits.late or status.late_share > limits.late_share):
         text = f"{status.late_ticks} ticks in a row late, {status.late_share:.0%} of the last second's"

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.format import Profile
+from wlr_gym.hardware.flow.reading import FlowReading
 from wlr_gym.hardware.servos import UNREAD, ServoRegisters
 from wlr_gym.physics.servo import CurrentLaw
 from wlr_gym.robot import JOINTS
@@ -43,6 +44,25 @@ REQUESTS = ("stop", "emergency stop")
 
 
 @dataclass(frozen=True)
+class CameraStatus:
+    """What the camera says.
+
+    Attributes:
+        pose: (3,) x, y (m) and yaw (rad, unwrapped) that was believed last, from the start pose; 0 before the first.
+        time: s at which it was exposed; the run's start before the first.
+        is_new: it came in this control step.
+        reason: why no pose comes; empty = nothing is wrong.
+        is_wrong: there are poses, and they contradict the robot's other sensors: they are kept back.
+    """
+
+    pose: Array = field(default_factory=lambda: np.zeros(3))
+    time: float = 0.0
+    is_new: bool = False
+    reason: str = ""
+    is_wrong: bool = False
+
+
+@dataclass(frozen=True)
 class RobotStatus:
     """What is known of the robot at a control step. Arrays are in joint order.
 
@@ -64,6 +84,8 @@ class RobotStatus:
         suspect: (8,) the joint's last reading was impossible, and has not been confirmed.
         unseen: (8,) s that the joint was not seen before its last answer, or before the first impossible one.
         jump: (8,) rad by which a joint's readings jumped for good, further than a motor can turn; 0 = not.
+        flow: of the optical-flow sensor in this step; None = the robot has none.
+        camera: what the camera says; None = there is none.
         asked_to_stop: why a stop was asked for. asked_off: why torque is to go off at once.
     """
 
@@ -89,10 +111,12 @@ class RobotStatus:
     asked_to_stop: str = ""
     asked_off: str = ""
     broken: int = 0
+    flow: FlowReading | None = None
     registers: ServoRegisters = UNREAD
     suspect: Mask = field(default_factory=lambda: np.zeros(len(JOINTS), bool))
     unseen: Array = field(default_factory=lambda: np.zeros(len(JOINTS)))
     jump: Array = field(default_factory=lambda: np.zeros(len(JOINTS)))
+    camera: CameraStatus | None = None
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_text
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
-from wlr_gym.data.sensor_columns import SENSED, channels
+from wlr_gym.data.sensor_columns import channels, sensed_columns
 from wlr_gym.data.simulation_record import ParameterChange, Simulation, departures, start_of
 from wlr_gym.data.write import write_run
 from wlr_gym.learning.evaluation.rollout import roll_out
@@ -53,7 +53,8 @@ class EpisodeRecorder:
         self._at_first = departures(self._parameters, nominal)
         self._start = start_of(core.state, robot)
         self._seed = int(core.episodes.seeds[robot])
-        self._readings = [channels(core.sensors, robot)]
+        self._columns = sensed_columns(core.task.robot)
+        self._readings = [channels(core.sensors, robot, self._columns)]
         self._goals: list[np.ndarray] = []
         self._changes: list[ParameterChange] = []
 
@@ -64,7 +65,7 @@ class EpisodeRecorder:
             return
         torque_on = True if core.actions.torque_on is None else core.actions.torque_on[robot]
         self._goals.append(np.where(torque_on, core.actions.setpoints[robot], np.nan))
-        self._readings.append(channels(core.sensors, robot))
+        self._readings.append(channels(core.sensors, robot, self._columns))
         parameters = core.parameters.values[robot]
         if core.robots.changed[robot]:
             self._changes.append(ParameterChange(row=row, parameters=departures(parameters, self._parameters)))
@@ -80,7 +81,7 @@ class EpisodeRecorder:
         period = core.task.config.control_period
         table = {"t": period * np.arange(rows)}
         table |= dict(zip(COMMANDS, np.reshape(self._goals, (rows, len(COMMANDS))).T, strict=True))
-        table |= dict(zip(SENSED, np.array(self._readings[:rows]).reshape(rows, len(SENSED)).T, strict=True))
+        table |= dict(zip(self._columns, np.array(self._readings[:rows]).reshape(rows, len(self._columns)).T, strict=True))
         options = core.plant.options
         simulation = Simulation(
             backend=core.settings.backend,

@@ -78,4 +78,15 @@ EFFECTS: tuple[Effect, ...] = (
         add("camera.delay", "delay"),
         search=Search("timing of the camera", "chirp", SENSOR, known={"delay": Known("camera.delay", step=0.01)}),
     ),
+    Effect(
+        "flow_misalignment",
+        "optical-flow sensor mounted turned by +yaw on the body, and its scale wrong",
+        "(x, y) measured = scale R(-yaw) (x, y)",
+        ("sensor",),
+        {
+            "yaw": EffectParameter("rad", "turn of the sensor on the body", -3.2, 3.2, 0.0, (-0.2, 0.2), 0.06, optional=True),
+            "scale": EffectParameter("-", "measured over true flow", 0.5, 2, 1.0, (0.8, 1.25), 1.05, optional=True),
+        },
+        together(add("flow.mount_yaw", "yaw"), multiply("flow.scale", "scale")),
+    ),
 )

@@ -63,16 +63,13 @@ class Layout:
 _WHEEL_XY = tuple(f"{wheel},{axis}" for wheel in WHEELS for axis in ("x", "y"))
 _WHEEL_XYZ = tuple(f"{wheel},{axis}" for wheel in WHEELS for axis in XYZ)
 
+_EFFORT = "motor current (legs) or load (wheels) times the nominal torque constant, before gear friction"
+
 SENSOR_LAYOUT = Layout(
     (
         Channel("joint_position", JOINTS, "rad", "encoder; wheels relative to their leg, unwrapped, zero at the run's start"),
         Channel("joint_velocity", JOINTS, "rad/s", "the servo's own velocity reading"),
-        Channel(
-            "joint_effort",
-            JOINTS,
-            "N m",
-            "motor current (legs) or load (wheels) times the nominal torque constant, before gear friction",
-        ),
+        Channel("joint_effort", JOINTS, "N m", _EFFORT),
         Channel("gyro", XYZ, "rad/s", "body frame"),
         Channel("accelerometer", XYZ, "m/s2", "body frame, specific force (+9.81 on z at rest)"),
         Channel("supply_voltage", (), "V", "at the servos"),
@@ -81,6 +78,12 @@ SENSOR_LAYOUT = Layout(
         Channel("imu_age", (), "s", "time since the IMU was read"),
         Channel("camera_age", (), "s", "time since the shown camera frame was exposed"),
         Channel("camera_is_new", (), "-", "1 when this tick delivered a new camera frame, else 0"),
+        Channel(
+            "flow", ("x", "y"), "rad/s", "turn of the floor below the flow sensor: v_x/h - w_y, v_y/h + w_x; last valid reading"
+        ),
+        Channel("flow_quality", (), "-", "surface quality of the flow sensor over its maximum; 0 = no valid reading"),
+        Channel("flow_age", (), "s", "time since the shown flow's interval ended"),
+        Channel("flow_is_new", (), "-", "1 when this tick delivered a new valid flow reading, else 0"),
     )
 )
 

@@ -24,6 +24,9 @@ class RobotOptions:
         deadman: s the operator may be silent; None = the hardware file's.
         effects: what the emulated robot has that its file does not say, as ``effects=`` of a simulator; no environment,
             policy or log is told of it.
+        camera: above the floor: name in ``configs/camera/`` or path of a YAML file; None = there is none.
+        poses: file that the emulated robot on ``ports`` writes its true pose into, for a camera that films it by rendering;
+            None = the camera is a real one.
 
     Raises:
         InputError: effects for a robot that is not emulated.
@@ -37,6 +40,8 @@ class RobotOptions:
     guard: bool = True
     deadman: float | None = None
     effects: Any = None
+    camera: str | Path | None = None
+    poses: Path | None = None
 
     def __post_init__(self) -> None:
         if self.effects and not self.emulated:

@@ -21,6 +21,11 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import normals4, stream_number, words4
 from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Channel, Layout, PlantOptions
+from wlr_gym.physics.plants.flow import ERRORS as FLOW_ERRORS
+from wlr_gym.physics.plants.flow import MEMORY as FLOW_MEMORY
+from wlr_gym.physics.plants.flow import SETTINGS as FLOW_SETTINGS
+from wlr_gym.physics.plants.flow import WIDTH as FLOW_WIDTH
+from wlr_gym.physics.plants.flow import check_flow, flow_phase, flow_settings, measure_flow
 from wlr_gym.physics.servo import effort_counts
 from wlr_gym.robot import FIRST_WHEEL, JOINTS, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameter_table import SPECS, XYZ
@@ -36,6 +41,8 @@ RAW_LAYOUT = Layout(
         Channel("gyro", XYZ, "rad/s", "low-passed angular velocity, body frame"),
         Channel("accelerometer", XYZ, "m/s2", "low-passed specific force at the body origin, body frame"),
         Channel("supply_voltage", (), "V", "at the servos"),
+        Channel("height", (), "m", "body origin over the floor at the tick's end"),
+        Channel("quaternion", ("w", "x", "y", "z"), "-", "body to floor frame at the tick's end"),
         Channel("pose", ("x", "y", "yaw"), "m, m, rad", "body origin in the floor frame at the tick's end; yaw may wrap"),
     )
 )
@@ -48,6 +55,8 @@ _CALIBRATION = (
     "camera.mount_yaw",
     "camera.scale",
     "camera.delay",
+    "camera.present",
+    "camera.dropout",
 )
 _ZERO_OFFSET = 0
 _GYRO_BIAS = 4
@@ -55,12 +64,16 @@ _ACCEL_BIAS = 7
 _MOUNT_YAW = 10
 _SCALE = 11
 _DELAY = 12
-_IMU_TO_BODY = 13
-_WHEEL_ZERO = 22
-_START_POSE = 26
-_SHOWN_POSE = 29
-_PHASE = 32
-_POSES = 33
+_CAMERA_PRESENT = 13
+_CAMERA_DROPOUT = 14
+_IMU_TO_BODY = 15
+_WHEEL_ZERO = 24
+_START_POSE = 28
+_SHOWN_POSE = 31
+_EXPOSED = 34
+_PHASE = 35
+_FLOW = 36
+_POSES = _FLOW + FLOW_WIDTH
 
 # Entries of the settings vector.
 _PERIOD = 0
@@ -76,13 +89,14 @@ _ACCEL_NOISE = 16
 _CAMERA_NOISE = 17
 _YAW_NOISE = 18
 _EFFORT_NOISE = 19
+_FLOW_SETTINGS = _EFFORT_NOISE + len(JOINTS)
 
 # First columns of the signals, as plain numbers for the kernel.
-_RAW_VELOCITY, _RAW_EFFORT, _RAW_GYRO, _RAW_ACCEL, _RAW_VOLT, _RAW_POSE = (
+_RAW_VELOCITY, _RAW_EFFORT, _RAW_GYRO, _RAW_ACCEL, _RAW_VOLT, _RAW_HEIGHT, _RAW_TURN, _RAW_POSE = (
     RAW_LAYOUT.slices[name].start
-    for name in ("joint_velocity", "joint_effort", "gyro", "accelerometer", "supply_voltage", "pose")
+    for name in ("joint_velocity", "joint_effort", "gyro", "accelerometer", "supply_voltage", "height", "quaternion", "pose")
 )
-_OUT_VELOCITY, _OUT_EFFORT, _OUT_GYRO, _OUT_ACCEL, _OUT_VOLT, _OUT_CAMERA, _OUT_AGE = (
+_OUT_VELOCITY, _OUT_EFFORT, _OUT_GYRO, _OUT_ACCEL, _OUT_VOLT, _OUT_CAMERA, _OUT_AGE, _OUT_FLOW = (
     SENSOR_LAYOUT.slices[name].start
     for name in (
         "joint_velocity",
@@ -92,11 +106,13 @@ _OUT_VELOCITY, _OUT_EFFORT, _OUT_GYRO, _OUT_ACCEL, _OUT_VOLT, _OUT_CAMERA, _OUT_
         "supply_voltage",
         "camera_pose",
         "joint_age",
+        "flow",
     )
 )
 _TICK_STREAM = stream_number("sensors")
 _CAMERA_STREAM = stream_number("camera")
 _PHASE_STREAM = stream_number("camera phase")
+_DROPOUT_STREAM = stream_number("camera dropout")
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -119,17 +135,25 @@ def _camera(seed: Any, tick: int, pose: Any, settings: Any, state: Any, out: Any
     now = tick * period
     frame = math.floor((now - state[_DELAY]) * rate - state[_PHASE])
     before = math.floor(((tick - 1) * period - state[_DELAY]) * rate - state[_PHASE])
-    exposed = (frame + state[_PHASE]) / rate
-    is_new = tick == 0 or frame > before
+    is_new = False
+    if state[_CAMERA_PRESENT] > 0.5 and (tick == 0 or not _is_lost(seed, frame, state[_CAMERA_DROPOUT])):
+        state[_EXPOSED] = (frame + state[_PHASE]) / rate
+        is_new = tick == 0 or frame > before
     if is_new:
-        _expose(seed, frame, exposed / period, length, settings, state)
+        _expose(seed, frame, state[_EXPOSED] / period, length, settings, state)
     out[_OUT_CAMERA] = state[_SHOWN_POSE]
     out[_OUT_CAMERA + 1] = state[_SHOWN_POSE + 1]
     out[_OUT_CAMERA + 2] = state[_SHOWN_POSE + 2]
     out[_OUT_AGE] = 0.0
     out[_OUT_AGE + 1] = 0.0
-    out[_OUT_AGE + 2] = now - exposed
+    out[_OUT_AGE + 2] = now - state[_EXPOSED]
     out[_OUT_AGE + 3] = 1.0 if is_new else 0.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _is_lost(seed: Any, frame: int, dropout: float) -> bool:
+    """Whether the camera's frame of this number never arrives."""
+    return dropout > 0.0 and float(np.int64(words4(seed, _DROPOUT_STREAM, frame, 0)[0])) * 2.0**-32 < dropout
 
 
 @njit(cache=True, nogil=True)
@@ -203,6 +227,17 @@ def measure_rows(raw: Any, seeds: Any, ticks: Any, settings: Any, states: Any, o
             out[_OUT_EFFORT + k] = _rounded(out[_OUT_EFFORT + k], settings[_EFFORT_COUNTS + k])
         out[_OUT_VOLT] = _rounded(out[_OUT_VOLT], settings[_VOLT_COUNT])
         _camera(seeds[i], ticks[i], row[_RAW_POSE : _RAW_POSE + 3], settings, state, out)
+        measure_flow(
+            seeds[i],
+            ticks[i],
+            settings[_PERIOD],
+            row[_RAW_HEIGHT],
+            row[_RAW_TURN : _RAW_TURN + 4],
+            row[_RAW_POSE : _RAW_POSE + 3],
+            settings[_FLOW_SETTINGS:],
+            state[_FLOW:_POSES],
+            out[_OUT_FLOW : _OUT_FLOW + 5],
+        )
         ticks[i] += 1
 
 
@@ -220,7 +255,8 @@ class SensorModel:
     ``camera.rate`` with a phase drawn per robot, shown at the first tick at least ``camera.delay`` after their exposure, and
     until the next; pose from the start pose (x and y in the start heading turned by ``camera.mount_yaw``, then times
     ``camera.scale``; yaw zeroed and unwrapped, not turned). Before the reset the robot is taken to have stood still.
-    ``camera_is_new`` is 1 at the reset.
+    ``camera_is_new`` is 1 at the reset. Of the frames the share ``camera.dropout`` never arrives; without a camera
+    (``camera.present`` 0) none does, and the age counts from the start. Optical flow: :mod:`wlr_gym.physics.plants.flow`.
 
     With ``options.sensor_noise`` False there is neither noise nor rounding; biases, offsets, delays and frame times stay.
     Sources: robot file's ``sensors``; counts of effort and voltage from :mod:`wlr_gym.physics.servo`.
@@ -232,8 +268,9 @@ class SensorModel:
         self._settings = _settings(robot, options)
         self._seeds = np.zeros(count, np.uint64)
         self._ticks = np.zeros(count, np.int64)
+        self._robot = robot
         self._states = np.zeros((count, _POSES + 3 * history))
-        self._states[:, _SCALE] = 1.0
+        self._states[:, _SCALE] = self._states[:, _CAMERA_PRESENT] = 1.0
         self._states[:, _IMU_TO_BODY:_WHEEL_ZERO] = np.eye(3).ravel()
 
     def reset(
@@ -262,15 +299,22 @@ class SensorModel:
         self._ticks[rows] = 0
         self._states[rows, _WHEEL_ZERO:_START_POSE] = raw[rows, WHEEL_SLICE]
         self._states[rows, _START_POSE:_SHOWN_POSE] = raw[rows, _RAW_POSE:]
+        self._states[rows, _SHOWN_POSE:_PHASE] = 0.0
         self._states[rows, _PHASE] = [_camera_phase(seed) for seed in self._seeds[rows]]
+        self._states[rows, _FLOW + FLOW_MEMORY : _POSES] = 0.0
+        self._states[rows, _FLOW + FLOW_MEMORY - 1] = [flow_phase(seed) for seed in self._seeds[rows]]
         for i in rows:
             measure_rows(raw, *self.memory(), out, i, i + 1)
 
     def set_errors(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
-        """Take zero errors, biases, mounting errors, camera scale and delay of robots ``rows``; nothing is forgotten."""
+        """Take zero errors, biases, mounting errors, faults of camera and flow of robots ``rows``; nothing is forgotten."""
+        check_flow(self._robot, parameters)
         errors = [parameters[name].reshape(self.count, -1)[rows] for name in _CALIBRATION]
         errors.append(imu_to_body(parameters)[rows].reshape(-1, 9))
         self._states[rows, :_WHEEL_ZERO] = np.concatenate(errors, axis=1)
+        self._states[rows, _FLOW : _FLOW + len(FLOW_ERRORS)] = np.stack(
+            [parameters[name][rows] for name in FLOW_ERRORS], axis=1
+        )
 
     def memory(self) -> tuple[NDArray[np.uint64], NDArray[np.int64], Array, Array]:
         """Return noise seeds, counters, counts and noise levels, and states: what :func:`measure_rows` reads and writes."""
@@ -320,9 +364,10 @@ def rotation(yaw: Array, pitch: Array, roll: Array) -> Array:
 
 
 def _settings(robot: Robot, options: PlantOptions) -> Array:
-    """Counts and noise levels as the vector the kernel reads; all zero without sensor noise."""
+    """Counts and noise levels as the vector the kernel reads; zero without sensor noise."""
     sensors = robot.sensors
-    settings = np.zeros(_EFFORT_NOISE + len(JOINTS))
+    settings = np.zeros(_FLOW_SETTINGS + FLOW_SETTINGS)
+    settings[_FLOW_SETTINGS:] = flow_settings(robot, options.sensor_noise)
     settings[_PERIOD] = options.control_period
     settings[_CAMERA_RATE] = sensors.camera.rate
     if not options.sensor_noise:
@@ -337,5 +382,5 @@ def _settings(robot: Robot, options: PlantOptions) -> Array:
     settings[_ACCEL_NOISE] = sensors.imu.accel_noise
     settings[_CAMERA_NOISE] = sensors.camera.position_noise
     settings[_YAW_NOISE] = sensors.camera.yaw_noise
-    settings[_EFFORT_NOISE:] = np.repeat([sensors.effort.leg_noise, sensors.effort.wheel_noise], 4)
+    settings[_EFFORT_NOISE:_FLOW_SETTINGS] = np.repeat([sensors.effort.leg_noise, sensors.effort.wheel_noise], 4)
     return settings

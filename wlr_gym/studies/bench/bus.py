@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +42,8 @@ _GRACE = 60.0
 _DRIVE = """
 import sys
 from wlr_gym.cli import main
-sys.exit(main(["deploy", "pid", "--emulated", "--hardware", sys.argv[1], "--seconds", sys.argv[2], "--out", sys.argv[3]]))
+file, seconds, log, *rest = sys.argv[1:]
+sys.exit(main(["deploy", "--emulated", "--hardware", file, "--seconds", seconds, "--out", log, *rest]))
 """
 #: Safety limits that let a drive on a busy computer go on: an answer that comes late makes a tick late, and is counted there.
 _PATIENT = {
@@ -88,7 +89,7 @@ def _measure_cycle(size: Size) -> list[Measurement]:
 def _measure_deadlines(size: Size) -> list[Measurement]:
     """Ticks that drives at 50 Hz missed, of all rounds; how late the others started and setpoints left, once a round."""
     seconds = size(60, 2)
-    drives = [_drive(seconds) for _ in range(size.rounds)]
+    drives = [drive_in_real_time(seconds, ["pid"]) for _ in range(size.rounds)]
     what = f"{seconds} s at {_TICKS_PER_SECOND} Hz on the emulated robot"
     missed = float(sum(drive["missed"] for drive in drives))  # not per round: a median would leave out the worst
     late, sent = (tuple(1e3 * drive[name]["p99"] for drive in drives) for name in ("jitter", "latency"))
@@ -99,8 +100,11 @@ def _measure_deadlines(size: Size) -> list[Measurement]:
     ]
 
 
-def _drive(seconds: int) -> dict[str, Any]:
-    """Run ``wlr deploy`` as a user does; return the control loop's statistics.
+def drive_in_real_time(seconds: int, words: Sequence[str]) -> dict[str, Any]:
+    """Run ``wlr deploy`` on an emulated robot as a user does; return the control loop's statistics.
+
+    Args:
+        seconds: to drive. words: policy and further options.
 
     Raises:
         RuntimeError: it failed, or hung.
@@ -112,9 +116,9 @@ def _drive(seconds: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="wlr-bench-") as folder:
         file, log = Path(folder) / "hardware.yaml", Path(folder) / "log"
         file.write_text(yaml.safe_dump(hardware.model_dump(mode="json")), encoding="utf-8")
-        words = [sys.executable, "-c", _DRIVE, str(file), str(seconds), str(log)]
+        command = [sys.executable, "-c", _DRIVE, str(file), str(seconds), str(log), *words]
         try:
-            done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=seconds + _GRACE)
+            done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=seconds + _GRACE)
         except subprocess.TimeoutExpired as error:
             raise RuntimeError(f"the emulated robot was not driven to the end within {error.timeout:g} s") from None
         if done.returncode != 0:

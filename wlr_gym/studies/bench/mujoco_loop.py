@@ -285,6 +285,7 @@ class MujocoLoopPlant:
         raw[_RAW["gyro"]] = rates[3:6]
         raw[_RAW["accelerometer"]] = (data.qacc[:3] - self._model.opt.gravity) @ matrix
         raw[_RAW["supply_voltage"]] = self.robot.servo.supply_voltage
+        raw[_RAW["height"]], raw[_RAW["quaternion"]] = pose[2], pose[3:7]
         raw[_RAW["pose"]] = pose[0], pose[1], np.arctan2(matrix[1, 0], matrix[0, 0])
 
     def truth(self) -> Truth:

@@ -67,6 +67,21 @@ def speed_command(signals: Signals) -> list[Value]:
     return [signals.command("linear_velocity_x")]
 
 
+# ---- sensors ----
+
+
+@computed(unit="-", frame="-", limit=1.0)
+def camera_present(signals: Signals) -> list[Value]:
+    """1 where the robot has a camera, else 0."""
+    return [signals.is_present("camera")]
+
+
+@computed(unit="-", frame="-", limit=1.0)
+def flow_present(signals: Signals) -> list[Value]:
+    """1 where the robot has an optical-flow sensor, else 0."""
+    return [signals.is_present("flow")]
+
+
 # ---- paths ----
 
 

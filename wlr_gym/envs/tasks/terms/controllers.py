@@ -27,7 +27,7 @@ _UNITS = ", ".join(["-"] * len(JOINTS) + ["rad/s", "m/s", "m/s"])
 
 
 @dataclass(frozen=True)
-class Motion:
+class WantedMotion:
     """What the controller is to do.
 
     Attributes:
@@ -44,7 +44,7 @@ class Motion:
 def velocity_controller(signals: Signals) -> list[Value]:
     """Action of the controller that follows the commanded velocity, and what it remembers."""
     turn = signals.command("yaw_rate") + _steer(signals, 0.0, 0.0)
-    return _feedback(signals, "velocity_controller", Motion(signals.command("linear_velocity_x"), turn))
+    return _feedback(signals, "velocity_controller", WantedMotion(signals.command("linear_velocity_x"), turn))
 
 
 @computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
@@ -53,7 +53,7 @@ def path_controller(signals: Signals) -> list[Value]:
     forward = signals.command("linear_velocity_x")
     error = references.path_error(signals, estimated_pose(signals))
     turn = error.curvature[0] * forward + _steer(signals, error.lateral, error.heading)
-    return _feedback(signals, "path_controller", Motion(forward, turn))
+    return _feedback(signals, "path_controller", WantedMotion(forward, turn))
 
 
 @computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
@@ -61,13 +61,13 @@ def posture_controller(signals: Signals) -> list[Value]:
     """Action of the controller that keeps straight on while the legs move, and what it remembers."""
     home = signals.robot("home.leg_angle")
     legs = [(angle - home, rate) for angle, rate in references.leg_references(signals)]
-    return _feedback(signals, "posture_controller", Motion(signals.command("linear_velocity_x"), _course(signals), legs))
+    return _feedback(signals, "posture_controller", WantedMotion(signals.command("linear_velocity_x"), _course(signals), legs))
 
 
 @computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
 def slope_controller(signals: Signals) -> list[Value]:
     """Action of the controller that climbs and holds, and what it remembers."""
-    return _feedback(signals, "slope_controller", Motion(references.climb_speed(signals), _course(signals)))
+    return _feedback(signals, "slope_controller", WantedMotion(references.climb_speed(signals), _course(signals)))
 
 
 def _course(signals: Signals) -> Value:
@@ -81,7 +81,7 @@ def _steer(signals: Signals, lateral: Value, heading: Value) -> Value:
     return signals.gain("uphill") * leftward_force - signals.gain("lateral") * lateral - signals.gain("heading") * heading
 
 
-def _feedback(signals: Signals, name: str, motion: Motion) -> list[Value]:
+def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
     gain = signals.gain
     yaw_rate, velocity = signals.sensors("gyro")[2], signals.estimate("linear_velocity_in_body")[0]
     yaw_integral, velocity_integral, slip_difference = (signals.remembered(f"{name}[{label}]") for label in MEMORY)

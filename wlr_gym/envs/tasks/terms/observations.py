@@ -94,6 +94,10 @@ _SENSED = {
         _sensor("camera_yaw", "camera_pose", "start", 20.0, "camera", lambda r: r.sensors.camera.yaw_noise, labels=("yaw",)),
         _sensor("camera_age", "camera_age", "-", 1.0, "camera", _zero),
         _sensor("camera_is_new", "camera_is_new", "-", 1.0, "camera", _zero),
+        _sensor("flow", "flow", "body", 20.0, "flow", lambda r: r.sensors.flow_noise),
+        _sensor("flow_quality", "flow_quality", "-", 1.0, "flow", _zero),
+        _sensor("flow_age", "flow_age", "-", 1.0, "flow", _zero),
+        _sensor("flow_is_new", "flow_is_new", "-", 1.0, "flow", _zero),
     )
 }  # fmt: skip
 

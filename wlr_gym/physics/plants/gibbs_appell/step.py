@@ -175,6 +175,7 @@ def observe(lanes: Lanes, step: Value, features: frozenset[str] = frozenset()) -
     out |= {f"raw_gyro_{a}": lanes[f"gyro_{a}"] for a in AXES}
     out |= {f"raw_acceleration_{a}": lanes[f"acceleration_{a}"] for a in AXES}
     out["raw_supply"] = drive.supply_voltage(lanes, features)
+    out |= {"raw_height": lanes["pz"]} | {f"raw_quaternion_{a}": lanes[f"q{a}"] for a in "wxyz"}
     out |= {"raw_x": lanes["px"], "raw_y": lanes["py"], "heading_cosine": rows[0][0], "heading_sine": rows[1][0]}
     return out
 

@@ -1,0 +1,63 @@
+"""``wlr calibrate flow``: scale and mounting of the optical-flow sensor, from a run that was recorded straight on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.cli.calibrate_robot import save_calibration, source_of
+from wlr_gym.cli.robot_options import RobotOption, ask_terminal
+
+
+@dataclass(frozen=True)
+class FlowOptions(RobotOption):
+    """Find scale and mounting of the optical-flow sensor from a straight run on a floor that grips, driven or pushed.
+
+    Record it with: wlr record --excitation straight
+
+    Attributes:
+        run: the run.
+        out: hardware file to write; may be the one of --hardware.
+        distance: m that the robot moved straight ahead, by a tape measure (negative: back); default: what its wheels rolled.
+        yes: do not ask before the file is written.
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    out: Path
+    distance: float | None = None
+    yes: bool = False
+
+
+def calibrate_flow(options: FlowOptions) -> int:
+    """Show what was found, ask, and write the file; 1 when the operator stops.
+
+    Raises:
+        InputError: a run without flow, too little way, a hardware file that names no flow sensor.
+    """
+    from wlr_gym.cli.calibrate_robot import today
+    from wlr_gym.data.read import read_run
+    from wlr_gym.hardware.calibration import with_flow_calibration
+    from wlr_gym.hardware.config import load_hardware
+    from wlr_gym.hardware.flow.calibration import calibrate_flow as find
+
+    robot, hardware = options.load()[0], load_hardware(options.hardware)
+    if hardware.flow is None:
+        raise InputError(
+            f"--hardware {options.hardware}: names no flow sensor; expected a section flow, such as flow: {{port: ...}}"
+        )
+    source = source_of(options.hardware, options.out)
+    fit = find(read_run(options.run), robot, hardware.flow.calibration, options.distance)
+    found = fit.calibration.model_copy(update={"date": today()})
+    before = hardware.flow.calibration
+    print(
+        f"{fit.way:.2f} m in {fit.windows} windows, against {'the wheels' if options.distance is None else 'the tape measure'}"
+    )
+    print(f"scale     {before.scale:.4f} -> {found.scale:.4f} +- {fit.scale_sigma:.4f}")
+    print(f"mount_yaw {before.mount_yaw:.4f} -> {found.mount_yaw:.4f} +- {fit.yaw_sigma:.4f} rad")
+    note = f"Flow sensor calibrated by wlr calibrate flow, {today()}: scale, and rotation about body z from body to sensor."
+    ask = (lambda text: "y") if options.yes else ask_terminal
+    return save_calibration(options.out, source, lambda file: with_flow_calibration(file, found), "flow", note, ask)

@@ -1,0 +1,188 @@
+"""Frames of an emulated robot, rendered from its true pose, and what can go wrong with a camera.
+
+Nothing but pictures, their time stamps and their arrival leaves this module; the detector finds the pose, as on the robot.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.hardware.camera.config import CameraFile
+from wlr_gym.hardware.camera.feed import RobotPose, scene_pose
+from wlr_gym.perception.markers.detection import Image
+from wlr_gym.perception.scene import (
+    Facet,
+    Look,
+    Renderer,
+    ScenePose,
+    floor_facets,
+    plate_facet,
+    robot_facets,
+    rotation_of,
+    view,
+)
+from wlr_gym.robot import Robot
+
+Array = NDArray[np.float64]
+
+#: Faults of a camera: what happens, a default value and its unit.
+CAMERA_FAULTS: dict[str, tuple[str, float, str]] = {
+    "camera_covered": ("something dark lies on the lens", 0.0, ""),
+    "camera_frozen": ("the driver repeats the same picture, newly stamped", 0.0, ""),
+    "camera_stalled": ("no frame comes: camera or driver hangs", 0.0, ""),
+    "camera_dead": ("the camera's process is killed", 0.0, ""),
+    "camera_moved": ("somebody knocks against the camera: it is turned by this", 0.03, "rad"),
+    "camera_sheet": ("the markers on the robot are printed at this scale", 0.8, "of it"),
+    "camera_back_to_front": ("the plate is mounted back to front", 0.0, ""),
+    "camera_mirrored": ("the picture is mirrored", 0.0, ""),
+    "camera_rotated": ("the picture is upside down", 0.0, ""),
+    "camera_stamps": ("the time stamps jump ahead by this", 0.3, "s"),
+    "camera_late": ("frames wait longer and longer before they arrive, by this per second", 0.2, "s/s"),
+    "camera_lag": ("pictures are older than their stamps say, by this", 0.3, "s"),
+    "camera_glare": ("a lamp shines into the lens", 0.0, ""),
+    "camera_blurred": ("the lens is out of focus: 1 sigma of the blur", 5.0, "px"),
+    "camera_decoy": ("another sheet with the robot's markers lies on the floor", 0.0, ""),
+}
+#: Instants of an exposure at which the robot is drawn.
+_INSTANTS = 2
+#: m around the middle of the floor where clutter lies.
+_CLUTTER_AREA = (2.0, 1.2)
+#: m, where the other sheet lies.
+_DECOY = (0.35, 0.35)
+
+#: Name of a fault -> its value while it holds, else None.
+Faults = Callable[[str], float | None]
+
+
+class Exposure(NamedTuple):
+    """A frame that will come.
+
+    Attributes:
+        number: of it. time: s of mid-exposure. shown: s at which the robot is shown. stamp: s that the driver writes on it.
+        arrival: s at which it is there. is_lost: it never is.
+    """
+
+    number: int
+    time: float
+    shown: float
+    stamp: float
+    arrival: float
+    is_lost: bool
+
+
+class RenderedCamera:
+    """A camera over an emulated robot.
+
+    Args:
+        file: how it is set up. robot: what is filmed. faults: what is wrong now.
+    """
+
+    def __init__(self, file: CameraFile, robot: Robot, faults: Faults = lambda _: None) -> None:
+        self.file, self.robot, self._faults = file, robot, faults
+        self._renderers: dict[tuple[float, bool], Renderer] = {}
+        self._phase = float(np.random.default_rng([file.emulated.seed, 1]).uniform())
+        self._last: Image | None = None
+        self._waiting = 0.0
+        self.renderer()
+
+    def exposure(self, number: int) -> Exposure:
+        """Return when a frame is exposed, stamped and there, with the faults that hold now; frames are asked for in order."""
+        scene, rate, faults = self.file.emulated, self.file.rate, self._faults
+        time = (number + self._phase) / rate
+        growth = faults("camera_late")
+        self._waiting = 0.0 if growth is None else self._waiting + growth / rate
+        arrival = time + scene.latency + self._waiting
+        is_lost = bool(np.random.default_rng([scene.seed, 2, number]).uniform() < scene.dropout)
+        is_lost = is_lost or faults("camera_stalled") is not None
+        stamp = time + (faults("camera_stamps") or 0.0)
+        return Exposure(number, time, time - (faults("camera_lag") or 0.0), stamp, arrival, is_lost)
+
+    def instants(self, exposure: Exposure) -> list[float]:
+        """Return the times (s) at which the robot's pose must be known for a frame."""
+        width = self.file.emulated.exposure
+        return [exposure.shown + width * ((k + 0.5) / _INSTANTS - 0.5) for k in range(_INSTANTS)]
+
+    def picture(self, exposure: Exposure, poses: list[RobotPose]) -> Image:
+        """Render the frame of an exposure that shows the robot at :meth:`instants`."""
+        if self._last is not None and self._faults("camera_frozen") is not None:
+            return self._last
+        if self._faults("camera_covered") is not None:
+            noise = np.random.default_rng([self.file.emulated.seed, 3, exposure.number])
+            shape = self.file.calibration.height, self.file.calibration.width
+            return np.clip(np.rint(noise.normal(12.0, 2.0, shape)), 0, 255).astype(np.uint8)
+        plate = self._plate()
+        parts = [*robot_facets(self.robot, poses[0].legs), plate]
+        moving = [[facet.moved(at.position, at.rotation) for facet in parts] for at in map(scene_pose, poses)]
+        scene = self.file.emulated
+        blur = self._faults("camera_blurred")
+        look = Look(blur=scene.blur if blur is None else blur, noise=scene.noise)
+        image = self.renderer().frame(moving, look, hash_seed(scene.seed, exposure.number))
+        self._last = self._spoilt(image)
+        return self._last
+
+    def renderer(self) -> Renderer:
+        """Return the renderer of where the camera hangs now, and of what lies on the floor."""
+        turned, decoy = self._faults("camera_moved") or 0.0, self._faults("camera_decoy") is not None
+        if (turned, decoy) not in self._renderers:
+            scene = self.file.emulated
+            still = [*floor_facets(self.file.floor), *_clutter(scene.clutter, scene.seed)]
+            if decoy:
+                flat = replace(plate_facet(self.file.body), centre=np.array([*_DECOY, 2e-4]))
+                still.append(flat)
+            eye = view(scene.tilt, scene.height / math.cos(scene.tilt), (0.0, 0.0, 0.0))
+            knock = rotation_of(turned, 0.3 * turned)  # about the camera's own axes: z is its optical axis
+            floor = ScenePose(knock @ eye.position, knock @ eye.rotation)
+            self._renderers[turned, decoy] = Renderer(self.file.calibration, floor, still, scene.samples)
+        return self._renderers[turned, decoy]
+
+    def _plate(self) -> Facet:
+        """The plate on the robot, with the markers that are on it."""
+        plate = plate_facet(self.file.body)
+        circles = plate.circles.copy()
+        if (scale := self._faults("camera_sheet")) is not None:
+            circles *= scale
+        if self._faults("camera_back_to_front") is not None:
+            circles[:, :2] *= -1.0
+        return replace(plate, circles=circles)
+
+    def _spoilt(self, image: Image) -> Image:
+        """What the faults do to the picture itself."""
+        if self._faults("camera_glare") is not None:
+            image = _glaring(image)
+        if self._faults("camera_mirrored") is not None:
+            image = np.ascontiguousarray(image[:, ::-1])
+        if self._faults("camera_rotated") is not None:
+            image = np.ascontiguousarray(image[::-1, ::-1])
+        return image
+
+
+def hash_seed(seed: int, number: int) -> int:
+    """Return the seed of a frame's noise."""
+    return int(np.random.default_rng([seed, 4, number]).integers(2**62))
+
+
+def _glaring(image: Image) -> Image:
+    """A bright spot with a wide halo over the middle of the picture."""
+    height, width = image.shape
+    x, y = (np.arange(width) - width / 2) / (0.3 * width), (np.arange(height) - height / 2) / (0.3 * height)
+    halo = 500.0 * np.exp(-0.5 * (x[None, :] ** 2 + y[:, None] ** 2))
+    return np.clip(image + halo, 0, 255).astype(np.uint8)
+
+
+def _clutter(count: int, seed: int) -> list[Facet]:
+    """Things on the floor that are no markers: boxes, discs, and rings whose radii are those of no code."""
+    random, flat, found = np.random.default_rng([seed, 5]), np.eye(3)[:2], []
+    for k in range(count):
+        centre = np.array([*random.uniform(-1, 1, 2) * _CLUTTER_AREA, 5e-5])
+        size, shade = random.uniform(0.02, 0.07), random.uniform(30.0, 220.0)
+        rings = np.zeros((0, 5))
+        if k % 3 == 0:
+            rings = np.array([[0.0, 0.0, 0.9 * size, 0.4 * size, 0.3 * size]])
+        found.append(Facet(centre, flat, (size, random.uniform(0.5, 1.0) * size), shade, disc=k % 3 == 1, circles=rings))
+    return found

@@ -1,0 +1,121 @@
+"""Frames of fixed size that a microcontroller sends: two bytes of sync, content, CRC-16 of all before it (polynomial 8005, as
+the servos use); and how old they are."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from wlr_gym.hardware.dynamixel.protocol import crc16
+
+#: Bytes of the CRC at a frame's end.
+CRC_SIZE = 2
+#: Bytes taken at once; systems give 4 kB at a time, and keep more for a port that nobody reads.
+_CHUNK = 65536
+#: Reads until the port must be empty: 256 kB.
+_LARGEST_BACKLOG = 64
+
+
+class Device(Protocol):
+    """What is used of ``serial.Serial`` with a time-out of 0. Failures are ``OSError``."""
+
+    def read(self, size: int) -> bytes: ...
+    def reset_input_buffer(self) -> None: ...
+    def close(self) -> None: ...
+
+
+def drained(device: Device) -> bytes:
+    """Return all bytes that have come; does not wait."""
+    data = b""
+    for _ in range(_LARGEST_BACKLOG):
+        part = device.read(_CHUNK)
+        data += part
+        if not part:
+            break
+    return data
+
+
+def sealed(body: bytes) -> bytes:
+    """Return a frame: its bytes up to the CRC, and the CRC."""
+    return body + crc16(body).to_bytes(CRC_SIZE, "little")
+
+
+class FrameFinder:
+    """Finds whole frames in a stream; noise costs no more than the frames it hits.
+
+    Args:
+        sync: how a frame begins.
+        size: bytes of a frame, CRC included.
+
+    Attributes:
+        crc_errors: frames dropped because their CRC was wrong.
+    """
+
+    def __init__(self, sync: bytes, size: int) -> None:
+        self._sync, self._size = sync, size
+        self._buffer = bytearray()
+        self.crc_errors = 0
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Take bytes; return the frames they complete, without their CRC."""
+        self._buffer += data
+        frames = []
+        while (place := self._buffer.find(self._sync)) >= 0 and len(self._buffer) >= place + self._size:
+            raw = bytes(self._buffer[place : place + self._size])
+            if crc16(raw[:-CRC_SIZE]) == int.from_bytes(raw[-CRC_SIZE:], "little"):
+                frames.append(raw[:-CRC_SIZE])
+                del self._buffer[: place + self._size]
+            else:
+                self.crc_errors += 1
+                del self._buffer[: place + 1]
+        del self._buffer[: max(0, len(self._buffer) - 2 * self._size)]  # noise without a start never piles up
+        return frames
+
+
+def missing_between(last: int | None, sequence: int) -> int:
+    """Return how many frames are missing between two sequence numbers (modulo 65536); the same again is none."""
+    return 0 if last is None or sequence == last else (sequence - last - 1) % 65536
+
+
+class StreamClock:
+    """Tells how old a frame is from the microcontroller's microseconds (modulo 2^32) and our clock.
+
+    The frame that came soonest after its stamp sets the offset between the clocks, so ages are short by at most what that one
+    took: at a poll, up to one frame period. The microcontroller's clock may be wrong by ``drift`` (a ceramic resonator is by
+    0.5 %, an RC oscillator by 2 %). A clock that goes back, or that is ahead of ours by more than ``jump``, restarted.
+    """
+
+    drift: float = 0.02  #: part by which the microcontroller's clock may be wrong
+    jump: float = 0.1  #: s
+    _turn = 2**32 * 1e-6  #: s after which the clock wraps
+
+    def __init__(self) -> None:
+        self._offset: float | None = None
+        self._time = 0.0
+        self._last = 0
+
+    def age(self, microseconds: int, now: float, *, is_recent: bool = True) -> tuple[float | None, bool]:
+        """Return the age (s) of a frame that is here at ``now`` (s), and whether the microcontroller restarted.
+
+        Args:
+            microseconds: the frame's stamp.
+            now: s.
+            is_recent: the port was empty a moment ago, so the frame is hardly older. Only such a frame can relate the clocks:
+                in a backlog nobody knows how old the newest is. The age is None while they are not related.
+        """
+        sample = microseconds * 1e-6 - now
+        if self._offset is None:
+            return self._relate(microseconds, now, is_recent), False
+        ahead = (sample - self._offset + self._turn / 2) % self._turn - self._turn / 2
+        drift = self.drift * (now - self._time)
+        is_back = (microseconds - self._last) % 2**32 > 2**31
+        if is_back or ahead > self.jump + drift:
+            return self._relate(microseconds, now, is_recent), True
+        self._last = microseconds
+        if ahead > -drift:
+            self._offset, self._time = self._offset + ahead, now
+        return max(0.0, -ahead - drift), False
+
+    def _relate(self, microseconds: int, now: float, is_recent: bool) -> float | None:
+        self._last, self._time = microseconds, now
+        self._offset = microseconds * 1e-6 - now if is_recent else None
+        return 0.0 if is_recent else None
