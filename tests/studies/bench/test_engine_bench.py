@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from wlr_gym.robot import load_robot
-from wlr_gym.studies.bench.engine import KINDS, EngineReport, EngineResult, Setting, make_reference, prepare
+from wlr_gym.studies.bench.engine import KINDS, EngineReport, EngineResult, EngineSetting, make_reference, prepare
 from wlr_gym.studies.bench.engine_report import lines, pairs, save_picture
 from wlr_gym.studies.bench.motions import distance, motions
 
 ROBOT = load_robot()
 HIP = np.array([0.2, 0.1, 0.0])
-TUNED = Setting("MuJoCo", 5e-4, contact="tuned", cone="elliptic", integrator="implicitfast")
+TUNED = EngineSetting("MuJoCo", 5e-4, contact="tuned", cone="elliptic", integrator="implicitfast")
 
 
 @pytest.fixture(scope="module")
@@ -30,22 +30,23 @@ def test_another_mujoco_robot_converges_to_the_same_limit(short):
     """Servos as MuJoCo's actuators and its own contact point: nothing shared with the plant but the masses."""
     chosen, reference = short
     apart = distance(prepare(TUNED, chosen, 1)()[0], reference.pose, HIP)
+    assert np.median(apart) < 1.5e-5
     assert apart.max() < 2e-4
-    coarse = prepare(Setting("MuJoCo", 1e-3, cone="elliptic"), chosen, 1)()[0]
+    coarse = prepare(EngineSetting("MuJoCo", 1e-3, cone="elliptic"), chosen, 1)()[0]
     assert distance(coarse, reference.pose, HIP).max() > 5e-4
 
 
 def test_rollout_and_batch_are_the_same_simulation(short):
     chosen, _ = short
-    rollouts = [Setting("MuJoCo", 1e-3, call="rollout", threads=threads) for threads in (1, 2)]
-    poses = [prepare(setting, chosen, 1)()[0] for setting in (Setting("MuJoCo", 1e-3), *rollouts)]
+    rollouts = [EngineSetting("MuJoCo", 1e-3, call="rollout", threads=threads) for threads in (1, 2)]
+    poses = [prepare(setting, chosen, 1)()[0] for setting in (EngineSetting("MuJoCo", 1e-3), *rollouts)]
     np.testing.assert_array_equal(poses[0], poses[1])
     np.testing.assert_array_equal(poses[0], poses[2])
 
 
 def test_locked_wheels_slide_as_far_as_the_closed_form_says():
     chosen = [motion for motion in motions(ROBOT) if motion.distance is not None]
-    pose, _ = prepare(Setting("engine", 1e-3, iterations=4, contact="own"), chosen, 1)()
+    pose, _ = prepare(EngineSetting("engine", 1e-3, iterations=4, contact="own"), chosen, 1)()
     assert len(chosen) == 2
     np.testing.assert_allclose(np.linalg.norm(pose[:, :2], axis=1), [motion.distance or 0.0 for motion in chosen], rtol=5e-3)
 
@@ -54,7 +55,7 @@ def _result(side, step, error, speed, **others):
     contact, cone, integrator = ("own", "elliptic", "Euler") if side == "engine" else ("default", "pyramidal", "Euler")
     upright, precision = others.pop("upright", True), others.pop("precision", "float64")
     iterations = 4 if side == "engine" else 100
-    setting = Setting(side, step, precision, iterations, contact, cone, integrator)
+    setting = EngineSetting(side, step, precision, iterations, contact, cone, integrator)
     return EngineResult(setting, error, 2 * error, upright, (speed, 2 * speed, 3 * speed))
 
 

@@ -20,7 +20,7 @@ from wlr_gym.physics.plants.mujoco.plant import MujocoPlant
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.measure import Size, interleave, summary
-from wlr_gym.studies.bench.motions import PERIOD, TICKS, Motion, distance, is_upright, motions, start
+from wlr_gym.studies.bench.motions import PERIOD, TICKS, BenchMotion, distance, is_upright, motions, start
 from wlr_gym.studies.bench.mujoco_loop import VIRTUAL_MASS_DIVISOR, Contact, ServoBatch, build_servo_model, servo_controls
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ ITERATIONS = 100
 
 
 @dataclass(frozen=True)
-class Setting:
+class EngineSetting:
     """How the motions are simulated.
 
     Attributes:
@@ -97,7 +97,7 @@ class EngineResult:
         speed: simulated seconds of a robot per second, one value per round.
     """
 
-    setting: Setting
+    setting: EngineSetting
     error: float
     worst: float
     upright: bool
@@ -147,7 +147,7 @@ class EngineReport:
         return {"reference": self.reference.as_dict(), "settings": [result.as_dict() for result in self.results]}
 
 
-def settings(*, quick: bool = False) -> list[Setting]:
+def settings(*, quick: bool = False) -> list[EngineSetting]:
     """Return every setting that is run."""
     if quick:
         return [_own(1e-3), _own(1e-3, "float32"), _peer(1e-3, KINDS[0])]
@@ -162,13 +162,13 @@ def settings(*, quick: bool = False) -> list[Setting]:
     return [*engine, *peers, *fewer, _peer(1e-3, KINDS[2], iterations=1), *rollouts, *threads]
 
 
-def _own(step: float, precision: str = "float64", sweeps: int = SWEEPS, threads: int = 1) -> Setting:
-    return Setting("engine", step, precision, sweeps, "own", "elliptic", threads=threads)
+def _own(step: float, precision: str = "float64", sweeps: int = SWEEPS, threads: int = 1) -> EngineSetting:
+    return EngineSetting("engine", step, precision, sweeps, "own", "elliptic", threads=threads)
 
 
-def _peer(step: float, kind: Kind, **others: Any) -> Setting:
+def _peer(step: float, kind: Kind, **others: Any) -> EngineSetting:
     cone, contact, integrator = kind
-    return Setting("MuJoCo", step, contact=contact, cone=cone, integrator=integrator, **others)
+    return EngineSetting("MuJoCo", step, contact=contact, cone=cone, integrator=integrator, **others)
 
 
 def measure_engine(size: Size) -> EngineReport:
@@ -181,7 +181,7 @@ def measure_engine(size: Size) -> EngineReport:
     return EngineReport(reference, [_result(setting, poses[setting], reference, speeds[setting]) for setting in runs])
 
 
-def _result(setting: Setting, pose: Array, reference: Reference, speed: tuple[float, ...]) -> EngineResult:
+def _result(setting: EngineSetting, pose: Array, reference: Reference, speed: tuple[float, ...]) -> EngineResult:
     apart = distance(pose, reference.pose, _hip())
     return EngineResult(setting, float(np.sqrt(np.mean(apart**2))), float(apart.max()), is_upright(pose), speed)
 
@@ -194,7 +194,7 @@ def _hip() -> Array:
 
 
 def make_reference(
-    chosen: list[Motion], engine: tuple[float, float] = ENGINE_LIMIT, peer: tuple[float, float] = MUJOCO_LIMIT
+    chosen: list[BenchMotion], engine: tuple[float, float] = ENGINE_LIMIT, peer: tuple[float, float] = MUJOCO_LIMIT
 ) -> Reference:
     """Return the mean of the limits of both simulators; both are of first order in the step, which is halved once."""
     coarse, fine = (_drive(_engine_plant(chosen, step), chosen) for step in engine)
@@ -221,18 +221,18 @@ def _unit(pose: Array) -> Array:
     return pose
 
 
-def _engine_plant(chosen: list[Motion], step: float) -> Plant:
+def _engine_plant(chosen: list[BenchMotion], step: float) -> Plant:
     return GibbsAppellPlant(load_robot(), len(chosen), PlantOptions(physics_step=step, sensor_noise=False), sweeps=8)
 
 
-def _mujoco_limit_plant(chosen: list[Motion], step: float) -> Plant:
+def _mujoco_limit_plant(chosen: list[BenchMotion], step: float) -> Plant:
     """The MuJoCo plant with less virtual mass at its contacts, whose push off the floor grows as the step shrinks."""
     plant = MujocoPlant(load_robot(), len(chosen), PlantOptions(physics_step=step, sensor_noise=False))
     plant._batch.divide_virtual_mass(VIRTUAL_MASS_DIVISOR)
     return plant
 
 
-def _drive(plant: Plant, chosen: list[Motion]) -> Array:
+def _drive(plant: Plant, chosen: list[BenchMotion]) -> Array:
     """Return the poses (N, 7) at the end of the motions."""
     parameters, state = start(load_robot(), chosen)
     plant.reset(parameters=parameters, state=state)
@@ -247,7 +247,7 @@ def _drive(plant: Plant, chosen: list[Motion]) -> Array:
 Run = Callable[[], tuple[Array, float]]
 
 
-def prepare(setting: Setting, chosen: list[Motion], copies: int) -> Run:
+def prepare(setting: EngineSetting, chosen: list[BenchMotion], copies: int) -> Run:
     """Return what runs the motions in a setting; ``copies`` robots make each in the engine."""
     if setting.side == "engine":
         return _engine_run(setting, chosen, copies)
@@ -261,11 +261,11 @@ def _timed(work: Callable[[], object], simulated: float, threads: int) -> float:
     return simulated / (clock() - begin)
 
 
-def _setpoints(chosen: list[Motion]) -> Array:
+def _setpoints(chosen: list[BenchMotion]) -> Array:
     return np.stack([motion.setpoints for motion in chosen], axis=1)
 
 
-def _engine_run(setting: Setting, chosen: list[Motion], copies: int) -> Run:
+def _engine_run(setting: EngineSetting, chosen: list[BenchMotion], copies: int) -> Run:
     many, robot = chosen * copies, load_robot()
     options = PlantOptions(physics_step=setting.step, precision=setting.precision, threads=setting.threads, sensor_noise=False)
     plant = GibbsAppellPlant(robot, len(many), options, sweeps=setting.iterations)
@@ -285,7 +285,7 @@ def _engine_run(setting: Setting, chosen: list[Motion], copies: int) -> Run:
     return run
 
 
-def _model(setting: Setting) -> mujoco.MjModel:
+def _model(setting: EngineSetting) -> mujoco.MjModel:
     robot = load_robot()
     assert setting.contact != "own"
     model = build_servo_model(robot, Parameters.nominal(robot), setting.step, setting.contact)
@@ -295,7 +295,7 @@ def _model(setting: Setting) -> mujoco.MjModel:
     return model
 
 
-def _batch_run(setting: Setting, chosen: list[Motion]) -> Run:
+def _batch_run(setting: EngineSetting, chosen: list[BenchMotion]) -> Run:
     parameters, state = start(load_robot(), chosen)
     batch, setpoints = ServoBatch(_model(setting), parameters, setting.threads), _setpoints(chosen)
     substeps = round(PERIOD / setting.step)
@@ -312,7 +312,7 @@ def _batch_run(setting: Setting, chosen: list[Motion]) -> Run:
     return run
 
 
-def _rollout_run(setting: Setting, chosen: list[Motion]) -> Run:
+def _rollout_run(setting: EngineSetting, chosen: list[BenchMotion]) -> Run:
     parameters, state = start(load_robot(), chosen)
     models = [_model(setting) for _ in chosen]
     for model, friction in zip(models, parameters["ground.mu_x"], strict=True):

@@ -22,7 +22,7 @@ RAMP = 0.2
 
 
 @dataclass(frozen=True)
-class Motion:
+class BenchMotion:
     """What one robot does on a level floor.
 
     Attributes:
@@ -40,20 +40,20 @@ class Motion:
     distance: float | None = None
 
 
-def motions(robot: Robot, ticks: int = TICKS) -> list[Motion]:
+def motions(robot: Robot, ticks: int = TICKS) -> list[BenchMotion]:
     """Return the ten motions, the same ones every time."""
     rng, still = np.random.default_rng(31), np.zeros(4)
     right = np.array([sign[1] < 0 for sign in CORNER_SIGNS])
     turn, arc = np.where(right, 4.0, -4.0), np.where(right, 5.0, 2.0)
 
-    def drive(name: str, friction: Array | float, *wheels: Array, legs: bool = False) -> Motion:
+    def drive(name: str, friction: Array | float, *wheels: Array, legs: bool = False) -> BenchMotion:
         speeds = np.array(wheels)
         angles = robot.home.leg_angle + rng.uniform(-0.3, 0.3, (len(wheels), 4)) * legs
-        return Motion(name, np.full(4, friction), _ramps(np.hstack([angles, speeds]), robot.home.leg_angle, ticks))
+        return BenchMotion(name, np.full(4, friction), _ramps(np.hstack([angles, speeds]), robot.home.leg_angle, ticks))
 
-    def slide(name: str, friction: float, velocity: tuple[float, float]) -> Motion:
+    def slide(name: str, friction: float, velocity: tuple[float, float]) -> BenchMotion:
         distance = float(np.square(velocity).sum()) / (2.0 * friction * robot.gravity)
-        return Motion(name, np.full(4, friction), drive(name, friction, still).setpoints, velocity, distance)
+        return BenchMotion(name, np.full(4, friction), drive(name, friction, still).setpoints, velocity, distance)
 
     def commands(count: int = 5) -> list[Array]:
         return list(rng.uniform(-4.0, 5.0, (count, 4)))
@@ -82,7 +82,7 @@ def _ramps(targets: Array, home: float, ticks: int) -> Array:
     return np.stack([np.interp(PERIOD * np.arange(1, ticks + 1), knots, column) for column in values.T], axis=1)
 
 
-def start(robot: Robot, chosen: list[Motion]) -> tuple[Parameters, PlantState]:
+def start(robot: Robot, chosen: list[BenchMotion]) -> tuple[Parameters, PlantState]:
     """Return parameters and start state of one robot per motion."""
     parameters = Parameters.nominal(robot, len(chosen))
     parameters["ground.mu_x"] = parameters["ground.mu_y"] = np.array([motion.friction for motion in chosen])
