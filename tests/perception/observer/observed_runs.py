@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from wlr_gym.base.random import generator, spawn_seeds
 from wlr_gym.envs.tasks.randomization import DRIFT_PERIOD, load_randomization
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Layout, PlantOptions
 from wlr_gym.robot import CORNER_SIGNS, Robot, load_robot
 
 Array = NDArray[np.float64]
@@ -28,14 +29,15 @@ class Runs:
 
     def sensed(self, name: str) -> Array:
         """A sensor channel, (T + 1, N, ...)."""
-        return _channel(SENSOR_LAYOUT, self.sensors, name)
+        return channel(SENSOR_LAYOUT, self.sensors, name)
 
     def true(self, name: str) -> Array:
         """A channel of the truth, (T + 1, N, ...)."""
-        return _channel(TRUTH_LAYOUT, self.truth, name)
+        return channel(TRUTH_LAYOUT, self.truth, name)
 
 
-def _channel(layout, values: Array, name: str) -> Array:
+def channel(layout: Layout, values: Array, name: str) -> Array:
+    """A channel of values laid out so."""
     columns = values[..., layout.slices[name]]
     return columns if layout.channels[name].labels else columns[..., 0]
 
@@ -84,13 +86,30 @@ def climbing_setpoints(robot: Robot, ticks: int, count: int, rng: np.random.Gene
     return setpoints
 
 
+#: Floors that no task has: friction drawn anew, all over the floor, every 1.5 to 3 s.
+FLOORS = {
+    "changing": {
+        "name": "changing",
+        "base": "slippery",
+        "events": {"floor_friction": {"when": "interval", "interval": [1.5, 3.0]}},
+    }
+}
 DRIVES = {"climb": climbing_setpoints, "commands": commanded_setpoints, "excitation": excited_setpoints}
 
 
-def simulate(backend: str, floor: str, drive: str, count: int, seconds: float, seed: int = 0, **parameters: float) -> Runs:
+def simulate(
+    backend: str,
+    floor: str,
+    drive: str,
+    count: int,
+    seconds: float,
+    seed: int = 0,
+    robot: Robot | None = None,
+    **parameters: float,
+) -> Runs:
     """Drive ``count`` robots drawn from a randomisation; ``parameters``: elements set after it, '.' written as '__'."""
-    robot = load_robot("nominal")
-    randomization = load_randomization(floor, robot)
+    robot = robot or load_robot("nominal")
+    randomization = load_randomization(FLOORS.get(floor, floor), robot)
     plant = make_plant(backend, robot, count, PlantOptions(control_period=PERIOD))
     ticks, seeds = round(seconds / PERIOD), spawn_seeds(seed, count, "observed")
     occurrences = np.zeros((count, len(randomization.intervals)), np.int64)
@@ -119,10 +138,26 @@ def simulate(backend: str, floor: str, drive: str, count: int, seconds: float, s
     return Runs(robot, np.array(sensors), np.array(truth))
 
 
-def observe(runs: Runs, camera: bool) -> Array:
-    """Return the observer's estimates (T + 1, N, ESTIMATE_LAYOUT.width)."""
+def play(policy: str, floor: str, count: int, seconds: float, seed: int = 0, backend: str = "gibbs_appell") -> Runs:
+    """Let a shipped policy drive ``count`` robots drawn from a randomisation; it sees what its task has it see."""
+    from wlr_gym.learning.evaluation.rollout import start_episodes
+    from wlr_gym.learning.evaluation.subjects import make_player
+
+    core, agent = make_player("WLR-Velocity-v0", policy, count, {"randomization": floor, "backend": backend})
+    start_episodes(core, agent, 1000 * seed)
+    sensors, truth = [core.sensors.values.copy()], [core.plant.truth().values.copy()]
+    for _ in range(round(seconds / PERIOD)):
+        core.step(agent.act(core.observation), core.everyone)
+        sensors.append(core.sensors.values.copy())
+        truth.append(core.plant.truth().values.copy())
+    core.close()
+    return Runs(load_robot("nominal"), np.array(sensors), np.array(truth))
+
+
+def observe(runs: Runs, camera: bool, kind: Any = SlipObserver) -> Array:
+    """Return an observer's estimates (T + 1, N, ESTIMATE_LAYOUT.width); ``kind``: its class."""
     count = runs.sensors.shape[1]
-    observer, everyone = SlipObserver(runs.robot, PERIOD, count, camera), np.ones(count, bool)
+    observer, everyone = kind(runs.robot, PERIOD, count, camera), np.ones(count, bool)
     observer.reset(everyone, runs.sensors[0])
     out = [observer.values.copy()]
     for readings in runs.sensors[1:]:
@@ -133,7 +168,7 @@ def observe(runs: Runs, camera: bool) -> Array:
 
 def estimated(values: Array, name: str) -> Array:
     """A channel of the estimates, (T + 1, N, ...)."""
-    return _channel(ESTIMATE_LAYOUT, values, name)
+    return channel(ESTIMATE_LAYOUT, values, name)
 
 
 def slip_in_truth_order(values: Array) -> Array:

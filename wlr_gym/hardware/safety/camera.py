@@ -106,15 +106,16 @@ class CameraWatch:
         self._agreeing: deque[_Seen] = deque(maxlen=512)
         self._frame: tuple[float, float, float] | None = None  # turn and shift from the floor frame to the run's
         self._doubts, self._agree_time = 0, _AGREES_AGAIN
-        self._began, self._heard, self._last_time = 0.0, -math.inf, -math.inf
+        self._began, self._before = 0.0, 0  # of the run, and frames until then
+        self._heard, self._last_time = -math.inf, -math.inf
         self._lag = [0.0, 0.0, 0.0, 0]  # sums of squared changes of the rate, of products, of squared errors; count
         self._offset = 0.0
         self._filter_delay = 1.0 / (2.0 * math.pi * robot.sensors.imu.bandwidth)
 
     @property
     def rate(self) -> float:
-        """Frames per second over the time from the first to the last."""
-        return (self.frames - 1) / span if (span := self._heard - self._began) > 0.0 and self.frames > 1 else 0.0
+        """Frames per second of the run, until the last."""
+        return (self.frames - self._before) / span if (span := self._heard - self._began) > 0.0 else 0.0
 
     # ---- the run ----
 
@@ -123,6 +124,7 @@ class CameraWatch:
         if not self._motion:
             return
         time, x, y, yaw, *_ = self._motion[-1]
+        self._began, self._before = time, self.frames
         cosine, sine = math.cos(yaw), math.sin(yaw)
         self._motion = deque(
             (t, cosine * (a - x) + sine * (b - y), cosine * (b - y) - sine * (a - x), c - yaw, *rest)
@@ -150,7 +152,6 @@ class CameraWatch:
             self._heard = now
             self.frames += 1
             self.work.append(reading.found - reading.arrival)
-            self._began = now if self.frames == 1 else self._began
             reason = self._judge(reading, now)
             is_new = not reason
             is_wrong = reason in CONTRADICTIONS or (is_wrong and reason == SETTLING)

@@ -37,8 +37,9 @@ def look(robot: Any, sensors: Any, r: Any) -> None:
     wx, wy, wz = r.rate[0], r.rate[1], r.rate[2]
     reach = robot.wheel_radius * scale
     for i in range(4):
-        angle, leg_rate, wheel_rate = sensors[i], sensors[_LEG_RATE + i], sensors[_WHEEL_RATE + i]
-        leg_x, leg_z = robot.leg_length * math.cos(angle), -robot.leg_length * math.sin(angle)
+        leg_rate, wheel_rate = sensors[_LEG_RATE + i], sensors[_WHEEL_RATE + i]
+        r.leg[i, 0], r.leg[i, 1] = math.cos(sensors[i]), math.sin(sensors[i])
+        leg_x, leg_z = robot.leg_length * r.leg[i, 0], -robot.leg_length * r.leg[i, 1]
         rim_x, rim_z = -reach * nx, -reach * nz
         x = robot.hip[i, 0] + leg_x + rim_x
         y = robot.hip[i, 1]
@@ -55,16 +56,15 @@ def look(robot: Any, sensors: Any, r: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _centre_of_mass(robot: Any, sensors: Any, r: Any) -> Any:
+def _centre_of_mass(robot: Any, r: Any) -> Any:
     """Centre of mass of the whole robot along heading, left and normal, m."""
     x, y, z = robot.body_mass * robot.body_com[0], robot.body_mass * robot.body_com[1], robot.body_mass * robot.body_com[2]
+    assembly = robot.leg_mass + robot.wheel_mass
+    moment = robot.leg_mass * robot.leg_com + robot.wheel_mass * robot.leg_length
     for i in range(4):
-        angle = sensors[i]
-        assembly = robot.leg_mass + robot.wheel_mass
-        moment = robot.leg_mass * robot.leg_com + robot.wheel_mass * robot.leg_length
-        x += assembly * robot.hip[i, 0] + moment * math.cos(angle)
+        x += assembly * robot.hip[i, 0] + moment * r.leg[i, 0]
         y += assembly * robot.hip[i, 1]
-        z += assembly * robot.hip[i, 2] - moment * math.sin(angle)
+        z += assembly * robot.hip[i, 2] - moment * r.leg[i, 1]
     x, y, z = x / robot.mass, y / robot.mass, z / robot.mass
     return (
         r.heading[0] * x + r.heading[2] * z,
@@ -74,7 +74,7 @@ def _centre_of_mass(robot: Any, sensors: Any, r: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def carry(robot: Any, sensors: Any, r: Any) -> Any:
+def carry(robot: Any, r: Any) -> Any:
     """Find the normal forces that hold the robot: ``r.load`` (4,) N; return the tilt of the floor they imply.
 
     Four feet on a floor are one too many for statics; their springs decide. The body sinks into the springs as a plane:
@@ -86,7 +86,7 @@ def carry(robot: Any, sensors: Any, r: Any) -> Any:
         b, c: slope of the true floor over the assumed one along heading and left; 0, 0 when fewer than three wheels carry.
     """
     fx, fy, fz = r.force[0], r.force[1], max(r.force[2], 1.0)
-    cx, cy, cz = _centre_of_mass(robot, sensors, r)
+    cx, cy, cz = _centre_of_mass(robot, r)
     height = cz - 0.25 * (r.point[0, 2] + r.point[1, 2] + r.point[2, 2] + r.point[3, 2])
     weight = robot.mass * fz / robot.stiffness
     mx = weight * cx - robot.mass * height * fx / robot.stiffness

@@ -24,5 +24,11 @@ ESTIMATE_LAYOUT = Layout(
         Channel("normal_force", WHEELS, "N", "of the floor on the wheel, from leg angles and accelerometer"),
         Channel("traction_use", WHEELS, "-", "size of the traction force over the normal force"),
         Channel("friction_demand", (), "-", "force of the floor on the whole robot: along the floor over normal to it"),
+        Channel(
+            "camera_innovation", (), "-", "size of the last camera frame's largest normalised innovation; 0 = no frame of late"
+        ),
+        Channel("camera_rejected", (), "-", "1 = the last camera frame was not believed, else 0"),
+        Channel("flow_innovation", (), "-", "size of the last flow reading's larger normalised innovation; 0 = none of late"),
+        Channel("flow_rejected", (), "-", "1 = the last flow reading was not believed, else 0"),
     )
 )

@@ -12,6 +12,7 @@ from wlr_gym.base.snapshot import RowStore
 from wlr_gym.perception.observer import slip_filter
 from wlr_gym.perception.observer.layout import ESTIMATE_LAYOUT
 from wlr_gym.perception.observer.state import constants, state_type
+from wlr_gym.perception.observer.trust import WORK
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import SPECS
@@ -39,6 +40,7 @@ class SlipObserver:
         self.values: Array = np.zeros((count, ESTIMATE_LAYOUT.width))
         self._constants = constants(robot, control_period, camera)
         self._states = np.zeros(count, state_type(history))
+        self._work = np.zeros(1, WORK)
 
     def reset(self, mask: Mask, sensors: Array) -> None:
         """Start the masked robots anew from their first readings (N, SENSOR_LAYOUT.width): at rest, or nearly."""
@@ -48,7 +50,7 @@ class SlipObserver:
     def update(self, mask: Mask, sensors: Array) -> None:
         """Take in the readings of one control step later of the masked robots. A reading that is no number is the last one."""
         self._require(mask, sensors)
-        slip_filter.update(self._constants, self._states, mask, sensors, self.values)
+        slip_filter.update(self._constants, self._states, mask, sensors, self.values, self._work)
 
     def stores(self) -> dict[str, RowStore]:
         """Return everything that decides the estimates to come."""

@@ -13,32 +13,21 @@ from typing import Any
 from numba import njit
 
 from wlr_gym.perception.observer import kalman
+from wlr_gym.perception.observer.camera import see_camera
 from wlr_gym.perception.observer.contacts import LEAST_LOAD, carry, look, pull
-from wlr_gym.perception.observer.correction import (
-    RADIUS,
-    guess_velocity,
-    see_camera,
-    see_friction_balance,
-    see_rest,
-    see_rolling,
-)
+from wlr_gym.perception.observer.correction import RADIUS, guess_velocity, see_rest, see_rolling
+from wlr_gym.perception.observer.flow import ROTATION, SCALE, see_flow
 from wlr_gym.perception.observer.layout import ESTIMATE_LAYOUT
 from wlr_gym.perception.observer.prediction import measure_force, move, sense_force, settle, spread, turn
+from wlr_gym.perception.observer.trust import gather, judge
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 
-# Uncertainty (1 sigma) at the start.
-#: m/s of a robot that has just been put down.
-_START_SPEED = 0.05
-#: m/s2 beyond the accelerometer's noise.
-_START_LEAK = 0.02
-#: m/s.
-_START_SLIP = 0.1
+#: m, 1 sigma at the start.
+_START_PLACE = 1e-4
 
 # Where the readings and the estimates stand in their rows.
 _GYRO = SENSOR_LAYOUT.slices["gyro"].start
 _ACCEL = SENSOR_LAYOUT.slices["accelerometer"].start
-_CAMERA = SENSOR_LAYOUT.slices["camera_pose"].start
-_CAMERA_IS_NEW = SENSOR_LAYOUT.slices["camera_is_new"].start
 _O_POSITION = ESTIMATE_LAYOUT.slices["position"].start
 _O_YAW = ESTIMATE_LAYOUT.slices["yaw"].start
 _O_YAW_SIGMA = ESTIMATE_LAYOUT.slices["yaw_sigma"].start
@@ -52,6 +41,8 @@ _O_TRACTION = ESTIMATE_LAYOUT.slices["traction_force"].start
 _O_LOAD = ESTIMATE_LAYOUT.slices["normal_force"].start
 _O_USE = ESTIMATE_LAYOUT.slices["traction_use"].start
 _O_DEMAND = ESTIMATE_LAYOUT.slices["friction_demand"].start
+_O_CAMERA = ESTIMATE_LAYOUT.slices["camera_innovation"].start
+_O_FLOW = ESTIMATE_LAYOUT.slices["flow_innovation"].start
 
 
 @njit(cache=True, nogil=True)
@@ -59,17 +50,17 @@ def reset(robot: Any, states: Any, mask: Any, sensors: Any, values: Any) -> None
     """Start masked robots anew; see :class:`wlr_gym.perception.observer.observer.SlipObserver`."""
     for i in range(mask.shape[0]):
         if mask[i]:
-            _start(robot, sensors[i], states[i])
-            _report(robot, states[i], values[i])
+            _start(robot[0], sensors[i], states[i])
+            _report(robot[0], states[i], values[i])
 
 
 @njit(cache=True, nogil=True)
-def update(robot: Any, states: Any, mask: Any, sensors: Any, values: Any) -> None:
+def update(robot: Any, states: Any, mask: Any, sensors: Any, values: Any, work: Any) -> None:
     """Advance masked robots by one control step."""
     for i in range(mask.shape[0]):
         if mask[i]:
-            _advance(robot, sensors[i], states[i])
-            _report(robot, states[i], values[i])
+            _advance(robot[0], sensors[i], states[i], work[0])
+            _report(robot[0], states[i], values[i])
 
 
 @njit(cache=True, nogil=True)
@@ -78,12 +69,22 @@ def _start(robot: Any, sensors: Any, r: Any) -> None:
     r.seen[:] = 0.0
     r.seen[_ACCEL + 2] = robot.gravity
     _take(sensors, r)
-    r.tick = r.yaw = r.gyro_bias = r.demand = r.doubt = r.strange = 0.0
+    r.tick = r.yaw = r.turned = r.gyro_bias = r.demand = r.shaken = r.legs = 0.0
+    r.camera_off = r.camera_rejected = r.refused = r.frame_time = r.doubt = 0.0
+    r.flow_off = r.flow_rejected = r.flow_refused = r.flow_time = r.repeats = 0.0
+    r.anchor[:] = 0.0
+    r.off[:] = 0.0
+    r.first_off[:] = 0.0
+    r.frame[:] = math.nan
+    r.reading[:] = math.nan
+    r.lens[:] = 0.0
+    r.memory[:] = 0.0
+    r.wander[:] = 1.0
     r.normal[0], r.normal[1], r.normal[2] = 0.0, 0.0, 1.0
     r.raw[:] = 0.0
     r.yaw_covariance[0], r.yaw_covariance[1], r.yaw_covariance[2] = 0.0, 0.0, robot.gyro_bias**2
     for k in range(3):
-        r.rate[k] = r.seen[_GYRO + k]
+        r.rate[k] = r.last_rate[k] = r.seen[_GYRO + k]
     r.yaw_rate = r.rate[2]
     look(robot, r.seen, r)
     measure_force(r)
@@ -91,18 +92,18 @@ def _start(robot: Any, sensors: Any, r: Any) -> None:
         r.force[k] = r.last_force[k]
     pull(robot, r.seen, r)
     r.traction[:] = 0.0
-    carry(robot, r.seen, r)
+    carry(robot, r)
     r.covariance[:] = 0.0
+    r.guess = math.sqrt(r.force[0] ** 2 + r.force[1] ** 2)
     for k in range(2):
         total = r.force[k]
         bias = total / (1.0 + (total / (3.0 * robot.accel_bias)) ** 4)  # more than that is a slope
         r.leak[k], r.slope[k] = bias, total - bias
-        r.position[k] = r.velocity[k] = r.raw_velocity[k] = r.surprise[k] = 0.0
-        r.covariance[k, kalman.VELOCITY, kalman.VELOCITY] = _START_SPEED**2
-        r.covariance[k, kalman.LEAK, kalman.LEAK] = robot.accel_noise**2 + _START_LEAK**2
-        for i in range(4):
-            r.slip[k, i] = 0.0
-            r.covariance[k, kalman.SLIP + i, kalman.SLIP + i] = _START_SLIP**2
+        r.position[k] = r.velocity[k] = r.raw_velocity[k] = r.last_velocity[k] = r.kick[k] = 0.0
+        r.covariance[k, 0, 0] = _START_PLACE**2
+        r.covariance[k, kalman.VELOCITY, kalman.VELOCITY] = robot.start_speed**2
+        r.covariance[k, kalman.LEAK, kalman.LEAK] = robot.start_leak**2
+        r.covariance[k, kalman.LENS, kalman.LENS] = (SCALE if k == 0 else ROTATION) ** 2
 
 
 @njit(cache=True, nogil=True)
@@ -114,24 +115,26 @@ def _take(sensors: Any, r: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _advance(robot: Any, sensors: Any, r: Any) -> None:
-    """Predict with the IMU, then take in wheels and camera."""
+def _advance(robot: Any, sensors: Any, r: Any, work: Any) -> None:
+    """Predict with the IMU, then take in wheels, camera and flow."""
     _take(sensors, r)
     r.tick += 1.0
-    turned = turn(robot, r)
+    for i in range(4):
+        r.last_rolling[i, 0], r.last_rolling[i, 1] = r.rolling[i, 0], r.rolling[i, 1]
+    turn(robot, r)
     look(robot, r.seen, r)
-    change = sense_force(robot, r)
-    move(robot, turned, r)
-    spread(robot, turned, change, r)
+    sense_force(robot, r)
+    move(robot, r)
+    spread(robot, r)
     pull(robot, r.seen, r)
     settle(robot, r)
     if r.tick == 1.0:
         guess_velocity(r)
+    gather(robot, r, work)
+    judge(robot, r, work)
     see_rolling(robot, r)
-    see_friction_balance(robot, r)
-    pose_sum = sensors[_CAMERA] + sensors[_CAMERA + 1] + sensors[_CAMERA + 2]
-    if robot.camera > 0.0 and r.seen[_CAMERA_IS_NEW] > 0.5 and math.isfinite(pose_sum):
-        see_camera(robot, r)
+    see_camera(robot, sensors, r)
+    see_flow(robot, sensors, r)
     see_rest(robot, r)
 
 
@@ -166,3 +169,5 @@ def _report(robot: Any, r: Any, out: Any) -> None:
         out[_O_TRACTION + i], out[_O_LOAD + i] = r.traction[i], r.load[i]
         out[_O_USE + i] = abs(r.traction[i]) / max(r.load[i], LEAST_LOAD)
     out[_O_DEMAND] = r.demand
+    out[_O_CAMERA], out[_O_CAMERA + 1] = r.camera_off, r.camera_rejected
+    out[_O_FLOW], out[_O_FLOW + 1] = r.flow_off, r.flow_rejected

@@ -3,74 +3,64 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.perception.observer import kalman
+from wlr_gym.perception.observer.trust import MEMORY, load_trust
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import CORNER_SIGNS, Robot
 
-Array = NDArray[np.float64]
+#: 1 sigma of rounding to whole counts.
+_ROUNDING = 12.0**-0.5
 
 
-class ObserverConstants(NamedTuple):
-    """The robot as its file describes it, and its sensors' errors."""
+def constants(robot: Robot, period: float, camera: bool) -> NDArray[np.void]:
+    """Return one record (1,): the robot as its file describes it, its sensors' errors, the learned weights of ``trust.py``.
 
-    period: float
-    gravity: float
-    mass: float
-    body_mass: float
-    body_com: Array
-    hip: Array
-    leg_length: float
-    leg_mass: float
-    leg_com: float
-    wheel_mass: float
-    wheel_radius: float
-    spin_inertia: float
-    gear_friction: float
-    stiffness: float
-    velocity_count: float
-    lag: float
-    gyro_noise: float
-    gyro_bias: float
-    accel_noise: float
-    accel_bias: float
-    camera: float
-    camera_noise: float
-    camera_yaw_noise: float
-
-
-def constants(robot: Robot, period: float, camera: bool) -> ObserverConstants:
-    """Return the constants of a robot read every ``period`` s; ``camera``: whether its poses are used."""
-    hip, sensors = robot.hip_position, robot.sensors
-    return ObserverConstants(
-        period=period,
-        gravity=robot.gravity,
-        mass=robot.total_mass,
-        body_mass=robot.body.mass,
-        body_com=np.array(robot.body.com_offset),
-        hip=np.array([(x * hip.x, y * hip.y, hip.z) for x, y in CORNER_SIGNS]),
-        leg_length=robot.leg.length,
-        leg_mass=robot.leg.mass or 0.0,
-        leg_com=robot.leg.com_along_leg,
-        wheel_mass=robot.wheel.mass or 0.0,
-        wheel_radius=robot.wheel.radius,
-        spin_inertia=robot.wheel.spin_inertia + robot.servo.wheel.armature,
-        gear_friction=robot.servo.wheel.coulomb_friction,
-        stiffness=robot.ground.normal_stiffness,
-        velocity_count=robot.sensors.encoder.velocity,
-        lag=1.0 / (2.0 * math.pi * sensors.imu.bandwidth * period),
-        gyro_noise=sensors.imu.gyro_noise,
-        gyro_bias=sensors.imu.gyro_bias,
-        accel_noise=sensors.imu.accel_noise,
-        accel_bias=sensors.imu.accel_bias,
-        camera=float(camera),
-        camera_noise=sensors.camera.position_noise,
-        camera_yaw_noise=sensors.camera.yaw_noise,
-    )
+    Args:
+        period: s between two readings.
+        camera: whether its poses are used.
+    """
+    sensors, flow = robot.sensors, robot.sensors.flow
+    values: dict[str, Any] = {
+        "period": period,
+        "gravity": robot.gravity,
+        "mass": robot.total_mass,
+        "body_mass": robot.body.mass,
+        "body_com": robot.body.com_offset,
+        "hip": [(x * robot.hip_position.x, y * robot.hip_position.y, robot.hip_position.z) for x, y in CORNER_SIGNS],
+        "leg_length": robot.leg.length,
+        "leg_mass": robot.leg.mass or 0.0,
+        "leg_com": robot.leg.com_along_leg,
+        "wheel_mass": robot.wheel.mass or 0.0,
+        "wheel_radius": robot.wheel.radius,
+        "spin_inertia": robot.wheel.spin_inertia + robot.servo.wheel.armature,
+        "gear_friction": robot.servo.wheel.coulomb_friction,
+        "stiffness": robot.ground.normal_stiffness,
+        "velocity_count": sensors.encoder.velocity,
+        "lag": 1.0 / (2.0 * math.pi * sensors.imu.bandwidth * period),
+        "gyro_noise": sensors.imu.gyro_noise,
+        "gyro_bias": sensors.imu.gyro_bias,
+        "accel_noise": sensors.imu.accel_noise,
+        "accel_bias": sensors.imu.accel_bias,
+        "camera": float(camera),
+        "camera_noise": sensors.camera.position_noise,
+        "camera_yaw_noise": sensors.camera.yaw_noise,
+        "flow": sensors.has_flow,
+        "lens": flow.position if flow else (0.0, 0.0, 0.0),
+        "flow_noise": math.hypot(flow.noise, _ROUNDING) * flow.count / max(period, 1.0 / flow.rate) if flow else 0.0,
+        "flow_speed_noise": flow.speed_noise if flow else 0.0,
+        "flow_quality": flow.quality if flow else 0.0,
+        **load_trust(),
+    }
+    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+    record = np.zeros(1, np.dtype([(name, np.float64, array.shape) for name, array in arrays.items()]))
+    for name, array in arrays.items():
+        record[name] = array
+    return record
 
 
 def state_type(history: int) -> np.dtype[Any]:
@@ -81,29 +71,52 @@ def state_type(history: int) -> np.dtype[Any]:
         # pose and motion
         "position": (2,),  # start frame
         "yaw": (),
+        "pointing": (2,),  # cosine and sine of the yaw
+        "turned": (),  # over the step
         "velocity": (2,),
         "leak": (2,),  # of the accelerometer, m/s2
-        "slip": (2, 4),  # by how much each wheel rolls faster than the body moves, m/s
+        "guess": (),  # what the accelerometer read along the floor at first, m/s2
         "slope": (2,),  # gravity along the floor, m/s2
         "covariance": (2, kalman.SIZE, kalman.SIZE),
         "yaw_covariance": (3,),  # yaw, yaw with bias, bias
         "gyro_bias": (),  # about the normal
         "normal": (3,),  # of the floor, body frame
         "rate": (3,),  # body frame
+        "last_rate": (3,),
         "yaw_rate": (),
         "force": (3,),  # specific, mean over the step
         "last_force": (3,),
         "demand": (),  # friction demand, smoothed
-        "limit": (),  # 0 to 1: slip that all wheels share is possible
-        "surprise": (2,),  # mean normalised innovation of the camera's last frames
-        "doubt": (),  # 0 to 1: the camera contradicts the wheels
-        "strange": (),  # camera frames far off, in a row
+        "kick": (2,),  # acceleration along the floor over the step, m/s2
+        "shaken": (),  # change of the specific force along the floor, m/s2
+        "inclined": (),  # 0 to 1: what the accelerometer read at first is a slope
+        "legs": (),  # rms rate of the legs, rad/s
+        # camera and flow
+        "anchor": (3,),  # pose of the camera's start frame in the start frame: it has been moved
+        "first_off": (3,),  # by how much the first of the refused frames in a row was off, start frame
+        "off": (3,),  # by how much the last refused frame was off, start frame
+        "refused": (),  # s over which frames have been off by the same
+        "doubt": (),  # m/s: the camera has contradicted the wheels by so much
+        "frame": (3,),  # last frame's pose
+        "camera_off": (),  # normalised innovation of the last frame, 0 when there has been none for a while
+        "camera_rejected": (),
+        "frame_time": (),  # s since the last frame
+        "lens": (2,),  # true over measured flow less 1, and the flow sensor's rotation (rad)
+        "reading": (2,),  # last flow reading
+        "repeats": (),  # readings that were the same as the last
+        "flow_error": (2,),  # m/s
+        "flow_variance": (2,),
+        "flow_off": (),
+        "flow_rejected": (),
+        "flow_refused": (),  # s
+        "flow_time": (),  # s since the last reading
         # without corrections, for what the camera saw some steps ago
         "raw_velocity": (2,),  # start frame
         "raw": (history, 3),  # x, y, yaw at each step
         # wheels, see contacts.py
         "heading": (3,),  # body frame
         "left": (3,),  # body frame
+        "leg": (4, 2),  # cosine and sine of the leg angles
         "point": (4, 3),
         "rolling": (4, 2),
         "lift": (4,),
@@ -111,15 +124,15 @@ def state_type(history: int) -> np.dtype[Any]:
         "load": (4,),
         "traction": (4,),
         "spin": (4,),
+        # trust in the wheels, see trust.py
+        "memory": (4, MEMORY),
+        "last_rolling": (4, 2),
+        "last_velocity": (2,),
+        "trust": (4, 2),
+        "lead": (4,),
+        "wander": (2,),
         # scratch
-        "noise": (kalman.SIZE,),
-        "decay": (4,),
         "column": (kalman.SIZE,),
         "change": (kalman.SIZE,),
-        "grips": (4,),
-        "loose": (),
-        "mean_square": (),
-        "weight": (4,),
-        "share": (4,),
     }
     return np.dtype([(name, np.float64, shape) for name, shape in numbers.items()])
