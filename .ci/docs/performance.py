@@ -1,7 +1,7 @@
-"""The numbers of docs/performance.md: kept in docs/data/bench.json, taken from reports of ``wlr bench --json``.
+"""The numbers of docs/performance.md and README's of the engine: kept in docs/data/bench.json, from ``wlr bench --json``.
 
 ``python .ci/docs/performance.py bench.json ...`` takes the rows of the reports over, each with its machine, versions and date,
-and writes the tables anew; without a report only the tables. What is measured again replaces all of its older rows.
+and writes tables and picture anew; without a report only the tables. What is measured again replaces all of its older rows.
 """
 
 from __future__ import annotations
@@ -13,9 +13,17 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from wlr_gym.studies.bench.engine_report import AT_DEFAULTS, LEVELS, level_name, save_picture
+from wlr_gym.studies.bench.engine_report import lines as engine_table
+
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "docs" / "data" / "bench.json"
 PAGE = ROOT / "docs" / "performance.md"
+README = ROOT / "README.md"
+PICTURE = ROOT / "docs" / "figures" / "accuracy_speed.png"
+#: The engine's ratios that README has.
+README_RATIOS = (level_name(LEVELS[0]), AT_DEFAULTS)
+TIMES = "\N{MULTIPLICATION SIGN}"
 #: Measurements with a table of their own, or none.
 APART = ("batch",)
 BATCH = re.compile(r"(\d+) robots, (\w+), (\d+) threads?")
@@ -108,27 +116,59 @@ def _condition(found: Row) -> str:
     return f"{found['date']}, {found['rounds']} round{'s' * (found['rounds'] > 1)}{load}"
 
 
-def tables(rows: list[Row]) -> dict[str, list[str]]:
+def engine_lines(engine: dict[str, Any] | None) -> list[str]:
+    """Return picture and table of accuracy against speed as lines of Markdown; a note before the first measurement."""
+    if engine is None:
+        return ["Not measured yet on a quiet machine: `wlr bench --only engine`."]
+    found = engine["measured"]
+    head = f"Measured {_condition(found)}, {found['processor']}; speed: median [smallest..largest] of the rounds."
+    return [f"![accuracy against speed](figures/{PICTURE.name})", "", head, *engine_table(engine)]
+
+
+def tables(rows: list[Row], engine: dict[str, Any] | None = None) -> dict[str, list[str]]:
     """Return every generated part of the page by its marker."""
-    return {"speed": speed_table(rows), "batch": batch_table(rows), "machines": machine_lines(rows)}
+    parts = {"speed": speed_table(rows), "batch": batch_table(rows), "machines": machine_lines(rows)}
+    return {**parts, "engine": engine_lines(engine)}
 
 
-def write_page(text: str, rows: list[Row]) -> str:
+def write_page(text: str, rows: list[Row], engine: dict[str, Any] | None = None) -> str:
     """Return the page with its generated parts replaced."""
-    for name, lines in tables(rows).items():
+    for name, content in tables(rows, engine).items():
         begin, end = f"<!-- {name}: made by .ci/docs/performance.py -->", f"<!-- end of {name} -->"
         before, _, rest = text.partition(begin)
-        text = "\n".join([before + begin, *lines, end]) + rest.partition(end)[2]
+        text = "\n".join([before + begin, *content, end]) + rest.partition(end)[2]
     return text
 
 
+def write_readme(text: str, rows: list[Row]) -> str:
+    """Return README with the engine's ratios; as it is before they were measured at equal error."""
+    ratios = {row["what"].partition(":")[0]: row["ratio"]["median"] for row in rows if row["name"] == "engine"}
+    cells = []
+    for what in README_RATIOS:
+        if f"float64, {what}" not in ratios:
+            return text
+        cells.append(
+            f"{what}: {ratios[f'float64, {what}']:.0f}{TIMES} (float64), {ratios[f'float32, {what}']:.0f}{TIMES} (float32)"
+        )
+    command = "`wlr bench --only engine` ([performance](docs/performance.md))"
+    row = f"| engine against MuJoCo, ten motions, one core | {'; '.join(cells)} | {command} |"
+    return re.sub(r"^\| engine against .*$", lambda _: row, text, flags=re.MULTILINE)
+
+
 def main(reports: list[str]) -> None:
-    """Take reports over and write the page."""
-    rows = json.loads(DATA.read_text(encoding="utf-8"))["rows"] if DATA.is_file() else []
+    """Take reports over, write the page, README's row and the picture."""
+    kept = json.loads(DATA.read_text(encoding="utf-8")) if DATA.is_file() else {"rows": []}
+    rows, engine = kept["rows"], kept.get("engine")
     for path in reports:
-        rows = merged(rows, json.loads(Path(path).read_text(encoding="utf-8")))
-    DATA.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
-    PAGE.write_text(write_page(PAGE.read_text(encoding="utf-8"), rows), encoding="utf-8")
+        report = json.loads(Path(path).read_text(encoding="utf-8"))
+        rows = merged(rows, report)
+        if "engine" in report:
+            engine = {**report["engine"], "measured": {**report["machine"], "rounds": report["rounds"]}}
+    DATA.write_text(json.dumps({"rows": rows} | ({"engine": engine} if engine else {}), indent=1) + "\n", encoding="utf-8")
+    PAGE.write_text(write_page(PAGE.read_text(encoding="utf-8"), rows, engine), encoding="utf-8")
+    README.write_text(write_readme(README.read_text(encoding="utf-8"), rows), encoding="utf-8")
+    if engine:
+        save_picture(engine, PICTURE)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,8 @@ def _load() -> ModuleType:
 
 
 performance = _load()
-ROWS = json.loads((ROOT / "docs" / "data" / "bench.json").read_text(encoding="utf-8"))["rows"]
+DATA = json.loads((ROOT / "docs" / "data" / "bench.json").read_text(encoding="utf-8"))
+ROWS = DATA["rows"]
 
 
 def report(*rows: Measurement, quick: bool = False) -> dict:
@@ -33,7 +34,9 @@ def report(*rows: Measurement, quick: bool = False) -> dict:
 
 def test_the_page_is_what_the_numbers_make():
     text = performance.PAGE.read_text(encoding="utf-8")
-    assert performance.write_page(text, ROWS) == text
+    assert performance.write_page(text, ROWS, DATA.get("engine")) == text
+    readme = performance.README.read_text(encoding="utf-8")
+    assert performance.write_readme(readme, ROWS) == readme
     assert {row["name"] for row in ROWS} <= set(MEASUREMENTS)
 
 
@@ -57,3 +60,26 @@ def test_a_pair_is_shown_with_its_peer_and_ratio():
 def test_quick_numbers_are_refused():
     with pytest.raises(SystemExit, match="mean nothing"):
         performance.merged([], report(quick=True))
+
+
+def test_the_engine_is_taken_over_into_page_readme_and_picture(tmp_path, monkeypatch):
+    for name in ("DATA", "PAGE", "README"):
+        copy = tmp_path / getattr(performance, name).name
+        copy.write_text(getattr(performance, name).read_text(encoding="utf-8"), encoding="utf-8")
+        monkeypatch.setattr(performance, name, copy)
+    monkeypatch.setattr(performance, "PICTURE", tmp_path / "accuracy_speed.png")
+    names = [f"{precision}, {what}: 1 ms" for precision in ("float64", "float32") for what in performance.README_RATIOS]
+    rows = [Measurement("engine", name, "x real time", (90.0 + n,), (1.0,), "MuJoCo") for n, name in enumerate(names)]
+    speed = {"median": 90.0, "min": 90.0, "max": 90.0}
+    setting = {"side": "engine", "label": "1 ms", "precision": "float64", "step": 1e-3, "threads": 1, "call": "step"}
+    setting |= {"is_usual": True, "error": 2e-5, "worst": 4e-5, "upright": True, "speed": speed}
+    limits = {"disagreement": {"median": 1e-8, "max": 3e-7}, "convergence": {"median": 1e-7, "max": 3e-6}}
+    engine = {"reference": {**limits, "closed_form": {"slide": 1e-5}}, "settings": [setting]}
+    file = tmp_path / "report.json"
+    file.write_text(json.dumps({**report(*rows), "engine": engine}), encoding="utf-8")
+    performance.main([str(file)])
+    assert "| engine | 1 ms | float64 | 0.02 mm | 0.04 mm | 90 [90..90] |" in performance.PAGE.read_text(encoding="utf-8")
+    assert "90\N{MULTIPLICATION SIGN} (float64), 92\N{MULTIPLICATION SIGN} (float32)" in performance.README.read_text(
+        encoding="utf-8"
+    )
+    assert performance.PICTURE.is_file()

@@ -20,11 +20,12 @@ from wlr_gym.studies.bench.measure import Measurement, Size, machine
 
 if TYPE_CHECKING:
     from wlr_gym.studies.bench.convergence import Deviation
+    from wlr_gym.studies.bench.engine import EngineReport
     from wlr_gym.studies.bench.vision import VisionResult
 
 #: Measurement -> function. Imported when it is run.
 MEASUREMENTS = {
-    "engine": "wlr_gym.studies.bench.speed:measure_engine",
+    "engine": "wlr_gym.studies.bench.engine:measure_engine",
     "mujoco": "wlr_gym.studies.bench.mujoco_plant:measure_mujoco",
     "env_step": "wlr_gym.studies.bench.speed:measure_env_step",
     "ppo": "wlr_gym.studies.bench.training:measure_ppo",
@@ -97,12 +98,27 @@ def run(options: BenchOptions) -> int:
     for name in asked or [name for name in MEASUREMENTS if name not in _ON_REQUEST]:
         with console.status(f"measuring {name}"):
             rows = _measure(name, size)
+        if name == "engine":
+            rows = _engine_pairs(rows, report, console, options.json)
         report[name if name in _OWN_ROWS else "measurements"] += [row.as_dict() for row in rows]
         _print(console, _TABLES.get(name, _speed_table)(rows))
     if options.json is not None:
         write_json(options.json, report)
         print(f"written: {options.json}")
     return OK
+
+
+def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console, json: Path | None) -> list[Measurement]:
+    """Put accuracy and speed of all settings into the report, print them, draw them beside it; return the ratios."""
+    from wlr_gym.studies.bench import engine_report
+
+    report["engine"] = found.as_dict()
+    console.print("\n".join(engine_report.lines(report["engine"])), markup=False, highlight=False, soft_wrap=True)
+    if json is not None:
+        picture = json.with_name(f"{json.stem}_engine.png")
+        engine_report.save_picture(report["engine"], picture)
+        print(f"written: {picture}")
+    return engine_report.pairs(found.results)
 
 
 def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
@@ -132,7 +148,7 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     return OK
 
 
-def _measure(name: str, size: Size) -> list[Any]:
+def _measure(name: str, size: Size) -> Any:
     module, _, function = MEASUREMENTS[name].partition(":")
     return getattr(importlib.import_module(module), function)(size)
 

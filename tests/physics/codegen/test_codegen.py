@@ -98,3 +98,16 @@ def test_threads_that_load_a_module_at_once_are_given_it_whole(monkeypatch, tmp_
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: load_module("test_slow", slow).value, range(4)))
     assert found == [tmp_path.name] * 4
+
+
+def test_a_compact_block_overwrites_what_it_reads_without_losing_it():
+    """Outputs are stored early, yet never before the input of their name is read: a swap, a chain, and a plain number."""
+    owner = Graph()
+    a, b, c = (owner.input(name) for name in "abc")
+    outputs = {"a": b, "b": a, "d": a * b + c * (a - b), "c": (a - b) * c, "e": 2.0}
+    expected = {"a": 5.0, "b": 3.0, "d": 1.0, "c": -14.0, "e": 2.0}
+    for compact in (False, True):
+        lanes = {"a": 3.0, "b": 5.0, "c": 7.0}
+        lines = emit(outputs, lambda n: f"w[{n!r}]", lambda n, v: f"w[{n!r}] = {v}", "", compact=compact)
+        exec("\n".join(lines), {"w": lanes})
+        assert lanes == expected

@@ -32,6 +32,7 @@ def test_measurement_runs_and_reports(name, tmp_path, capsys):
     assert report["schema"] == 1
     assert report["machine"]["cores"] >= 1
     assert report["machine"]["processor"]
+    assert ("engine" in report) == (name == "engine")
     rows = report["convergence" if name == "convergence" else "measurements"]
     assert rows
     for row in rows:

@@ -172,6 +172,7 @@ def emit(
     indent: str,
     constant: Callable[[float], str] = repr,
     fused: bool = False,
+    compact: bool = False,
 ) -> list[str]:
     """Print expressions as straight-line source.
 
@@ -183,10 +184,13 @@ def emit(
         constant: prints a number in the kernel's precision.
         fused: print ``a * b + c`` as ``fma(a, b, c)`` (exactly one rounding, on every machine). Explicit fusion keeps
             results equal for any vector width; compiler contraction does not.
+        compact: keep few values alive, for blocks with far more than a processor has registers: the longer chain of operands
+            first, and every output stored as soon as it is known and the input of its name is read. Inputs and outputs of
+            different names must not share a place. The same bits.
 
     Returns:
-        Source lines. All loads precede all stores, so a block may overwrite what it reads. Choices are printed as
-        ``select(...)``: no branches.
+        Source lines. All loads precede all stores (compact: all loads of a name its store), so a block may overwrite what it
+        reads. Choices are printed as ``select(...)``: no branches.
     """
     absorbed = _absorbed_products(live_nodes(outputs.values())) if fused else {}
     names: dict[int, str] = {}
@@ -195,14 +199,27 @@ def emit(
     def text(operand: Operand) -> str:
         return names[operand.index] if isinstance(operand, Node) else constant(float(operand))
 
-    for node in _needed(outputs.values(), absorbed):
+    order = _needed(outputs.values(), absorbed, compact)
+    due = _store_times(outputs, order) if compact else {len(order): list(outputs)}
+    for at, node in enumerate(order):
         expression = (
             load(node.operands[0]) if node.op == "input" else _expression(node, text, constant, absorbed.get(node.index))
         )
         names[node.index] = f"t{node.index}"
         lines.append(f"{indent}t{node.index} = {expression}")
-    lines += [indent + store(name, text(value)) for name, value in outputs.items()]
-    return lines
+        lines += [indent + store(name, text(outputs[name])) for name in due.get(at, ())]
+    return lines + [indent + store(name, text(outputs[name])) for name in due.get(len(order), ())]
+
+
+def _store_times(outputs: Mapping[str, Operand], order: Sequence[Node]) -> dict[int, list[str]]:
+    """Return after which node of ``order`` each output is stored: the later of its value and the read of its own name."""
+    known = {node.index: at for at, node in enumerate(order)}
+    read = {node.operands[0]: at for at, node in enumerate(order) if node.op == "input"}
+    due: dict[int, list[str]] = {}
+    for name, value in outputs.items():
+        at = max(known[value.index], read.get(name, 0)) if isinstance(value, Node) else len(order)
+        due.setdefault(at, []).append(name)
+    return due
 
 
 def straight_line_source(name: str, parameters: Sequence[str], lines: Sequence[str]) -> list[str]:
@@ -235,8 +252,14 @@ def _absorbed_products(order: Iterable[Node]) -> dict[int, Node]:
     return chosen
 
 
-def _needed(roots: Iterable[Operand], absorbed: Mapping[int, Node]) -> list[Node]:
-    """Return the nodes to print, operands first; a product used only inside fused sums is not among them."""
+def _needed(roots: Iterable[Operand], absorbed: Mapping[int, Node], compact: bool = False) -> list[Node]:
+    """Return the nodes to print, operands first; a product used only inside fused sums is not among them.
+
+    Args:
+        roots: what is wanted.
+        absorbed: sum -> the product that is fused into it.
+        compact: the operand with the longest chain of nodes behind it comes first.
+    """
 
     def children(node: Node) -> list[Operand]:
         product = absorbed.get(node.index)
@@ -245,7 +268,14 @@ def _needed(roots: Iterable[Operand], absorbed: Mapping[int, Node]) -> list[Node
         others = [x for x in node.operands if x is not product]
         return [*product.operands, *(others or [product])]
 
-    return _ordered(roots, children)
+    roots = list(roots)
+    order = _ordered(roots, children)
+    if not compact:
+        return order
+    depth: dict[int, int] = {}
+    for node in order:
+        depth[node.index] = 1 + max((depth[x.index] for x in children(node) if isinstance(x, Node)), default=0)
+    return _ordered(roots, lambda node: sorted(children(node), key=lambda x: -depth[x.index] if isinstance(x, Node) else 0))
 
 
 def _expression(node: Node, text: Callable[[Operand], str], constant: Callable[[float], str], product: Node | None) -> str:

@@ -7,16 +7,17 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from wlr_gym.base.provenance import git_commit, versions
 
 #: Runs some work and returns its rate (1/s) or its time (s).
 Contender = Callable[[], float]
+Name = TypeVar("Name", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -87,11 +88,11 @@ def summary(values: Sequence[float]) -> dict[str, Any]:
     return {"median": statistics.median(values), "min": min(values), "max": max(values), "values": list(values)}
 
 
-def interleave(contenders: Mapping[str, Contender], rounds: int) -> dict[str, tuple[float, ...]]:
+def interleave(contenders: Mapping[Name, Contender], rounds: int, *, warm_up: bool = True) -> dict[Name, tuple[float, ...]]:
     """Run every contender once unmeasured (compilation, caches), then ``rounds`` times in turn; return their values."""
-    for contender in contenders.values():
+    for contender in contenders.values() if warm_up else ():
         contender()
-    values: dict[str, list[float]] = {name: [] for name in contenders}
+    values: dict[Name, list[float]] = {name: [] for name in contenders}
     for _ in range(rounds):
         for name, contender in contenders.items():
             values[name].append(contender())

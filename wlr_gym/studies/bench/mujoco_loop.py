@@ -8,9 +8,11 @@ The servo law is expressed in MuJoCo's own actuators, so a control tick is a sin
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import mujoco
 import numpy as np
+from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
@@ -26,15 +28,25 @@ from wlr_gym.physics.plants.base import (
     check_setpoints,
     standing_state,
 )
-from wlr_gym.physics.plants.mujoco.mjcf import build_model
+from wlr_gym.physics.plants.mujoco.batch import GEAR_IMPEDANCE
+from wlr_gym.physics.plants.mujoco.mjcf import CONTACT_IMPEDANCE, build_model
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
-from wlr_gym.robot import FIRST_WHEEL, JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
+from wlr_gym.robot import FIRST_WHEEL, JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot, standing_height
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import contact_slip_velocity
 
 Array = NDArray[np.float64]
 
 BACKEND = "mujoco_loop"
+Contact = Literal["default", "stiff friction", "matched", "tuned"]
+#: What each contact setting is.
+CONTACTS: dict[Contact, str] = {
+    "default": "MuJoCo's default springs and friction",
+    "stiff friction": "MuJoCo's default springs, impratio 100",
+    "matched": "the engine's springs, impratio 1e5",
+    "tuned": "matched, with the engine's contact point, stiffer gear friction and less virtual mass",
+}
+VIRTUAL_MASS_DIVISOR = 1e3
 
 
 def register_backend() -> None:
@@ -43,23 +55,45 @@ def register_backend() -> None:
 
 
 def build_servo_model(
-    robot: Robot, parameters: Parameters, physics_step: float = 0.001, *, soft: bool = False
+    robot: Robot, parameters: Parameters, physics_step: float = 0.001, contact: Contact = "default"
 ) -> mujoco.MjModel:
     """Return the robot with its servos as actuators; ``ctrl[:4]`` leg angles, ``ctrl[4:]`` and ``ctrl[8:]`` wheel speeds.
 
     Args:
         robot, parameters: the robot; row 0 is used. Servo profiles must be off.
         physics_step: s.
-        soft: MuJoCo's default contact impedance and impratio instead of those that match the contact spring and stop
-            creep. Less exact, and how most users leave it.
+        contact: of :data:`CONTACTS`.
     """
     model = build_model(robot, parameters, physics_step=physics_step, extend=_add_servos(robot, parameters))
-    if soft:
-        model.opt.impratio = 1.0
+    if contact in ("default", "stiff friction"):
+        model.opt.impratio = 1.0 if contact == "default" else 100.0
         model.pair_solimp[:] = 0.9, 0.95, 0.001, 0.5, 2.0
         model.pair_solref[:] = 0.02, 1.0
         model.pair_solreffriction[:] = 0.0
+    if contact == "tuned":
+        _tune(model, robot, parameters)
     return model
+
+
+def _tune(model: mujoco.MjModel, robot: Robot, parameters: Parameters) -> None:
+    """Matched springs, and what else MuJoCo allows towards Coulomb friction on the engine's contact point.
+
+    The contact point of a sphere lies halfway into the overlap: the sphere is enlarged by the overlap at rest, and a negative
+    margin takes it off again. Gear friction sticks within a step. Sliding friction is damped over one step, and 1000 times the
+    apparent inverse mass makes the virtual mass of the impedance, which pushes a sliding wheel off the floor, as much smaller.
+    """
+    wheels = [model.body(name).id for name in WHEELS]
+    radius = parameters["wheel.radius"][0]
+    overlap = standing_height(robot, robot.home.leg_angle) - standing_state(robot, parameters).position[0, 2]
+    model.geom_size[[model.geom(name).id for name in WHEELS], 0] = radius + overlap
+    model.geom_rbound[[model.geom(name).id for name in WHEELS]] = radius + overlap
+    model.pair_margin[:] = -overlap
+    model.dof_solref[6:] = -1.0, -GEAR_IMPEDANCE / model.opt.timestep
+    model.dof_solimp[6:, :2] = GEAR_IMPEDANCE
+    model.body_invweight0[wheels] *= VIRTUAL_MASS_DIVISOR
+    model.pair_solref[:] *= VIRTUAL_MASS_DIVISOR
+    model.opt.impratio *= VIRTUAL_MASS_DIVISOR
+    model.pair_solreffriction[:] = -1.0, -CONTACT_IMPEDANCE / model.opt.timestep
 
 
 def _add_servos(robot: Robot, parameters: Parameters) -> Callable[[mujoco.MjSpec], None]:
@@ -98,6 +132,38 @@ def _add_actuator(spec: mujoco.MjSpec, joint: str, gain: float, bias: list[float
     )
 
 
+class ServoBatch:
+    """Robots on bare ``mujoco.batch``: a control tick is one call.
+
+    Args:
+        model: of :func:`build_servo_model`.
+        parameters: one robot per row; their friction is used, all else is the model's.
+        threads: of MuJoCo.
+    """
+
+    def __init__(self, model: mujoco.MjModel, parameters: Parameters, threads: int = 1) -> None:
+        self._batch = batch = Batch(model, len(parameters), threads)
+        batch.expand("pair_friction")[:, :, :2] = parameters["ground.mu_x"][:, :, None]
+        self.position, self.velocity = batch.bind("qpos"), batch.bind("qvel")
+        self._control, self._activation = batch.bind("ctrl"), batch.bind("act")
+
+    def reset(self, state: PlantState) -> None:
+        """Start at home with the bodies at the heights and velocities of ``state`` (level, joints at rest)."""
+        self._batch.reset()
+        self.position[:, :3], self.velocity[:, :3] = state.position, state.linear_velocity_in_body
+        self._activation[:] = 0.0
+
+    def step(self, setpoints: Array, substeps: int) -> None:
+        """Advance one control tick."""
+        self._control[:] = servo_controls(setpoints)
+        self._batch.step(nstep=substeps)
+
+
+def servo_controls(setpoints: Array) -> Array:
+    """Return ``ctrl`` (..., 12) of the servo model for setpoints (..., 8)."""
+    return np.concatenate([setpoints, setpoints[..., WHEEL_SLICE]], axis=-1)
+
+
 class MujocoLoopPlant:
     """One robot on ``mj_step(nstep)``; see :class:`wlr_gym.physics.plants.base.Plant` for the contract.
 
@@ -106,7 +172,6 @@ class MujocoLoopPlant:
     """
 
     capabilities: Capabilities = Capabilities(BACKEND, has_truth=True, can_set_state=True, real_time=False)
-    soft = True
 
     def __init__(self, robot: Robot, count: int = 1, options: PlantOptions | None = None) -> None:
         if count != 1:
@@ -127,7 +192,7 @@ class MujocoLoopPlant:
         return 1
 
     def _build(self) -> None:
-        self._model = build_servo_model(self.robot, self.parameters, self.options.physics_step, soft=self.soft)
+        self._model = build_servo_model(self.robot, self.parameters, self.options.physics_step)
         self._data = mujoco.MjData(self._model)
         constant, resistance = servo.motor_constants(
             self.parameters["servo.stall_torque"][0], self.parameters["servo.no_load_speed"][0], self.robot.servo.supply_voltage
@@ -182,8 +247,7 @@ class MujocoLoopPlant:
     def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick with the servos as actuators."""
         row = check_setpoints(setpoints, 1)[0]
-        self._data.ctrl[:8] = row
-        self._data.ctrl[8:] = row[WHEEL_SLICE]
+        self._data.ctrl[:] = servo_controls(row)
         mujoco.mj_step(self._model, self._data, nstep=self.options.substeps)
         self._look()
         self._sensors.measure(self._raw, self._readings.values)

@@ -6,10 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import standing_state
 from wlr_gym.physics.plants.mujoco.plant import MujocoPlant
 from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.measure import Contender, Measurement, Size, interleave, rate
-from wlr_gym.studies.bench.speed import SUBSTEPS, mujoco_batch, random_setpoints
+from wlr_gym.studies.bench.mujoco_loop import ServoBatch, build_servo_model
+from wlr_gym.studies.bench.speed import SUBSTEPS, random_setpoints
 
 Array = NDArray[np.float64]
 
@@ -26,7 +29,7 @@ def measure_mujoco(size: Size) -> list[Measurement]:
     contenders = {
         "plant": _plant("mujoco", count, ticks),
         "alone": _steps_alone(count, ticks),
-        "servos": mujoco_batch(count, ticks, soft=False),
+        "servos": _servos(count, ticks),
         "engine": _plant("gibbs_appell", count, ticks),
     }
     values = interleave(contenders, size.rounds)
@@ -51,6 +54,25 @@ def _plant(backend: str, count: int, ticks: int) -> Contender:
 
     def run() -> float:
         plant.reset()
+        return rate(drive, count * ticks * SUBSTEPS)
+
+    return run
+
+
+def _servos(count: int, ticks: int) -> Contender:
+    robot, setpoints = load_robot(), random_setpoints(ticks, count)
+    parameters = Parameters.nominal(robot, count)
+    batch, state = (
+        ServoBatch(build_servo_model(robot, parameters, contact="matched"), parameters),
+        standing_state(robot, parameters),
+    )
+
+    def drive() -> None:
+        for row in setpoints:
+            batch.step(row, SUBSTEPS)
+
+    def run() -> float:
+        batch.reset(state)
         return rate(drive, count * ticks * SUBSTEPS)
 
     return run

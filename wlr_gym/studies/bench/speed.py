@@ -1,7 +1,5 @@
-"""Speed of engine, environment, import and start. The peer is MuJoCo with the same robot, servo law, friction and step."""
+"""Speed of the environment, import and start, and of the engine by batch size."""
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo fills its namespace when it is imported.)
 from __future__ import annotations
 
 import subprocess
@@ -10,23 +8,21 @@ import time
 from collections.abc import Callable, Sequence
 
 import gymnasium as gym
-import mujoco.batch
 import numpy as np
 from numpy.typing import NDArray
 
 import wlr_gym  # noqa: F401  (registers the environments)
-from wlr_gym.physics.plants.base import PlantOptions, standing_state
+from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
-from wlr_gym.robot import WHEEL_SLICE, load_robot
-from wlr_gym.robot.parameters import Parameters
+from wlr_gym.robot import load_robot
 from wlr_gym.studies.bench.measure import Contender, Measurement, Size, against_fastest, interleave, rate
-from wlr_gym.studies.bench.mujoco_loop import BACKEND, build_servo_model, register_backend
+from wlr_gym.studies.bench.mujoco_loop import BACKEND, register_backend
 
 Array = NDArray[np.float64]
 
 ENVIRONMENT = "WLR-Velocity-v0"
 SUBSTEPS = PlantOptions().substeps
-ENGINE_BARS = {"float32": 60.0, "float64": 25.0}
+PRECISIONS = ("float32", "float64")
 START = (
     "import gymnasium, wlr_gym; env = gymnasium.make('{}'); env.reset(seed=0); env.step(env.action_space.sample()); env.close()"
 )
@@ -40,26 +36,6 @@ def random_setpoints(ticks: int, count: int) -> Array:
     return np.repeat(np.concatenate([legs, wheels], axis=2), 10, axis=0)[:ticks]
 
 
-def measure_engine(size: Size) -> list[Measurement]:
-    """Substeps per second on one thread against ``mujoco.batch``; our sensors and truth are part of our time."""
-    count = size(1024, 16)
-    contenders: dict[str, Contender] = {
-        precision: _engine(count, size(50, 2), precision, threads=1) for precision in ENGINE_BARS
-    }
-    contenders |= {
-        f"mujoco.batch, {label} contact": mujoco_batch(count, size(2, 1), soft=soft)
-        for label, soft in (("matched", False), ("default", True))
-    }
-    values = interleave(contenders, size.rounds)
-    peers = {name: series for name, series in values.items() if name not in ENGINE_BARS}
-    return [
-        against_fastest(
-            "engine", f"substeps of 1 ms, {count} robots, 1 thread, {precision}", "1/s", values[precision], peers, bar
-        )
-        for precision, bar in ENGINE_BARS.items()
-    ]
-
-
 def _engine(count: int, ticks: int, precision: str, threads: int) -> Contender:
     plant = GibbsAppellPlant(load_robot(), count, PlantOptions(precision=precision, threads=threads))
     setpoints = random_setpoints(ticks, count)
@@ -70,30 +46,6 @@ def _engine(count: int, ticks: int, precision: str, threads: int) -> Contender:
 
     def run() -> float:
         plant.reset()
-        return rate(drive, count * ticks * SUBSTEPS)
-
-    return run
-
-
-def mujoco_batch(count: int, ticks: int, *, soft: bool) -> Contender:
-    """Bare ``mujoco.batch`` with the servos as MuJoCo's actuators: a control tick is one call."""
-    robot = load_robot()
-    parameters = Parameters.nominal(robot)
-    batch = mujoco.batch.Batch(build_servo_model(robot, parameters, soft=soft), count, 1)
-    position, control, activation = batch.bind("qpos"), batch.bind("ctrl"), batch.bind("act")
-    setpoints = random_setpoints(ticks, count)
-    height = standing_state(robot, parameters).position[0, 2]
-
-    def drive() -> None:
-        for row in setpoints:
-            control[:, :8] = row
-            control[:, 8:] = row[:, WHEEL_SLICE]
-            batch.step(nstep=SUBSTEPS)
-
-    def run() -> float:
-        batch.reset()
-        position[:, 2] = height
-        activation[:] = 0.0
         return rate(drive, count * ticks * SUBSTEPS)
 
     return run
@@ -137,7 +89,7 @@ def _stepping(env: gym.Env, steps: int) -> Contender:
 def measure_batch(size: Size) -> list[Measurement]:
     """Substeps per second by batch size, precision and threads; for information."""
     counts: Sequence[int] = (1, 4) if size.quick else (1, 8, 64, 512, 4096)
-    cases = [(count, precision, threads) for precision in ENGINE_BARS for threads in (1, 2) for count in counts]
+    cases = [(count, precision, threads) for precision in PRECISIONS for threads in (1, 2) for count in counts]
     ticks = {count: max(5, 5_000 // count) if not size.quick else 2 for count in counts}
     contenders = {
         f"{count} robots, {precision}, {threads} thread{'s' * (threads > 1)}": _engine(count, ticks[count], precision, threads)

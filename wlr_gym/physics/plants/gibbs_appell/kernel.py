@@ -119,7 +119,7 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
     for block, outputs in blocks.items():
         used = {node.operands[0] for node in live_nodes(outputs.values()) if node.op == "input"}
         scalars = [name for name in _SCALARS if name in used]
-        body = emit(outputs, load, lambda name, text: f"w[{start[name]} + k] = {text}", "", constant, fused=True)
+        body = emit(outputs, load, lambda name, text: f"w[{start[name]} + k] = {text}", "", constant, fused=True, compact=True)
         lines += [
             *straight_line_source(f"{block}_of_robot", ["w", "k", *scalars], body),
             "",

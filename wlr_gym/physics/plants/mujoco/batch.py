@@ -155,6 +155,15 @@ class RobotBatch:
         self._solref[rows, :, 0] = -scale * parameters["ground.normal_stiffness"]
         self._solref[rows, :, 1] = -scale * parameters["ground.normal_damping"]
 
+    def divide_virtual_mass(self, divisor: float) -> None:
+        """Make the mass that the impedance adds to contacts, and its push on sliding wheels, ``divisor`` times smaller.
+
+        That push grows as the step shrinks, and MuJoCo allows no smaller impedance. Springs, dampers and friction stay as
+        they are from the next :meth:`set_parameters` on, which must leave inertia and geometry alone.
+        """
+        self._inverse_weight[:, [self._body[name] for name in WHEELS]] *= divisor
+        self._batch.expand("opt.impratio")[:] *= divisor
+
     def stores(self) -> dict[str, RowStore]:
         """Return what a step takes from the one before it."""
         names = ("qpos", "qvel", "warmstart", "applied", "armature", "gear_bound")

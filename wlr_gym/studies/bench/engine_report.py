@@ -1,0 +1,131 @@
+"""What the measurement of engine and MuJoCo says: ratios at equal error and at defaults, a table, a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.base.files import replace_file
+from wlr_gym.studies.bench.engine import KINDS, EngineResult
+from wlr_gym.studies.bench.measure import Measurement
+
+#: m: errors at which the fastest setting of each side is compared. The first two
+#: are met where the contacts are nearly those of Coulomb, the last by MuJoCo's default contact.
+LEVELS = (1e-4, 5e-4, 2e-3, 2.5e-2)
+#: m: up to this error MuJoCo's setting counts as comparable.
+COMPARABLE = 1e-3
+COMPARABLE_BARS = {"float64": 50.0, "float32": 100.0}
+NOT_MEASURED = "Not measured, for want of a GPU: MuJoCo Warp, MJX, Isaac Sim, Genesis."
+UNIT = "x real time"
+AT_DEFAULTS = "both at 1 ms, MuJoCo's defaults"
+#: What is compared at 1 ms: in words, how MuJoCo is called, threads, bars.
+STANDARD = ((AT_DEFAULTS, "step", 1, {"float64": 30.0, "float32": 60.0}), ("both at 1 ms, 2 threads", "rollout", 2, {}))
+
+
+def level_name(level: float) -> str:
+    """Return what a level is called."""
+    return f"error at most {1e3 * level:g} mm"
+
+
+def pairs(results: Sequence[EngineResult]) -> list[Measurement]:
+    """Return the ratios of speed: at equal error, at MuJoCo's defaults and equal step, and with two threads."""
+    found: list[Measurement] = []
+    for precision in ("float64", "float32"):
+        ours = [one for one in results if one.setting.side == "engine" and one.setting.precision == precision]
+        peers = [one for one in results if one.setting.side == "MuJoCo"]
+        for level in LEVELS:
+            bar = COMPARABLE_BARS[precision] if level < COMPARABLE else None
+            found += _pair(f"{precision}, {level_name(level)}", _fastest(ours, level), _fastest(peers, level), bar)
+        for what, call, threads, bar in STANDARD:
+            standard = _standard(ours, "step", threads), _standard(peers, call, threads)
+            found += _pair(f"{precision}, {what}", *standard, bar.get(precision))
+    return found
+
+
+def _pair(what: str, ours: EngineResult | None, peer: EngineResult | None, bar: float | None) -> list[Measurement]:
+    if ours is None or peer is None:
+        return []
+    text = f"{what}: {ours.setting.label} ({_millimetres(ours.error)})"
+    name = f"MuJoCo {peer.setting.label} ({_millimetres(peer.error)})"
+    return [Measurement("engine", text, UNIT, ours.speed, peer.speed, name, bar)]
+
+
+def _fastest(results: Iterable[EngineResult], level: float) -> EngineResult | None:
+    """Return the fastest on one thread that stays upright with an error of at most ``level``."""
+    fit = [one for one in results if one.upright and one.error <= level and one.setting.threads == 1]
+    return max(fit, key=lambda one: sorted(one.speed)[len(one.speed) // 2], default=None)
+
+
+def _standard(results: Iterable[EngineResult], call: str, threads: int) -> EngineResult | None:
+    """Return the setting of 1 ms with everything else at its default."""
+    for one in results:
+        setting = one.setting
+        kind = (setting.cone, setting.contact, setting.integrator)
+        usual = setting.side == "engine" or kind == KINDS[0]
+        if usual and setting.step == 1e-3 and setting.call == call and setting.threads == threads and setting.is_usual:
+            return one
+    return None
+
+
+def _millimetres(value: float | None) -> str:
+    return "lost" if value is None else f"{1e3 * value:.3g} mm" if value < 0.1 else f"{1e3 * value:.0f} mm"
+
+
+def lines(report: dict[str, Any]) -> list[str]:
+    """Return the reference and the table of all settings as lines of Markdown; ``report`` is ``EngineReport.as_dict()``."""
+    reference = report["reference"]
+    apart, rest = reference["disagreement"], reference["convergence"]
+    closed = "; ".join(f"{name}: {1e3 * value:+.2f} mm" for name, value in reference["closed_form"].items())
+    text = (
+        f"The limits of both simulators differ by {1e6 * apart['median']:.2g} µm (median) and {1e6 * apart['max']:.2g} µm "
+        f"(largest) and lie {1e6 * rest['max']:.2g} µm at most beyond the finest step. Distance driven, reference minus the "
+        f"closed form of a rigid robot: {closed}. {NOT_MEASURED}"
+    )
+    rows = ["| side | setting | precision | error, rms | worst | x real time |", "|---|---|---|---|---|---|"]
+    for one in report["settings"]:
+        errors = [_millimetres(one[key]) if one["upright"] else "falls" for key in ("error", "worst")]
+        speed = one["speed"]
+        cells = (one["side"], one["label"], one["precision"], *errors)
+        rows.append(f"| {' | '.join(cells)} | {speed['median']:.4g} [{speed['min']:.4g}..{speed['max']:.4g}] |")
+    return [text, "", *rows]
+
+
+_COLOURS = {"float64": "#1f4e9c", "float32": "#e06c00"}
+_MUJOCO_COLOURS = ("#111111", "#7a7a7a", "#2a8a4a", "#8fc79f", "#b02a5b", "#7b3fb5", "#c39be6")
+
+
+def save_picture(report: dict[str, Any], path: Path) -> None:
+    """Write error against speed of every setting on one thread as a PNG; ``report`` is ``EngineReport.as_dict()``."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.5, 6.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    shown = [one for one in report["settings"] if one["upright"] and one["threads"] == 1 and one["call"] == "step"]
+    for precision, colour in _COLOURS.items():
+        rows = [one for one in shown if one["side"] == "engine" and one["precision"] == precision]
+        _draw(axes, rows, f"engine, {precision}", colour, "o")
+    for kind, colour in zip(KINDS, _MUJOCO_COLOURS, strict=True):
+        rows = [one for one in shown if one["side"] == "MuJoCo" and (one["cone"], one["contact"], one["integrator"]) == kind]
+        _draw(axes, rows, f"MuJoCo float64, {kind[0]}, {kind[1]} contact, {kind[2]}", colour, "s")
+    axes.set(xscale="log", yscale="log", xlabel="error of the pose after 2 s, rms of ten motions (mm)")
+    axes.set_ylabel("simulated seconds of a robot per second of one core")
+    axes.grid(which="both", alpha=0.25)
+    axes.legend(fontsize=8)
+    axes.set_title("Accuracy against speed; numbers: step in ms. Crosses: fewer or more passes or iterations", fontsize=10)
+    replace_file(path, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
+
+
+def _draw(axes: Any, rows: list[dict[str, Any]], label: str, colour: str, marker: str) -> None:
+    """One curve over the step; settings with another number of passes or iterations are crosses."""
+    usual = [one for one in rows if one["is_usual"]]
+    other = [one for one in rows if not one["is_usual"]]
+    for chosen, style in ((usual, {"marker": marker, "label": label}), (other, {"marker": "x", "linestyle": "none"})):
+        if chosen:
+            points = [(1e3 * one["error"], one["speed"]["median"]) for one in chosen]
+            axes.plot(*zip(*points, strict=True), color=colour, markersize=5, linewidth=1.2, **style)
+    for one in usual:
+        place = (1e3 * one["error"], one["speed"]["median"])
+        axes.annotate(f"{1e3 * one['step']:g}", place, textcoords="offset points", xytext=(5, 3), fontsize=7, color=colour)
