@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,4 +106,14 @@ def run_command(command: str, *, smaller: bool = True) -> int:
     program, *words = shlex.split(command)
     assert program == "wlr", f"{command}: only wlr is run here"
     fitting = [options for key, options in SMALLER.items() if set(key.split()) <= set(words)]
-    return main([*words, *(" ".join(fitting).split() if smaller else [])])
+    return main(laid_over(words, " ".join(fitting).split() if smaller else []))
+
+
+def laid_over(words: Sequence[str], more: Sequence[str]) -> list[str]:
+    """Return the words of a command without the options, and their values, that ``more`` gives, and ``more``."""
+    kept, skipped = [], False
+    for word in words:
+        skipped = word in more if word.startswith("--") else skipped
+        if not skipped:
+            kept.append(word)
+    return [*kept, *more]

@@ -10,6 +10,7 @@ from blocks import PAGES, ROOT, blocks, run_page
 
 #: Page -> number of its blocks that nothing runs; each says why. All others are run.
 NOT_RUN = {
+    "docs/camera.md": 1,  # a camera
     "docs/evaluation.md": 1,  # runs of one training with several seeds
     "docs/gap.md": 4,  # minutes each; the quickstart has one
     "docs/pictures.md": 1,  # a window

@@ -142,7 +142,10 @@ def walk(found: Any, place: str, seen: set[int]) -> Iterator[tuple[str, Any]]:
 
 
 #: What a step writes before it reads it, or an address.
-SCRATCH = (".plant._table", ".plant._generalised", ".plant._force_inputs", ".plant._batch.contact", ".plant._batch.constraint")
+SCRATCH = (
+    ".plant._table", ".plant._generalised", ".plant._force_inputs", ".plant._batch.contact", ".plant._batch.constraint",
+    ".observer._work",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("case", ["engine", "mujoco", "engine float32"])

@@ -4,9 +4,11 @@ import math
 import os
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("cv2")
 pytest.importorskip("dynamixel_sdk")
@@ -456,3 +458,19 @@ def test_the_emulator_feeds_pose_and_faults(tmp_path):
     assert faults.pop("camera_moved") == pytest.approx(1.05)
     assert not any(faults.values())
     machine.close()
+
+
+# ---- what the page says ----
+
+
+def test_the_file_of_the_page_is_one(tmp_path):
+    """docs/camera.md: its file, with the shipped markers and calibration in place of the reader's own."""
+    page = (Path(__file__).parents[2] / "docs" / "camera.md").read_text(encoding="utf-8")
+    given = yaml.safe_load(page.split("```yaml\n")[1].split("```")[0])
+    shipped = small_camera()
+    calibration = shipped.calibration.model_dump(mode="json")
+    content = given | {"calibration": calibration, "body": "body", "floor": "floor"}
+    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(content))
+    camera = load_camera_file(tmp_path / "camera.yaml")
+    assert (camera.name, camera.rate, camera.delay) == ("overhead", 30.0, 0.0)
+    assert not camera.is_film

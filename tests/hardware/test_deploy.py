@@ -214,7 +214,8 @@ def test_an_emulated_robot_may_hide_something(tmp_path):
 
 
 def words(folder, *more):
-    return ["pid", "--emulated", "--stepped", "--seconds", "1", "--out", str(folder), *more]
+    seconds = [] if "--seconds" in more else ["--seconds", "1"]
+    return ["pid", "--emulated", "--stepped", *seconds, "--out", str(folder), *more]
 
 
 def test_command_line_in_emulated_time(tmp_path, capsys):

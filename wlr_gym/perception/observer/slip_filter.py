@@ -75,8 +75,8 @@ def _start(robot: Any, sensors: Any, r: Any) -> None:
     r.anchor[:] = 0.0
     r.off[:] = 0.0
     r.first_off[:] = 0.0
-    r.frame[:] = math.nan
-    r.reading[:] = math.nan
+    r.frame[:] = math.inf  # as none will be
+    r.reading[:] = math.inf
     r.lens[:] = 0.0
     r.memory[:] = 0.0
     r.wander[:] = 1.0

@@ -25,6 +25,7 @@ def constants(robot: Robot, period: float, camera: bool) -> NDArray[np.void]:
         camera: whether its poses are used.
     """
     sensors, flow = robot.sensors, robot.sensors.flow
+    frames = max(flow.rate * period, 1.0) if flow else 1.0  # of a reading
     values: dict[str, Any] = {
         "period": period,
         "gravity": robot.gravity,
@@ -51,8 +52,8 @@ def constants(robot: Robot, period: float, camera: bool) -> NDArray[np.void]:
         "camera_yaw_noise": sensors.camera.yaw_noise,
         "flow": sensors.has_flow,
         "lens": flow.position if flow else (0.0, 0.0, 0.0),
-        "flow_noise": math.hypot(flow.noise, _ROUNDING) * flow.count / max(period, 1.0 / flow.rate) if flow else 0.0,
-        "flow_speed_noise": flow.speed_noise if flow else 0.0,
+        "flow_noise": math.hypot(flow.noise * math.sqrt(frames), _ROUNDING) * flow.count * flow.rate / frames if flow else 0.0,
+        "flow_speed_noise": flow.speed_noise / math.sqrt(frames) if flow else 0.0,
         "flow_quality": flow.quality if flow else 0.0,
         **load_trust(),
     }
