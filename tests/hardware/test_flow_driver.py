@@ -5,6 +5,7 @@ import struct
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from wlr_gym.hardware.flow.stream import FlowStream
 from wlr_gym.robot import JOINTS, load_robot
 
 ROBOT = load_robot("flow")
-SENSOR = ROBOT.sensors.flow
+SENSOR: Any = ROBOT.sensors.flow
 PORT = FlowPort(port="/dev/spidev0.0", driver="spi", axes=("x", "y"))
 STREAM = FlowPort(port="/dev/ttyACM1", axes=("x", "y"))
 
@@ -80,6 +81,7 @@ class Chip:
             assert self.clock() >= 100.0 + 0.04, "40 ms after power"
             self.since_reset, self.page, self.is_set_up = self.clock(), 0, False
             return
+        assert self.since_reset is not None
         assert self.clock() >= self.since_reset + 1e-3, "1 ms after a reset"
         if register == 0x7F:
             self.page = value
@@ -361,6 +363,7 @@ def hardware_with(**flow):
 
 def test_hardware_file_names_the_sensor_and_the_robot_must_have_one():
     hardware = with_ports(hardware_with(), {"flow": "/dev/ttyACM7"})
+    assert hardware.flow is not None
     assert hardware.flow.port == "/dev/ttyACM7"
     check_fit(ROBOT, hardware)
     with pytest.raises(InputError, match=r"its file needs a section sensors\.flow"):
@@ -375,6 +378,8 @@ def test_the_pages_hardware_files_are_read():
     page = (Path(__file__).parents[2] / "docs" / "optical_flow.md").read_text(encoding="utf-8")
     lines = re.findall("```yaml\n(.*?)```", page, re.S)[1].splitlines()
     stream, chip = (hardware_with(**yaml.safe_load(line)["flow"]).flow for line in lines)
+    assert stream is not None
+    assert chip is not None
     assert (stream.driver, chip.driver) == ("stream", "spi")
 
 
@@ -399,7 +404,7 @@ def straight_run(scale=1.0, yaw=0.0, slip=1.0, noise=0.1, speed=0.25, seconds=6.
     table |= {f"pos_{joint}": np.full(len(t), np.pi / 2) for joint in JOINTS}
     table |= {f"vel_{joint}": v / 0.034 if "wheel" in joint else np.zeros(len(t)) for joint in JOINTS}
 
-    run = Table(table)
+    run: Any = Table(table)
     run.path = "run_01.csv"
     return run
 

@@ -1,6 +1,7 @@
 """The optical-flow sensor of the emulated robot: plant to control loop, faults; the commands of docs/optical_flow.md."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,8 @@ from wlr_gym.robot import load_robot
 
 ROBOT = load_robot("flow")
 HARDWARE = with_flow_port(ROBOT, load_hardware("nominal"))
-LENS = np.array(ROBOT.sensors.flow.position)
+SENSOR: Any = ROBOT.sensors.flow
+LENS = np.array(SENSOR.position)
 STAND, DRIVE, TURN = (0.0, 0.0), (5.0, 5.0), (2.0, 5.0)
 #: Fault -> how its reason begins, of the reading; in the order of what they do.
 FAULTS = {
@@ -54,7 +56,9 @@ class Robot:
         rows = []
         for _ in range(round(seconds / 0.02)):
             sensors = self.plant.step(setpoints)
-            truth, reading = self.machine.plant.truth(), self.plant.loop.status.flow
+            truth = self.machine.plant.truth()
+            status: Any = self.plant.loop.status
+            reading = status.flow
             height = lens_height(ROBOT, sensors.joint_position[0, :4])
             v = floor_velocity(sensors.flow[0], truth.angular_velocity_in_body[0], height, LENS)
             rows.append((bool(sensors.flow_is_new[0]), reading.trouble, reading.note, v - truth.linear_velocity_in_body[0, :2]))
@@ -76,7 +80,7 @@ def test_emulated_flow_tells_the_velocity_over_the_floor_as_in_the_simulator(rob
     assert np.mean([new for new, *_ in rows]) > 0.98
     errors = np.array([error for *_, error in rows])
     assert np.abs(errors.mean(axis=0)).max() < 0.006
-    one = ROBOT.sensors.flow.noise * ROBOT.sensors.flow.count * np.sqrt(121 * 50) * 0.134
+    one = SENSOR.noise * SENSOR.count * np.sqrt(121 * 50) * 0.134
     assert np.all(errors.std(axis=0) < 2.0 * one)
 
 
@@ -96,7 +100,7 @@ def test_frames_come_over_a_port_of_their_own():
     pytest.importorskip("serial")
     machine = Machine(ROBOT, HARDWARE, MachineOptions(tick=0.002, timing=NO_TIME))
     with Server(machine, real_time=False) as server:
-        stream = FlowStream(FlowPort(port=server.ports["flow"]), ROBOT.sensors.flow, lambda: machine.time)
+        stream = FlowStream(FlowPort(port=server.ports["flow"]), SENSOR, lambda: machine.time)
         stream.open()
         server.advance(0.06)
         reading = stream.read()
@@ -163,7 +167,9 @@ def test_record_calibrate_and_doctor_from_the_command_line(tmp_path, capsys):
     hardware.write_text(text.replace("robot: emanual", "robot: flow") + "flow: {port: /dev/ttyACM1}\n")
     run = next((tmp_path / "runs").glob("run_*.csv"))
     assert main(["calibrate", "flow", str(run), "--hardware", str(hardware), "--out", str(hardware), "--yes"]) == 0
-    found = load_hardware(hardware).flow.calibration
+    flow = load_hardware(hardware).flow
+    assert flow is not None
+    found = flow.calibration
     assert found.scale == pytest.approx(1.1, abs=0.04)
     assert found.mount_yaw == pytest.approx(0.12, abs=0.04)
     assert found.date is not None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -56,8 +58,9 @@ def test_needs_a_simulator_and_limits():
         make_policy("mppi", core.contract()).act(core.observation)
     core.close()
     core = make_core("WLR-Velocity-v0", 1, {"task": {"success": {"velocity_error": None, "yaw_rate_error": None}}})
+    planner: Any = load_agent("mppi").make_policy(core.contract(), {})
     with pytest.raises(InputError, match="no limits of success"):
-        load_agent("mppi").make_policy(core.contract(), {}).use_simulator(core)
+        planner.use_simulator(core)
     core.close()
 
 

@@ -1,5 +1,7 @@
 """Hand-made episodes whose scores are known."""
 
+from typing import Any
+
 import numpy as np
 
 from wlr_gym.learning.evaluation import Measure, Rollout
@@ -43,7 +45,7 @@ def rollout(ticks=TICKS, episodes=EPISODES, **changes) -> Rollout:
     return Rollout(**(content | changes))
 
 
-def measured(velocity, yaw_rate=0.0, ticks=TICKS, episodes=EPISODES):
+def measured(velocity: Any, yaw_rate: Any = 0.0, ticks=TICKS, episodes=EPISODES):
     """Constant errors of velocity (m/s) and yaw rate (rad/s), one per episode or one for all."""
     errors = np.zeros((ticks, episodes, 2))
     errors[:, :, 0], errors[:, :, 1] = velocity, yaw_rate

@@ -1,5 +1,7 @@
 """The optical-flow sensor against what it is computed from by other means: true velocities, and counted statistics."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from wlr_gym.robot import load_robot, robot_content, robot_hash
 from wlr_gym.robot.parameters import Parameters
 
 ROBOT = load_robot("flow")
-FLOW = ROBOT.sensors.flow
+FLOW: Any = ROBOT.sensors.flow
 PERIOD = 0.02
 QUIET = PlantOptions(sensor_noise=False)
 
@@ -94,7 +96,8 @@ def test_flow_is_that_of_the_true_velocities_on_a_slope_and_with_a_pitched_body(
     coarse, truth = drive(backend, robot, PERIOD, seconds, parameters, setpoints)
     _, fine = drive(backend, robot, 0.001, seconds, parameters, setpoints)
     np.testing.assert_allclose(fine[::20, :3], truth[:, :3], atol=1e-9)  # the same motion
-    flow = instantaneous_flow(fine, np.array(robot.sensors.flow.position))
+    sensor: Any = robot.sensors.flow
+    flow = instantaneous_flow(fine, np.array(sensor.position))
     assert np.ptp(rotation_matrix(fine[:, 3:7])[:, 2, 0]) > 0.05  # it pitches
     shift = np.concatenate([np.zeros((1, 2)), np.cumsum(0.0005 * (flow[1:] + flow[:-1]), axis=0)])
     times = 0.001 * np.arange(len(shift))
