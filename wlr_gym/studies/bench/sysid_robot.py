@@ -126,7 +126,7 @@ def peer_of(problem: FewNumbers) -> PeerProblem:
 
     @lru_cache(maxsize=2 * len(problem.quantities))
     def compiled(numbers: bytes) -> mujoco.MjModel:
-        model = build_servo_model(problem.robot, problem.table(np.frombuffer(numbers)), STEP)
+        model = build_servo_model(problem.robot, problem.table(np.frombuffer(numbers)), STEP, "matched")
         model.dof_solref[:] = 2.0 * STEP, 1.0  # as stiff as the step allows: MuJoCo's gear friction creeps
         return model
 
