@@ -9,7 +9,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks.task_config import ObserverConfig
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import check_contract, load_policy, make_policy, read_contract, write_contract
-from wlr_gym.policy.file import DEFAULTS, with_defaults
+from wlr_gym.policy.file import DEFAULTS, LEFT_OUT, with_defaults
 from wlr_gym.robot import Robot, load_robot
 
 
@@ -90,7 +90,7 @@ def test_another_torque_speed_line_is_refused(contract, motor):
 
 @pytest.mark.parametrize("absent", DEFAULTS)
 def test_an_absent_key_means_its_default(contract, absent):
-    contract = with_defaults(contract)
+    contract = dict.fromkeys(LEFT_OUT) | with_defaults(contract)
     group, _, key = absent.partition(".")
 
     def forget(c):
@@ -109,7 +109,7 @@ def test_an_absent_key_means_its_default(contract, absent):
     older = changed(contract, forget)
     check_contract(older, contract, "policy")
     check_contract(contract, older, "policy")
-    assert with_defaults(older) == contract
+    assert dict.fromkeys(LEFT_OUT) | with_defaults(older) == contract
     if key and contract[group]:
         with pytest.raises(InputError, match=rf"{key} is .* in the policy, 'other' in the environment"):
             check_contract(older, changed(contract, differ), "policy")

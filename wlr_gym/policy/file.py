@@ -32,6 +32,8 @@ DEFAULTS = {
     "observer.camera": True,
     "controller": None,
 }
+#: Keys that contracts have only where they are not the default.
+LEFT_OUT = ("controller",)
 _INDEX = re.compile(r"\[\d+\]")
 
 
@@ -120,7 +122,8 @@ def with_defaults(environment: Contract) -> dict[str, Any]:
     for place, default in DEFAULTS.items():
         group, _, key = place.partition(".")
         if not key:
-            whole.setdefault(group, default)
+            if group not in LEFT_OUT:
+                whole.setdefault(group, default)
         elif isinstance(whole.get(group), list):
             whole[group] = [{**entry, key: entry.get(key, default)} for entry in whole[group]]
         elif isinstance(whole.get(group), Mapping):
