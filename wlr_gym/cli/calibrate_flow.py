@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli.calibrate_robot import save_calibration, source_of
+from wlr_gym.cli.calibrate_robot import save_calibration, source_of, today
 from wlr_gym.cli.robot_options import RobotOption, ask_terminal
 
 
@@ -38,7 +38,6 @@ def calibrate_flow(options: FlowOptions) -> int:
     Raises:
         InputError: a run without flow, too little way, a hardware file that names no flow sensor.
     """
-    from wlr_gym.cli.calibrate_robot import today
     from wlr_gym.data.read import read_run
     from wlr_gym.hardware.calibration import with_flow_calibration
     from wlr_gym.hardware.config import load_hardware

@@ -3,7 +3,8 @@ the servos use); and how old they are."""
 
 from __future__ import annotations
 
-from typing import Protocol
+import struct
+from typing import Any, Protocol
 
 from wlr_gym.hardware.dynamixel.protocol import crc16
 
@@ -71,9 +72,37 @@ class FrameFinder:
         return frames
 
 
-def missing_between(last: int | None, sequence: int) -> int:
-    """Return how many frames are missing between two sequence numbers (modulo 65536); the same again is none."""
-    return 0 if last is None or sequence == last else (sequence - last - 1) % 65536
+class NumberedFrames:
+    """Finds whole frames in a stream, and counts by their sequence numbers (modulo 65536) what is missing.
+
+    Args:
+        layout: of a frame without its CRC: sync, sequence number, and what else is in it.
+        sync: how a frame begins.
+
+    Attributes:
+        lost: frames missing between the received ones.
+    """
+
+    def __init__(self, layout: struct.Struct, sync: bytes) -> None:
+        self._layout = layout
+        self._finder = FrameFinder(sync, layout.size + CRC_SIZE)
+        self._last: int | None = None
+        self.lost = 0
+
+    @property
+    def crc_errors(self) -> int:
+        """Frames dropped because their CRC was wrong."""
+        return self._finder.crc_errors
+
+    def take(self, data: bytes) -> list[tuple[tuple[Any, ...], bool]]:
+        """Take bytes; return the content of the frames they complete, after the sync, and whether it is the last one again."""
+        return [self._count(self._layout.unpack(raw)[1:]) for raw in self._finder.feed(data)]
+
+    def _count(self, content: tuple[Any, ...]) -> tuple[tuple[Any, ...], bool]:
+        sequence, last, self._last = content[0], self._last, content[0]
+        is_repeated = sequence == last
+        self.lost += 0 if last is None or is_repeated else (sequence - last - 1) % 65536
+        return content, is_repeated
 
 
 class StreamClock:

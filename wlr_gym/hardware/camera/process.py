@@ -26,6 +26,7 @@ from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS, RenderedCamera
 from wlr_gym.hardware.camera.slot import Slot
 from wlr_gym.hardware.camera.stamps import StampClock
 from wlr_gym.perception.markers.detection import Image
+from wlr_gym.perception.vision.live_camera import open_device
 from wlr_gym.perception.vision.live_pose import PoseFinder
 from wlr_gym.perception.vision.tracking import VideoFrame
 from wlr_gym.perception.vision.video import grey
@@ -53,11 +54,7 @@ def frames_of_device(file: CameraFile) -> Iterator[Taken | None]:
     """
     import cv2
 
-    capture = cv2.VideoCapture(file.device)
-    if not capture.isOpened():
-        raise InputError(f"camera {file.device}: cannot be opened; is it plugged in, and free?")
-    capture.set(cv2.CAP_PROP_FRAME_WIDTH, file.calibration.width)
-    capture.set(cv2.CAP_PROP_FRAME_HEIGHT, file.calibration.height)
+    capture = open_device(file.device, file.calibration)
     capture.set(cv2.CAP_PROP_FPS, file.rate)
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not the oldest that waits
     last = time.monotonic()

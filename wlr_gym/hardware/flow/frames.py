@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from wlr_gym.hardware.framing import CRC_SIZE, FrameFinder, missing_between, sealed
+from wlr_gym.hardware.framing import CRC_SIZE, NumberedFrames, sealed
 
 SYNC = b"\xa5\xf1"
 _LAYOUT = struct.Struct("<2sHIHhhBxH")
@@ -45,31 +45,12 @@ def encode_frame(frame: FlowFrame) -> bytes:
     return sealed(_LAYOUT.pack(SYNC, frame.sequence & 0xFFFF, frame.microseconds & 0xFFFFFFFF, *numbers))
 
 
-class FlowFrameParser:
-    """Reads the frames of a stream.
-
-    Attributes:
-        lost: frames missing between the received ones, by their sequence numbers.
-    """
+class FlowFrameParser(NumberedFrames):
+    """Reads the frames of a stream."""
 
     def __init__(self) -> None:
-        self._finder = FrameFinder(SYNC, SIZE)
-        self._last: int | None = None
-        self.lost = 0
-
-    @property
-    def crc_errors(self) -> int:
-        """Frames dropped because their CRC was wrong."""
-        return self._finder.crc_errors
+        super().__init__(_LAYOUT, SYNC)
 
     def feed(self, data: bytes) -> list[FlowFrame]:
         """Take bytes; return the frames they complete, the same one again left out."""
-        return [frame for raw in self._finder.feed(data) if (frame := self._take(raw)) is not None]
-
-    def _take(self, raw: bytes) -> FlowFrame | None:
-        frame = FlowFrame(*_LAYOUT.unpack(raw)[1:])
-        if frame.sequence == self._last:
-            return None
-        self.lost += missing_between(self._last, frame.sequence)
-        self._last = frame.sequence
-        return frame
+        return [FlowFrame(*content) for content, is_repeated in self.take(data) if not is_repeated]

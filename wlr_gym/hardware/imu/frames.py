@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.hardware.framing import FrameFinder, missing_between, sealed
+from wlr_gym.hardware.framing import NumberedFrames, sealed
 
 SYNC = b"\xa5\x5a"
 SIZE = 24
@@ -68,29 +68,18 @@ def encode_frame(frame: ImuFrame) -> bytes:
     return sealed(body)
 
 
-class FrameParser:
-    """Reads the frames of a stream.
-
-    Attributes:
-        lost: frames missing between the received ones, by their sequence numbers.
-    """
+class FrameParser(NumberedFrames):
+    """Reads the frames of a stream."""
 
     def __init__(self) -> None:
-        self._finder = FrameFinder(SYNC, SIZE)
-        self._last: int | None = None
-        self.lost = 0
-
-    @property
-    def crc_errors(self) -> int:
-        """Frames dropped because their CRC was wrong."""
-        return self._finder.crc_errors
+        super().__init__(_LAYOUT, SYNC)
 
     def feed(self, data: bytes) -> list[ImuFrame]:
         """Take bytes; return the frames they complete."""
-        return [self._take(raw) for raw in self._finder.feed(data)]
+        return [_frame(*content) for content, _ in self.take(data)]
 
-    def _take(self, raw: bytes) -> ImuFrame:
-        _, sequence, microseconds, ax, ay, az, temperature, gx, gy, gz = _LAYOUT.unpack(raw)
-        self.lost += missing_between(self._last, sequence)
-        self._last = sequence
-        return ImuFrame(sequence, microseconds, (ax, ay, az), temperature, (gx, gy, gz))
+
+def _frame(
+    sequence: int, microseconds: int, ax: int, ay: int, az: int, temperature: int, gx: int, gy: int, gz: int
+) -> ImuFrame:
+    return ImuFrame(sequence, microseconds, (ax, ay, az), temperature, (gx, gy, gz))

@@ -39,11 +39,7 @@ def film(number: int, folder: Path, camera: Camera, seconds: float | None = None
     require_package("cv2", "vision")
     import cv2
 
-    capture = cv2.VideoCapture(number)
-    if not capture.isOpened():
-        raise InputError(f"camera {number}: cannot be opened; is it plugged in, and free?")
-    capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
-    capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
+    capture = open_device(number, camera)
     rate = capture.get(cv2.CAP_PROP_FPS)
     rate = rate if 1 < rate < 2000 else 30.0
     queue: Queue[tuple[float, Image] | str | None] = Queue(_BACKLOG)
@@ -75,6 +71,22 @@ def film(number: int, folder: Path, camera: Camera, seconds: float | None = None
     if fault:
         raise InputError(f"camera {number}: {fault} after {times[-1]:.1f} s; {len(times)} frames are kept in {folder}")
     return folder / "film.avi", folder / "film.csv"
+
+
+def open_device(device: int | str, camera: Camera) -> Any:
+    """Return a camera's ``cv2.VideoCapture``, asked for pictures of the size it was calibrated with.
+
+    Raises:
+        InputError: it cannot be opened.
+    """
+    import cv2
+
+    capture = cv2.VideoCapture(device)
+    if not capture.isOpened():
+        raise InputError(f"camera {device}: cannot be opened; is it plugged in, and free?")
+    capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
+    capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
+    return capture
 
 
 def _grab(capture: Any, queue: Queue[tuple[float, Image] | str | None], stop: threading.Event) -> None:
