@@ -18,7 +18,7 @@ from rich.table import Table
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.provenance import record_provenance
-from wlr_gym.cli import OK
+from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import PatchOption, environment_of
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.learning.evaluation import (
@@ -29,6 +29,7 @@ from wlr_gym.learning.evaluation import (
     Condition,
     Rollout,
     Subject,
+    acceptance,
     common_robot,
     comparison_rows,
     make_player,
@@ -43,6 +44,7 @@ from wlr_gym.learning.evaluation import (
     write_episodes,
     write_samples,
 )
+from wlr_gym.learning.evaluation.acceptance import ACCEPTANCE_FILE, accept, acceptance_rows, write_acceptance
 from wlr_gym.learning.evaluation.scoring import (
     BACKENDS,
     BASELINES,
@@ -97,6 +99,10 @@ class EvaluateOptions(PatchOption):
     """Name in configs/robot/ or path; default: the robot that the policy was trained with, else the task's."""
     threads: int = 1
     """Threads of the simulator; results do not depend on it."""
+    accept: bool = False
+    """Acceptance test instead of the card: on every family of floors of the task the policy must not lose more than 5 % of
+    tracking error (upper 95 % bound) against the baselines (default: its controller and the blind policy); 512 episodes x 5
+    seeds. Exit code 1 where it does."""
     out: Path | None = None
     """Folder for card.md, card.json, pictures, episodes.parquet (every episode's scores) and samples.csv (what randomization
     drew); default: only print."""
@@ -112,6 +118,8 @@ class EvaluateOptions(PatchOption):
 
 def run(options: EvaluateOptions) -> int:
     """Play, print the card, write it."""
+    if options.accept:
+        return _accept(options)
     options = _complete(options)
     _check(options)
     patch = options.patch()
@@ -135,6 +143,35 @@ def run(options: EvaluateOptions) -> int:
         subjects = read_subjects([options.policy, *(options.baselines or ())])
         _film(options, [_shown(card, subject) for subject in subjects[:2]], options.video, keywords)
     return OK
+
+
+def _accept(options: EvaluateOptions) -> int:
+    """Run the acceptance test, print its table, write it."""
+    if len(options.policy) != 1:
+        raise InputError(f"--accept: expected one policy, got {len(options.policy)}")
+    if options.out is not None:
+        make_output_folder(options.out)
+    with progress(options.progress) as tell:
+        result = accept(
+            options.policy[0],
+            options.env,
+            references=options.baselines,
+            floors=None if options.randomization is None else (options.randomization,),
+            episodes=options.episodes or acceptance.EPISODES,
+            seeds=options.seeds or acceptance.SEEDS,
+            robot=options.robot,
+            effects=options.patch(),
+            threads=options.threads,
+            tell=tell,
+        )
+    _print(
+        f"acceptance of {result.policy}: {result.episodes} episodes x {result.seeds} seeds a family", acceptance_rows(result)
+    )
+    if options.out is not None:
+        write_acceptance(options.out / ACCEPTANCE_FILE, result)
+        print(f"written: {options.out / ACCEPTANCE_FILE}")
+    print("accepted" if result.accepted else f"refused: {len(result.refused)} losses may be above {result.largest_loss:g} %")
+    return OK if result.accepted else FAILED
 
 
 def _shown(card: Card, subject: Subject) -> Subject:

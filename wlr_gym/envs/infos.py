@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.envs.core import Core
-from wlr_gym.envs.tasks.success import limits_of, succeeded, tracking_error
+from wlr_gym.envs.tasks.success import limits_of, scales_of, succeeded, tracking_error
 
 Array = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ class Infos:
 
     def __init__(self, core: Core) -> None:
         self._core = core
-        self._limits = limits_of(core.task.config)
+        self._limits, self._scales = limits_of(core.task.config), scales_of(core.task.config)
         self.has_truth: bool = core.settings.truth_info
 
     def step(self) -> dict[str, Any]:
@@ -62,7 +62,7 @@ class Infos:
         limited = {which: error for which, error in errors.items() if which[1] == "rms" or which in self._limits}
         measures = {name if kind == "rms" else f"{name}_{kind}": error for (name, kind), error in limited.items()}
         if self._limits:
-            measures["tracking_error"] = tracking_error(self._limits, errors, core.terminated)
+            measures["tracking_error"] = tracking_error(self._scales, errors, core.terminated)
             measures["success"] = succeeded(self._limits, errors, core.terminated).astype(np.float64)
         return {"episode_reward_terms": sums, "episode_measures": measures}
 
@@ -75,7 +75,7 @@ class Infos:
 
     def tracking_error(self) -> Array:
         """Return the tracking error (N,) of the episode so far."""
-        return tracking_error(self._limits, self.errors(), self._core.terminated)
+        return tracking_error(self._scales, self.errors(), self._core.terminated)
 
     def succeeded(self) -> NDArray[np.bool_]:
         """Return whether the episode so far (N,) is a success."""

@@ -18,7 +18,7 @@ from pydantic import Field
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import SettingsModel, parse_config
 from wlr_gym.envs.core import Core
-from wlr_gym.envs.tasks.success import limits_of
+from wlr_gym.envs.tasks.success import scales_of
 from wlr_gym.policy import make_policy
 from wlr_gym.robot import FIRST_WHEEL, JOINTS
 
@@ -82,13 +82,13 @@ class Mppi:
         """
         if not core.plant.capabilities.can_set_state:
             raise InputError(f"agent 'mppi' plans from the true state, which backend '{core.settings.backend}' does not tell")
-        limits = limits_of(core.task.config)
-        if not limits:
+        scales = scales_of(core.task.config)
+        if not scales:
             raise InputError(f"agent 'mppi': task '{core.task.config.name}' has no limits of success to plan for")
         names = list(core.task.measures)
         self._weights = np.zeros(len(names))
-        for (name, _), limit in limits.items():
-            self._weights[names.index(name)] += 1.0 / (len(limits) * limit**2)
+        for (name, _), scale in scales.items():
+            self._weights[names.index(name)] += 1.0 / (len(scales) * scale**2)
         self._core = core
         self._owner = np.repeat(np.arange(core.count), self.config.samples)
         self._imagined = _imagined(core, len(self._owner))

@@ -81,7 +81,7 @@ def _ramp(config: TaskConfig, command: str) -> str:
 def limits_text(config: TaskConfig, measure: str) -> str:
     """Return ``rms at most 0.02`` for a measure that success depends on."""
     limits = config.success.get(measure)
-    texts = [] if limits is None else [f"{kind} at most {value:g}" for kind, value in limits if value is not None]
+    texts = [f"{kind} at most {limit:g}" for kind in ("rms", "max") if (limit := getattr(limits, kind, None)) is not None]
     return ", ".join(texts) or "-"
 
 

@@ -28,20 +28,30 @@ def limits_of(config: TaskConfig) -> dict[Which, float]:
     return limits
 
 
-def tracking_error(limits: Mapping[Which, float], errors: Mapping[Which, Array], fell: Flags) -> Array:
-    """Return the tracking error of each episode (N,): rms of what is reached of every limit; a fall adds :data:`FALL`.
+def scales_of(config: TaskConfig) -> dict[Which, float]:
+    """Return what counts as 1 in the tracking error of a task: the limit of success where no scale is given, SI units."""
+    scales = limits_of(config)
+    given = {(name, "rms"): chosen.scale for name, chosen in config.success.items()}
+    return {which: given.get(which) or limit for which, limit in scales.items()}
+
+
+def tracking_error(scales: Mapping[Which, float], errors: Mapping[Which, Array], fell: Flags) -> Array:
+    """Return the tracking error of each episode (N,): rms over the measures in units of their scales; a fall adds :data:`FALL`.
 
     Args:
-        limits: of the task; without any the rms is 0.
-        errors: measure and kind -> (N,), SI units; of all that is limited.
+        scales: of the task; without any the rms is 0.
+        errors: measure and kind -> (N,), SI units; of all that has a scale.
         fell: (N,) a termination term ended the episode.
     """
-    shares = np.array([errors[which] / limit for which, limit in limits.items()]).reshape(len(limits), len(fell))
-    return np.sqrt((shares**2).sum(axis=0) / max(1, len(limits))) + FALL * fell
+    shares = np.array([errors[which] / scale for which, scale in scales.items()]).reshape(len(scales), len(fell))
+    return np.sqrt((shares**2).sum(axis=0) / max(1, len(scales))) + FALL * fell
 
 
 def succeeded(limits: Mapping[Which, float], errors: Mapping[Which, Array], fell: Flags) -> Flags:
-    """Return which episodes (N,) were a success: not fallen, and within every limit. Arguments as for the tracking error."""
+    """Return which episodes (N,) did not fall and stayed within every limit; with limits of success: which were a success.
+
+    Arguments as for the tracking error.
+    """
     well = ~fell
     for which, limit in limits.items():
         well &= errors[which] <= limit

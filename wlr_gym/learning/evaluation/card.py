@@ -28,7 +28,7 @@ IDLE = "do_nothing"
 #: Training seeds from which the interquartile mean is not the mean.
 FEWEST = 4
 #: Metrics that are compared by their difference: a share of 0 %, or of a reward with an arbitrary zero, says nothing.
-BY_DIFFERENCE = ("success", "falls", "reward")
+BY_DIFFERENCE = ("success", "within_scales", "falls", "reward")
 
 
 @cache

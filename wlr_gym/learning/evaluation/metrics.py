@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.envs.tasks.success import FALL, Which, tracking_error
+from wlr_gym.envs.tasks.success import FALL, Which, succeeded, tracking_error
 from wlr_gym.learning.evaluation.rollout import Measure, Rollout
 
 Array = NDArray[np.float64]
@@ -67,6 +67,7 @@ GENERAL = (
 def metrics_of(measures: Sequence[Measure]) -> tuple[Metric, ...]:
     """Return the rows of a task's card, in order: all limits in one number, the measures, success, and the general ones."""
     limits = [f"{kind} of {m.name} {limit:g} {m.unit}" for m in measures for kind, limit in _limits(m).items()]
+    scales = [f"{kind} of {m.name} {scale:g} {m.unit}" for m in measures for kind, scale in _scales_of(m).items()]
     general = [metric.key for metric in GENERAL]
     own = []
     for m in measures:
@@ -80,11 +81,12 @@ def metrics_of(measures: Sequence[Measure]) -> tuple[Metric, ...]:
             "-",
             3,
             True,
-            f"rms over the task's limits of what is reached of each ({', '.join(limits)}); a fall adds {FALL:g}",
+            f"rms over the measures in units of their scales ({', '.join(scales)}); a fall adds {FALL:g}",
         ),
         *TRACKING,
         *own,
-        Metric("success", "%", 0, False, "episodes without a fall and within every limit"),
+        Metric("success", "%", 0, False, f"episodes without a fall and within every limit ({', '.join(limits)})"),
+        Metric("within_scales", "%", 0, False, "episodes without a fall and within every scale of the tracking error"),
         *GENERAL,
     )
 
@@ -98,8 +100,13 @@ def _limits(measure: Measure) -> dict[str, float]:
     return {kind: limit for kind in ("rms", "max") if (limit := getattr(measure, kind)) is not None}
 
 
-def _all_limits(measures: Sequence[Measure]) -> dict[Which, float]:
-    return {(measure.name, kind): limit for measure in measures for kind, limit in _limits(measure).items()}
+def _scales_of(measure: Measure) -> dict[str, float]:
+    limits = _limits(measure)
+    return limits if measure.scale is None else limits | {"rms": measure.scale}
+
+
+def _scales(measures: Sequence[Measure]) -> dict[Which, float]:
+    return {(measure.name, kind): scale for measure in measures for kind, scale in _scales_of(measure).items()}
 
 
 @dataclass(frozen=True)
@@ -161,6 +168,7 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
         **{name if kind == "rms" else f"{name}_{kind}": error for (name, kind), error in errors.items()},
         **tracking,
         "success": 100.0 * rollout.succeeded,
+        "within_scales": 100.0 * succeeded(_scales(rollout.measures), errors, rollout.fell),
         "falls": 100.0 * rollout.fell,
         "slip_speed": _sum(slip, active) / ticks,
         "excess_slip": _sum(rollout.excess_slip, active) / ticks,
@@ -177,13 +185,13 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
 
 def _tracking(rollout: Rollout, errors: dict[Which, Array]) -> dict[str, tuple[Array, Array]]:
     """Return the tracking error of every episode, whole and in parts: value and weight; weight 0 where there is none."""
-    limits, known = _all_limits(rollout.measures), np.full(rollout.episodes, float(has_limits(rollout.measures)))
-    whole = (tracking_error(limits, errors, rollout.fell), known)
+    scales, known = _scales(rollout.measures), np.full(rollout.episodes, float(has_limits(rollout.measures)))
+    whole = (tracking_error(scales, errors, rollout.fell), known)
     parts = {"tracking_error": whole, "tracking_error_median": whole, "tracking_error_p90": whole}
     steady = is_steady(rollout)
     for name, chosen in (("steady", rollout.active & steady), ("transient", rollout.active & ~steady)):
         own = errors_of(rollout.measures, rollout.measured, chosen)
-        parts[f"tracking_error_{name}"] = tracking_error(limits, own, np.zeros_like(rollout.fell)), known * chosen.any(axis=0)
+        parts[f"tracking_error_{name}"] = tracking_error(scales, own, np.zeros_like(rollout.fell)), known * chosen.any(axis=0)
     return parts
 
 

@@ -30,6 +30,7 @@ class Measure:
     Attributes:
         name, unit, doc: what it is.
         rms, max: largest root mean square and largest magnitude over an episode that still count as a success; None = any.
+        scale: root mean square that counts as 1 in the tracking error; None = ``rms``.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Measure:
     doc: str
     rms: float | None = None
     max: float | None = None
+    scale: float | None = None
 
 
 @dataclass(frozen=True)
@@ -222,8 +224,7 @@ def measures_of(core: Core) -> tuple[Measure, ...]:
     """Return the measures of a core's task."""
     from wlr_gym.envs.tasks.terms import MEASURES
 
-    success = core.task.config.success
-    limits = {name: {"rms": success[name].rms, "max": success[name].max} for name in success}
+    limits = {name: chosen.model_dump() for name, chosen in core.task.config.success.items()}
     return tuple(Measure(name, MEASURES[name].unit, MEASURES[name].doc, **limits.get(name, {})) for name in core.task.measures)
 
 

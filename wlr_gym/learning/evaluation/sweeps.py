@@ -100,7 +100,8 @@ DELAY = (0.0, 0.01, 0.02, 0.04, 0.06)
 PAYLOAD = (0.0, 0.25, 0.5, 1.0, 2.0)
 #: m, body frame: ahead, to the left and above the middle, so that the wheels carry unequal loads.
 PAYLOAD_PLACE = {"payload.position[x]": 0.05, "payload.position[y]": 0.03, "payload.position[z]": 0.05}
-FLOORS = ("slippery", "nominal", "ice", "split", "patches", "wide")
+#: No training and no choice of a setting has seen the last two.
+FLOORS = ("slippery", "nominal", "ice", "split", "patches", "wide", "stripes", "ribbed")
 
 SWEEPS: dict[str, Sweep] = {
     sweep.name: sweep

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import require_package
 from wlr_gym.envs.core import Core
-from wlr_gym.envs.tasks.success import limits_of, tracking_error
+from wlr_gym.envs.tasks.success import scales_of, tracking_error
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
 from wlr_gym.hardware.camera.config import CameraFile, load_camera_file
 from wlr_gym.hardware.emulator.line import NO_TIME
@@ -173,8 +173,8 @@ def chain_errors(setting: ChainSetting, seeds: Sequence[int], skip: float = 1.0)
 
 
 def _tracking(core: Core, rms: Mapping[str, float], fell: bool) -> float:
-    limits = limits_of(core.task.config)
-    return float(tracking_error(limits, {which: np.array([rms[which[0]]]) for which in limits}, np.array([fell]))[0])
+    scales = scales_of(core.task.config)
+    return float(tracking_error(scales, {which: np.array([rms[which[0]]]) for which in scales}, np.array([fell]))[0])
 
 
 def drive_chain(setting: ChainSetting, seed: int, log: Path | None = None) -> ChainDrive:

@@ -48,6 +48,24 @@ def velocity_error(signals: Signals, *, linear: Value = 0.02, angular: Value = 0
     return ops.absolute(forward) / linear + ops.absolute(turning) / angular
 
 
+@registered(REWARDS, linear=POSITIVE, angular=POSITIVE)
+def squared_velocity_error(signals: Signals, *, linear: Value = 0.02, angular: Value = 0.06) -> Value:
+    """(error / ``linear``)^2 of forward velocity (m/s) plus (error / ``angular``)^2 of yaw rate (rad/s), each at most 25."""
+    forward = (signals.command("linear_velocity_x") - signals.truth("linear_velocity_in_body")[0]) / linear
+    turning = (signals.command("yaw_rate") - signals.truth("angular_velocity_in_body")[2]) / angular
+    return ops.minimum(forward * forward, 25.0) + ops.minimum(turning * turning, 25.0)
+
+
+@registered(REWARDS, scale=POSITIVE)
+def estimate_error(signals: Signals, *, scale: Value = 0.01) -> Value:
+    """|error| of the slip observer's forward velocity over ``scale`` (m/s), as |r| / (1 + |r| / 8).
+
+    How one drives decides what can be observed: without a camera wheels that all slip alike hide the velocity.
+    """
+    error = signals.estimate("linear_velocity_in_body")[0] - signals.truth("linear_velocity_in_body")[0]
+    return _levelling(error / scale)
+
+
 @registered(REWARDS, lateral=POSITIVE, heading=POSITIVE)
 def path_error(signals: Signals, *, lateral: Value = 0.015, heading: Value = 0.2) -> Value:
     """Distance from the path over ``lateral`` (m), heading error over ``heading`` (rad), each r as |r| / (1 + |r| / 8)."""

@@ -1,0 +1,205 @@
+"""The acceptance test of a policy: on no family of floors does it lose much against what it is to replace."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import write_json
+from wlr_gym.envs.registry import task_name_of, task_source_of
+from wlr_gym.envs.tasks.randomization import load_randomization
+from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.learning.evaluation.card import MAIN
+from wlr_gym.learning.evaluation.scoring import evaluate
+from wlr_gym.learning.evaluation.subjects import Source, identity, read_subjects
+from wlr_gym.policy import policy_environment, shipped_names, trained_environment
+from wlr_gym.robot import load_robot
+
+#: Task -> families of floors of its card. No training and no setting knows ``stripes`` and ``ribbed``.
+FAMILIES: Mapping[str, tuple[str, ...]] = {
+    "velocity": ("slippery", "nominal", "ice", "split", "patches", "wide", "stripes", "ribbed"),
+    "path": ("slippery", "nominal", "ice", "split", "patches", "wide", "stripes", "ribbed"),
+    "posture": ("asymmetric", "nominal", "slippery", "ice", "stripes", "ribbed"),
+    "slope": ("slope",),
+}
+#: Largest loss of tracking error that is accepted, %: the upper end of its 95 % interval counts.
+LARGEST_LOSS = 5.0
+EPISODES, SEEDS = 512, 5
+#: Name of the file, and its version.
+ACCEPTANCE_FILE = "acceptance.json"
+FORMAT = 1
+
+Tell = Callable[[str, float], object]
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What a policy loses against a reference on a family of floors, in tracking error, paired episode by episode.
+
+    Attributes:
+        floors: name of the randomisation. reference: what it is compared with.
+        error, reference_error: mean tracking errors.
+        loss: by how much the policy's is larger, % of the reference's; negative = it gains.
+        bound: upper end of the 95 % interval of the loss, %.
+    """
+
+    floors: str
+    reference: str
+    error: float
+    reference_error: float
+    loss: float
+    bound: float
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """Result of the test of one policy.
+
+    Attributes:
+        policy: as given. environment: id. episodes, seeds: per family of floors.
+        largest_loss: %, what was allowed.
+        inputs: SHA-256 of the policies and of the task, robot and randomisations that were played.
+        losses: one per family of floors and reference.
+    """
+
+    policy: str
+    environment: str
+    episodes: int
+    seeds: int
+    largest_loss: float
+    inputs: str
+    losses: tuple[Loss, ...]
+
+    @property
+    def refused(self) -> tuple[Loss, ...]:
+        """Losses that are larger than what was allowed."""
+        return tuple(loss for loss in self.losses if not loss.bound <= self.largest_loss)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether no bound of a loss is larger than what was allowed."""
+        return not self.refused
+
+
+def accept(
+    policy: Source,
+    env_id: str | None = None,
+    *,
+    references: Sequence[Source] | None = None,
+    floors: Sequence[Any] | None = None,
+    episodes: int = EPISODES,
+    seeds: int = SEEDS,
+    largest_loss: float = LARGEST_LOSS,
+    robot: Any = None,
+    effects: Any = None,
+    threads: int = 1,
+    tell: Tell = lambda text, share: None,
+) -> Acceptance:
+    """Play a policy and its references on the same episodes of every family of floors.
+
+    Args:
+        policy: one policy or agent, as :func:`wlr_gym.learning.evaluation.scoring.evaluate` takes it.
+        env_id: id of the environment; None = the one the policy was trained in.
+        references: None = :func:`references_of` the policy.
+        floors: randomisations; None = those of the task's card.
+        episodes: per seed. seeds: blocks of episodes.
+        largest_loss: % of the tracking error.
+        robot, effects, threads: of the environment; None = the task's.
+        tell: called with what is going on and the share of the work that was done since.
+
+    Raises:
+        InputError: unknown names, or a policy without references.
+    """
+    subject = read_subjects([policy])[0]
+    environment = env_id or trained_environment(subject.sources[0]) or "WLR-Velocity-v0"
+    task = task_name_of(environment)
+    chosen = FAMILIES.get(task, ("nominal",)) if floors is None else tuple(floors)
+    against = references_of(subject.sources[0], environment) if references is None else tuple(references)
+    if not against:
+        raise InputError(f"policy '{policy}': nothing to compare it with; expected a reference")
+    losses: list[Loss] = []
+    for family in chosen:
+        card = evaluate(
+            policy,
+            environment,
+            baselines=against,
+            episodes=episodes,
+            seeds=seeds,
+            randomization=family,
+            robot=robot,
+            effects=effects,
+            threads=threads,
+            tell=_part_of(tell, _name(family), len(chosen)),
+        )
+        errors = {name: scores["tracking_error"].mean for name, scores in card.scores[MAIN].items()}
+        for name, better in card.comparison[MAIN].items():
+            gain = better["tracking_error"]
+            losses.append(Loss(_name(family), name, errors[subject.name], errors[name], -gain.mean, -gain.low))
+    inputs = fingerprint(environment, [policy, *against], chosen, robot)
+    return Acceptance(str(policy), environment, episodes, seeds, largest_loss, inputs, tuple(losses))
+
+
+def _part_of(tell: Tell, family: str, families: int) -> Tell:
+    return lambda text, share: tell(f"{family}: {text}", share / families)
+
+
+def _name(family: Any) -> str:
+    return family if isinstance(family, str) else str(family.get("name", "given"))
+
+
+def references_of(policy: Source, environment: str) -> tuple[str, ...]:
+    """Return what a policy is compared with: the controller it acts on or could be replaced by, and the task's blind policy."""
+    observer = policy_environment(policy).get("task", {}).get("observer") or {}
+    has_camera = observer.get("camera", True)
+    controller = "slip_compensating" if has_camera else "slip_compensating_no_camera"
+    blind = f"{task_name_of(environment)}_blind"
+    return (controller, *([blind] if blind in shipped_names() and blind != str(policy) else []))
+
+
+def fingerprint(environment: str, policies: Iterable[Source], floors: Sequence[Any], robot: Any = None) -> str:
+    """Return the SHA-256 of what is played: the policies' content, the task, the robot and the randomisations."""
+    config = read_task(task_source_of(environment))
+    own = load_robot(config.robot if robot is None else robot)
+    played = {
+        "policies": [identity(subject) for subject in read_subjects(list(policies))],
+        "task": config.model_dump(mode="json"),
+        "floors": [load_randomization(family, own).config.model_dump(mode="json") for family in floors],
+        "robot": own.model_dump(mode="json"),
+    }
+    return hashlib.sha256(json.dumps(played, sort_keys=True).encode()).hexdigest()
+
+
+def acceptance_rows(result: Acceptance) -> list[list[str]]:
+    """Return the table as text: a header, then one row per family of floors and reference."""
+    header = ["floors", "against", "tracking error", "its", "loss (%)", "upper bound (%)", "accepted"]
+    return [header, *(_row(loss, result.largest_loss) for loss in result.losses)]
+
+
+def _row(loss: Loss, largest: float) -> list[str]:
+    numbers = [f"{loss.error:.3f}", f"{loss.reference_error:.3f}", f"{loss.loss:.1f}", f"{loss.bound:.1f}"]
+    return [loss.floors, loss.reference, *numbers, "yes" if loss.bound <= largest else "no"]
+
+
+def write_acceptance(path: Path, result: Acceptance) -> None:
+    """Write a result as JSON."""
+    write_json(path, {"format": FORMAT, **asdict(result)})
+
+
+def read_acceptance(path: Path) -> Acceptance:
+    """Read what :func:`write_acceptance` wrote.
+
+    Raises:
+        InputError: not such a file.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        content.pop("format")
+        losses = tuple(Loss(**loss) for loss in content.pop("losses"))
+        return Acceptance(**content, losses=losses)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: expected a result of wlr evaluate --accept: {error}") from None
