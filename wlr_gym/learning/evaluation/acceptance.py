@@ -62,6 +62,7 @@ class Acceptance:
 
     Attributes:
         policy: as given. environment: id. episodes, seeds: per family of floors.
+        sensors: those of the robots that not every robot has; None = as their file says.
         largest_loss: %, what was allowed.
         inputs: SHA-256 of the policies and of the task, robot and randomisations that were played.
         losses: one per family of floors and reference.
@@ -71,6 +72,7 @@ class Acceptance:
     environment: str
     episodes: int
     seeds: int
+    sensors: tuple[str, ...] | None
     largest_loss: float
     inputs: str
     losses: tuple[Loss, ...]
@@ -95,6 +97,7 @@ def accept(
     episodes: int = EPISODES,
     seeds: int = SEEDS,
     largest_loss: float = LARGEST_LOSS,
+    sensors: Sequence[str] | None = None,
     robot: Any = None,
     effects: Any = None,
     threads: int = 1,
@@ -109,7 +112,7 @@ def accept(
         floors: randomisations; None = those of the task's card.
         episodes: per seed. seeds: blocks of episodes.
         largest_loss: % of the tracking error.
-        robot, effects, threads: of the environment; None = the task's.
+        sensors, robot, effects, threads: of the environment; None = the task's.
         tell: called with what is going on and the share of the work that was done since.
 
     Raises:
@@ -131,6 +134,7 @@ def accept(
             episodes=episodes,
             seeds=seeds,
             randomization=family,
+            sensors=sensors,
             robot=robot,
             effects=effects,
             threads=threads,
@@ -141,7 +145,16 @@ def accept(
             gain = better["tracking_error"]
             losses.append(Loss(_name(family), name, errors[subject.name], errors[name], -gain.mean, -gain.low))
     inputs = fingerprint(environment, [policy, *against], chosen, robot)
-    return Acceptance(str(policy), environment, episodes, seeds, largest_loss, inputs, tuple(losses))
+    return Acceptance(
+        str(policy),
+        environment,
+        episodes,
+        seeds,
+        None if sensors is None else tuple(sensors),
+        largest_loss,
+        inputs,
+        tuple(losses),
+    )
 
 
 def _part_of(tell: Tell, family: str, families: int) -> Tell:
@@ -199,7 +212,8 @@ def read_acceptance(path: Path) -> Acceptance:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         content.pop("format")
+        sensors = content.pop("sensors")
         losses = tuple(Loss(**loss) for loss in content.pop("losses"))
-        return Acceptance(**content, losses=losses)
+        return Acceptance(**content, sensors=None if sensors is None else tuple(sensors), losses=losses)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: expected a result of wlr evaluate --accept: {error}") from None

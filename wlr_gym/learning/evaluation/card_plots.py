@@ -11,13 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from wlr_gym.learning.evaluation.card import BY_DIFFERENCE, IDLE, MAIN, Card
-from wlr_gym.learning.evaluation.metrics import JITTER_FREQUENCY, Metric
+from wlr_gym.learning.evaluation.metrics import JITTER_FREQUENCY, Metric, has_limits
 from wlr_gym.learning.evaluation.plots import save
 from wlr_gym.learning.evaluation.sweeps import Sweep
 
 #: Panels of a sweep, each a metric.
 SWEPT = ("tracking_error", "success", "excess_slip")
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive", "tab:cyan")
+#: Slip in the picture of tracking against slip.
+SLIP = ("slip_speed", "excess_slip", "slip_per_metre", "excess_slip_per_metre")
 #: Drawn in grey: what any policy should beat.
 REFERENCES = (IDLE, "untrained")
 #: Distance between two subjects at one rank of a sweep without numbers.
@@ -30,6 +32,8 @@ def draw_card(folder: Path, card: Card) -> dict[str, str]:
     figures = {"spectrum": spectra(card)}
     if _rivals(card):
         figures["improvement"] = improvements(card)
+        if has_limits(card.main[card.names[0]].measures):
+            figures["pareto"] = pareto(card)
     figures |= {f"sweep_{sweep.name}": sweep_curves(card, sweep) for sweep in card.sweeps}
     return {name: save(figure, folder / f"{name}.png").name for name, figure in figures.items()}
 
@@ -118,6 +122,25 @@ def improvements(card: Card) -> Figure:
     axes.set_xlabel(f"{card.names[0]} is better by (%), 95 % interval, paired; beyond -100: cut")
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     axes.grid(alpha=0.3, axis="x")
+    return figure
+
+
+def pareto(card: Card) -> Figure:
+    """Draw tracking error against slip, total and excess, per second and per metre: best is what is low and left."""
+    figure = Figure(figsize=(9, 7.4), layout="constrained")
+    metrics = [metric for key in SLIP for metric in card.metrics if metric.key == key]
+    for axes, metric in zip(figure.subplots(2, 2).flat, metrics, strict=True):
+        for name in [card.names[0], *_rivals(card)]:
+            error, slip = (card.scores[MAIN][name][key] for key in ("tracking_error", metric.key))
+            ends = [[[e.mean - e.low], [e.high - e.mean]] for e in (error, slip)]
+            style = _style(card, name) | {"linestyle": "", "capsize": 2, "elinewidth": 1}
+            axes.errorbar(error.mean, slip.mean, xerr=np.abs(ends[0]), yerr=np.abs(ends[1]), label=name, **style)
+        axes.set(xlabel="tracking error", ylabel=f"{metric.key.replace('_', ' ')} ({metric.unit})")
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlim(left=0.0)
+        axes.grid(alpha=0.3)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
     return figure
 
 

@@ -142,6 +142,7 @@ def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
             "",
         ]
         lines += [*_table(comparison_rows(card)), "", *picture("improvement", "Paired improvements")]
+    lines += picture("pareto", "Tracking error against slip, 95 % intervals")
     for index, sweep in enumerate(card.sweeps):
         lines += [f"## Sweep: {sweep.name}", "", f"{sweep.doc[0].upper()}{sweep.doc[1:]}. Tracking error:", ""]
         lines += [*_table(sweep_rows(card, index, short=False)), ""]

@@ -10,6 +10,7 @@ from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.settings import read_settings
 from wlr_gym.envs.tasks.describe import contract
+from wlr_gym.envs.tasks.signals import PRESENCE
 from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card
 from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, play, work
 from wlr_gym.learning.evaluation.rollout import Rollout
@@ -22,6 +23,8 @@ from wlr_gym.robot import RobotSource, load_robot, robot_hash
 BACKENDS = ("gibbs_appell", "mujoco")
 #: What a policy is compared with where nothing is chosen, as far as it fits the task.
 BASELINES = ("do_nothing", "pid")
+#: Sensors that a robot may have or not.
+OPTIONAL = PRESENCE
 #: Episodes of each value of a sweep, and of each other condition.
 SWEEP_EPISODES = 64
 OTHER_EPISODES = 64
@@ -43,6 +46,7 @@ def evaluate(
     sweeps: Sequence[str] = (),
     sweep_episodes: int = SWEEP_EPISODES,
     randomization: Any = None,
+    sensors: Sequence[str] | None = None,
     robot: Any = None,
     effects: Any = None,
     threads: int = 1,
@@ -63,6 +67,7 @@ def evaluate(
         other_episodes: in the second simulator.
         sweeps: names of sweeps (:func:`wlr_gym.learning.evaluation.sweeps_for` lists those that suit a task).
         sweep_episodes: per point of a sweep.
+        sensors: which of :data:`OPTIONAL` the robots have; None = as their file and the randomisation say.
         randomization, effects, threads: of the environment; see :class:`wlr_gym.envs.settings.EnvironmentOptions`. None = the
             task's.
         robot: that all drive; None = the one that the first trained policy was made for, else the task's.
@@ -90,7 +95,7 @@ def evaluate(
     subjects = read_subjects([policy, *(fitting_baselines(environment) if baselines is None else baselines)])
     robot = common_robot(subjects) if robot is None else robot
     keywords: dict[str, Any] = {"randomization": randomization, "robot": robot, "effects": patch}
-    keywords |= {"backend": main, "threads": threads}
+    keywords |= {"backend": main, "threads": threads, **having(sensors)}
     chosen = tuple(read_sweep(name, task) for name in dict.fromkeys(sweeps))
     conditions = [Condition(MAIN, keywords, episodes=episodes, blocks=seeds)]
     for sweep in chosen:
@@ -103,6 +108,8 @@ def evaluate(
         "environment": environment, "backend": main, "episodes": f"{episodes} x {seeds} seeds", "first seed": seed,
         "randomization": randomization or "the task's", "robot": _named(robot), "effects": patch.summary(),
     }  # fmt: skip
+    if sensors is not None:
+        said["sensors that not every robot has"] = ", ".join(sensors) or "none"
     training_seeds = {subject.name: subject.seeds for subject in subjects if subject.seeds}
     if training_seeds:
         said["training seeds"] = "; ".join(f"{name}: {len(own)} ({', '.join(own)})" for name, own in training_seeds.items())
@@ -110,6 +117,20 @@ def evaluate(
         said |= {"second simulator": f"{others[0]}, {fewer} episodes"}
     said |= {"sweeps": f"{sweep_episodes} episodes per point"} if chosen else {}
     return Card(results, chosen, said, {subject.name: identity(subject) for subject in subjects}, training_seeds)
+
+
+def having(sensors: Sequence[str] | None) -> dict[str, Any]:
+    """Return the keywords of an environment whose robots have these of :data:`OPTIONAL` and not the others.
+
+    Raises:
+        InputError: another name.
+    """
+    if sensors is None:
+        return {}
+    for name in sensors:
+        if name not in OPTIONAL:
+            raise unknown_name("sensor", name, OPTIONAL)
+    return {"task": {"sensors": {name: float(name in sensors) for name in OPTIONAL}}}
 
 
 def _named(robot: RobotSource | None) -> str:
