@@ -150,6 +150,7 @@ class PidGains(SettingsModel):
         lateral: yaw rate per lateral error, rad/(m s). heading: yaw rate per heading error, 1/s.
         uphill: yaw rate per specific force to the left, rad s/m: turns the robot uphill on a slope.
         legs_inward: rad by which the legs reach under the body: a shorter wheelbase turns with less slip.
+        lean_time: s from the start of an episode in which they do, evenly; at once, they jerk the body.
         integral_limit: bound of the corrections by integrals, m/s and rad/s.
     """
 
@@ -162,6 +163,7 @@ class PidGains(SettingsModel):
     heading: float = Field(0.0, ge=0)
     uphill: float = Field(0.0, ge=0)
     legs_inward: float = Field(0.0, ge=-0.4, le=0.4)
+    lean_time: float = Field(0.0, ge=0)
     integral_limit: float = Field(0.2, gt=0)
 
 
@@ -195,7 +197,7 @@ class Integral:
     """
 
     def __init__(self, gain: float, period: float, limit: float) -> None:
-        self._step = gain * period
+        self.step = gain * period
         self._limit = limit
         self.value: Array = np.zeros(0)
 
@@ -203,7 +205,7 @@ class Integral:
         """Return the integrals (N,) with the present errors (N,) in them."""
         if len(self.value) != len(error):
             self.value = np.zeros(len(error))
-        self.value = np.clip(self.value + self._step * error, -self._limit, self._limit)
+        self.value = np.clip(self.value + self.step * error, -self._limit, self._limit)
         return self.value
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
@@ -212,7 +214,7 @@ class Integral:
 
 
 class Pid:
-    """The controller; one integral per robot is what it remembers."""
+    """The controller; integrals and the time since the start of each robot's episode are what it remembers."""
 
     def __init__(self, contract: Mapping[str, Any], config: PidConfig, agent: str = "pid") -> None:
         self.config = config
@@ -231,13 +233,23 @@ class Pid:
         period = contract["control_period"]
         self._yaw_rate_integral = Integral(config.yaw_rate_i, period, config.integral_limit)
         self._velocity_integral = Integral(config.velocity_i, period, config.integral_limit)
+        self._clock = Integral(1.0, period, np.inf)
 
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return actions (N, 8) for observations (N, D)."""
         forward, turn = self.motion(observations)
-        legs = self.legs(observations)
+        lean, lean_rate = self._lean(len(observations))
+        legs = self.legs(observations) + lean
         rolling = self.rolling_speed(observations, forward, turn)
-        return self.chassis.actions(legs, self.chassis.wheel_rate(rolling, legs, self.leg_rate(observations)))
+        return self.chassis.actions(legs, self.chassis.wheel_rate(rolling, legs, self.leg_rate(observations) + lean_rate))
+
+    def _lean(self, count: int) -> tuple[Array, Array]:
+        """Return by how much the legs reach under the body after this step (N, 4), rad, and how fast they move, rad/s."""
+        config, period = self.config, self._clock.step
+        done = self._clock.add(np.ones(count))
+        share = np.minimum(done / max(config.lean_time, period), 1.0)
+        rate = np.where(config.lean_time - done > -0.5 * period, config.legs_inward / max(config.lean_time, period), 0.0)
+        return config.legs_inward * share[:, None] * self.chassis.front, rate[:, None] * self.chassis.front
 
     def motion(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
         """Return the forward velocity and turn (N,) to roll at: what is wanted, with corrections."""
@@ -258,9 +270,8 @@ class Pid:
         return self.turn(observations) + steer + self.config.uphill * self.leftward_force(observations)
 
     def legs(self, observations: NDArray[np.floating]) -> Array:
-        """Return the leg setpoints (N, 4), rad."""
-        home = self.chassis.robot.home.leg_angle + self.config.legs_inward * self.chassis.front
-        return home + self.leg_offset(observations)
+        """Return the leg setpoints (N, 4), rad, without what reaches under the body."""
+        return self.chassis.robot.home.leg_angle + self.leg_offset(observations)
 
     def rolling_speed(self, observations: NDArray[np.floating], forward: Array, turn: Array) -> Array:
         """Return how fast each wheel is to roll ahead (N, 4), m/s."""
@@ -270,6 +281,7 @@ class Pid:
         """Forget the integrals of the robots in ``mask`` (N,)."""
         self._yaw_rate_integral.reset(mask)
         self._velocity_integral.reset(mask)
+        self._clock.reset(mask)
 
 
 def task_settings(model: type[Settings], contract: Mapping[str, Any], config: Mapping[str, Any], agent: str) -> Settings:

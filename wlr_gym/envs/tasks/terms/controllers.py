@@ -97,15 +97,25 @@ def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
     reach = hip_x * hip_x / hip_y
     allowed = gain("slip_limit") + reach * ops.absolute(turn / ops.maximum(gain("steering"), 1.0))
     lean = _lean(signals, slip_difference)
+    inward, inward_rate = _inward(signals)
     legs, wheels = [], []
     for (front, left), (offset, rate) in zip(CORNER_SIGNS, motion.legs, strict=True):
         side = hip_y * left
         travel = velocity - yaw_rate * side
         rolling = ops.clip(forward - turn * side, travel - allowed, travel + allowed)
-        offset = offset + gain("legs_inward") * front + lean
+        offset = offset + inward * front + lean
+        rate = rate + inward_rate * front
         legs.append(offset / signals.task("action.leg_scale"))
         wheels.append(_wheel_rate(signals, rolling, offset, rate) / signals.task("action.wheel_scale"))
     return [*(ops.clip(action, -1.0, 1.0) for action in legs + wheels), yaw_integral, velocity_integral, slip_difference]
+
+
+def _inward(signals: Signals) -> tuple[Value, Value]:
+    """Angle (rad) by which the legs reach under the body after the next step, and how fast they move (rad/s)."""
+    wanted, within, period = signals.gain("legs_inward"), signals.gain("lean_time"), signals.control_period
+    longest = ops.maximum(within, period)
+    share = ops.minimum((signals.time + period) / longest, 1.0)
+    return wanted * share, ops.where_positive(within - signals.time - 0.5 * period, wanted / longest, 0.0)
 
 
 def _integral(signals: Signals, value: Value, rate: Value) -> Value:
