@@ -151,7 +151,8 @@ class PidGains(SettingsModel):
         uphill: yaw rate per specific force to the left, rad s/m: turns the robot uphill on a slope.
         legs_inward: rad by which the legs reach under the body: a shorter wheelbase turns with less slip.
         lean_time: s from the start of an episode in which they do, evenly; at once, they jerk the body.
-        integral_limit: bound of the corrections by integrals, m/s and rad/s.
+        leg_i: on the integral of the error of a leg's measured angle, 1/s: servos give way to loads. Only where legs sweep.
+        integral_limit: bound of the corrections by integrals, m/s, rad/s and rad.
     """
 
     steering: float = Field(1.0, ge=0)
@@ -164,6 +165,7 @@ class PidGains(SettingsModel):
     uphill: float = Field(0.0, ge=0)
     legs_inward: float = Field(0.0, ge=-0.4, le=0.4)
     lean_time: float = Field(0.0, ge=0)
+    leg_i: float = Field(0.0, ge=0)
     integral_limit: float = Field(0.2, gt=0)
 
 
@@ -188,7 +190,7 @@ Settings = TypeVar("Settings", bound=PidConfig)
 
 
 class Integral:
-    """Integrals of an error, one per robot, bounded.
+    """Integrals of errors, of each robot, bounded.
 
     Args:
         gain: 1/s; the integral is of gain * error.
@@ -202,15 +204,16 @@ class Integral:
         self.value: Array = np.zeros(0)
 
     def add(self, error: Array) -> Array:
-        """Return the integrals (N,) with the present errors (N,) in them."""
-        if len(self.value) != len(error):
-            self.value = np.zeros(len(error))
+        """Return the integrals (N, ...) with the present errors (N, ...) in them."""
+        if self.value.shape != error.shape:
+            self.value = np.zeros(error.shape)
         self.value = np.clip(self.value + self.step * error, -self._limit, self._limit)
         return self.value
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
         """Forget the robots in ``mask`` (N,)."""
-        self.value = np.where(mask, 0.0, self.value) if len(self.value) == len(mask) else np.zeros(len(mask))
+        if len(self.value) == len(mask):
+            self.value[mask] = 0.0
 
 
 class Pid:
@@ -230,9 +233,12 @@ class Pid:
         self.leftward_force: Reader = read.first(("accelerometer[y]",))
         self.estimated_forward: Reader | None = read.first((ESTIMATED_FORWARD,)) if ESTIMATED_FORWARD in read else None
         self.leg_offset, self.leg_rate = read.legs("leg_reference"), read.legs("leg_reference_rate")
+        self.leg_angle: Reader = read.legs("leg_position")
         period = contract["control_period"]
         self._yaw_rate_integral = Integral(config.yaw_rate_i, period, config.integral_limit)
         self._velocity_integral = Integral(config.velocity_i, period, config.integral_limit)
+        sweeping = f"leg_reference[{LEGS[0]}]" in read
+        self._leg_integral = Integral(config.leg_i if sweeping else 0.0, period, config.integral_limit)
         self._clock = Integral(1.0, period, np.inf)
 
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -241,7 +247,8 @@ class Pid:
         lean, lean_rate = self._lean(len(observations))
         legs = self.legs(observations) + lean
         rolling = self.rolling_speed(observations, forward, turn)
-        return self.chassis.actions(legs, self.chassis.wheel_rate(rolling, legs, self.leg_rate(observations) + lean_rate))
+        wheels = self.chassis.wheel_rate(rolling, legs, self.leg_rate(observations) + lean_rate)
+        return self.chassis.actions(legs + self._leg_integral.add(legs - self.leg_angle(observations)), wheels)
 
     def _lean(self, count: int) -> tuple[Array, Array]:
         """Return by how much the legs reach under the body after this step (N, 4), rad, and how fast they move, rad/s."""
@@ -281,6 +288,7 @@ class Pid:
         """Forget the integrals of the robots in ``mask`` (N,)."""
         self._yaw_rate_integral.reset(mask)
         self._velocity_integral.reset(mask)
+        self._leg_integral.reset(mask)
         self._clock.reset(mask)
 
 

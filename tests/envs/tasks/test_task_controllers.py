@@ -15,7 +15,7 @@ PROMPT = {"joints": {"delay": [0.0, 0.0]}, "imu": {"delay": [0.0, 0.0]}}
 #: Every gain at work, none as it ships.
 GAINS = {
     "steering": 1.7, "yaw_rate_p": 3.0, "yaw_rate_i": 4.0, "velocity_p": 2.0, "velocity_i": 3.0, "lateral": 3.0, "heading": 1.5,
-    "uphill": 0.05, "legs_inward": 0.1, "lean_time": 0.5,
+    "uphill": 0.05, "legs_inward": 0.1, "lean_time": 0.5, "leg_i": 0.7,
     "integral_limit": 0.05, "slip_limit": 0.05, "load_shift": 2.0, "load_shift_time": 0.3,
 }  # fmt: skip
 TASKS = ("velocity", "path", "posture", "slope")

@@ -14,11 +14,13 @@ from wlr_gym.envs.tasks.terms import references
 from wlr_gym.envs.tasks.terms.computed import computed
 from wlr_gym.envs.tasks.terms.geometry import estimated_pose
 from wlr_gym.physics.codegen import ops
-from wlr_gym.robot import CORNER_SIGNS, JOINTS
+from wlr_gym.robot import CORNER_SIGNS, JOINTS, LEG_SLICE, LEGS
 
 #: What the controller remembers: integrals of the errors of yaw rate (rad/s) and forward velocity (m/s), times their gains, and
-#: by how much the front wheels slip more than the rear ones (m/s).
+#: by how much the front wheels slip more than the rear ones (m/s), where load is shifted.
 MEMORY = ("yaw_rate_integral", "velocity_integral", "slip_difference")
+#: Where the legs sweep also integrals of the errors of their angles (rad), times their gain.
+LEG_MEMORY = tuple(f"{leg}_integral" for leg in LEGS)
 #: Ends the name of a term that holds a controller's action.
 CONTROLLER = "_controller"
 
@@ -32,12 +34,13 @@ class WantedMotion:
 
     Attributes:
         forward: velocity, m/s. turn: yaw rate, rad/s.
-        legs: angle from home (rad) and rate (rad/s) of each leg.
+        legs: angle from home (rad) and rate (rad/s) of each leg. sweeping: integrate their errors.
     """
 
     forward: Value
     turn: Value
     legs: Sequence[tuple[Value, Value]] = ((0.0, 0.0),) * 4
+    sweeping: bool = False
 
 
 @computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
@@ -56,12 +59,13 @@ def path_controller(signals: Signals) -> list[Value]:
     return _feedback(signals, "path_controller", WantedMotion(forward, turn))
 
 
-@computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
+@computed(*_LABELS, *LEG_MEMORY, unit=f"{_UNITS}, rad, rad, rad, rad", frame="-", limit=1.0, estimated=True)
 def posture_controller(signals: Signals) -> list[Value]:
     """Action of the controller that keeps straight on while the legs move, and what it remembers."""
     home = signals.robot("home.leg_angle")
     legs = [(angle - home, rate) for angle, rate in references.leg_references(signals)]
-    return _feedback(signals, "posture_controller", WantedMotion(signals.command("linear_velocity_x"), _course(signals), legs))
+    motion = WantedMotion(signals.command("linear_velocity_x"), _course(signals), legs, sweeping=True)
+    return _feedback(signals, "posture_controller", motion)
 
 
 @computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
@@ -91,7 +95,7 @@ def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
     error = motion.forward - velocity
     velocity_integral = _integral(signals, velocity_integral, gain("velocity_i") * error)
     forward = motion.forward + gain("velocity_p") * error + velocity_integral
-    share = ops.minimum(signals.control_period / gain("load_shift_time"), 1.0)
+    share = ops.where_positive(gain("load_shift"), ops.minimum(signals.control_period / gain("load_shift_time"), 1.0), 0.0)
     slip_difference = slip_difference + share * (_slip_difference(signals) - slip_difference)
     hip_x, hip_y = signals.robot("hip_position.x"), signals.robot("hip_position.y")
     reach = hip_x * hip_x / hip_y
@@ -99,15 +103,31 @@ def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
     lean = _lean(signals, slip_difference)
     inward, inward_rate = _inward(signals)
     legs, wheels = [], []
-    for (front, left), (offset, rate) in zip(CORNER_SIGNS, motion.legs, strict=True):
+    corrections: list[Value] = []
+    for leg, (front, left), (offset, rate) in zip(LEGS, CORNER_SIGNS, motion.legs, strict=True):
         side = hip_y * left
         travel = velocity - yaw_rate * side
         rolling = ops.clip(forward - turn * side, travel - allowed, travel + allowed)
         offset = offset + inward * front + lean
         rate = rate + inward_rate * front
-        legs.append(offset / signals.task("action.leg_scale"))
+        if motion.sweeping:
+            corrections.append(_leg_correction(signals, f"{name}[{leg}_integral]", LEGS.index(leg), offset))
+        correction = corrections[-1] if motion.sweeping else 0.0
+        legs.append((offset + correction) / signals.task("action.leg_scale"))
         wheels.append(_wheel_rate(signals, rolling, offset, rate) / signals.task("action.wheel_scale"))
-    return [*(ops.clip(action, -1.0, 1.0) for action in legs + wheels), yaw_integral, velocity_integral, slip_difference]
+    return [
+        *(ops.clip(action, -1.0, 1.0) for action in legs + wheels),
+        yaw_integral,
+        velocity_integral,
+        slip_difference,
+        *corrections,
+    ]
+
+
+def _leg_correction(signals: Signals, remembered: str, leg: int, offset: Value) -> Value:
+    """What is added to a leg's setpoint (rad): the integral of the error of its measured angle."""
+    error = signals.robot("home.leg_angle") + offset - signals.sensors("joint_position")[LEG_SLICE][leg]
+    return _integral(signals, signals.remembered(remembered), signals.gain("leg_i") * error)
 
 
 def _inward(signals: Signals) -> tuple[Value, Value]:
