@@ -88,7 +88,7 @@ def test_another_robot_is_refused(old, tmp_path):
         (["--reseal", "pid"], "'pid' is an agent"),
         (["--reseal", "velocity_blind", "--out", "x.onnx"], "neither --out nor --card"),
         (["velocity_blind", "--robot", "nominal"], "--robot: of archives (.zip) and with --reseal only"),
-        (["velocity_blind", "velocity_oracle"], "expected one policy, got 2"),
+        (["velocity_blind", "path_blind"], "expected one policy, got 2"),
     ],
 )
 def test_options_that_do_not_go_together(words, message, capsys):

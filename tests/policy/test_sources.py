@@ -92,12 +92,12 @@ def test_shipped_policies_go_by_their_names(exported, tmp_path, monkeypatch):
 
 
 def test_a_policy_is_loaded_for_an_environment_or_its_contract():
-    env = gymnasium.make("WLR-Velocity-v0", task={"observer": {"camera": False}})
-    by_env, by_contract = (load_policy("velocity_slip_aware_no_camera", it) for it in (env, env.unwrapped.contract()))  # type: ignore[attr-defined]
+    env = gymnasium.make("WLR-Velocity-v0", **policy_environment("velocity_slip_aware"))
+    by_env, by_contract = (load_policy("velocity_slip_aware", it) for it in (env, env.unwrapped.contract()))  # type: ignore[attr-defined]
     observation = np.zeros((1, *env.observation_space.shape), np.float32)  # type: ignore[misc]
     np.testing.assert_array_equal(by_env.act(observation), by_contract.act(observation))
     with pytest.raises(InputError, match="expected one that was made"):
-        load_policy("velocity_slip_aware_no_camera", "WLR-Velocity-v0")  # type: ignore[arg-type]
+        load_policy("velocity_slip_aware", "WLR-Velocity-v0")  # type: ignore[arg-type]
 
 
 def test_an_agent_is_not_taken_for_an_unknown_name():

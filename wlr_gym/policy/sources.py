@@ -155,9 +155,17 @@ def policy_environment(source: str | Path) -> dict[str, Any]:
 
 
 def robot_of_contract(content: Mapping[str, Any]) -> Any:
-    """Return the robot that a policy was made for, by content (of older policies: by name or path); None = the nominal one."""
-    stated = (content["environment"].get("robot") or {}).get("description")
-    return stated if stated is not None else (content["config"].get("environment") or {}).get("robot")
+    """Return the robot that a policy was made for, by content (of older policies: by name or path); None = the nominal one.
+
+    A sensor that the policy did without at times is left out: it is a condition, and fits the robot with and without it.
+    """
+    environment = content["environment"]
+    stated = (environment.get("robot") or {}).get("description")
+    if stated is None:
+        return (content["config"].get("environment") or {}).get("robot")
+    if (environment.get("sensors") or {}).get("flow", 1.0) >= 1.0:
+        return stated
+    return {**stated, "sensors": {name: sensor for name, sensor in stated["sensors"].items() if name != "flow"}}
 
 
 def environment_for(source: str | Path, given: Mapping[str, Any]) -> dict[str, Any]:

@@ -73,8 +73,6 @@ KNOWS = {
     "ppo_blind": (None, False),
     "ppo_slip_aware": (True, False),
     "ppo_slip_aware_no_camera": (False, False),
-    "ppo_privileged": (True, False),
-    "ppo_oracle": (True, True),
     "pid": (None, False),
     "slip_compensating": (True, False),
 }
@@ -91,7 +89,7 @@ def test_each_agent_is_told_what_its_name_says(name):
     assert (contract["observer"] or {}).get("camera") == camera
     assert ("estimate" in sources) == (camera is not None)
     assert ("truth" in sources) == oracle
-    assert (getattr(groups, "spaces", None) is not None) == (name == "ppo_privileged")
+    assert (getattr(groups, "spaces", None) is not None) == name.startswith("ppo_")
 
 
 @pytest.mark.parametrize("task", ["Path", "Posture", "Slope"])
@@ -164,30 +162,24 @@ def test_what_a_file_says_lies_over_its_base_for_every_task(tmp_path):
 
 
 @pytest.mark.parametrize("task", ["velocity", "path", "posture", "slope"])
-@pytest.mark.parametrize(
-    "name", ["ppo", "ppo_slip_aware", "ppo_slip_aware_no_camera", "ppo_blind", "ppo_privileged", "ppo_oracle"]
-)
-def test_settings_of_every_task_are_valid(contract, name, task):
-    load_agent("ppo").make_policy(contract, load_agent_config(name, task=task))
+@pytest.mark.parametrize("name", ["ppo", "ppo_slip_aware", "ppo_slip_aware_no_camera", "ppo_blind"])
+def test_settings_of_every_task_are_valid(name, task):
+    settings = load_agent_config(name, task=task)
+    core = make_core(f"WLR-{task.title()}-v0", 1, settings["environment"])
+    load_agent("ppo").make_policy(core.contract(), settings)
+    core.close()
 
 
 @pytest.mark.parametrize("config", ["ppo_slip_aware", "ppo_blind"])
-@pytest.mark.parametrize("task", ["velocity", "posture", "slope"])
+@pytest.mark.parametrize("task", ["velocity", "path", "posture", "slope"])
 def test_what_is_learnt_from_comes_later_than_what_is_scored(task, config):
-    """Training draws commands 0 to 30 ms late, alike for all joints, on the task's own floors; scores have the task's own."""
+    """Training draws commands 0 to 30 ms late, alike for all joints; scores have the task's own."""
     learnt, scored = _learnt_and_scored(task, config)
     late = learnt[:, DELAYS]
     assert late.min() < 0.005
     assert 0.025 < late.max() <= 0.03
     np.testing.assert_array_equal(late, late[:, [0]].repeat(8, axis=1))
     assert scored[:, DELAYS].max() <= 0.01
-    np.testing.assert_array_equal(np.delete(learnt, DELAYS, axis=1), np.delete(scored, DELAYS, axis=1))
-
-
-@pytest.mark.parametrize("config", ["ppo_slip_aware", "ppo_blind"])
-def test_path_learns_from_what_is_scored(config):
-    learnt, scored = _learnt_and_scored("path", config)
-    np.testing.assert_array_equal(learnt, scored)
 
 
 def _learnt_and_scored(task, config):

@@ -25,7 +25,7 @@ CASES += [("gibbs_appell", "slope", "climb", 64), ("gibbs_appell", "slippery", "
 CASES += [("gibbs_appell", "changing", "commands", 64)]
 CASES += [("mujoco", floor, drive, 32) for floor in FLOORS for drive in ("commands", "excitation")]
 CASES += [("mujoco", floor, "commands", 32) for floor in ("slippery", "changing")]
-POLICIES = ("velocity_blind", "velocity_slip_aware", "velocity_slip_aware_no_camera")
+POLICIES = ("velocity_blind", "velocity_slip_aware")
 PLAYED = [(policy, floor, 64) for policy in POLICIES for floor in ("slippery", "ice", "split")]
 
 

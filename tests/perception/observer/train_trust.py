@@ -33,11 +33,7 @@ CAMERA_NOISE, FLOW_NOISE, FLOW_SCALE = ROBOT.sensors.camera.position_noise, 0.01
 FLOORS = ("nominal", "wide", "split", "ice", "patches")
 DRIVEN = [(floor, drive) for floor in FLOORS for drive in ("commands", "excitation")]
 DRIVEN += [("slope", "climb"), ("slippery", "commands"), ("changing", "commands")]
-PLAYED = [
-    (p, f)
-    for p in ("velocity_blind", "velocity_slip_aware", "velocity_slip_aware_no_camera")
-    for f in ("slippery", "ice", "split")
-]
+PLAYED = [(p, f) for p in ("velocity_blind", "velocity_slip_aware") for f in ("slippery", "ice", "split")]
 #: What is taken from the compiled observer's state of each step.
 TAKEN = ("rolling", "load", "traction", "force", "slope", "turned", "yaw_rate", "shaken", "legs", "inclined", "guess")
 Batch = dict[str, Tensor]

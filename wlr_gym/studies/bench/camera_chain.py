@@ -117,7 +117,7 @@ def measure_camera(size: Size) -> list[Measurement]:
     for floor in ("slippery", "ice", "split"):
         setting = ChainSetting("velocity_slip_aware", floor, camera, seconds)
         simulated, chain = simulated_errors(setting, seeds), chain_errors(setting, seeds)
-        blind = chain_errors(replace(setting, policy="velocity_slip_aware_no_camera", camera=None), seeds)
+        blind = chain_errors(replace(setting, camera=None), seeds)
         hidden = chain_errors(replace(setting, faults=covered), seeds)
         what = f"{floor}, {len(seeds)} episodes of {seconds:g} s: tracking error"
         ratios = (chain.mean() / simulated.mean(), hidden.mean() / blind.mean())

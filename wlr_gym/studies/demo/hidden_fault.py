@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from wlr_gym.data import Run
 
 TITLE = "3. A robot with a hidden fault"
-POLICY = "velocity_slip_aware_no_camera"
+POLICY = "velocity_slip_aware"
 #: What each run is driven by: the policy, or a motion that brings out what a robot is made of.
 DRIVERS = ("posture", POLICY, "turns", "stop_and_go")
 Draw = np.random.Generator
