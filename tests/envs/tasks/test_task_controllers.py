@@ -88,3 +88,43 @@ def test_controller_needs_gains():
 def test_controller_of_another_task_is_refused():
     with pytest.raises(InputError, match=r"'path_controller' needs the command 'path_"):
         load_task("velocity", None, {"controller": {}, "observations": {"path_controller": {}}})
+
+
+def test_legs_reach_under_the_body_evenly_from_the_start():
+    """As the gain says: a tenth of the way per 0.1 s of 1 s, front and rear legs towards each other, and no further."""
+    changes = {
+        "latency": PROMPT,
+        "controller": {"legs_inward": 0.2, "lean_time": 1.0},
+        "observations": {"velocity_controller": {}},
+    }
+    core = make_core("WLR-Velocity-v0", 1, {"task": changes, "randomization": "none"})
+    columns = [k for k, column in enumerate(core.task.policy) if column.term == "velocity_controller"][:4]
+    core.seed(0, 0)
+    core.begin_episodes(core.everyone)
+    leaned = []
+    for _ in range(60):
+        leaned.append(core.observation[0, columns] * core.task.actions[0].scale)
+        core.step(np.zeros((1, 8), np.float32), core.everyone)
+    core.close()
+    wanted = 0.2 * np.minimum(np.arange(1, 61) * 0.02, 1.0)
+    np.testing.assert_allclose(np.abs(leaned), wanted[:, None].repeat(4, axis=1), atol=1e-6)
+    assert (np.sign(leaned[-1]) == [1, 1, -1, -1]).all() or (np.sign(leaned[-1]) == [1, -1, 1, -1]).all()
+
+
+def test_legs_that_sweep_are_held_against_loads():
+    """With the integral the servos' sag under load goes from the legs' angles; without it, it stays."""
+    errors = {}
+    for gain in (0.0, 2.0):
+        changes = {
+            "controller": GAINS | {"legs_inward": 0.0, "load_shift": 0.0, "leg_i": gain},
+            "observations": {"posture_controller": {}},
+        }
+        core = make_core("WLR-Posture-v0", 1, {"task": changes, "randomization": "none"})
+        columns = [k for k, column in enumerate(core.task.policy) if column.term == "posture_controller"][:8]
+        core.seed(0, 3)
+        core.begin_episodes(core.everyone)
+        for _ in range(190):
+            core.step(core.observation[:, columns], core.everyone)
+        errors[gain] = abs(core.measures[0, list(core.task.measures).index("leg_error")])
+        core.close()
+    assert errors[2.0] < 0.5 * errors[0.0]

@@ -56,10 +56,10 @@ def test_every_rule_acts(name):
         ("velocity", "commands.ramp.linear_velocity_x", 0.5),  # the floor, not the motors, is the limit of both
         ("velocity", "action.wheel_scale", 3.0),
         ("velocity", "action.leg_scale", 0.267),  # twice the wheelbase over three times the leg: 0.4 * 2/3
-        ("velocity", "success.yaw_rate_error.rms", 0.03),
+        ("velocity", "success.yaw_rate_error.rms", 0.015),
         ("velocity", "terminations.left_floor.clearance", 0.9),
         ("path", "commands.terms.path_curvature", (-0.8, 0.8)),
-        ("path", "success.path_lateral_error.rms", 0.03),
+        ("path", "success.path_lateral_error.rms", 0.024),
         ("posture", "commands.terms.front_leg_first", (1.05, 2.09)),  # 0.96 + (0.5236 - 0.35)/2.44 * 1.22
         ("posture", "action.leg_scale", 0.625),
         ("slope", "observations.wheel_effort.scale", 0.1),

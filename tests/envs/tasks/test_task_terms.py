@@ -11,7 +11,7 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks import load_task
 from wlr_gym.envs.tasks.signals import Signals
-from wlr_gym.envs.tasks.success import limits_of, succeeded
+from wlr_gym.envs.tasks.success import limits_of, scales_of, succeeded
 from wlr_gym.envs.tasks.terms import MEASURES, REWARDS, references
 from wlr_gym.envs.tasks.terms.geometry import PlanarPose, true_pose
 from wlr_gym.learning.evaluation.metrics import errors_of
@@ -235,3 +235,30 @@ def test_costs_by_hand():
     climbing = {"command.climb_speed": 0.05, "command.climb_time": 9.0, ahead: 0.05}
     assert cost("track_climb_speed", climbing) == pytest.approx(1.0)
     assert cost("track_climb_speed", climbing | {ahead: 0.02}, width=0.03) == pytest.approx(math.exp(-1.0))
+
+
+def reward(name, values, **numbers):
+    """A reward term for signals by name, zero where not given."""
+    return float(REWARDS[name].function(Signals(lambda signal: values.get(signal, 0.0)), **numbers))
+
+
+def test_large_errors_cost_the_most():
+    """Ten times the error, a hundred times the cost; beyond five scales no more."""
+    errors = [{"truth.linear_velocity_in_body[x]": v} for v in (0.002, 0.02, 0.1, 1.0)]
+    costs = [reward("squared_velocity_error", error) for error in errors]
+    assert costs == pytest.approx([0.01, 1.0, 25.0, 25.0])
+    turning = {"command.yaw_rate": 0.06, "truth.angular_velocity_in_body[z]": -0.06}
+    assert reward("squared_velocity_error", turning) == pytest.approx(4.0)
+
+
+def test_what_the_observer_gets_wrong_costs():
+    wrong = {"estimate.linear_velocity_in_body[x]": 0.05, "truth.linear_velocity_in_body[x]": 0.06}
+    assert reward("estimate_error", wrong, scale=0.01) == pytest.approx(1.0 / 1.125)
+    assert reward("estimate_error", {}, scale=0.01) == 0.0
+
+
+def test_a_scale_takes_the_place_of_the_limit_in_the_tracking_error_only():
+    changes = {"success": {"velocity_error": {"rms": 0.1, "scale": 0.4}, "yaw_rate_error": None}}
+    config = load_task("velocity", load_robot(), changes).config
+    assert limits_of(config) == {("velocity_error", "rms"): 0.1}
+    assert scales_of(config) == {("velocity_error", "rms"): 0.4}

@@ -144,3 +144,16 @@ def test_an_episode_without_a_steady_part():
     card = score(rollout(measured=measured(0.02, 0.06)))
     assert np.isnan(card["tracking_error_steady"].mean)
     assert card["tracking_error_transient"].mean == pytest.approx(1.0)
+
+
+def test_the_scale_of_the_tracking_error_is_not_the_limit_of_success():
+    """Twice the limit and half the scale: no success, though the tracking error is small."""
+    own = (Measure("velocity_error", "m/s", "ahead", rms=0.01, scale=0.04), MEASURES[1])
+    errors = measured(0.02, 0.0)
+    card = score(rollout(measured=errors, measures=own, succeeded=np.zeros(EPISODES, bool)))
+    assert card["tracking_error"].mean == pytest.approx(0.5 / np.sqrt(2))
+    assert card["success"].mean == 0.0
+    assert card["within_scales"].mean == 100.0
+    docs = {metric.key: metric.doc for metric in metrics_of(own)}
+    assert "0.04 m/s" in docs["tracking_error"]
+    assert "0.01 m/s" in docs["success"]

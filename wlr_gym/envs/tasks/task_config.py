@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.paths import named_in
@@ -126,18 +126,12 @@ class CurriculumConfig(SettingsModel):
 class SuccessConfig(SettingsModel):
     """Largest root mean square and largest magnitude of a measure over an episode, in its unit.
 
-    ``scale``: root mean square that counts as 1 in the tracking error; None = the limit ``rms``.
+    ``scale``: root mean square that counts as 1 in the tracking error, in place of the limit ``rms``.
     """
 
     rms: float | None = Field(default=None, gt=0)
     max: float | None = Field(default=None, gt=0)
     scale: float | None = Field(default=None, gt=0)
-
-    @model_validator(mode="after")
-    def _scale_of_something(self) -> SuccessConfig:
-        if self.scale is not None and self.rms is None:
-            raise ValueError("scale needs rms, the limit of the same measure")
-        return self
 
 
 class TaskConfig(SettingsModel):
