@@ -25,7 +25,7 @@ def config(name):
 @pytest.mark.parametrize(
     ("name", "base"),
     [("nominal", None), ("wide", None)]
-    + [(name, "nominal") for name in ("ice", "split", "patches", "slippery", "asymmetric", "slope")],
+    + [(name, "nominal") for name in ("ice", "split", "patches", "slippery", "asymmetric", "slope", "stripes", "ribbed")],
 )
 def test_tables_are_those_of_the_code(name, base):
     block = TEXT.split(f"<!-- {name}: ")[1].split(f"<!-- end of {name} -->")[0]
