@@ -146,9 +146,9 @@ def test_shipped_randomizations_stay_in_the_table_bounds(robot, name):
     assert np.array_equal(drawn.values[:, fixed], Parameters.nominal(robot, len(SEEDS)).values[:, fixed])
     if name != "none":
         still = drawn.values[:, randomization.columns].std(axis=0) == 0
-        stated = (
-            {"patch.x_min[patch_1]", "patch.x_max[patch_1]", "patch.y_max[patch_1]"} if name in ("split", "slippery") else set()
-        )
+        half = {"patch.x_min[patch_1]", "patch.x_max[patch_1]", "patch.y_max[patch_1]"}
+        across = {f"patch.y_{end}[patch_{k}]" for end in ("min", "max") for k in (1, 2, 3, 4)}
+        stated = {"split": half, "slippery": half, "stripes": across}.get(name, set())
         assert {element for element, fixed in zip(randomization.elements, still, strict=True) if fixed} == stated
 
 

@@ -116,7 +116,7 @@ def test_card_files(swept, tmp_path):
     pictures = draw_card(folder, swept)
     write_card(folder, swept, pictures)
     write_episodes(folder / "episodes.parquet", swept, 7)
-    assert set(pictures.values()) == {"spectrum.png", "improvement.png", "sweep_friction.png"}
+    assert set(pictures.values()) == {"spectrum.png", "improvement.png", "pareto.png", "sweep_friction.png"}
     assert all((folder / name).stat().st_size > 5000 for name in pictures.values())
     text = (folder / "card.md").read_text()
     assert text.startswith("# Score card: ours\n")
