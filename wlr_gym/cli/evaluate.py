@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import tyro
@@ -19,8 +19,9 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import PatchOption, environment_of
+from wlr_gym.cli.options import PatchOption, SensorsOption, environment_of
 from wlr_gym.envs.registry import task_name_of
+from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.evaluation import (
     FIRST_SEED,
     MAIN,
@@ -52,7 +53,6 @@ from wlr_gym.learning.evaluation.scoring import (
     SWEEP_EPISODES,
     evaluate,
     fitting_baselines,
-    having,
 )
 from wlr_gym.physics.effects import Patch
 from wlr_gym.policy import shipped_names, trained_environment
@@ -68,7 +68,7 @@ FULL_SEEDS = 5
 
 
 @dataclass(frozen=True)
-class EvaluateOptions(PatchOption):
+class EvaluateOptions(PatchOption, SensorsOption):
     policy: tyro.conf.Positional[tuple[str, ...]]
     """Agent, policy file (.onnx), policy or run folder, or shipped policy; NAME=POLICY names it. Several, NAME=POLICY,POLICY, a
     pattern ('out/trials/lr=1e-3-*') or a folder of run folders: trainings of one recipe with different seeds, as one column."""
@@ -96,9 +96,6 @@ class EvaluateOptions(PatchOption):
     """Episodes per point of a sweep."""
     randomization: str | None = None
     """Name in configs/randomization/, path, or a gap result (.json); default: the task's."""
-    sensors: tuple[Literal["camera", "flow", "none"], ...] | None = None
-    """Which of the sensors that not every robot has the robots have: camera, flow (optical flow), or none; default: as the
-    robot's file says."""
     robot: str | None = None
     """Name in configs/robot/ or path; default: the robot that the policy was trained with, else the task's."""
     threads: int = 1
@@ -134,7 +131,7 @@ def run(options: EvaluateOptions) -> int:
     robot = options.robot or common_robot(read_subjects([options.policy, *(options.baselines or ())]))
     keywords = {
         "randomization": options.randomization, "robot": robot, "effects": patch, "threads": options.threads,
-        "backend": BACKENDS[0] if options.backend == "both" else options.backend, **having(_sensors(options)),
+        "backend": BACKENDS[0] if options.backend == "both" else options.backend, **having(options.present()),
     }  # fmt: skip
     if options.out is not None:
         settings = {key: _plain(value) for key, value in asdict(options).items()}
@@ -163,7 +160,7 @@ def _accept(options: EvaluateOptions) -> int:
             floors=None if options.randomization is None else (options.randomization,),
             episodes=options.episodes or acceptance.EPISODES,
             seeds=options.seeds or acceptance.SEEDS,
-            sensors=_sensors(options),
+            sensors=options.present(),
             robot=options.robot,
             effects=options.patch(),
             threads=options.threads,
@@ -224,10 +221,6 @@ def _check(options: EvaluateOptions) -> None:
             raise InputError(f"--video-seconds {options.video_seconds:g}: expected more than 0")
 
 
-def _sensors(options: EvaluateOptions) -> tuple[str, ...] | None:
-    return None if options.sensors is None else tuple(name for name in options.sensors if name != "none")
-
-
 def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
 
@@ -253,7 +246,7 @@ def _play(options: EvaluateOptions, patch: Patch) -> tuple[Card, Rollout]:
             sweeps=options.sweep or (),
             sweep_episodes=options.sweep_episodes,
             randomization=options.randomization,
-            sensors=_sensors(options),
+            sensors=options.present(),
             robot=options.robot,
             effects=patch,
             threads=options.threads,

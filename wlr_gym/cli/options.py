@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from wlr_gym.base.errors import InputError
 
@@ -29,6 +29,19 @@ class PatchOption:
         from wlr_gym.physics.effects import load_patch
 
         return load_patch(list(self.effects))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorsOption:
+    """``--sensors`` of commands that make robots."""
+
+    sensors: tuple[Literal["camera", "flow", "none"], ...] | None = None
+    """Which of the sensors that not every robot has the robots have: camera, flow (optical flow), or none; default: as the
+    robot's file says."""
+
+    def present(self) -> tuple[str, ...] | None:
+        """Return the sensors; None = as the robot's file says."""
+        return None if self.sensors is None else tuple(name for name in self.sensors if name != "none")
 
 
 def pairs(option: str, words: Sequence[str], example: str) -> dict[str, str]:

@@ -12,7 +12,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption, environment_of
+from wlr_gym.cli.options import PatchOption, SensorsOption, environment_of
 from wlr_gym.render.display import require_display
 from wlr_gym.render.view import View
 from wlr_gym.render.web.page import HOST, PORT
@@ -35,7 +35,7 @@ FPS = 25.0
 
 
 @dataclass(frozen=True)
-class PlayOptions(PatchOption):
+class PlayOptions(PatchOption, SensorsOption):
     env: tyro.conf.Positional[str | None] = None
     """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
     agent: str = "pid"
@@ -78,12 +78,13 @@ class PlayOptions(PatchOption):
 
 def run(options: PlayOptions) -> int:
     """Play, until the window is closed or the video is written."""
+    from wlr_gym.envs.tasks.task_config import having
     from wlr_gym.learning.evaluation import make_core
     from wlr_gym.policy import environment_for, make_policy
 
     _check(options)
     keywords: dict[str, Any] = {name: getattr(options, name) for name in ("backend", "randomization", "robot")}
-    keywords["effects"] = options.patch()
+    keywords |= {"effects": options.patch(), **having(options.present())}
     own = environment_for(options.agent, keywords)
     keywords["robot"] = own["robot"]  # a second one drives the same robot
     core = make_core(environment_of(options.env, options.agent), 1, own)

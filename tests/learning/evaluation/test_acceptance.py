@@ -6,6 +6,7 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
+from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.evaluation.acceptance import (
     ACCEPTANCE_FILE,
     FAMILIES,
@@ -16,7 +17,6 @@ from wlr_gym.learning.evaluation.acceptance import (
     references_of,
     write_acceptance,
 )
-from wlr_gym.learning.evaluation.scoring import having
 from wlr_gym.policy import shipped_names
 
 STORED = sorted((Path(__file__).parents[3] / "docs" / "data" / "acceptance").glob("*.json"))

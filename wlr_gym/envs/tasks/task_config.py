@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -104,6 +104,24 @@ class SensorsConfig(SettingsModel):
 
     camera: float | None = Field(default=None, ge=0, le=1)
     flow: float | None = Field(default=None, ge=0, le=1)
+
+
+#: Sensors that a robot may have or not.
+OPTIONAL = tuple(SensorsConfig.model_fields)
+
+
+def having(sensors: Sequence[str] | None) -> dict[str, Any]:
+    """Return the keywords of an environment whose robots have these of :data:`OPTIONAL` and not the others.
+
+    Raises:
+        InputError: another name.
+    """
+    if sensors is None:
+        return {}
+    for name in sensors:
+        if name not in OPTIONAL:
+            raise unknown_name("sensor", name, OPTIONAL)
+    return {"task": {"sensors": {name: float(name in sensors) for name in OPTIONAL}}}
 
 
 class RampConfig(SettingsModel):

@@ -10,7 +10,7 @@ from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.settings import read_settings
 from wlr_gym.envs.tasks.describe import contract
-from wlr_gym.envs.tasks.signals import PRESENCE
+from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card
 from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, play, work
 from wlr_gym.learning.evaluation.rollout import Rollout
@@ -23,8 +23,6 @@ from wlr_gym.robot import RobotSource, load_robot, robot_hash
 BACKENDS = ("gibbs_appell", "mujoco")
 #: What a policy is compared with where nothing is chosen, as far as it fits the task.
 BASELINES = ("do_nothing", "pid")
-#: Sensors that a robot may have or not.
-OPTIONAL = PRESENCE
 #: Episodes of each value of a sweep, and of each other condition.
 SWEEP_EPISODES = 64
 OTHER_EPISODES = 64
@@ -67,7 +65,7 @@ def evaluate(
         other_episodes: in the second simulator.
         sweeps: names of sweeps (:func:`wlr_gym.learning.evaluation.sweeps_for` lists those that suit a task).
         sweep_episodes: per point of a sweep.
-        sensors: which of :data:`OPTIONAL` the robots have; None = as their file and the randomisation say.
+        sensors: which of camera and flow the robots have; None = as their file and the randomisation say.
         randomization, effects, threads: of the environment; see :class:`wlr_gym.envs.settings.EnvironmentOptions`. None = the
             task's.
         robot: that all drive; None = the one that the first trained policy was made for, else the task's.
@@ -117,20 +115,6 @@ def evaluate(
         said |= {"second simulator": f"{others[0]}, {fewer} episodes"}
     said |= {"sweeps": f"{sweep_episodes} episodes per point"} if chosen else {}
     return Card(results, chosen, said, {subject.name: identity(subject) for subject in subjects}, training_seeds)
-
-
-def having(sensors: Sequence[str] | None) -> dict[str, Any]:
-    """Return the keywords of an environment whose robots have these of :data:`OPTIONAL` and not the others.
-
-    Raises:
-        InputError: another name.
-    """
-    if sensors is None:
-        return {}
-    for name in sensors:
-        if name not in OPTIONAL:
-            raise unknown_name("sensor", name, OPTIONAL)
-    return {"task": {"sensors": {name: float(name in sensors) for name in OPTIONAL}}}
 
 
 def _named(robot: RobotSource | None) -> str:
