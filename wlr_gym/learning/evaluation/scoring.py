@@ -48,6 +48,7 @@ def evaluate(
     robot: Any = None,
     effects: Any = None,
     threads: int = 1,
+    precision: str = "float64",
     tell: Tell = lambda text, share: None,
     watch: Watch = lambda condition, subject, block, rollout: None,
 ) -> Card:
@@ -66,7 +67,7 @@ def evaluate(
         sweeps: names of sweeps (:func:`wlr_gym.learning.evaluation.sweeps_for` lists those that suit a task).
         sweep_episodes: per point of a sweep.
         sensors: which of camera and flow the robots have; None = as their file and the randomisation say.
-        randomization, effects, threads: of the environment; see :class:`wlr_gym.envs.settings.EnvironmentOptions`. None = the
+        randomization, effects, threads, precision: of the environment; see :class:`wlr_gym.envs.settings.EnvironmentOptions`. None = the
             task's.
         robot: that all drive; None = the one that the first trained policy was made for, else the task's.
         tell: called with what is being played and the share that was done since, of 1.
@@ -93,7 +94,7 @@ def evaluate(
     subjects = read_subjects([policy, *(fitting_baselines(environment) if baselines is None else baselines)])
     robot = common_robot(subjects) if robot is None else robot
     keywords: dict[str, Any] = {"randomization": randomization, "robot": robot, "effects": patch}
-    keywords |= {"backend": main, "threads": threads, **having(sensors)}
+    keywords |= {"backend": main, "threads": threads, "precision": precision, **having(sensors)}
     chosen = tuple(read_sweep(name, task) for name in dict.fromkeys(sweeps))
     conditions = [Condition(MAIN, keywords, episodes=episodes, blocks=seeds)]
     for sweep in chosen:

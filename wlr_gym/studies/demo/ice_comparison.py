@@ -52,10 +52,10 @@ def compare(demo: Demo, tell: Tell) -> Section:
     tell("on ice", 0.0)
     card = _play(demo, tell)
     html = paragraph(
-        f"{demo.episodes} episodes of 20 s each on each kind of floor: the same floors, robots and commands for all. No robot "
-        "has a camera, as the deployed one. A success keeps velocity and yaw rate within 5 % of the range of commands, rms over "
-        "the episode. Tracking error: rms of both, in units of 10 %; then each by itself; extra slip: mean slip speed of the "
-        "wheels beyond what turning needs. Mean ± half of the 95 % confidence interval."
+        f"{demo.episodes} episodes of 20 s each on each kind of floor: the same floors, robots, commands for all. No robot "
+        "has a camera, as the deployed one. A success keeps velocity and yaw rate within 5 % of the range of commands, rms "
+        "over the episode. Tracking error: rms of both, in units of 10 %; then each by itself; extra slip: mean slip speed of "
+        "the wheels beyond what turning needs. Mean ± half of the 95 % confidence interval."
     )
     html += "".join(heading(said) + _table(card, label) + paragraph(_against(card, label)) for label, said in FLOORS.items())
     return Section(TITLE, _headline(card), html + _film(demo, tell))
