@@ -67,8 +67,8 @@ def evaluate(
         sweeps: names of sweeps (:func:`wlr_gym.learning.evaluation.sweeps_for` lists those that suit a task).
         sweep_episodes: per point of a sweep.
         sensors: which of camera and flow the robots have; None = as their file and the randomisation say.
-        randomization, effects, threads, precision: of the environment; see :class:`wlr_gym.envs.settings.EnvironmentOptions`. None = the
-            task's.
+        randomization, effects, threads, precision: of the environment; see :class:`wlr_gym.envs.settings.EnvironmentOptions`.
+            None = the task's.
         robot: that all drive; None = the one that the first trained policy was made for, else the task's.
         tell: called with what is being played and the share that was done since, of 1.
         watch: called with the episodes of every block once they were played.
