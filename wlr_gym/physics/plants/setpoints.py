@@ -46,6 +46,7 @@ class SetpointHistory:
         self._period = control_period
         depth = int(np.ceil(SPECS["command.delay"].high / control_period)) + 2
         self._ring = np.zeros((depth, count, 8))
+        self._columns = np.arange(count * 8).reshape(count, 8)
         self._head = 0
         self._ticks = np.zeros((count, 8), np.intp)
         self._switch_time = np.zeros((count, 8))
@@ -82,7 +83,7 @@ class SetpointHistory:
 
     def _at(self, ticks: NDArray[np.intp]) -> Array:
         places = (self._head - ticks) % len(self._ring)
-        return np.take_along_axis(self._ring, places[None], axis=0)[0]
+        return self._ring.take(places * self._columns.size + self._columns)
 
 
 class _NewestFirst:
