@@ -9,6 +9,7 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli.gap_decide import ask
 from wlr_gym.data.excitations import GENTLE, excite
+from wlr_gym.data.read import read_run
 from wlr_gym.data.record import record_simulation
 from wlr_gym.gap import Budget, Recorded, decide
 from wlr_gym.gap.report.entries import Result
@@ -46,7 +47,7 @@ def test_one_name_with_95_percent_is_decided():
     assert (only.name, [effect.name for effect in only.effects]) == ("coulomb_friction", ["coulomb_friction"])
 
 
-def test_names_that_share_the_probability_are_in_play_with_nothing():
+def test_names_that_share_the_probability_are_in_play():
     found = result(
         "effect_found",
         (0.0, [
@@ -55,7 +56,7 @@ def test_names_that_share_the_probability_are_in_play_with_nothing():
             candidate("viscous_friction", 0.01, "worse fit"),
         ]),
     )  # fmt: skip
-    assert [one.name for one in explanations(found)] == ["coulomb_friction", "rolling_resistance", "nothing"]
+    assert [one.name for one in explanations(found)] == ["coulomb_friction", "rolling_resistance"]
 
 
 def test_places_of_a_name_count_together_and_the_best_one_stands_for_it():
@@ -117,8 +118,14 @@ def test_a_motion_that_loads_what_is_in_question_promises_more():
 def test_motions_keep_the_profile_of_the_runs_and_are_drawn_anew():
     first, again = (next_run.motions_to_drive(ROBOT, GENTLE, driven) for driven in ([], ["random"]))
     assert "steps" not in [motion.name for motion in first]  # made for no profile
-    changed = [one.name for one, two in zip(first, again, strict=True) if not np.array_equal(one.setpoints, two.setpoints)]
+    changed = [one.name for one, two in zip(first, again, strict=True) if not np.array_equal(one.setpoints, two.setpoints, True)]
     assert changed == ["random"]
+
+
+def test_runs_of_an_excitation_are_known_by_their_setpoints(data):
+    whole = record_simulation(data / "run_03.parquet", excite("straight", robot=ROBOT), ROBOT, "gibbs_appell")
+    runs = [read_run(path) for path in (data / "run_02.parquet", whole)]
+    assert next_run.driven_already(runs, ROBOT) == ["straight"]  # the first was cut short
 
 
 # ---- rounds ----------------------------------------------------------------------------------------------------------
@@ -172,7 +179,7 @@ def test_from_two_runs_to_a_decision(data, tmp_path, answers):
     assert [one.verdict for one in rounds] == ["too_few_runs", "effect_found", "effect_found"]
     assert [one.run for one in rounds] == ["run_03", "run_04", ""]
     assert rounds[1].excitation == "turns"
-    assert rounds[1].names == pytest.approx({"coulomb_friction": 0.6, "rolling_resistance": 0.4, "nothing": 0.0})
+    assert rounds[1].names == pytest.approx({"coulomb_friction": 0.6, "rolling_resistance": 0.4})
     assert (found.history.ended, found.history.driven) == ("decided", [rounds[0].excitation, "turns"])
     assert found.folder == tmp_path / "out" / "round_03"
     assert json.loads((tmp_path / "out" / "history.json").read_text())["rounds"][1]["run"] == "run_04"

@@ -20,7 +20,7 @@ from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
 from wlr_gym.gap.report.entries import Result
 from wlr_gym.gap.report.explanations import Explanation, explanations
 from wlr_gym.gap.report.result import RESULT_FILE, read_result
-from wlr_gym.gap.robot.next_run import TELLS, most_shown, motions_to_drive, promises
+from wlr_gym.gap.robot.next_run import TELLS, driven_already, most_shown, motions_to_drive, promises
 from wlr_gym.gap.robot.open import LEAST_RUNS
 from wlr_gym.gap.workflow import Tell, analyse
 from wlr_gym.physics.effects import Patch, Source, load_patch
@@ -242,14 +242,16 @@ def _choice(
         return "decided", None
     if len(history.driven) >= asked.budget.runs:
         return "budget", None
+    before = [read_run(path) for path in run_files(asked.data) if path.stem not in {one.run for one in history.rounds}]
     own = robot_of(read_run(run_files(asked.data)[0]), asked.robot)
+    driven = [*driven_already(before, own), *history.driven]
     seconds = asked.budget.seconds - history.seconds
-    motions = motions_to_drive(own, read_meta(asked.data).profile, history.driven)
+    motions = motions_to_drive(own, read_meta(asked.data).profile, driven)
     motions = [motion for motion in motions if motion.duration <= seconds]
     if not motions:
         return "budget", None
     if result is None or len(left) < 2:
-        return "", _shows_most(result, motions, history.driven)
+        return "", _shows_most(result, motions, driven)
     asked.tell("choosing the next run", 1.0)
     found = promises(result, left, motions, own, known=asked.known, backend=asked.backend, threads=asked.threads)
     if max(one.most for one in found) < TELLS:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from wlr_gym.gap.analysis import EQUIVALENT, FAILS_CROSS_VALIDATION, SELECTED, TOO_LITTLE, WORSE_FIT
+from wlr_gym.gap.analysis import EQUIVALENT, FAILS_CROSS_VALIDATION, REMOVED, SELECTED, TOO_LITTLE, WORSE_FIT
 from wlr_gym.gap.report.entries import EvidenceEntry, Result
 from wlr_gym.physics.effects import PatchEffect
 
@@ -36,13 +36,15 @@ def explanations(result: Result) -> tuple[Explanation, ...]:
     """Return the explanations in play, most probable first; one where the runs have decided, none without an analysis.
 
     They are those of the first round of the search in which no name alone has 95 %: the smallest set of names that has it,
-    what the result calls equivalent, and nothing. Once an effect was found, a round that adds nothing is decided.
+    nothing among them, and what was selected. Once an effect was found, a round that adds nothing is decided.
     """
     added: tuple[PatchEffect, ...] = ()
     found: list[Explanation] = []
     for threshold in result.thresholds:
         entries = [one for one in result.evidence if one.round == threshold.round and one.outcome in _OPEN]
         selected = next((one for one in entries if one.outcome == SELECTED), None)
+        if any(one.outcome == REMOVED for one in result.evidence if one.round == threshold.round):
+            continue
         if selected is None and added:
             break
         found = _of_round(entries, threshold.none or 0.0, added)
@@ -63,16 +65,15 @@ def _of_round(entries: Sequence[EvidenceEntry], nothing: float, added: tuple[Pat
         Explanation(name, share / whole, (*added, _effect(best[name])) if name in best else added)
         for name, share in sorted(total.items(), key=lambda one: -one[1])
     ]
-    equal = {entry.name for entry in entries if entry.outcome == EQUIVALENT}
     chosen = next((entry.name for entry in entries if entry.outcome == SELECTED), NOTHING)
-    if ranked[0].name == chosen and ranked[0].probability >= DECIDED and not equal:
+    if ranked[0].name == chosen and ranked[0].probability >= DECIDED:
         return ranked[:1]
     reached, credible = 0.0, set()
     for one in ranked:
         if reached < DECIDED:
             credible.add(one.name)
         reached += one.probability
-    return [one for one in ranked if one.name in credible | equal | {chosen, NOTHING}]
+    return [one for one in ranked if one.name in credible | {chosen}]
 
 
 def _effect(entry: EvidenceEntry) -> PatchEffect:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.data.excitations import EXCITATIONS, GENTLE, Motion, excite
 from wlr_gym.data.format import Profile
-from wlr_gym.data.read import read_run
-from wlr_gym.data.record import record_simulation
+from wlr_gym.data.read import Run, read_run
+from wlr_gym.data.record import motion_of, record_simulation
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.report.entries import AdequacyEntry, Result
 from wlr_gym.gap.report.explanations import Explanation
@@ -33,11 +33,13 @@ from wlr_gym.robot import Robot
 Array = NDArray[np.float64]
 
 #: Least weight of an explanation in play, however improbable.
-LEAST_WEIGHT = 0.05
+LEAST_WEIGHT = 1e-6
 #: Expected difference of minus two log evidence that takes even odds to 95 %: a motion that promises less would not tell.
 TELLS = 2.0 * math.log(19.0)
 #: Half of a 95 % interval, in standard deviations.
 _HALF_95 = 1.96
+#: Share of rows in which a run of an excitation has its setpoints.
+ALIKE = 0.9
 
 
 @dataclass(frozen=True)
@@ -67,10 +69,25 @@ def motions_to_drive(robot: Robot, profile: Profile, driven: Sequence[str]) -> l
     Args:
         robot: whose limits they keep.
         profile: of the runs that are there. A motion made for another one is left out.
-        driven: names of the excitations that were driven.
+        driven: names of the excitations that were driven, once for each time.
     """
     names = [name for name, excitation in EXCITATIONS.items() if excitation.profile in (GENTLE, profile)]
     return [replace(excite(name, list(driven).count(name), robot), profile=profile) for name in names]
+
+
+def driven_already(runs: Sequence[Run], robot: Robot) -> list[str]:
+    """Return the names of the excitations that some runs are of, as ``wlr record`` drives them."""
+    commands = [motion_of(run).setpoints for run in runs]
+    names = [(name, excite(name, robot=robot).setpoints) for name in EXCITATIONS]
+    return [name for own in commands for name, setpoints in names if _alike(own, setpoints)]
+
+
+def _alike(one: Array, two: Array) -> bool:
+    """Whether setpoints are the same in nearly all rows."""
+    rows = min(len(one), len(two))
+    if rows < ALIKE * max(len(one), len(two)):
+        return False
+    return bool(np.isclose(one[:rows], two[:rows], equal_nan=True).all(axis=1).mean() >= ALIKE)
 
 
 def most_shown(motions: Sequence[Motion], driven: Sequence[str]) -> Motion:
