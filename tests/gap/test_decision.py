@@ -5,9 +5,10 @@ import json
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli.gap_decide import ask
+from wlr_gym.cli.gap_decide import DecideOptions, ask, recorder_of
 from wlr_gym.data.excitations import GENTLE, excite
 from wlr_gym.data.read import read_run
 from wlr_gym.data.record import record_simulation
@@ -104,6 +105,7 @@ def test_what_calibration_takes_up_does_not_tell():
     assert np.allclose(found, found.T)
 
 
+@pytest.mark.slow
 def test_a_motion_that_loads_what_is_in_question_promises_more():
     both = [candidate("coulomb_friction", 0.5, "selected"), candidate("viscous_friction", 0.5, "equivalent")]
     found = result("effect_found", (0.0, both))
@@ -118,7 +120,8 @@ def test_a_motion_that_loads_what_is_in_question_promises_more():
 def test_motions_keep_the_profile_of_the_runs_and_are_drawn_anew():
     first, again = (next_run.motions_to_drive(ROBOT, GENTLE, driven) for driven in ([], ["random"]))
     assert "steps" not in [motion.name for motion in first]  # made for no profile
-    changed = [one.name for one, two in zip(first, again, strict=True) if not np.array_equal(one.setpoints, two.setpoints, True)]
+    pairs = zip(first, again, strict=True)
+    changed = [one.name for one, two in pairs if not np.array_equal(one.setpoints, two.setpoints, equal_nan=True)]
     assert changed == ["random"]
 
 
@@ -231,9 +234,21 @@ def test_a_history_of_other_data_is_refused(data, tmp_path, answers):
         decide(data, data, record)
 
 
-def test_asking_waits_for_the_run(data, tmp_path, capsys):
-    from rich.console import Console
+@pytest.mark.slow
+def test_an_emulated_robot_drives_a_motion_into_the_folder(data):
+    options = DecideOptions(until_decided=True, record="emulated", hidden=("stiff_leg",))
+    motion = excite("straight", robot=ROBOT, seconds=0.4)
+    found = recorder_of(options, ROBOT, "gibbs_appell", data, Console())(motion, data)
+    assert (found.run, found.reason) == (data / "run_03.csv", "")
+    assert read_run(found.run).meta.profile == motion.profile
 
+
+def test_a_real_robot_has_no_hidden_effects(tmp_path):
+    with pytest.raises(InputError, match="--hidden: a real robot has its own effects"):
+        recorder_of(DecideOptions(until_decided=True, hidden=("stiff_leg",)), ROBOT, "gibbs_appell", tmp_path, Console())
+
+
+def test_asking_waits_for_the_run(data, tmp_path, capsys):
     motion = excite("turns", robot=ROBOT)
     waited = []
 
