@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from wlr_gym.data.excitations import Motion
-    from wlr_gym.gap.decision import Decision, Recorded, Recorder
+    from wlr_gym.gap.decision import Decided, Recorded, Recorder
     from wlr_gym.physics.effects import Patch
     from wlr_gym.robot import Robot
 
@@ -111,7 +111,7 @@ def _emulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backen
     return Recorded(drive.run, drive.reason)
 
 
-def print_rounds(decision: Decision, console: Console) -> None:
+def print_rounds(decision: Decided, console: Console) -> None:
     """Print a row for every round, and how it ended."""
     from rich import box
     from rich.table import Table

@@ -67,7 +67,7 @@ class Recorded:
 Recorder = Callable[[Motion, Path], Recorded]
 
 
-class Round(SettingsModel):
+class DecisionRound(SettingsModel):
     """One round: an analysis, and the run that was driven after it.
 
     Attributes:
@@ -97,7 +97,7 @@ class History(SettingsModel):
     robot: str | None
     backend: str
     known: list[dict[str, Any]]
-    rounds: tuple[Round, ...] = ()
+    rounds: tuple[DecisionRound, ...] = ()
     ended: Ending = ""
 
     @property
@@ -112,7 +112,7 @@ class History(SettingsModel):
 
 
 @dataclass(frozen=True)
-class Decision:
+class Decided:
     """How it ended.
 
     Attributes:
@@ -137,7 +137,7 @@ def decide(
     backend: str = "gibbs_appell",
     threads: int = 1,
     tell: Tell = lambda stage, share: None,
-) -> Decision:
+) -> Decided:
     """Analyse measured runs, have the runs driven that distinguish best what may be missing, until one name has 95 %.
 
     Called again with the same folders it goes on where it was interrupted, or with a larger budget where that was used up. A
@@ -162,12 +162,12 @@ def decide(
         now = now.model_copy(update={"excitation": promise.name, "why": promise.why}) if promise else now
         folder, last = asked.folder(now), None
         if promise is None:
-            return Decision(_saved(asked, history, now, ended), result, folder)
+            return Decided(_saved(asked, history, now, ended), result, folder)
         _saved(asked, history, now)
         recorded = record(promise.motion, asked.data)
         now = _with_run(now, recorded)
         if recorded.run is None:
-            return Decision(_saved(asked, history, now, "stopped"), result, folder)
+            return Decided(_saved(asked, history, now, "stopped"), result, folder)
         history = _saved(asked, history, now)
 
 
@@ -190,7 +190,7 @@ class _Asked:
         known = [dict(effect.content()) for effect in self.known.effects]
         return History(data=str(self.data.resolve()), robot=robot, backend=self.backend, known=known)
 
-    def folder(self, now: Round) -> Path:
+    def folder(self, now: DecisionRound) -> Path:
         """Where the report of a round goes."""
         return self.out / f"round_{now.number:02d}"
 
@@ -198,10 +198,12 @@ class _Asked:
 # ---- one round -------------------------------------------------------------------------------------------------------
 
 
-def _analysed(asked: _Asked, history: History, last: Round | None) -> tuple[Round, Result | None, tuple[Explanation, ...]]:
+def _analysed(
+    asked: _Asked, history: History, last: DecisionRound | None
+) -> tuple[DecisionRound, Result | None, tuple[Explanation, ...]]:
     """Analyse the runs that are there, unless the round that was interrupted has done so."""
     runs = tuple(path.stem for path in run_files(asked.data))
-    now = Round(number=len(history.rounds) + 1, runs=runs, verdict=TOO_FEW_RUNS)
+    now = DecisionRound(number=len(history.rounds) + 1, runs=runs, verdict=TOO_FEW_RUNS)
     if len(runs) < LEAST_RUNS:
         return now, None, ()
     folder = asked.folder(now)
@@ -235,7 +237,7 @@ class _Next:
 
 
 def _choice(
-    asked: _Asked, history: History, now: Round, result: Result | None, left: Sequence[Explanation]
+    asked: _Asked, history: History, now: DecisionRound, result: Result | None, left: Sequence[Explanation]
 ) -> tuple[Ending, _Next | None]:
     """Return what to drive next; or None and why it ends."""
     if len(left) == 1 and now.verdict not in (NOT_EXCITED, BAD_DATA):
@@ -268,7 +270,7 @@ def _shows_most(result: Result | None, motions: Sequence[Motion], driven: Sequen
     return _Next(new[0], "the report recommends it") if new else _Next(most_shown(motions, driven), "shows most effects best")
 
 
-def _with_run(now: Round, recorded: Recorded) -> Round:
+def _with_run(now: DecisionRound, recorded: Recorded) -> DecisionRound:
     """The round with the run that was driven after it."""
     if recorded.run is None:
         return now.model_copy(update={"stopped": recorded.reason or "nothing was recorded"})
@@ -281,7 +283,7 @@ def _with_run(now: Round, recorded: Recorded) -> Round:
 # ---- the history -----------------------------------------------------------------------------------------------------
 
 
-def _resumed(asked: _Asked) -> tuple[History, Round | None]:
+def _resumed(asked: _Asked) -> tuple[History, DecisionRound | None]:
     """Return the history of complete rounds, and the last one where it was interrupted or nothing was driven after it."""
     if not run_files(asked.data):
         raise InputError(
@@ -307,7 +309,7 @@ def _resumed(asked: _Asked) -> tuple[History, Round | None]:
     return history.model_copy(update={"rounds": tuple(before)}), last
 
 
-def _saved(asked: _Asked, history: History, now: Round, ended: Ending = "") -> History:
+def _saved(asked: _Asked, history: History, now: DecisionRound, ended: Ending = "") -> History:
     """Return the history with a further round, and write it."""
     longer = history.model_copy(update={"rounds": (*history.rounds, now), "ended": ended})
     write_json(asked.out / HISTORY_FILE, longer.model_dump(mode="json"))
