@@ -1,6 +1,6 @@
 """The hidden fault of the demo's robot, and how a diagnosis is judged."""
 
-from wlr_gym.gap.report.result import EffectEntry, ParameterEntry
+from wlr_gym.gap.report.entries import EffectEntry, ParameterEntry
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.studies.demo.diagnosis import judge
 from wlr_gym.studies.demo.hidden_fault import hide

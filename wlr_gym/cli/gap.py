@@ -1,11 +1,13 @@
 """Find what the model lacks: compare it with measured runs, name the missing effect, validate it on held-out runs.
 
 Writes report.html, result.json, patch.yaml (the effects found, for --effects), plots, config.yaml and provenance.yaml.
-docs/gap.md says how to read the report.
+docs/gap.md says how to read the report. --until-decided has further runs driven, and analyses again; then each round has a
+folder of its own.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -17,6 +19,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.gap_decide import DecideOptions, print_rounds, recorder_of
 from wlr_gym.cli.options import PatchOption
 from wlr_gym.cli.progress import progress
 
@@ -28,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class GapOptions(PatchOption):
+class GapOptions(DecideOptions, PatchOption):
     data: tyro.conf.Positional[Path]
     """Folder of measured runs; with --rig, of recordings of the rig."""
     out: Path
@@ -60,8 +63,10 @@ def run(options: GapOptions) -> int:
 
     _check(options)
     known = _known(options)
-    check_folder(options.out)
     console = Console(soft_wrap=True, highlight=False)
+    if options.until_decided:
+        return _decide(options, known, console)
+    check_folder(options.out)
     with progress(console) as tell:
         analysis = analyse(
             options.data,
@@ -75,9 +80,40 @@ def run(options: GapOptions) -> int:
             tell=partial(tell, ""),
         )
     settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
-    record_provenance(options.out, settings | {"heldout": list(options.heldout), "effects": known.content()["effects"]})
+    settings |= {"heldout": list(options.heldout), "hidden": list(options.hidden)}
+    record_provenance(options.out, settings | {"effects": known.content()["effects"]})
     _print(analysis, options.out, console)
     return FAILED if analysis.verdict == BAD_DATA else OK
+
+
+def _decide(options: GapOptions, known: Patch, console: Console) -> int:
+    """Have runs driven until it is decided; 1 where the last analysis could not be made."""
+    from wlr_gym.data.read import read_dataset
+    from wlr_gym.data.replay import robot_of
+    from wlr_gym.gap.analysis import BAD_DATA
+    from wlr_gym.gap.decision import Budget, decide
+    from wlr_gym.gap.report.folder import REPORT_FILE
+
+    budget = Budget(options.budget_runs, math.inf if options.budget_seconds is None else options.budget_seconds)
+    robot = robot_of(read_dataset(options.data).runs[0], options.robot)
+    with progress(console) as tell:
+        decision = decide(
+            options.data,
+            options.out,
+            recorder_of(options, robot, options.backend, options.out, console),
+            budget,
+            known=known,
+            robot=options.robot,
+            backend=options.backend,
+            threads=options.threads or os.cpu_count() or 1,
+            tell=partial(tell, ""),
+        )
+    print_rounds(decision, console)
+    if decision.result is None:
+        return FAILED
+    console.print(decision.result.summary, markup=False)
+    console.print(f"report: {decision.folder / REPORT_FILE}", markup=False)
+    return FAILED if decision.result.verdict == BAD_DATA else OK
 
 
 def _check(options: GapOptions) -> None:
@@ -99,6 +135,10 @@ def _check(options: GapOptions) -> None:
     for name in options.effects:
         if Path(name).resolve().parent == options.out.resolve() and Path(name).is_file():
             raise InputError(f"--effects {name}: the results would replace it: give another --out")
+    if options.until_decided and (options.rig is not None or options.heldout):
+        raise InputError("--until-decided: runs of the robot, held out anew in every round: leave --rig and --heldout out")
+    if options.hidden and not options.until_decided:
+        raise InputError("--hidden: it is for --until-decided with --record emulated or simulator")
     if options.threads is not None and options.threads < 1:
         raise InputError(f"--threads {options.threads}: expected 1 or more")
 

@@ -23,6 +23,7 @@ UNKNOWN = "unknown_effect"
 SELECTED = "selected"
 EQUIVALENT = "equivalent"
 WORSE_FIT = "worse fit"
+TOO_LITTLE = "too little"
 FAILS_CROSS_VALIDATION = "fails cross-validation"
 REMOVED = "removed"
 REJECTED = "rejected at screening"
@@ -107,6 +108,7 @@ class Evidence:
         reason: of the outcome, one sentence.
         by_run: fall of the weighted squares per fit run; empty where it was only screened.
         probability: of this candidate among all that were refitted and none of them; 0 where it was only screened.
+        formula, units: of an unknown effect; empty otherwise.
     """
 
     round: int
@@ -119,6 +121,8 @@ class Evidence:
     reason: str
     by_run: Mapping[str, float] = field(default_factory=dict)
     probability: float = 0.0
+    formula: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

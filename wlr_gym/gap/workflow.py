@@ -24,6 +24,7 @@ from wlr_gym.gap.analysis import (
     REJECTED,
     REMOVED,
     SELECTED,
+    TOO_LITTLE,
     UNKNOWN,
     WORSE_FIT,
     Analysis,
@@ -348,12 +349,14 @@ def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int
             number,
             h.candidate.name,
             h.candidate.where,
-            h.candidate.parameters(h.values),
+            h.candidate.effect(h.values).parameters,
             h.gain,
             h.predicted_gain,
             *_outcome(h, look, equal, kept),
             {problem.runs[k]: float(gain) for k, gain in zip(fitted, h.by_run, strict=True)},
             share,
+            h.candidate.formula,
+            h.candidate.units,
         )
         for h, share in zip(look.hypotheses, shares, strict=True)
     ]
@@ -390,5 +393,5 @@ def _outcome(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Contain
         return "inconsistent", "helps some runs and harms others"
     if best is None:
         least = least_gain(len(hypothesis.values), look.threshold)
-        return "too little", f"improves the fit by less than chance and an imperfect simulator can ({least:.0f})"
+        return TOO_LITTLE, f"improves the fit by less than chance and an imperfect simulator can ({least:.0f})"
     return WORSE_FIT, f"improves the fit by {max(hypothesis.gain, 0.0) / best.gain:.0%} of what the selected effect does"

@@ -1,7 +1,7 @@
 """The result file of an analysis, ``result.json``, and the patch that adds what was found to the model, ``patch.yaml``.
 
-The models below are the format: what is written has passed them, and :func:`read_result` checks a file against them. Keys that
-other versions add are kept.
+The models of :mod:`wlr_gym.gap.report.entries` are the format: what is written has passed them, and :func:`read_result`
+checks a file against them. Keys that other versions add are kept.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ValidationError
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
-from wlr_gym.base.settings import SettingsModel
 from wlr_gym.gap.analysis import Adequacy, Analysis, Calibrated, Evidence, FoundEffect, GapFigures, ParameterEstimate, Statistic
+from wlr_gym.gap.report.entries import Result, finite
 from wlr_gym.gap.report.text import closure, sentence, unit_of
 from wlr_gym.physics.effects import Patch, PatchEffect, save_patch
 from wlr_gym.physics.plants.forces import COORDINATES
@@ -28,192 +28,6 @@ from wlr_gym.physics.plants.forces import COORDINATES
 RESULT_FILE = "result.json"
 PATCH_FILE = "patch.yaml"
 MADE_BY = "wlr gap"
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN: a number that is none becomes null."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-Number = Annotated[float, Field(allow_inf_nan=False)]
-MaybeNumber = Annotated[float | None, BeforeValidator(_finite)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Interval = tuple[Number, Number]
-
-
-class _Entry(SettingsModel):
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="allow", allow_inf_nan=True)
-
-
-class ParameterEntry(_Entry):
-    """A fitted parameter of an effect; ``ci95`` is null where the data give none."""
-
-    value: Number
-    ci95: Interval | None
-    unit: str
-
-    @model_validator(mode="after")
-    def _inside(self) -> ParameterEntry:
-        if self.ci95 is not None and not self.ci95[0] <= self.value <= self.ci95[1]:
-            raise ValueError(f"value {self.value:g} is not within its ci95 {list(self.ci95)}")
-        return self
-
-
-class RangeEntry(_Entry):
-    """Lowest and highest value of what a formula reads, in the fitted runs."""
-
-    range: Interval
-    unit: str
-
-
-class EffectEntry(_Entry):
-    """One missing effect.
-
-    ``confidence`` is its selection frequency; ``formula`` is text with units, of unknown effects only, ``validity`` where
-    it was tried.
-    """
-
-    name: str
-    where: list[str]
-    parameters: dict[str, ParameterEntry]
-    confidence: Share
-    gain: MaybeNumber = None
-    formula: str | None = None
-    validity: dict[str, RangeEntry] = Field(default_factory=dict)
-
-
-class CalibrationEntry(_Entry):
-    """A calibrated parameter; ``sigma`` is its tolerance."""
-
-    nominal: Number
-    fitted: Number
-    unit: str
-    sigma: MaybeNumber = None
-    ci95: Interval | None = None
-
-
-class LocalisationEntry(_Entry):
-    """Where the gap is."""
-
-    share_of_gap: Share
-    state_dependence: str
-
-
-class GapEntry(_Entry):
-    """The gap: rms error of replayed runs, 1.0 = sensor noise.
-
-    ``reduction`` lies in 0..1; ``reduction_signed`` is negative where the effects make held-out runs worse, and null where
-    calibration leaves nothing to remove and in results of versions without it. The interval is that of
-    ``reduction_signed``, null where held-out runs are too few.
-    """
-
-    metric: str
-    fit_before: MaybeNumber
-    fit_after: MaybeNumber
-    heldout_before: MaybeNumber
-    heldout_calibrated: MaybeNumber
-    heldout_after: MaybeNumber
-    noise_floor: MaybeNumber
-    reduction: Share
-    reduction_signed: Annotated[float | None, Field(le=1.0), BeforeValidator(_finite)] = None
-    reduction_ci95: tuple[MaybeNumber, MaybeNumber] | None
-
-
-class RelationEntry(_Entry):
-    """A relation of the model and the predicted improvement of the best law there, as a fall of minus two log posterior."""
-
-    name: str
-    law: str
-    formula: str
-    gain: Number
-
-
-class RunsEntry(_Entry):
-    """Names of the runs that were fitted to, and of the held-out ones."""
-
-    fit: list[str]
-    heldout: list[str]
-
-
-class DetectableEntry(_Entry):
-    """Smallest severity of an effect that the data would have shown; null: none that is plausible."""
-
-    parameter: str
-    value: MaybeNumber
-    unit: str
-
-
-class StatisticEntry(_Entry):
-    """A statistic of what the final model leaves in the fitted runs, beside the same of runs that it made itself.
-
-    ``expected`` is their median, ``limit`` their 95 % quantile, ``p`` the share of them, the observed ones counted in, that is
-    as large, ``ratio`` value over expected.
-    """
-
-    value: MaybeNumber
-    expected: MaybeNumber
-    limit: MaybeNumber
-    p: MaybeNumber
-    ratio: MaybeNumber
-
-
-class ByChannelEntry(StatisticEntry):
-    """A statistic over all channels, and of each."""
-
-    channels: dict[str, StatisticEntry]
-
-
-class PulledEntry(StatisticEntry):
-    """By how many standard errors one run pulls a number away from the other runs: the largest there is."""
-
-    number: str
-    run: str
-
-
-class ConstancyEntry(StatisticEntry):
-    """Scatter of the runs' estimates of the model's numbers, over what their rows predict."""
-
-    pulled_most: PulledEntry
-
-
-class TurningEntry(_Entry):
-    """A signal's residual is periodic in its joint's angle; ``amplitude``: noise units, ``confidence``: selection frequency."""
-
-    joint: str
-    signal: str
-    order: int
-    share: float
-    amplitude: float
-    confidence: float
-
-
-class AdequacyEntry(_Entry):
-    """Whether the final model is adequate: information, no decision. ``replicates`` sets of runs were made by it."""
-
-    replicates: int
-    level: ByChannelEntry
-    whiteness: ByChannelEntry
-    constancy: ConstancyEntry
-
-
-class Result(_Entry):
-    """Contents of ``result.json``."""
-
-    verdict: Literal["bad_data", "not_excited", "nothing_missing", "effect_found", "unknown_effect"]
-    summary: str = ""
-    effects: list[EffectEntry]
-    equivalent: list[list[str]]
-    separating_runs: list[str] = Field(default_factory=list)
-    calibration: dict[str, CalibrationEntry]
-    localisation: dict[str, LocalisationEntry]
-    relations: list[RelationEntry] = Field(default_factory=list)
-    gap: GapEntry | None
-    runs: RunsEntry
-    patch: str
-    detectable: dict[str, DetectableEntry] = Field(default_factory=dict)
-    closure: str = ""
-    turning: TurningEntry | None = None
-    adequacy: AdequacyEntry | dict[str, MaybeNumber] | None = None  # earlier versions: the level of each channel
 
 
 # ---- writing ---------------------------------------------------------------------------------------------------------
@@ -350,7 +164,13 @@ def _statistic(found: Statistic) -> dict[str, float]:
 
 
 def _evidence(one: Evidence) -> dict[str, Any]:
-    return {**vars(one), "where": list(one.where), "values": dict(one.values), "by_run": dict(one.by_run)}
+    return {
+        **vars(one),
+        "where": list(one.where),
+        "values": dict(one.values),
+        "by_run": dict(one.by_run),
+        "units": dict(one.units),
+    }
 
 
 def _plain(value: Any) -> Any:
@@ -360,7 +180,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(entry) for entry in value]
     if isinstance(value, float):
-        return _finite(float(value))  # NumPy's are floats, too
+        return finite(float(value))  # NumPy's are floats, too
     if isinstance(value, np.generic):
         return _plain(value.item())
     return value if isinstance(value, str | bool | int | type(None)) else str(value)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from wlr_gym.data.replay import ReplayResult
-    from wlr_gym.gap.report.result import EffectEntry, Result
+    from wlr_gym.gap.report.entries import EffectEntry, Result
     from wlr_gym.physics.effects.effect import PatchEffect
 
 Array = NDArray[np.float64]

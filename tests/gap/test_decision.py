@@ -1,0 +1,262 @@
+"""Going on until it is decided: what is in play, what is driven next, how it ends, and how it goes on after an interruption."""
+
+import importlib
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.cli.gap_decide import DecideOptions, ask, recorder_of
+from wlr_gym.data.excitations import GENTLE, excite
+from wlr_gym.data.read import read_run
+from wlr_gym.data.record import record_simulation
+from wlr_gym.gap import Budget, Recorded, decide
+from wlr_gym.gap.report.entries import Result
+from wlr_gym.gap.report.explanations import explanations
+from wlr_gym.gap.robot import next_run
+from wlr_gym.robot import load_robot
+
+decision = importlib.import_module("wlr_gym.gap.decision")
+ROBOT = load_robot()
+EMPTY = {"effects": [], "equivalent": [], "calibration": {}, "localisation": {}, "gap": None, "patch": "patch.yaml"}
+
+
+def candidate(name, probability, outcome, number=1, where=("wheel_lf",)):
+    values = {"coulomb_friction": "torque", "rolling_resistance": "coefficient", "viscous_friction": "coefficient"}
+    return {
+        "round": number, "name": name, "where": list(where), "values": {values[name]: 0.1}, "outcome": outcome,
+        "probability": probability,
+    }  # fmt: skip
+
+
+def result(verdict, *rounds, runs=("run_01", "run_02")):
+    evidence = [entry for _, entries in rounds for entry in entries]
+    thresholds = [{"round": k, "none": none} for k, (none, _) in enumerate(rounds, 1)]
+    content = {"verdict": verdict, "evidence": evidence, "thresholds": thresholds, "runs": {"fit": list(runs), "heldout": []}}
+    return Result.model_validate(EMPTY | content)
+
+
+def test_one_name_with_95_percent_is_decided():
+    found = result(
+        "effect_found",
+        (0.0, [candidate("coulomb_friction", 0.97, "selected"), candidate("rolling_resistance", 0.03, "worse fit")]),
+        (0.3, [candidate("viscous_friction", 0.7, "too little", 2)]),
+    )
+    (only,) = explanations(found)
+    assert (only.name, [effect.name for effect in only.effects]) == ("coulomb_friction", ["coulomb_friction"])
+
+
+def test_names_that_share_the_probability_are_in_play():
+    found = result(
+        "effect_found",
+        (0.0, [
+            candidate("coulomb_friction", 0.6, "selected"),
+            candidate("rolling_resistance", 0.39, "equivalent"),
+            candidate("viscous_friction", 0.01, "worse fit"),
+        ]),
+    )  # fmt: skip
+    assert [one.name for one in explanations(found)] == ["coulomb_friction", "rolling_resistance"]
+
+
+def test_places_of_a_name_count_together_and_the_best_one_stands_for_it():
+    entries = [
+        candidate("coulomb_friction", 0.5, "selected"),
+        candidate("coulomb_friction", 0.46, "worse fit", where=["leg_lf"]),
+    ]
+    (only,) = explanations(result("effect_found", (0.04, entries)))
+    assert only.probability == pytest.approx(0.96)
+    assert only.effects[0].where == ("wheel_lf",)
+
+
+def test_what_further_runs_cannot_change_is_not_in_play():
+    entries = [candidate("coulomb_friction", 0.9, "implausible"), candidate("viscous_friction", 0.001, "too little")]
+    (only,) = explanations(result("nothing_missing", (0.099, entries)))
+    assert (only.name, only.effects) == ("nothing", ())
+
+
+def test_a_probable_name_that_was_not_selected_is_not_decided():
+    entries = [candidate("coulomb_friction", 0.99, "fails cross-validation")]
+    assert [one.name for one in explanations(result("not_excited", (0.01, entries)))] == ["coulomb_friction", "nothing"]
+
+
+def test_later_rounds_build_on_what_was_found():
+    found = result(
+        "effect_found",
+        (0.0, [candidate("coulomb_friction", 1.0, "selected")]),
+        (0.1, [candidate("viscous_friction", 0.5, "selected", 2), candidate("rolling_resistance", 0.4, "worse fit", 2)]),
+        (1.0, []),
+    )
+    names = {one.name: [effect.name for effect in one.effects] for one in explanations(found)}
+    assert names["rolling_resistance"] == ["coulomb_friction", "rolling_resistance"]
+    assert names["nothing"] == ["coulomb_friction"]
+
+
+# ---- what a motion promises ------------------------------------------------------------------------------------------
+
+
+def test_what_calibration_takes_up_does_not_tell():
+    predicted = np.array([[3.0, 0.0], [0.0, 0.0], [0.0, 2.0]])
+    columns = np.array([[2.0, 0.0]])
+    found = next_run._differences(predicted, columns)
+    assert found[0, 1] == pytest.approx(9.0 / (1.0 + 4.0))  # a number of unit variance leaves d^2 / (1 + c^2)
+    assert found[1, 2] == pytest.approx(4.0)
+    assert np.allclose(found, found.T)
+
+
+@pytest.mark.slow
+def test_a_motion_that_loads_what_is_in_question_promises_more():
+    both = [candidate("coulomb_friction", 0.5, "selected"), candidate("viscous_friction", 0.5, "equivalent")]
+    found = result("effect_found", (0.0, both))
+    drive = excite("straight", robot=ROBOT, seconds=3.0)
+    stand = decision.Motion("stand", np.repeat(drive.setpoints[:1], 150, axis=0), drive.period)
+    promised = next_run.promises(found, explanations(found), [stand, drive], ROBOT)
+    assert [one.motion.name for one in promised] == ["straight", "stand"]
+    assert promised[0].most > next_run.TELLS > promised[1].most
+    assert {"coulomb_friction", "viscous_friction"} & set(promised[0].pair)
+
+
+def test_motions_keep_the_profile_of_the_runs_and_are_drawn_anew():
+    first, again = (next_run.motions_to_drive(ROBOT, GENTLE, driven) for driven in ([], ["random"]))
+    assert "steps" not in [motion.name for motion in first]  # made for no profile
+    pairs = zip(first, again, strict=True)
+    changed = [one.name for one, two in pairs if not np.array_equal(one.setpoints, two.setpoints, equal_nan=True)]
+    assert changed == ["random"]
+
+
+def test_runs_of_an_excitation_are_known_by_their_setpoints(data):
+    whole = record_simulation(data / "run_03.parquet", excite("straight", robot=ROBOT), ROBOT, "gibbs_appell")
+    runs = [read_run(path) for path in (data / "run_02.parquet", whole)]
+    assert next_run.driven_already(runs, ROBOT) == ["straight"]  # the first was cut short
+
+
+# ---- rounds ----------------------------------------------------------------------------------------------------------
+
+UNDECIDED = (
+    "effect_found",
+    (0.0, [candidate("coulomb_friction", 0.6, "selected"), candidate("rolling_resistance", 0.4, "equivalent")]),
+)
+CERTAIN = ("effect_found", (0.0, [candidate("coulomb_friction", 1.0, "selected")]), (1.0, []))
+
+
+@pytest.fixture
+def data(tmp_path):
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    for name in ("straight", "random"):
+        record(excite(name, robot=ROBOT, seconds=1.0), folder)
+    return folder
+
+
+def record(motion, folder):
+    path = folder / f"run_{len(list(folder.glob('run_*.parquet'))) + 1:02d}.parquet"
+    return Recorded(record_simulation(path, motion.cut(1.0), ROBOT, "gibbs_appell"))
+
+
+@pytest.fixture
+def answers(monkeypatch):
+    """Analyses that give what is asked for, one after the other; motions promise what ``telling`` says."""
+    given = {"results": [], "analysed": 0, "telling": 100.0}
+
+    def analyse(data, folder, **options):
+        given["analysed"] += 1
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "result.json").write_text(given["results"].pop(0).model_dump_json())
+
+    def promises(found, left, motions, robot, **options):
+        names = (left[0].name, left[1].name)
+        return [
+            next_run.Promise(motion, given["telling"], given["telling"], names) for motion in motions if motion.name == "turns"
+        ]
+
+    monkeypatch.setattr(decision, "analyse", analyse)
+    monkeypatch.setattr(decision, "promises", promises)
+    return given
+
+
+def test_from_two_runs_to_a_decision(data, tmp_path, answers):
+    answers["results"] = [result(*UNDECIDED), result(*CERTAIN)]
+    found = decide(data, tmp_path / "out", record)
+    rounds = found.history.rounds
+    assert [one.verdict for one in rounds] == ["too_few_runs", "effect_found", "effect_found"]
+    assert [one.run for one in rounds] == ["run_03", "run_04", ""]
+    assert rounds[1].excitation == "turns"
+    assert rounds[1].names == pytest.approx({"coulomb_friction": 0.6, "rolling_resistance": 0.4})
+    assert (found.history.ended, found.history.driven) == ("decided", [rounds[0].excitation, "turns"])
+    assert found.folder == tmp_path / "out" / "round_03"
+    assert json.loads((tmp_path / "out" / "history.json").read_text())["rounds"][1]["run"] == "run_04"
+
+
+def test_it_ends_with_the_budget_and_goes_on_with_a_larger_one(data, tmp_path, answers):
+    answers["results"] = [result(*UNDECIDED), result(*CERTAIN)]
+    first = decide(data, tmp_path / "out", record, Budget(runs=1))
+    assert (first.history.ended, len(first.history.rounds)) == ("budget", 2)
+    second = decide(data, tmp_path / "out", record, Budget(runs=2))
+    assert (second.history.ended, len(second.history.rounds)) == ("decided", 3)
+    assert answers["analysed"] == 2  # what was analysed is not analysed again
+    assert decide(data, tmp_path / "out", record).history == second.history
+
+
+def test_motions_that_take_longer_than_what_is_left_are_not_driven(data, tmp_path, answers):
+    found = decide(data, tmp_path / "out", record, Budget(seconds=5.0))
+    assert (found.history.ended, found.history.seconds, found.result) == ("budget", 0.0, None)
+
+
+def test_it_ends_when_no_motion_would_tell(data, tmp_path, answers):
+    answers.update(results=[result(*UNDECIDED)], telling=1.0)
+    assert decide(data, tmp_path / "out", record).history.ended == "nothing would tell"
+
+
+def test_it_goes_on_after_an_interruption_with_the_run_that_was_driven(data, tmp_path, answers):
+    def interrupted(motion, folder):
+        record(motion, folder)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        decide(data, tmp_path / "out", interrupted)
+    answers["results"] = [result(*CERTAIN)]
+    found = decide(data, tmp_path / "out", record)
+    assert [one.run for one in found.history.rounds] == ["run_03", ""]
+    assert found.history.rounds[0].seconds == pytest.approx(0.98)
+
+
+def test_a_drive_that_leaves_nothing_ends_it(data, tmp_path, answers):
+    found = decide(data, tmp_path / "out", lambda motion, folder: Recorded(None, "a leg is too warm"))
+    assert (found.history.ended, found.history.rounds[-1].stopped) == ("stopped", "a leg is too warm")
+
+
+def test_a_history_of_other_data_is_refused(data, tmp_path, answers):
+    decide(data, tmp_path / "out", record, Budget(runs=0))
+    with pytest.raises(InputError, match=r"history.json: backend: gibbs_appell, asked for mujoco"):
+        decide(data, tmp_path / "out", record, backend="mujoco")
+    with pytest.raises(InputError, match=r"expected a new folder, or one with a history.json"):
+        decide(data, data, record)
+
+
+@pytest.mark.slow
+def test_an_emulated_robot_drives_a_motion_into_the_folder(data):
+    options = DecideOptions(until_decided=True, record="emulated", hidden=("stiff_leg",))
+    motion = excite("straight", robot=ROBOT, seconds=0.4)
+    found = recorder_of(options, ROBOT, "gibbs_appell", data, Console())(motion, data)
+    assert (found.run, found.reason) == (data / "run_03.csv", "")
+    assert read_run(found.run).meta.profile == motion.profile
+
+
+def test_a_real_robot_has_no_hidden_effects(tmp_path):
+    with pytest.raises(InputError, match="--hidden: a real robot has its own effects"):
+        recorder_of(DecideOptions(until_decided=True, hidden=("stiff_leg",)), ROBOT, "gibbs_appell", tmp_path, Console())
+
+
+def test_asking_waits_for_the_run(data, tmp_path, capsys):
+    motion = excite("turns", robot=ROBOT)
+    waited = []
+
+    def wait(seconds):
+        waited.append(seconds)
+        if len(waited) == 2:
+            record(motion, data)
+
+    found = ask(motion, data, out=tmp_path, console=Console(soft_wrap=True), wait=wait)
+    assert found.run == data / "run_03.parquet"
+    assert f"wlr record --commands {tmp_path / 'motions' / 'turns.csv'} --out {data}" in capsys.readouterr().out

@@ -1,0 +1,316 @@
+"""Go on until it is decided: analyse, choose the next run, have it driven, and analyse again; see docs/gap.md."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder, write_json
+from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
+from wlr_gym.data.excitations import Motion
+from wlr_gym.data.read import read_meta, read_run, run_files
+from wlr_gym.data.replay import robot_of
+from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
+from wlr_gym.gap.report.entries import Result
+from wlr_gym.gap.report.explanations import Explanation, explanations
+from wlr_gym.gap.report.result import RESULT_FILE, read_result
+from wlr_gym.gap.robot.next_run import TELLS, driven_already, most_shown, motions_to_drive, promises
+from wlr_gym.gap.robot.open import LEAST_RUNS
+from wlr_gym.gap.workflow import Tell, analyse
+from wlr_gym.physics.effects import Patch, Source, load_patch
+
+HISTORY_FILE = "history.json"
+#: Instead of a verdict: no analysis yet.
+TOO_FEW_RUNS = "too_few_runs"
+
+#: Why it ended. ``decided``: one name has 95 %; ``nothing would tell``: no motion promises to distinguish what is left;
+#: ``budget``: runs or seconds are used up; ``stopped``: a drive recorded nothing. Empty: it goes on.
+Ending = Literal["", "decided", "nothing would tell", "budget", "stopped"]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What may be driven beside the runs that are there.
+
+    Attributes:
+        runs: further runs. seconds: of driving.
+    """
+
+    runs: int = 5
+    seconds: float = math.inf
+
+    def __post_init__(self) -> None:
+        if self.runs < 0 or not self.seconds >= 0.0:
+            raise InputError(f"budget of {self.runs} runs, {self.seconds:g} s: expected 0 or more of both")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a drive left.
+
+    Attributes:
+        run: path of the run; None = nothing was recorded.
+        reason: why it ended early; empty = it did not.
+    """
+
+    run: Path | None
+    reason: str = ""
+
+
+#: Has a motion driven, and a run of it left in a folder.
+Recorder = Callable[[Motion, Path], Recorded]
+
+
+class DecisionRound(SettingsModel):
+    """One round: an analysis, and the run that was driven after it.
+
+    Attributes:
+        number: from 1 on; its report is in ``round_01``, ...
+        runs: that were there.
+        verdict: of the analysis; ``too_few_runs``: there was none, for want of runs.
+        names: left, with their probabilities; more than one = not decided.
+        excitation: driven next; "" = none. why: it was chosen.
+        run: that it left; "" = none yet. seconds: of driving. stopped: why the drive ended early.
+    """
+
+    number: int
+    runs: tuple[str, ...]
+    verdict: str
+    names: dict[str, float] = Field(default_factory=dict)
+    excitation: str = ""
+    why: str = ""
+    run: str = ""
+    seconds: float = 0.0
+    stopped: str = ""
+
+
+class History(SettingsModel):
+    """``history.json``: what was asked, all rounds, and how it ended."""
+
+    data: str
+    robot: str | None
+    backend: str
+    known: list[dict[str, Any]]
+    rounds: tuple[DecisionRound, ...] = ()
+    ended: Ending = ""
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of driving, those of runs that were there before left out."""
+        return sum(one.seconds for one in self.rounds)
+
+    @property
+    def driven(self) -> list[str]:
+        """Names of the excitations that were driven."""
+        return [one.excitation for one in self.rounds if one.run or one.stopped]
+
+
+@dataclass(frozen=True)
+class Decided:
+    """How it ended.
+
+    Attributes:
+        history: all rounds.
+        result: of the last analysis; None = there were too few runs for one.
+        folder: of its report, result and patch.
+    """
+
+    history: History
+    result: Result | None
+    folder: Path
+
+
+def decide(
+    data: str | Path,
+    out: str | Path,
+    record: Recorder,
+    budget: Budget | None = None,
+    *,
+    known: Source = None,
+    robot: str | Path | None = None,
+    backend: str = "gibbs_appell",
+    threads: int = 1,
+    tell: Tell = lambda stage, share: None,
+) -> Decided:
+    """Analyse measured runs, have the runs driven that distinguish best what may be missing, until one name has 95 %.
+
+    Called again with the same folders it goes on where it was interrupted, or with a larger budget where that was used up. A
+    run that somebody added to ``data`` meanwhile is analysed with the others.
+
+    Args:
+        data: folder of runs, two or more; further runs go there.
+        out: ``history.json``, and the report of each round in ``round_01``, ``round_02``, ...
+        record: has one motion driven.
+        budget: of further runs and seconds of driving; None = five runs.
+        known, robot, backend, threads, tell: see :func:`wlr_gym.gap.workflow.analyse`.
+
+    Raises:
+        InputError: see :func:`wlr_gym.gap.workflow.analyse`; or ``out`` has a history of other data, robot or simulator.
+    """
+    known = load_patch(known)
+    asked = _Asked(Path(data), Path(out), budget or Budget(), known, robot, backend, threads, tell)
+    history, last = _resumed(asked)
+    while True:
+        now, result, left = _analysed(asked, history, last)
+        ended, promise = _choice(asked, history, now, result, left)
+        now = now.model_copy(update={"excitation": promise.name, "why": promise.why}) if promise else now
+        folder, last = asked.folder(now), None
+        if promise is None:
+            return Decided(_saved(asked, history, now, ended), result, folder)
+        _saved(asked, history, now)
+        recorded = record(promise.motion, asked.data)
+        now = _with_run(now, recorded)
+        if recorded.run is None:
+            return Decided(_saved(asked, history, now, "stopped"), result, folder)
+        history = _saved(asked, history, now)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What :func:`decide` was asked."""
+
+    data: Path
+    out: Path
+    budget: Budget
+    known: Patch
+    robot: str | Path | None
+    backend: str
+    threads: int
+    tell: Tell
+
+    def history(self) -> History:
+        """An empty history."""
+        robot = None if self.robot is None else str(self.robot)
+        known = [dict(effect.content()) for effect in self.known.effects]
+        return History(data=str(self.data.resolve()), robot=robot, backend=self.backend, known=known)
+
+    def folder(self, now: DecisionRound) -> Path:
+        """Where the report of a round goes."""
+        return self.out / f"round_{now.number:02d}"
+
+
+# ---- one round -------------------------------------------------------------------------------------------------------
+
+
+def _analysed(
+    asked: _Asked, history: History, last: DecisionRound | None
+) -> tuple[DecisionRound, Result | None, tuple[Explanation, ...]]:
+    """Analyse the runs that are there, unless the round that was interrupted has done so."""
+    runs = tuple(path.stem for path in run_files(asked.data))
+    now = DecisionRound(number=len(history.rounds) + 1, runs=runs, verdict=TOO_FEW_RUNS)
+    if len(runs) < LEAST_RUNS:
+        return now, None, ()
+    folder = asked.folder(now)
+    if last is None or last.runs != runs or not (folder / RESULT_FILE).is_file():
+        analyse(
+            asked.data,
+            folder,
+            known=asked.known,
+            robot=asked.robot,
+            backend=asked.backend,
+            threads=asked.threads,
+            tell=asked.tell,
+        )
+    result = read_result(folder / RESULT_FILE)
+    left = explanations(result)
+    now = now.model_copy(update={"verdict": result.verdict, "names": {one.name: one.probability for one in left}})
+    _saved(asked, history, now)
+    return now, result, left
+
+
+@dataclass(frozen=True)
+class _Next:
+    """The motion that is driven next, and why."""
+
+    motion: Motion
+    why: str
+
+    @property
+    def name(self) -> str:
+        return self.motion.name
+
+
+def _choice(
+    asked: _Asked, history: History, now: DecisionRound, result: Result | None, left: Sequence[Explanation]
+) -> tuple[Ending, _Next | None]:
+    """Return what to drive next; or None and why it ends."""
+    if len(left) == 1 and now.verdict not in (NOT_EXCITED, BAD_DATA):
+        return "decided", None
+    if len(history.driven) >= asked.budget.runs:
+        return "budget", None
+    before = [read_run(path) for path in run_files(asked.data) if path.stem not in {one.run for one in history.rounds}]
+    own = robot_of(read_run(run_files(asked.data)[0]), asked.robot)
+    driven = [*driven_already(before, own), *history.driven]
+    seconds = asked.budget.seconds - history.seconds
+    motions = motions_to_drive(own, read_meta(asked.data).profile, driven)
+    motions = [motion for motion in motions if motion.duration <= seconds]
+    if not motions:
+        return "budget", None
+    if result is None or len(left) < 2:
+        return "", _shows_most(result, motions, driven)
+    asked.tell("choosing the next run", 1.0)
+    found = promises(result, left, motions, own, known=asked.known, backend=asked.backend, threads=asked.threads)
+    if max(one.most for one in found) < TELLS:
+        return "nothing would tell", None
+    best = found[0]
+    names = " and ".join(best.pair)
+    return "", _Next(best.motion, f"promises {best.telling / best.motion.duration:.2g} per s, {best.most:.0f} between {names}")
+
+
+def _shows_most(result: Result | None, motions: Sequence[Motion], driven: Sequence[str]) -> _Next:
+    """Where there are no explanations to distinguish: what the report recommends, else what shows most effects best."""
+    advised = [one.excitation for one in result.recommendations] if result is not None else []
+    new = [motion for name in advised for motion in motions if motion.name == name and name not in driven]
+    return _Next(new[0], "the report recommends it") if new else _Next(most_shown(motions, driven), "shows most effects best")
+
+
+def _with_run(now: DecisionRound, recorded: Recorded) -> DecisionRound:
+    """The round with the run that was driven after it."""
+    if recorded.run is None:
+        return now.model_copy(update={"stopped": recorded.reason or "nothing was recorded"})
+    t = read_run(recorded.run)["t"]
+    return now.model_copy(
+        update={"run": recorded.run.stem, "seconds": round(float(t[-1] - t[0]), 3), "stopped": recorded.reason}
+    )
+
+
+# ---- the history -----------------------------------------------------------------------------------------------------
+
+
+def _resumed(asked: _Asked) -> tuple[History, DecisionRound | None]:
+    """Return the history of complete rounds, and the last one where it was interrupted or nothing was driven after it."""
+    if not run_files(asked.data):
+        raise InputError(
+            f"{asked.data}: no run_*.csv or run_*.parquet: record two first: wlr record --excitation straight random"
+        )
+    fresh, path = asked.history(), asked.out / HISTORY_FILE
+    if not path.is_file():
+        if asked.out.exists() and (not asked.out.is_dir() or any(asked.out.iterdir())):
+            raise InputError(f"--out {asked.out}: expected a new folder, or one with a {HISTORY_FILE}")
+        make_output_folder(asked.out)
+        return fresh, None
+    history = parse_config(History, read_yaml(path), str(path))
+    for name in ("data", "robot", "backend", "known"):
+        if getattr(history, name) != getattr(fresh, name):
+            given, there = getattr(fresh, name), getattr(history, name)
+            raise InputError(f"{path}: {name}: {there}, asked for {given}; expected the same, or another --out")
+    if not history.rounds or history.rounds[-1].run:
+        return history, None
+    *before, last = history.rounds
+    new = [path for path in run_files(asked.data) if path.stem not in last.runs]
+    if last.excitation and new:  # it was driven, but nobody was there to note it
+        return history.model_copy(update={"rounds": (*before, _with_run(last, Recorded(new[0])))}), None
+    return history.model_copy(update={"rounds": tuple(before)}), last
+
+
+def _saved(asked: _Asked, history: History, now: DecisionRound, ended: Ending = "") -> History:
+    """Return the history with a further round, and write it."""
+    longer = history.model_copy(update={"rounds": (*history.rounds, now), "ended": ended})
+    write_json(asked.out / HISTORY_FILE, longer.model_dump(mode="json"))
+    return longer

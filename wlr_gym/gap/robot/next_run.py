@@ -1,0 +1,181 @@
+"""Which motion to drive next: the one that distinguishes best, per second of driving, what may still be missing.
+
+Every explanation in play is replayed in every motion, and so is the model with each of its numbers moved. What two
+explanations predict differently, less what calibrated numbers can take up within their uncertainty, is what a run of that
+motion would add to the difference of their minus two log evidence, to first order; levels and autocorrelation times are those
+that the last analysis found. The mean over all pairs is weighted by the probabilities of both (Box and Hill, 1967).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.data.excitations import EXCITATIONS, GENTLE, Motion, excite
+from wlr_gym.data.format import Profile
+from wlr_gym.data.read import Run, read_run
+from wlr_gym.data.record import motion_of, record_simulation
+from wlr_gym.gap.problem import Setting
+from wlr_gym.gap.report.entries import AdequacyEntry, Result
+from wlr_gym.gap.report.explanations import Explanation
+from wlr_gym.gap.robot.candidates import shown_by
+from wlr_gym.gap.robot.problem import RobotProblem
+from wlr_gym.physics.effects import Source
+from wlr_gym.robot import Robot
+
+Array = NDArray[np.float64]
+
+#: Least weight of an explanation in play, however improbable.
+LEAST_WEIGHT = 1e-6
+#: Expected difference of minus two log evidence that takes even odds to 95 %: a motion that promises less would not tell.
+TELLS = 2.0 * math.log(19.0)
+#: Half of a 95 % interval, in standard deviations.
+_HALF_95 = 1.96
+#: Share of rows in which a run of an excitation has its setpoints.
+ALIKE = 0.9
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What a run of a motion would tell.
+
+    Attributes:
+        motion: its setpoints.
+        telling: expected difference of minus two log evidence, mean over the pairs of explanations.
+        most: the same of the pair that it distinguishes best. pair: their names.
+    """
+
+    motion: Motion
+    telling: float
+    most: float
+    pair: tuple[str, str]
+
+    @property
+    def per_second(self) -> float:
+        """``telling`` per second of driving."""
+        return self.telling / self.motion.duration
+
+
+def motions_to_drive(robot: Robot, profile: Profile, driven: Sequence[str]) -> list[Motion]:
+    """Return the excitations that may be driven with a servo profile; one that was driven already is drawn anew.
+
+    Args:
+        robot: whose limits they keep.
+        profile: of the runs that are there. A motion made for another one is left out.
+        driven: names of the excitations that were driven, once for each time.
+    """
+    names = [name for name, excitation in EXCITATIONS.items() if excitation.profile in (GENTLE, profile)]
+    return [replace(excite(name, list(driven).count(name), robot), profile=profile) for name in names]
+
+
+def driven_already(runs: Sequence[Run], robot: Robot) -> list[str]:
+    """Return the names of the excitations that some runs are of, as ``wlr record`` drives them."""
+    commands = [motion_of(run).setpoints for run in runs]
+    names = [(name, excite(name, robot=robot).setpoints) for name in EXCITATIONS]
+    return [name for own in commands for name, setpoints in names if _alike(own, setpoints)]
+
+
+def _alike(one: Array, two: Array) -> bool:
+    """Whether setpoints are the same in nearly all rows."""
+    rows = min(len(one), len(two))
+    if rows < ALIKE * max(len(one), len(two)):
+        return False
+    return bool(np.isclose(one[:rows], two[:rows], equal_nan=True).all(axis=1).mean() >= ALIKE)
+
+
+def most_shown(motions: Sequence[Motion], driven: Sequence[str]) -> Motion:
+    """Return the motion that shows most effects best, of those that were driven least often: before any analysis."""
+    shows = list(shown_by().values())
+    return min(motions, key=lambda motion: (list(driven).count(motion.name), -shows.count(motion.name)))
+
+
+def promises(
+    result: Result,
+    explanations: Sequence[Explanation],
+    motions: Sequence[Motion],
+    robot: Robot,
+    *,
+    known: Source = None,
+    backend: str = "gibbs_appell",
+    threads: int = 1,
+) -> list[Promise]:
+    """Return what every motion promises, most per second first.
+
+    Args:
+        result: of the last analysis: its calibration, and what its model leaves.
+        explanations: in play, two or more.
+        motions: to choose from.
+        robot, known, backend, threads: of the analysis.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        found = []
+        for motion in motions:
+            path = record_simulation(Path(folder) / f"run_{motion.name}.parquet", motion, robot, "gibbs_appell")
+            problem = RobotProblem([read_run(path)], robot, known, backend, threads=threads)
+            found.append(_promise(problem, result, explanations, motion))
+    return sorted(found, key=lambda one: -one.per_second)
+
+
+def _promise(problem: RobotProblem, result: Result, explanations: Sequence[Explanation], motion: Motion) -> Promise:
+    values, deviations = _calibrated(problem, result)
+    moved = [Setting(values + step) for step in np.diag(_inside(problem, values, deviations))]
+    settings = [*(Setting(values, one.effects) for one in explanations), Setting(values), *moved]
+    (residuals,) = problem.residuals(settings, [0])
+    rows = np.nan_to_num(residuals) * np.sqrt(_weights(problem, result))
+    rows = rows.reshape(len(settings), -1)
+    predicted, bare, columns = rows[: len(explanations)], rows[len(explanations)], rows[len(explanations) + 1 :]
+    differ = _differences(predicted, columns - bare)
+    weights = np.maximum([one.probability for one in explanations], LEAST_WEIGHT)
+    pairs = list(itertools.combinations(range(len(explanations)), 2))
+    shares = np.array([weights[i] * weights[j] for i, j in pairs])
+    told = np.array([differ[i, j] for i, j in pairs])
+    best = tuple(explanations[k].name for k in pairs[int(np.argmax(told))])
+    return Promise(motion, float(shares @ told / shares.sum()), float(told.max()), (best[0], best[1]))
+
+
+def _differences(predicted: Array, columns: Array) -> Array:
+    """Squared distances (explanations, explanations) of weighted predictions, less what numbers of unit variance take up."""
+    small = np.linalg.inv(np.eye(len(columns)) + columns @ columns.T)
+    away = predicted @ predicted.T - (predicted @ columns.T) @ small @ (columns @ predicted.T)
+    own = np.diag(away)
+    return np.maximum(own[:, None] + own[None, :] - away - away.T, 0.0)
+
+
+def _calibrated(problem: RobotProblem, result: Result) -> tuple[Array, Array]:
+    """Values and standard deviations of the problem's quantities; nominal, to their tolerance, where the result has none."""
+    values, deviations = [], []
+    for quantity in problem.quantities:
+        entry = result.calibration.get(quantity.name)
+        values.append(quantity.nominal if entry is None else entry.fitted)
+        half = None if entry is None or entry.ci95 is None else 0.5 * (entry.ci95[1] - entry.ci95[0])
+        deviations.append(quantity.sigma if half is None else min(half / _HALF_95, quantity.sigma))
+    return np.array(values), np.array(deviations)
+
+
+def _inside(problem: RobotProblem, values: Array, deviations: Array) -> Array:
+    """The deviations as steps to the side where there is room."""
+    high = np.array([quantity.high for quantity in problem.quantities])
+    return np.where(values + deviations <= high, deviations, -deviations)
+
+
+def _weights(problem: RobotProblem, result: Result) -> Array:
+    """Weight (channels) of a squared residual, as of the fit that left what the result says; 0 where nothing was measured."""
+    adequacy = result.adequacy
+    if not isinstance(adequacy, AdequacyEntry):
+        return np.full(len(problem.signals), 1.0 / problem.tempering)
+    scatter = problem.tempering * max(adequacy.constancy.value or 1.0, 1.0)
+    levels, times = _by_channel(adequacy.level.channels), _by_channel(adequacy.whiteness.channels)
+    worth = {name: 1.0 / (max(level, 1.0) ** 2 * times[name] * scatter) for name, level in levels.items() if name in times}
+    return np.array([worth.get(signal.name, 0.0) for signal in problem.signals])
+
+
+def _by_channel(entries: Mapping[str, object]) -> dict[str, float]:
+    found = {name: getattr(entry, "value", None) for name, entry in entries.items()}
+    return {name: float(value) for name, value in found.items() if value is not None}
