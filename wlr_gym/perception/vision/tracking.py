@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 
 import numpy as np
@@ -61,6 +61,7 @@ class Sample:
         covariance: (6, 6) of it.
         markers: number used. residual: px rms.
         centres: (M, 2) px of the body's markers; NaN where not seen.
+        seen: the markers used. in_camera, floor: body and floor in the camera frame; None without a pose.
     """
 
     index: int
@@ -71,6 +72,9 @@ class Sample:
     markers: int
     residual: float
     centres: Array
+    seen: dict[int, Detection] = field(default_factory=dict)
+    in_camera: TargetPose | None = None
+    floor: TargetPose | None = None
 
 
 class Tracker:
@@ -100,9 +104,9 @@ class Tracker:
             self._track = []
             dark = found is None and math.isinf(shift)  # nothing at all is seen
             return _no_pose(frame, MOVED if shift > _MOVED_BY and not dark else LOST, centres)
-        for index, detection in seen.items():
-            if found.used[index]:
-                centres[index] = detection.ellipse[:2]
+        used = {index: detection for index, detection in seen.items() if found.used[index]}
+        for index, detection in used.items():
+            centres[index] = detection.ellipse[:2]
         pose, covariance = pose_in_floor(found, self.floor_pose)
         if not (_HEIGHTS[0] < pose[2] < _HEIGHTS[1] and math.cos(pose[4]) * math.cos(pose[5]) > _LEAST_COSINE):
             self._track = []
@@ -110,7 +114,7 @@ class Tracker:
         self._track = [*self._track[-1:], (frame.time, found)]
         count = int(found.used.sum())
         status = OK if count == len(self.body.markers) else PARTIAL
-        return Sample(frame.index, frame.time, status, pose, covariance, count, found.residual, centres)
+        return Sample(frame.index, frame.time, status, pose, covariance, count, found.residual, centres, used, found, self.floor_pose)
 
     def _follow(self, frame: VideoFrame) -> tuple[TargetPose | None, dict[int, Detection]]:
         """Look where the markers should be."""
@@ -220,7 +224,8 @@ def locate_floor(frames: Sequence[VideoFrame], camera: Camera, floor: Target) ->
             f"{len(frames)} frames, and at least 4 must fit together (check their positions in the target file, and the light)"
         )
     means = {index: _mean(found) for index, found in sums.items() if len(found) >= max(1, len(frames) // 2)}
-    found = solve_pose(means, floor, camera, start.rotation, start.position) or start
+    tolerated = {index: _tolerant(seen, floor.tolerance / start.position[2]) for index, seen in means.items()}
+    found = solve_pose(tolerated, floor, camera, start.rotation, start.position) or start
     centres = np.full((len(floor.markers), 2), np.nan)
     for index, detection in means.items():
         centres[index] = detection.ellipse[:2]
@@ -305,3 +310,8 @@ def _mean(found: Sequence[Detection]) -> Detection:
     spread = np.where(known[:, None, None], covariances.mean(axis=0) / len(found), np.nan)
     shape, ellipse = np.mean([d.shape for d in found], axis=0), np.mean([d.ellipse for d in found], axis=0)
     return replace(found[0], centres=mean, covariances=spread, shape=shape, ellipse=ellipse)
+
+
+def _tolerant(detection: Detection, std: float) -> Detection:
+    """With the tolerance of the marker's place (1 sigma, undistorted coordinates), which its circles share."""
+    return replace(detection, covariances=detection.covariances + len(detection.covariances) * std**2 * np.eye(2))
