@@ -25,7 +25,7 @@ BODY_RINGS = ((0.03, 0.03 * 0.76, 0.03 * 0.50), *3 * ((0.03, 0.03 * 0.667, 0.03 
 class Lab:
     """What is not perfect: standard deviations of hand-laid markers (m), stretch of the print, shutter (s), camera (rad, m).
 
-    ``shake`` is the amplitude of the camera's sway (m), ``drift`` its speed (m/s), both along the floor, the view's centre held.
+    ``shake`` is the amplitude of the camera's sway (m), ``drift`` its speed (m/s), both along the floor, what it looks at held.
     """
 
     floor_error: float = 0.0
@@ -106,18 +106,19 @@ def _ink(x, y, places, rings, reach):
 
 
 @njit(cache=True)
-def _ray(u, v, floor, body, floor_rings, body_rings, place, turn, seat, axes):
+def _ray(u, v, floor, body, floor_rings, body_rings, origin, to_body, seat, to_floor):
+    """Brightness and distance to the nearest edge along the ray of a pixel."""
     x, y = (u - 319.5) / 520.0, (v - 239.5) / 520.0
-    ray = x * axes[0] + y * axes[1] + axes[2]
-    origin, along = turn.T @ (seat - place), turn.T @ ray
-    depth = (body[0, 2] - origin[2]) / along[2]
-    px, py = origin[0] + depth * along[0], origin[1] + depth * along[1]
-    edge = min(abs(abs(px) - 0.2), abs(abs(py) - 0.145))
-    if abs(px) < 0.2 and abs(py) < 0.145:
+    depth = (body[0, 2] - origin[2]) / (to_body[2, 0] * x + to_body[2, 1] * y + to_body[2, 2])
+    px = origin[0] + depth * (to_body[0, 0] * x + to_body[0, 1] * y + to_body[0, 2])
+    py = origin[1] + depth * (to_body[1, 0] * x + to_body[1, 1] * y + to_body[1, 2])
+    edge = max(abs(px) - 0.2, abs(py) - 0.145)
+    if edge < 0:
         shade, near = _ink(px, py, body, body_rings, 1.5)
-        return shade, min(near, edge)
-    depth = -seat[2] / ray[2]
-    fx, fy = seat[0] + depth * ray[0], seat[1] + depth * ray[1]
+        return shade, min(near, -edge)
+    depth = -seat[2] / (to_floor[2, 0] * x + to_floor[2, 1] * y + to_floor[2, 2])
+    fx = seat[0] + depth * (to_floor[0, 0] * x + to_floor[0, 1] * y + to_floor[0, 2])
+    fy = seat[1] + depth * (to_floor[1, 0] * x + to_floor[1, 1] * y + to_floor[1, 2])
     shade, near = _ink(fx, fy, floor, floor_rings, 1.5)
     on_sheet = False
     for m in range(floor.shape[0]):
@@ -130,12 +131,14 @@ def _ray(u, v, floor, body, floor_rings, body_rings, place, turn, seat, axes):
 @njit(cache=True)
 def _render(image, floor, body, floor_rings, body_rings, places, turns, seats, axes):
     for v in range(image.shape[0]):
-        place, turn, seat, axis = places[v], np.ascontiguousarray(turns[v]), seats[v], np.ascontiguousarray(axes[v])
+        turn, seat = np.ascontiguousarray(turns[v].T), seats[v]
+        origin, to_floor = turn @ (seat - places[v]), np.ascontiguousarray(axes[v].T)
+        to_body = turn @ to_floor
         for u in range(image.shape[1]):
-            shade, near = _ray(u, v, floor, body, floor_rings, body_rings, place, turn, seat, axis)
-            if near < 0.004:
+            shade, near = _ray(u, v, floor, body, floor_rings, body_rings, origin, to_body, seat, to_floor)
+            if near < 0.003:
                 shade = 0.0
                 for i in range(25):
                     du, dv = (i % 5 - 2) / 5, (i // 5 - 2) / 5
-                    shade += _ray(u + du, v + dv, floor, body, floor_rings, body_rings, place, turn, seat, axis)[0] / 25
+                    shade += _ray(u + du, v + dv, floor, body, floor_rings, body_rings, origin, to_body, seat, to_floor)[0] / 25
             image[v, u] = shade

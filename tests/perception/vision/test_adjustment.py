@@ -29,7 +29,7 @@ def ellipse_centre(place, radius, rotation, position, lag=0.0, velocity=None):
     return middle + radius * np.linalg.solve([[2 * a, b], [b, 2 * c]], [-d, -e])
 
 
-def film(target, places, count=60, readout=0.0, seed=0, noise=NOISE):
+def film(target, places, count=40, readout=0.0, seed=0, noise=NOISE):
     """Views of a target at ``places`` that drives and turns under a camera 1.8 m above it."""
     rng, views = np.random.default_rng(seed), []
     for k in range(count):
@@ -46,7 +46,8 @@ def film(target, places, count=60, readout=0.0, seed=0, noise=NOISE):
             centres = [ellipse_centre(places[m], s * marker.radius, rotation, position, lag, velocity) for s in shares]
             ellipse = np.array([0.0, row, 1, 0, 0, 1])
             centres = np.array(centres) + noise * rng.standard_normal((3, 2))
-            seen[m] = Detection(int(target.codes[m]), ellipse, centres, np.tile(NOISE**2 * np.eye(2), (3, 1, 1)), ellipse, 200.0, 0.1, 1.0)  # fmt: skip
+            spread = np.tile(NOISE**2 * np.eye(2), (3, 1, 1))
+            seen[m] = Detection(int(target.codes[m]), ellipse, centres, spread, ellipse, 200.0, 0.1, 1.0)
         guess = Rotation.from_rotvec(0.003 * rng.standard_normal(3)).as_matrix() @ rotation
         views.append(View(seen, guess, position + 0.003 * rng.standard_normal(3), velocity))
     return views
@@ -122,7 +123,12 @@ def test_a_marker_is_put_back_to_the_frames_time(body):
 def test_a_wrong_caliper_reading_is_refused(tmp_path):
     text = "name: b\ncaliper: 0.2\nmarkers:\n" + "".join(
         f"  - {{name: {n}, position: [{x}, {y}, 0.04], radius: 0.03, code: {c}}}\n"
-        for n, x, y, c in (("a", 0.14, 0.1, "body_key"), ("b", 0.14, -0.1, "body"), ("c", -0.14, 0.1, "body"), ("d", -0.14, -0.1, "body"))  # fmt: skip
+        for n, x, y, c in (
+            ("a", 0.14, 0.1, "body_key"),
+            ("b", 0.14, -0.1, "body"),
+            ("c", -0.14, 0.1, "body"),
+            ("d", -0.14, -0.1, "body"),
+        )
     )
     (tmp_path / "b.yaml").write_text(text)
     with pytest.raises(InputError, match=r"caliper 0.2: expected about 0.28 \(m, between a and c\)"):

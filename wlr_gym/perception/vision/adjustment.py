@@ -32,6 +32,7 @@ UNKNOWN_READOUT, STATED_READOUT = 0.015, 0.0002
 MOST_VIEWS = 150
 _TURNS = 8
 _HUBER = 3.0  # sigmas from which on a circle counts less
+_FLATNESS = 0.1  # tolerance of a marker's height over the tolerance in the plane: markers lie on a flat plate
 _READOUT = -1  # column of the readout among the shared unknowns
 
 
@@ -147,7 +148,7 @@ def at_frame_time(view: View, target: Target, height: int, readout: float) -> di
 
 
 def whitened(circles: Circles, rotations: Array, positions: Array, shared: Array) -> tuple[Array, Array, Array]:
-    """Residuals (F, M, 3, 2) over their sigma, with derivatives by a turn and a shift (., 6) and by places and readout (., S)."""
+    """Residuals (F, M, 3, 2) over their sigma, derivatives by turn and shift (., 6), by places and readout (., S)."""
     count = len(shared)
     arms, points, normals, drift = _points(circles, rotations, positions, shared)
     predicted, by_point, by_normal = _projected(points, normals, circles.squares)
@@ -167,7 +168,8 @@ def whitened(circles: Circles, rotations: Array, positions: Array, shared: Array
         by_shared[:, index, ..., 3 * index : 3 * index + 3] = by_place[:, index]
     by_shared[..., _READOUT] = np.einsum("fmrij,fmj->fmri", by_point, circles.row[..., None] * drift)
     residual = np.einsum("fmrij,fmrj->fmri", circles.roots, predicted - circles.measured)
-    return residual, *(np.einsum("fmrij,fmrjk->fmrik", circles.roots, part) for part in (by_pose, by_shared))
+    by_pose, by_shared = (np.einsum("fmrij,fmrjk->fmrik", circles.roots, part) for part in (by_pose, by_shared))
+    return residual, by_pose, by_shared
 
 
 def _points(circles: Circles, rotations: Array, positions: Array, shared: Array) -> tuple[Array, Array, Array, Array]:
@@ -230,7 +232,8 @@ def _step(
 def _prior(target: Target, shared: Array, readout: float | None) -> tuple[Array, Array]:
     """Information (S, S) of the prior about the shared unknowns, and its pull (S,) at their present values."""
     count, drawn = len(shared), target.positions
-    covariance = max(target.tolerance, 1e-6) ** 2 * np.eye(count)
+    tolerances = max(target.tolerance, 1e-6) * np.tile([1.0, 1.0, _FLATNESS], len(drawn))
+    covariance = np.diag(np.append(tolerances**2, 1.0))
     for axis in range(2):
         along = np.zeros_like(drawn)
         along[:, axis] = drawn[:, axis] - drawn[:, axis].mean()
@@ -262,6 +265,7 @@ def _circles(target: Target, views: Sequence[View], height: int) -> Circles:
             measured[f, m, known] = seen.centres[known]
             roots[f, m, known] = np.linalg.inv(np.linalg.cholesky(seen.covariances[known]))
             row[f, m] = seen.ellipse[1] / height - 0.5
-    squares = np.array([[(s * r) ** 2 for s in ring_radii(c)] for r, c in zip(target.radii, target.codes.tolist(), strict=True)])
+    squares = np.array(
+        [[(s * r) ** 2 for s in ring_radii(c)] for r, c in zip(target.radii, target.codes.tolist(), strict=True)]
+    )
     return Circles(measured, roots, row, squares, np.stack([view.velocity for view in views]))
-

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 #: s; a readout that the film alone tells counts from here on, and from so many sigmas on: global shutters stay exact.
 LEAST_READOUT, SURE_READOUT = 0.001, 4.0
+#: m; a layout that is right to this leaves the film's poses as they are.
+LEAST_LAYOUT = 0.00005
 #: m; marker places that the film moves by more are worth saying.
 TOLD_LAYOUT = 0.0005
 #: Sigmas (of the stated tolerance) by which a marker may lie off before the target file is held to be wrong.
@@ -49,21 +51,34 @@ class SelfCalibration:
 
 def self_calibrated(samples: tuple[Sample, ...], camera: Camera, body: Target) -> tuple[tuple[Sample, ...], SelfCalibration]:
     """Adjust target and shutter over the film, and solve every frame anew with them."""
-    for _ in range(2):  # the second time with speeds that the shutter no longer falsifies
-        speeds = _velocities(samples)
-        views = [
-            View(sample.seen, sample.in_camera.rotation, sample.in_camera.position, speed)
-            for sample, speed in zip(samples, speeds, strict=True)
-            if sample.in_camera is not None
-        ]
-        found = adjust(body, views, camera.height, camera.readout)
-        readout = camera.readout if camera.readout == 0.0 else found.readout
-        if camera.readout is None and not abs(found.readout) > max(LEAST_READOUT, SURE_READOUT * found.readout_std):
-            readout = 0.0
-            found = adjust(body, views, camera.height, readout)
-        target = found.target.model_copy(update={"tolerance": 0.0})
-        samples = tuple(_solved(s, v, camera, target, readout) for s, v in zip(samples, speeds, strict=True))
-    return samples, SelfCalibration(found, readout, body, camera.readout is not None)
+    first, _ = _once(samples, camera, body)
+    return _once(first, camera, body)  # with speeds that the shutter no longer falsifies
+
+
+def _once(samples: tuple[Sample, ...], camera: Camera, body: Target) -> tuple[tuple[Sample, ...], SelfCalibration]:
+    speeds = _velocities(samples)
+    found, readout = _adjusted(samples, speeds, camera, body)
+    calibration = SelfCalibration(found, readout, body, camera.readout is not None)
+    if readout == 0.0 and calibration.moved.max() < LEAST_LAYOUT:
+        return samples, calibration
+    target = found.target.model_copy(update={"tolerance": 0.0})
+    solved = tuple(_solved(s, v, camera, target, readout) for s, v in zip(samples, speeds, strict=True))
+    return solved, calibration
+
+
+def _adjusted(samples: Sequence[Sample], speeds: Array, camera: Camera, body: Target) -> tuple[Adjustment, float]:
+    """Target and readout that the film tells; a readout that is not sure is 0."""
+    views = [
+        View(sample.seen, sample.in_camera.rotation, sample.in_camera.position, speed)
+        for sample, speed in zip(samples, speeds, strict=True)
+        if sample.in_camera is not None
+    ]
+    found = adjust(body, views, camera.height, camera.readout)
+    if camera.readout == 0.0:
+        return found, 0.0
+    if camera.readout is None and not abs(found.readout) > max(LEAST_READOUT, SURE_READOUT * found.readout_std):
+        return adjust(body, views, camera.height, 0.0), 0.0
+    return found, found.readout
 
 
 def calibration_findings(calibration: SelfCalibration) -> Iterator[str]:
@@ -78,19 +93,19 @@ def calibration_findings(calibration: SelfCalibration) -> Iterator[str]:
         name = drawn.markers[int(np.argmax(moved))].name
         yield (
             f"marker '{name}' lies {1e3 * moved.max():.1f} mm off: more than the tolerance in the target file allows "
-            f"({1e3 * drawn.tolerance:g} mm, 1 sigma); is it the right file and sheet? The slip may be off by more than its sigma"
+            f"({1e3 * drawn.tolerance:g} mm, 1 sigma); the right file and sheet? The slip may be off by more than its sigma"
         )
     if calibration.readout and not calibration.stated:
         std = 1e3 * found.readout_std
         yield (
-            f"rolling shutter: {1e3 * calibration.readout:.1f} ± {std:.1f} ms from the first row to the last, estimated from the "
-            "film and taken off; write it into the camera file (readout, in s)"
+            f"rolling shutter: {1e3 * calibration.readout:.1f} ± {std:.1f} ms from the first row to the last, estimated from "
+            "the film and taken off; write it into the camera file (readout, in s)"
         )
     if drawn.stretch and drawn.caliper is None:
         first, second = (drawn.markers[k].name for k in drawn.long_side)
         yield (
-            f"no caliper reading of the sheet (distance of the centres of {first} and {second}): a film cannot tell the print's "
-            f"scale, which costs {1e3 * found.scale_std:.1f} mm of slip per metre driven (1 sigma)"
+            f"no caliper reading of the sheet (distance of the centres of {first} and {second}): a film cannot tell the "
+            f"print's scale, which costs {1e3 * found.scale_std:.1f} mm of slip per metre driven (1 sigma)"
         )
 
 
@@ -107,9 +122,7 @@ def _solved(sample: Sample, speed: Array, camera: Camera, target: Target, readou
         return sample
     pose, covariance = pose_in_floor(found, sample.floor)
     count = int(found.used.sum())
-    return replace(
-        sample, pose=pose, covariance=covariance, residual=found.residual, markers=count, in_camera=found
-    )
+    return replace(sample, pose=pose, covariance=covariance, residual=found.residual, markers=count, in_camera=found)
 
 
 def _velocities(samples: Sequence[Sample]) -> Array:
