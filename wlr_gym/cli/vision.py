@@ -153,13 +153,14 @@ def _print(analysis: VideoAnalysis, console: Console) -> None:
     table = Table(
         title=f"Slip over {found['seconds']:.1f} s, mm ± 1 sigma", title_justify="left", title_style="bold", box=box.SIMPLE
     )
-    for heading in ("wheel", "longitudinal", "± from radius", "lateral", "both ± from layout"):
+    for heading in ("wheel", "longitudinal", "± from radius", "lateral", "± from layout"):
         table.add_column(heading, justify="left" if heading == "wheel" else "right")
     for wheel, w in found["wheels"].items():
         table.add_row(
             wheel, f"{1e3 * w['longitudinal_slip_m']:+.2f} ± {1e3 * w['longitudinal_std_m']:.2f}",
             f"{1e3 * w['longitudinal_std_from_radius_m']:.2f}",
-            f"{1e3 * w['lateral_slip_m']:+.2f} ± {1e3 * w['lateral_std_m']:.2f}", f"{1e3 * w['std_from_layout_m']:.2f}",
+            f"{1e3 * w['lateral_slip_m']:+.2f} ± {1e3 * w['lateral_std_m']:.2f}",
+            ", ".join(f"{1e3 * w[f'{axis}_std_from_layout_m']:.2f}" for axis in ("longitudinal", "lateral")),
         )  # fmt: skip
     body = (f"{1e3 * found[f'body_{axis}_slip_m']:+.2f}" for axis in ("longitudinal", "lateral"))
     longitudinal, lateral = body

@@ -52,6 +52,7 @@ class Camera(SettingsModel):
         width, height: px; images of another size are refused.
         focal: (fx, fy) px. centre: (cx, cy) px.
         distortion: (k1, k2, p1, p2, k3).
+        readout: s from the first row's exposure to the last row's; 0 = global shutter, None = not known, films tell it.
         quality: of the calibration; None for parameters from elsewhere.
     """
 
@@ -61,6 +62,7 @@ class Camera(SettingsModel):
     focal: tuple[float, float]
     centre: tuple[float, float]
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    readout: float | None = Field(default=None, gt=-0.1, lt=0.1)
     quality: Quality | None = None
 
     @property

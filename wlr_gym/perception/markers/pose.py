@@ -33,6 +33,8 @@ MINIMUM_MARKERS = 3
 LARGEST_RESIDUAL = 1.5
 _SHAPE_TOLERANCE = 0.25  # of a marker's seen size and shape against what the pose says
 _OUTLIER = 16.0  # chi square per degree of freedom that makes the worst marker suspicious
+_MODEL_ERROR = 0.15  # px; beyond its noise, but too small for an outlier
+_TOLERATED = 2.0  # rms over the markers of a target in its tolerance: what 98 % of hand-laid ones stay below
 _MOST_CANDIDATES = 8  # markers of one code tried for a target
 
 
@@ -95,7 +97,8 @@ def solve_pose(
 ) -> TargetPose | None:
     """Least-squares pose from markers with known identity, near a first guess; None when too few agree.
 
-    A marker that is off on its own is left out. Three markers are enough; fewer are not.
+    A marker that is off on its own is left out, unless all are off by no more than the target's tolerance explains. Three
+    markers are enough; fewer are not.
     """
     indices = sorted(seen)
     while len(indices) >= MINIMUM_MARKERS:
@@ -110,7 +113,8 @@ def solve_pose(
         wrong = [i for i in indices if not _looks_right(seen[i], target, i, turn, place)]
         suspicious = wrong or ([indices[int(np.argmax(per_marker))]] if chi_square > _OUTLIER and len(indices) > 3 else [])
         residual = _pixels(data, turn, place, camera)
-        if not suspicious or (not wrong and residual < 0.15):  # tiny, but beyond its noise: a model error, not an outlier
+        explained = max(_MODEL_ERROR, _TOLERATED * target.tolerance * camera.focal[0] / place[2])
+        if not suspicious or (not wrong and residual < explained):
             used = np.zeros(len(target.markers), bool)
             used[indices] = True
             return TargetPose(turn, place, covariance * max(1.0, chi_square), used, residual, chi_square)

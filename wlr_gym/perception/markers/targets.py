@@ -48,13 +48,17 @@ class Target(SettingsModel):
         name: of the target.
         frame: what its frame is, in words.
         markers: four or more; exactly one has the code of its own that tells which way round the target is.
-        tolerance: m, 1 sigma of a marker's place, along each axis: print, glue, measurement.
+        tolerance: m, 1 sigma of a marker's place, along each axis: glue, measurement.
+        stretch: 1 sigma of the print's stretch, along x and along y.
+        caliper: m, measured between the centres of the markers of :attr:`long_side`; None = not measured.
     """
 
     name: str
     frame: str = ""
     markers: tuple[Marker, ...]
     tolerance: float = Field(default=0.0005, ge=0, lt=0.1)
+    stretch: float = Field(default=0.0, ge=0, lt=0.1)
+    caliper: float | None = Field(default=None, gt=0)
 
     @property
     def positions(self) -> Array:
@@ -72,10 +76,12 @@ class Target(SettingsModel):
         return np.array([CODE_NAMES.index(marker.code) for marker in self.markers])
 
     @property
-    def layout_std(self) -> float:
-        """1 sigma of the target's scale (-) and of its heading (rad) as a whole: least squares over the markers' places."""
-        places = self.positions - self.positions.mean(axis=0)
-        return self.tolerance / float(np.linalg.norm(places))
+    def long_side(self) -> tuple[int, int]:
+        """Indices of the two markers at the ends of the longest side: nearest to parallel to x or y, then farthest apart."""
+        apart = np.abs(self.positions[:, None] - self.positions[None])[:, :, :2]
+        along = np.where(apart.min(axis=2) < 0.1 * apart.max(axis=2), apart.max(axis=2), 0.0)
+        first, second = divmod(int(np.argmax(along)), len(along))
+        return first, second
 
     @property
     def key(self) -> int:
@@ -124,6 +130,11 @@ def _faults(target: Target, where: str) -> list[InputError]:
     gaps = np.linalg.norm(positions[:, None] - positions[None], axis=2) - QUIET_ZONE * radii[:, None] - radii[None]
     if (gaps + 10 * np.eye(len(radii))).min() < 0:
         return [InputError(f"{where}: markers are so close that one lies in the white margin ({QUIET_ZONE} radii) of another")]
+    first, second = target.long_side
+    drawn = float(np.linalg.norm(positions[first] - positions[second]))
+    if target.caliper is not None and abs(target.caliper / drawn - 1) > 0.03:
+        names = f"{target.markers[first].name} and {target.markers[second].name}"
+        return [InputError(f"{where}: caliper {target.caliper:g}: expected about {drawn:g} (m, between {names})")]
     single = [code for code, count in Counter(marker.code for marker in target.markers).items() if count == 1]
     if len(single) != 1 or len({marker.code for marker in target.markers}) != 2:
         return [InputError(f"{where}: expected one marker with a code of its own and one code for all others, got {single}")]

@@ -22,6 +22,7 @@ from wlr_gym.data.write import write_run
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.alignment import Alignment, align, joint_signals
+from wlr_gym.perception.vision.self_calibration import SelfCalibration, calibration_findings, self_calibrated
 from wlr_gym.perception.vision.slip import SlipResult, measure_slip, smoothed_poses
 from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, Sample, VideoFrame, track
 from wlr_gym.perception.vision.video import Frames
@@ -54,6 +55,7 @@ class VideoAnalysis:
         offset: servo time = camera time + offset, s. slip: per row. robot: geometry used. origin: of the ``cam_*`` columns.
         height_error: m, body height by the camera minus that by the legs, median: shows a wrong print scale.
         missing_frames: that the video announces but that could not be decoded. findings: what is odd, in words.
+        calibration: marker places and shutter that the film told.
     """
 
     run: Run
@@ -66,6 +68,7 @@ class VideoAnalysis:
     height_error: float
     missing_frames: int
     findings: tuple[str, ...]
+    calibration: SelfCalibration | None = None
 
     def summary(self) -> dict[str, Any]:
         """Return the main numbers as plain JSON types."""
@@ -76,7 +79,8 @@ class VideoAnalysis:
                 "longitudinal_slip_m": float(slip.slip[-1, w, 0]), "longitudinal_std_m": float(slip.slip_std[-1, w, 0]),
                 "longitudinal_std_from_radius_m": float(slip.slip_radius_std[-1, w]),
                 "lateral_slip_m": float(slip.slip[-1, w, 1]), "lateral_std_m": float(slip.slip_std[-1, w, 1]),
-                "std_from_layout_m": float(slip.slip_layout_std[-1, w]),
+                "longitudinal_std_from_layout_m": float(slip.slip_layout_std[-1, w, 0]),
+                "lateral_std_from_layout_m": float(slip.slip_layout_std[-1, w, 1]),
             }
             for w, wheel in enumerate(WHEELS)
         }  # fmt: skip
@@ -91,6 +95,8 @@ class VideoAnalysis:
             "offset_by_signal_s": {name: part[0] for name, part in self.alignment.parts.items()} if self.alignment else {},
             "origin": self.origin,
             "height_error_m": self.height_error,
+            "readout_s": self.calibration.readout if self.calibration else None,
+            "markers_moved_m": self.calibration.moved.tolist() if self.calibration else [],
             "seconds": float(slip.time[-1] - slip.time[0]),
             "body_longitudinal_slip_m": float(slip.body_slip[-1, 0]),
             "body_lateral_slip_m": float(slip.body_slip[-1, 1]),
@@ -134,20 +140,24 @@ def analyse(
     if seen < 10:
         counts = ", ".join(f"{count} {name}" for name, count in Counter(sample.status for sample in samples).items())
         raise InputError(f"only {seen} of {len(samples)} frames have a pose of the robot ({counts}); are its markers in view?")
+    samples, calibration = self_calibrated(samples, camera, body)
     alignment = None
     if offset is None:
         time, poses = np.array([s.time for s in samples]), np.stack([s.pose for s in samples])
         alignment = align(time, poses, run, found, parameters, around)
         offset = alignment.offset
     known = alignment.std if alignment else 0.0
-    slip = measure_slip(samples, offset, run, found, parameters, known, body.layout_std)
+    layout = calibration.adjustment.scale_std, calibration.adjustment.heading_std
+    slip = measure_slip(samples, offset, run, found, parameters, known, layout)
     table = camera_columns(samples, offset, run, origin, slip.outliers)
     measured = Run(table, run.meta, run.path, run.findings)
     legs = joint_signals(run, slip.time, found)[0][:, LEG_SLICE] - parameters["joint.zero_offset"]
     height_error = float(np.median(slip.pose[:, 2] - rest_pose(parameters, legs)[:, 0]))
     missing = frames.missing if isinstance(frames, Frames) else 0
-    findings = tuple(_findings(samples, slip, height_error, missing))
-    return VideoAnalysis(measured, samples, alignment, offset, slip, found, origin, height_error, missing, findings)
+    findings = (*_findings(samples, slip, height_error, missing), *calibration_findings(calibration))
+    return VideoAnalysis(
+        measured, samples, alignment, offset, slip, found, origin, height_error, missing, findings, calibration
+    )
 
 
 def camera_columns(
@@ -251,7 +261,11 @@ def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, 
         yield missing_frames(missing, len(samples))
     if counts[MOVED]:
         first = next(sample for sample in samples if sample.status == MOVED)
-        yield f"the camera moved: {counts[MOVED]} frames from {first.index} on ({first.time:.2f} s) have no pose"
+        yield f"the camera moved, and the floor was not to be located: {counts[MOVED]} frames from {first.index} on ({first.time:.2f} s) have no pose"
+    floors = [sample.floor for sample in samples if sample.floor is not None]
+    followed = sum(floor is not floors[0] for floor in floors)
+    if followed:
+        yield f"the camera moved: in {followed} frames the floor was located anew; their poses are less precise"
     if counts[LOST]:
         yield f"{counts[LOST]} frames without the robot's markers (hidden, blurred or out of view)"
     if counts[IMPOSSIBLE]:
@@ -321,7 +335,7 @@ def _draw_slip(analysis: VideoAnalysis) -> Any:
     slip = analysis.slip
     for w, (wheel, colour) in enumerate(zip(WHEELS, _WHEEL_COLOURS, strict=True)):
         for axes, a in ((panels[0], 0), (panels[1], 1)):
-            spread = np.hypot(slip.slip_std[:, w, a], slip.slip_layout_std[:, w])
+            spread = np.hypot(slip.slip_std[:, w, a], slip.slip_layout_std[:, w, a])
             spread = np.hypot(spread, slip.slip_radius_std[:, w]) if a == 0 else spread
             axes.plot(slip.time, 1e3 * slip.slip[:, w, a], color=colour, linewidth=1.2, label=wheel)
             axes.fill_between(slip.time, 1e3 * (slip.slip[:, w, a] - 2 * spread), 1e3 * (slip.slip[:, w, a] + 2 * spread),

@@ -54,7 +54,7 @@ class SlipResult:
         slip_velocity: (K, 4, 2) m/s of each wheel's contact along its heading and to its left; slip_velocity_std: 1 sigma.
         slip: (K, 4, 2) m, slip velocity accumulated from the first row. slip_std: 1 sigma, random errors.
         slip_radius_std: (K, 4) m, 1 sigma of the longitudinal slip from the wheel radius.
-        slip_layout_std: (K, 4) m, 1 sigma of either from the places of the markers on the body.
+        slip_layout_std: (K, 4, 2) m, 1 sigma of both from the places of the markers on the body.
         ratio, angle: (K, 4) slip ratio and angle (rad).
         no_slip_error: share of the predicted path that ignoring slip gets wrong (the paper's measure).
         covered: (K,) False where no frame with a pose is near.
@@ -95,8 +95,8 @@ class SlipResult:
                 columns[f"slip_velocity_{axis}_std_{wheel}"] = self.slip_velocity_std[:, w, a]
                 columns[f"slip_{axis}_{wheel}"] = self.slip[:, w, a]
                 columns[f"slip_{axis}_std_{wheel}"] = self.slip_std[:, w, a]
+                columns[f"slip_{axis}_layout_std_{wheel}"] = self.slip_layout_std[:, w, a]
             columns[f"slip_longitudinal_radius_std_{wheel}"] = self.slip_radius_std[:, w]
-            columns[f"slip_layout_std_{wheel}"] = self.slip_layout_std[:, w]
             columns |= {f"slip_ratio_{wheel}": self.ratio[:, w], f"slip_angle_{wheel}": self.angle[:, w]}
         columns |= {"slip_longitudinal_body": self.body_slip[:, 0], "slip_lateral_body": self.body_slip[:, 1]}
         columns["covered"] = self.covered.astype(float)
@@ -110,7 +110,7 @@ def measure_slip(
     robot: Robot,
     parameters: Parameters,
     offset_std: float = 0.0,
-    layout_std: float = 0.0,
+    layout_std: tuple[float, float] = (0.0, 0.0),
 ) -> SlipResult:
     """Slip of a run from the samples of its video.
 
@@ -118,8 +118,8 @@ def measure_slip(
         samples: of :func:`wlr_gym.perception.vision.tracking.track`.
         offset: servo time = camera time + offset, s; offset_std: 1 sigma.
         run: encoders. robot: encoder counts, radius tolerance. parameters: (1) geometry.
-        layout_std: 1 sigma of the body target's scale and heading
-            (:attr:`wlr_gym.perception.markers.targets.Target.layout_std`).
+        layout_std: 1 sigma of the body target's scale and of its heading
+            (:class:`wlr_gym.perception.vision.adjustment.Adjustment`).
 
     Raises:
         InputError: fewer than 10 rows of the run lie within the video.
@@ -154,7 +154,8 @@ def measure_slip(
     known = robot.tolerances.get("wheel.radius")
     share = 0.0 if known is None else known.share("wheel.radius", robot.wheel.radius)
     side_speed = rate[:, 1] * np.cos(value[:, 3]) - rate[:, 0] * np.sin(value[:, 3])
-    way = np.hypot(accumulate(heading_speed, rows), accumulate(side_speed, rows))  # wrong scales err along it, headings across
+    way = np.stack([accumulate(heading_speed, rows), accumulate(side_speed, rows)], axis=1)
+    layout = np.hypot(layout_std[0] * way, layout_std[1] * way[:, ::-1])  # wrong scales err along the way, headings across
     return SlipResult(
         time=rows,
         pose=value,
@@ -165,7 +166,7 @@ def measure_slip(
         slip=slip,
         slip_std=np.sqrt(slip_std),
         slip_radius_std=share * np.abs(accumulate(rolling, rows)),
-        slip_layout_std=np.repeat(layout_std * way[:, None], 4, axis=1),
+        slip_layout_std=np.repeat(layout[:, None], 4, axis=1),
         ratio=slip_ratio(travel, rolling),
         angle=slip_angle(travel, velocity[:, :, 1]),
         no_slip_error=float(no_slip_error(accumulate(heading_speed, rows)[-1], accumulate(no_slip_speed, rows)[-1])),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 
 import numpy as np
@@ -38,6 +38,7 @@ FLOOR_FRAMES = 20
 #: m; positions of floor markers may be off by this much (they were measured by hand).
 FLOOR_TOLERANCE = 0.01
 _MOVED_BY = 0.4  # px, median over the floor's markers: 1 mm at 2 m with a focal length of 800 px
+_FOLLOWED_FROM = 0.1  # px; likewise where the floor can be located in every frame from then on
 _LEAST_COSINE = 0.7  # of the tilt of the body against the floor
 _HEIGHTS = (0.0, 0.6)  # m, of the body's origin
 
@@ -61,6 +62,7 @@ class Sample:
         covariance: (6, 6) of it.
         markers: number used. residual: px rms.
         centres: (M, 2) px of the body's markers; NaN where not seen.
+        seen: the markers used. in_camera, floor: body and floor in the camera frame; None without a pose.
     """
 
     index: int
@@ -71,6 +73,9 @@ class Sample:
     markers: int
     residual: float
     centres: Array
+    seen: dict[int, Detection] = field(default_factory=dict)
+    in_camera: TargetPose | None = None
+    floor: TargetPose | None = None
 
 
 class Tracker:
@@ -79,19 +84,26 @@ class Tracker:
     Args:
         camera: its lens. body, floor: targets.
         floor_pose, homes: where the floor is, and its markers in px (:func:`locate_floor`).
+        follow: once the camera moves, locate the floor in every frame; else frames from then on have no pose.
     """
 
-    def __init__(self, camera: Camera, body: Target, floor: Target, floor_pose: TargetPose, homes: Array) -> None:
+    def __init__(
+        self, camera: Camera, body: Target, floor: Target, floor_pose: TargetPose, homes: Array, follow: bool = False
+    ) -> None:
         self.camera, self.body, self.floor, self.floor_pose = camera, body, floor, floor_pose
         self._homes = homes
         self._values = camera.values
         self._track: list[tuple[float, TargetPose]] = []  # the last two poses
         self._watched = 0
+        self._follow_camera, self._moving = follow, False
+        self._noticed = _FOLLOWED_FROM if follow else _MOVED_BY
 
     def __call__(self, frame: VideoFrame) -> Sample:
         """Process one frame. Frames must come in order of time."""
         check_size(frame.image, self.camera, f"frame {frame.index}")
-        shift = self._floor_shift(frame.image)
+        shift = math.inf if self._moving else self._floor_shift(frame.image)
+        if shift > self._noticed and self._follow_camera and self._locate_anew(frame.image):
+            self._moving, shift = True, 0.0
         found, seen = self._follow(frame)
         if found is None:
             found, seen = self._search(frame)
@@ -100,9 +112,9 @@ class Tracker:
             self._track = []
             dark = found is None and math.isinf(shift)  # nothing at all is seen
             return _no_pose(frame, MOVED if shift > _MOVED_BY and not dark else LOST, centres)
-        for index, detection in seen.items():
-            if found.used[index]:
-                centres[index] = detection.ellipse[:2]
+        used = {index: detection for index, detection in seen.items() if found.used[index]}
+        for index, detection in used.items():
+            centres[index] = detection.ellipse[:2]
         pose, covariance = pose_in_floor(found, self.floor_pose)
         if not (_HEIGHTS[0] < pose[2] < _HEIGHTS[1] and math.cos(pose[4]) * math.cos(pose[5]) > _LEAST_COSINE):
             self._track = []
@@ -110,7 +122,9 @@ class Tracker:
         self._track = [*self._track[-1:], (frame.time, found)]
         count = int(found.used.sum())
         status = OK if count == len(self.body.markers) else PARTIAL
-        return Sample(frame.index, frame.time, status, pose, covariance, count, found.residual, centres)
+        return Sample(
+            frame.index, frame.time, status, pose, covariance, count, found.residual, centres, used, found, self.floor_pose
+        )
 
     def _follow(self, frame: VideoFrame) -> tuple[TargetPose | None, dict[int, Detection]]:
         """Look where the markers should be."""
@@ -168,11 +182,28 @@ class Tracker:
         """
         self._watched = (self._watched + 1) % len(self._homes)
         shift = self._marker_shift(image, self._watched)
-        if shift < _MOVED_BY:
+        if shift < self._noticed:
             return shift
         shifts = np.array([self._marker_shift(image, index) for index in range(len(self._homes))])
         known = shifts[np.isfinite(shifts)]
         return float(np.median(known)) if len(known) else math.inf
+
+    def _locate_anew(self, image: Image) -> bool:
+        """Locate the floor in this frame alone, with the weights it was located with at first; False when it is not whole."""
+        last = self.floor_pose
+        seen = _seen_at(image, self.floor, self._values, last)
+        if len(seen) < len(self.floor.markers):
+            detections = detect(image, self.camera)
+            tolerance = _floor_pixels(self.camera, detections, self.floor)
+            found = find_target(detections, self.floor, self.camera, tolerance=tolerance)
+            if found is None:
+                return False
+            last, seen = found, _seen_at(image, self.floor, self._values, found)
+        found = _solved_floor(seen, self.floor, self.camera, last)
+        if found is None or found.used.sum() < len(self.floor.markers):
+            return False
+        self.floor_pose = found
+        return True
 
     def _marker_shift(self, image: Image, index: int) -> float:
         """Distance (px) of a floor marker from its place; NaN when it is not seen there."""
@@ -190,7 +221,7 @@ def track(frames: Iterable[VideoFrame], camera: Camera, body: Target, floor: Tar
     """
     stream = iter(frames)
     first = list(islice(stream, FLOOR_FRAMES))
-    tracker = Tracker(camera, body, floor, *locate_floor(first, camera, floor))
+    tracker = Tracker(camera, body, floor, *locate_floor(first, camera, floor), follow=True)
     return (tracker(frame) for frame in chain(first, stream))
 
 
@@ -220,7 +251,7 @@ def locate_floor(frames: Sequence[VideoFrame], camera: Camera, floor: Target) ->
             f"{len(frames)} frames, and at least 4 must fit together (check their positions in the target file, and the light)"
         )
     means = {index: _mean(found) for index, found in sums.items() if len(found) >= max(1, len(frames) // 2)}
-    found = solve_pose(means, floor, camera, start.rotation, start.position) or start
+    found = _solved_floor(means, floor, camera, start) or start
     centres = np.full((len(floor.markers), 2), np.nan)
     for index, detection in means.items():
         centres[index] = detection.ellipse[:2]
@@ -305,3 +336,14 @@ def _mean(found: Sequence[Detection]) -> Detection:
     spread = np.where(known[:, None, None], covariances.mean(axis=0) / len(found), np.nan)
     shape, ellipse = np.mean([d.shape for d in found], axis=0), np.mean([d.ellipse for d in found], axis=0)
     return replace(found[0], centres=mean, covariances=spread, shape=shape, ellipse=ellipse)
+
+
+def _solved_floor(seen: dict[int, Detection], floor: Target, camera: Camera, start: TargetPose) -> TargetPose | None:
+    """The floor's pose, with the tolerance of its markers' places in the weights and in the covariance."""
+    tolerated = {index: _tolerant(marker, floor.tolerance / start.position[2]) for index, marker in seen.items()}
+    return solve_pose(tolerated, floor, camera, start.rotation, start.position)
+
+
+def _tolerant(detection: Detection, std: float) -> Detection:
+    """With the tolerance of the marker's place (1 sigma, undistorted coordinates), which its circles share."""
+    return replace(detection, covariances=detection.covariances + len(detection.covariances) * std**2 * np.eye(2))
