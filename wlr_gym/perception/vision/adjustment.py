@@ -223,7 +223,7 @@ def _step(
     reduced = information + np.einsum("fri,frj->ij", b, b) - np.einsum("fis,fit->st", mixed, known)
     rest = right - np.einsum("fri,fr->i", b, r) + np.einsum("fis,fi->s", known, pose_right)
     size = 1 / np.sqrt(np.diag(reduced))  # places and seconds: scaled before the inverse
-    covariance = size[:, None] * np.linalg.inv(size[:, None] * reduced * size) * size
+    covariance = np.asarray(size[:, None] * np.linalg.inv(size[:, None] * reduced * size) * size, np.float64)
     change = covariance @ rest
     steps = -np.einsum("fij,fj->fi", inner, pose_right) - known @ change
     return steps, change, covariance
