@@ -1,0 +1,63 @@
+"""Films of a lab that is not perfect, drawn by a second renderer: hand-laid markers, rolling shutter, a camera that drifts."""
+
+import numpy as np
+import pytest
+from second_renderer import Lab, frames, lens, true_places
+
+from wlr_gym.perception.markers.targets import load_target
+from wlr_gym.perception.vision.analysis import analyse
+from wlr_gym.robot import load_robot
+from wlr_gym.studies.bench.vision import true_slip
+from wlr_gym.studies.bench.vision_drives import skid_turn
+
+SECONDS, RATE = 4.6, 15.0
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return skid_turn(load_robot())
+
+
+def analysed(drive, lab, **body):
+    target = load_target("body").model_copy(update=body)
+    return analyse(list(frames(drive, lab, SECONDS, RATE)), drive.run, lens(), target, load_target("floor"), drive.robot)
+
+
+def checked(drive, analysis):
+    """Every frame has a pose; the slip is right to 1 mm and to 2.5 sigma at the end."""
+    assert all(np.isfinite(sample.pose[0]) for sample in analysis.samples)
+    slip = analysis.slip
+    error = (slip.slip - true_slip(drive, slip.time))[-1]
+    assert np.abs(slip.slip[-1]).max() > 0.05  # there is slip to be found
+    assert np.abs(error).max() < 1e-3
+    assert np.all(np.abs(error) < 2.5 * np.hypot(slip.slip_std[-1], slip.slip_layout_std[-1]))
+
+
+@pytest.mark.slow
+def test_a_rolling_shutter_over_a_floor_laid_by_hand(drive):
+    found = analysed(drive, Lab(floor_error=0.003, readout=0.025, seed=3))
+    checked(drive, found)
+    assert found.calibration is not None
+    assert found.calibration.readout == pytest.approx(0.025, abs=0.0015)
+    assert any("rolling shutter" in finding for finding in found.findings)
+
+
+@pytest.mark.slow
+def test_a_print_that_is_stretched_both_ways_with_a_caliper_reading(drive):
+    lab = Lab(stretch=(0.002, 0.005), floor_error=0.001, seed=5)
+    places = true_places(lab)[1]
+    reading = float(np.linalg.norm(places[0] - places[2]))
+    found = analysed(drive, lab, tolerance=1e-4, stretch=0.005, caliper=reading)
+    checked(drive, found)
+    assert found.calibration is not None
+    assert np.ptp(found.calibration.adjustment.target.positions, axis=0)[:2] == pytest.approx(
+        np.ptp(places, axis=0)[:2], rel=1e-3
+    )
+    assert any("caliper" in finding for finding in analysed(drive, lab, tolerance=1e-4, stretch=0.005).findings)
+
+
+@pytest.mark.slow
+def test_a_camera_that_drifts(drive):
+    found = analysed(drive, Lab(drift=0.002))
+    checked(drive, found)
+    assert any("the floor was located anew" in finding for finding in found.findings)
