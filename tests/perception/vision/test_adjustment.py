@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from wlr_gym.base.errors import InputError
 from wlr_gym.perception.markers.detection import Detection
 from wlr_gym.perception.markers.targets import load_target, ring_radii
-from wlr_gym.perception.vision.adjustment import View, _circles, adjust, at_frame_time, whitened
+from wlr_gym.perception.vision.adjustment import TargetView, _circles, adjust, at_frame_time, whitened
 
 FOCAL, HEIGHT = 800.0, 720
 NOISE = 0.015 / FOCAL  # of a circle's centre
@@ -49,7 +49,7 @@ def film(target, places, count=40, readout=0.0, seed=0, noise=NOISE):
             spread = np.tile(NOISE**2 * np.eye(2), (3, 1, 1))
             seen[m] = Detection(int(target.codes[m]), ellipse, centres, spread, ellipse, 200.0, 0.1, 1.0)
         guess = Rotation.from_rotvec(0.003 * rng.standard_normal(3)).as_matrix() @ rotation
-        views.append(View(seen, guess, position + 0.003 * rng.standard_normal(3), velocity))
+        views.append(TargetView(seen, guess, position + 0.003 * rng.standard_normal(3), velocity))
     return views
 
 

@@ -37,6 +37,7 @@ def checked(drive, analysis):
 def test_a_rolling_shutter_over_a_floor_laid_by_hand(drive):
     found = analysed(drive, Lab(floor_error=0.003, readout=0.025, seed=3))
     checked(drive, found)
+    assert found.calibration is not None
     assert found.calibration.readout == pytest.approx(0.025, abs=0.0015)
     assert any("rolling shutter" in finding for finding in found.findings)
 
@@ -48,6 +49,7 @@ def test_a_print_that_is_stretched_both_ways_with_a_caliper_reading(drive):
     reading = float(np.linalg.norm(places[0] - places[2]))
     found = analysed(drive, lab, tolerance=1e-4, stretch=0.005, caliper=reading)
     checked(drive, found)
+    assert found.calibration is not None
     assert np.ptp(found.calibration.adjustment.target.positions, axis=0)[:2] == pytest.approx(
         np.ptp(places, axis=0)[:2], rel=1e-3
     )

@@ -37,7 +37,7 @@ _READOUT = -1  # column of the readout among the shared unknowns
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class TargetView:
     """One frame's markers and a first guess of where the target is.
 
     Attributes:
@@ -105,7 +105,7 @@ class Circles:
     velocity: Array
 
 
-def adjust(target: Target, views: Sequence[View], height: int, readout: float | None) -> Adjustment:
+def adjust(target: Target, views: Sequence[TargetView], height: int, readout: float | None) -> Adjustment:
     """Adjust target and readout to views of one film.
 
     Args:
@@ -138,7 +138,7 @@ def adjust(target: Target, views: Sequence[View], height: int, readout: float | 
     return Adjustment(found, covariance[:_READOUT, :_READOUT], float(shared[_READOUT]), std, noise)
 
 
-def at_frame_time(view: View, target: Target, height: int, readout: float) -> dict[int, Detection]:
+def at_frame_time(view: TargetView, target: Target, height: int, readout: float) -> dict[int, Detection]:
     """The detections as a shutter that is open for all rows at the frame's time would show them."""
     circles = _circles(target, [view], height)
     shared = target.positions.ravel()
@@ -175,7 +175,8 @@ def whitened(circles: Circles, rotations: Array, positions: Array, shared: Array
 def _points(circles: Circles, rotations: Array, positions: Array, shared: Array) -> tuple[Array, Array, Array, Array]:
     """Arms and centres of the markers (F, M, 3) in the camera frame at their rows' times; normals (F, 3); their velocity."""
     arms = np.einsum("fij,mj->fmi", rotations, shared[:_READOUT].reshape(-1, 3))
-    drift = circles.velocity[:, None, 3:] + np.cross(circles.velocity[:, None, :3], arms)
+    turning = np.einsum("fij,fmj->fmi", _cross(circles.velocity[:, :3]), arms)
+    drift = circles.velocity[:, None, 3:] + turning
     points = arms + positions[:, None] + (shared[_READOUT] * circles.row)[..., None] * drift
     return arms, points, rotations[:, :, 2], drift
 
@@ -222,8 +223,8 @@ def _step(
     known = np.einsum("fij,fjs->fis", inner, mixed)
     reduced = information + np.einsum("fri,frj->ij", b, b) - np.einsum("fis,fit->st", mixed, known)
     rest = right - np.einsum("fri,fr->i", b, r) + np.einsum("fis,fi->s", known, pose_right)
-    size = 1 / np.sqrt(np.diag(reduced))  # places and seconds: scaled before the inverse
-    covariance = np.asarray(size[:, None] * np.linalg.inv(size[:, None] * reduced * size) * size, np.float64)
+    size = np.outer(*2 * (1 / np.sqrt(np.diag(reduced)),))  # places and seconds: scaled before the inverse
+    covariance: Array = size * np.linalg.inv(size * reduced)
     change = covariance @ rest
     steps = -np.einsum("fij,fj->fi", inner, pose_right) - known @ change
     return steps, change, covariance
@@ -255,7 +256,7 @@ def _prior(target: Target, shared: Array, readout: float | None) -> tuple[Array,
     return information, right
 
 
-def _circles(target: Target, views: Sequence[View], height: int) -> Circles:
+def _circles(target: Target, views: Sequence[TargetView], height: int) -> Circles:
     markers = len(target.markers)
     measured, roots = np.zeros((len(views), markers, 3, 2)), np.zeros((len(views), markers, 3, 2, 2))
     row = np.zeros((len(views), markers))

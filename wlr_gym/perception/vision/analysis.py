@@ -261,7 +261,10 @@ def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, 
         yield missing_frames(missing, len(samples))
     if counts[MOVED]:
         first = next(sample for sample in samples if sample.status == MOVED)
-        yield f"the camera moved, and the floor was not to be located: {counts[MOVED]} frames from {first.index} on ({first.time:.2f} s) have no pose"
+        yield (
+            f"the camera moved, and the floor was not to be located: {counts[MOVED]} frames from {first.index} on "
+            f"({first.time:.2f} s) have no pose"
+        )
     floors = [sample.floor for sample in samples if sample.floor is not None]
     followed = sum(floor is not floors[0] for floor in floors)
     if followed:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.pose import LARGEST_RESIDUAL, solve_pose
 from wlr_gym.perception.markers.targets import Target
-from wlr_gym.perception.vision.adjustment import Adjustment, View, adjust, at_frame_time
+from wlr_gym.perception.vision.adjustment import Adjustment, TargetView, adjust, at_frame_time
 from wlr_gym.perception.vision.tracking import Sample, pose_in_floor
 
 Array = NDArray[np.float64]
@@ -69,7 +69,7 @@ def _once(samples: tuple[Sample, ...], camera: Camera, body: Target) -> tuple[tu
 def _adjusted(samples: Sequence[Sample], speeds: Array, camera: Camera, body: Target) -> tuple[Adjustment, float]:
     """Target and readout that the film tells; a readout that is not sure is 0."""
     views = [
-        View(sample.seen, sample.in_camera.rotation, sample.in_camera.position, speed)
+        TargetView(sample.seen, sample.in_camera.rotation, sample.in_camera.position, speed)
         for sample, speed in zip(samples, speeds, strict=True)
         if sample.in_camera is not None
     ]
@@ -116,7 +116,7 @@ def _solved(sample: Sample, speed: Array, camera: Camera, target: Target, readou
         return sample
     seen = sample.seen
     if readout:
-        seen = at_frame_time(View(seen, first.rotation, first.position, speed), target, camera.height, readout)
+        seen = at_frame_time(TargetView(seen, first.rotation, first.position, speed), target, camera.height, readout)
     found = solve_pose(seen, target, camera, first.rotation, first.position)
     if found is None or found.residual > LARGEST_RESIDUAL:
         return sample
