@@ -150,6 +150,13 @@ def _accept(options: EvaluateOptions) -> int:
     """Run the acceptance test, print its table, write it."""
     if len(options.policy) != 1:
         raise InputError(f"--accept: expected one policy, got {len(options.policy)}")
+    card_only = {
+        "--full": options.full, "--sweep": options.sweep, "--backend": options.backend, "--record": options.record,
+        "--video": options.video, "--seed": options.seed != FIRST_SEED,
+    }  # fmt: skip
+    given = [name for name, value in card_only.items() if value]
+    if given:
+        raise InputError(f"--accept: {given[0]} is of the card; leave it out")
     if options.out is not None:
         make_output_folder(options.out)
     with progress(options.progress) as tell:

@@ -262,3 +262,6 @@ def test_a_scale_takes_the_place_of_the_limit_in_the_tracking_error_only():
     config = load_task("velocity", load_robot(), changes).config
     assert limits_of(config) == {("velocity_error", "rms"): 0.1}
     assert scales_of(config) == {("velocity_error", "rms"): 0.4}
+    largest = {"velocity_error": {"rms": None, "max": 0.2, "scale": 0.4}}  # a scale of no limit: nothing
+    config = load_task("velocity", load_robot(), {"success": changes["success"] | largest}).config
+    assert scales_of(config) == {("velocity_error", "max"): 0.2}

@@ -157,3 +157,5 @@ def test_the_scale_of_the_tracking_error_is_not_the_limit_of_success():
     docs = {metric.key: metric.doc for metric in metrics_of(own)}
     assert "0.04 m/s" in docs["tracking_error"]
     assert "0.01 m/s" in docs["success"]
+    largest = (Measure("velocity_error", "m/s", "ahead", max=0.1, scale=0.04), MEASURES[1])  # as the environment has it
+    assert score(rollout(measured=errors, measures=largest))["tracking_error"].mean == pytest.approx(0.2 / np.sqrt(2))

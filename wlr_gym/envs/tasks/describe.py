@@ -8,6 +8,7 @@ from typing import Any
 from wlr_gym.envs.tasks.entries import AreaConfig, EventConfig
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.scaling import QUANTITIES, quantities_of, scaled_numbers
+from wlr_gym.envs.tasks.success import limits_within
 from wlr_gym.envs.tasks.task import ObservationColumn, Task
 from wlr_gym.envs.tasks.task_config import TaskConfig
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
@@ -80,9 +81,9 @@ def _ramp(config: TaskConfig, command: str) -> str:
 
 def limits_text(config: TaskConfig, measure: str) -> str:
     """Return ``rms at most 0.02`` for a measure that success depends on."""
-    limits = config.success.get(measure)
-    texts = [f"{kind} at most {limit:g}" for kind in ("rms", "max") if (limit := getattr(limits, kind, None)) is not None]
-    return ", ".join(texts) or "-"
+    bounds = config.success.get(measure)
+    limits = {} if bounds is None else limits_within(bounds)
+    return ", ".join(f"{kind} at most {limit:g}" for kind, limit in limits.items()) or "-"
 
 
 def _action_rows(task: Task) -> list[tuple[str, ...]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,21 +19,38 @@ Which = tuple[str, str]
 FALL = 10.0
 
 
+class Bounds(Protocol):
+    """What success asks of a measure, as :class:`wlr_gym.envs.tasks.task_config.SuccessConfig`."""
+
+    @property
+    def rms(self) -> float | None: ...
+    @property
+    def max(self) -> float | None: ...
+    @property
+    def scale(self) -> float | None: ...
+
+
+def limits_within(bounds: Bounds) -> dict[str, float]:
+    """Return the limits of success of a measure: ``rms`` and ``max``, those there are."""
+    return {kind: limit for kind, limit in (("rms", bounds.rms), ("max", bounds.max)) if limit is not None}
+
+
+def scales_within(bounds: Bounds) -> dict[str, float]:
+    """Return what counts as 1 in the tracking error: the limits, in place of the limit ``rms`` its scale where there is one."""
+    limits = limits_within(bounds)
+    return limits | ({"rms": bounds.scale} if "rms" in limits and bounds.scale is not None else {})
+
+
 def limits_of(config: TaskConfig) -> dict[Which, float]:
     """Return the limits of success of a task, in the order of its measures, SI units."""
-    limits: dict[Which, float] = {}
-    for name in config.measures:
-        chosen = config.success.get(name)
-        given = {} if chosen is None else {"rms": chosen.rms, "max": chosen.max}
-        limits |= {(name, kind): limit for kind, limit in given.items() if limit is not None}
-    return limits
+    chosen = [(name, config.success[name]) for name in config.measures if name in config.success]
+    return {(name, kind): limit for name, bounds in chosen for kind, limit in limits_within(bounds).items()}
 
 
 def scales_of(config: TaskConfig) -> dict[Which, float]:
-    """Return what counts as 1 in the tracking error of a task: the limit of success where no scale is given, SI units."""
-    scales = limits_of(config)
-    given = {(name, "rms"): chosen.scale for name, chosen in config.success.items()}
-    return {which: given.get(which) or limit for which, limit in scales.items()}
+    """Return what counts as 1 in the tracking error of a task, in the order of its measures, SI units."""
+    chosen = [(name, config.success[name]) for name in config.measures if name in config.success]
+    return {(name, kind): scale for name, bounds in chosen for kind, scale in scales_within(bounds).items()}
 
 
 def tracking_error(scales: Mapping[Which, float], errors: Mapping[Which, Array], fell: Flags) -> Array:

@@ -17,13 +17,14 @@ from wlr_gym.envs.tasks.task_config import read_task
 from wlr_gym.learning.evaluation.card import MAIN
 from wlr_gym.learning.evaluation.scoring import evaluate
 from wlr_gym.learning.evaluation.subjects import Source, identity, read_subjects
+from wlr_gym.learning.evaluation.sweeps import FLOORS
 from wlr_gym.policy import policy_environment, shipped_names, trained_environment
 from wlr_gym.robot import load_robot
 
 #: Task -> families of floors of its card. No training and no setting knows ``stripes`` and ``ribbed``.
 FAMILIES: Mapping[str, tuple[str, ...]] = {
-    "velocity": ("slippery", "nominal", "ice", "split", "patches", "wide", "stripes", "ribbed"),
-    "path": ("slippery", "nominal", "ice", "split", "patches", "wide", "stripes", "ribbed"),
+    "velocity": FLOORS,
+    "path": FLOORS,
     "posture": ("asymmetric", "nominal", "slippery", "ice", "stripes", "ribbed"),
     "slope": ("slope",),
 }

@@ -66,7 +66,7 @@ def _draw_sweep(axes: Axes, card: Card, sweep: Sweep, metric: Metric) -> None:
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_title("tracking error (1 = at the task's limits)", fontsize=9)
+        axes.set_title("tracking error (1 = at the task's scales)", fontsize=9)
     else:
         axes.set_ylim(bottom=0.0)
         axes.set_title(f"{metric.key.replace('_', ' ')} ({metric.unit})", fontsize=9)

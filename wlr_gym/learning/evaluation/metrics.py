@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.envs.tasks.success import FALL, Which, succeeded, tracking_error
+from wlr_gym.envs.tasks.success import FALL, Which, limits_within, scales_within, succeeded, tracking_error
 from wlr_gym.learning.evaluation.rollout import Measure, Rollout
 
 Array = NDArray[np.float64]
@@ -67,8 +67,8 @@ GENERAL = (
 
 def metrics_of(measures: Sequence[Measure]) -> tuple[Metric, ...]:
     """Return the rows of a task's card, in order: all limits in one number, the measures, success, and the general ones."""
-    limits = [f"{kind} of {m.name} {limit:g} {m.unit}" for m in measures for kind, limit in _limits(m).items()]
-    scales = [f"{kind} of {m.name} {scale:g} {m.unit}" for m in measures for kind, scale in _scales_of(m).items()]
+    limits = [f"{kind} of {m.name} {limit:g} {m.unit}" for m in measures for kind, limit in limits_within(m).items()]
+    scales = [f"{kind} of {m.name} {scale:g} {m.unit}" for m in measures for kind, scale in scales_within(m).items()]
     general = [metric.key for metric in GENERAL]
     own = []
     for m in measures:
@@ -94,20 +94,11 @@ def metrics_of(measures: Sequence[Measure]) -> tuple[Metric, ...]:
 
 def has_limits(measures: Sequence[Measure]) -> bool:
     """Return whether there is a limit to track within."""
-    return any(_limits(measure) for measure in measures)
-
-
-def _limits(measure: Measure) -> dict[str, float]:
-    return {kind: limit for kind in ("rms", "max") if (limit := getattr(measure, kind)) is not None}
-
-
-def _scales_of(measure: Measure) -> dict[str, float]:
-    limits = _limits(measure)
-    return limits if measure.scale is None else limits | {"rms": measure.scale}
+    return any(limits_within(measure) for measure in measures)
 
 
 def _scales(measures: Sequence[Measure]) -> dict[Which, float]:
-    return {(measure.name, kind): scale for measure in measures for kind, scale in _scales_of(measure).items()}
+    return {(measure.name, kind): scale for measure in measures for kind, scale in scales_within(measure).items()}
 
 
 @dataclass(frozen=True)

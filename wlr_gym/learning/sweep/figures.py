@@ -22,7 +22,7 @@ _DPI = 110
 #: So many values of a setting have a tick each.
 _FEW = 5
 _WORDS = {
-    "tracking_error": "tracking error (1 = at the task's limits)",
+    "tracking_error": "tracking error (1 = at the task's scales)",
     "success": "success (%)",
     "excess_slip": "slip beyond a turn's (m/s)",
     "reward": "reward per episode",

@@ -29,7 +29,7 @@ from wlr_gym.policy import load_agent_config  # noqa: E402
 
 EPOCHS = 4
 #: Reward per second of simulated time, exploration included, from which the task counts as learnt: both tracking kernels are
-#: beyond 0.93 then, where errors at the limits of success (0.02 m/s, 0.06 rad/s) would give 0.90 and 0.91.
+#: beyond 0.93 then, where errors at the scales of the tracking error (0.02 m/s, 0.06 rad/s) would give 0.90 and 0.91.
 SOLVED = 1.7
 #: Frames over which it is averaged.
 WINDOW = 16_384

@@ -104,16 +104,17 @@ def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
     inward, inward_rate = _inward(signals)
     legs, wheels = [], []
     corrections: list[Value] = []
-    for leg, (front, left), (offset, rate) in zip(LEGS, CORNER_SIGNS, motion.legs, strict=True):
+    for index, ((front, left), (offset, rate)) in enumerate(zip(CORNER_SIGNS, motion.legs, strict=True)):
         side = hip_y * left
         travel = velocity - yaw_rate * side
         rolling = ops.clip(forward - turn * side, travel - allowed, travel + allowed)
         offset = offset + inward * front + lean
         rate = rate + inward_rate * front
+        setpoint = offset
         if motion.sweeping:
-            corrections.append(_leg_correction(signals, f"{name}[{leg}_integral]", LEGS.index(leg), offset))
-        correction = corrections[-1] if motion.sweeping else 0.0
-        legs.append((offset + correction) / signals.task("action.leg_scale"))
+            corrections.append(_leg_correction(signals, name, index, offset))
+            setpoint = offset + corrections[index]
+        legs.append(setpoint / signals.task("action.leg_scale"))
         wheels.append(_wheel_rate(signals, rolling, offset, rate) / signals.task("action.wheel_scale"))
     return [
         *(ops.clip(action, -1.0, 1.0) for action in legs + wheels),
@@ -124,10 +125,10 @@ def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
     ]
 
 
-def _leg_correction(signals: Signals, remembered: str, leg: int, offset: Value) -> Value:
+def _leg_correction(signals: Signals, name: str, leg: int, offset: Value) -> Value:
     """What is added to a leg's setpoint (rad): the integral of the error of its measured angle."""
     error = signals.robot("home.leg_angle") + offset - signals.sensors("joint_position")[LEG_SLICE][leg]
-    return _integral(signals, signals.remembered(remembered), signals.gain("leg_i") * error)
+    return _integral(signals, signals.remembered(f"{name}[{LEG_MEMORY[leg]}]"), signals.gain("leg_i") * error)
 
 
 def _inward(signals: Signals) -> tuple[Value, Value]:
