@@ -82,10 +82,10 @@ def test_a_recorded_run_has_the_camera(tmp_path, camera_file):
 
 @pytest.mark.slow
 def test_the_chain_tracks_as_the_simulator_does():
-    """One episode on ice; docs/camera.md has more."""
-    file = small_camera(latency=0.04, dropout=0.1)
+    """Six episodes on ice: of one, most is how it starts, and the two start differently. docs/camera.md has more."""
+    file, seeds = small_camera(latency=0.04, dropout=0.1), range(9000, 9006)
     setting = ChainSetting(POLICY, "ice", file, 4.0)
-    assert chain_errors(setting, [9000])[0] < 1.2 * simulated_errors(setting, [9000])[0]
+    assert chain_errors(setting, seeds).mean() < 1.2 * simulated_errors(setting, seeds).mean()
 
 
 @pytest.mark.slow
