@@ -2,8 +2,8 @@
 
 In every control step each robot's true state is copied to a batch of imagined robots, which try random plans; the plan that
 is followed is their mean, weighted by what they cost. The cost is the task's own tracking error, so that the score says what
-is reachable with the robot's motors on the floors at hand, known exactly. Commands are taken to stay as they are. With ``knows``
-it plans for a nominal robot or a nominal floor instead: what the knowledge of them is worth.
+is reachable with the robot's motors on the floors at hand, known exactly. Commands are taken to stay as they are. The
+setting ``knows`` has it plan for a nominal robot or a nominal floor instead: what the knowledge of them is worth.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class MppiConfig(SettingsModel):
         slip: weight of the mean slip speed (per 0.05 m/s) beside the squared tracking error.
         action_rate: weight of the squared change of the action.
         proposer: agent whose action, kept, is among the plans tried.
-        knows: of what the numbers are those of each robot, beside its state; of the rest they are nominal, without friction patches.
+        knows: what has each robot's own numbers, its state apart; the rest has nominal ones, and no friction patches.
         tasks: task name -> settings that differ there. environment: keywords of the environment.
     """
 
