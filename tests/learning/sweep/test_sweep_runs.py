@@ -54,6 +54,7 @@ def test_one_fails_the_others_go_on_and_a_resume_completes_it(tmp_path, monkeypa
     assert [one.status for one in found.trials] == ["done", "done"]
     for one in found.trials:
         assert_like_alone(one, tmp_path / f"alone_{one.trial.name}")
+        assert read_yaml(one.folder / "provenance.yaml")["command"] == read_yaml(out / "provenance.yaml")["command"]
 
     import pandas
 

@@ -183,7 +183,7 @@ def fingerprint(environment: str, policies: Iterable[Source], floors: Sequence[A
     config = read_task(task_source_of(environment))
     own = load_robot(config.robot if robot is None else robot)
     played = {
-        "policies": [identity(subject) for subject in read_subjects(list(policies))],
+        "policies": [identity(subject, config.name) for subject in read_subjects(list(policies))],
         "task": config.model_dump(mode="json"),
         "floors": [load_randomization(family, own).config.model_dump(mode="json") for family in floors],
         "robot": own.model_dump(mode="json"),

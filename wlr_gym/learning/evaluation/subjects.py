@@ -90,14 +90,22 @@ def _named(text: str) -> tuple[str, tuple[str, ...]]:
     return name, tuple(source for part in parts for source in expand(part) or (part,))
 
 
-def identity(subject: Subject) -> str:
-    """Return who exactly plays: the SHA-256 of each source's policy file or folder, or of its agent's settings."""
-    return ", ".join(_identity(source) for source in subject.sources)
+def identity(subject: Subject, task: str = "") -> str:
+    """Return who exactly plays: the SHA-256 of each source's policy file or folder, or of its agent's settings.
+
+    Args:
+        subject: who.
+        task: name; of an agent's settings for single tasks those for this one alone count. Empty = all.
+    """
+    return ", ".join(_identity(source, task) for source in subject.sources)
 
 
-def _identity(source: str) -> str:
+def _identity(source: str, task: str) -> str:
     if source in agent_names():
-        return f"agent, settings {hashlib.sha256(json.dumps(load_agent_config(source)).encode()).hexdigest()}"
+        settings = load_agent_config(source)
+        if task and "tasks" in settings:
+            settings = {**settings, "tasks": settings["tasks"].get(task)}
+        return f"agent, settings {hashlib.sha256(json.dumps(settings).encode()).hexdigest()}"
     place = find_policy(source)
     if place.is_file():
         return hashlib.sha256(place.read_bytes()).hexdigest()

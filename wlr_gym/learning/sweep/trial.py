@@ -7,6 +7,7 @@ import hashlib
 import json
 import platform
 import shutil
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -51,6 +52,7 @@ def job_of(plan: SweepPlan, trial: Trial, out: Path, *, report: bool = False, tr
         "report": report,
         "train": train,
         "version": __version__,
+        "command": sys.argv,
     }
     return Job(trial.name, "wlr_gym.learning.sweep.trial", task, str(out / LOGS / f"{trial.name}.txt"))
 
@@ -81,6 +83,7 @@ def train_trial(task: Mapping[str, Any], send: Send) -> None:
     if "check" in task:
         check_settings(task["agent"], task["settings"])
         return
+    sys.argv[:] = task["command"]  # the run folder says how the sweep was started, not how its processes are
     out = Path(task["out"])
     folder = out / TRIALS / task["name"]
     with locked(out / LOCKS / task["name"], 2 * PATIENCE):
