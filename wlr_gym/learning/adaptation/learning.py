@@ -1,0 +1,230 @@
+"""Steps in which nothing drives: what the result states, training on from the policy, and the acceptance test."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
+from wlr_gym.base.text import duration
+from wlr_gym.data.read import run_files
+from wlr_gym.envs.registry import task_source_of
+from wlr_gym.envs.tasks.task_config import OPTIONAL, read_task
+from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
+from wlr_gym.gap.decision import Budget, Decided, Recorded, decide
+from wlr_gym.gap.report.result import PATCH_FILE
+from wlr_gym.learning.adaptation.plan import Progress, StepRecord
+from wlr_gym.learning.adaptation.robots import AdaptedRobot, excite_robot
+from wlr_gym.learning.adaptation.uncertainty import STATED, Family, Uncertainty, uncertainty_of
+from wlr_gym.learning.evaluation.acceptance import (
+    LARGEST_LOSS,
+    Acceptance,
+    accept,
+    acceptance_rows,
+    read_acceptance,
+    write_acceptance,
+)
+from wlr_gym.learning.training import resume_training, train
+from wlr_gym.physics.effects import load_patch
+from wlr_gym.policy import contract_of
+from wlr_gym.policy.agents import TrainingProgress, agent_function
+from wlr_gym.robot import Robot
+
+#: Share of the learning rate that is left at the end of the training.
+FALLS_TO = 0.3
+#: Environment steps between scores on held-out episodes, and between checkpoints, as shares of the training.
+_SCORES = 4
+#: Name of the settings of the training.
+SETTINGS_FILE = "training.yaml"
+TRAINING = "training"
+
+
+# ---- gap -------------------------------------------------------------------------------------------------------------
+
+
+def find_gap(progress: Progress, robot: AdaptedRobot | None) -> tuple[StepRecord, Decided]:
+    """Find what the model lacks, with further runs where there is a robot to drive."""
+    asked = progress.asked
+    data = Path(asked.robot_runs) if asked.robot_runs is not None else progress.out / "runs"
+    runs = asked.budget_runs if robot is not None else 0
+    budget = Budget(runs, math.inf if asked.budget_seconds is None else asked.budget_seconds)
+
+    def record(motion: Any, folder: Path) -> Recorded:
+        assert robot is not None
+        return excite_robot(robot, motion, folder, asked.seed + 100 + len(run_files(folder)))
+
+    decided = decide(data, progress.out / "gap", record, budget, threads=progress.threads, tell=progress.tell)
+    history, result = decided.history, decided.result
+    said = [f"Ended: {history.ended}, after {len(history.driven)} further runs."]
+    if result is None:
+        said.append("There are too few usable runs for an analysis.")
+    else:
+        said.insert(0, result.summary or result.verdict)
+    names = [one.name for one in result.effects] if result is not None else []
+    record_of = StepRecord(
+        said=tuple(said),
+        driving=history.seconds,
+        command=f"wlr gap {data} --out {progress.out / 'gap'} --until-decided --budget-runs {runs}"
+        + (f" --record emulated --hidden {progress.out / 'hidden.yaml'}" if asked.driven == "emulated" else ""),
+        numbers={
+            "verdict": "" if result is None else result.verdict,
+            "effects": names,
+            "ended": history.ended,
+            "folder": str(decided.folder),
+        },
+    )
+    return record_of, decided
+
+
+def state_uncertainty(progress: Progress, decided: Decided, own: Robot) -> tuple[StepRecord, Uncertainty | None]:
+    """Return what the result states, as patch and randomisation; None where it states nothing."""
+    folder, result = progress.folder("model"), decided.result
+    if result is None or result.verdict in (BAD_DATA, NOT_EXCITED) or not (result.calibration or result.effects):
+        why = "There is no result." if result is None else f"The verdict is '{result.verdict}': there are no numbers to take."
+        return StepRecord(outcome="left out", said=(why, "The old policy is kept.")), None
+    patch = load_patch(decided.folder / PATCH_FILE)
+    found = uncertainty_of(result, patch, task_randomization(progress.asked.environment), own, folder)
+    command = f"wlr envs {progress.asked.environment} --randomization {folder / 'randomization.yaml'}"
+    numbers = {"effects": patch.content()["effects"], "families": [one.name for one in found.families]}
+    return StepRecord(said=found.said, command=command, numbers=numbers), found
+
+
+def task_randomization(environment: str) -> str | Mapping[str, Any]:
+    """Return the randomisation of a task's own."""
+    return read_task(task_source_of(environment)).randomization
+
+
+# ---- training --------------------------------------------------------------------------------------------------------
+
+
+def training_settings(policy: str, family: Family, *, steps: int, rate: float, seed: int, sensors: Any = ()) -> dict[str, Any]:
+    """Return the settings of a training on from a policy: its own recipe, on the robots of a family.
+
+    Args:
+        policy: where it starts. family: what it trains with.
+        steps: environment steps. rate: learning rate at the start. seed: of everything random.
+        sensors: which of camera and flow the robot has.
+    """
+    settings = dict(agent_function("ppo", "settings_to_start_from")(policy))
+    environment = dict(settings.get("environment") or {})
+    task = environment.get("task")
+    task = dict(task) if isinstance(task, Mapping) else {}
+    if task.get("sensors"):
+        task["sensors"] = {name: float(name in sensors) for name in OPTIONAL}
+    environment |= {"randomization": dict(family.randomization)} | ({"task": task} if task else {})
+    if family.effects:
+        environment["effects"] = [dict(one) for one in family.effects]
+    else:
+        environment.pop("effects", None)
+    batch = settings.get("num_envs", 512) * settings.get("steps_per_env", 32)
+    every = max(batch, steps // _SCORES)
+    return settings | {
+        "environment": environment,
+        "tasks": {},
+        "seed": seed,
+        "total_steps": steps,
+        "learning_rate": rate,
+        "final_learning_rate": FALLS_TO * rate,
+        "evaluate_every": every,
+        "checkpoint_every": every,
+    }
+
+
+def train_on(progress: Progress, found: Uncertainty) -> StepRecord:
+    """Train on from the policy; an interrupted training resumes from its newest checkpoint."""
+    asked, folder = progress.asked, progress.out / TRAINING
+    config = progress.folder("model") / SETTINGS_FILE
+
+    def on_update(update: TrainingProgress) -> None:
+        progress.tell("training", update.steps / update.total_steps)
+
+    if (folder / CONFIG_FILE).is_file():
+        resume_training(folder, on_update=on_update)
+    else:
+        settings = training_settings(
+            asked.policy, found.training, steps=asked.steps, rate=asked.learning_rate, seed=asked.seed, sensors=asked.sensors
+        )
+        write_yaml(config, settings)
+        train(asked.environment, folder, config, init=asked.policy, on_update=on_update)
+    seconds = progress.spent.get(TRAINING, 0.0)
+    return StepRecord(
+        said=(f"{asked.steps:,} environment steps from {asked.policy}, learning rate {asked.learning_rate:g}.",),
+        command=f"wlr train {asked.environment} --config {config} --init {asked.policy} --out {folder}",
+        numbers={"steps": asked.steps, "earlier": duration(seconds)},
+    )
+
+
+def trained_policy(progress: Progress) -> str:
+    """Return the policy that did best on the training's held-out episodes."""
+    best = progress.out / TRAINING / "best"
+    return str(best if best.is_dir() else progress.out / TRAINING / "policy")
+
+
+# ---- acceptance ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Tested:
+    """What the acceptance test says of the trained policy.
+
+    Attributes:
+        losses: one per family.
+        accepted: it is nowhere worse by more than was allowed, and better where the result says that the robot is.
+    """
+
+    losses: tuple[Any, ...]
+    accepted: bool
+
+
+def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> tuple[StepRecord, str]:
+    """Test the trained policy against the old one over all that the result leaves open; return which one is kept."""
+    asked, folder, new = progress.asked, progress.folder("acceptance"), trained_policy(progress)
+    tests: list[Acceptance] = []
+    for number, family in enumerate(found.families):
+        path = folder / f"{family.name.replace(' ', '_')}.json"
+        if not path.is_file():
+            progress.tell(f"acceptance: {family.name}", number / len(found.families))
+            write_acceptance(path, test_family(new, asked.policy, asked, family, own, progress.threads))
+        tests.append(read_acceptance(path))
+    losses = tuple(loss for test in tests for loss in test.losses)
+    worse = [loss for loss in losses if not loss.bound <= LARGEST_LOSS]
+    better = next(loss for loss in losses if loss.floors == STATED).bound < 0.0
+    kept = new if better and not worse else asked.policy
+    if kept == new:
+        verdict = "The new policy is kept: better on the robot as the result states it, and nowhere worse."
+    elif worse:
+        verdict = f"The old policy is kept: the new one may be worse in '{worse[0].floors}' (by up to {worse[0].bound:.1f} %)."
+    else:
+        verdict = "The old policy is kept: the new one is not better beyond the interval."
+    rows = [row for test in tests for row in acceptance_rows(test)[1:]]
+    numbers = {
+        "kept": "new" if kept == new else "old",
+        "losses": [{"family": one.floors, "loss_percent": one.loss, "upper_bound": one.bound} for one in losses],
+    }
+    randomization = progress.out / "model" / "randomization.yaml"
+    command = f"wlr evaluate new={new} old={asked.policy} --randomization {randomization} --sensors none"
+    return StepRecord(said=(verdict,), command=command, numbers=numbers | {"rows": rows}), kept
+
+
+def test_family(new: str, old: str, asked: Any, family: Family, own: Robot, threads: int = 1) -> Acceptance:
+    """Play two policies on the same episodes of a family."""
+    return accept(
+        new,
+        asked.environment,
+        references=[old],
+        floors=[{**family.randomization, "name": family.name}],
+        episodes=asked.episodes,
+        seeds=1,
+        sensors=asked.sensors,
+        robot=own,
+        effects=list(family.effects) or None,
+        threads=threads,
+    )
+
+
+def policy_is_new(progress: Progress, kept: str) -> bool:
+    """Whether the kept policy is not the old one."""
+    return contract_of(kept) != contract_of(progress.asked.policy)
