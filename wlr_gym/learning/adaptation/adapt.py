@@ -155,9 +155,7 @@ def _fitting(policy: str | Path, environment: str, own: Robot) -> str:
 def run_steps(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> Adapted:
     """Do the steps that are not done, and write the page."""
     _step(progress, "before", lambda: drive_before(progress, robot))
-    _step(progress, "runs", lambda: record_runs(progress, robot, own))
-    decided = _gap(progress, robot)
-    found = _model(progress, decided, own)
+    _, found = find_uncertainty(progress, robot, own)
     kept = progress.asked.policy
     if found is None:
         for name in ("training", "acceptance"):
@@ -168,6 +166,13 @@ def run_steps(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> Ada
     _step(progress, "after", lambda: drive_after(progress, robot, kept))
     page = write_page(progress, kept)
     return Adapted(kept, kept != progress.asked.policy, dict(progress.steps), page)
+
+
+def find_uncertainty(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> tuple[Decided, Uncertainty | None]:
+    """Do the steps from the runs to what the result states; None where it states nothing."""
+    _step(progress, "runs", lambda: record_runs(progress, robot, own))
+    decided = _gap(progress, robot)
+    return decided, _model(progress, decided, own)
 
 
 def _step(progress: Progress, name: str, work: Callable[[], StepRecord]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,6 @@ from wlr_gym.learning.evaluation.acceptance import (
 )
 from wlr_gym.learning.training import resume_training, train
 from wlr_gym.physics.effects import load_patch
-from wlr_gym.policy import contract_of
 from wlr_gym.policy.agents import TrainingProgress, agent_function
 from wlr_gym.robot import Robot
 
@@ -166,19 +164,6 @@ def trained_policy(progress: Progress) -> str:
 # ---- acceptance ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Tested:
-    """What the acceptance test says of the trained policy.
-
-    Attributes:
-        losses: one per family.
-        accepted: it is nowhere worse by more than was allowed, and better where the result says that the robot is.
-    """
-
-    losses: tuple[Any, ...]
-    accepted: bool
-
-
 def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> tuple[StepRecord, str]:
     """Test the trained policy against the old one over all that the result leaves open; return which one is kept."""
     asked, folder, new = progress.asked, progress.folder("acceptance"), trained_policy(progress)
@@ -187,7 +172,7 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> tuple[S
         path = folder / f"{family.name.replace(' ', '_')}.json"
         if not path.is_file():
             progress.tell(f"acceptance: {family.name}", number / len(found.families))
-            write_acceptance(path, test_family(new, asked.policy, asked, family, own, progress.threads))
+            write_acceptance(path, compare_on(new, asked.policy, asked, family, own, progress.threads))
         tests.append(read_acceptance(path))
     losses = tuple(loss for test in tests for loss in test.losses)
     worse = [loss for loss in losses if not loss.bound <= LARGEST_LOSS]
@@ -209,7 +194,7 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> tuple[S
     return StepRecord(said=(verdict,), command=command, numbers=numbers | {"rows": rows}), kept
 
 
-def test_family(new: str, old: str, asked: Any, family: Family, own: Robot, threads: int = 1) -> Acceptance:
+def compare_on(new: str, old: str, asked: Any, family: Family, own: Robot, threads: int = 1) -> Acceptance:
     """Play two policies on the same episodes of a family."""
     return accept(
         new,
@@ -223,8 +208,3 @@ def test_family(new: str, old: str, asked: Any, family: Family, own: Robot, thre
         effects=list(family.effects) or None,
         threads=threads,
     )
-
-
-def policy_is_new(progress: Progress, kept: str) -> bool:
-    """Whether the kept policy is not the old one."""
-    return contract_of(kept) != contract_of(progress.asked.policy)

@@ -67,7 +67,9 @@ def uncertainty_of(result: Result, found: Patch, base: str | Mapping[str, Any], 
     Raises:
         InputError: a result with numbers that mean nothing to the robot.
     """
-    named = [one for one in result.effects if one.name in EFFECTS]
+    refuted = makes_worse(result)
+    found = Patch() if refuted else found
+    named = [] if refuted else [one for one in result.effects if one.name in EFFECTS]
     effects = [dict(one.content()) for one in found.effects if one.name == UNKNOWN_EFFECT]
     maker = _Maker(result, robot, folder)
     base = _named_base(base, folder)
@@ -77,7 +79,7 @@ def uncertainty_of(result: Result, found: Patch, base: str | Mapping[str, Any], 
         if named and any(one.ci95 for entry in named for one in entry.parameters.values()):
             families.append(Family(name, maker.make(name, OWN_FLOOR, [_at_end(one, end) for one in named]), effects))
     families.append(Family("other floors", maker.make("other floors", base, named), effects))
-    for one in explanations(result)[1:] if len(explanations(result)) > 1 else ():
+    for one in explanations(result)[1:]:
         if one.probability >= LEAST_PROBABILITY and {e.name for e in one.effects} <= set(EFFECTS):
             entries = [_entry(effect) for effect in one.effects]
             title = "nothing missing" if one.name == NOTHING else f"or {plain(one.name)}"
@@ -85,6 +87,12 @@ def uncertainty_of(result: Result, found: Patch, base: str | Mapping[str, Any], 
     save_patch(found, folder / "patch.yaml")
     write_yaml(folder / "randomization.yaml", dict(training.randomization))
     return Uncertainty(found, training, tuple(families), _said(result, named, effects))
+
+
+def makes_worse(result: Result) -> bool:
+    """Whether what was found makes the error of the held-out runs larger: then it is not taken."""
+    gap = result.gap
+    return gap is not None and gap.reduction_signed is not None and gap.reduction_signed < 0.0
 
 
 class _Maker:
@@ -132,12 +140,14 @@ def _entry(effect: PatchEffect) -> EffectEntry:
 
 def _said(result: Result, named: Sequence[EffectEntry], formulas: Sequence[Any]) -> tuple[str, ...]:
     lines = []
+    if result.effects and makes_worse(result):
+        lines.append("What was named makes the error of the held-out runs larger: it is not taken.")
     if named:
         lines.append(f"Effects of the result: {listed([plain(one.name) for one in named])}, each within its interval.")
     if formulas:
         lines.append("A formula of the result acts as it is, without an interval.")
     if not (named or formulas):
-        lines.append("No effect was named: only what calibration knows is taken.")
+        lines.append("No effect is taken: only what calibration knows.")
     elif len(explanations(result)) > 1:
         lines.append("The runs do not decide between names; the others are families of the acceptance test.")
     return (*lines, f"{len(result.calibration)} calibrated numbers, each within its interval.")
