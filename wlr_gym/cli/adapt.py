@@ -64,9 +64,9 @@ class AdaptOptions(PatchOption, SensorsOption):
     """Episodes of the task before and after, each."""
     drive_seconds: float = 10.0
     """Length of such an episode."""
-    steps: int = 1_000_000
+    steps: int = 2_500_000
     """Environment steps of the training."""
-    learning_rate: float = 1e-4
+    learning_rate: float = 5e-4
     """Its learning rate at the start."""
     episodes: int = 256
     """Episodes of every family of the acceptance test."""

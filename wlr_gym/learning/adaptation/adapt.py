@@ -15,7 +15,7 @@ from wlr_gym.gap.decision import Decided
 from wlr_gym.learning.adaptation.driving import drive_after, drive_before, record_runs
 from wlr_gym.learning.adaptation.learning import accept_policy, find_gap, state_uncertainty, train_on
 from wlr_gym.learning.adaptation.page import write_page
-from wlr_gym.learning.adaptation.plan import EXCITATIONS, Asked, Progress, StepRecord, Tell, open_folder
+from wlr_gym.learning.adaptation.plan import EXCITATIONS, AdaptStep, Asked, Progress, Tell, open_folder
 from wlr_gym.learning.adaptation.robots import AdaptedRobot, EmulatedRobot, RealRobot
 from wlr_gym.learning.adaptation.uncertainty import Uncertainty
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
@@ -38,7 +38,7 @@ class Adapted:
 
     policy: str
     is_new: bool
-    steps: dict[str, StepRecord]
+    steps: dict[str, AdaptStep]
     page: Path
 
 
@@ -57,8 +57,8 @@ def adapt(
     budget_seconds: float | None = None,
     drives: int = 6,
     drive_seconds: float = 10.0,
-    steps: int = 1_000_000,
-    learning_rate: float = 1e-4,
+    steps: int = 2_500_000,
+    learning_rate: float = 5e-4,
     episodes: int = 256,
     sensors: Sequence[str] = (),
     seed: int = 0,
@@ -159,7 +159,7 @@ def run_steps(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> Ada
     kept = progress.asked.policy
     if found is None:
         for name in ("training", "acceptance"):
-            _step(progress, name, lambda: StepRecord(outcome="left out", said=("There is nothing to train on.",)))
+            _step(progress, name, lambda: AdaptStep(outcome="left out", said=("There is nothing to train on.",)))
     else:
         _step(progress, "training", lambda: train_on(progress, found))
         kept = _acceptance(progress, found, own)
@@ -175,7 +175,7 @@ def find_uncertainty(progress: Progress, robot: AdaptedRobot | None, own: Robot)
     return decided, _model(progress, decided, own)
 
 
-def _step(progress: Progress, name: str, work: Callable[[], StepRecord]) -> None:
+def _step(progress: Progress, name: str, work: Callable[[], AdaptStep]) -> None:
     """Do a step that is not done yet; Ctrl-C leaves what it has."""
     if name in progress.steps:
         return
@@ -189,7 +189,7 @@ def _gap(progress: Progress, robot: AdaptedRobot | None) -> Decided:
     """Do the gap step; where it is done, read what it found: the search itself resumes."""
     kept: list[Decided] = []
 
-    def work() -> StepRecord:
+    def work() -> AdaptStep:
         found, decided = find_gap(progress, robot)
         kept.append(decided)
         return found
@@ -213,7 +213,7 @@ def _decided(progress: Progress) -> Decided:
 
 
 def _model(progress: Progress, decided: Decided, own: Robot) -> Uncertainty | None:
-    """State what is uncertain: quick, and so made again where the step is done."""
+    """AdaptState what is uncertain: quick, and so made again where the step is done."""
     with progress.clock("model"):
         record, found = state_uncertainty(progress, decided, own)
     _step(progress, "model", lambda: record)
@@ -223,7 +223,7 @@ def _model(progress: Progress, decided: Decided, own: Robot) -> Uncertainty | No
 def _acceptance(progress: Progress, found: Uncertainty, own: Robot) -> str:
     kept: list[Any] = []
 
-    def work() -> StepRecord:
+    def work() -> AdaptStep:
         record, policy = accept_policy(progress, found, own)
         kept.append(policy)
         return record.model_copy(update={"numbers": {**record.numbers, "policy": policy}})

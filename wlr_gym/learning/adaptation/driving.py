@@ -16,7 +16,7 @@ from wlr_gym.base.files import write_json
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.read import read_dataset, read_run, run_files
 from wlr_gym.data.replay import robot_of
-from wlr_gym.learning.adaptation.plan import Progress, StepRecord
+from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
 from wlr_gym.learning.adaptation.robots import AdaptedRobot, excite_robot, interrupted
 from wlr_gym.learning.evaluation.robot_episodes import RobotEpisode, drive_episode
 from wlr_gym.learning.evaluation.scoring import evaluate
@@ -33,18 +33,18 @@ EPISODES_FILE = "episodes.json"
 _NO_ROBOT = "No robot to drive: measured runs were given."
 
 
-def drive_before(progress: Progress, robot: AdaptedRobot | None) -> StepRecord:
+def drive_before(progress: Progress, robot: AdaptedRobot | None) -> AdaptStep:
     """Drive the task with the old policy; in simulation the same commands on the model as its file has it."""
     asked = progress.asked
     if robot is None:
-        return StepRecord(outcome="left out", said=(_NO_ROBOT,))
+        return AdaptStep(outcome="left out", said=(_NO_ROBOT,))
     seeds = [BEFORE + 1000 * asked.seed + k for k in range(asked.drives)]
     driven = episodes_of(progress, "before", {"old": asked.policy}, robot, seeds)["old"]
     model = on_the_model(progress, seeds)
     errors = errors_of(driven)
     lost = paired(errors, np.full(len(errors), model))
     said = f"Tracking error on the robot {errors.mean():.3f}, of the model as its file has it {model:.3f}."
-    return StepRecord(
+    return AdaptStep(
         said=(said, *stops(driven)),
         driving=sum(one.seconds for one in driven),
         command=_deploy_command(asked.policy, progress, seeds[0]),
@@ -53,13 +53,13 @@ def drive_before(progress: Progress, robot: AdaptedRobot | None) -> StepRecord:
     )
 
 
-def drive_after(progress: Progress, robot: AdaptedRobot | None, kept: str) -> StepRecord:
+def drive_after(progress: Progress, robot: AdaptedRobot | None, kept: str) -> AdaptStep:
     """Drive fresh episodes with the old policy and the kept one, in turns."""
     asked = progress.asked
     if robot is None:
-        return StepRecord(outcome="left out", said=(_NO_ROBOT, f"To drive it: wlr deploy {kept}"))
+        return AdaptStep(outcome="left out", said=(_NO_ROBOT, f"To drive it: wlr deploy {kept}"))
     if kept == asked.policy:
-        return StepRecord(outcome="left out", said=("The old policy is kept: there is nothing new to drive.",))
+        return AdaptStep(outcome="left out", said=("The old policy is kept: there is nothing new to drive.",))
     seeds = [AFTER + 1000 * asked.seed + k for k in range(asked.drives)]
     driven = episodes_of(progress, "after", {"old": asked.policy, "new": kept}, robot, seeds)
     old, new = errors_of(driven["old"]), errors_of(driven["new"])
@@ -67,7 +67,7 @@ def drive_after(progress: Progress, robot: AdaptedRobot | None, kept: str) -> St
     regained = 100.0 * (old.mean() - new.mean()) / (old.mean() - model) if old.mean() > model else float("nan")
     said = f"Tracking error on fresh episodes {old.mean():.3f} with the old policy, {new.mean():.3f} with the new one: "
     said += f"{gain.mean:.0f} % [{gain.low:.0f}, {gain.high:.0f}] better."
-    return StepRecord(
+    return AdaptStep(
         said=(said, *stops([*driven["old"], *driven["new"]])),
         driving=sum(one.seconds for both in driven.values() for one in both),
         command=_deploy_command(kept, progress, seeds[0]),
@@ -76,7 +76,7 @@ def drive_after(progress: Progress, robot: AdaptedRobot | None, kept: str) -> St
     )
 
 
-def record_runs(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> StepRecord:
+def record_runs(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> AdaptStep:
     """Drive the excitations, or check the runs that were given.
 
     Raises:
@@ -103,7 +103,7 @@ def record_runs(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> S
         write_json(noted, done)
     stopped = [f"The supervision stopped '{name}': {one['stopped']}" for name, one in done.items() if one["stopped"]]
     kept = [name for name, one in done.items() if one["run"]]
-    return StepRecord(
+    return AdaptStep(
         said=(f"{len(kept)} of {len(done)} excitations left a run: {', '.join(kept) or 'none'}.", *stopped),
         driving=sum(one["seconds"] for one in done.values()),
         command=f"wlr record --excitation {' '.join(asked.excitations)} --out {folder}{_emulated_words(progress)}",
@@ -117,7 +117,7 @@ def _drop_unnoted(folder: Path, done: Mapping[str, Any]) -> None:
             path.unlink()
 
 
-def _given_runs(folder: Path, own: Robot) -> StepRecord:
+def _given_runs(folder: Path, own: Robot) -> AdaptStep:
     runs = read_dataset(folder).runs
     for run in runs:
         measured = robot_of(run)
@@ -127,7 +127,7 @@ def _given_runs(folder: Path, own: Robot) -> StepRecord:
                 f"({robot_hash(own)}); expected runs of the policy's robot"
             )
     seconds = sum(float(run["t"][-1] - run["t"][0]) for run in runs)
-    return StepRecord(said=(f"{len(runs)} measured runs were given, {seconds:.0f} s in all.",), driving=seconds)
+    return AdaptStep(said=(f"{len(runs)} measured runs were given, {seconds:.0f} s in all.",), driving=seconds)
 
 
 def _seconds(run: Path) -> float:
@@ -185,8 +185,8 @@ def errors_of(episodes: Sequence[RobotEpisode]) -> Array:
 
 def paired(ours: Array, theirs: Array) -> Estimate:
     """Return by how much ours is better, % of theirs, with its interval over the episodes."""
-    pairs = [np.stack([values, np.ones(len(values))], axis=1)[None] for values in (ours, theirs)]
-    return Bootstrap(1, len(ours)).reduction(*pairs)
+    one, other = (np.stack([values, np.ones(len(values))], axis=1)[None] for values in (ours, theirs))
+    return Bootstrap(1, len(ours)).reduction(one, other)
 
 
 def stops(episodes: Sequence[RobotEpisode]) -> tuple[str, ...]:

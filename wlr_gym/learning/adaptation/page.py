@@ -10,7 +10,7 @@ from typing import Any
 from wlr_gym.base.files import write_json, write_text
 from wlr_gym.base.html import commands, document, section, table
 from wlr_gym.base.text import duration
-from wlr_gym.learning.adaptation.plan import STEPS, Progress, StepRecord
+from wlr_gym.learning.adaptation.plan import STEPS, AdaptStep, Progress
 
 PAGE_FILE, NUMBERS_FILE = "adapt.html", "adapt.json"
 FORMAT = 1
@@ -90,7 +90,7 @@ def _times(progress: Progress, content: dict[str, Any]) -> str:
     return table(("step", "", "driving", "computing"), rows, (2, 3))
 
 
-def _step(record: StepRecord) -> str:
+def _step(record: AdaptStep) -> str:
     said = "".join(f"<p>{escape(line)}</p>" for line in record.said)
     numbers = record.numbers
     if "rows" in numbers:

@@ -22,7 +22,7 @@ STEPS = ("before", "runs", "gap", "model", "training", "acceptance", "after")
 #: Excitations of the first runs: between them they drive straight, turn, stop and move the legs.
 EXCITATIONS = ("straight", "turns", "stop_and_go", "posture")
 
-Tell = Callable[[str, float], object]
+Tell = Callable[[str, float], None]
 
 
 class Asked(SettingsModel):
@@ -53,18 +53,18 @@ class Asked(SettingsModel):
     effects: list[dict[str, Any]] = Field(default_factory=list)
     backend: str = "gibbs_appell"
     excitations: tuple[str, ...] = EXCITATIONS
-    budget_runs: int = Field(2, ge=0)
-    budget_seconds: float | None = Field(None, ge=0)
-    drives: int = Field(6, ge=2)
-    drive_seconds: float = Field(10.0, gt=0)
-    steps: int = Field(1_000_000, gt=0)
-    learning_rate: float = Field(1e-4, gt=0)
-    episodes: int = Field(256, ge=8)
+    budget_runs: int = Field(default=2, ge=0)
+    budget_seconds: float | None = Field(default=None, ge=0)
+    drives: int = Field(default=6, ge=2)
+    drive_seconds: float = Field(default=10.0, gt=0)
+    steps: int = Field(default=2_500_000, gt=0)
+    learning_rate: float = Field(default=5e-4, gt=0)
+    episodes: int = Field(default=256, ge=8)
     sensors: tuple[str, ...] = ()
-    seed: int = Field(0, ge=0)
+    seed: int = Field(default=0, ge=0)
 
 
-class StepRecord(SettingsModel):
+class AdaptStep(SettingsModel):
     """A step that is over.
 
     Attributes:
@@ -83,11 +83,11 @@ class StepRecord(SettingsModel):
     numbers: dict[str, Any] = Field(default_factory=dict)
 
 
-class State(SettingsModel):
+class AdaptState(SettingsModel):
     """``state.json``."""
 
     asked: Asked
-    steps: dict[str, StepRecord] = Field(default_factory=dict)
+    steps: dict[str, AdaptStep] = Field(default_factory=dict)
     spent: dict[str, float] = Field(default_factory=dict)
 
 
@@ -105,7 +105,7 @@ class Progress:
     asked: Asked
     tell: Tell = lambda text, share: None
     threads: int = 1
-    steps: dict[str, StepRecord] = field(default_factory=dict)
+    steps: dict[str, AdaptStep] = field(default_factory=dict)
     spent: dict[str, float] = field(default_factory=dict)
 
     def folder(self, step: str) -> Path:
@@ -113,14 +113,14 @@ class Progress:
         make_output_folder(self.out / step)
         return self.out / step
 
-    def note(self, step: str, record: StepRecord) -> None:
+    def note(self, step: str, record: AdaptStep) -> None:
         """Note that a step is over."""
         self.steps[step] = record.model_copy(update={"computing": round(self.spent.get(step, 0.0), 2)})
         self.save()
 
     def save(self) -> None:
         """Write ``state.json``."""
-        state = State(asked=self.asked, steps=self.steps, spent=self.spent)
+        state = AdaptState(asked=self.asked, steps=self.steps, spent=self.spent)
         write_json(self.out / STATE_FILE, state.model_dump(mode="json"))
 
     @contextmanager
@@ -147,7 +147,7 @@ def open_folder(out: Path, asked: Asked, tell: Tell, threads: int) -> Progress:
         make_output_folder(out)
         return Progress(out, asked, tell, threads)
     try:
-        state = parse_config(State, json.loads(path.read_text(encoding="utf-8")), str(path))
+        state = parse_config(AdaptState, json.loads(path.read_text(encoding="utf-8")), str(path))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
     for name in Asked.model_fields:

@@ -77,7 +77,7 @@ class AdaptStudy:
     cases: tuple[AdaptCase, ...]
     drives: int = 8
     seconds: float = 10.0
-    steps: int = 1_000_000
+    steps: int = 2_500_000
     episodes: int = 256
     excitations: tuple[str, ...] = ("straight", "turns", "stop_and_go", "posture")
     budget_runs: int = 1
@@ -225,7 +225,7 @@ def _train(progress: Progress, name: str, family: Family) -> str:
         settings = training_settings(asked.policy, family, steps=asked.steps, rate=asked.learning_rate, seed=asked.seed)
         write_yaml(progress.out / f"{name}.yaml", settings)
         train(asked.environment, folder, progress.out / f"{name}.yaml", init=asked.policy)
-    return str(folder / "best")
+    return str(folder / "policy")
 
 
 def _truth(progress: Progress, hidden: Patch, own: Robot) -> str:
@@ -247,7 +247,7 @@ def _wide(study: AdaptStudy, own: Robot) -> str:
     asked = study.asked(study.cases[0]).model_copy(update={"seed": 0})
     progress = Progress(study.out / "work", asked)
     if (progress.out / "wide" / "policy").is_dir():
-        return str(progress.out / "wide" / "best")
+        return str(progress.out / "wide" / "policy")
     randomization = load_randomization("wide", own).config.model_dump(mode="json", exclude_none=True)
     return _train(progress, "wide", Family("wide", randomization))
 
