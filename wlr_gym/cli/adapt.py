@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -91,7 +93,7 @@ def run(options: AdaptOptions) -> int:
     _check(options)
     console = Console(soft_wrap=True, highlight=False, file=sys.stderr if options.json else None)
     real = _real(options, console) if options.hardware is not None else None
-    with progress(console) as tell:
+    with _resumable(), progress(console) as tell:
         found = adapt(
             options.policy,
             options.out,
@@ -121,6 +123,15 @@ def run(options: AdaptOptions) -> int:
         return OK
     _print(found, console)
     return OK
+
+
+@contextmanager
+def _resumable() -> Iterator[None]:
+    """Say on Ctrl-C how it goes on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("interrupted; the same command goes on where it was") from None
 
 
 def _check(options: AdaptOptions) -> None:

@@ -9,8 +9,10 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.provenance import record_provenance
+from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.record import same_profile
+from wlr_gym.envs.registry import task_name_of
 from wlr_gym.gap.decision import Decided
 from wlr_gym.learning.adaptation.driving import drive_after, drive_before, record_runs
 from wlr_gym.learning.adaptation.learning import accept_policy, find_gap, state_uncertainty, train_on
@@ -95,26 +97,27 @@ def adapt(
     if driven is None and robot_runs is None:
         driven = EmulatedRobot(own, patch, backend)
     same_profile([excite(name, seed, own) for name in excitations])
-    asked = Asked(
-        policy=str(policy),
-        identity=identity(read_subjects([str(policy)])[0]),
-        environment=chosen,
-        robot_runs=None if robot_runs is None else str(Path(robot_runs).resolve()),
-        robot=_fitting(policy, chosen, own),
-        driven="" if driven is None else "real" if isinstance(driven, RealRobot) else "emulated",
-        effects=[dict(one.content()) for one in patch.effects],
-        backend=backend,
-        excitations=tuple(excitations),
-        budget_runs=budget_runs,
-        budget_seconds=budget_seconds,
-        drives=drives,
-        drive_seconds=drive_seconds,
-        steps=steps,
-        learning_rate=learning_rate,
-        episodes=episodes,
-        sensors=tuple(sensors),
-        seed=seed,
-    )
+    given = {
+        "policy": str(policy),
+        "identity": identity(read_subjects([str(policy)])[0]),
+        "environment": chosen,
+        "robot_runs": None if robot_runs is None else str(Path(robot_runs).resolve()),
+        "robot": _fitting(policy, chosen, own),
+        "driven": "" if driven is None else "real" if isinstance(driven, RealRobot) else "emulated",
+        "effects": [dict(one.content()) for one in patch.effects],
+        "backend": backend,
+        "excitations": tuple(excitations),
+        "budget_runs": budget_runs,
+        "budget_seconds": budget_seconds,
+        "drives": drives,
+        "drive_seconds": drive_seconds,
+        "steps": steps,
+        "learning_rate": learning_rate,
+        "episodes": episodes,
+        "sensors": tuple(sensors),
+        "seed": seed,
+    }
+    asked = parse_config(Asked, given, "wlr adapt")
     if robot_runs is not None and not Path(robot_runs).is_dir():
         raise InputError(f"--robot-runs {robot_runs}: no such folder; expected measured runs")
     progress = open_folder(Path(out), asked, tell, threads)
@@ -144,6 +147,9 @@ def _fitting(policy: str | Path, environment: str, own: Robot) -> str:
     from wlr_gym.robot import robot_hash
 
     contract_to_start_from(policy)
+    trained = trained_environment(policy)
+    if trained is not None and task_name_of(trained) != task_name_of(environment):
+        raise InputError(f"--env {environment}: '{policy}' was made for another environment, {trained}; leave --env out")
     core = make_core(environment, 1, environment_for(policy, {"robot": own}))
     try:
         make_policy(str(policy), core.contract())
@@ -202,7 +208,6 @@ def _gap(progress: Progress, robot: AdaptedRobot | None) -> Decided:
 
 def _decided(progress: Progress) -> Decided:
     """Return what a gap step that is done has found, from its files."""
-    from wlr_gym.base.settings import parse_config, read_yaml
     from wlr_gym.gap.decision import HISTORY_FILE, History
     from wlr_gym.gap.report.result import RESULT_FILE, read_result
 
