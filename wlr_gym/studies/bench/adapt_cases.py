@@ -1,8 +1,9 @@
-"""Cases of ``wlr bench adapt``, fixed beforehand: faults of the blind test's tables, on two copies of the robot each.
+"""Cases of ``wlr bench adapt``, fixed beforehand: faults on two copies of the robot each.
 
-Places, signs and sizes are those of the blind test, which shares no code with what names them; so are the three laws that no
-library names, written here as formulas. What acts in the emulated robot is the library's own implementation of each effect, on
-another simulator and at another step than the training's: analyser and fault share the law. ``shared`` says so, case by case.
+Named faults are as large as the library holds for plausible, since smaller ones cost the shipped policy nothing that eight episodes
+would show. Laws that no library names are drawn by the blind test, which shares no code with what names effects, and written here as
+formulas. What acts in the emulated robot is the library's own implementation, on another simulator and at another step than the
+training's: analyser and fault share the law of every named effect. ``shared`` says so, case by case.
 """
 
 from __future__ import annotations
@@ -15,19 +16,29 @@ import numpy as np
 
 from wlr_gym.base.errors import unknown_name
 from wlr_gym.envs.tasks.randomization import load_randomization
-from wlr_gym.robot import Robot
+from wlr_gym.robot import JOINTS, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
-from wlr_gym.studies.bench.blind.cases import named, strange
+from wlr_gym.studies.bench.blind.cases import strange
 
-#: Named effects: what cost the shipped policy most in a sweep of the library on the emulated robot, and others that did not.
-NAMED = (
-    "joint_zero_offset", "friction_asymmetry", "gyro_bias", "weak_motor", "command_delay", "wheel_radius_error",
-    "external_force", "tyre_creep", "payload", "backlash", "com_offset", "coulomb_friction",
-)  # fmt: skip
-#: Severities of the blind test: all at the first, the first six at the second, too.
-SEVERITIES = (4.0, 2.0)
-SECOND = NAMED[:6]
+LEFT = ("wheel_lf", "wheel_lr")
+#: Effect -> where, parameters, and for six of them the parameters of the second severity.
+NAMED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float], Mapping[str, float] | None]] = {
+    "joint_zero_offset": (("leg_rr",), {"angle": -0.1}, {"angle": -0.05}),
+    "friction_asymmetry": (LEFT, {"mu": 0.12}, {"mu": 0.25}),
+    "gyro_bias": (("sensor",), {"z": 0.05}, {"z": 0.02}),
+    "weak_motor": (LEFT, {"scale": 0.4}, {"scale": 0.65}),
+    "command_delay": (JOINTS, {"delay": 0.06}, {"delay": 0.04}),
+    "wheel_radius_error": (LEFT, {"scale": 0.91}, {"scale": 0.96}),
+    "external_force": (("body",), {"fx": -3.0, "fy": 2.0}, None),
+    "tyre_creep": (WHEELS, {"creep_speed": 0.2}, None),
+    "payload": (("body",), {"mass": 1.5, "x": -0.12, "y": 0.1, "z": 0.08}, None),
+    "backlash": (WHEELS, {"angle": 0.09}, None),
+    "com_offset": (("body",), {"x": -0.045, "y": 0.04, "z": 0.0}, None),
+    "coulomb_friction": (LEFT, {"torque": 0.3}, None),
+}
 PAIRS = (("joint_zero_offset", "command_delay"), ("friction_asymmetry", "gyro_bias"))
+#: Severity of the blind test at which its laws are drawn.
+STRANGE_SEVERITY = 6.0
 #: Laws outside the library: coordinate and formula; ``None`` = the leg at which the law is drawn.
 OUTSIDE: Mapping[str, tuple[str | None, str, Mapping[str, str]]] = {
     "leg_spring": (None, "-stiffness * (leg_angle - rest)", {"stiffness": "N m/rad", "rest": "rad"}),
@@ -44,14 +55,13 @@ class AdaptCase:
     """One robot with a fault.
 
     Attributes:
-        name: of the case. kind: ``named``, ``pair`` or ``outside``. severity: of the blind test.
+        name: of the case. kind: ``named``, ``second`` (severity), ``pair`` or ``outside``.
         effects: what is hidden, as a patch says it.
         copy: number of the copy. shared: the law that acts is the one that the analyser tries.
     """
 
     name: str
     kind: str
-    severity: float
     effects: tuple[Mapping[str, Any], ...]
     copy: int
     shared: bool
@@ -64,21 +74,14 @@ class AdaptCase:
 
 def cases() -> tuple[AdaptCase, ...]:
     """Return all cases: copy by copy, so that a part of them is a sample of all."""
-    faults = [("named", name, SEVERITIES[0], (name,)) for name in NAMED]
-    faults += [("pair", " + ".join(both), 2.0, both) for both in PAIRS]
-    faults += [("outside", name, SEVERITIES[0], (name,)) for name in OUTSIDE]
-    faults += [("named", name, SEVERITIES[1], (name,)) for name in SECOND]
+    faults = [("named", name, (_named(name),)) for name in NAMED]
+    faults += [("pair", "+".join(both), tuple(_named(name, second=True) for name in both)) for both in PAIRS]
+    faults += [("outside", name, (_outside(name),)) for name in OUTSIDE]
+    faults += [("second", f"{name}_2", (_named(name, second=True),)) for name in NAMED if NAMED[name][2] is not None]
     return tuple(
-        AdaptCase(
-            f"{title.replace(' + ', '+')}_{severity:g}_{copy}",
-            kind,
-            severity,
-            tuple(_effect(kind, name, severity, number) for name in names),
-            copy,
-            kind != "outside",
-        )
+        AdaptCase(f"{title}_copy{copy}", kind, effects, copy, kind != "outside")
         for copy in range(COPIES)
-        for number, (kind, title, severity, names) in enumerate(faults)
+        for kind, title, effects in faults
     )
 
 
@@ -99,15 +102,17 @@ def chosen_cases(names: tuple[str, ...]) -> tuple[AdaptCase, ...]:
     return tuple(there[name] for name in names)
 
 
-def _effect(kind: str, name: str, severity: float, number: int) -> Mapping[str, Any]:
-    draw = np.random.default_rng([27, number])
-    if kind != "outside":
-        return named(name, severity, draw)
-    drawn, (where, formula, units) = strange(name, severity, draw), OUTSIDE[name]
-    place = [where] if where is not None else drawn["where"]
+def _named(name: str, second: bool = False) -> Mapping[str, Any]:
+    where, first, other = NAMED[name]
+    return {"name": name, "where": list(where), "parameters": dict(other if second and other else first)}
+
+
+def _outside(name: str) -> Mapping[str, Any]:
+    drawn = strange(name, STRANGE_SEVERITY, np.random.default_rng([27, list(OUTSIDE).index(name)]))
+    where, formula, units = OUTSIDE[name]
     return {
         "name": "unknown_effect",
-        "where": place,
+        "where": [where] if where is not None else drawn["where"],
         "formula": formula,
         "parameters": dict(drawn["parameters"]),
         "units": dict(units),

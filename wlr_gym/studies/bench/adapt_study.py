@@ -205,7 +205,6 @@ def _line(study: AdaptStudy, case: AdaptCase, contender: str, say: Say) -> dict[
     return {
         "case": case.name,
         "kind": case.kind,
-        "severity": case.severity,
         "effects": [dict(one) for one in case.effects],
         "shared_law": case.shared,
         "contender": contender,
