@@ -1,4 +1,4 @@
-"""Episodes on an emulated robot: as in simulation, scored by the true motion; and the whole loop at a tiny size."""
+"""Episodes on an emulated robot, scored by the true motion; and the whole loop of docs/adapt.md at a tiny size."""
 
 import json
 
@@ -10,6 +10,7 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("onnxruntime")
 
 from wlr_gym.cli import OK, run_command
+from wlr_gym.hardware.emulator.memory import EmulatedWorld
 from wlr_gym.learning.adaptation.driving import paired
 from wlr_gym.learning.adaptation.robots import EmulatedRobot, RealRobot
 from wlr_gym.learning.evaluation import robot_episodes
@@ -34,7 +35,7 @@ class Watched(EmulatedRobot):
             self.seen.append((now["linear_velocity_in_body"][0, 0], now["angular_velocity_in_body"][0, 2]))
             return sensors
 
-        plant.step = stepped
+        plant.step = stepped  # pyright: ignore[reportAttributeAccessIssue]
         return plant, truth
 
     seen: list = []  # noqa: RUF012
@@ -69,6 +70,7 @@ class Failing(EmulatedRobot):
 
     def start(self, log, seed, meta=None):
         plant, truth = super().start(log, seed, meta)
+        assert isinstance(plant.loop.clock, EmulatedWorld)
         plant.loop.clock.machine.inject("dead imu after=1.5")
         return plant, truth
 

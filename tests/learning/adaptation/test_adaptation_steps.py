@@ -16,10 +16,11 @@ from wlr_gym.cli import main
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.record import record_simulation
 from wlr_gym.envs.tasks import load_randomization
-from wlr_gym.gap.decision import Recorded
+from wlr_gym.gap.decision import Decided, History, Recorded
 from wlr_gym.gap.report.entries import Result
 from wlr_gym.learning.adaptation import driving, learning, uncertainty
 from wlr_gym.learning.adaptation.plan import STEPS, AdaptStep, Asked, Progress, open_folder
+from wlr_gym.learning.adaptation.robots import EmulatedRobot
 from wlr_gym.learning.evaluation.acceptance import Acceptance, Loss
 from wlr_gym.physics.effects import Patch, load_patch
 from wlr_gym.robot import load_robot
@@ -35,7 +36,7 @@ def quiet(text, share):
 
 def asked(**changes):
     fields = {"policy": "velocity_slip_aware", "identity": "x", "environment": "WLR-Velocity-v0", "robot": "y"}
-    return Asked(**(fields | {"driven": "emulated"} | changes))
+    return Asked.model_validate(fields | {"driven": "emulated"} | changes)
 
 
 def result(effects=(), reduction=0.5, calibration=None, **content):
@@ -106,7 +107,7 @@ def test_a_formula_acts_as_an_effect_and_a_name_still_in_play_is_a_family(tmp_pa
     evidence[1] |= {"values": {"delay": 0.04}, "probability": 0.45}
     unknown = {"name": "unknown_effect", "where": ["leg_lr"], "parameters": {}, "confidence": 1.0, "formula": "-k * leg_angle"}
     content = {"evidence": evidence, "thresholds": [{"round": 1, "none": 0.05}]}
-    found = uncertainty.uncertainty_of(result([unknown], **content), patch, "slippery", ROBOT, tmp_path)
+    found = uncertainty.uncertainty_of(result([unknown], 0.5, None, **content), patch, "slippery", ROBOT, tmp_path)
     assert [one["formula"] for one in found.training.effects] == ["-k * leg_angle"]
     assert load_patch(tmp_path / "patch.yaml").content()["effects"] == patch.content()["effects"]
     other = next(one for one in found.families if one.name == "or command delay")
@@ -115,7 +116,8 @@ def test_a_formula_acts_as_an_effect_and_a_name_still_in_play_is_a_family(tmp_pa
 
 
 def test_without_numbers_the_old_policy_is_kept(tmp_path):
-    decided = SimpleNamespace(result=result(calibration={}, verdict="bad_data"), folder=tmp_path)
+    history = History(data="", robot=None, backend="", known=[])
+    decided = Decided(history, result(calibration={}, verdict="bad_data"), tmp_path)
     record, found = learning.state_uncertainty(Progress(tmp_path, asked()), decided, ROBOT)
     assert (record.outcome, found) == ("left out", None)
 
@@ -147,6 +149,7 @@ def test_the_new_policy_is_kept_where_it_is_better_and_nowhere_worse(tmp_path, m
 
     monkeypatch.setattr(learning, "compare_on", compare)
     monkeypatch.setattr(learning, "trained_policy", lambda progress: "new")
+    monkeypatch.setattr(learning, "export_trained", lambda progress: "new")
     families = [uncertainty.Family(name, {}) for name in bounds]
     found = uncertainty.Uncertainty(Patch(), families[0], tuple(families), ())
     for _ in range(2):  # the second time its files answer
@@ -179,8 +182,8 @@ def test_a_stopped_drive_is_said_and_an_interrupted_one_is_driven_again(tmp_path
     monkeypatch.setattr(driving, "excite_robot", drive)
     progress = Progress(tmp_path, asked(excitations=("straight", "turns")))
     with pytest.raises(KeyboardInterrupt):
-        driving.record_runs(progress, SimpleNamespace(), ROBOT)
-    record = driving.record_runs(progress, SimpleNamespace(), ROBOT)
+        driving.record_runs(progress, EmulatedRobot(ROBOT), ROBOT)
+    record = driving.record_runs(progress, EmulatedRobot(ROBOT), ROBOT)
     assert calls == ["straight", "turns", "turns"]
     assert record.said[0] == "1 of 2 excitations left a run: straight."
     assert record.said[1] == "The supervision stopped 'turns': tilt: 40 degrees"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, require_package, unknown_name
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.data.excitations import excite
@@ -32,7 +32,7 @@ class Adapted:
     """How an adaptation ended.
 
     Attributes:
-        policy: the one that is kept: the new one, or the old one as it was given.
+        policy: the one that is kept: the new one as a file, or the old one as it was given.
         is_new: whether it is the new one.
         steps: what each step found.
         page: ``adapt.html``; ``adapt.json`` beside it has the numbers.
@@ -87,6 +87,8 @@ def adapt(
         InputError: bad input of any step, before anything is driven where that can be known.
         KeyboardInterrupt: interrupted; the same call resumes.
     """
+    require_package("torch", "train")
+    require_package("onnxscript", "export")
     chosen = environment or _environment(policy)
     own = load_robot(robot if robot is not None else policy_environment(policy).get("robot") or "nominal")
     patch = load_patch(effects)

@@ -26,8 +26,10 @@ from wlr_gym.learning.evaluation.acceptance import (
     read_acceptance,
     write_acceptance,
 )
+from wlr_gym.learning.evaluation.rollout import make_core, seen_observations
 from wlr_gym.learning.training import resume_training, train
 from wlr_gym.physics.effects import load_patch
+from wlr_gym.policy import export_policy, make_policy, policy_environment
 from wlr_gym.policy.agents import TrainingProgress, agent_function
 from wlr_gym.robot import Robot
 
@@ -41,6 +43,10 @@ _SCORES = 4
 #: Name of the settings of the training.
 SETTINGS_FILE = "training.yaml"
 TRAINING = "training"
+#: Name of the policy that is kept, where it is the new one.
+POLICY_FILE = "policy.onnx"
+#: Robots, and s of their episodes, on whose observations the file is compared with the policy.
+EXPORT_ROBOTS, EXPORT_SECONDS = 8, 4.0
 
 
 # ---- gap -------------------------------------------------------------------------------------------------------------
@@ -164,6 +170,18 @@ def trained_policy(progress: Progress) -> str:
     return str(progress.out / TRAINING / "policy")
 
 
+def export_trained(progress: Progress) -> str:
+    """Write the trained policy as one file, which runs without torch, and return its path."""
+    source, path = trained_policy(progress), progress.out / POLICY_FILE
+    core = make_core(progress.asked.environment, EXPORT_ROBOTS, policy_environment(source))
+    try:
+        seen = seen_observations(core, make_policy(source, core.contract()), EXPORT_SECONDS)
+    finally:
+        core.close()
+    export_policy(source, path, seen)
+    return str(path)
+
+
 # ---- acceptance ------------------------------------------------------------------------------------------------------
 
 
@@ -188,8 +206,10 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> tuple[A
     else:
         verdict = "The old policy is kept: the new one is not better beyond the interval."
     rows = [row for test in tests for row in acceptance_rows(test)[1:]]
+    is_new = kept == new
+    kept = export_trained(progress) if is_new else kept
     numbers = {
-        "kept": "new" if kept == new else "old",
+        "kept": "new" if is_new else "old",
         "losses": [{"family": one.floors, "loss_percent": one.loss, "upper_bound": one.bound} for one in losses],
     }
     randomization = progress.out / "model" / "randomization.yaml"
