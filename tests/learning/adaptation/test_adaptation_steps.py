@@ -18,7 +18,7 @@ from wlr_gym.data.record import record_simulation
 from wlr_gym.envs.tasks import load_randomization
 from wlr_gym.gap.decision import Decided, History, Recorded
 from wlr_gym.gap.report.entries import Result
-from wlr_gym.learning.adaptation import driving, learning, uncertainty
+from wlr_gym.learning.adaptation import driving, identification, retraining, uncertainty
 from wlr_gym.learning.adaptation.plan import STEPS, AdaptStep, Asked, Progress, open_folder
 from wlr_gym.learning.adaptation.robots import EmulatedRobot
 from wlr_gym.learning.evaluation.acceptance import Acceptance, Loss
@@ -118,7 +118,7 @@ def test_a_formula_acts_as_an_effect_and_a_name_still_in_play_is_a_family(tmp_pa
 def test_without_numbers_the_old_policy_is_kept(tmp_path):
     history = History(data="", robot=None, backend="", known=[])
     decided = Decided(history, result(calibration={}, verdict="bad_data"), tmp_path)
-    record, found = learning.state_uncertainty(Progress(tmp_path, asked()), decided, ROBOT)
+    record, found = identification.state_uncertainty(Progress(tmp_path, asked()), decided, ROBOT)
     assert (record.outcome, found) == ("left out", None)
 
 
@@ -127,7 +127,7 @@ def test_without_numbers_the_old_policy_is_kept(tmp_path):
 
 def test_training_goes_on_with_the_policy_s_recipe_on_the_stated_robots(tmp_path):
     found = uncertainty.uncertainty_of(result([delay(0.03, 0.002)]), Patch(), "slippery", ROBOT, tmp_path)
-    settings = learning.training_settings("velocity_slip_aware", found.training, steps=10**6, rate=5e-4, seed=3)
+    settings = retraining.training_settings("velocity_slip_aware", found.training, steps=10**6, rate=5e-4, seed=3)
     environment = settings["environment"]
     assert environment["randomization"] == found.training.randomization
     assert environment["task"]["sensors"] == {"camera": 0.0, "flow": 0.0}
@@ -147,13 +147,13 @@ def test_the_new_policy_is_kept_where_it_is_better_and_nowhere_worse(tmp_path, m
         loss = Loss(family.name, old, 0.2, 0.2, bounds[family.name] - 1.0, bounds[family.name])
         return Acceptance(new, asked.environment, 8, 1, (), 5.0, "", (loss,))
 
-    monkeypatch.setattr(learning, "compare_on", compare)
-    monkeypatch.setattr(learning, "trained_policy", lambda progress: "new")
-    monkeypatch.setattr(learning, "export_trained", lambda progress: "new")
+    monkeypatch.setattr(retraining, "compare_on", compare)
+    monkeypatch.setattr(retraining, "trained_policy", lambda progress: "new")
+    monkeypatch.setattr(retraining, "export_trained", lambda progress: "new")
     families = [uncertainty.Family(name, {}) for name in bounds]
     found = uncertainty.Uncertainty(Patch(), families[0], tuple(families), ())
     for _ in range(2):  # the second time its files answer
-        assert learning.accept_policy(Progress(tmp_path, asked()), found, ROBOT)[1] == kept
+        assert retraining.accept_policy(Progress(tmp_path, asked()), found, ROBOT)[1] == kept
     assert played == list(bounds)
 
 

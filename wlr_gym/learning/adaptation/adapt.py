@@ -15,9 +15,10 @@ from wlr_gym.data.record import same_profile
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.gap.decision import Decided
 from wlr_gym.learning.adaptation.driving import drive_after, drive_before, record_runs
-from wlr_gym.learning.adaptation.learning import accept_policy, find_gap, state_uncertainty, train_on
+from wlr_gym.learning.adaptation.identification import find_gap, state_uncertainty
 from wlr_gym.learning.adaptation.page import write_page
 from wlr_gym.learning.adaptation.plan import EXCITATIONS, AdaptStep, Asked, Progress, Tell, open_folder
+from wlr_gym.learning.adaptation.retraining import accept_policy, train_on
 from wlr_gym.learning.adaptation.robots import AdaptedRobot, EmulatedRobot, RealRobot
 from wlr_gym.learning.adaptation.uncertainty import Uncertainty
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects

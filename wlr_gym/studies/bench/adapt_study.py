@@ -31,8 +31,9 @@ from wlr_gym.gap.robot.open import open_robot
 from wlr_gym.gap.workflow import SCATTER
 from wlr_gym.learning.adaptation.adapt import find_uncertainty
 from wlr_gym.learning.adaptation.driving import episodes_of, errors_of
-from wlr_gym.learning.adaptation.learning import accept_policy, task_randomization, train_on, training_settings
+from wlr_gym.learning.adaptation.identification import task_randomization
 from wlr_gym.learning.adaptation.plan import Asked, Progress, open_folder
+from wlr_gym.learning.adaptation.retraining import accept_policy, train_on, training_settings
 from wlr_gym.learning.adaptation.robots import EmulatedRobot
 from wlr_gym.learning.adaptation.uncertainty import Family, Uncertainty, uncertainty_of
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
