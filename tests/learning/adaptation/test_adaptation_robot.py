@@ -45,9 +45,7 @@ class Watched(EmulatedRobot):
 def test_an_episode_is_scored_by_the_true_motion(backend, monkeypatch):
     commands = []
     take = robot_episodes._Score.take
-    monkeypatch.setattr(
-        robot_episodes._Score, "take", lambda self, truth, command: commands.append(command[0]) or take(self, truth, command)
-    )
+    monkeypatch.setattr(robot_episodes._Score, "take", lambda self, command: commands.append(command[0]) or take(self, command))
     episode = drive_episode(ENVIRONMENT, POLICY, Watched(load_robot(), backend=backend, physics_step=0.002), 5, 1.0)
     speed, turn = (np.array(Watched.seen) - np.array(commands)).T
     assert episode.whole

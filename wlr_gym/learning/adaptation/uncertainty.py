@@ -11,7 +11,7 @@ from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import write_yaml
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.gap.report.entries import EffectEntry, Result
-from wlr_gym.gap.report.explanations import NOTHING, explanations
+from wlr_gym.gap.report.explanations import NOTHING, Explanation, explanations
 from wlr_gym.gap.report.text import listed, plain
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Patch, PatchEffect, save_patch
 from wlr_gym.robot import Robot
@@ -79,14 +79,20 @@ def uncertainty_of(result: Result, found: Patch, base: str | Mapping[str, Any], 
         if named and any(one.ci95 for entry in named for one in entry.parameters.values()):
             families.append(Family(name, maker.make(name, OWN_FLOOR, [_at_end(one, end) for one in named]), effects))
     families.append(Family("other floors", maker.make("other floors", base, named), effects))
-    for one in explanations(result)[1:]:
-        if one.probability >= LEAST_PROBABILITY and {e.name for e in one.effects} <= set(EFFECTS):
-            entries = [_entry(effect) for effect in one.effects]
-            title = "nothing missing" if one.name == NOTHING else f"or {plain(one.name)}"
-            families.append(Family(title, maker.make(title, OWN_FLOOR, entries)))
+    for one in _others(result, named):
+        title = "nothing missing" if one.name == NOTHING else f"or {plain(one.name)}"
+        families.append(Family(title, maker.make(title, OWN_FLOOR, [_entry(effect) for effect in one.effects])))
     save_patch(found, folder / "patch.yaml")
     write_yaml(folder / "randomization.yaml", dict(training.randomization))
     return Uncertainty(found, training, tuple(families), _said(result, named, effects))
+
+
+def _others(result: Result, named: Sequence[EffectEntry]) -> list[Explanation]:
+    """Return the explanations in play besides what is taken of the result, without formulas."""
+    taken = {(one.name, tuple(one.where)) for one in named}
+    found = [one for one in explanations(result) if one.probability >= LEAST_PROBABILITY]
+    found = [one for one in found if all(effect.name in EFFECTS for effect in one.effects)]
+    return [one for one in found if {(effect.name, tuple(effect.where)) for effect in one.effects} != taken]
 
 
 def makes_worse(result: Result) -> bool:

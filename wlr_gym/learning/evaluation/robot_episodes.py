@@ -17,7 +17,7 @@ from wlr_gym.envs.settings import read_settings
 from wlr_gym.envs.tasks.compiled_terms import Scores, compile_scores
 from wlr_gym.envs.tasks.success import scales_of, tracking_error
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
-from wlr_gym.hardware.loop import StoppedError
+from wlr_gym.hardware.deployment import Deployment, deploy
 from wlr_gym.hardware.operator import stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.evaluation.rollout import make_core
@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 
 #: Why an episode ended that was driven to its end.
 WHOLE = "time is over"
+#: The same of one in which it fell.
+FELL = "it fell"
 
 
 class EpisodeRobot(Protocol):
@@ -90,26 +92,13 @@ def drive_episode(
     core.plant.close()
     plant, truth = robot.start(log, seed)
     core.plant = plant
-    driver = make_policy(policy, core.contract())
-    score = _Score(_whole_task(environment, policy), core)
-    core.seed(0, seed)
-    driver.reset(core.everyone)
-    fell = False
+    score = _Score(_whole_task(environment, policy), core, truth)
     try:
         with stop_on_signals(plant.loop.operator):
-            core.begin_episodes(core.everyone)
-            score.begin(truth)
-            while not (core.terminated[0] or core.truncated[0] or fell):
-                command = core.command.copy()
-                core.step(driver.act(core.observation), core.everyone)
-                fell = score.take(truth, command)
-            plant.loop.stop("it fell" if fell else WHOLE)
-    except StoppedError:
-        pass
+            driven = deploy(core, make_policy(policy, core.contract()), seed, watcher=score)
     finally:
         core.close()
-    run = plant.loop.recorder.run
-    return score.episode(seed, plant.loop.reason, "" if run is None else str(run))
+    return score.episode(seed, driven)
 
 
 def _whole_task(environment: str, policy: str) -> Task:
@@ -120,8 +109,8 @@ def _whole_task(environment: str, policy: str) -> Task:
 class _Score:
     """The measures of an episode on a robot, by the kernel that scores simulated ones."""
 
-    def __init__(self, task: Task, core: Core) -> None:
-        self._task, self._core = task, core
+    def __init__(self, task: Task, core: Core, truth: Any) -> None:
+        self._task, self._core, self._true = task, core, truth
         self._kernel = compile_scores(task)
         wide, measures = len(task.rewards), len(task.measures)
         self._scores = Scores(
@@ -134,31 +123,30 @@ class _Score:
             largest=np.zeros((1, measures)),
         )
         self._start = np.zeros_like(core.start)
-        self._ticks, self._fell = 0, False
+        self._ticks = 0
 
-    def begin(self, truth: Any) -> None:
+    def begin(self) -> None:
         """Note where the episode starts."""
-        now = self._truth(truth)
+        now = self._truth()
         self._start[0, :2] = TRUTH_LAYOUT.view(now, "position")[0, :2]
         self._start[0, 2] = yaw_of(*TRUTH_LAYOUT.view(now, "quaternion").T)[0]
 
-    def take(self, truth: Any, command: Array) -> bool:
-        """Score a control step; return whether a termination of the task ended the episode."""
+    def take(self, command: Array) -> str:
+        """Score a control step; say so where a termination of the task ends the episode."""
         core, task = self._core, self._task
         estimate = np.zeros((1, ESTIMATE_LAYOUT.width)) if core.observer is None else core.observer.values
         clock = np.array([[(self._ticks + 1) * task.config.control_period]])
         signals = (
-            core.sensors.values, estimate, self._truth(truth), command, core.action, core.actions.previous, self._start, clock,
+            core.sensors.values, estimate, self._truth(), command, core.action, core.actions.previous, self._start, clock,
             core.presence, core.computed,
         )  # fmt: skip
         self._kernel.run(core.everyone, signals, self._kernel.numbers, tuple(self._scores))
         self._ticks += 1
-        self._fell = bool((self._scores.over > 0.0).any())
-        return self._fell
+        return FELL if (self._scores.over > 0.0).any() else ""
 
-    def _truth(self, truth: Any) -> Array:
-        if truth is not None:
-            return truth.truth().values.copy()
+    def _truth(self) -> Array:
+        if self._true is not None:
+            return self._true.truth().values.copy()
         core = self._core
         found = measured_truth(core.sensors)
         if core.observer is not None:
@@ -166,8 +154,9 @@ class _Score:
             found[:, TRUTH_LAYOUT.slices["linear_velocity_in_body"]][:, :2] = speed
         return np.nan_to_num(found)
 
-    def episode(self, seed: int, reason: str, run: str) -> RobotEpisode:
+    def episode(self, seed: int, driven: Deployment) -> RobotEpisode:
         """Return how it went."""
+        reason, run = driven.reason, "" if driven.run is None else str(driven.run)
         task, ticks = self._task, max(1, self._ticks)
         rms = np.sqrt(self._scores.squares[0] / ticks)
         measures = {name: float(value) for name, value in zip(task.measures, rms, strict=True)}
