@@ -64,7 +64,7 @@ def identified_events(path: str | Path, robot: Robot) -> dict[str, EventConfig]:
 
 
 def _without(events: Mapping[str, EventConfig], elements: tuple[str, ...]) -> dict[str, EventConfig]:
-    """Events without what they set of some elements: an effect that sets them, such as the friction of one wheel, replaces it."""
+    """Events without what they set of some elements: what an effect sets, such as one wheel's friction, replaces it."""
     found = {}
     for name, event in events.items():
         kept = tuple(one for one in event.parameters if event.operation != "set" or one not in elements)
