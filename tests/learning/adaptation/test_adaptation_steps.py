@@ -11,12 +11,13 @@ pytest.importorskip("torch")
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("onnxruntime")
 
+import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.record import record_simulation
 from wlr_gym.envs.tasks import load_randomization
-from wlr_gym.gap.decision import Decided, History, Recorded
+from wlr_gym.gap.decision import HISTORY_FILE, Decided, History, Recorded
 from wlr_gym.gap.report.entries import Result
 from wlr_gym.learning.adaptation import driving, identification, retraining, uncertainty
 from wlr_gym.learning.adaptation.plan import STEPS, AdaptStep, Asked, Progress, open_folder
@@ -265,3 +266,25 @@ def test_unknown_effects_and_agents_are_refused(tmp_path, capsys):
     assert "weak_motor" in capsys.readouterr().err
     assert main(["adapt", "pid", "--emulated", "--out", str(tmp_path / "out")]) == 2
     assert "expected a policy that PPO trained" in capsys.readouterr().err
+
+
+def test_measured_runs_alone_drive_nothing(tmp_path, monkeypatch):
+    record_simulation(tmp_path / "data" / "run_01.parquet", excite("straight", seconds=4.0), ROBOT, "gibbs_appell")
+    budgets = []
+
+    def decide(data, out, record, budget, **_):
+        budgets.append(budget.runs)
+        out.mkdir()
+        history = History(data=str(data), robot=None, backend="gibbs_appell", known=[], ended="budget")
+        (out / HISTORY_FILE).write_text(history.model_dump_json())
+        return Decided(history, None, out)
+
+    monkeypatch.setattr(identification, "decide", decide)
+    for _ in range(2):  # the second time from its files
+        found = wlr_gym.adapt("velocity_slip_aware", tmp_path / "out", robot_runs=tmp_path / "data")
+        assert (found.policy, found.is_new) == ("velocity_slip_aware", False)
+    outcomes = {name: step.outcome for name, step in found.steps.items()}
+    assert outcomes == dict.fromkeys(STEPS, "left out") | {"runs": "done", "gap": "done"}
+    assert budgets == [0]
+    assert "There are too few usable runs" in found.page.read_text()
+    assert [path.name for path in (tmp_path / "data").glob("*.parquet")] == ["run_01.parquet"]
