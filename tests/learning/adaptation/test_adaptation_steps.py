@@ -280,9 +280,9 @@ def test_measured_runs_alone_drive_nothing(tmp_path, monkeypatch):
         return Decided(history, None, out)
 
     monkeypatch.setattr(identification, "decide", decide)
-    for _ in range(2):  # the second time from its files
-        found = wlr_gym.adapt("velocity_slip_aware", tmp_path / "out", robot_runs=tmp_path / "data")
-        assert (found.policy, found.is_new) == ("velocity_slip_aware", False)
+    first, found = (wlr_gym.adapt("velocity_slip_aware", tmp_path / "out", robot_runs=tmp_path / "data") for _ in range(2))
+    assert (first.policy, first.is_new) == ("velocity_slip_aware", False)
+    assert found == first  # from its files
     outcomes = {name: step.outcome for name, step in found.steps.items()}
     assert outcomes == dict.fromkeys(STEPS, "left out") | {"runs": "done", "gap": "done"}
     assert budgets == [0]
