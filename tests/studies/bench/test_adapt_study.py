@@ -7,7 +7,9 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.physics.effects import load_patch
+from wlr_gym.envs.tasks import load_randomization
+from wlr_gym.learning.adaptation.uncertainty import uncertainty_of
+from wlr_gym.physics.effects import apply_patch, load_patch
 from wlr_gym.robot import load_robot
 
 pytest.importorskip("torch")
@@ -91,3 +93,14 @@ def test_a_broken_line_is_named(tmp_path):
     path.write_text(json.dumps(line("a", "none", [1.0])) + "\n{}\n")
     with pytest.raises(InputError, match="line 2: expected case, contender and errors"):
         adapt_study.read_lines(path)
+
+
+@pytest.mark.parametrize("name", ["friction_asymmetry_copy0", "command_delay_copy1"])
+def test_the_truth_is_the_robot_that_is_driven(name, tmp_path):
+    (case,), own = chosen_cases((name,)), load_robot()
+    hidden = load_patch([dict(one) for one in case.effects])
+    found = uncertainty_of(adapt_study.exact_result(case, own), hidden, "slippery", own, tmp_path)
+    (stated, *_), seeds = found.families, np.arange(3, dtype=np.uint64)
+    drawn = load_randomization(dict(stated.randomization), own).parameters(seeds, seeds)
+    true = apply_patch(hidden, case.parameters(own)).values
+    assert drawn.values == pytest.approx(np.repeat(true, 3, axis=0), rel=1e-9, abs=1e-12)

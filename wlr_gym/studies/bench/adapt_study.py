@@ -40,13 +40,15 @@ from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 from wlr_gym.learning.training import resume_training, train
 from wlr_gym.physics.effects import Patch, load_patch
 from wlr_gym.robot import Robot, load_robot, robot_hash
+from wlr_gym.robot.parameter_table import ELEMENTS
+from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.adapt_cases import AdaptCase
 
 POLICY, ENVIRONMENT = "velocity_slip_aware", "WLR-Velocity-v0"
 #: Contender -> what it is. The first three need no gap workflow.
 CONTENDERS = {
     "none": "no adaptation",
-    "truth": "the truth patched in",
+    "truth": "the truth patched in, the copy's numbers too",
     "wide": "retrained once with wider randomisation",
     "ours": "wlr adapt",
     "calibrated": "calibration only, no naming",
@@ -196,7 +198,7 @@ def _line(study: AdaptStudy, case: AdaptCase, contender: str, say: Say) -> dict[
     robot = EmulatedRobot(own, hidden, "mujoco", PHYSICS_STEP, case.parameters(own))
     progress = open_folder(study.out / "work" / case.name, study.asked(case), lambda text, share: None, 1)
     progress.save()
-    work = {"none": lambda: (POLICY, {}), "truth": lambda: (_truth(progress, hidden, own), {})}
+    work = {"none": lambda: (POLICY, {}), "truth": lambda: (_truth(progress, case, hidden, own), {})}
     work |= {"wide": lambda: (_wide(study, own), {}), "ours": lambda: _ours(progress, robot, own)}
     work |= {"calibrated": lambda: _calibrated(progress, robot, own)}
     policy, said = work[contender]()
@@ -228,18 +230,40 @@ def _train(progress: Progress, name: str, family: Family) -> str:
     return str(folder / "policy")
 
 
-def _truth(progress: Progress, hidden: Patch, own: Robot) -> str:
-    """Return the policy that is trained on with the fault itself, on copies within tolerances."""
-    randomization = load_randomization(TRUTH_COPIES, own).config.model_dump(mode="json", exclude_none=True)
-    return _train(progress, "truth", Family("truth", randomization, [dict(one.content()) for one in hidden.effects]))
+def _truth(progress: Progress, case: AdaptCase, hidden: Patch, own: Robot) -> str:
+    """Return the policy that is trained on with the fault and the copy's own numbers, as exact as they are."""
+    folder = progress.out / "truth_model"
+    make_output_folder(folder)
+    found = uncertainty_of(exact_result(case, own), hidden, task_randomization(ENVIRONMENT), own, folder)
+    return _train(progress, "truth", found.training)
 
 
-#: Robots that the truth is trained with: the task's own floors, the main one as it is known.
-TRUTH_COPIES = {
-    "name": "the truth",
-    "base": "slippery",
-    "events": {"floor_friction": {"distribution": "uniform", "low": 0.5, "high": 0.7}},
-}
+def exact_result(case: AdaptCase, own: Robot) -> Result:
+    """Return what a gap result would say that knew everything."""
+    true, nominal = case.parameters(own).values[0], Parameters.nominal(own).values[0]
+    differs = np.flatnonzero(true != nominal)
+    calibration = {ELEMENTS[k]: {"nominal": float(nominal[k]), "fitted": float(true[k]), "unit": "-"} for k in differs}
+    effects = [
+        {
+            "name": one["name"],
+            "where": list(one["where"]),
+            "confidence": 1.0,
+            "parameters": {name: {"value": value, "ci95": None, "unit": "-"} for name, value in one["parameters"].items()},
+        }
+        for one in case.effects
+    ]
+    return Result.model_validate(
+        {
+            "verdict": "effect_found",
+            "effects": effects,
+            "equivalent": [],
+            "calibration": calibration,
+            "localisation": {},
+            "gap": None,
+            "runs": {"fit": [], "heldout": []},
+            "patch": "patch.yaml",
+        }
+    )
 
 
 def _wide(study: AdaptStudy, own: Robot) -> str:
