@@ -47,6 +47,7 @@ def markdown(lines: Sequence[Line]) -> str:
     """Return the tables as Markdown."""
     table = by_case(lines)
     header = ["case", "shared law", *(f"{CONTENDERS[name]}" for name in CONTENDERS), "found", "kept", "regained (%)"]
+    header += ["driven for it (s)", "took (min)"]
     rows = [_row(name, case) for name, case in table.items()]
     text = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header), *("| " + " | ".join(row) + " |" for row in rows)]
     return "\n".join([*text, "", *summary(table), ""])
@@ -54,7 +55,7 @@ def markdown(lines: Sequence[Line]) -> str:
 
 def summary(table: Table) -> list[str]:
     """Return what all cases say together, one sentence a line."""
-    known = {name: helps(case) for name, case in table.items()}
+    known = {name: one for name, case in table.items() if (one := helps(case)) is not None}
     counted = [name for name, one in known.items() if one]
     said = [f"- The truth makes the policy at least {HELPS:.0%} better in {len(counted)} of {len(known)} cases."]
     with_ours = [name for name in counted if "ours" in table[name]]
@@ -96,7 +97,8 @@ def _row(name: str, case: Mapping[str, Line]) -> list[str]:
     ours = case.get("ours", {})
     found = ", ".join(dict.fromkeys(one["name"] for one in ours.get("found", []))) or ("nothing" if ours else "")
     share = _interval(regained(case)) if helps(case) and ours else ""
-    return [name, "yes" if any_line["shared_law"] else "no", *errors, found, str(ours.get("kept", "")), share]
+    times = [f"{ours['recording_seconds']:.0f}", f"{ours['wall_seconds'] / 60.0:.1f}"] if "wall_seconds" in ours else ["", ""]
+    return [name, "yes" if any_line["shared_law"] else "no", *errors, found, str(ours.get("kept", "")), share, *times]
 
 
 def _interval(found: Estimate) -> str:
