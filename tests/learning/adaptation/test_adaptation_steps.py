@@ -249,6 +249,7 @@ def test_a_folder_of_another_command_is_refused(tmp_path):
         (("--robot-runs", "nowhere"), "--robot-runs nowhere: no such folder"),
         (("--emulated", "--env", "WLR-Path-v0"), "was made for another environment, WLR-Velocity-v0"),
         (("--emulated", "--drives", "0"), "drives"),
+        (("--emulated", "--sensors", "camera"), "driven without a camera"),
         (("--emulated", "--backend", "mujco"), "did you mean 'mujoco'"),
         (("--emulated", "--excitations", "strait"), "did you mean 'straight'"),
     ],

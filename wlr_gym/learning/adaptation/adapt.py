@@ -99,6 +99,8 @@ def adapt(
         raise InputError("--effects: measured runs have what their robot has; they are for --emulated")
     if driven is None and robot_runs is None:
         driven = EmulatedRobot(own, patch, backend)
+    if driven is not None and "camera" in sensors:
+        raise InputError("--sensors camera: robots are driven without a camera here; give measured runs, or leave it out")
     same_profile([excite(name, seed, own) for name in excitations])
     given = {
         "policy": str(policy),

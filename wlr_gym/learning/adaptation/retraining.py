@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
-from wlr_gym.base.text import duration
 from wlr_gym.envs.tasks.task_config import OPTIONAL
 from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
 from wlr_gym.learning.adaptation.uncertainty import STATED, Family, Uncertainty
@@ -93,11 +92,10 @@ def train_on(progress: Progress, found: Uncertainty) -> AdaptStep:
         )
         write_yaml(config, settings)
         train(asked.environment, folder, config, init=asked.policy, on_update=on_update)
-    seconds = progress.spent.get(TRAINING, 0.0)
     return AdaptStep(
         said=(f"{asked.steps:,} environment steps from {asked.policy}, learning rate {asked.learning_rate:g}.",),
         command=f"wlr train {asked.environment} --config {config} --init {asked.policy} --out {folder}",
-        numbers={"steps": asked.steps, "earlier": duration(seconds)},
+        numbers={"steps": asked.steps, "learning_rate": asked.learning_rate},
     )
 
 
