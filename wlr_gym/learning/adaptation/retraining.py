@@ -25,8 +25,7 @@ from wlr_gym.robot import Robot
 
 #: Share of the learning rate that is left at the end of the training.
 FALLS_TO = 0.2
-#: Logarithm of the exploration noise at the start. With less (-4.6, that of other fine-tunings) a policy finds half as much in
-#: as many steps; docs/adapt.md.
+#: Logarithm of the exploration noise at the start: more than other fine-tunings have; what was tried is in docs/adapt.md.
 LOG_STD = -2.5
 #: Environment steps between scores on held-out episodes, and between checkpoints, as shares of the training.
 _SCORES = 4
