@@ -21,6 +21,7 @@ HOMES = {
     "Snapshot": "wlr_gym.base.snapshot",
     "train": "wlr_gym.learning.training",
     "resume_training": "wlr_gym.learning.training",
+    "adapt": "wlr_gym.learning.adaptation.adapt",
     "sweep": "wlr_gym.learning.sweep.running",
     "resume_sweep": "wlr_gym.learning.sweep.running",
     "import_policy": "wlr_gym.learning.foreign",

@@ -14,6 +14,7 @@ from wlr_gym.envs.user_tasks import register_task as register_task
 from wlr_gym.envs.vector import WlrVectorEnv as WlrVectorEnv
 from wlr_gym.gap.analysis import Analysis as Analysis
 from wlr_gym.gap.workflow import analyse as analyse
+from wlr_gym.learning.adaptation.adapt import adapt as adapt
 from wlr_gym.learning.evaluation.card import Card as Card
 from wlr_gym.learning.evaluation.scoring import evaluate as evaluate
 from wlr_gym.learning.foreign import import_policy as import_policy
@@ -54,6 +55,7 @@ __all__ = [
     "TrainingProgress",
     "WlrEnv",
     "WlrVectorEnv",
+    "adapt",
     "analyse",
     "evaluate",
     "hardware",

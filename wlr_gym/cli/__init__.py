@@ -47,6 +47,7 @@ COMMANDS = {
     "doctor": "look at a robot before it drives: ports, servos, IMU, policy; names the first fault and its remedy",
     "commission": "test a robot on a stand, compare each result with the emulator, write what was measured",
     "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults on command",
+    "adapt": "adapt a policy to a robot: drive, find what the model lacks, train on with it, test, drive again; one page",
     "bench": "measure the speed of the engine, the environments and training on this machine",
     "demo": "the whole loop in about three minutes: learn, drive on ice, find the hidden fault of a robot; one page",
 }

@@ -46,6 +46,8 @@ _OWN_ROWS = ("convergence", "vision")
 _ON_REQUEST = ("vision", "bus", "camera", "perception", "learning", "sysid")
 #: Its own kind: hours, resumable, with a folder of results. See docs/gap_benchmark.md.
 BLIND_TEST = "gap"
+#: Another: what a hidden fault costs a policy, and how much of it is won back. See docs/adapt.md.
+ADAPT_STUDY = "adapt"
 SCHEMA = 1
 
 
@@ -56,7 +58,7 @@ class BenchOptions:
     only: tuple[str, ...] = ()
     """engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, camera, perception, vision,
     sysid.
-    gap (the blind test of the gap workflow): alone, with --out"""
+    gap (the blind test of the gap workflow), adapt (what adaptation wins back): alone, with --out"""
     json: Path | None = None
     """File for all numbers."""
     rounds: int = 5
@@ -64,7 +66,11 @@ class BenchOptions:
     quick: bool = False
     """Tiny sizes: shows that it runs; the numbers mean nothing."""
     out: Path | None = None
-    """gap: folder for results, truths and the score; an interrupted test resumes from it."""
+    """gap, adapt: folder for results; an interrupted test resumes from it."""
+    cases: tuple[str, ...] = ()
+    """adapt: names of cases, or how many of them; default: all."""
+    contenders: tuple[str, ...] = ()
+    """adapt: none, truth, wide, ours, calibrated; default: all."""
     sets: int = 240
     """gap: data sets."""
     processes: int = 2
@@ -83,12 +89,14 @@ def run(options: BenchOptions) -> int:
     """Measure, print, write."""
     asked = (*options.what, *options.only)
     for name in asked:
-        if name not in (*MEASUREMENTS, BLIND_TEST):
-            raise unknown_name("measurement", name, (*MEASUREMENTS, BLIND_TEST))
+        if name not in (*MEASUREMENTS, BLIND_TEST, ADAPT_STUDY):
+            raise unknown_name("measurement", name, (*MEASUREMENTS, BLIND_TEST, ADAPT_STUDY))
     if options.rounds < 1:
         raise InputError(f"--rounds {options.rounds}: expected 1 or more")
     if options.json is not None and not options.json.parent.is_dir():
         raise InputError(f"--json {options.json}: folder {options.json.parent} does not exist")
+    if ADAPT_STUDY in asked:
+        return _adapt_study(options, asked)
     if BLIND_TEST in asked:
         return _blind_test(options, asked)
     console, size = Console(), Size(options.rounds, options.quick)
@@ -145,6 +153,30 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     if options.json is not None:
         write_json(options.json, report)
     console.print(f"written: {', '.join(str(options.out / name) for name in ('score.json', 'score.md', 'answers.json'))}")
+    return OK
+
+
+def _adapt_study(options: BenchOptions, asked: tuple[str, ...]) -> int:
+    """Adapt a policy to robots with hidden faults, and others beside it; print and write the table."""
+    from wlr_gym.studies.bench import adapt_study
+    from wlr_gym.studies.bench.adapt_cases import chosen_cases
+    from wlr_gym.studies.bench.adapt_table import markdown
+
+    if len(asked) > 1:
+        raise InputError(f"{ADAPT_STUDY} takes hours and is run alone, not with {', '.join(set(asked) - {ADAPT_STUDY})}")
+    if options.out is None:
+        raise InputError(f"{ADAPT_STUDY} needs --out DIR: finished cases are kept there, so that it can be interrupted")
+    for name in options.contenders:
+        if name not in adapt_study.CONTENDERS:
+            raise unknown_name("contender", name, adapt_study.CONTENDERS)
+    console = Console(soft_wrap=True, highlight=False)
+    contenders = options.contenders or tuple(adapt_study.CONTENDERS)
+    study = adapt_study.AdaptStudy(options.out, chosen_cases(options.cases), contenders=contenders)
+    lines = adapt_study.run_adapt_study(study.quick() if options.quick else study, console.print)
+    text = markdown(lines)
+    (options.out / "adapt.md").write_text(text, encoding="utf-8")
+    console.print(text, markup=False)
+    console.print(f"written: {options.out / adapt_study.LINES_FILE}, {options.out / 'adapt.md'}")
     return OK
 
 

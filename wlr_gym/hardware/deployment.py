@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,18 @@ class Deployment:
     inference: NDArray[np.float64]
 
 
+class DriveWatcher(Protocol):
+    """Looks on while a policy drives."""
+
+    def begin(self) -> None:
+        """The robot stands where its episode begins."""
+        ...
+
+    def take(self, command: NDArray[np.float64]) -> str:
+        """A control step is over in which the robot followed ``command`` (1, C); return why the run is to end, or nothing."""
+        ...
+
+
 def loop_of(core: Core) -> ControlLoop:
     """Return the control loop of a core that drives the real robot.
 
@@ -67,6 +79,7 @@ def deploy(
     seed: int = 0,
     command: Mapping[str, float] | None = None,
     steer: Callable[[], Mapping[str, float]] | None = None,
+    watcher: DriveWatcher | None = None,
 ) -> Deployment:
     """Bring the robot to its start pose and drive it until the episode is over or something stops it; torque is off then.
 
@@ -76,6 +89,7 @@ def deploy(
         seed: of the commands that are drawn.
         command: held instead of drawn ones.
         steer: asked in every control step for commands to follow from then on (a gamepad).
+        watcher: looks on; may end the run.
     """
     loop = loop_of(core)
     core.seed(0, seed)
@@ -88,6 +102,8 @@ def deploy(
         try:
             held = {**(command or {}), **(steer() if steer else {})}
             core.begin_episodes(core.everyone, {"command": held} if held else None)
+            if watcher is not None:
+                watcher.begin()
             while not (core.terminated[0] or core.truncated[0]):
                 start = time.perf_counter()
                 action = policy.act(core.observation)
@@ -95,7 +111,11 @@ def deploy(
                 _log(core, loop, action)
                 if steer is not None:
                     core.set_command(steer())
+                followed = core.command.copy()
                 core.step(action, core.everyone)
+                if watcher is not None and (reason := watcher.take(followed)):
+                    loop.stop(reason)
+                    break
             loop.stop("time is over")
         except StoppedError:
             pass  # it is in the loop's reason

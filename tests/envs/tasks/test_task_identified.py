@@ -134,3 +134,13 @@ def test_unreadable_results(robot, tmp_path):
     (tmp_path / "broken.json").write_text("{]")
     with pytest.raises(InputError, match="line 1, column 2: broken JSON"):
         load_randomization(tmp_path / "broken.json", robot)
+
+
+def test_an_effect_that_sets_some_wheels_takes_them_out_of_the_calibration(robot, result):
+    path = result(
+        calibration={"ground.mu": {"fitted": 0.55, "ci95": [0.53, 0.57]}},
+        effects=[{"name": "friction_asymmetry", "where": ["wheel_lf"], "parameters": {"mu": estimate(0.2, 0.02)}}],
+    )
+    drawn = draw(load_randomization(path, robot))
+    assert drawn["ground.mu_x"].mean(axis=0) == pytest.approx([0.2, 0.55, 0.55, 0.55], abs=0.002)
+    assert drawn["ground.mu_x"][:, 0].std() == pytest.approx(0.04 / 3.92, rel=0.1)

@@ -52,6 +52,8 @@ def identified_events(path: str | Path, robot: Robot) -> dict[str, EventConfig]:
             robot_as_found[element] = mean
     for index, entry in enumerate(result.get("effects") or []):
         for number, event in enumerate(_effect_events(entry, robot_as_found, f"{path}: effect {index + 1}")):
+            if event.operation == "set":
+                events = _without(events, event.parameters)
             events[f"identified {entry['name']} {index + 1}.{number + 1}"] = event
             for element in event.parameters:
                 if element.startswith(_REPLACED):
@@ -59,6 +61,16 @@ def identified_events(path: str | Path, robot: Robot) -> dict[str, EventConfig]:
     if not events:
         raise InputError(f"{path}: neither calibrated parameters nor effects: nothing to draw from")
     return events
+
+
+def _without(events: Mapping[str, EventConfig], elements: tuple[str, ...]) -> dict[str, EventConfig]:
+    """Events without what they set of some elements: what an effect sets, such as one wheel's friction, replaces it."""
+    found = {}
+    for name, event in events.items():
+        kept = tuple(one for one in event.parameters if event.operation != "set" or one not in elements)
+        if kept:
+            found[name] = event.model_copy(update={"parameters": kept})
+    return found
 
 
 def _read(path: str | Path) -> Mapping[str, Any]:

@@ -1,0 +1,178 @@
+"""Adapt a policy to a robot: drive, find what the model lacks, train on with it, test, drive again; one page.
+
+Each step has a folder in --out. Ctrl-C anywhere: the same command goes on. Every step is an ordinary command, and the page
+names it. See docs/adapt.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.cli import OK
+from wlr_gym.cli.options import PatchOption, SensorsOption
+from wlr_gym.cli.progress import progress
+from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from wlr_gym.learning.adaptation import Adapted
+    from wlr_gym.learning.adaptation.robots import RealRobot
+
+#: Without it the page would be of nothing.
+_NONE_CHOSEN = "nothing to adapt to: give measured runs (--robot-runs DATA), an emulated robot (--emulated), or --hardware FILE"
+
+
+@dataclass(frozen=True)
+class AdaptOptions(PatchOption, SensorsOption):
+    policy: tyro.conf.Positional[str]
+    """Policy that PPO trained: shipped, a file, or a policy or run folder."""
+    robot_runs: Path | None = None
+    """Measured runs of the robot. Without --hardware nothing is driven: before and after are left out."""
+    emulated: bool = False
+    """An emulated robot, in emulated time; --effects is what it has that its file does not say."""
+    hardware: str | None = None
+    """A real robot: hardware file, or name in configs/hardware/. You are asked before every drive."""
+    port: tuple[str, ...] = ()
+    """Other ports than the hardware file's: legs=/dev/ttyUSB0."""
+    yes: bool = False
+    """Do not ask before the robot moves."""
+    env: str | None = None
+    """Environment id; default: the one that the policy was trained in."""
+    robot: str | None = None
+    """Robot file or config name; default: the policy's."""
+    backend: str = "gibbs_appell"
+    """Simulator behind the emulated robot: gibbs_appell or mujoco."""
+    out: Path = Path("out/adapt")
+    """Folder for all steps, the page and its numbers."""
+    excitations: tuple[str, ...] = ("straight", "turns", "stop_and_go", "posture")
+    """First runs, see: wlr record --list."""
+    budget_runs: int = 2
+    """Most further runs, until one name has 95 %."""
+    budget_seconds: float | None = None
+    """Most seconds of driving them; default: as many as they take."""
+    drives: int = 6
+    """Episodes of the task before and after, each."""
+    drive_seconds: float = 10.0
+    """Length of such an episode."""
+    steps: int = 2_500_000
+    """Environment steps of the training."""
+    learning_rate: float = 5e-4
+    """Its learning rate at the start."""
+    episodes: int = 256
+    """Episodes of every family of the acceptance test."""
+    seed: int = 0
+    """Seed of everything random."""
+    threads: int | None = None
+    """Worker threads; default: one per core."""
+    json: bool = False
+    """Print the numbers of adapt.json instead of the table."""
+
+
+def run(options: AdaptOptions) -> int:
+    """Adapt; 0 = done, whichever policy is kept.
+
+    Raises:
+        InputError: bad options, runs of another robot, a policy that does not fit, a folder of another command.
+    """
+    from rich.console import Console
+
+    from wlr_gym.learning.adaptation import adapt
+
+    _check(options)
+    console = Console(soft_wrap=True, highlight=False, file=sys.stderr if options.json else None)
+    real = _real(options, console) if options.hardware is not None else None
+    with _resumable(), progress(console) as tell:
+        found = adapt(
+            options.policy,
+            options.out,
+            robot_runs=options.robot_runs,
+            driven=real,
+            effects=options.patch() if options.emulated else None,
+            backend=options.backend,
+            environment=options.env,
+            robot=options.robot,
+            excitations=options.excitations,
+            budget_runs=options.budget_runs,
+            budget_seconds=options.budget_seconds,
+            drives=options.drives,
+            drive_seconds=options.drive_seconds,
+            steps=options.steps,
+            learning_rate=options.learning_rate,
+            episodes=options.episodes,
+            sensors=options.present() or (),
+            seed=options.seed,
+            threads=options.threads or os.cpu_count() or 1,
+            tell=partial(tell, ""),
+        )
+    if options.json:
+        from wlr_gym.learning.adaptation.page import NUMBERS_FILE
+
+        print((found.page.parent / NUMBERS_FILE).read_text(encoding="utf-8"), end="")
+        return OK
+    _print(found, console)
+    return OK
+
+
+@contextmanager
+def _resumable() -> Iterator[None]:
+    """Say on Ctrl-C how it goes on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("interrupted; the same command goes on where it was") from None
+
+
+def _check(options: AdaptOptions) -> None:
+    if not (options.robot_runs or options.emulated or options.hardware):
+        raise InputError(_NONE_CHOSEN)
+    if options.emulated and (options.robot_runs or options.hardware):
+        raise InputError("--emulated: an emulated robot, a real one (--hardware) or its runs (--robot-runs): one of them")
+    if options.effects and not options.emulated:
+        raise InputError("--effects: a real robot has its own; they are for --emulated")
+    if options.port and options.hardware is None:
+        raise InputError("--port: it goes with --hardware")
+    if options.threads is not None and options.threads < 1:
+        raise InputError(f"--threads {options.threads}: expected 1 or more")
+
+
+def _real(options: AdaptOptions, console: Console) -> RealRobot:
+    from wlr_gym.learning.adaptation import RealRobot
+    from wlr_gym.policy import policy_environment
+    from wlr_gym.robot import load_robot
+
+    def ask(text: str) -> None:
+        if not options.yes:
+            wait_for_enter(console, f"{text} Free floor? Hand on the switch?")
+
+    own = load_robot(options.robot or policy_environment(options.policy).get("robot") or "nominal")
+    return RealRobot(own, options.hardware or "nominal", port_pairs(options.port), ask)
+
+
+def _print(found: Adapted, console: Console) -> None:
+    from rich import box
+    from rich.table import Table
+
+    from wlr_gym.base.text import duration
+    from wlr_gym.learning.adaptation.page import NUMBERS_FILE, headline
+
+    content = json.loads((found.page.parent / NUMBERS_FILE).read_text(encoding="utf-8"))
+    table = Table("step", "driving", "computing", "found", box=box.SIMPLE)
+    for name, one in found.steps.items():
+        said = one.said[0] if one.said else ""
+        table.add_row(name, duration(one.driving), duration(one.computing), said)
+    console.print(table)
+    console.print(headline(content), markup=False)
+    console.print(f"policy: {found.policy}", markup=False)
+    console.print(f"page: {found.page}", markup=False)

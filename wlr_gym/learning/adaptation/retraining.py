@@ -1,0 +1,166 @@
+"""Steps that learn: training on from the policy, and the acceptance test of what comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
+from wlr_gym.envs.tasks.task_config import OPTIONAL
+from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
+from wlr_gym.learning.adaptation.uncertainty import STATED, Family, Uncertainty
+from wlr_gym.learning.evaluation.acceptance import (
+    LARGEST_LOSS,
+    Acceptance,
+    accept,
+    acceptance_rows,
+    read_acceptance,
+    write_acceptance,
+)
+from wlr_gym.learning.evaluation.rollout import make_core, seen_observations
+from wlr_gym.learning.training import resume_training, train
+from wlr_gym.policy import export_policy, make_policy, policy_environment
+from wlr_gym.policy.agents import TrainingProgress, agent_function
+from wlr_gym.robot import Robot
+
+#: Share of the learning rate that is left at the end of the training.
+FALLS_TO = 0.2
+#: Logarithm of the exploration noise at the start: more than other fine-tunings have; what was tried is in docs/adapt.md.
+LOG_STD = -2.5
+#: Environment steps between scores on held-out episodes, and between checkpoints, as shares of the training.
+_SCORES = 4
+#: Name of the settings of the training.
+SETTINGS_FILE = "training.yaml"
+TRAINING = "training"
+#: Name of the policy that is kept, where it is the new one.
+POLICY_FILE = "policy.onnx"
+#: Robots, and s of their episodes, on whose observations the file is compared with the policy.
+EXPORT_ROBOTS, EXPORT_SECONDS = 8, 4.0
+
+
+# ---- training --------------------------------------------------------------------------------------------------------
+
+
+def training_settings(policy: str, family: Family, *, steps: int, rate: float, seed: int, sensors: Any = ()) -> dict[str, Any]:
+    """Return the settings of a training on from a policy: its own recipe, on the robots of a family.
+
+    Args:
+        policy: where it starts. family: what it trains with.
+        steps: environment steps. rate: learning rate at the start. seed: of everything random.
+        sensors: which of camera and flow the robot has.
+    """
+    settings = dict(agent_function("ppo", "settings_to_start_from")(policy))
+    environment = dict(settings.get("environment") or {})
+    task = environment.get("task")
+    task = dict(task) if isinstance(task, Mapping) else {}
+    if task.get("sensors"):
+        task["sensors"] = {name: float(name in sensors) for name in OPTIONAL}
+    environment |= {"randomization": dict(family.randomization)} | ({"task": task} if task else {})
+    if family.effects:
+        environment["effects"] = [dict(one) for one in family.effects]
+    else:
+        environment.pop("effects", None)
+    batch = settings.get("num_envs", 512) * settings.get("steps_per_env", 32)
+    every = max(batch, steps // _SCORES)
+    return settings | {
+        "environment": environment,
+        "tasks": {},
+        "seed": seed,
+        "total_steps": steps,
+        "learning_rate": rate,
+        "final_learning_rate": FALLS_TO * rate,
+        "initial_log_std": LOG_STD,
+        "evaluate_every": every,
+        "checkpoint_every": every,
+    }
+
+
+def train_on(progress: Progress, found: Uncertainty) -> AdaptStep:
+    """Train on from the policy; an interrupted training resumes from its newest checkpoint."""
+    asked, folder = progress.asked, progress.out / TRAINING
+    config = progress.folder("model") / SETTINGS_FILE
+
+    def on_update(update: TrainingProgress) -> None:
+        progress.tell("training", update.steps / update.total_steps)
+
+    if (folder / CONFIG_FILE).is_file():
+        resume_training(folder, on_update=on_update)
+    else:
+        settings = training_settings(
+            asked.policy, found.training, steps=asked.steps, rate=asked.learning_rate, seed=asked.seed, sensors=asked.sensors
+        )
+        write_yaml(config, settings)
+        train(asked.environment, folder, config, init=asked.policy, on_update=on_update)
+    return AdaptStep(
+        said=(f"{asked.steps:,} environment steps from {asked.policy}, learning rate {asked.learning_rate:g}.",),
+        command=f"wlr train {asked.environment} --config {config} --init {asked.policy} --out {folder}",
+        numbers={"steps": asked.steps, "learning_rate": asked.learning_rate},
+    )
+
+
+def trained_policy(progress: Progress) -> str:
+    """Return the policy of the training: that of its end, where the learning rate has fallen."""
+    return str(progress.out / TRAINING / "policy")
+
+
+def export_trained(progress: Progress) -> str:
+    """Write the trained policy as one file, which runs without torch, and return its path."""
+    source, path = trained_policy(progress), progress.out / POLICY_FILE
+    core = make_core(progress.asked.environment, EXPORT_ROBOTS, policy_environment(source))
+    try:
+        seen = seen_observations(core, make_policy(source, core.contract()), EXPORT_SECONDS)
+    finally:
+        core.close()
+    export_policy(source, path, seen)
+    return str(path)
+
+
+# ---- acceptance ------------------------------------------------------------------------------------------------------
+
+
+def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> tuple[AdaptStep, str]:
+    """Test the trained policy against the old one over all that the result leaves open; return which one is kept."""
+    asked, folder, new = progress.asked, progress.folder("acceptance"), trained_policy(progress)
+    tests: list[Acceptance] = []
+    for number, family in enumerate(found.families):
+        path = folder / f"{family.name.replace(' ', '_')}.json"
+        if not path.is_file():
+            progress.tell(f"acceptance: {family.name}", number / len(found.families))
+            write_acceptance(path, compare_on(new, asked.policy, asked, family, own, progress.threads))
+        tests.append(read_acceptance(path))
+    losses = tuple(loss for test in tests for loss in test.losses)
+    worse = [loss for loss in losses if not loss.bound <= LARGEST_LOSS]
+    better = next(loss for loss in losses if loss.floors == STATED).bound < 0.0
+    kept = new if better and not worse else asked.policy
+    if kept == new:
+        verdict = "The new policy is kept: better on the robot as the result states it, and nowhere worse."
+    elif worse:
+        verdict = f"The old policy is kept: the new one may be worse in '{worse[0].floors}' (by up to {worse[0].bound:.1f} %)."
+    else:
+        verdict = "The old policy is kept: the new one is not better beyond the interval."
+    rows = [row for test in tests for row in acceptance_rows(test)[1:]]
+    is_new = kept == new
+    kept = export_trained(progress) if is_new else kept
+    numbers = {
+        "kept": "new" if is_new else "old",
+        "losses": [{"family": one.floors, "loss_percent": one.loss, "upper_bound": one.bound} for one in losses],
+    }
+    randomization = progress.out / "model" / "randomization.yaml"
+    command = f"wlr evaluate new={new} old={asked.policy} --randomization {randomization} --sensors none"
+    return AdaptStep(said=(verdict,), command=command, numbers=numbers | {"rows": rows}), kept
+
+
+def compare_on(new: str, old: str, asked: Any, family: Family, own: Robot, threads: int = 1) -> Acceptance:
+    """Play two policies on the same episodes of a family."""
+    return accept(
+        new,
+        asked.environment,
+        references=[old],
+        floors=[{**family.randomization, "name": family.name}],
+        episodes=asked.episodes,
+        seeds=1,
+        sensors=asked.sensors,
+        robot=own,
+        effects=list(family.effects) or None,
+        threads=threads,
+    )

@@ -1,0 +1,114 @@
+"""Tables of ``wlr bench adapt``: case by case, and what all cases say together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.learning.evaluation.statistics import Bootstrap, Estimate
+from wlr_gym.studies.bench.adapt_study import CONTENDERS, HELPS
+
+Array = NDArray[np.float64]
+Line = Mapping[str, Any]
+#: case -> contender -> its line.
+Table = dict[str, dict[str, Line]]
+
+
+def by_case(lines: Sequence[Line]) -> Table:
+    """Return the lines by case and contender; of repeated ones the last."""
+    found: Table = {}
+    for line in lines:
+        found.setdefault(line["case"], {})[line["contender"]] = line
+    return found
+
+
+def helps(case: Mapping[str, Line]) -> bool | None:
+    """Whether the truth helps enough for a case to count; None = not known."""
+    if not {"none", "truth"} <= case.keys():
+        return None
+    return float(_errors(case["truth"]).mean()) <= (1.0 - HELPS) * float(_errors(case["none"]).mean())
+
+
+def regained(case: Mapping[str, Line], contender: str = "ours") -> Estimate:
+    """Return (old - contender) / (old - truth), %, paired over the episodes."""
+    pairs = [_pairs(case[name]) for name in (contender, "truth", "none", "none")]
+    return Bootstrap(1, len(_errors(case["none"]))).share(*pairs, subjects=(0, 1, 2, 2))
+
+
+def better(case: Mapping[str, Line], ours: str, theirs: str) -> Estimate:
+    """Return by how much one contender is better than another, % of the other's, paired over the episodes."""
+    return Bootstrap(1, len(_errors(case["none"]))).reduction(_pairs(case[ours]), _pairs(case[theirs]))
+
+
+def markdown(lines: Sequence[Line]) -> str:
+    """Return the tables as Markdown."""
+    table = by_case(lines)
+    header = ["case", "shared law", *(f"{CONTENDERS[name]}" for name in CONTENDERS), "found", "kept", "regained (%)"]
+    header += ["driven for it (s)", "took (min)"]
+    rows = [_row(name, case) for name, case in table.items()]
+    text = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header), *("| " + " | ".join(row) + " |" for row in rows)]
+    return "\n".join([*text, "", *summary(table), ""])
+
+
+def summary(table: Table) -> list[str]:
+    """Return what all cases say together, one sentence a line."""
+    known = {name: one for name, case in table.items() if (one := helps(case)) is not None}
+    counted = [name for name, one in known.items() if one]
+    said = [f"- The truth makes the policy at least {HELPS:.0%} better in {len(counted)} of {len(known)} cases."]
+    with_ours = [name for name in counted if "ours" in table[name]]
+    if with_ours:
+        shares = np.array([regained(table[name]).mean for name in with_ours])
+        said.append(
+            f"- Regained in {len(with_ours)} of these, %: median {np.median(shares):.0f}; at least 50 in "
+            f"{(shares >= 50.0).sum()} of {len(shares)}."
+        )
+    adapted = [name for name, case in table.items() if {"ours", "none"} <= case.keys()]
+    worse = [name for name in adapted if better(table[name], "ours", "none").high < 0.0]
+    if adapted:
+        said.append(
+            f"- Worse than before adaptation beyond the interval: {len(worse)} of {len(adapted)} ({', '.join(worse) or '-'})."
+        )
+        kept = sum(table[name]["ours"].get("kept") == "old" for name in adapted)
+        said.append(f"- The acceptance test kept the old policy in {kept} of {len(adapted)} cases.")
+    for other in ("wide", "calibrated", "none"):
+        both = [name for name, case in table.items() if {"ours", other} <= case.keys()]
+        if both:
+            found = _all(table, both, "ours", other)
+            said.append(f"- Ours against '{CONTENDERS[other]}', {len(both)} cases: {_interval(found)} % better.")
+    return said
+
+
+def _all(table: Table, names: Sequence[str], ours: str, theirs: str) -> Estimate:
+    """Ours against theirs over several cases, each case a block of episodes, in units of its old policy's error."""
+    length = min(len(_errors(table[name]["none"])) for name in names)
+    blocks = []
+    for who in (ours, theirs):
+        scaled = [_errors(table[name][who])[:length] / _errors(table[name]["none"]).mean() for name in names]
+        blocks.append(np.stack([np.array(scaled), np.ones((len(names), length))], axis=2))
+    return Bootstrap(len(names), length).reduction(*blocks)
+
+
+def _row(name: str, case: Mapping[str, Line]) -> list[str]:
+    any_line = next(iter(case.values()))
+    errors = [f"{_errors(case[one]).mean():.3f}" if one in case else "" for one in CONTENDERS]
+    ours = case.get("ours", {})
+    found = ", ".join(dict.fromkeys(one["name"] for one in ours.get("found", []))) or ("nothing" if ours else "")
+    share = _interval(regained(case)) if helps(case) and ours else ""
+    times = [f"{ours['recording_seconds']:.0f}", f"{ours['wall_seconds'] / 60.0:.1f}"] if "wall_seconds" in ours else ["", ""]
+    return [name, "yes" if any_line["shared_law"] else "no", *errors, found, str(ours.get("kept", "")), share, *times]
+
+
+def _interval(found: Estimate) -> str:
+    return f"{found.mean:.0f} [{found.low:.0f}, {found.high:.0f}]"
+
+
+def _errors(line: Line) -> Array:
+    return np.array(line["errors"], np.float64)
+
+
+def _pairs(line: Line) -> Array:
+    errors = _errors(line)
+    return np.stack([errors, np.ones(len(errors))], axis=1)[None]
