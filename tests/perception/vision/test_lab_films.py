@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from second_renderer import Lab, frames, lens, true_places
+from wlr_gym.studies.bench.lab_renderer import Lab, frames, lens, true_places
 
 from wlr_gym.perception.markers.targets import load_target
 from wlr_gym.perception.vision.analysis import analyse
 from wlr_gym.robot import load_robot
-from wlr_gym.studies.bench.vision import true_slip
+from wlr_gym.studies.bench.vision_drives import true_slip
 from wlr_gym.studies.bench.vision_drives import skid_turn
 
 SECONDS, RATE = 4.6, 15.0

@@ -39,7 +39,7 @@ from wlr_gym.robot import Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.measure import Size
 from wlr_gym.studies.bench.vision_clutter import clutter
-from wlr_gym.studies.bench.vision_drives import FilmedDrive, film, paper_test, skid_turn
+from wlr_gym.studies.bench.vision_drives import FilmedDrive, film, paper_test, skid_turn, true_slip
 
 Array = NDArray[np.float64]
 
@@ -380,10 +380,3 @@ def measure_drive(drive: FilmedDrive, tilt: float = 0.0, look: Look | None = Non
         *lines,
         VisionResult(f"{drive.name}: clock offset (± {1e3 * found.std:.1f})", "ours", late, "ms", 2.0, count=len(samples)),
     ]
-
-
-def true_slip(drive: FilmedDrive, at: Array) -> Array:
-    """(K, 4, 2) m, true accumulated slip from the first of the times on."""
-    flat = drive.slip.reshape(len(drive.time), 8)
-    values = np.stack([np.interp(at, drive.time, column) for column in flat.T], axis=1).reshape(-1, 4, 2)
-    return values - values[0]
