@@ -64,9 +64,10 @@ class BenchOptions:
     quick: bool = False
     """Tiny sizes: shows that it runs; the numbers mean nothing."""
     out: Path | None = None
-    """gap: folder for results, truths and the score; an interrupted test resumes from it."""
-    sets: int = 240
-    """gap: data sets."""
+    """gap: folder for results, truths and the score; an interrupted test resumes from it.
+    vision: instead of the table, film a lab that is not perfect and keep every film's result here; resumes likewise"""
+    sets: int | None = None
+    """gap: data sets (240). vision with --out: films (60)."""
     processes: int = 2
     """gap: data sets at a time."""
     ray: tuple[str, ...] | None = None
@@ -91,6 +92,8 @@ def run(options: BenchOptions) -> int:
         raise InputError(f"--json {options.json}: folder {options.json.parent} does not exist")
     if BLIND_TEST in asked:
         return _blind_test(options, asked)
+    if options.out is not None:
+        return _lab_films(options, asked)
     console, size = Console(), Size(options.rounds, options.quick)
     report: dict[str, Any] = {"schema": SCHEMA, "machine": machine(), "rounds": options.rounds, "quick": options.quick}
     report |= {"measurements": [], "convergence": [], "vision": []}
@@ -134,7 +137,7 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
         raise InputError(f"{BLIND_TEST} needs --out DIR: finished data sets are kept there, so that it can be interrupted")
     console = Console(soft_wrap=True)
     report = gap.run_blind_test(
-        gap.Plan(options.out, options.sets, options.processes),
+        gap.Plan(options.out, 240 if options.sets is None else options.sets, options.processes),
         say=console.print,
         answers=options.answers,
         ray=ray_address(options.ray),
@@ -145,6 +148,27 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     if options.json is not None:
         write_json(options.json, report)
     console.print(f"written: {', '.join(str(options.out / name) for name in ('score.json', 'score.md', 'answers.json'))}")
+    return OK
+
+
+def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
+    """Film a lab that is not perfect; print and write the score."""
+    from wlr_gym.studies.bench.lab_films import FILMS, bars, run_lab_films, score
+
+    if asked != ("vision",) or options.out is None:
+        raise InputError(f"--out: for gap or vision, alone; got {', '.join(asked) or 'nothing'}")
+    console = Console(soft_wrap=True, highlight=False)
+    count = FILMS if options.sets is None else options.sets
+    if count < 1:
+        raise InputError(f"--sets {count}: expected 1 or more")
+    results = run_lab_films(options.out, count, lambda text: console.print(text, markup=False))
+    found = score(results)
+    write_json(options.out / "score.json", {"machine": machine(), "score": found})
+    table = Table("what", "found", "bar", "met", box=None, title=f"{count} films of a lab", title_justify="left")
+    for what, value, bar, met in bars(found):
+        table.add_row(what, value, bar, _YES_NO[met])
+    console.print(table)
+    console.print(f"written: {options.out / 'score.json'}")
     return OK
 
 

@@ -31,6 +31,7 @@ from wlr_gym.studies.bench.vision_drives import FilmedDrive, lab_drive, pose_at,
 
 Array = NDArray[np.float64]
 
+FILMS = 60
 SECONDS, RATE, OFFSET = 5.0, 30.0, 0.137
 CAMERAS = ("steady", "drifting", "hand-held")
 #: kbit/s at 1280 x 720; films of fewer pixels get as much per pixel.
@@ -42,6 +43,7 @@ _READING = 0.0002
 #: Bars: error of any wheel's slip at the end (m) and its sigmas, in this share of the films; sigmas that are never exceeded
 #: without a finding that doubts the result; share of refused films.
 LARGEST_ERROR, LARGEST_RATIO, SHARE, SILENT, REFUSALS = 0.001, 2.5, 0.95, 4.0, 0.02
+SIGMAS_HOLD = (0.8, 1.3)
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def plan(count: int) -> list[LabFilm]:
     """Films that fill the space evenly (a Latin hypercube with low discrepancy)."""
     from scipy.stats import qmc
 
-    points = qmc.LatinHypercube(16, optimization="random-cd", rng=np.random.default_rng(28)).random(count)
+    points = qmc.LatinHypercube(18, optimization="random-cd", rng=np.random.default_rng(29)).random(count)
     return [_film(index, point) for index, point in enumerate(points)]
 
 
@@ -119,11 +121,12 @@ def _film(index: int, p: Array) -> LabFilm:
         stretch=(0.005 * (2 * p[5] - 1), 0.005 * (2 * p[6] - 1)), readout=0.025 * p[7] if p[7] > 0.1 else 0.0,
         drift=0.004 * p[8] if camera == "drifting" else 0.0, hand=0.2 + 0.8 * p[8] if camera == "hand-held" else 0.0,
         noise=2 + 3 * p[9], blur=0.5 + 0.6 * p[10], gradient=0.4 * (2 * p[11] - 1), above=1.35 + 0.25 * p[12],
-        uneven=0.006 * p[13] if p[13] > 0.5 else 0.0, dropped=0.05 * (p[13] > 0.75), seed=100 * index,
+        uneven=0.006 * p[13] if p[13] > 0.6 else 0.0, dropped=0.05 * (p[13] > 0.8),
+        stamp_error=0.01 * p[13] if p[13] < 0.2 else 0.0, doubled=0.04 * (0.2 <= p[13] < 0.3), seed=100 * index,
     )  # fmt: skip
     codec = ("none", "h264", "hevc")[int(3 * p[14])]
     return LabFilm(
-        index, lab, 0.08 + 0.14 * p[15], 0.6 + 0.6 * p[4], 0.25 + 0.35 * p[9], camera, codec, bit_rate, hand_laid
+        index, lab, 0.08 + 0.14 * p[15], 0.6 + 0.6 * p[16], 0.25 + 0.35 * p[17], camera, codec, bit_rate, hand_laid
     )  # fmt: skip
 
 
@@ -237,6 +240,31 @@ def line(result: LabResult) -> str:
     )
 
 
+def bars(found: dict[str, Any]) -> list[tuple[str, str, str, bool | None]]:
+    """Rows of the table: what, what was found, bar, whether it is met."""
+    share, slip, pose = f">= {100 * SHARE:.0f} %", found["slip_ratio_rms"], found["pose_ratio_rms"]
+    honest = {name: all(SIGMAS_HOLD[0] <= value <= SIGMAS_HOLD[1] for value in values)
+              for name, values in (("slip", [slip]), ("pose", pose))}  # fmt: skip
+    span, poses = "{:g} to {:g}".format(*SIGMAS_HOLD), ", ".join(f"{value:.2f}" for value in pose)
+    return [
+        ("slip at the end within 1 mm, body target printed on one sheet", _percent(found["within_1_mm"]), share,
+         found["within_1_mm"] >= SHARE),
+        ("slip at the end within 1 mm, all", _percent(found["within_1_mm_all"]), "-", None),
+        ("slip at the end within 2.5 sigma", _percent(found["within_2.5_sigma"]), share, found["within_2.5_sigma"] >= SHARE),
+        ("beyond 4 sigma without a finding that doubts it", str(found["silently_wrong"]), "0", not found["silently_wrong"]),
+        ("refused", f"{found['refused']} of {found['films']}", f"<= {100 * REFUSALS:.0f} %",
+         found["refused"] <= REFUSALS * found["films"]),
+        ("error over sigma of slip at the end, rms", f"{slip:.2f}", span, honest["slip"]),
+        ("error over sigma of poses (x, y, z, yaw, pitch, roll), rms", poses, span, honest["pose"]),
+        ("largest error of a wheel's slip, median over films", f"{1e3 * found['median_error_m']:.2f} mm", "-", None),
+        ("frames with a pose", _percent(found["poses"]), "-", None),
+    ]  # fmt: skip
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
 def score(results: Sequence[LabResult]) -> dict[str, Any]:
     """The numbers that the bars are about."""
     done = [result for result in results if not result.refused]
@@ -249,7 +277,6 @@ def score(results: Sequence[LabResult]) -> dict[str, Any]:
         "within_1_mm": float(np.mean([result.worst <= LARGEST_ERROR for result in printed])),
         "within_1_mm_all": float(np.mean([result.worst <= LARGEST_ERROR for result in done])),
         "within_2.5_sigma": float(np.mean([result.ratio <= LARGEST_RATIO for result in done])),
-        "both": float(np.mean([result.worst <= LARGEST_ERROR and result.ratio <= LARGEST_RATIO for result in done])),
         "silently_wrong": sum(result.ratio > SILENT and not result.doubted for result in done),
         "doubted": sum(result.doubted for result in done),
         "median_error_m": float(np.median([result.worst for result in done])),
