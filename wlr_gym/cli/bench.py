@@ -163,7 +163,9 @@ def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
         raise InputError(f"--sets {count}: expected 1 or more")
     results = run_lab_films(options.out, count, lambda text: console.print(text, markup=False))
     found = score(results)
-    write_json(options.out / "score.json", {"machine": machine(), "score": found})
+    report = {"machine": machine(), "score": found, "films": [asdict(result) for result in results]}
+    for path in (options.out / "score.json", *([] if options.json is None else [options.json])):
+        write_json(path, report)
     table = Table("what", "found", "bar", "met", box=None, title=f"{count} films of a lab", title_justify="left")
     for what, value, bar, met in bars(found):
         table.add_row(what, value, bar, _YES_NO[met])
