@@ -300,8 +300,8 @@ def _turn_findings(samples: Sequence[Sample], offset: float, run: Run, robot: Ro
     difference = turn_difference(samples, offset, run, robot)
     if difference is not None:
         yield (
-            f"camera and gyroscope see turns that differ by {1e3 * difference[1]:.0f} mrad, most at {difference[0]:.2f} s: frame "
-            f"times that jump (frames dropped without a trace?), or a wrong run; {UNSURE}"
+            f"camera and gyroscope see turns that differ by {1e3 * difference[1]:.0f} mrad, most at {difference[0]:.2f} s: "
+            f"frame times that jump (frames dropped without a trace?), or a wrong run; {UNSURE}"
         )
 
 

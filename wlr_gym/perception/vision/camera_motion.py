@@ -1,8 +1,8 @@
 """Where the floor is in the camera frame over a film: one place for a camera that stands, one per frame for one that moves.
 
 A camera stands while the floor's markers stay where they are in the image, averaged over half a second. Once it moves, the
-places of the floor's markers are adjusted over the film first (the target file's tolerance as prior), so that it does not matter
-which of them a frame shows. A sheet that changes its place against the others was kicked: it is left out, and named.
+places of the floor's markers are adjusted over the film first (the target file's tolerance as prior), so that it does not
+matter which of them a frame shows. A sheet that changes its place against the others was kicked: it is left out, and named.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import Detection
 from wlr_gym.perception.markers.pose import MINIMUM_MARKERS, TargetPose, solve_pose
 from wlr_gym.perception.markers.targets import Target
-from wlr_gym.perception.vision.adjustment import TargetView, adjust, at_frame_time
+from wlr_gym.perception.vision.adjustment import TargetView, adjust, at_frame_time, velocity_between
 from wlr_gym.perception.vision.tracking import Sample, mean_detection, solved_floor
 
 Array = NDArray[np.float64]
@@ -88,16 +88,13 @@ def camera_motion(samples: Sequence[Sample], camera: Camera, floor: Target, read
 
 def velocities(times: Sequence[float], poses: Sequence[TargetPose | None]) -> Array:
     """Turn rate and speed (F, 6) of a target in the camera frame, from the frames before and after; 0 where not known."""
-    from scipy.spatial.transform import Rotation
-
     result = np.zeros((len(poses), 6))
     known = [(k, pose) for k, pose in enumerate(poses) if pose is not None]
     for place, (k, _) in enumerate(known):
         (i, before), (j, after) = known[max(0, place - 1)], known[min(len(known) - 1, place + 1)]
         step = times[j] - times[i]
         if 0 < step < _LONGEST_STEP:
-            turn = Rotation.from_matrix(after.rotation @ before.rotation.T).as_rotvec()
-            result[k] = np.concatenate([turn, after.position - before.position]) / step
+            result[k] = velocity_between(before, after, step)
     return result
 
 

@@ -1,7 +1,7 @@
 """What is wrong with the frames of a film as such: noise that compression adds, times that jitter, pictures shown twice.
 
-Of five frames, neighbours or every other one, what a cubic in time does not explain is noise; it is held against the sigmas that
-the edges of the markers state. An error of a frame's time moves its pose along the velocity, other noise does not.
+Of five frames, neighbours or every other one, what a cubic in time does not explain is noise; it is held against the sigmas
+that the edges of the markers state. An error of a frame's time moves its pose along the velocity, other noise does not.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +71,7 @@ def widened(samples: Sequence[Sample], noise: FrameNoise) -> tuple[Sample, ...]:
 
 def without_repeats(samples: Sequence[Sample]) -> Iterator[Sample]:
     """Take the pose off frames that show the picture before once more, while the robot moves."""
-    steps = np.array([_step(a, b) for a, b in zip(samples[:-1], samples[1:], strict=True)])
+    steps = np.array([_step(a, b) for a, b in pairwise(samples)])
     for k, sample in enumerate(samples):
         inside = 2 <= k < len(samples) - 1
         repeated = inside and steps[k - 1] < _SAME and steps[k - 2] > _MOVING and steps[k] > _MOVING
@@ -78,7 +79,7 @@ def without_repeats(samples: Sequence[Sample]) -> Iterator[Sample]:
 
 
 def turn_difference(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> tuple[float, float] | None:
-    """Where (s, servo clock) and by how much (rad) the turns that the camera saw differ from the gyroscope's; None = they agree.
+    """Where (s, servo clock) and by how much (rad) the camera's turns differ from the gyroscope's; None = they agree.
 
     Constant, drift and scale of the gyroscope are left open.
     """

@@ -27,6 +27,7 @@ from wlr_gym.perception.markers.pose import (
     solve_pose,
 )
 from wlr_gym.perception.markers.targets import Target
+from wlr_gym.perception.vision.adjustment import TargetView, at_frame_time, velocity_between
 
 Array = NDArray[np.float64]
 
@@ -47,6 +48,7 @@ FLOOR_FRAMES = 20
 #: m; positions of floor markers may be off by this much (they were measured by hand).
 FLOOR_TOLERANCE = 0.01
 _MOVED_BY = 0.4  # px, median over the floor's markers: 1 mm at 2 m with a focal length of 800 px
+_LONGEST_STEP = 0.3  # s; frames further apart do not give a speed
 _FILM_SLACK = 0.001  # m; 1 sigma of what a rolling shutter displaces a marker by
 _LEAST_COSINE = 0.7  # of the tilt of the body against the floor
 _HEIGHTS = (0.0, 0.6)  # m, of the body's origin
@@ -106,8 +108,8 @@ class Tracker:
         self._values = camera.values
         self._track: list[tuple[float, TargetPose]] = []  # the last two poses
         self._watched = 0
-        self._follow_camera = follow
-        if follow:  # what is off is found out over the whole film, so no marker may be left out for it
+        self._follow_camera, self._stated = follow, body
+        if follow or camera.readout:  # what is off is found out, and taken off, so no marker may be left out for it
             self.body = body.model_copy(update={"tolerance": math.hypot(body.tolerance, _FILM_SLACK)})
 
     def __call__(self, frame: VideoFrame) -> Sample:
@@ -124,6 +126,10 @@ class Tracker:
             dark = found is None and math.isinf(shift)  # nothing at all is seen
             status = MOVED if shift > _MOVED_BY and not dark else LOST
             return replace(_no_pose(frame, status, centres), floor=self.floor_pose, floor_seen=floor_seen)
+        before = self._track[-1:]
+        self._track = [*before, (frame.time, found)]
+        if self.camera.readout and not self._follow_camera:
+            found = self._at_frame_time(found, seen)
         used = {index: detection for index, detection in seen.items() if found.used[index]}
         for index, detection in used.items():
             centres[index] = detection.ellipse[:2]
@@ -131,7 +137,6 @@ class Tracker:
         if not (_HEIGHTS[0] < pose[2] < _HEIGHTS[1] and math.cos(pose[4]) * math.cos(pose[5]) > _LEAST_COSINE):
             self._track = []
             return replace(_no_pose(frame, IMPOSSIBLE, centres), floor=self.floor_pose, floor_seen=floor_seen)
-        self._track = [*self._track[-1:], (frame.time, found)]
         count = int(found.used.sum())
         status = OK if count == len(self.body.markers) else PARTIAL
         return Sample(
@@ -153,6 +158,17 @@ class Tracker:
                     seen[index] = detection
         found = solve_pose(seen, self.body, self.camera, rotation, position)
         return (found, seen) if found is not None and found.residual < LARGEST_RESIDUAL else (None, seen)
+
+    def _at_frame_time(self, found: TargetPose, seen: dict[int, Detection]) -> TargetPose:
+        """The pose with each marker at its own row's time, by the speed since the frame before."""
+        (before, first), (now, last) = self._track[0], self._track[-1]
+        if not before < now < before + _LONGEST_STEP:
+            return found
+        speed = velocity_between(first, last, now - before)
+        view = TargetView(seen, found.rotation, found.position, speed)
+        moved = at_frame_time(view, self._stated, self.camera.height, self.camera.readout or 0.0)
+        again = solve_pose(moved, self._stated, self.camera, found.rotation, found.position)
+        return again if again is not None and again.residual < LARGEST_RESIDUAL else found
 
     def _search(self, frame: VideoFrame) -> tuple[TargetPose | None, dict[int, Detection]]:
         """Look around where the body was, then everywhere."""
