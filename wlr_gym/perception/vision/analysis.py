@@ -20,6 +20,8 @@ from wlr_gym.data.replay import robot_of
 from wlr_gym.data.robot_file import robot_of_meta
 from wlr_gym.data.write import write_run
 from wlr_gym.perception.markers.camera import Camera
+from wlr_gym.perception.markers.detection import detect
+from wlr_gym.perception.markers.sheet_fault import sheet_fault
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.alignment import Alignment, align, joint_signals
 from wlr_gym.perception.vision.frame_noise import turn_difference, without_repeats
@@ -136,11 +138,13 @@ def analyse(
         raise unknown_name("origin", origin, ORIGINS)
     found = robot_of(run, robot)
     parameters = Parameters.nominal(found)
-    samples = tuple(_observed(frames, camera, body, floor, watch or (lambda frame, sample: None)))
+    shown: list[VideoFrame] = []  # the first frame, to say what is in it when the robot is not
+    samples = tuple(_observed(frames, camera, body, floor, watch or (lambda frame, sample: None), shown))
     seen = sum(math.isfinite(sample.pose[0]) for sample in samples)
     if seen < 10:
         counts = ", ".join(f"{count} {name}" for name, count in Counter(sample.status for sample in samples).items())
-        raise InputError(f"only {seen} of {len(samples)} frames have a pose of the robot ({counts}); are its markers in view?")
+        why = sheet_fault(detect(shown[0].image, camera), body, camera)
+        raise InputError(f"only {seen} of {len(samples)} frames have a pose of the robot ({counts}); in the first frame {why}")
     samples, calibration = self_calibrated(tuple(without_repeats(samples)), camera, body, floor)
     alignment = None
     if offset is None:
@@ -228,7 +232,12 @@ def frame_table(samples: Sequence[Sample], offset: float) -> pandas.DataFrame:
 
 
 def _observed(
-    frames: Iterable[VideoFrame], camera: Camera, body: Target, floor: Target, watch: Callable[[VideoFrame, Sample], None]
+    frames: Iterable[VideoFrame],
+    camera: Camera,
+    body: Target,
+    floor: Target,
+    watch: Callable[[VideoFrame, Sample], None],
+    shown: list[VideoFrame],
 ) -> Iterator[Sample]:
     """Track, and hand each frame with its sample to ``watch``; frames wait no longer than until the floor is located."""
     waiting: list[VideoFrame] = []
@@ -236,6 +245,7 @@ def _observed(
     def passing() -> Iterator[VideoFrame]:
         for frame in frames:
             waiting.append(frame)
+            shown[:] = shown or [frame]
             yield frame
 
     for sample in track(passing(), camera, body, floor):

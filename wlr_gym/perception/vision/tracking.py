@@ -26,6 +26,7 @@ from wlr_gym.perception.markers.pose import (
     find_target,
     solve_pose,
 )
+from wlr_gym.perception.markers.sheet_fault import sheet_fault, target_pixels
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.adjustment import TargetView, at_frame_time, velocity_between
 
@@ -45,8 +46,6 @@ IMPOSSIBLE = "impossible"
 #: The picture before once more.
 REPEATED = "repeated"
 FLOOR_FRAMES = 20
-#: m; positions of floor markers may be off by this much (they were measured by hand).
-FLOOR_TOLERANCE = 0.01
 _MOVED_BY = 0.4  # px, median over the floor's markers: 1 mm at 2 m with a focal length of 800 px
 _LONGEST_STEP = 0.3  # s; frames further apart do not give a speed
 _FILM_SLACK = 0.001  # m; 1 sigma of what a rolling shutter displaces a marker by
@@ -220,15 +219,15 @@ class Tracker:
     def _locate_anew(self, image: Image) -> dict[int, Detection]:
         """Locate the floor in this frame alone; returns its markers. It stays where it was when too few are seen."""
         last = self.floor_pose
-        seen = _seen_at(image, self.floor, self._values, last)
+        seen = seen_at(image, self.floor, self._values, last)
         if len(seen) < MINIMUM_MARKERS:
             detections = detect(image, self.camera)
             found = find_target(
-                detections, self.floor, self.camera, tolerance=_floor_pixels(self.camera, detections, self.floor)
+                detections, self.floor, self.camera, tolerance=target_pixels(self.camera, detections, self.floor)
             )
             if found is None:
                 return {}
-            last, seen = found, _seen_at(image, self.floor, self._values, found)
+            last, seen = found, seen_at(image, self.floor, self._values, found)
         found = solved_floor(seen, self.floor, self.camera, last)
         if found is None:
             return {}
@@ -270,16 +269,13 @@ def locate_floor(frames: Sequence[VideoFrame], camera: Camera, floor: Target) ->
         check_size(frame.image, camera, f"frame {frame.index}")
         if start is None:
             detections = detect(frame.image, camera)
-            most = max(most, [d for d in detections if d.code in floor.codes], key=len)
-            start = find_target(detections, floor, camera, tolerance=_floor_pixels(camera, detections, floor))
+            most = max(most, detections, key=lambda found: sum(d.code in floor.codes for d in found))
+            start = find_target(detections, floor, camera, tolerance=target_pixels(camera, detections, floor))
         if start is not None:
-            for index, detection in _seen_at(frame.image, floor, camera.values, start).items():
+            for index, detection in seen_at(frame.image, floor, camera.values, start).items():
                 sums[index].append(detection)
     if start is None:
-        raise InputError(
-            f"no floor frame: {len(most)} of the target's {len(floor.markers)} floor markers were found in the first "
-            f"{len(frames)} frames, and at least 4 must fit together (check their positions in the target file, and the light)"
-        )
+        raise InputError(f"no floor frame in the first {len(frames)} frames: {sheet_fault(most, floor, camera)}")
     means = {index: mean_detection(found) for index, found in sums.items() if len(found) >= max(1, len(frames) // 2)}
     found = solved_floor(means, floor, camera, start) or start
     centres = np.full((len(floor.markers), 2), np.nan)
@@ -344,7 +340,8 @@ def _no_pose(frame: VideoFrame, status: str, centres: Array) -> Sample:
     return Sample(frame.index, frame.time, status, np.full(6, np.nan), np.full((6, 6), np.nan), 0, math.nan, centres)
 
 
-def _seen_at(image: Image, target: Target, camera: Array, pose: TargetPose) -> dict[int, Detection]:
+def seen_at(image: Image, target: Target, camera: Array, pose: TargetPose) -> dict[int, Detection]:
+    """The markers of a target where a pose puts them."""
     seen = {}
     for index in range(len(target.markers)):
         ellipse = expected_ellipse(target, index, camera, pose.rotation, pose.position)
@@ -362,13 +359,6 @@ def _identified(detections: Sequence[Detection], found: TargetPose, target: Targ
             x, y = ellipse[:2]
             seen[index] = min(detections, key=lambda d, x=x, y=y: math.hypot(d.ellipse[0] - x, d.ellipse[1] - y))
     return seen
-
-
-def _floor_pixels(camera: Camera, detections: Sequence[Detection], floor: Target) -> float:
-    """Largest residual of the floor (px): what a marker off by :data:`FLOOR_TOLERANCE` looks like."""
-    sizes = [d.radius for d in detections if d.code in floor.codes]
-    scale = max(sizes) / floor.radii.min() if sizes else camera.focal[0]
-    return LARGEST_RESIDUAL + FLOOR_TOLERANCE * scale
 
 
 def mean_detection(found: Sequence[Detection]) -> Detection:
