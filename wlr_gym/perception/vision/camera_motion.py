@@ -8,7 +8,7 @@ matter which of them a frame shows. A sheet that changes its place against the o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,10 +25,10 @@ Array = NDArray[np.float64]
 
 #: px, and sigmas of the mean over a block, by which the floor's markers leave their places once the camera moves.
 MOVED_BY, MOVED_SIGMAS = 0.03, 4.0
-#: px, and sigmas, of a marker's step against the others that makes it a kicked one.
-KICKED_BY, KICKED_SIGMAS = 0.5, 8.0
+#: px, and times the usual (median), of a step against the others that makes a marker a kicked one.
+KICKED_BY, KICKED_TIMES = 0.5, 4.0
 _BLOCK = 15  # frames that are averaged
-_AROUND = 4  # frames before and after a step
+_AROUND = 2  # frames before and after a step
 #: s; frames further apart do not give a speed.
 _LONGEST_STEP = 0.3
 
@@ -140,22 +140,39 @@ def _mean(block: Array) -> Array:
 
 def _kicks(centres: Array, times: Array, scale: float) -> Iterator[Kick]:
     """Markers that make a step against the others: the largest step of each; ``scale`` is m per px."""
-    count = len(centres)
-    if count <= 2 * _AROUND:
-        return
-    steps = np.full(centres.shape, np.nan)
+    count, markers = centres.shape[:2]
+    away = np.zeros((count, markers))
     for k in range(_AROUND, count - _AROUND + 1):
-        after, before = _mean(centres[k : k + _AROUND]), _mean(centres[k - _AROUND : k])
-        steps[min(k, count - 1)] = after - before
-    known = np.isfinite(steps[:, :, 0]).sum(axis=1) >= MINIMUM_MARKERS
-    if not known.any():
-        return
-    against = np.full(steps.shape[:2], np.nan)
-    common = np.nanmedian(steps[known], axis=1, keepdims=True)
-    against[known] = np.linalg.norm(steps[known] - common, axis=2)
-    limit = np.maximum(KICKED_BY, KICKED_SIGMAS * np.nanmedian(against))
-    for marker in range(centres.shape[1]):
-        own = np.nan_to_num(against[:, marker])
-        k = int(np.argmax(own))
-        if own[k] > limit:
-            yield Kick(marker, float(times[k]), scale * float(own[k]))
+        before, after = _mean(centres[k - _AROUND : k]), _mean(centres[k : k + _AROUND])
+        seen = np.flatnonzero(np.isfinite(before[:, 0]) & np.isfinite(after[:, 0]))
+        if len(seen) > MINIMUM_MARKERS:
+            marker, step = _odd_one(before, after, seen)
+            away[min(k, count - 1), marker] = step
+    steps = away[away > 0]
+    limit = max(KICKED_BY, KICKED_TIMES * float(np.median(steps))) if len(steps) else math.inf
+    for marker in range(markers):
+        k = int(np.argmax(away[:, marker]))
+        if away[k, marker] > limit:
+            yield Kick(marker, float(times[k]), scale * float(away[k, marker]))
+
+
+def _odd_one(before: Array, after: Array, seen: NDArray[np.int64]) -> tuple[int, float]:
+    """The marker without which the others only shift, turn and grow together, and how far (px) it leaves them."""
+    best, odd, step = math.inf, 0, 0.0
+    for marker in seen:
+        others = seen[seen != marker]
+        moved = _similarity(before[others], after[others])
+        rest = float(np.linalg.norm(moved(before[others]) - after[others]))
+        if rest < best:
+            best, odd, step = rest, int(marker), float(np.linalg.norm(moved(before[[marker]]) - after[marker]))
+    return odd, step
+
+
+def _similarity(before: Array, after: Array) -> Callable[[Array], Array]:
+    """The shift, turn and growth that takes points ``before`` (K, 2) to ``after`` with least squares."""
+    start, end = before.mean(axis=0), after.mean(axis=0)
+    # as complex numbers, turn and growth are one factor
+    a, b = (before - start) @ (1, 1j), (after - end) @ (1, 1j)
+    factor = np.vdot(a, b) / np.vdot(a, a)
+    matrix = np.array([[factor.real, factor.imag], [-factor.imag, factor.real]])
+    return lambda points: (points - start) @ matrix + end
