@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import Detection, Image, detect
 from wlr_gym.perception.markers.pose import find_target
-from wlr_gym.perception.markers.sheet_fault import sheet_fault, target_pixels
+from wlr_gym.perception.markers.sheet_fault import FLOOR_TOLERANCE, sheet_fault, target_pixels
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.adjustment import TargetView, adjust
 from wlr_gym.perception.vision.sheets import target_pages
@@ -92,7 +92,8 @@ def check_sheets(image: Image, camera: Camera, targets: Sequence[Target]) -> lis
 
 
 def _checked(image: Image, camera: Camera, target: Target, detections: Sequence[Detection]) -> SheetCheck:
-    found = find_target(detections, target, camera, tolerance=target_pixels(camera, detections, target))
+    loose = target.model_copy(update={"tolerance": FLOOR_TOLERANCE})
+    found = find_target(detections, loose, camera, tolerance=target_pixels(camera, detections, target))
     if found is None:
         own = sum(detection.code in target.codes for detection in detections)
         return SheetCheck(target, own, sheet_fault(detections, target, camera))
@@ -101,8 +102,8 @@ def _checked(image: Image, camera: Camera, target: Target, detections: Sequence[
     if len(target_pages(target)) > 1:
         return SheetCheck(target, len(seen), misfit=misfit)
     view = TargetView(seen, found.rotation, found.position, np.zeros(6))
-    loose = target.model_copy(update={"stretch": max(target.stretch, _STRETCH), "tolerance": min(target.tolerance, _PRINT)})
-    result = adjust(loose, [view], camera.height, 0.0)
+    printed = target.model_copy(update={"stretch": max(target.stretch, _STRETCH), "tolerance": min(target.tolerance, _PRINT)})
+    result = adjust(printed, [view], camera.height, 0.0)
     # stretch is what the affine map from the drawn places to those found has on its diagonal
     solve = np.linalg.pinv(np.column_stack([np.ones(len(target.markers)), target.positions[:, :2]]))[1:]
     stretch = np.diag(solve @ result.target.positions[:, :2]) - 1
