@@ -1,7 +1,8 @@
 """Slip from films of a lab that is not perfect, drawn by the second renderer: how far off, and how many sigmas.
 
 The films fill the space of what can be wrong evenly: hand-laid markers, stretched prints, rolling shutters, codecs, cameras
-that stand, drift or are held in the hands, uneven frame times, dropped frames. Every finished film is one file, so the work resumes.
+that stand, drift or are held in the hands, uneven frame times, dropped frames. Every finished film is one file, so
+the work resumes.
 """
 
 from __future__ import annotations
