@@ -30,7 +30,7 @@ BODY_RINGS = ((0.03, 0.03 * 0.76, 0.03 * 0.50), *3 * ((0.03, 0.03 * 0.667, 0.03 
 _HAND = ((0.45, 0.006, 0.008), (1.3, 0.002, 0.003), (4.1, 0.0003, 0.0006))
 
 
-class Motion(Protocol):
+class FilmedMotion(Protocol):
     """Where a body is, tick by tick: time (T,) s, position (T, 3) m, rotation (T, 3, 3)."""
 
     @property
@@ -90,7 +90,7 @@ def true_places(lab: Lab) -> tuple[Array, Array]:
 
 
 def frames(
-    motion: Motion, lab: Lab, seconds: float = 5.0, rate: float = 30.0, offset: float = 0.137, start: float = 0.011
+    motion: FilmedMotion, lab: Lab, seconds: float = 5.0, rate: float = 30.0, offset: float = 0.137, start: float = 0.011
 ) -> Iterator[VideoFrame]:
     """Film a drive; the middle row shows a frame's time. Servo time = the frame's time + ``offset``."""
     import cv2
@@ -120,7 +120,7 @@ def frames(
         number += 1
 
 
-def _body(motion: Motion, times: Array) -> tuple[Array, Array]:
+def _body(motion: FilmedMotion, times: Array) -> tuple[Array, Array]:
     """Position (T, 3) and rotation (T, 3, 3): linear between the truth's ticks."""
     place = np.clip(times / (motion.time[1] - motion.time[0]), 0, len(motion.time) - 2)
     k = place.astype(int)

@@ -30,12 +30,10 @@ from wlr_gym.perception.scene import (
     rotation_of,
     view,
 )
-from wlr_gym.perception.vision.alignment import align
+from wlr_gym.perception.vision.analysis import analyse
 from wlr_gym.perception.vision.paper_method import paper_pose
-from wlr_gym.perception.vision.slip import measure_slip
-from wlr_gym.perception.vision.tracking import Tracker, VideoFrame, locate_floor, track
+from wlr_gym.perception.vision.tracking import Tracker, VideoFrame, locate_floor
 from wlr_gym.robot import load_robot
-from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.measure import Size
 from wlr_gym.studies.bench.vision_clutter import clutter
 from wlr_gym.studies.bench.vision_drives import FilmedDrive, film, paper_test, skid_turn, true_slip
@@ -288,11 +286,10 @@ def measure_drive(drive: FilmedDrive, tilt: float = 0.0, look: Look | None = Non
     body, floor = load_target("body"), load_target("floor")
     camera = CAMERA.model_copy(update={"distortion": LENS})
     renderer = Renderer(camera, view(tilt, 2.0), floor_facets(floor))
-    samples = list(track(film(drive, renderer, body, look or Look(), TRUE_OFFSET), camera, body, floor))
-    parameters = Parameters.nominal(drive.robot)
-    poses = np.stack([sample.pose for sample in samples])
-    found = align(np.array([sample.time for sample in samples]), poses, drive.run, drive.robot, parameters)
-    slip = measure_slip(samples, found.offset, drive.run, drive.robot, parameters, found.std)
+    shots = film(drive, renderer, body, look or Look(), TRUE_OFFSET)
+    analysis = analyse(shots, drive.run, camera, body, floor, drive.robot)
+    samples, slip, found = analysis.samples, analysis.slip, analysis.alignment
+    assert found is not None  # no offset was given
     error = 1e3 * np.abs(slip.slip - true_slip(drive, slip.time))
     final = 1e3 * (slip.slip[-1] - true_slip(drive, slip.time)[-1])
     largest = 1e3 * np.abs(drive.slip[-1]).max(axis=0)
