@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -81,9 +82,9 @@ def _opencv(dictionary: Any) -> Finder:
 @cache  # the package crashes once a second detector is made
 def _apriltag_3() -> Finder:
     """AprilTag 3 at full resolution with refined edges; its corners go round the other way."""
-    from pupil_apriltags import Detector
-
-    detector = Detector("tag36h11", quad_decimate=1.0, quad_sigma=0.0, refine_edges=1, decode_sharpening=0.25)
+    detector = import_module("pupil_apriltags").Detector(
+        "tag36h11", quad_decimate=1.0, quad_sigma=0.0, refine_edges=1, decode_sharpening=0.25
+    )
 
     def find(image: Image) -> dict[int, Array]:
         found = detector.detect(np.ascontiguousarray(image))
