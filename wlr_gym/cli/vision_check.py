@@ -45,6 +45,7 @@ def run(options: VisionCheckOptions) -> int:
 
     from wlr_gym.perception.vision import load_camera, load_target
     from wlr_gym.perception.vision.sheet_check import check_sheets
+    from wlr_gym.perception.vision.video import grey
 
     if options.only not in (None, "markers", "floor"):
         raise InputError(f"--only {options.only}: expected markers or floor")
@@ -54,7 +55,7 @@ def run(options: VisionCheckOptions) -> int:
     image = cv2.imread(str(options.photo), cv2.IMREAD_GRAYSCALE) if options.photo.is_file() else None
     if image is None:
         raise InputError(f"{options.photo}: no such picture, or it cannot be read as one")
-    checks = check_sheets(image, camera, targets)
+    checks = check_sheets(grey(image), camera, targets)
     for check in checks:
         print(_line(check))
         print("".join(f"  {warning}\n" for warning in check.warnings), end="")

@@ -193,7 +193,8 @@ def encoded(shots: Sequence[VideoFrame], film: LabFilm, folder: Path) -> Iterato
     path, times = folder / "film.mp4", folder / "times.csv"
     rate = film.bit_rate * width * height / (1280 * 720)
     codec = {"h264": "libx264", "hevc": "libx265"}[film.codec]
-    writer = imageio_ffmpeg.write_frames(
+    write: Any = imageio_ffmpeg.write_frames  # its annotation asks for a whole number of pictures per second
+    writer = write(
         str(path), (width, height), pix_fmt_in="gray", codec=codec, fps=RATE, macro_block_size=1, ffmpeg_log_level="quiet",
         output_params=["-b:v", f"{rate:.0f}k", "-threads", "1"],
     )  # fmt: skip

@@ -82,9 +82,8 @@ def _opencv(dictionary: Any) -> Finder:
 @cache  # the package crashes once a second detector is made
 def _apriltag_3() -> Finder:
     """AprilTag 3 at full resolution with refined edges; its corners go round the other way."""
-    detector = import_module("pupil_apriltags").Detector(
-        "tag36h11", quad_decimate=1.0, quad_sigma=0.0, refine_edges=1, decode_sharpening=0.25
-    )
+    settings = {"quad_decimate": 1.0, "quad_sigma": 0.0, "refine_edges": 1, "decode_sharpening": 0.25}
+    detector = import_module("pupil_apriltags").Detector("tag36h11", **settings)
 
     def find(image: Image) -> dict[int, Array]:
         found = detector.detect(np.ascontiguousarray(image))
