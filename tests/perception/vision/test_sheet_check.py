@@ -26,6 +26,7 @@ def changed(target, factors=(1.0, 1.0), codes=None):
 def test_right_sheets_are_right(studio, photo):
     body, floor = check_sheets(photo, studio.camera, [studio.body, studio.floor])
     assert body.warnings == floor.warnings == ()
+    assert body.stretch is not None
     assert abs(body.stretch[0] - body.stretch[1]) < max(0.001, 3 * body.difference_std)
     assert floor.stretch is None  # four prints
     assert floor.misfit < 0.5e-3
@@ -33,6 +34,7 @@ def test_right_sheets_are_right(studio, photo):
 
 def test_a_print_stretched_one_way_is_measured_and_named(studio, photo):
     (found,) = check_sheets(photo, studio.camera, [changed(studio.body, (1.0, 0.99))])
+    assert found.stretch is not None
     assert found.stretch[0] - found.stretch[1] == pytest.approx(-0.01, abs=0.002)
     assert "more along x than along y" in found.warnings[0]
 
@@ -41,6 +43,7 @@ def test_a_caliper_reading_makes_both_stretches_known(studio, photo):
     target = changed(studio.body, (0.995, 0.99)).model_copy(update={"caliper": 0.28})
     (found,) = check_sheets(photo, studio.camera, [target])
     assert found.stretch == pytest.approx([0.005, 0.01], abs=0.002)
+    assert found.stretch_std is not None
     assert found.stretch_std[0] == pytest.approx(0.0002 / 0.28, rel=0.3)
 
 
