@@ -2,14 +2,15 @@
 
 In every control step each robot's true state is copied to a batch of imagined robots, which try random plans; the plan that
 is followed is their mean, weighted by what they cost. The cost is the task's own tracking error, so that the score says what
-is reachable with the robot's motors on the floors at hand, known exactly. Commands are taken to stay as they are.
+is reachable with the robot's motors on the floors at hand, known exactly. Commands are taken to stay as they are. The
+setting ``knows`` has it plan for a nominal robot or a nominal floor instead: what the knowledge of them is worth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,10 @@ from wlr_gym.envs.core import Core
 from wlr_gym.envs.tasks.success import scales_of
 from wlr_gym.policy import make_policy
 from wlr_gym.robot import FIRST_WHEEL, JOINTS
+from wlr_gym.robot.parameters import ELEMENTS, Parameters
 
 if TYPE_CHECKING:
+    from wlr_gym.base.snapshot import Snapshot
     from wlr_gym.policy import Policy
 
 Array = NDArray[np.float64]
@@ -41,6 +44,7 @@ class MppiConfig(SettingsModel):
         slip: weight of the mean slip speed (per 0.05 m/s) beside the squared tracking error.
         action_rate: weight of the squared change of the action.
         proposer: agent whose action, kept, is among the plans tried.
+        knows: what has each robot's own numbers, its state apart; the rest has nominal ones, and no friction patches.
         tasks: task name -> settings that differ there. environment: keywords of the environment.
     """
 
@@ -55,6 +59,7 @@ class MppiConfig(SettingsModel):
     slip: float = Field(0.0, ge=0)
     action_rate: float = Field(0.02, ge=0)
     proposer: str = "slip_compensating"
+    knows: tuple[Literal["robot", "floor"], ...] = ("robot", "floor")
     tasks: dict[str, dict[str, Any]] = Field(default_factory=dict)
     environment: dict[str, Any] = Field(default_factory=dict)
 
@@ -92,6 +97,8 @@ class Mppi:
         self._core = core
         self._owner = np.repeat(np.arange(core.count), self.config.samples)
         self._imagined = _imagined(core, len(self._owner))
+        self._nominal = Parameters.nominal(core.task.robot).values
+        self._known = known_parameters(self.config.knows)
         knots = -(-self.config.horizon // self.config.hold)
         self._plan = np.zeros((core.count, knots, len(JOINTS)))
         self._noise = np.full(len(JOINTS), self.config.leg_noise)
@@ -103,7 +110,7 @@ class Mppi:
             raise InputError("agent 'mppi' plans on a simulator's own state: it runs in 'wlr evaluate' and nowhere else")
         config, core = self.config, self._core
         proposed = self._proposer.act(observations).astype(np.float64)
-        state = core.plant.get_state()[self._owner]
+        state = self._believed(core.plant.get_state())[self._owner]
         for iteration in range(config.iterations):
             plans = self._candidates(proposed, 0.5**iteration)
             cost = self._cost(state, plans)
@@ -121,6 +128,11 @@ class Mppi:
             self._random = np.random.default_rng(self.config.seed)
         if self._core is not None:
             self._plan[mask] = 0.0
+
+    def _believed(self, state: Snapshot) -> Snapshot:
+        """Return the state of robots that have nominal numbers where the planner does not know theirs."""
+        parameters = np.where(self._known, state.arrays["parameters"], self._nominal)
+        return replace(state, arrays={**state.arrays, "parameters": parameters})
 
     def _candidates(self, proposed: Array, size: float) -> Array:
         """Return plans (N, S, K, 8): that of the last step, the proposer's action kept, and random changes of both."""
@@ -151,6 +163,11 @@ class Mppi:
             change = imagined.action - imagined.actions.previous
             cost += self.config.action_rate * (change**2).sum(axis=1)
         return (cost / self.config.horizon).reshape(plans.shape[:2])
+
+
+def known_parameters(knows: Collection[str]) -> NDArray[np.bool_]:
+    """Return which columns (P,) of the parameter table belong to what is known: ``robot``, ``floor``."""
+    return np.array([("floor" if name.startswith(("ground.", "patch.")) else "robot") in knows for name in ELEMENTS])
 
 
 def _imagined(core: Core, count: int) -> Core:

@@ -10,7 +10,7 @@ from wlr_gym.robot.parameter_table import ELEMENTS
 
 ENVIRONMENT = "WLR-Velocity-v0"
 #: Agents that act on observations alone.
-READERS = [name for name in agent_names() if name != "mppi"]
+READERS = [name for name in agent_names() if not name.startswith("mppi")]
 DELAYS = [index for index, element in enumerate(ELEMENTS) if element.startswith("command.delay[")]
 
 

@@ -45,6 +45,25 @@ def test_planning_leaves_the_robots_alone():
     core.close()
 
 
+@pytest.mark.parametrize(("name", "parameter"), [("mppi_nominal", "ground.mu_x"), ("mppi_nominal", "servo.stall_torque")])
+def test_what_is_not_known_changes_no_plan(name, parameter):
+    """The same state on another floor, or with other motors: a planner that does not know of it does the same."""
+    core, knowing = make_player("WLR-Velocity-v0", "mppi", 1, SLIPS)
+    ignorant: Any = make_policy(name, core.contract())
+    ignorant.use_simulator(core)
+    core.seed(0, 3)
+    core.begin_episodes(core.everyone)
+    before = [policy.act(core.observation) for policy in (ignorant, knowing)]
+    core.parameters[parameter] = 0.5 * core.parameters[parameter]
+    core.plant.set_parameters(core.parameters, core.everyone)
+    for policy in (ignorant, knowing):
+        policy.reset(core.everyone)
+    after = [policy.act(core.observation) for policy in (ignorant, knowing)]
+    core.close()
+    np.testing.assert_array_equal(after[0], before[0])
+    assert (after[1] != before[1]).any()
+
+
 @pytest.mark.slow
 def test_plans_are_better_than_the_controller_on_split_floors():
     conditions = {**SLIPS, "episode_length": 3.0}
