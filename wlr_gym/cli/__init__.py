@@ -52,6 +52,9 @@ COMMANDS = {
     "demo": "the whole loop in about three minutes: learn, drive on ice, find the hidden fault of a robot; one page",
 }
 
+#: Words behind a command that name a module of their own (``vision_check``).
+NESTED = {("vision", "check")}
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``wlr`` and return its exit code: 0 done, 1 failed, 2 bad input, 130 interrupted."""
@@ -97,6 +100,8 @@ def _import_modules(words: list[str]) -> list[str]:
 
 def run_command(name: str, arguments: Sequence[str]) -> int:
     """Parse the arguments of one command and run it."""
+    if (name, *arguments[:1]) in NESTED:
+        name, arguments = f"{name}_{arguments[0]}", arguments[1:]
     return _module(name).run(parse(name, arguments))
 
 
@@ -113,8 +118,8 @@ def parse(name: str, arguments: Sequence[str]) -> Any:
         if given.count(option) > 1:
             raise InputError(f"wlr {name}: {option} is given twice; all its values go behind one: {option} FIRST SECOND")
     module = _module(name)
-    kind = getattr(module, f"{name.capitalize()}Options")
-    return tyro.cli(kind, prog=f"wlr {name}", description=module.__doc__, args=list(arguments))
+    kind = getattr(module, "".join(part.capitalize() for part in name.split("_")) + "Options")
+    return tyro.cli(kind, prog=f"wlr {name.replace('_', ' ')}", description=module.__doc__, args=list(arguments))
 
 
 def _module(name: str) -> Any:

@@ -66,13 +66,14 @@ class BenchOptions:
     quick: bool = False
     """Tiny sizes: shows that it runs; the numbers mean nothing."""
     out: Path | None = None
-    """gap, adapt: folder for results; an interrupted test resumes from it."""
+    """gap, adapt: folder for results; an interrupted test resumes from it.
+    vision: instead of the table, film a lab that is not perfect and keep every film's result here; resumes likewise."""
     cases: tuple[str, ...] = ()
     """adapt: names of cases, or how many of them; default: all."""
     contenders: tuple[str, ...] = ()
     """adapt: none, truth, wide, ours, calibrated; default: all."""
-    sets: int = 240
-    """gap: data sets."""
+    sets: int | None = None
+    """gap: data sets (240). vision with --out: films (60)."""
     processes: int = 2
     """gap: data sets at a time."""
     ray: tuple[str, ...] | None = None
@@ -99,6 +100,8 @@ def run(options: BenchOptions) -> int:
         return _adapt_study(options, asked)
     if BLIND_TEST in asked:
         return _blind_test(options, asked)
+    if options.out is not None:
+        return _lab_films(options, asked)
     console, size = Console(), Size(options.rounds, options.quick)
     report: dict[str, Any] = {"schema": SCHEMA, "machine": machine(), "rounds": options.rounds, "quick": options.quick}
     report |= {"measurements": [], "convergence": [], "vision": []}
@@ -142,7 +145,7 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
         raise InputError(f"{BLIND_TEST} needs --out DIR: finished data sets are kept there, so that it can be interrupted")
     console = Console(soft_wrap=True)
     report = gap.run_blind_test(
-        gap.Plan(options.out, options.sets, options.processes),
+        gap.Plan(options.out, 240 if options.sets is None else options.sets, options.processes),
         say=console.print,
         answers=options.answers,
         ray=ray_address(options.ray),
@@ -177,6 +180,29 @@ def _adapt_study(options: BenchOptions, asked: tuple[str, ...]) -> int:
     (options.out / "adapt.md").write_text(text, encoding="utf-8")
     console.print(text, markup=False)
     console.print(f"written: {options.out / adapt_study.LINES_FILE}, {options.out / 'adapt.md'}")
+    return OK
+
+
+def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
+    """Film a lab that is not perfect; print and write the score."""
+    from wlr_gym.studies.bench.lab_films import FILMS, bars, run_lab_films, score
+
+    if asked != ("vision",) or options.out is None:
+        raise InputError(f"--out: for gap or vision, alone; got {', '.join(asked) or 'nothing'}")
+    console = Console(soft_wrap=True, highlight=False)
+    count = FILMS if options.sets is None else options.sets
+    if count < 1:
+        raise InputError(f"--sets {count}: expected 1 or more")
+    results = run_lab_films(options.out, count, lambda text: console.print(text, markup=False))
+    found = score(results)
+    report = {"machine": machine(), "score": found, "films": [asdict(result) for result in results]}
+    for path in (options.out / "score.json", *([] if options.json is None else [options.json])):
+        write_json(path, report)
+    table = Table("what", "found", "bar", "met", box=None, title=f"{count} films of a lab", title_justify="left")
+    for what, value, bar, met in bars(found):
+        table.add_row(what, value, bar, _YES_NO[met])
+    console.print(table)
+    console.print(f"written: {options.out / 'score.json'}")
     return OK
 
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from second_renderer import Lab, frames, lens, true_places
 
 from wlr_gym.perception.markers.targets import load_target
 from wlr_gym.perception.vision.analysis import analyse
+from wlr_gym.perception.vision.live_pose import PoseFinder
 from wlr_gym.robot import load_robot
-from wlr_gym.studies.bench.vision import true_slip
-from wlr_gym.studies.bench.vision_drives import skid_turn
+from wlr_gym.studies.bench.lab_renderer import Lab, frames, lens, true_places
+from wlr_gym.studies.bench.vision_drives import skid_turn, true_slip
 
 SECONDS, RATE = 4.6, 15.0
 
@@ -60,4 +60,25 @@ def test_a_print_that_is_stretched_both_ways_with_a_caliper_reading(drive):
 def test_a_camera_that_drifts(drive):
     found = analysed(drive, Lab(drift=0.002))
     checked(drive, found)
-    assert any("the floor was located anew" in finding for finding in found.findings)
+    assert any("the camera moved" in finding for finding in found.findings)
+
+
+@pytest.mark.slow
+def test_a_camera_in_the_hands_a_kicked_sheet_and_times_that_jitter(drive):
+    found = analysed(drive, Lab(hand=0.7, floor_error=0.002, kick=(3.9, 0.012), stamp_error=0.002, seed=7))
+    checked(drive, found)
+    assert any("floor sheet 'b' changed its place" in finding for finding in found.findings)
+    assert found.calibration is not None
+    assert found.calibration.noise.jitter == pytest.approx(0.002, rel=0.5)
+
+
+@pytest.mark.slow
+def test_the_live_tracker_gives_the_poses_of_the_film(drive):
+    """With a rolling shutter whose readout the camera file states."""
+    shots = [frame for frame in frames(drive, Lab(readout=0.025), 4.6, 30.0) if frame.time > 1.5]
+    film = analyse(shots, drive.run, lens(0.025), load_target("body"), load_target("floor"), drive.robot)
+    finder = PoseFinder(lens(0.025), load_target("body"), load_target("floor"))
+    apart = np.array([finder(shot).pose - sample.pose for shot, sample in zip(shots, film.samples, strict=True)])
+    apart = apart[np.isfinite(apart[:, 0])]
+    assert len(apart) > 60
+    assert np.all(np.sqrt(np.mean(apart**2, axis=0)) < [1e-4, 1e-4, 2e-4, 1e-4, 2e-3, 2e-3])

@@ -129,7 +129,7 @@ def test_wrong_image_size_is_refused(studio):
 def test_too_few_floor_markers_are_refused(studio):
     frame = studio.frame(moving(0), 0)
     frame.image[:360, :640] = 128
-    with pytest.raises(InputError, match=r"no floor frame: 3 of the target's 4 floor markers"):
+    with pytest.raises(InputError, match=r"no floor frame in the first 1 frames: 3 of the 4 markers of 'floor' seen"):
         track([frame], studio.camera, studio.body, studio.floor)
 
 

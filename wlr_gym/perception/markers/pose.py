@@ -113,7 +113,7 @@ def solve_pose(
         wrong = [i for i in indices if not _looks_right(seen[i], target, i, turn, place)]
         suspicious = wrong or ([indices[int(np.argmax(per_marker))]] if chi_square > _OUTLIER and len(indices) > 3 else [])
         residual = _pixels(data, turn, place, camera)
-        explained = max(_MODEL_ERROR, _TOLERATED * target.tolerance * camera.focal[0] / place[2])
+        explained = max(_MODEL_ERROR, _TOLERATED * target.slack * camera.focal[0] / place[2])
         if not suspicious or (not wrong and residual < explained):
             used = np.zeros(len(target.markers), bool)
             used[indices] = True

@@ -7,6 +7,7 @@ own, so that no turn of the target looks like another.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from pathlib import Path
 
@@ -69,6 +70,11 @@ class Target(SettingsModel):
     def radii(self) -> Array:
         """Outer radii (M,) in m."""
         return np.array([marker.radius for marker in self.markers])
+
+    @property
+    def slack(self) -> float:
+        """1 sigma (m) of how far a marker may be off its stated place: by hand, and by the print's stretch."""
+        return math.hypot(self.tolerance, self.stretch * float(np.abs(self.positions[:, :2]).max()))
 
     @property
     def codes(self) -> NDArray[np.int64]:

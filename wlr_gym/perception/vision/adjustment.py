@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.perception.markers.detection import Detection
-from wlr_gym.perception.markers.pose import turned
+from wlr_gym.perception.markers.pose import TargetPose, turned
 from wlr_gym.perception.markers.targets import Target, ring_radii
 
 Array = NDArray[np.float64]
@@ -136,6 +136,14 @@ def adjust(target: Target, views: Sequence[TargetView], height: int, readout: fl
     found = target.model_copy(update={"markers": markers})
     std = math.sqrt(covariance[_READOUT, _READOUT])
     return Adjustment(found, covariance[:_READOUT, :_READOUT], float(shared[_READOUT]), std, noise)
+
+
+def velocity_between(before: TargetPose, after: TargetPose, step: float) -> Array:
+    """Turn rate about the camera's axes (rad/s) and speed (m/s) of a target from one pose to another, ``step`` s later."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix(after.rotation @ before.rotation.T).as_rotvec()
+    return np.concatenate([turn, after.position - before.position]) / step
 
 
 def at_frame_time(view: TargetView, target: Target, height: int, readout: float) -> dict[int, Detection]:

@@ -20,11 +20,14 @@ from wlr_gym.data.replay import robot_of
 from wlr_gym.data.robot_file import robot_of_meta
 from wlr_gym.data.write import write_run
 from wlr_gym.perception.markers.camera import Camera
+from wlr_gym.perception.markers.detection import detect
+from wlr_gym.perception.markers.sheet_fault import sheet_fault
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.alignment import Alignment, align, joint_signals
-from wlr_gym.perception.vision.self_calibration import SelfCalibration, calibration_findings, self_calibrated
+from wlr_gym.perception.vision.frame_noise import turn_difference, without_repeats
+from wlr_gym.perception.vision.self_calibration import UNSURE, SelfCalibration, calibration_findings, self_calibrated
 from wlr_gym.perception.vision.slip import SlipResult, measure_slip, smoothed_poses
-from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, Sample, VideoFrame, track
+from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, REPEATED, Sample, VideoFrame, track
 from wlr_gym.perception.vision.video import Frames
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
@@ -87,7 +90,7 @@ class VideoAnalysis:
         return {
             "frames": len(self.samples),
             "missing_frames": self.missing_frames,
-            "status": {name: counts.get(name, 0) for name in (OK, PARTIAL, LOST, MOVED, IMPOSSIBLE)},
+            "status": {name: counts.get(name, 0) for name in (OK, PARTIAL, LOST, MOVED, IMPOSSIBLE, REPEATED)},
             "outliers": int(slip.outliers.sum()),
             "median_residual_px": float(np.median(residuals)),
             "offset_s": self.offset,
@@ -135,12 +138,14 @@ def analyse(
         raise unknown_name("origin", origin, ORIGINS)
     found = robot_of(run, robot)
     parameters = Parameters.nominal(found)
-    samples = tuple(_observed(frames, camera, body, floor, watch or (lambda frame, sample: None)))
+    shown: list[VideoFrame] = []  # the first frame, to say what is in it when the robot is not
+    samples = tuple(_observed(frames, camera, body, floor, watch or (lambda frame, sample: None), shown))
     seen = sum(math.isfinite(sample.pose[0]) for sample in samples)
     if seen < 10:
         counts = ", ".join(f"{count} {name}" for name, count in Counter(sample.status for sample in samples).items())
-        raise InputError(f"only {seen} of {len(samples)} frames have a pose of the robot ({counts}); are its markers in view?")
-    samples, calibration = self_calibrated(samples, camera, body)
+        why = sheet_fault(detect(shown[0].image, camera), body, camera)
+        raise InputError(f"only {seen} of {len(samples)} frames have a pose of the robot ({counts}); in the first frame {why}")
+    samples, calibration = self_calibrated(tuple(without_repeats(samples)), camera, body, floor)
     alignment = None
     if offset is None:
         time, poses = np.array([s.time for s in samples]), np.stack([s.pose for s in samples])
@@ -154,7 +159,10 @@ def analyse(
     legs = joint_signals(run, slip.time, found)[0][:, LEG_SLICE] - parameters["joint.zero_offset"]
     height_error = float(np.median(slip.pose[:, 2] - rest_pose(parameters, legs)[:, 0]))
     missing = frames.missing if isinstance(frames, Frames) else 0
-    findings = (*_findings(samples, slip, height_error, missing), *calibration_findings(calibration))
+    findings = (
+        *_findings(samples, slip, height_error, missing), *calibration_findings(calibration),
+        *_turn_findings(samples, offset, run, found),
+    )  # fmt: skip
     return VideoAnalysis(
         measured, samples, alignment, offset, slip, found, origin, height_error, missing, findings, calibration
     )
@@ -224,7 +232,12 @@ def frame_table(samples: Sequence[Sample], offset: float) -> pandas.DataFrame:
 
 
 def _observed(
-    frames: Iterable[VideoFrame], camera: Camera, body: Target, floor: Target, watch: Callable[[VideoFrame, Sample], None]
+    frames: Iterable[VideoFrame],
+    camera: Camera,
+    body: Target,
+    floor: Target,
+    watch: Callable[[VideoFrame, Sample], None],
+    shown: list[VideoFrame],
 ) -> Iterator[Sample]:
     """Track, and hand each frame with its sample to ``watch``; frames wait no longer than until the floor is located."""
     waiting: list[VideoFrame] = []
@@ -232,6 +245,7 @@ def _observed(
     def passing() -> Iterator[VideoFrame]:
         for frame in frames:
             waiting.append(frame)
+            shown[:] = shown or [frame]
             yield frame
 
     for sample in track(passing(), camera, body, floor):
@@ -265,12 +279,10 @@ def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, 
             f"the camera moved, and the floor was not to be located: {counts[MOVED]} frames from {first.index} on "
             f"({first.time:.2f} s) have no pose"
         )
-    floors = [sample.floor for sample in samples if sample.floor is not None]
-    followed = sum(floor is not floors[0] for floor in floors)
-    if followed:
-        yield f"the camera moved: in {followed} frames the floor was located anew; their poses are less precise"
     if counts[LOST]:
         yield f"{counts[LOST]} frames without the robot's markers (hidden, blurred or out of view)"
+    if counts[REPEATED]:
+        yield f"{counts[REPEATED]} frames repeat the picture before, and were left out"
     if counts[IMPOSSIBLE]:
         yield f"{counts[IMPOSSIBLE]} frames gave a pose that cannot be, and were left out"
     if slip.outliers.any():
@@ -292,6 +304,15 @@ def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, 
     dropped = int(np.sum(np.round(steps / np.median(steps)) - 1)) if len(steps) else 0
     if dropped > 0:
         yield f"about {dropped} frames were dropped by the camera"
+
+
+def _turn_findings(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> Iterator[str]:
+    difference = turn_difference(samples, offset, run, robot)
+    if difference is not None:
+        yield (
+            f"camera and gyroscope see turns that differ by {1e3 * difference[1]:.0f} mrad, most at {difference[0]:.2f} s: "
+            f"frame times that jump (frames dropped without a trace?), or a wrong run; {UNSURE}"
+        )
 
 
 # --- plots ------------------------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.perception.markers.camera import Camera
-from wlr_gym.perception.markers.pose import LARGEST_RESIDUAL, solve_pose
+from wlr_gym.perception.markers.pose import LARGEST_RESIDUAL, TargetPose, solve_pose
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.adjustment import Adjustment, TargetView, adjust, at_frame_time
-from wlr_gym.perception.vision.tracking import Sample, pose_in_floor
+from wlr_gym.perception.vision.camera_motion import CameraMotion, camera_motion, velocities
+from wlr_gym.perception.vision.frame_noise import FrameNoise, frame_noise, widened
+from wlr_gym.perception.vision.tracking import MOVED, OK, PARTIAL, Sample, pose_in_floor, without_pose
 
 Array = NDArray[np.float64]
 
@@ -25,8 +26,10 @@ LEAST_LAYOUT = 0.00005
 TOLD_LAYOUT = 0.0005
 #: Sigmas (of the stated tolerance) by which a marker may lie off before the target file is held to be wrong.
 WRONG_LAYOUT = 4.0
-#: s; frames further apart do not tell a speed.
-_LONGEST_STEP = 0.3
+#: Films are said to be noisy from here on: noise of the poses over what the edges of their markers state; s, of the times.
+TOLD_NOISE, TOLD_JITTER = 1.6, 0.001
+#: In findings that doubt the result.
+UNSURE = "the slip may be off by more than its sigma"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +38,16 @@ class SelfCalibration:
 
     Attributes:
         adjustment: of the body's target and the shutter. readout: s that was used. drawn: the target as its file has it.
-        stated: the readout came with the camera file.
+        stated: the readout came with the camera file. motion: of the camera.
+        noise: of the frames, found from one to the next.
     """
 
     adjustment: Adjustment
     readout: float
     drawn: Target
     stated: bool
+    motion: CameraMotion
+    noise: FrameNoise
 
     @property
     def moved(self) -> Array:
@@ -49,20 +55,28 @@ class SelfCalibration:
         return np.linalg.norm(self.adjustment.target.positions - self.drawn.positions, axis=1)
 
 
-def self_calibrated(samples: tuple[Sample, ...], camera: Camera, body: Target) -> tuple[tuple[Sample, ...], SelfCalibration]:
-    """Adjust target and shutter over the film, and solve every frame anew with them."""
-    first, _ = _once(samples, camera, body)
-    return _once(first, camera, body)  # with speeds that the shutter no longer falsifies
+def self_calibrated(
+    samples: tuple[Sample, ...], camera: Camera, body: Target, floor: Target
+) -> tuple[tuple[Sample, ...], SelfCalibration]:
+    """Adjust target and shutter over the film, find out where the camera is, and solve every frame anew with them."""
+    first, _ = _once(samples, camera, body, floor)
+    second, found = _once(first, camera, body, floor)  # with speeds that the shutter no longer falsifies
+    noise = frame_noise(second)
+    return widened(second, noise), replace(found, noise=noise)
 
 
-def _once(samples: tuple[Sample, ...], camera: Camera, body: Target) -> tuple[tuple[Sample, ...], SelfCalibration]:
-    speeds = _velocities(samples)
+def _once(
+    samples: tuple[Sample, ...], camera: Camera, body: Target, floor: Target
+) -> tuple[tuple[Sample, ...], SelfCalibration]:
+    speeds = velocities([sample.time for sample in samples], [sample.in_camera for sample in samples])
     found, readout = _adjusted(samples, speeds, camera, body)
-    calibration = SelfCalibration(found, readout, body, camera.readout is not None)
-    if readout == 0.0 and calibration.moved.max() < LEAST_LAYOUT:
-        return samples, calibration
-    target = found.target.model_copy(update={"tolerance": 0.0})
-    solved = tuple(_solved(s, v, camera, target, readout) for s, v in zip(samples, speeds, strict=True))
+    motion = camera_motion(samples, camera, floor, readout)
+    calibration = SelfCalibration(found, readout, body, camera.readout is not None, motion, FrameNoise())
+    as_drawn = readout == 0.0 and calibration.moved.max() < LEAST_LAYOUT
+    target = None if as_drawn else found.target.model_copy(update={"tolerance": 0.0})
+    solved = tuple(
+        _solved(s, v, camera, target, readout, f, motion.moves) for s, v, f in zip(samples, speeds, motion.floors, strict=True)
+    )
     return solved, calibration
 
 
@@ -85,15 +99,26 @@ def calibration_findings(calibration: SelfCalibration) -> Iterator[str]:
     """What was estimated away, and what the film cannot tell, in words."""
     found, drawn = calibration.adjustment, calibration.drawn
     moved = calibration.moved
+    noise = calibration.noise
+    if noise.scale > TOLD_NOISE:
+        yield f"poses scatter {noise.scale:.1f} times as much as their edges state (compression?); their sigmas were widened"
+    if noise.jitter > TOLD_JITTER:
+        yield f"frame times are off by {1e3 * noise.jitter:.1f} ms (1 sigma) from frame to frame; sigmas were widened"
+    for kick in calibration.motion.kicks:
+        name, place = calibration.motion.names[kick.marker], f"about {1e3 * kick.distance:.0f} mm at {kick.time:.2f} s"
+        rest = "it was left out" if calibration.motion.enough else f"too few others are left: {UNSURE}"
+        yield f"floor sheet '{name}' changed its place by {place} (kicked?); {rest}"
+    if calibration.motion.moves:
+        yield "the camera moved: the floor was located in every frame; the poses are less precise"
     if moved.max() > TOLD_LAYOUT:
         places = ", ".join(f"{m.name} {1e3 * d:.1f}" for m, d in zip(drawn.markers, moved, strict=True))
         yield f"markers lie off their stated places, and were measured anew from the film (mm): {places}"
-    allowed = WRONG_LAYOUT * math.hypot(drawn.tolerance, drawn.stretch * float(np.abs(drawn.positions).max()))
+    allowed = WRONG_LAYOUT * drawn.slack
     if moved.max() > allowed:
         name = drawn.markers[int(np.argmax(moved))].name
         yield (
             f"marker '{name}' lies {1e3 * moved.max():.1f} mm off: more than the tolerance in the target file allows "
-            f"({1e3 * drawn.tolerance:g} mm, 1 sigma); the right file and sheet? The slip may be off by more than its sigma"
+            f"({1e3 * drawn.tolerance:g} mm, 1 sigma); the right file and sheet? {UNSURE}"
         )
     if calibration.readout and not calibration.stated:
         std = 1e3 * found.readout_std
@@ -109,33 +134,25 @@ def calibration_findings(calibration: SelfCalibration) -> Iterator[str]:
         )
 
 
-def _solved(sample: Sample, speed: Array, camera: Camera, target: Target, readout: float) -> Sample:
-    """One frame with corrected markers; as it was where it has no pose."""
-    first = sample.in_camera
-    if first is None or sample.floor is None:
+def _solved(
+    sample: Sample, speed: Array, camera: Camera, target: Target | None, readout: float, floor: TargetPose | None, moving: bool
+) -> Sample:
+    """One frame with corrected markers (``target`` None = they are right) and floor; as it was where it has no pose."""
+    found = sample.in_camera
+    if found is None or sample.floor is None:
         return sample
-    seen = sample.seen
-    if readout:
-        seen = at_frame_time(TargetView(seen, first.rotation, first.position, speed), target, camera.height, readout)
-    found = solve_pose(seen, target, camera, first.rotation, first.position)
-    if found is None or found.residual > LARGEST_RESIDUAL:
-        return sample
-    pose, covariance = pose_in_floor(found, sample.floor)
+    if floor is None:
+        return without_pose(sample, MOVED)
+    if target is not None:
+        seen = sample.seen
+        if readout:
+            seen = at_frame_time(TargetView(seen, found.rotation, found.position, speed), target, camera.height, readout)
+        again = solve_pose(seen, target, camera, found.rotation, found.position)
+        found = again if again is not None and again.residual < LARGEST_RESIDUAL else found
+    pose, covariance = pose_in_floor(found, floor, moving)
     count = int(found.used.sum())
-    return replace(sample, pose=pose, covariance=covariance, residual=found.residual, markers=count, in_camera=found)
-
-
-def _velocities(samples: Sequence[Sample]) -> Array:
-    """Turn rate and speed (F, 6) of the body in the camera frame, from the frames before and after; 0 where not known."""
-    from scipy.spatial.transform import Rotation
-
-    result = np.zeros((len(samples), 6))
-    known = [k for k, sample in enumerate(samples) if sample.in_camera is not None]
-    for place, k in enumerate(known):
-        before, after = samples[known[max(0, place - 1)]], samples[known[min(len(known) - 1, place + 1)]]
-        step = after.time - before.time
-        if not 0 < step < _LONGEST_STEP or before.in_camera is None or after.in_camera is None:
-            continue
-        turn = Rotation.from_matrix(after.in_camera.rotation @ before.in_camera.rotation.T).as_rotvec()
-        result[k] = np.concatenate([turn, after.in_camera.position - before.in_camera.position]) / step
-    return result
+    status = OK if count == len(found.used) else PARTIAL
+    return replace(
+        sample, status=status, pose=pose, covariance=covariance, residual=found.residual, markers=count, in_camera=found,
+        floor=floor,
+    )  # fmt: skip

@@ -18,8 +18,17 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import Detection, Image, detect, refine
-from wlr_gym.perception.markers.pose import LARGEST_RESIDUAL, TargetPose, expected_ellipse, find_target, solve_pose
+from wlr_gym.perception.markers.pose import (
+    LARGEST_RESIDUAL,
+    MINIMUM_MARKERS,
+    TargetPose,
+    expected_ellipse,
+    find_target,
+    solve_pose,
+)
+from wlr_gym.perception.markers.sheet_fault import sheet_fault, target_pixels
 from wlr_gym.perception.markers.targets import Target
+from wlr_gym.perception.vision.adjustment import TargetView, at_frame_time, velocity_between
 
 Array = NDArray[np.float64]
 
@@ -34,11 +43,12 @@ LOST = "lost"
 MOVED = "moved"
 #: A pose that cannot be: in the floor, or upside down.
 IMPOSSIBLE = "impossible"
+#: The picture before once more.
+REPEATED = "repeated"
 FLOOR_FRAMES = 20
-#: m; positions of floor markers may be off by this much (they were measured by hand).
-FLOOR_TOLERANCE = 0.01
 _MOVED_BY = 0.4  # px, median over the floor's markers: 1 mm at 2 m with a focal length of 800 px
-_FOLLOWED_FROM = 0.1  # px; likewise where the floor can be located in every frame from then on
+_LONGEST_STEP = 0.3  # s; frames further apart do not give a speed
+_FILM_SLACK = 0.001  # m; 1 sigma of what a rolling shutter displaces a marker by
 _LEAST_COSINE = 0.7  # of the tilt of the body against the floor
 _HEIGHTS = (0.0, 0.6)  # m, of the body's origin
 
@@ -63,6 +73,7 @@ class Sample:
         markers: number used. residual: px rms.
         centres: (M, 2) px of the body's markers; NaN where not seen.
         seen: the markers used. in_camera, floor: body and floor in the camera frame; None without a pose.
+        floor_seen: the floor's markers; films only.
     """
 
     index: int
@@ -76,6 +87,7 @@ class Sample:
     seen: dict[int, Detection] = field(default_factory=dict)
     in_camera: TargetPose | None = None
     floor: TargetPose | None = None
+    floor_seen: dict[int, Detection] = field(default_factory=dict)
 
 
 class Tracker:
@@ -84,7 +96,7 @@ class Tracker:
     Args:
         camera: its lens. body, floor: targets.
         floor_pose, homes: where the floor is, and its markers in px (:func:`locate_floor`).
-        follow: once the camera moves, locate the floor in every frame; else frames from then on have no pose.
+        follow: locate the floor in every frame (films); else frames from the first on in which the camera moved have no pose.
     """
 
     def __init__(
@@ -95,15 +107,15 @@ class Tracker:
         self._values = camera.values
         self._track: list[tuple[float, TargetPose]] = []  # the last two poses
         self._watched = 0
-        self._follow_camera, self._moving = follow, False
-        self._noticed = _FOLLOWED_FROM if follow else _MOVED_BY
+        self._follow_camera, self._stated = follow, body
+        if follow or camera.readout:  # what is off is found out, and taken off, so no marker may be left out for it
+            self.body = body.model_copy(update={"tolerance": math.hypot(body.tolerance, _FILM_SLACK)})
 
     def __call__(self, frame: VideoFrame) -> Sample:
         """Process one frame. Frames must come in order of time."""
         check_size(frame.image, self.camera, f"frame {frame.index}")
-        shift = math.inf if self._moving else self._floor_shift(frame.image)
-        if shift > self._noticed and self._follow_camera and self._locate_anew(frame.image):
-            self._moving, shift = True, 0.0
+        floor_seen = self._locate_anew(frame.image) if self._follow_camera else {}
+        shift = 0.0 if self._follow_camera else self._floor_shift(frame.image)
         found, seen = self._follow(frame)
         if found is None:
             found, seen = self._search(frame)
@@ -111,20 +123,25 @@ class Tracker:
         if found is None or shift > _MOVED_BY:
             self._track = []
             dark = found is None and math.isinf(shift)  # nothing at all is seen
-            return _no_pose(frame, MOVED if shift > _MOVED_BY and not dark else LOST, centres)
+            status = MOVED if shift > _MOVED_BY and not dark else LOST
+            return replace(_no_pose(frame, status, centres), floor=self.floor_pose, floor_seen=floor_seen)
+        before = self._track[-1:]
+        self._track = [*before, (frame.time, found)]
+        if self.camera.readout and not self._follow_camera:
+            found = self._at_frame_time(found, seen)
         used = {index: detection for index, detection in seen.items() if found.used[index]}
         for index, detection in used.items():
             centres[index] = detection.ellipse[:2]
         pose, covariance = pose_in_floor(found, self.floor_pose)
         if not (_HEIGHTS[0] < pose[2] < _HEIGHTS[1] and math.cos(pose[4]) * math.cos(pose[5]) > _LEAST_COSINE):
             self._track = []
-            return _no_pose(frame, IMPOSSIBLE, centres)
-        self._track = [*self._track[-1:], (frame.time, found)]
+            return replace(_no_pose(frame, IMPOSSIBLE, centres), floor=self.floor_pose, floor_seen=floor_seen)
         count = int(found.used.sum())
         status = OK if count == len(self.body.markers) else PARTIAL
         return Sample(
-            frame.index, frame.time, status, pose, covariance, count, found.residual, centres, used, found, self.floor_pose
-        )
+            frame.index, frame.time, status, pose, covariance, count, found.residual, centres, used, found, self.floor_pose,
+            floor_seen,
+        )  # fmt: skip
 
     def _follow(self, frame: VideoFrame) -> tuple[TargetPose | None, dict[int, Detection]]:
         """Look where the markers should be."""
@@ -140,6 +157,17 @@ class Tracker:
                     seen[index] = detection
         found = solve_pose(seen, self.body, self.camera, rotation, position)
         return (found, seen) if found is not None and found.residual < LARGEST_RESIDUAL else (None, seen)
+
+    def _at_frame_time(self, found: TargetPose, seen: dict[int, Detection]) -> TargetPose:
+        """The pose with each marker at its own row's time, by the speed since the frame before."""
+        (before, first), (now, last) = self._track[0], self._track[-1]
+        if not before < now < before + _LONGEST_STEP:
+            return found
+        speed = velocity_between(first, last, now - before)
+        view = TargetView(seen, found.rotation, found.position, speed)
+        moved = at_frame_time(view, self._stated, self.camera.height, self.camera.readout or 0.0)
+        again = solve_pose(moved, self._stated, self.camera, found.rotation, found.position)
+        return again if again is not None and again.residual < LARGEST_RESIDUAL else found
 
     def _search(self, frame: VideoFrame) -> tuple[TargetPose | None, dict[int, Detection]]:
         """Look around where the body was, then everywhere."""
@@ -182,28 +210,29 @@ class Tracker:
         """
         self._watched = (self._watched + 1) % len(self._homes)
         shift = self._marker_shift(image, self._watched)
-        if shift < self._noticed:
+        if shift < _MOVED_BY:
             return shift
         shifts = np.array([self._marker_shift(image, index) for index in range(len(self._homes))])
         known = shifts[np.isfinite(shifts)]
         return float(np.median(known)) if len(known) else math.inf
 
-    def _locate_anew(self, image: Image) -> bool:
-        """Locate the floor in this frame alone, with the weights it was located with at first; False when it is not whole."""
+    def _locate_anew(self, image: Image) -> dict[int, Detection]:
+        """Locate the floor in this frame alone; returns its markers. It stays where it was when too few are seen."""
         last = self.floor_pose
-        seen = _seen_at(image, self.floor, self._values, last)
-        if len(seen) < len(self.floor.markers):
+        seen = seen_at(image, self.floor, self._values, last)
+        if len(seen) < MINIMUM_MARKERS:
             detections = detect(image, self.camera)
-            tolerance = _floor_pixels(self.camera, detections, self.floor)
-            found = find_target(detections, self.floor, self.camera, tolerance=tolerance)
+            found = find_target(
+                detections, self.floor, self.camera, tolerance=target_pixels(self.camera, detections, self.floor)
+            )
             if found is None:
-                return False
-            last, seen = found, _seen_at(image, self.floor, self._values, found)
-        found = _solved_floor(seen, self.floor, self.camera, last)
-        if found is None or found.used.sum() < len(self.floor.markers):
-            return False
+                return {}
+            last, seen = found, seen_at(image, self.floor, self._values, found)
+        found = solved_floor(seen, self.floor, self.camera, last)
+        if found is None:
+            return {}
         self.floor_pose = found
-        return True
+        return {index: detection for index, detection in seen.items() if found.used[index]}
 
     def _marker_shift(self, image: Image, index: int) -> float:
         """Distance (px) of a floor marker from its place; NaN when it is not seen there."""
@@ -240,18 +269,15 @@ def locate_floor(frames: Sequence[VideoFrame], camera: Camera, floor: Target) ->
         check_size(frame.image, camera, f"frame {frame.index}")
         if start is None:
             detections = detect(frame.image, camera)
-            most = max(most, [d for d in detections if d.code in floor.codes], key=len)
-            start = find_target(detections, floor, camera, tolerance=_floor_pixels(camera, detections, floor))
+            most = max(most, detections, key=lambda found: sum(d.code in floor.codes for d in found))
+            start = find_target(detections, floor, camera, tolerance=target_pixels(camera, detections, floor))
         if start is not None:
-            for index, detection in _seen_at(frame.image, floor, camera.values, start).items():
+            for index, detection in seen_at(frame.image, floor, camera.values, start).items():
                 sums[index].append(detection)
     if start is None:
-        raise InputError(
-            f"no floor frame: {len(most)} of the target's {len(floor.markers)} floor markers were found in the first "
-            f"{len(frames)} frames, and at least 4 must fit together (check their positions in the target file, and the light)"
-        )
-    means = {index: _mean(found) for index, found in sums.items() if len(found) >= max(1, len(frames) // 2)}
-    found = _solved_floor(means, floor, camera, start) or start
+        raise InputError(f"no floor frame in the first {len(frames)} frames: {sheet_fault(most, floor, camera)}")
+    means = {index: mean_detection(found) for index, found in sums.items() if len(found) >= max(1, len(frames) // 2)}
+    found = solved_floor(means, floor, camera, start) or start
     centres = np.full((len(floor.markers), 2), np.nan)
     for index, detection in means.items():
         centres[index] = detection.ellipse[:2]
@@ -268,11 +294,14 @@ def check_size(image: Image, camera: Camera, where: str) -> None:
         )
 
 
-def pose_in_floor(body: TargetPose, floor: TargetPose) -> tuple[Array, Array]:
-    """Pose (6,) of the body in the floor frame and its covariance (6, 6); that of the floor itself is not part of it."""
+def pose_in_floor(body: TargetPose, floor: TargetPose, moving: bool = False) -> tuple[Array, Array]:
+    """Pose (6,) of the body in the floor frame and its covariance (6, 6).
+
+    That of the floor's own place is part of it only where every frame has its own (``moving``).
+    """
     rotation = floor.rotation.T @ body.rotation
-    position = floor.rotation.T @ (body.position - floor.position)
-    pose = np.concatenate([position, angles(rotation)])
+    apart = body.position - floor.position
+    pose = np.concatenate([floor.rotation.T @ apart, angles(rotation)])
     yaw, pitch = pose[3], pose[4]
     # a small turn w about the floor's axes changes yaw, pitch and roll by this matrix times w
     cosine = max(0.1, math.cos(pitch))
@@ -286,7 +315,12 @@ def pose_in_floor(body: TargetPose, floor: TargetPose) -> tuple[Array, Array]:
     jacobian = np.zeros((6, 6))
     jacobian[:3, 3:] = floor.rotation.T
     jacobian[3:, :3] = rates @ floor.rotation.T
-    return pose, jacobian @ body.covariance @ jacobian.T
+    covariance = jacobian @ body.covariance @ jacobian.T
+    if moving:
+        x, y, z = apart
+        jacobian[:3, :3] = -floor.rotation.T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        covariance = covariance + jacobian @ floor.covariance @ jacobian.T
+    return pose, covariance
 
 
 def angles(rotation: Array) -> Array:
@@ -296,11 +330,18 @@ def angles(rotation: Array) -> Array:
     return np.array([yaw, pitch, math.atan2(rotation[2, 1], rotation[2, 2])])
 
 
+def without_pose(sample: Sample, status: str) -> Sample:
+    """The sample with its pose taken off."""
+    nothing = np.full(6, np.nan), np.full((6, 6), np.nan)
+    return replace(sample, status=status, pose=nothing[0], covariance=nothing[1], markers=0, residual=math.nan, in_camera=None)
+
+
 def _no_pose(frame: VideoFrame, status: str, centres: Array) -> Sample:
     return Sample(frame.index, frame.time, status, np.full(6, np.nan), np.full((6, 6), np.nan), 0, math.nan, centres)
 
 
-def _seen_at(image: Image, target: Target, camera: Array, pose: TargetPose) -> dict[int, Detection]:
+def seen_at(image: Image, target: Target, camera: Array, pose: TargetPose) -> dict[int, Detection]:
+    """The markers of a target where a pose puts them."""
     seen = {}
     for index in range(len(target.markers)):
         ellipse = expected_ellipse(target, index, camera, pose.rotation, pose.position)
@@ -320,14 +361,7 @@ def _identified(detections: Sequence[Detection], found: TargetPose, target: Targ
     return seen
 
 
-def _floor_pixels(camera: Camera, detections: Sequence[Detection], floor: Target) -> float:
-    """Largest residual of the floor (px): what a marker off by :data:`FLOOR_TOLERANCE` looks like."""
-    sizes = [d.radius for d in detections if d.code in floor.codes]
-    scale = max(sizes) / floor.radii.min() if sizes else camera.focal[0]
-    return LARGEST_RESIDUAL + FLOOR_TOLERANCE * scale
-
-
-def _mean(found: Sequence[Detection]) -> Detection:
+def mean_detection(found: Sequence[Detection]) -> Detection:
     """The mean of several detections of one marker that stands still."""
     centres = np.stack([d.centres for d in found])
     covariances = np.stack([d.covariances for d in found])
@@ -338,7 +372,7 @@ def _mean(found: Sequence[Detection]) -> Detection:
     return replace(found[0], centres=mean, covariances=spread, shape=shape, ellipse=ellipse)
 
 
-def _solved_floor(seen: dict[int, Detection], floor: Target, camera: Camera, start: TargetPose) -> TargetPose | None:
+def solved_floor(seen: dict[int, Detection], floor: Target, camera: Camera, start: TargetPose) -> TargetPose | None:
     """The floor's pose, with the tolerance of its markers' places in the weights and in the covariance."""
     tolerated = {index: _tolerant(marker, floor.tolerance / start.position[2]) for index, marker in seen.items()}
     return solve_pose(tolerated, floor, camera, start.rotation, start.position)

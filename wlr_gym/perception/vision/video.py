@@ -120,7 +120,7 @@ def grey(image: Any) -> Image:
     """Return one channel (H, W)."""
     import cv2
 
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    return np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 def _read_times(path: Path) -> list[float]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import detect, refine
 from wlr_gym.perception.markers.pose import circle_centres, find_target
-from wlr_gym.perception.markers.targets import Target, load_target, ring_radii
+from wlr_gym.perception.markers.targets import load_target, ring_radii
 from wlr_gym.perception.scene import (
     Facet,
     Look,
@@ -27,32 +27,23 @@ from wlr_gym.perception.scene import (
     floor_facets,
     plate_facet,
     project,
-    robot_facets,
     rotation_of,
     view,
 )
-from wlr_gym.perception.vision.alignment import align
+from wlr_gym.perception.vision.analysis import analyse
 from wlr_gym.perception.vision.paper_method import paper_pose
-from wlr_gym.perception.vision.slip import measure_slip
-from wlr_gym.perception.vision.tracking import Tracker, VideoFrame, angles, locate_floor, track
-from wlr_gym.robot import Robot, load_robot
-from wlr_gym.robot.parameters import Parameters
+from wlr_gym.perception.vision.tracking import Tracker, VideoFrame, locate_floor
+from wlr_gym.robot import load_robot
 from wlr_gym.studies.bench.measure import Size
 from wlr_gym.studies.bench.vision_clutter import clutter
-from wlr_gym.studies.bench.vision_drives import FilmedDrive, film, paper_test, skid_turn
+from wlr_gym.studies.bench.vision_drives import FilmedDrive, film, paper_test, skid_turn, true_slip
+from wlr_gym.studies.bench.vision_scenes import CAMERA, HOME_HEIGHT, LENS, STRONG_LENSES, pose_error, random_pose, shown_robot
+from wlr_gym.studies.bench.vision_tags import tag_kinds, tag_poses
 
 Array = NDArray[np.float64]
 
-CAMERA = Camera(width=1280, height=720, focal=(800.0, 800.0), centre=(639.5, 359.5))
-#: Distortion (k1, k2, p1, p2, k3) of the camera in most scenes, and of two strong lenses.
-LENS = (-0.1, 0.02, 0.001, -0.001, 0.0)
-STRONG_LENSES = ((-0.3, 0.1, 0.0, 0.0, 0.0), (0.3, -0.05, 0.0, 0.0, 0.0))
-#: m, the body's origin above the floor with the legs at home.
-HOME_HEIGHT = 0.169
 #: s between the film's clock and the log's.
 TRUE_OFFSET = 0.137
-#: m.
-TAG_SIDE = 0.06
 
 
 @dataclass(frozen=True)
@@ -168,8 +159,8 @@ def measure_poses(size: Size) -> list[VisionResult]:
         results += _pose_lines(label, "ours", rings, bars)
         for legs, errors in paper.items():
             results += _pose_lines(f"{label}{legs}", "paper's method", errors, None)
-        for dictionary in ("APRILTAG_36H11", "5X5_100"):
-            errors, seen = _tag_poses(tilt, size(30, 2), dictionary)
+        for dictionary in tag_kinds():
+            errors, seen = tag_poses(tilt, size(30, 2), dictionary)
             results += _pose_lines(label, f"tags {dictionary} ({seen})", errors, None)
     return results
 
@@ -186,15 +177,6 @@ def _pose_lines(label: str, method: str, errors: Array, bars: tuple[float, float
             VisionResult(f"body yaw, {label}", method, yaw, "deg", second, count=count)]  # fmt: skip
 
 
-def _random_pose(rng: np.random.Generator, height: float | None = None) -> ScenePose:
-    position = np.array([rng.uniform(-0.45, 0.45), rng.uniform(-0.2, 0.2), height or HOME_HEIGHT + rng.uniform(-0.06, 0.0)])
-    return ScenePose(position, rotation_of(rng.uniform(-math.pi, math.pi), rng.uniform(-0.1, 0.1) if height is None else 0.0))
-
-
-def _shown(robot: Robot, plate: Facet, pose: ScenePose) -> list[Facet]:
-    return [facet.moved(pose.position, pose.rotation) for facet in (*robot_facets(robot, pose.legs), plate)]
-
-
 def _ring_poses(tilt: float, count: int) -> tuple[Array, dict[str, Array]]:
     """Errors (F, 3) of our poses, and of the paper's method with legs at home and with legs that moved."""
     body, floor, robot = load_target("body"), load_target("floor"), load_robot()
@@ -208,10 +190,10 @@ def _ring_poses(tilt: float, count: int) -> tuple[Array, dict[str, Array]]:
     rng = np.random.default_rng(11)
     for k in range(count):
         for home in (True, False):
-            pose = _random_pose(rng, HOME_HEIGHT if home else None)
-            image = renderer.frame([_shown(robot, plate, pose)], Look(), k)
+            pose = random_pose(rng, HOME_HEIGHT if home else None)
+            image = renderer.frame([shown_robot(robot, plate, pose)], Look(), k)
             sample = Tracker(camera, body, floor, floor_pose, homes)(VideoFrame(k, 0.0, image))
-            ours.append(_error(sample.pose[[0, 1, 3]], pose))
+            ours.append(pose_error(sample.pose[[0, 1, 3]], pose))
             near = project(camera, (body.positions @ pose.rotation.T + pose.position) @ straight.rotation.T + straight.position)
             height = HOME_HEIGHT + float(body.positions[0, 2])
             found = paper_pose(image, camera, body, straight.rotation, straight.position, height, near)
@@ -219,64 +201,12 @@ def _ring_poses(tilt: float, count: int) -> tuple[Array, dict[str, Array]]:
                 # the method knows nothing of the height of the markers over the body's origin; held against the plate's middle
                 plate_middle = pose.position + pose.rotation[:, 2] * body.positions[0, 2]
                 paper[", legs at home" if home else ", legs moved"].append(
-                    _error(found, ScenePose(plate_middle, pose.rotation))
+                    pose_error(found, ScenePose(plate_middle, pose.rotation))
                 )
     lost = [error for error in ours if not np.isfinite(error).all()]
     if lost:
         raise RuntimeError(f"{len(lost)} of {len(ours)} poses were not found at tilt {tilt:g} rad")
     return np.array(ours), {name: np.array(errors) for name, errors in paper.items()}
-
-
-def _error(found: Array, pose: ScenePose) -> Array:
-    """x, y (m) and yaw (rad) found, minus the truth."""
-    yaw = angles(pose.rotation)[0]
-    return np.array([*(found[:2] - pose.position[:2]), math.remainder(found[2] - yaw, 2 * math.pi)])
-
-
-def _tag_poses(tilt: float, count: int, name: str) -> tuple[Array, str]:
-    """Errors (F, 3) with four square tags in the markers' places; the floor is given. Best of the corner conventions."""
-    import cv2
-
-    body, robot = load_target("body"), load_robot()
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
-    cells = dictionary.markerSize + 2
-    bits = [np.asarray(cv2.aruco.generateImageMarker(dictionary, k, cells) > 127, np.uint8) for k in range(4)]
-    tags = [(x, y, TAG_SIDE, bit) for (x, y, _), bit in zip(body.positions, bits, strict=True)]
-    plate, straight = plate_facet(body, tags), view(tilt, 2.0)
-    camera = CAMERA.model_copy(update={"distortion": LENS})
-    renderer = Renderer(camera, straight, floor_facets(None))
-    settings = cv2.aruco.DetectorParameters()
-    settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(dictionary, settings)
-    rng, errors, whole = np.random.default_rng(11), {shift: [] for shift in (0.0, -0.5, 0.5)}, 0
-    for k in range(count):
-        pose = _random_pose(rng)
-        image = renderer.frame([_shown(robot, plate, pose)], Look(), k)
-        corners, ids, _ = detector.detectMarkers(image)
-        seen: dict[int, Any] = {}
-        if ids is not None:
-            seen = {int(k): corner for k, corner in zip(np.asarray(ids).reshape(-1), corners, strict=True)}
-        whole += len(seen) == 4
-        if len(seen) < 3:
-            continue
-        for shift, kept in errors.items():
-            kept.append(_tag_error(seen, shift, body, camera, straight, pose))
-    best = min(errors.values(), key=lambda kept: float(np.mean(np.square(kept))) if kept else math.inf)
-    return np.array(best).reshape(-1, 3), f"all four in {whole} of {count} frames"
-
-
-def _tag_error(seen: dict[int, Any], shift: float, body: Target, camera: Camera, floor: ScenePose, pose: ScenePose) -> Array:
-    import cv2
-
-    half = TAG_SIDE / 2
-    square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
-    places = np.concatenate([body.positions[k] + square for k in seen])
-    pixels = np.concatenate([np.asarray(c, float).reshape(4, 2) for c in seen.values()]) + shift
-    _, turn, place = cv2.solvePnP(places, pixels, camera.matrix, np.array(camera.distortion), flags=cv2.SOLVEPNP_SQPNP)
-    turn, place = cv2.solvePnPRefineLM(places, pixels, camera.matrix, np.array(camera.distortion), turn, place)
-    rotation = floor.rotation.T @ cv2.Rodrigues(turn)[0]
-    position = floor.rotation.T @ (np.asarray(place).reshape(3) - floor.position)
-    return _error(np.array([*position[:2], angles(rotation)[0]]), pose)
 
 
 # --- recall, false poses, rate ----------------------------------------------------------------------------------------
@@ -292,7 +222,7 @@ def measure_recall(size: Size) -> list[VisionResult]:
         pose = ScenePose(np.array([*rng.uniform(-0.2, 0.2, 2), 0.06]), rotation_of(rng.uniform(-math.pi, math.pi)))
         look = Look(blur=rng.uniform(0.5, 1.2), noise=rng.uniform(0, 10), gain=rng.uniform(0.5, 1.1),
                     gradient=(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4)))  # fmt: skip
-        detections = detect(renderer.frame([_shown(robot, plate_facet(body), pose)], look, k), CAMERA)
+        detections = detect(renderer.frame([shown_robot(robot, plate_facet(body), pose)], look, k), CAMERA)
         eye = renderer.floor_in_camera
         places = project(CAMERA, (body.positions @ pose.rotation.T + pose.position) @ eye.rotation.T + eye.position)
         for place, code in zip(places, body.codes, strict=True):
@@ -326,7 +256,7 @@ def measure_rate(size: Size) -> list[VisionResult]:
     for k in range(size(60, 8)):
         moment = k / 30
         pose = ScenePose(np.array([-0.3 + 0.15 * moment, 0.02 * math.sin(moment), HOME_HEIGHT]), rotation_of(0.4 * moment))
-        frames.append(VideoFrame(k, moment, renderer.frame([_shown(robot, plate_facet(body), pose)], Look(), k)))
+        frames.append(VideoFrame(k, moment, renderer.frame([shown_robot(robot, plate_facet(body), pose)], Look(), k)))
     floor_pose = locate_floor(frames[:5], CAMERA, floor)
     rates = []
     for _ in range(size.rounds):
@@ -356,11 +286,10 @@ def measure_drive(drive: FilmedDrive, tilt: float = 0.0, look: Look | None = Non
     body, floor = load_target("body"), load_target("floor")
     camera = CAMERA.model_copy(update={"distortion": LENS})
     renderer = Renderer(camera, view(tilt, 2.0), floor_facets(floor))
-    samples = list(track(film(drive, renderer, body, look or Look(), TRUE_OFFSET), camera, body, floor))
-    parameters = Parameters.nominal(drive.robot)
-    poses = np.stack([sample.pose for sample in samples])
-    found = align(np.array([sample.time for sample in samples]), poses, drive.run, drive.robot, parameters)
-    slip = measure_slip(samples, found.offset, drive.run, drive.robot, parameters, found.std)
+    shots = film(drive, renderer, body, look or Look(), TRUE_OFFSET)
+    analysis = analyse(shots, drive.run, camera, body, floor, drive.robot)
+    samples, slip, found = analysis.samples, analysis.slip, analysis.alignment
+    assert found is not None  # no offset was given
     error = 1e3 * np.abs(slip.slip - true_slip(drive, slip.time))
     final = 1e3 * (slip.slip[-1] - true_slip(drive, slip.time)[-1])
     largest = 1e3 * np.abs(drive.slip[-1]).max(axis=0)
@@ -380,10 +309,3 @@ def measure_drive(drive: FilmedDrive, tilt: float = 0.0, look: Look | None = Non
         *lines,
         VisionResult(f"{drive.name}: clock offset (± {1e3 * found.std:.1f})", "ours", late, "ms", 2.0, count=len(samples)),
     ]
-
-
-def true_slip(drive: FilmedDrive, at: Array) -> Array:
-    """(K, 4, 2) m, true accumulated slip from the first of the times on."""
-    flat = drive.slip.reshape(len(drive.time), 8)
-    values = np.stack([np.interp(at, drive.time, column) for column in flat.T], axis=1).reshape(-1, 4, 2)
-    return values - values[0]

@@ -90,6 +90,24 @@ def skid_turn(robot: Robot) -> FilmedDrive:
     return _drive("skid turn", robot, parameters, [math.pi / 2] * 4, setpoints, 8.5, np.ones(8, bool), -0.3)
 
 
+def lab_drive(robot: Robot, speed: float, spin: float, friction: float, seconds: float = 5.4) -> FilmedDrive:
+    """Forward, a turn on the spot, forward again, rest, all within 5 s; the legs move.
+
+    Args:
+        robot: it. speed: m/s of the wheels' rims. spin: the turn's share of that. friction: of the floor. seconds: of the run.
+    """
+    parameters = Parameters.nominal(robot)
+    parameters["ground.mu_x"] = parameters["ground.mu_y"] = friction
+    pace = speed / float(parameters["wheel.radius"].mean())
+
+    def setpoints(t: float) -> tuple[list[float], list[float]]:
+        sweep = math.pi / 2 + 0.25 * math.sin(2.0 * min(max(0.0, t - 0.6), math.pi))
+        left, right = (1.0, 1.0) if 0.6 <= t < 1.9 or 3.3 <= t < 4.4 else (-spin, spin) if 1.9 <= t < 3.3 else (0.0, 0.0)
+        return [sweep] * 4, [pace * left, pace * right] * 2
+
+    return _drive("lab drive", robot, parameters, [math.pi / 2] * 4, setpoints, seconds, np.ones(8, bool), -0.15)
+
+
 def _paper_parameters(robot: Robot) -> Parameters:
     profile = Profile(wheel_acceleration=PAPER_ACCELERATION, leg_velocity=PAPER_LEG_SPEED)
     parameters = profile_parameters(Parameters.nominal(robot), profile)
@@ -204,3 +222,10 @@ def _robot_at(drive: FilmedDrive, time: float, body: Target) -> list[Facet]:
     pose = pose_at(drive, time)
     facets = [*robot_facets(drive.robot, pose.legs), plate_facet(body)]
     return [facet.moved(pose.position, pose.rotation) for facet in facets]
+
+
+def true_slip(drive: FilmedDrive, at: Array) -> Array:
+    """(K, 4, 2) m, true accumulated slip from the first of the times on."""
+    flat = drive.slip.reshape(len(drive.time), 8)
+    values = np.stack([np.interp(at, drive.time, column) for column in flat.T], axis=1).reshape(-1, 4, 2)
+    return values - values[0]

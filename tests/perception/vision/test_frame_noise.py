@@ -1,0 +1,59 @@
+"""Noise, jitter, repeated pictures and lost time of a film, from samples made of a simulated drive; no pictures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_measure import OFFSET, samples_of
+
+from wlr_gym.perception.vision.frame_noise import frame_noise, turn_difference, widened, without_repeats
+from wlr_gym.perception.vision.tracking import REPEATED
+from wlr_gym.robot import load_robot
+from wlr_gym.studies.bench.vision_drives import skid_turn
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return skid_turn(load_robot())
+
+
+def jittered(drive, std):
+    """Samples whose times are not those at which their poses were taken."""
+    rng = np.random.default_rng(4)
+    return [replace(sample, time=sample.time + std * rng.standard_normal()) for sample in samples_of(drive)]
+
+
+def test_the_frames_noise_is_found_from_one_to_the_next(drive):
+    honest = samples_of(drive)
+    assert frame_noise(honest).scale == pytest.approx(1.0, abs=0.15)
+    assert frame_noise(honest).jitter == 0.0
+    bold = [replace(sample, covariance=sample.covariance / 2.5**2) for sample in honest]
+    assert frame_noise(bold).scale == pytest.approx(2.5, rel=0.15)
+
+
+def test_jitter_of_the_times_is_told_from_noise_and_widens_along_the_motion(drive):
+    samples = jittered(drive, 0.003)
+    noise = frame_noise(samples)
+    assert noise.jitter == pytest.approx(0.003, rel=0.4)
+    assert noise.scale == pytest.approx(1.0, abs=0.2)
+    middle = len(samples) // 2  # in the turn on the spot
+    before, after = samples[middle].covariance, widened(samples, noise)[middle].covariance
+    assert after[3, 3] > 100 * before[3, 3]
+    assert after[2, 2] < 4 * before[2, 2]
+
+
+def test_a_repeated_picture_has_no_pose_unless_the_robot_stands(drive):
+    places = np.cumsum([0, 3, 3, 0, 6, 3, 0, 0, 0])
+    samples = [replace(s, centres=np.full((4, 2), float(p))) for s, p in zip(samples_of(drive), places, strict=False)]
+    assert [k for k, sample in enumerate(without_repeats(samples)) if sample.status == REPEATED] == [3]
+
+
+def test_time_that_is_lost_without_a_trace_shows_against_the_gyroscope(drive):
+    samples = samples_of(drive)
+    assert turn_difference(samples, OFFSET, drive.run, drive.robot) is None
+    middle = len(samples) // 2
+    late = [*samples[:middle], *(replace(sample, time=sample.time - 0.1) for sample in samples[middle + 3 :])]
+    found = turn_difference(late, OFFSET, drive.run, drive.robot)
+    assert found is not None
+    assert found[0] == pytest.approx(samples[middle].time + OFFSET, abs=1.5)
+    assert found[1] > 0.01

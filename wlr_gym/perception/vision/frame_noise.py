@@ -1,0 +1,135 @@
+"""What is wrong with the frames of a film as such: noise that compression adds, times that jitter, pictures shown twice.
+
+Of five frames, neighbours or every other one, what a cubic in time does not explain is noise; it is held against the sigmas
+that the edges of the markers state. An error of a frame's time moves its pose along the velocity, other noise does not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.data.read import Run
+from wlr_gym.perception.vision.tracking import REPEATED, Sample, without_pose
+from wlr_gym.robot import Robot
+from wlr_gym.robot.slip import accumulate
+
+Array = NDArray[np.float64]
+
+_LEAST_NOISE, _LEAST_FRAMES = 0.7, 30
+_NORMAL = 1.4826  # standard deviation over the median of absolute values
+#: Errors of a frame's time (s, 1 sigma) and factors of the noise that are tried.
+_JITTERS = np.array([0.0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 6, 8, 12]) * 1e-3
+_FACTORS = 0.6 * 1.15 ** np.arange(15)
+#: Twice the gain in log likelihood that an error of the times must bring.
+_WORTH = 12.0
+#: px; markers that move by less than the first between frames that move by more than the second are the picture before.
+_SAME, _MOVING = 0.1, 0.5
+#: rad, and sigmas, by which the camera's turns may differ from the gyroscope's.
+_TURN_ERROR, _TURN_SIGMAS = 0.006, 6.0
+_TOGETHER = 5  # frames over which that difference is averaged
+
+
+@dataclass(frozen=True)
+class FrameNoise:
+    """Noise of the frames' poses over what the edges of their markers state, and of the frames' times (s, 1 sigma)."""
+
+    scale: float = 1.0
+    jitter: float = 0.0
+
+
+def frame_noise(samples: Sequence[Sample]) -> FrameNoise:
+    """Find the noise of a film's poses and times."""
+    seen = [sample for sample in samples if math.isfinite(sample.pose[0])]
+    if len(seen) < _LEAST_FRAMES:
+        return FrameNoise()
+    time, poses, variance, rates = _signals(seen)
+    differences = [_fourth_difference(time, poses, variance, rates**2, stride) for stride in (1, 2)]
+    jitter = _jitter(*differences[0])
+    scales = [
+        float(np.median(_NORMAL * np.median(np.abs(rest) / np.sqrt(edges + jitter**2 * late), axis=0)))
+        for rest, edges, late in differences
+    ]
+    return FrameNoise(max(_LEAST_NOISE, *scales), jitter)
+
+
+def widened(samples: Sequence[Sample], noise: FrameNoise) -> tuple[Sample, ...]:
+    """The samples with that noise in their covariances."""
+    rates = iter(_signals([sample for sample in samples if math.isfinite(sample.pose[0])])[3])
+    return tuple(
+        replace(sample, covariance=noise.scale**2 * sample.covariance + noise.jitter**2 * np.outer(rate, rate))
+        if math.isfinite(sample.pose[0]) and (rate := next(rates)) is not None
+        else sample
+        for sample in samples
+    )
+
+
+def without_repeats(samples: Sequence[Sample]) -> Iterator[Sample]:
+    """Take the pose off frames that show the picture before once more, while the robot moves."""
+    steps = np.array([_step(a, b) for a, b in pairwise(samples)])
+    for k, sample in enumerate(samples):
+        inside = 2 <= k < len(samples) - 1
+        repeated = inside and steps[k - 1] < _SAME and steps[k - 2] > _MOVING and steps[k] > _MOVING
+        yield without_pose(sample, REPEATED) if repeated else sample
+
+
+def turn_difference(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> tuple[float, float] | None:
+    """Where (s, servo clock) and by how much (rad) the camera's turns differ from the gyroscope's; None = they agree.
+
+    Constant, drift and scale of the gyroscope are left open.
+    """
+    seen = [sample for sample in samples if math.isfinite(sample.pose[0])]
+    if "gyro_z" not in run or not np.isfinite(run["gyro_z"]).all() or len(seen) < _LEAST_FRAMES:
+        return None
+    time = np.array([sample.time for sample in seen]) + offset
+    inside = (time > run["t"][0]) & (time < run["t"][-1])
+    yaw = np.unwrap([sample.pose[3] for sample in seen])[inside]
+    std = float(np.median([math.sqrt(sample.covariance[3, 3]) for sample in seen]))
+    late = 1 / (2 * math.pi * robot.sensors.imu.bandwidth)
+    turned = np.interp(time[inside], run["t"] - late, accumulate(run["gyro_z"], run["t"]))
+    known = np.column_stack([np.ones(len(yaw)), time[inside], turned])
+    rest = yaw - known @ np.linalg.lstsq(known, yaw, rcond=None)[0]
+    mean = np.convolve(rest, np.full(_TOGETHER, 1 / _TOGETHER), mode="valid")
+    worst = int(np.argmax(np.abs(mean)))
+    limit = max(_TURN_ERROR, _TURN_SIGMAS * std)
+    return (float(time[inside][worst + _TOGETHER // 2]), float(abs(mean[worst]))) if abs(mean[worst]) > limit else None
+
+
+def _signals(seen: Sequence[Sample]) -> tuple[Array, Array, Array, Array]:
+    """Times (F,), poses, their variances and their rates (F, 6)."""
+    time, poses = np.array([sample.time for sample in seen]), np.stack([sample.pose for sample in seen])
+    poses[:, 3] = np.unwrap(poses[:, 3])
+    variance = np.stack([np.diag(sample.covariance) for sample in seen])
+    return time, poses, variance, np.gradient(poses, time, axis=0)
+
+
+def _fourth_difference(time: Array, poses: Array, variance: Array, late: Array, stride: int) -> tuple[Array, Array, Array]:
+    """Fourth divided differences (., 6), their variance by the edges, and by one s2 of error of the times."""
+    rows = np.arange(len(time) - 4 * stride)[:, None] + stride * np.arange(5)
+    at = (time[rows] - time[rows[:, [2]]]) / np.ptp(time[rows], axis=1)[:, None]
+    weights = 1 / np.prod(at[:, :, None] - at[:, None, :] + np.eye(5), axis=2)
+    weights /= np.linalg.norm(weights, axis=1)[:, None]
+    rest, *variances = (np.einsum("fk,fkc->fc", w, values[rows]) for w, values in
+                        ((weights, poses), (weights**2, variance), (weights**2, late)))  # fmt: skip
+    return rest, variances[0], variances[1]
+
+
+def _jitter(rest: Array, edges: Array, late: Array) -> float:
+    """Error of the frames' times (s) that makes the differences most likely, robustly; 0 unless it is plain."""
+    total = _FACTORS[:, None, None, None] ** 2 * edges + _JITTERS[:, None, None] ** 2 * late
+    cost = np.sum(np.log(total) + 5 * np.log1p(rest**2 / total / 4), axis=(2, 3)) / 5  # five differences share a frame
+    best = cost.min(axis=0)
+    least = int(np.argmin(best))
+    return float(_JITTERS[least]) if best[0] - best[least] > _WORTH else 0.0
+
+
+def _step(a: Sample, b: Sample) -> float:
+    """How far (px) the markers moved between two frames; infinite when none is seen in both."""
+    moved = np.linalg.norm(b.centres - a.centres, axis=1)
+    known = moved[np.isfinite(moved)]
+    return float(known.max()) if len(known) else math.inf
