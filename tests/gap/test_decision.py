@@ -240,7 +240,7 @@ def test_an_emulated_robot_drives_a_motion_into_the_folder(data):
     motion = excite("straight", robot=ROBOT, seconds=0.4)
     found = recorder_of(options, ROBOT, "gibbs_appell", data, Console())(motion, data)
     assert (found.run, found.reason) == (data / "run_03.csv", "")
-    assert read_run(found.run).meta.profile == motion.profile
+    assert read_run(data / "run_03.csv").meta.profile == motion.profile
 
 
 def test_a_real_robot_has_no_hidden_effects(tmp_path):
