@@ -8,7 +8,7 @@ import shlex
 import pytest
 from blocks import PAGES, ROOT, Block, blocks
 
-from wlr_gym.cli import COMMANDS, parse
+from wlr_gym.cli import COMMANDS, NESTED, parse
 
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]+)?\)")
 #: Pages that exist on the documentation site only (.ci/docs/pages.py).
@@ -40,6 +40,8 @@ def test_command_parses(command: str, capsys: pytest.CaptureFixture[str]) -> Non
     if name == "--import":
         _, name, *arguments = arguments
     assert name in COMMANDS, f"no command '{name}'"
+    if (name, *arguments[:1]) in NESTED:
+        name, arguments = f"{name}_{arguments[0]}", arguments[1:]
     try:
         parse(name, arguments)
     except SystemExit:

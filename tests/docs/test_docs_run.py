@@ -22,7 +22,7 @@ NOT_RUN = {
     "docs/robot.md": 5,  # a robot, or until Ctrl-C
     "docs/run_format.md": 1,  # shortened
     "docs/sweep.md": 3,  # a cluster
-    "docs/vision.md": 3,  # installation, pictures, a film
+    "docs/vision.md": 4,  # installation, pictures, a film, a photograph
 }
 #: Pages whose blocks take most of a minute or more together; the slow suite runs them.
 LONG = {"README.md", "docs/quickstart.md", "docs/run_format.md", "docs/compare.md", "docs/pictures.md", "docs/sweep.md"}

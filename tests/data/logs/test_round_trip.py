@@ -9,7 +9,7 @@ import numpy as np
 import pandas
 import pytest
 from foreign_logs import made_up, rows_of
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from wlr_gym.base.errors import InputError
@@ -38,9 +38,17 @@ def runs(draw):
     return Run(table, RunMeta(profile=Profile(leg_velocity=1.5), ground="ice"), Path("run_01.csv"))
 
 
+def with_a_live_camera():
+    """Every row says how old the last pose is, also without a new one."""
+    columns = {name: [0.0, 0.1] for name in REQUIRED} | {"cam_x": [0.2, math.nan], "cam_age": [0.03, 0.05]}
+    table = pandas.DataFrame({name: columns[name] for name in COLUMNS if name in columns})
+    return Run(table, RunMeta(profile=Profile(leg_velocity=1.5), ground="ice"), Path("run_01.csv"))
+
+
 @pytest.mark.parametrize(("form", "name"), [("mcap", "a.mcap"), ("rosbag2", "a")])
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(run=runs())
+@example(run=with_a_live_camera())
 def test_any_run_comes_back(form, name, tmp_path_factory, run):
     if (np.diff([nanoseconds(t, 10) for t in run["t"]]) <= 0).any():
         return

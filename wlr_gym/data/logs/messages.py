@@ -27,11 +27,13 @@ RUN, JOINT_STATES, COMMANDS, IMU, SUPPLY, CAMERA_TOPIC, FLOW_TOPIC = (
     "/wlr/run", "/joint_states", "/joint_commands", "/imu", "/supply", "/camera", "/flow",
 )  # fmt: skip
 STRING, JOINT_STATE, IMU_TYPE = "std_msgs/msg/String", "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
+#: Columns of the camera: its pose, and how old that is.
+SEEN = (*CAMERA, "cam_age")
 SUPPLY_TYPE, CAMERA_TYPE, FLOW_TYPE = "wlr_gym_msgs/msg/Supply", "wlr_gym_msgs/msg/Camera", "wlr_gym_msgs/msg/Flow"
 #: Definitions of our own types: units as in docs/run_format.md.
 OWN_TYPES = {
     SUPPLY_TYPE: "std_msgs/Header header\nfloat64 voltage",
-    CAMERA_TYPE: "std_msgs/Header header\n" + "\n".join(f"float64 {name.removeprefix('cam_')}" for name in CAMERA),
+    CAMERA_TYPE: "std_msgs/Header header\n" + "\n".join(f"float64 {name.removeprefix('cam_')}" for name in SEEN),
     FLOW_TYPE: "std_msgs/Header header\n" + "\n".join(f"float64 {name.removeprefix('flow_')}" for name in FLOW),
 }
 #: Frames: what the robot reads is in the body's, where it is stands in the floor's.
@@ -137,7 +139,7 @@ def row_messages(row: Mapping[str, float], time: int) -> Iterator[Sent]:
         yield sent(IMU, IMU_TYPE, time, _imu(row, time))
     if "volt" in row:
         yield sent(SUPPLY, SUPPLY_TYPE, time, make(SUPPLY_TYPE, header=header(time, BODY), voltage=row["volt"]))
-    frame = {name.removeprefix("cam_"): row.get(name, math.nan) for name in CAMERA}
+    frame = {name.removeprefix("cam_"): row.get(name, math.nan) for name in SEEN}
     if not all(map(math.isnan, frame.values())):
         yield sent(CAMERA_TOPIC, CAMERA_TYPE, time, make(CAMERA_TYPE, header=header(time, FLOOR), **frame))
     flow = {name.removeprefix("flow_"): row.get(name, math.nan) for name in FLOW}
@@ -192,7 +194,7 @@ PLACES: dict[str, tuple[str, str]] = (
     | {f"cmd_{joint}": (COMMANDS, f"velocity[{joint}]") for joint in WHEELS}
     | {f"gyro_{axis}": (IMU, f"angular_velocity.{axis}") for axis in _XYZ}
     | {f"acc_{axis}": (IMU, f"linear_acceleration.{axis}") for axis in _XYZ}
-    | {name: (CAMERA_TOPIC, name.removeprefix("cam_")) for name in CAMERA}
+    | {name: (CAMERA_TOPIC, name.removeprefix("cam_")) for name in SEEN}
     | {name: (FLOW_TOPIC, name.removeprefix("flow_")) for name in FLOW}
     | {"volt": (SUPPLY, "voltage")}
 )
