@@ -228,7 +228,7 @@ def test_a_drive_that_leaves_nothing_ends_it(data, tmp_path, answers):
 
 def test_a_history_of_other_data_is_refused(data, tmp_path, answers):
     decide(data, tmp_path / "out", record, Budget(runs=0))
-    with pytest.raises(InputError, match=r"history.json: backend: gibbs_appell, asked for mujoco"):
+    with pytest.raises(InputError, match=r"history.json: backend: gibbs_appell, requested mujoco"):
         decide(data, tmp_path / "out", record, backend="mujoco")
     with pytest.raises(InputError, match=r"expected a new folder, or one with a history.json"):
         decide(data, data, record)

@@ -6,7 +6,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,36 @@ def make_output_folder(path: Path, option: str = "--out") -> None:
         raise InputError(f"{option} {path}: cannot be a folder: {error.strerror}") from None
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"{option} {path}: cannot be written to")
+
+
+def resumes(folder: Path, file: str) -> bool:
+    """Whether work in a folder for results resumes from its ``file``; otherwise the folder is new or empty, and is made.
+
+    Raises:
+        InputError: a folder of something else.
+    """
+    if (folder / file).is_file():
+        return True
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"--out {folder}: expected a new folder, or one with a {file} of the same command")
+    make_output_folder(folder)
+    return False
+
+
+def check_same_request(path: Path, there: Mapping[str, Any], requested: Mapping[str, Any]) -> None:
+    """Refuse to resume what was requested otherwise.
+
+    Args:
+        path: file that says what was requested. there: what it says. requested: now.
+
+    Raises:
+        InputError: the first difference.
+    """
+    for name, value in requested.items():
+        if there.get(name) != value:
+            raise InputError(
+                f"{path}: {name}: {there.get(name)}, requested {value}; expected the same command, or another --out"
+            )
 
 
 def replace_file(path: Path, write: Callable[[Path], object]) -> None:

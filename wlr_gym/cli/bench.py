@@ -188,7 +188,7 @@ def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
     from wlr_gym.studies.bench.lab_films import FILMS, bars, run_lab_films, score
 
     if asked != ("vision",) or options.out is None:
-        raise InputError(f"--out: for gap or vision, alone; got {', '.join(asked) or 'nothing'}")
+        raise InputError(f"--out: for gap, adapt or vision, alone; got {', '.join(asked) or 'nothing'}")
     console = Console(soft_wrap=True, highlight=False)
     count = FILMS if options.sets is None else options.sets
     if count < 1:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, write_json
+from wlr_gym.base.files import check_same_request, resumes, write_json
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.data.excitations import Motion
 from wlr_gym.data.read import read_meta, read_run, run_files
@@ -290,16 +290,11 @@ def _resumed(asked: _Asked) -> tuple[History, DecisionRound | None]:
             f"{asked.data}: no run_*.csv or run_*.parquet: record two first: wlr record --excitation straight random"
         )
     fresh, path = asked.history(), asked.out / HISTORY_FILE
-    if not path.is_file():
-        if asked.out.exists() and (not asked.out.is_dir() or any(asked.out.iterdir())):
-            raise InputError(f"--out {asked.out}: expected a new folder, or one with a {HISTORY_FILE}")
-        make_output_folder(asked.out)
+    if not resumes(asked.out, HISTORY_FILE):
         return fresh, None
     history = parse_config(History, read_yaml(path), str(path))
-    for name in ("data", "robot", "backend", "known"):
-        if getattr(history, name) != getattr(fresh, name):
-            given, there = getattr(fresh, name), getattr(history, name)
-            raise InputError(f"{path}: {name}: {there}, asked for {given}; expected the same, or another --out")
+    requested = {name: getattr(fresh, name) for name in ("data", "robot", "backend", "known")}
+    check_same_request(path, dict(history), requested)
     if not history.rounds or history.rounds[-1].run:
         return history, None
     *before, last = history.rounds

@@ -165,6 +165,11 @@ class Mppi:
         return (cost / self.config.horizon).reshape(plans.shape[:2])
 
 
+def make_planner(contract: Mapping[str, Any], config: Mapping[str, Any]) -> Mppi:
+    """Return the planner for an environment's contract: the ``make_policy`` of its agents."""
+    return Mppi(contract, parse_settings(config, contract["task"]))
+
+
 def known_parameters(knows: Collection[str]) -> NDArray[np.bool_]:
     """Return which columns (P,) of the parameter table belong to what is known: ``robot``, ``floor``."""
     return np.array([("floor" if name.startswith(("ground.", "patch.")) else "robot") in knows for name in ELEMENTS])

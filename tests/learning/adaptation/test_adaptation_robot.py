@@ -1,6 +1,7 @@
 """Episodes on an emulated robot, scored by the true motion; and the whole loop of docs/adapt.md at a tiny size."""
 
 import json
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -24,6 +25,8 @@ POLICY, ENVIRONMENT = "velocity_slip_aware", "WLR-Velocity-v0"
 class Watched(EmulatedRobot):
     """An emulated robot that notes its true motion after every control step."""
 
+    seen: ClassVar[list[tuple[float, float]]] = []
+
     def start(self, log, seed, meta=None):
         plant, truth = super().start(log, seed, meta)
         self.seen.clear()
@@ -37,8 +40,6 @@ class Watched(EmulatedRobot):
 
         plant.step = stepped  # pyright: ignore[reportAttributeAccessIssue]
         return plant, truth
-
-    seen: list = []  # noqa: RUF012
 
 
 @pytest.mark.parametrize("backend", ["gibbs_appell", "mujoco"])

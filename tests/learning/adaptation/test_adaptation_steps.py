@@ -154,7 +154,7 @@ def test_the_new_policy_is_kept_where_it_is_better_and_nowhere_worse(tmp_path, m
     families = [uncertainty.Family(name, {}) for name in bounds]
     found = uncertainty.Uncertainty(Patch(), families[0], tuple(families), ())
     for _ in range(2):  # the second time its files answer
-        assert retraining.accept_policy(Progress(tmp_path, asked()), found, ROBOT)[1] == kept
+        assert retraining.accept_policy(Progress(tmp_path, asked()), found, ROBOT).numbers["policy"] == kept
     assert played == list(bounds)
 
 
@@ -211,11 +211,13 @@ def test_it_resumes_at_every_step_and_repeats_none(tmp_path, monkeypatch, interr
 
     monkeypatch.setattr(steps, "drive_before", step("before"))
     monkeypatch.setattr(steps, "record_runs", step("runs"))
-    monkeypatch.setattr(steps, "find_gap", step("gap", lambda record: (record, decided)))
+    monkeypatch.setattr(steps, "find_gap", step("gap"))
     monkeypatch.setattr(steps, "_decided", lambda progress: decided)
     monkeypatch.setattr(steps, "state_uncertainty", step("model", lambda record: (record, "found")))
     monkeypatch.setattr(steps, "train_on", step("training"))
-    monkeypatch.setattr(steps, "accept_policy", step("acceptance", lambda record: (record, "new")))
+    monkeypatch.setattr(
+        steps, "accept_policy", step("acceptance", lambda record: record.model_copy(update={"numbers": {"policy": "new"}}))
+    )
     monkeypatch.setattr(steps, "drive_after", step("after", lambda record: record.model_copy(update={"outcome": "left out"})))
     with pytest.raises(KeyboardInterrupt):
         steps.run_steps(open_folder(tmp_path / "out", asked(), quiet, 1), None, ROBOT)
@@ -230,7 +232,7 @@ def test_it_resumes_at_every_step_and_repeats_none(tmp_path, monkeypatch, interr
 
 def test_a_folder_of_another_command_is_refused(tmp_path):
     open_folder(tmp_path / "out", asked(), quiet, 1).save()
-    with pytest.raises(InputError, match=r"state.json: seed: 0, asked for 7; expected the same command, or another --out"):
+    with pytest.raises(InputError, match=r"state.json: seed: 0, requested 7; expected the same command, or another --out"):
         open_folder(tmp_path / "out", asked(seed=7), quiet, 1)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "file").write_text("")

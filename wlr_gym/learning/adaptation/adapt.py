@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from wlr_gym.base.errors import InputError, require_package, unknown_name
 from wlr_gym.base.provenance import record_provenance
@@ -173,7 +172,8 @@ def run_steps(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> Ada
             _step(progress, name, lambda: AdaptStep(outcome="left out", said=("There is nothing to train on.",)))
     else:
         _step(progress, "training", lambda: train_on(progress, found))
-        kept = _acceptance(progress, found, own)
+        _step(progress, "acceptance", lambda: accept_policy(progress, found, own))
+        kept = str(progress.steps["acceptance"].numbers["policy"])
     _step(progress, "after", lambda: drive_after(progress, robot, kept))
     page = write_page(progress, kept)
     return Adapted(kept, kept != progress.asked.policy, dict(progress.steps), page)
@@ -182,7 +182,8 @@ def run_steps(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> Ada
 def find_uncertainty(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> tuple[Decided, Uncertainty | None]:
     """Do the steps from the runs to what the result states; None where it states nothing."""
     _step(progress, "runs", lambda: record_runs(progress, robot, own))
-    decided = _gap(progress, robot)
+    _step(progress, "gap", lambda: find_gap(progress, robot))
+    decided = _decided(progress)
     return decided, _model(progress, decided, own)
 
 
@@ -196,23 +197,8 @@ def _step(progress: Progress, name: str, work: Callable[[], AdaptStep]) -> None:
     progress.note(name, found)
 
 
-def _gap(progress: Progress, robot: AdaptedRobot | None) -> Decided:
-    """Do the gap step; where it is done, read what it found: the search itself resumes."""
-    kept: list[Decided] = []
-
-    def work() -> AdaptStep:
-        found, decided = find_gap(progress, robot)
-        kept.append(decided)
-        return found
-
-    if "gap" in progress.steps:
-        return _decided(progress)
-    _step(progress, "gap", work)
-    return kept[0]
-
-
 def _decided(progress: Progress) -> Decided:
-    """Return what a gap step that is done has found, from its files."""
+    """Return what the gap step has found, from its files."""
     from wlr_gym.gap.decision import HISTORY_FILE, History
     from wlr_gym.gap.report.result import RESULT_FILE, read_result
 
@@ -228,15 +214,3 @@ def _model(progress: Progress, decided: Decided, own: Robot) -> Uncertainty | No
         record, found = state_uncertainty(progress, decided, own)
     _step(progress, "model", lambda: record)
     return found
-
-
-def _acceptance(progress: Progress, found: Uncertainty, own: Robot) -> str:
-    kept: list[Any] = []
-
-    def work() -> AdaptStep:
-        record, policy = accept_policy(progress, found, own)
-        kept.append(policy)
-        return record.model_copy(update={"numbers": {**record.numbers, "policy": policy}})
-
-    _step(progress, "acceptance", work)
-    return str(progress.steps["acceptance"].numbers["policy"])

@@ -20,7 +20,7 @@ from wlr_gym.physics.effects import load_patch
 from wlr_gym.robot import Robot
 
 
-def find_gap(progress: Progress, robot: AdaptedRobot | None) -> tuple[AdaptStep, Decided]:
+def find_gap(progress: Progress, robot: AdaptedRobot | None) -> AdaptStep:
     """Find what the model lacks, with further runs where there is a robot to drive."""
     asked = progress.asked
     data = Path(asked.robot_runs) if asked.robot_runs is not None else progress.out / "runs"
@@ -39,7 +39,7 @@ def find_gap(progress: Progress, robot: AdaptedRobot | None) -> tuple[AdaptStep,
     else:
         said.insert(0, result.summary or result.verdict)
     names = [one.name for one in result.effects] if result is not None else []
-    record_of = AdaptStep(
+    return AdaptStep(
         said=tuple(said),
         driving=history.seconds,
         command=f"wlr gap {data} --out {progress.out / 'gap'} --until-decided --budget-runs {runs}"
@@ -51,7 +51,6 @@ def find_gap(progress: Progress, robot: AdaptedRobot | None) -> tuple[AdaptStep,
             "folder": str(decided.folder),
         },
     )
-    return record_of, decided
 
 
 def state_uncertainty(progress: Progress, decided: Decided, own: Robot) -> tuple[AdaptStep, Uncertainty | None]:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, write_json
+from wlr_gym.base.files import check_same_request, make_output_folder, resumes, write_json
 from wlr_gym.base.settings import SettingsModel, parse_config
 
 STATE_FILE = "state.json"
@@ -140,18 +140,12 @@ def open_folder(out: Path, asked: Asked, tell: Tell, threads: int) -> Progress:
     Raises:
         InputError: a folder of something else, or of another request; the message names the first difference.
     """
-    path = out / STATE_FILE
-    if not path.is_file():
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise InputError(f"--out {out}: expected a new folder, or one with a {STATE_FILE} of the same command")
-        make_output_folder(out)
+    if not resumes(out, STATE_FILE):
         return Progress(out, asked, tell, threads)
+    path = out / STATE_FILE
     try:
         state = parse_config(AdaptState, json.loads(path.read_text(encoding="utf-8")), str(path))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
-    for name in Asked.model_fields:
-        there, given = getattr(state.asked, name), getattr(asked, name)
-        if there != given:
-            raise InputError(f"{path}: {name}: {there}, asked for {given}; expected the same command, or another --out")
+    check_same_request(path, dict(state.asked), dict(asked))
     return Progress(out, asked, tell, threads, dict(state.steps), dict(state.spent))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
-from wlr_gym.envs.tasks.task_config import OPTIONAL
+from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
 from wlr_gym.learning.adaptation.uncertainty import STATED, Family, Uncertainty
 from wlr_gym.learning.evaluation.acceptance import (
@@ -54,7 +55,7 @@ def training_settings(policy: str, family: Family, *, steps: int, rate: float, s
     task = environment.get("task")
     task = dict(task) if isinstance(task, Mapping) else {}
     if task.get("sensors"):
-        task["sensors"] = {name: float(name in sensors) for name in OPTIONAL}
+        task |= having(sensors)["task"]
     environment |= {"randomization": dict(family.randomization)} | ({"task": task} if task else {})
     if family.effects:
         environment["effects"] = [dict(one) for one in family.effects]
@@ -75,22 +76,33 @@ def training_settings(policy: str, family: Family, *, steps: int, rate: float, s
     }
 
 
-def train_on(progress: Progress, found: Uncertainty) -> AdaptStep:
-    """Train on from the policy; an interrupted training resumes from its newest checkpoint."""
-    asked, folder = progress.asked, progress.out / TRAINING
-    config = progress.folder("model") / SETTINGS_FILE
+def train_in(progress: Progress, folder: Path, config: Path, family: Family) -> None:
+    """Train on from the policy with a family, in ``folder``; an interrupted training resumes from its newest checkpoint.
+
+    Args:
+        progress: what was asked for. folder: of the run. config: file that the settings are written to.
+        family: what it trains with.
+    """
+    asked = progress.asked
 
     def on_update(update: TrainingProgress) -> None:
         progress.tell("training", update.steps / update.total_steps)
 
     if (folder / CONFIG_FILE).is_file():
         resume_training(folder, on_update=on_update)
-    else:
-        settings = training_settings(
-            asked.policy, found.training, steps=asked.steps, rate=asked.learning_rate, seed=asked.seed, sensors=asked.sensors
-        )
-        write_yaml(config, settings)
-        train(asked.environment, folder, config, init=asked.policy, on_update=on_update)
+        return
+    settings = training_settings(
+        asked.policy, family, steps=asked.steps, rate=asked.learning_rate, seed=asked.seed, sensors=asked.sensors
+    )
+    write_yaml(config, settings)
+    train(asked.environment, folder, config, init=asked.policy, on_update=on_update)
+
+
+def train_on(progress: Progress, found: Uncertainty) -> AdaptStep:
+    """Train on from the policy with what was found."""
+    asked, folder = progress.asked, progress.out / TRAINING
+    config = progress.folder("model") / SETTINGS_FILE
+    train_in(progress, folder, config, found.training)
     return AdaptStep(
         said=(f"{asked.steps:,} environment steps from {asked.policy}, learning rate {asked.learning_rate:g}.",),
         command=f"wlr train {asked.environment} --config {config} --init {asked.policy} --out {folder}",
@@ -118,8 +130,8 @@ def export_trained(progress: Progress) -> str:
 # ---- acceptance ------------------------------------------------------------------------------------------------------
 
 
-def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> tuple[AdaptStep, str]:
-    """Test the trained policy against the old one over all that the result leaves open; return which one is kept."""
+def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> AdaptStep:
+    """Test the trained policy against the old one over all that the result leaves open; ``policy`` is the one that is kept."""
     asked, folder, new = progress.asked, progress.folder("acceptance"), trained_policy(progress)
     tests: list[Acceptance] = []
     for number, family in enumerate(found.families):
@@ -131,23 +143,23 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> tuple[A
     losses = tuple(loss for test in tests for loss in test.losses)
     worse = [loss for loss in losses if not loss.bound <= LARGEST_LOSS]
     better = next(loss for loss in losses if loss.floors == STATED).bound < 0.0
-    kept = new if better and not worse else asked.policy
-    if kept == new:
+    is_new = better and not worse
+    if is_new:
         verdict = "The new policy is kept: better on the robot as the result states it, and nowhere worse."
     elif worse:
         verdict = f"The old policy is kept: the new one may be worse in '{worse[0].floors}' (by up to {worse[0].bound:.1f} %)."
     else:
         verdict = "The old policy is kept: the new one is not better beyond the interval."
-    rows = [row for test in tests for row in acceptance_rows(test)[1:]]
-    is_new = kept == new
-    kept = export_trained(progress) if is_new else kept
     numbers = {
         "kept": "new" if is_new else "old",
+        "policy": export_trained(progress) if is_new else asked.policy,
         "losses": [{"family": one.floors, "loss_percent": one.loss, "upper_bound": one.bound} for one in losses],
+        "rows": [row for test in tests for row in acceptance_rows(test)[1:]],
     }
     randomization = progress.out / "model" / "randomization.yaml"
-    command = f"wlr evaluate new={new} old={asked.policy} --randomization {randomization} --sensors none"
-    return AdaptStep(said=(verdict,), command=command, numbers=numbers | {"rows": rows}), kept
+    sensors = " ".join(asked.sensors) or "none"
+    command = f"wlr evaluate new={new} old={asked.policy} --randomization {randomization} --sensors {sensors}"
+    return AdaptStep(said=(verdict,), command=command, numbers=numbers)
 
 
 def compare_on(new: str, old: str, asked: Any, family: Family, own: Robot, threads: int = 1) -> Acceptance:

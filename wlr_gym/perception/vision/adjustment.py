@@ -30,6 +30,8 @@ CALIPER_STD = 0.0002
 UNKNOWN_READOUT, STATED_READOUT = 0.015, 0.0002
 #: Frames that are adjusted together at most.
 MOST_VIEWS = 150
+#: s; frames further apart do not give a speed.
+LONGEST_STEP = 0.3
 _TURNS = 8
 _HUBER = 3.0  # sigmas from which on a circle counts less
 _FLATNESS = 0.1  # tolerance of a marker's height over the tolerance in the plane: markers lie on a flat plate

@@ -18,7 +18,7 @@ from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import Detection
 from wlr_gym.perception.markers.pose import MINIMUM_MARKERS, TargetPose, solve_pose
 from wlr_gym.perception.markers.targets import Target
-from wlr_gym.perception.vision.adjustment import TargetView, adjust, at_frame_time, velocity_between
+from wlr_gym.perception.vision.adjustment import LONGEST_STEP, TargetView, adjust, at_frame_time, velocity_between
 from wlr_gym.perception.vision.tracking import Sample, mean_detection, solved_floor
 
 Array = NDArray[np.float64]
@@ -29,8 +29,6 @@ MOVED_BY, MOVED_SIGMAS = 0.03, 4.0
 KICKED_BY, KICKED_TIMES = 0.5, 4.0
 _BLOCK = 15  # frames that are averaged
 _AROUND = 2  # frames before and after a step
-#: s; frames further apart do not give a speed.
-_LONGEST_STEP = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +91,7 @@ def velocities(times: Sequence[float], poses: Sequence[TargetPose | None]) -> Ar
     for place, (k, _) in enumerate(known):
         (i, before), (j, after) = known[max(0, place - 1)], known[min(len(known) - 1, place + 1)]
         step = times[j] - times[i]
-        if 0 < step < _LONGEST_STEP:
+        if 0 < step < LONGEST_STEP:
             result[k] = velocity_between(before, after, step)
     return result
 

@@ -60,13 +60,12 @@ def frame_noise(samples: Sequence[Sample]) -> FrameNoise:
 
 def widened(samples: Sequence[Sample], noise: FrameNoise) -> tuple[Sample, ...]:
     """The samples with that noise in their covariances."""
-    rates = iter(_signals([sample for sample in samples if math.isfinite(sample.pose[0])])[3])
-    return tuple(
-        replace(sample, covariance=noise.scale**2 * sample.covariance + noise.jitter**2 * np.outer(rate, rate))
-        if math.isfinite(sample.pose[0]) and (rate := next(rates)) is not None
-        else sample
-        for sample in samples
-    )
+    seen = [k for k, sample in enumerate(samples) if math.isfinite(sample.pose[0])]
+    result = list(samples)
+    for k, rate in zip(seen, _signals([samples[k] for k in seen])[3], strict=True):
+        covariance = noise.scale**2 * samples[k].covariance + noise.jitter**2 * np.outer(rate, rate)
+        result[k] = replace(samples[k], covariance=covariance)
+    return tuple(result)
 
 
 def without_repeats(samples: Sequence[Sample]) -> Iterator[Sample]:

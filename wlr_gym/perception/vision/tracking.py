@@ -28,7 +28,7 @@ from wlr_gym.perception.markers.pose import (
 )
 from wlr_gym.perception.markers.sheet_fault import sheet_fault, target_pixels
 from wlr_gym.perception.markers.targets import Target
-from wlr_gym.perception.vision.adjustment import TargetView, at_frame_time, velocity_between
+from wlr_gym.perception.vision.adjustment import LONGEST_STEP, TargetView, at_frame_time, velocity_between
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,6 @@ IMPOSSIBLE = "impossible"
 REPEATED = "repeated"
 FLOOR_FRAMES = 20
 _MOVED_BY = 0.4  # px, median over the floor's markers: 1 mm at 2 m with a focal length of 800 px
-_LONGEST_STEP = 0.3  # s; frames further apart do not give a speed
 _FILM_SLACK = 0.001  # m; 1 sigma of what a rolling shutter displaces a marker by
 _LEAST_COSINE = 0.7  # of the tilt of the body against the floor
 _HEIGHTS = (0.0, 0.6)  # m, of the body's origin
@@ -161,7 +160,7 @@ class Tracker:
     def _at_frame_time(self, found: TargetPose, seen: dict[int, Detection]) -> TargetPose:
         """The pose with each marker at its own row's time, by the speed since the frame before."""
         (before, first), (now, last) = self._track[0], self._track[-1]
-        if not before < now < before + _LONGEST_STEP:
+        if not before < now < before + LONGEST_STEP:
             return found
         speed = velocity_between(first, last, now - before)
         view = TargetView(seen, found.rotation, found.position, speed)

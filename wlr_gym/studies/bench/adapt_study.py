@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder
-from wlr_gym.base.provenance import CONFIG_FILE, git_commit, write_yaml
+from wlr_gym.base.files import check_same_request, make_output_folder
+from wlr_gym.base.provenance import git_commit
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
 from wlr_gym.gap.decision import Decided
@@ -33,11 +33,10 @@ from wlr_gym.learning.adaptation.adapt import find_uncertainty
 from wlr_gym.learning.adaptation.driving import episodes_of, errors_of
 from wlr_gym.learning.adaptation.identification import task_randomization
 from wlr_gym.learning.adaptation.plan import Asked, Progress, open_folder
-from wlr_gym.learning.adaptation.retraining import accept_policy, train_on, training_settings
+from wlr_gym.learning.adaptation.retraining import accept_policy, train_in, train_on
 from wlr_gym.learning.adaptation.robots import EmulatedRobot
 from wlr_gym.learning.adaptation.uncertainty import Family, Uncertainty, uncertainty_of
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
-from wlr_gym.learning.training import resume_training, train
 from wlr_gym.physics.effects import Patch, load_patch
 from wlr_gym.robot import Robot, load_robot, robot_hash
 from wlr_gym.robot.parameter_table import ELEMENTS
@@ -159,23 +158,17 @@ def _check_size(study: AdaptStudy) -> None:
     size |= {"excitations": list(study.excitations), "budget_runs": study.budget_runs}
     path = study.out / "size.json"
     if path.is_file():
-        there = json.loads(path.read_text(encoding="utf-8"))
-        other = next((name for name in size if there.get(name) != size[name]), None)
-        if other is not None:
-            raise InputError(
-                f"{path}: {other} = {there.get(other)}, asked for {size[other]}; expected the same, or another --out"
-            )
+        check_same_request(path, json.loads(path.read_text(encoding="utf-8")), size)
     path.write_text(json.dumps(size) + "\n", encoding="utf-8")
 
 
 def _order(study: AdaptStudy, lines: Sequence[Mapping[str, Any]]) -> Iterator[tuple[AdaptCase, str]]:
-    """Yield what is left: cheap contenders of all cases, then the others, where the truth helps most first."""
+    """Yield what is left: cheap contenders of all cases, then the others; ``lines`` grows meanwhile."""
     done = {(one["case"], one["contender"]) for one in lines}
     for case in study.cases:
         for name in CHEAP:
             if name in study.contenders and (case.name, name) not in done:
                 yield case, name
-    lines = read_lines(study.out / LINES_FILE)
     for case in sorted(study.cases, key=lambda one: -truth_helps(lines, one.name)):
         for name in study.contenders:
             if name not in CHEAP and (case.name, name) not in done:
@@ -220,14 +213,8 @@ def _line(study: AdaptStudy, case: AdaptCase, contender: str, say: Say) -> dict[
 
 def _train(progress: Progress, name: str, family: Family) -> str:
     """Train on from the old policy with a family, in a folder of its own; return the policy."""
-    asked, folder = progress.asked, progress.out / name
-    if (folder / CONFIG_FILE).is_file():
-        resume_training(folder)
-    else:
-        settings = training_settings(asked.policy, family, steps=asked.steps, rate=asked.learning_rate, seed=asked.seed)
-        write_yaml(progress.out / f"{name}.yaml", settings)
-        train(asked.environment, folder, progress.out / f"{name}.yaml", init=asked.policy)
-    return str(folder / "policy")
+    train_in(progress, progress.out / name, progress.out / f"{name}.yaml", family)
+    return str(progress.out / name / "policy")
 
 
 def _truth(progress: Progress, case: AdaptCase, hidden: Patch, own: Robot) -> str:
@@ -303,8 +290,8 @@ def _trained(progress: Progress, found: Uncertainty | None, own: Robot) -> tuple
         return POLICY, {"kept": "old"}
     if not (progress.out / "training" / "policy").is_dir():
         train_on(progress, found)
-    record, policy = accept_policy(progress, found, own)
-    return policy, {"kept": record.numbers["kept"], "losses": record.numbers["losses"]}
+    numbers = accept_policy(progress, found, own).numbers
+    return numbers["policy"], {"kept": numbers["kept"], "losses": numbers["losses"]}
 
 
 def calibration_alone(decided: Decided, data: Path) -> Result:

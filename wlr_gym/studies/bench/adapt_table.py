@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.learning.adaptation.driving import paired
 from wlr_gym.learning.evaluation.statistics import Bootstrap, Estimate
 from wlr_gym.studies.bench.adapt_study import CONTENDERS, HELPS
 
@@ -40,7 +41,7 @@ def regained(case: Mapping[str, Line], contender: str = "ours") -> Estimate:
 
 def better(case: Mapping[str, Line], ours: str, theirs: str) -> Estimate:
     """Return by how much one contender is better than another, % of the other's, paired over the episodes."""
-    return Bootstrap(1, len(_errors(case["none"]))).reduction(_pairs(case[ours]), _pairs(case[theirs]))
+    return paired(_errors(case[ours]), _errors(case[theirs]))
 
 
 def markdown(lines: Sequence[Line]) -> str:
