@@ -19,8 +19,8 @@ NOT_RUN = {
     "docs/policy_file.md": 1,  # an archive of somebody else's
     "docs/quickstart.md": 1,  # installation
     "docs/randomization.md": 1,  # the result of an analysis
-    "docs/robot.md": 5,  # a robot, or until Ctrl-C
-    "docs/run_format.md": 1,  # shortened
+    "docs/emulator.md": 1,  # until Ctrl-C
+    "docs/robot.md": 2,  # a robot
     "docs/sweep.md": 3,  # a cluster
     "docs/vision.md": 4,  # installation, pictures, a film, a photograph
 }

@@ -162,7 +162,7 @@ def test_an_exception_in_the_middle_does_not_block_torque_off(server, group, mon
     assert not any(server.machine.servos[joint]["torque_enable"] for joint in ("leg_lf", "leg_rf", "leg_lr", "leg_rr"))
 
 
-# --- the SDK's defects, by number (docs/robot.md)
+# --- the SDK's defects, by number (wlr_gym/hardware/dynamixel/port.py)
 
 
 def sdk_port(server):

@@ -334,8 +334,8 @@ def test_every_limit_stands_in_the_file_with_its_reason():
 
 
 def test_every_limit_is_in_the_documentation():
-    page = (ROOT / "docs/robot.md").read_text(encoding="utf-8")
-    section = page.split("### Limits", 1)[1].split("\n#", 1)[0]
+    page = (ROOT / "docs/robot_safety.md").read_text(encoding="utf-8")
+    section = page.split("## Limits", 1)[1].split("\n#", 1)[0]
     for name in SafetyLimits.model_fields:
         assert f"`{name}`" in section, name
 

@@ -148,7 +148,7 @@ def _save(
     if is_own and (options.yes or ask(f"Write the measured values into {source}? [y/N]").strip().lower() in ("y", "yes")):
         targets.append(source)
     for target in targets:
-        save_hardware(target, source, changed, "measured", "Measured on the robot by wlr commission; see docs/robot.md.")
+        save_hardware(target, source, changed, "measured", "Measured on the robot by wlr commission: docs/commissioning.md.")
         console.print(f"written: {target}")
 
 

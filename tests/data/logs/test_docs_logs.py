@@ -27,7 +27,7 @@ def test_its_map_is_a_map():
 
 
 def test_its_units_are_those_of_the_code():
-    (line,) = re.findall(r"^Units: .*$", PAGE, re.M)
+    (line,) = re.findall(r"^Units: .*?(?=\n\n)", PAGE, re.M | re.S)
     groups = [re.findall(r"`([^`]+)`", part) for part in line.split(";")]
     expected = [[*factors, *(CURRENTS if unit == "N m" else ())] for unit, factors in FACTORS.items()]
     assert [*groups[:-1], groups[-1][:2]] == expected

@@ -1,7 +1,8 @@
 """The serial port of one bus: dynamixel-sdk's port driver without its verified defects, and packets in and out of it.
 
-Version 4.1.0 was read and tried; the numbers below are those of docs/robot.md. Tests in tests/hardware/test_bus.py show the
-defect in the SDK and its absence here. Import only behind ``require_package``: the SDK and pyserial are optional.
+Version 4.1.0 was read and tried. Its defects are numbered below. A test in tests/hardware/test_bus.py shows each in the SDK and
+its absence here: an SDK that has mended one fails that test, and the guard can go. Import only behind ``require_package``: the
+SDK and pyserial are optional.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 :class:`Registers` is its control table, :class:`Health` what it watches about itself. No motion here:
 :meth:`EmulatedServo.drive` is what the firmware asks of the motor, and :class:`Shaft` what the physics made of it, both in the
-encoder's own frame. Source: ROBOTIS e-manual; where it is silent, docs/robot.md lists what was chosen.
+encoder's own frame. Source: ROBOTIS e-manual; where it is silent, docs/emulator.md lists what was chosen.
 """
 
 from __future__ import annotations
