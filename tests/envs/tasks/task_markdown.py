@@ -60,12 +60,28 @@ def task_tables(task: Task, tasks: Mapping[str, Task]) -> list[str]:
     return tables[:-1]
 
 
-def randomization_table(config: RandomizationConfig, base: RandomizationConfig | None = None) -> list[str]:
-    """Return the events as the lines of a table, without those that ``base`` has just so."""
-    known = [] if base is None else randomization_rows(base)
-    rows = [row for row in randomization_rows(config) if row not in known]
-    code = [(f"`{name}`", ", ".join(f"`{item}`" for item in items.split(", ")), *rest) for name, items, *rest in rows]
-    return _table(RANDOMIZATION_HEADER, code)[:-1]
+def randomization_table(config: RandomizationConfig) -> list[str]:
+    """Return the events as the lines of a table; events that are drawn alike share a line."""
+    alike: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for name, items, *rest in randomization_rows(config):
+        alike.setdefault(tuple(rest), []).append((name, items))
+    rows = [(_code(name for name, _ in same), _code(items for _, items in same), *rest) for rest, same in alike.items()]
+    return _table(RANDOMIZATION_HEADER, rows)[:-1]
+
+
+def preset_table(configs: Mapping[str, RandomizationConfig], base: RandomizationConfig) -> list[str]:
+    """Return what presets draw otherwise than ``base``, as the lines of one table."""
+    known = randomization_rows(base)
+    rows = [
+        (f"`{preset}`", _code([name]), _code([items]), *rest)
+        for preset, config in configs.items()
+        for name, items, *rest in (row for row in randomization_rows(config) if row not in known)
+    ]
+    return _table(("preset", *RANDOMIZATION_HEADER), rows)[:-1]
+
+
+def _code(names: Iterable[str]) -> str:
+    return ", ".join(f"`{name}`" for text in names for name in text.split(", "))
 
 
 def _shared(groups: Sequence[list[tuple[str, ...]]]) -> list[tuple[str, ...]]:

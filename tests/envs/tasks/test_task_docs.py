@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from task_markdown import randomization_table, shared_tables, task_tables
+from task_markdown import preset_table, randomization_table, shared_tables, task_tables
 
 from wlr_gym.envs.registry import ENVIRONMENTS
 from wlr_gym.envs.tasks import load_randomization, load_task
@@ -16,6 +16,8 @@ from wlr_gym.robot import load_robot
 
 ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs" / "randomization.md").read_text(encoding="utf-8")
+#: Laid over `nominal`.
+PRESETS = ("ice", "split", "patches", "slippery", "asymmetric", "slope", "stripes", "ribbed")
 ENVIRONMENTS_PAGE = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
 
 
@@ -32,13 +34,13 @@ def config(name):
     return load_randomization(name, load_robot()).config
 
 
-@pytest.mark.parametrize(
-    ("name", "base"),
-    [("nominal", None), ("wide", None)]
-    + [(name, "nominal") for name in ("ice", "split", "patches", "slippery", "asymmetric", "slope", "stripes", "ribbed")],
-)
-def test_tables_are_those_of_the_code(name, base):
-    assert _generated(TEXT, name) == randomization_table(config(name), None if base is None else config(base))
+@pytest.mark.parametrize("name", ["nominal", "wide"])
+def test_tables_are_those_of_the_code(name):
+    assert _generated(TEXT, name) == randomization_table(config(name))
+
+
+def test_the_table_of_presets_is_that_of_the_code():
+    assert _generated(TEXT, "presets") == preset_table({name: config(name) for name in PRESETS}, config("nominal"))
 
 
 @pytest.mark.parametrize(("env_id", "name"), [(env_id, name) for env_id, name in ENVIRONMENTS.items()])
