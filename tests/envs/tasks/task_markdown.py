@@ -15,7 +15,6 @@ _OBSERVATION = ("numbers", "unit", "frame", "scale", "meaning")
 def shared_tables(tasks: Mapping[str, Task]) -> list[str]:
     """Return the lines of the tables of all tasks together: shared observations, rewards, terminations, measures."""
     policy = _shared([_terms(task.policy) for task in tasks.values()])
-    privileged = _shared([_terms(task.privileged) for task in tasks.values()])
     rewards = [
         (
             f"`{name}`",
@@ -39,7 +38,6 @@ def shared_tables(tasks: Mapping[str, Task]) -> list[str]:
     ]
     return [
         *_table(("observation", *_OBSERVATION), policy),
-        *_table(("privileged", *_OBSERVATION), privileged),
         *_table(("reward: weight (1/s)", *tasks, "parameters", "meaning"), rewards),
         *_table(("termination", "parameters", "meaning"), terminations),
         *_table(("measure", "unit", *tasks, "meaning"), measures)[:-1],
@@ -52,11 +50,9 @@ def task_tables(task: Task, tasks: Mapping[str, Task]) -> list[str]:
         (f"`{name}`", f"{low:g} to {high:g}", COMMANDS[name].unit, COMMANDS[name].doc)
         for name, (low, high) in task.config.commands.terms.items()
     ]
-    tables = _table(("command", "range", "unit", "meaning"), commands)
-    for title, group in (("observation", "policy"), ("privileged", "privileged")):
-        shared = _shared([_terms(getattr(other, group)) for other in tasks.values()])
-        own = [row for row in _terms(getattr(task, group)) if row not in shared]
-        tables += _table((title, *_OBSERVATION), own) if own else []
+    shared = _shared([_terms(other.policy) for other in tasks.values()])
+    own = [row for row in _terms(task.policy) if row not in shared]
+    tables = _table(("command", "range", "unit", "meaning"), commands) + _table(("observation", *_OBSERVATION), own)
     return tables[:-1]
 
 
