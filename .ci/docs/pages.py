@@ -56,6 +56,23 @@ INTRODUCTION = (
 )
 
 
+#: LaTeX in a page: a displayed formula, or one within the text.
+FORMULA = re.compile(r"\$\$(?P<display>.+?)\$\$|\$(?P<inline>[^$\s](?:[^$]*[^$\s])?)\$", re.S)
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Turn LaTeX into MathML, which browsers draw without a script; only pages that display formulas have any."""
+    if "$$" not in markdown:
+        return markdown
+    from latex2mathml.converter import convert
+
+    def mathml(found: re.Match[str]) -> str:
+        display = found["display"]
+        return convert(display, display="block") if display else convert(found["inline"])
+
+    return FORMULA.sub(mathml, markdown)
+
+
 def on_page_content(html: str, **_: Any) -> str:
     """Turn the roles of docstrings into links, which are resolved when all pages are known."""
 

@@ -13,6 +13,8 @@ NOT_RUN = {
     "docs/camera.md": 1,  # a camera
     "docs/evaluation.md": 1,  # runs of one training with several seeds
     "docs/gap.md": 5,  # minutes each; the quickstart has one
+    "docs/gap_benchmark.md": 1,  # hours
+    "docs/paper.md": 1,  # minutes
     "docs/pictures.md": 1,  # a window
     "docs/own_robot.md": 4,  # examples/own_robot.py goes the same way
     "docs/own_logs.md": 2,  # logs of somebody else's

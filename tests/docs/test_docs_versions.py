@@ -91,6 +91,15 @@ def test_roles_of_docstrings_are_links_on_the_site():
         assert kind not in shown(f"<p>{kind}<code>{name}</code></p>"), role
 
 
+def test_formulas_are_mathml_on_the_site():
+    pytest.importorskip("latex2mathml")
+    page = (ROOT / "docs" / "derivation.md").read_text(encoding="utf-8")
+    shown = _pages().on_page_markdown(page)
+    assert "$" not in shown
+    assert shown.count('display="block"') == page.count("$$") // 2
+    assert _pages().on_page_markdown("`$WLR_GYM_CACHE`, else `$HOME`") == "`$WLR_GYM_CACHE`, else `$HOME`"
+
+
 def test_the_package_says_that_it_is_typed():
     assert (ROOT / "wlr_gym" / "py.typed").is_file()
     assert wlr_gym.__doc__

@@ -106,7 +106,7 @@ def test_options_have_one_list_of_names_and_types():
     for name in EnvironmentOptions.__annotations__:
         assert f"\n    {name}: " in str(inspect.getdoc(EnvironmentOptions)), name
     page = Path(__file__).parents[2].joinpath("docs", "environments.md").read_text(encoding="utf-8")
-    table = page.split("**Keywords**")[1].split("**Info**")[0]
+    table = page.split("## Keywords")[1].split("## Info")[0]
     assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == [*EnvironmentOptions.__annotations__]
 
 

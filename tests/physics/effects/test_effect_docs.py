@@ -36,8 +36,9 @@ def test_yaml_examples_load(number):
 
 
 def test_ready_patches_and_units_are_all_named():
-    assert f"`configs/effects/`: {', '.join(f'`{path.stem}`' for path in ready_patches())}." in TEXT
-    assert f"SI symbols without prefixes ({', '.join(UNITS)})" in TEXT
+    text = " ".join(TEXT.split())
+    assert f"`configs/effects/`: {', '.join(f'`{path.stem}`' for path in ready_patches())}." in text
+    assert f"SI symbols without prefixes ({', '.join(UNITS)})" in text
 
 
 def test_prose_names_only_effects_and_parameters_that_exist():

@@ -10,11 +10,6 @@ from wlr_gym.physics.plants.forces import COORDINATES, FEATURES
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 
 _PLACES = {JOINTS: "joints", LEGS: "legs", WHEELS: "wheels"}
-_SCOPES = {
-    "joint": "of the joint the force acts on",
-    "corner": "of the force's own corner, or of one named: `_lf` `_rf` `_lr` `_rr`",
-    "robot": "of the robot",
-}
 
 
 def places(effect: Effect) -> str:
@@ -46,8 +41,8 @@ def effect_table() -> list[str]:
 
 def feature_table() -> list[str]:
     """Return what a formula may depend on as lines of a Markdown table."""
-    rows = [(f"`{name}`", feature.unit, feature.doc, _SCOPES[feature.scope]) for name, feature in FEATURES.items()]
-    return _markdown(("name", "unit", "meaning", "whose"), rows)
+    rows = [(f"`{name}`", feature.unit, feature.doc, feature.scope) for name, feature in FEATURES.items()]
+    return _markdown(("name", "unit", "meaning", "of the"), rows)
 
 
 def coordinate_table() -> list[str]:

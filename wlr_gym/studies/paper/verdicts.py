@@ -151,11 +151,15 @@ EQUATIONS: dict[int, Equation] = {row[0]: _equation(*row) for row in _rows()}
 
 
 def verdict_table() -> list[str]:
-    """Return the verdicts as lines of a Markdown table."""
+    """Return the verdicts as lines of a Markdown table; equations of one verdict, remark and correction share a line."""
+    groups: dict[tuple[tuple[str, ...], str, str], list[Equation]] = {}
+    for equation in EQUATIONS.values():
+        groups.setdefault((equation.verdicts, equation.remark, equation.correction), []).append(equation)
     head = ["| | equation | verdict | why | correct |", "|---|---|---|---|---|"]
     return head + [
-        f"| ({e.number}) | {e.title} | {', '.join(e.verdicts)} | {_cell(e.remark)} | {_code(e.correction)} |"
-        for e in EQUATIONS.values()
+        f"| {', '.join(f'({e.number})' for e in same)} | {'; '.join(e.title for e in same)} | {', '.join(verdicts)} "
+        f"| {_cell(remark)} | {_code(right)} |"
+        for (verdicts, remark, right), same in groups.items()
     ]
 
 
