@@ -30,7 +30,7 @@ def compiled(function: Callable[..., Any], *signatures: Any) -> Any:
     For functions whose arguments are named tuples of this package; those of arrays and numbers need no more than numba's own.
     """
     dispatcher = njit(nogil=True)(function)
-    dispatcher._cache = _Kept(function)
+    dispatcher._cache = _Kept(function)  # pyright: ignore[reportAttributeAccessIssue]
     for signature in signatures:
         dispatcher.compile(signature)
         dispatcher.disable_compile()
