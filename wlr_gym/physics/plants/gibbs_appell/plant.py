@@ -290,9 +290,8 @@ class GibbsAppellPlant(Simulator):
         if self._formulas:  # in full precision: single precision would lose it step by step
             _scatter(self._memory, self._width, self._all, self._time[:, None], slice(0, 1))
         arguments = (self._lanes, self._constants, *inputs, self._truth.values, self._raw)
-        chunks = iter(
-            self._chunks
-        )  # whoever is done takes the next: a thread whose core has other work as well holds nobody up
+        # Whoever is done takes the next: a thread whose core has other work as well holds nobody up.
+        chunks = iter(self._chunks)
         helpers = [self._pool.submit(self._run, arguments, chunks) for _ in range(self._helpers)] if self._pool else ()
         self._run(arguments, chunks)
         for helper in helpers:
