@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from wlr_gym.physics.plants.base import PlantOptions
-from wlr_gym.physics.plants.gibbs_appell.plant import TILES_PER_THREAD, GibbsAppellPlant
+from wlr_gym.physics.plants.gibbs_appell.plant import TILES_AT_A_TIME, GibbsAppellPlant
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -67,7 +67,7 @@ def test_alone_or_in_a_batch(precision):
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_on_two_threads_and_again(precision):
-    count = 16 * TILES_PER_THREAD * 3 + 5
+    count = 16 * TILES_AT_A_TIME * 3 + 5
     parameters, setpoints, seeds = random_parameters(count), random_setpoints(count, 5), np.arange(count, dtype=np.uint64)
     once = rollout(parameters, setpoints, seeds, precision)
     again = rollout(parameters, setpoints, seeds, precision)
@@ -78,7 +78,7 @@ def test_on_two_threads_and_again(precision):
 
 
 def test_two_threads_are_really_used():
-    count = 16 * TILES_PER_THREAD
+    count = 16 * TILES_AT_A_TIME
     plant = GibbsAppellPlant(ROBOT, count, PlantOptions(threads=2))
     assert plant._pool is not None
     plant.close()

@@ -10,9 +10,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import njit, typeof, types
+from numba import typeof, types
 from numpy.typing import NDArray
 
+from wlr_gym.base.compiled import compiled
 from wlr_gym.gap.robot.clock import CLOCK
 from wlr_gym.gap.robot.recorder import Recorder, Tape, take
 from wlr_gym.gap.robot.schedule import Schedule, arrive
@@ -68,7 +69,7 @@ def _compiled(signature: Any, batch: Any, schedule: Any, tape: Any) -> Any:
     numba keeps it with the sensor model compiled in (``measure_rows``), and looks at this file only to tell whether it is old.
     """
     arguments = (types.FunctionType(signature), batch, schedule, tape, types.int64, types.int64)
-    return njit(types.void(*arguments), cache=True, nogil=True)(_ticks)
+    return compiled(_ticks, types.void(*arguments))
 
 
 def _ticks(function: Any, batch: Any, schedule: Any, tape: Any, first: int, last: int) -> None:

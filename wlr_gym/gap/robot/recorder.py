@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.base.compiled import compiled
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, Sensors, Truth
@@ -158,7 +159,7 @@ def _torque_changes(clocks: Sequence[RunClock], ticks: int, settings: int) -> di
     return {tick: np.repeat(on[tick], settings, axis=0) for tick in [0, *changed.tolist()]}
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def take(tick: Any, readings: Any, truth: Any, tape: Any) -> None:
     """Write what is read at a tick (robots, SENSOR_LAYOUT.width) onto a tape; see :class:`Tape`."""
     if tick % POSE_TICKS == 0:
@@ -196,7 +197,7 @@ def _store(readings: Any, shift: Any, out: Any) -> None:
         out[i, _VOLT] = readings[i, _SENSED_VOLT]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _read_row(tick: Any, place: Any, first: Any, settings: Any, out: Any, apart: Any, anchored: Any, tape: Any) -> None:
     """Write one row of a run: readings of this tick, or on a line through the last one and this one.
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.base.compiled import compiled
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import RowStore
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
@@ -72,7 +72,7 @@ class WrittenSetpoints:
         return self.schedule.newer, self.schedule.older, self.schedule.wait
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def arrive(now: Any, schedule: Any) -> None:
     """Fill the setpoints of the tick that begins at ``now`` (s) and move the rows on to those that have arrived."""
     rows, goals = schedule.rows, schedule.goals

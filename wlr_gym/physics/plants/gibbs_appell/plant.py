@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 
 #: Passes over the friction rows per substep; see docs/physics.md for the study behind it.
 SWEEPS = 4
-#: Below this many tiles per thread, waking a thread costs more than it saves.
-TILES_PER_THREAD = 8
+#: Threads take so many tiles at a time: fewer cost more than they save.
+TILES_AT_A_TIME = 8
 _LANE = {name: index for index, name in enumerate(STORED)}
 _ROTOR_LEAD = [_LANE[f"rotor_lead{j}"] for j in range(8)]
 _ROTOR_RATE = [_LANE[f"rotor_rate{j}"] for j in range(8)]
@@ -113,7 +113,9 @@ class GibbsAppellPlant(Simulator):
         self._lanes = np.zeros((self._tiles, len(STORED) * self._width), self._float)
         self._constants = np.zeros((self._tiles, len(packing.PARAMETER_LANES) * self._width), self._float)
         self._torque_on = np.ones((count, 8))
-        self._pool = self._make_pool()
+        self._chunks = self._shared_out(self._tiles)
+        self._helpers = min(self.options.threads, len(self._chunks)) - 1
+        self._pool = ThreadPoolExecutor(self._helpers, thread_name_prefix="wlr-engine") if self._helpers else None
         self._formulas = compile_forces(forces, self.options.precision) if forces else None
         values = self._formulas.values if self._formulas else np.zeros(0)
         self.set_force_values(np.tile(values, (count, 1)))
@@ -121,16 +123,10 @@ class GibbsAppellPlant(Simulator):
         self._features: frozenset[str] | None = None
         self._start()
 
-    def _make_pool(self) -> ThreadPoolExecutor | None:
-        self._chunks = self._shared_out(self._tiles)
-        if len(self._chunks) < 2:
-            return None
-        return ThreadPoolExecutor(len(self._chunks) - 1, thread_name_prefix="wlr-engine")
-
     def _shared_out(self, tiles: int) -> list[tuple[int, int]]:
-        """First and last of the tiles of each thread."""
-        threads = max(1, min(self.options.threads, tiles // TILES_PER_THREAD))
-        return list(itertools.pairwise(np.linspace(0, tiles, threads + 1).astype(int).tolist()))
+        """First and last of the tiles that a thread takes at a time."""
+        count = max(1, tiles // TILES_AT_A_TIME) if self.options.threads > 1 else 1
+        return list(itertools.pairwise(np.linspace(0, tiles, count + 1).astype(int).tolist()))
 
     # ---- parameters and state ----
 
@@ -277,8 +273,7 @@ class GibbsAppellPlant(Simulator):
 
     def keep_going(self, count: int) -> None:
         """Leave the tiles without any of the first ``count`` robots; see ``Simulator.keep_going``."""
-        going = -(-count // self._width)
-        self._chunks = [(0, going)] if self._pool is None else self._shared_out(going)
+        self._chunks = self._shared_out(-(-count // self._width))
 
     def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick; see :meth:`wlr_gym.physics.plants.base.Plant.step`.
@@ -295,19 +290,20 @@ class GibbsAppellPlant(Simulator):
         if self._formulas:  # in full precision: single precision would lose it step by step
             _scatter(self._memory, self._width, self._all, self._time[:, None], slice(0, 1))
         arguments = (self._lanes, self._constants, *inputs, self._truth.values, self._raw)
-        if self._pool is None:
-            self._run(arguments, *self._chunks[0])
-        else:
-            waiting = [self._pool.submit(self._run, arguments, *chunk) for chunk in self._chunks[1:]]
-            self._run(arguments, *self._chunks[0])
-            for future in waiting:
-                future.result()
+        # Whoever is done takes the next: a thread whose core has other work as well holds nobody up.
+        chunks = iter(self._chunks)
+        helpers = [self._pool.submit(self._run, arguments, chunks) for _ in range(self._helpers)] if self._pool else ()
+        self._run(arguments, chunks)
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()
         self._time += self.options.control_period
         return self._readings
 
-    def _run(self, arguments: tuple[Array, ...], first: int, last: int) -> None:
-        self._kernel.tick(*arguments, first, last, self._count, self._step, self.substeps, self.sweeps)
-        self._sensors.measure(self._raw, self._readings.values, first * self._width, min(last * self._width, self._count))
+    def _run(self, arguments: tuple[Array, ...], chunks: Iterator[tuple[int, int]]) -> None:
+        for first, last in chunks:
+            self._kernel.tick(*arguments, first, last, self._count, self._step, self.substeps, self.sweeps)
+            self._sensors.measure(self._raw, self._readings.values, first * self._width, min(last * self._width, self._count))
 
     def compiled_tick(self) -> tuple[Any, CompiledTick]:
         """Return the compiled function that moves the robots by a tick, and what it works on: :meth:`step` without Python.
@@ -328,7 +324,6 @@ class GibbsAppellPlant(Simulator):
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
-            self._chunks = [(0, self._tiles)]
 
 
 def _scatter(lanes: Array, width: int, rows: NDArray[np.intp], values: Array, which: slice = slice(None)) -> None:
