@@ -56,7 +56,7 @@ class BenchOptions:
     what: tyro.conf.Positional[tuple[str, ...]] = ()
     """Measurements to make, as with --only."""
     only: tuple[str, ...] = ()
-    """engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, camera, perception, vision,
+    """Some of engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, camera, perception, vision,
     sysid.
     gap (the blind test of the gap workflow), adapt (what adaptation wins back): alone, with --out"""
     json: Path | None = None

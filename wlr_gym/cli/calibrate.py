@@ -23,7 +23,7 @@ class CameraOptions:
         out: camera file to write (YAML).
         columns: squares of the board along its longer side.
         rows: squares along its shorter side.
-        square: m, side of a square as measured on the print.
+        square: side of a square as measured on the print, m.
         every: use every n-th frame of a video.
     """
 
@@ -50,14 +50,15 @@ class TargetsOptions:
     floor: str = "floor"
 
 
-CalibrateOptions = (
-    Annotated[CameraOptions, tyro.conf.subcommand("camera", description="lens of a camera, from views of a board")]
-    | Annotated[TargetsOptions, tyro.conf.subcommand("targets", description="sheets to print: markers and calibration board")]
-    | Annotated[ServoOptions, tyro.conf.subcommand("servo", description="id and baud rate of a new servo")]
-    | Annotated[JointsOptions, tyro.conf.subcommand("joints", description="sign and zero of each servo, by hand")]
-    | Annotated[ImuOptions, tyro.conf.subcommand("imu", description="biases, scale and mounting of the IMU")]
-    | Annotated[FlowOptions, tyro.conf.subcommand("flow", description="scale and mounting of the optical-flow sensor")]
-)
+#: Command -> its options, and what it does.
+COMMANDS = {
+    "camera": (CameraOptions, "lens of a camera, from views of a board"),
+    "targets": (TargetsOptions, "sheets to print: markers and calibration board"),
+    "servo": (ServoOptions, "id and baud rate of a new servo"),
+    "joints": (JointsOptions, "sign and zero of each servo, by hand"),
+    "imu": (ImuOptions, "biases, scale and mounting of the IMU"),
+    "flow": (FlowOptions, "scale and mounting of the optical-flow sensor"),
+}
 
 
 def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions | ImuOptions | FlowOptions) -> int:

@@ -39,13 +39,13 @@ class CompareOptions(PatchOption):
     runs: Path | None = None
     """Drive the commands of this measured run, or folder of runs, instead."""
     seed: int = 0
-    """Of the excitations: another seed, another motion of the same kind."""
+    """Seed of the excitations: another seed, another motion of the same kind."""
     seconds: float | None = None
     """Cut every motion off after this long."""
     robot: str | None = None
     """Robot file or config name; default: the one the runs' meta.yaml names, else the nominal one."""
     physics_step: float = 0.001
-    """s per substep of both plants."""
+    """Substep of both plants, s."""
     halve: bool = False
     """Repeat at half of both steps: shows whether the difference shrinks, and each plant's own step error."""
     every_effect: bool = False

@@ -264,8 +264,8 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
         if robot is not None:
             write_robot(Path(folder) / "robot.yaml", load_robot(robot))
             words += ["--robot", str(Path(folder) / "robot.yaml")]
-        for fault in options.fault:
-            words += ["--fault", fault]
+        if options.fault:
+            words += ["--fault", *options.fault]
         if options.effects:
             words += ["--effects", *options.effects]
         modules = [word for module in IMPORTED for word in ("--import", module)]

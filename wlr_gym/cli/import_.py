@@ -41,7 +41,7 @@ class ImportOptions:
     robot: str | None = None
     """Robot file or config name; default: the one that the map's meta names, else the nominal one."""
     format: Literal["parquet", "csv"] = "parquet"
-    """Of the runs."""
+    """Format of the runs."""
 
 
 def run(options: ImportOptions) -> int:

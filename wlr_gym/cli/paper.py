@@ -35,11 +35,11 @@ class PaperOptions(HardwareOption):
     robot: str | None = None
     """Robot file or config name; default: the nominal one."""
     draws: int = 8
-    """Of the search for what could explain the paper's slip: draws per combination at first; 0 = no search."""
+    """Search for what could explain the paper's slip: draws per combination at first; 0 = no search."""
     levels: int = 2
     """Most departures from the nominal robot at once in the search: 1 to 3."""
     seed: int = 0
-    """Of the search."""
+    """Seed of the search."""
     threads: int = 2
     """Worker threads of the engine."""
     plots: bool = True

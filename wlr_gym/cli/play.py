@@ -43,7 +43,7 @@ class PlayOptions(PatchOption, SensorsOption):
     beside: str | None = None
     """A second one, in the same episode, beside the first in a video."""
     backend: str = "gibbs_appell"
-    """Simulator."""
+    """Simulator: gibbs_appell or mujoco."""
     randomization: str | None = None
     """Name in configs/randomization/ or path; default: the task's."""
     robot: str | None = None
@@ -51,7 +51,7 @@ class PlayOptions(PatchOption, SensorsOption):
     seed: int = 0
     """Seed of the first episode."""
     command: str | None = None
-    """Commands by schedule instead of keys: 0.1,0 for good, or 0:0.1,0; 3:0.05,0.3 from these times (s) on."""
+    """Commands by schedule instead of keys: '0.1,0' for good, or '0:0.1,0; 3:0.05,0.3' from these times (s) on."""
     gamepad: bool = False
     """Take commands from the first gamepad instead of the keys."""
     web: bool = False
@@ -67,7 +67,7 @@ class PlayOptions(PatchOption, SensorsOption):
     fps: float = FPS
     """Pictures per second of a video, where the control period allows."""
     camera: str = "follow"
-    """follow, chase, side or top."""
+    """View: follow, chase, side or top."""
     size: tuple[int, int] = (640, 480)
     """Width and height of the video, pixels."""
     forces: bool = False

@@ -35,7 +35,7 @@ class RecordOptions(CameraOption, PatchOption):
         commands: files with setpoints to drive: of --commands-only, or of whole runs.
         out: folder for the runs; made if it is not there.
         backend: dynamixel = the robot (with --emulated an emulated one), or a simulator: gibbs_appell, mujoco.
-        seed: of the motions, and of a simulator's noise.
+        seed: seed of the motions, and of a simulator's noise.
         seconds: cut each motion off after this long.
         commands_only: write the setpoints only, one file per motion.
         list: show the excitations.

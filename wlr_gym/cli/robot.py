@@ -53,13 +53,14 @@ class ShowOptions:
     json: bool = False
 
 
-RobotOptions = (
-    Annotated[NewOptions, tyro.conf.subcommand("new", description="a robot file from a few questions")]
-    | Annotated[CheckOptions, tyro.conf.subcommand("check", description="what is wrong or odd about a robot, with numbers")]
-    | Annotated[ShowOptions, tyro.conf.subcommand("show", description="what a robot is and can do; a picture")]
-    | Annotated[RobotImportOptions, tyro.conf.subcommand("import", description="a robot file from MJCF or URDF")]
-    | Annotated[RobotExportOptions, tyro.conf.subcommand("export", description="a robot as MJCF or URDF")]
-)
+#: Command -> its options, and what it does.
+COMMANDS = {
+    "new": (NewOptions, "a robot file from a few questions"),
+    "check": (CheckOptions, "what is wrong or odd about a robot, with numbers"),
+    "show": (ShowOptions, "what a robot is and can do; a picture"),
+    "import": (RobotImportOptions, "a robot file from MJCF or URDF"),
+    "export": (RobotExportOptions, "a robot as MJCF or URDF"),
+}
 
 
 def run(options: NewOptions | CheckOptions | ShowOptions | RobotImportOptions | RobotExportOptions) -> int:

@@ -51,7 +51,7 @@ class RobotExportOptions:
     Attributes:
         robot: name in configs/robot/ or path.
         out: file to write; .xml or .mjcf: MJCF, .urdf: URDF.
-        format: mjcf or urdf; default: by the end of --out.
+        format: of the file, mjcf or urdf; default: by the end of --out.
         force: replace a file that is there.
         json: print what the format cannot hold as JSON.
     """

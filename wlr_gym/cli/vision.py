@@ -37,13 +37,13 @@ class VisionOptions:
         camera: calibration file; make one with: wlr calibrate camera.
         markers: markers on the robot: name in configs/vision/ or path.
         floor: markers on the floor: name in configs/vision/ or path.
-        robot: robot file or config name; left out, the one meta.yaml names, else the nominal one.
-        offset: s, servo time minus camera time, exactly; left out, found from the motion.
-        around: s, servo time minus camera time to 1 s: where the offset is looked for.
+        robot: robot file or config name; default: the one meta.yaml names, else the nominal one.
+        offset: servo time minus camera time, s; default: found from the motion.
+        around: where the offset is looked for: servo time minus camera time to within 1 s, s.
         origin: frame of cam_*: start (0, 0, 0 at the start, as in simulated runs) or floor.
-        rate: Hz, frames evenly spaced; left out, the times in the video.
+        rate: of evenly spaced frames, Hz; default: the times in the video.
         times: CSV with one time (s) per frame, before --rate.
-        seconds: of the video to use; left out, all.
+        seconds: how much of the video to use, s; default: all.
         annotate: write annotated.mp4.
     """
 
