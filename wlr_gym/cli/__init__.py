@@ -114,7 +114,11 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     """Parse the arguments of one command and run it."""
     if (name, *arguments[:1]) in NESTED:
         name, arguments = f"{name}_{arguments[0]}", arguments[1:]
-    return _module(name).run(parse(name, arguments))
+    from wlr_gym.cli.results import only_results
+
+    options = parse(name, arguments)
+    with only_results(getattr(options, "json", False)):
+        return _module(name).run(options)
 
 
 def parse(name: str, arguments: Sequence[str]) -> Any:
@@ -147,8 +151,12 @@ def usage() -> str:
     """Return the help text of ``wlr``."""
     from wlr_gym.cli import parsing
 
-    hint = "wlr COMMAND --help explains one; wlr --version\nwlr --import MODULE COMMAND first imports what adds to the library"
-    return f"{parsing.usage('wlr', COMMANDS)}\n\n{hint}\nwlr --completion bash (or zsh, fish) prints what completes commands and options"
+    hints = (
+        "wlr COMMAND --help explains one; wlr --version",
+        "wlr --import MODULE COMMAND first imports what adds to the library",
+        "wlr --completion bash (or zsh, fish) prints what completes commands and options",
+    )
+    return "\n".join([parsing.usage("wlr", COMMANDS), "", *hints])
 
 
 def _say(message: str, colour: str) -> None:

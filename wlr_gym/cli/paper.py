@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import HardwareOption, confirm
 
 if TYPE_CHECKING:
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class PaperOptions(HardwareOption):
+class PaperOptions(JsonOption, ForceOption, HardwareOption):
     out: Path
     """Folder for the report; made if it is not there."""
     plant: tuple[str, ...] = ("reduced", "gibbs_appell", "mujoco")
@@ -54,7 +56,7 @@ def run(options: PaperOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.base.files import make_output_folder, refuse_existing
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.cli import FAILED, OK
     from wlr_gym.hardware.loop import StoppedError
@@ -66,6 +68,7 @@ def run(options: PaperOptions) -> int:
 
     _check(options)
     robot = load_robot(options.robot) if options.robot else load_robot()
+    refuse_existing(options.out / "report.md", options.force)
     make_output_folder(options.out)
     write_tests(options.out / "commands")
     console = Console()
@@ -86,7 +89,10 @@ def run(options: PaperOptions) -> int:
     report.write_report(options.out, robot, records, claims, findings, decisive)
     given = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
     record_provenance(options.out, given | {"plant": list(options.plant), "robot": robot.name}, options.seed)
-    _show(console, claims)
+    if options.json:
+        print_json(claims)
+    else:
+        _show(console, claims)
     console.print(f"report: {options.out / 'report.md'}", soft_wrap=True)
     return OK
 

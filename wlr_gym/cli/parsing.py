@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 import io
+import operator
 import re
 import textwrap
 import types
@@ -102,7 +104,7 @@ def _one_of(commands: Mapping[str, Any]) -> Any:
         else:
             member = builder(kind)
         members.append(Annotated[Any, tyro.conf.subcommand(name, constructor=member)])
-    return Union[tuple(members)]
+    return functools.reduce(operator.or_, members)
 
 
 # ---- what options there are ------------------------------------------------------------------------------------------

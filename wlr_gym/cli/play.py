@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import refuse_existing
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption, SensorsOption, environment_of
+from wlr_gym.cli.options import ForceOption, PatchOption, SensorsOption, environment_of
 from wlr_gym.render.display import require_display
 from wlr_gym.render.view import View
 from wlr_gym.render.web.page import HOST, PORT
@@ -35,7 +36,7 @@ FPS = 25.0
 
 
 @dataclass(frozen=True)
-class PlayOptions(PatchOption, SensorsOption):
+class PlayOptions(ForceOption, PatchOption, SensorsOption):
     env: tyro.conf.Positional[str | None] = None
     """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
     agent: str = "pid"
@@ -123,6 +124,7 @@ def _check(options: PlayOptions) -> None:
         raise InputError("--web and --video: one or the other")
     if options.video is not None:
         check_video(options.video)
+        refuse_existing(options.video, options.force, "--video")
     elif not options.web:
         require_display()
 

@@ -15,6 +15,8 @@ import tyro
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.cli import OK
+from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class VisionOptions:
+class VisionOptions(JsonOption, ForceOption):
     """Video to pose and slip.
 
     Attributes:
@@ -72,7 +74,7 @@ def run(options: VisionOptions) -> int:
     require_package("cv2", "vision")
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.base.files import make_output_folder, refuse_existing
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.data import read_run
     from wlr_gym.perception.vision import load_camera, load_target, save_video_analysis
@@ -84,6 +86,7 @@ def run(options: VisionOptions) -> int:
     camera, body, floor = load_camera(options.camera), load_target(options.markers), load_target(options.floor)
     if options.out.resolve() == options.run.resolve().parent:
         raise InputError(f"--out {options.out}: is the run's own folder; the run would be overwritten")
+    refuse_existing(options.out / "summary.json", options.force)
     fresh = not options.out.exists()
     make_output_folder(options.out)
     console = Console(highlight=False, soft_wrap=True)
@@ -99,7 +102,10 @@ def run(options: VisionOptions) -> int:
     paths = save_video_analysis(analysis, options.out)
     settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
     record_provenance(options.out, settings | {"robot": analysis.robot.name})
-    _print(analysis, console)
+    if options.json:
+        print_json(analysis.summary())
+    else:
+        _print(analysis, console)
     console.print(f"in {options.out}: {', '.join(path.name for path in paths)}{', annotated.mp4' if options.annotate else ''}")
     return OK
 
