@@ -70,8 +70,8 @@ def run(options: GapOptions) -> int:
     console = Console(soft_wrap=True, highlight=False)
     if options.until_decided:
         return _decide(options, known, console)
-    check_folder(options.out)
     refuse_existing(options.out / RESULT_FILE, options.force)
+    check_folder(options.out)
     with progress(console) as tell:
         analysis = analyse(
             options.data,
