@@ -238,6 +238,8 @@ def _check(options: Mapping[str, inspect.Parameter], program: str, arguments: Se
         if name in given:
             raise InputError(f"{name} is given twice; all its values go behind one: {name} FIRST SECOND")
         given.add(name)
+        if equals and _value_type((named | negated)[name].annotation) is bool:
+            raise InputError(f"{name} takes no value")
         if name in named:
             _check_values(name, _value_type(named[name].annotation), [value] if equals else _values(arguments[place + 1 :]))
     for name, one in named.items():
