@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import refuse_existing, write_json
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption, ray_address
+from wlr_gym.cli.progress import progress
 from wlr_gym.cli.results import print_json
 from wlr_gym.studies.bench.measure import Measurement, Size, machine
 
@@ -108,9 +109,8 @@ def run(options: BenchOptions) -> int:
     report: dict[str, Any] = {"schema": SCHEMA, "machine": machine(), "rounds": options.rounds, "quick": options.quick}
     report |= {"measurements": [], "convergence": [], "vision": []}
     console.print(_machine_line(report["machine"]))
-    for name in asked or [name for name in MEASUREMENTS if name not in _ON_REQUEST]:
-        with console.status(f"measuring {name}"):
-            rows = _measure(name, size)
+    names = asked or tuple(name for name in MEASUREMENTS if name not in _ON_REQUEST)
+    for name, rows in _measured(names, size, console):
         if name == "engine":
             rows = _engine_pairs(rows, report, console, options.save)
         report[name if name in _OWN_ROWS else "measurements"] += [row.as_dict() for row in rows]
@@ -121,6 +121,14 @@ def run(options: BenchOptions) -> int:
         write_json(options.save, report)
         print(f"written: {options.save}")
     return OK
+
+
+def _measured(names: Sequence[str], size: Size, console: Console) -> Iterator[tuple[str, Any]]:
+    """Yield each measurement and what came of it, under a bar with the remaining time."""
+    with progress(console) as tell:
+        for done, name in enumerate(names):
+            tell("", f"measuring {name}", done / len(names))
+            yield name, _measure(name, size)
 
 
 def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console, save: Path | None) -> list[Measurement]:

@@ -6,16 +6,19 @@ A live camera (its number) is filmed first, to film.avi and film.csv, until Ctrl
 
 from __future__ import annotations
 
+import math
 import shutil
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import tyro
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.progress import progress
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
@@ -131,15 +134,19 @@ def _analyse(
     from wlr_gym.perception.vision import Frames, analyse
     from wlr_gym.perception.vision.video import AnnotatedVideo
 
+    began: float | None = None
     frames = Frames(options.video, options.rate, options.times, options.seconds)
     writer = AnnotatedVideo(options.out / "annotated.mp4", body) if options.annotate else nullcontext()
-    with writer as video, console.status("tracking") as status:
+    length = min(float(np.ptp(measured["t"])), options.seconds or math.inf)  # a film is about as long as its run
+    with writer as video, progress(console) as tell:
 
         def watch(frame: VideoFrame, sample: Sample) -> None:
+            nonlocal began
+            began = frame.time if began is None else began
             if video is not None:
                 video.add(frame, sample)
             if frame.index % 30 == 0:
-                status.update(f"tracking, frame {frame.index}: {sample.status}")
+                tell("", f"tracking: frame {frame.index}, {sample.status}", min((frame.time - began) / length, 0.99))
 
         return analyse(
             frames, measured, camera, body, floor, options.robot, options.offset, options.origin, watch, options.around
