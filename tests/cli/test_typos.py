@@ -15,7 +15,10 @@ COMMANDS = {
     "half a number": (["play", "--seconds", "1,5"], "--seconds 1,5: expected a number"),
     "no value": (["evaluate", "pid", "--env"], "--env: expected a value"),
     "one value of two": (["play", "--size", "640"], "--size: expected 2 values: INT INT"),
-    "a value that is none": (["evaluate", "pid", "--sensors", "camra"], "--sensors: unknown value 'camra' (did you mean 'camera'?)"),
+    "a value that is none": (
+        ["evaluate", "pid", "--sensors", "camra"],
+        "--sensors: unknown value 'camra' (did you mean 'camera'?)",
+    ),
     "what must be there": (["compare"], "expected --out PATH; see: wlr compare --help"),
     "nothing to work on": (["gap", "--out", "x"], "expected DATA"),
     "too many words": (["envs", "WLR-Path-v0", "WLR-Slope-v0"], "more words than it takes: WLR-Slope-v0; see: wlr envs --help"),
@@ -74,7 +77,10 @@ def test_a_mistake_in_make(keywords, expected):
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        ({"effects": [{"name": "weak_moter", "where": ["wheel_lf"], "parameters": {"scale": 0.9}}]}, "did you mean 'weak_motor'?"),
+        (
+            {"effects": [{"name": "weak_moter", "where": ["wheel_lf"], "parameters": {"scale": 0.9}}]},
+            "did you mean 'weak_motor'?",
+        ),
         ({"effect": []}, "did you mean 'effects'?"),
         ({"effects": [{"name": "weak_motor", "where": ["wheel_lf"], "parameters": {"scale": "0,9"}}]}, "scale"),
     ],
