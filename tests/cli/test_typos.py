@@ -17,7 +17,7 @@ COMMANDS = {
     "one value of two": (["play", "--size", "640"], "--size: expected 2 values: INT INT"),
     "a value that is none": (
         ["evaluate", "pid", "--sensors", "camra"],
-        "--sensors: unknown value 'camra' (did you mean 'camera'?)",
+        "unknown value 'camra' (did you mean 'camera'?)",
     ),
     "what must be there": (["compare"], "expected --out PATH; see: wlr compare --help"),
     "nothing to work on": (["gap", "--out", "x"], "expected DATA"),
