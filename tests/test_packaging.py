@@ -53,3 +53,9 @@ def test_readme_has_one_command_per_marker():
         (block,) = re.findall(rf"<!-- {marker} -->\n```bash\n(.+?)\n```\n<!-- /{marker} -->", readme, re.DOTALL)
         assert "\n" not in block
         assert block.startswith("pip install -c constraints.txt")
+
+
+def test_every_python_that_is_named_is_at_least_the_required_one():
+    named = [line.rpartition(" ")[2] for line in PROJECT["project"]["classifiers"] if re.search(r":: 3\.\d+$", line)]
+    assert f">={named[0]}" == PROJECT["project"]["requires-python"]
+    assert named == sorted(named, key=lambda version: int(version.partition(".")[2]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import re
 from pathlib import Path
@@ -93,6 +94,7 @@ def on_files(files: Files, config: Any) -> Files:
         "api.md": api_page(),
         "changes.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
     }
+    made |= {f"notebooks/{path.stem}.md": notebook_page(path) for path in (ROOT / "docs" / "notebooks").glob("*.ipynb")}
     for name, text in made.items():
         files.append(File.generated(config, name, content=text))
     return files
@@ -106,24 +108,39 @@ def start_page() -> str:
     return text.replace("](LICENSE)", "](https://opensource.org/license/mit)")
 
 
+def notebook_page(path: Path) -> str:
+    """The cells of a notebook, and where to get it."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    texts = ["".join(cell["source"]) for cell in cells]
+    shown = [
+        f"```python\n{text}\n```" if cell["cell_type"] == "code" else text for cell, text in zip(cells, texts, strict=True)
+    ]
+    title, *rest = shown[0].split("\n\n", 1)
+    note = f"This page is a notebook: [{path.name}]({path.name}){{: download }}. CI runs it from top to bottom."
+    return "\n\n".join([title, note, *rest, *shown[1:]]) + "\n"
+
+
 def command_page() -> str:
     """Every command's help text."""
-    from wlr_gym.cli import COMMANDS, usage
+    from wlr_gym.cli import COMMANDS, options_of, usage
 
-    os.environ["COLUMNS"], os.environ["NO_COLOR"] = "100", "1"
+    os.environ["COLUMNS"], os.environ["NO_COLOR"] = "80", "1"
     parts = ["# Commands", "", _block(usage())]
     for name in COMMANDS:
         parts += [f"## wlr {name}", "", _block(help_of(name))]
+        own = options_of(name)
+        for word in own if isinstance(own, dict) else ():
+            parts += [f"### wlr {name} {word}", "", _block(help_of(name, word))]
     return "\n".join(parts)
 
 
-def help_of(name: str) -> str:
-    """Return what ``wlr NAME --help`` prints."""
+def help_of(*words: str) -> str:
+    """Return what ``wlr WORDS --help`` prints."""
     from wlr_gym.cli import main
 
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-        main([name, "--help"])
+        main([*words, "--help"])
     return re.sub(r"\x1b\[[0-9;]*m", "", text.getvalue()).rstrip()
 
 

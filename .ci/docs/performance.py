@@ -1,4 +1,4 @@
-"""The numbers of docs/performance.md and README's of the engine: kept in docs/data/bench.json, from ``wlr bench --json``.
+"""The numbers of docs/performance.md and README's of the engine: kept in docs/data/bench.json, from ``wlr bench --save``.
 
 ``python .ci/docs/performance.py bench.json ...`` takes the rows of the reports over, each with its machine, versions and date,
 and writes tables and picture anew; without a report only the tables. What is measured again replaces all of its older rows.

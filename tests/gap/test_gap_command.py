@@ -100,7 +100,7 @@ def test_options_reach_the_analysis(data, tmp_path, answer):
     settings = yaml.safe_load((out / "config.yaml").read_text())
     assert settings["heldout"] == ["run_03", "run_06"]
     assert settings["effects"][0]["name"] == "friction_patch"
-    assert main(["gap", str(data), "--out", str(out), "--rig", "pendulum"]) == 0  # replaces the earlier one
+    assert main(["gap", str(data), "--out", str(out), "--rig", "pendulum", "--force"]) == 0  # replaces the earlier one
     assert asked["heldout"] == ()
     assert asked["rig"] == "pendulum"
     assert not asked["known"].effects

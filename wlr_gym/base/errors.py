@@ -18,8 +18,9 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     """Return `` (did you mean 'x'?)`` for the valid name closest to ``name``, or an empty string."""
     options = list(valid)
     lowered = {option.lower(): option for option in options}
-    close = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
-    return f" (did you mean '{lowered[close[0]]}'?)" if close else ""
+    close = difflib.get_close_matches(name.lower(), lowered, n=3, cutoff=0.5)
+    swapped = [option for option in close if sorted(option) == sorted(name.lower())]  # letters in another order are likeliest
+    return f" (did you mean '{lowered[(swapped or close)[0]]}'?)" if close else ""
 
 
 def unknown_name(kind: str, name: str, valid: Iterable[str], where: str = "") -> InputError:

@@ -28,6 +28,16 @@ def make_output_folder(path: Path, option: str = "--out") -> None:
         raise InputError(f"{option} {path}: cannot be written to")
 
 
+def refuse_existing(path: Path, force: bool, option: str = "--out") -> None:
+    """Refuse to write over a file or folder, unless ``--force`` is given.
+
+    Raises:
+        InputError: it is there.
+    """
+    if path.exists() and not force:
+        raise InputError(f"{option} {path}: exists; choose another name, or replace it with --force")
+
+
 def resumes(folder: Path, file: str) -> bool:
     """Whether work in a folder for results resumes from its ``file``; otherwise the folder is new or empty, and is made.
 

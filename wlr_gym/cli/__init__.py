@@ -26,30 +26,30 @@ IMPORTED: list[str] = []
 
 #: Command -> what it does, in one line. The module of the same name is imported only when the command is used.
 COMMANDS = {
-    "envs": "list the environments, or describe one: its actions, observations and rewards",
-    "effects": "list the effects that can be added to the robot, explain one, or check patch files",
-    "robot": "robot files of your own: new, check, show, import from and export to MJCF and URDF",
-    "train": "train an agent on an environment; resumes after an interruption",
-    "sweep": "train settings x seeds, or search settings, on this machine or a Ray cluster; resumes trial by trial",
-    "evaluate": "score a policy or agent over many episodes, against baselines, with confidence intervals",
-    "export": "write a policy as one file (ONNX) that runs without torch, or its model card; runs as MCAP or rosbag2",
-    "play": "drive a robot in a window or a browser with keys or a gamepad, or into a video",
-    "view": "watch measured runs in a browser beside what a simulator makes of them; works over ssh, without internet",
-    "replay": "drive a simulator with the commands of measured runs and report where they diverge",
-    "compare": "drive two plants with the same setpoints and report where they diverge, in noise units",
-    "gap": "find what the model lacks: compare with measured runs, name the missing effect, validate it on held-out runs",
-    "import": "make measured runs of other programs' logs: MCAP, rosbags, CSV, Parquet, LeRobot; proposes what is what",
-    "record": "drive a robot or simulator through an excitation and write the measured run",
-    "paper": "run the paper's experiments in several models and check its claims",
+    "demo": "the whole loop in about three minutes: learn, drive on ice, find a hidden fault",
+    "envs": "list the environments, or describe one",
+    "effects": "list what can be added to the robot's model, explain it, or check patch files",
+    "robot": "robot files: new, check, show; import from and export to MJCF and URDF",
+    "train": "train an agent on an environment",
+    "sweep": "train settings x seeds, or search settings, here or on a Ray cluster",
+    "evaluate": "score a policy against baselines, with confidence intervals",
+    "play": "drive a robot in a window, in a browser, or into a video",
+    "export": "write a policy as one file (ONNX), its model card, or runs as MCAP or rosbag2",
+    "record": "drive a robot or simulator through a motion and write the measured run",
+    "import": "make measured runs of other programs' logs",
+    "view": "watch measured runs in a browser beside what a simulator makes of them",
+    "replay": "drive a simulator with the commands of measured runs; where do they diverge?",
+    "compare": "drive two simulators with the same setpoints; where do they diverge?",
+    "gap": "find what the model lacks: name the missing effect, validate it on held-out runs",
+    "adapt": "adapt a policy to a robot: drive, find what the model lacks, train on, test",
     "vision": "measure pose and slip from a video of the robot with ring markers",
-    "calibrate": "calibrate the robot's joints, its IMU or a camera, or write the marker sheets to print",
+    "calibrate": "calibrate joints, IMU, flow sensor or camera; write the marker sheets",
+    "doctor": "look at a robot before it drives; names the first fault and its remedy",
+    "commission": "test a robot on a stand, compare each result with the emulator",
     "deploy": "drive the robot with a policy, through the command limiter",
-    "doctor": "look at a robot before it drives: ports, servos, IMU, policy; names the first fault and its remedy",
-    "commission": "test a robot on a stand, compare each result with the emulator, write what was measured",
-    "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults on command",
-    "adapt": "adapt a policy to a robot: drive, find what the model lacks, train on with it, test, drive again; one page",
-    "bench": "measure the speed of the engine, the environments and training on this machine",
-    "demo": "the whole loop in about three minutes: learn, drive on ice, find the hidden fault of a robot; one page",
+    "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults",
+    "paper": "repeat the paper's experiments in several models and check its claims",
+    "bench": "measure the speed of the engine, the environments and training",
 }
 
 #: Words behind a command that name a module of their own (``vision_check``).
@@ -77,10 +77,22 @@ def _dispatch(words: list[str]) -> int:
     if words[0] in {"-V", "--version"}:
         print(f"wlr_gym {__version__}")
         return OK
+    if words[0] == "--completion":
+        print(_completion(words[1:]))
+        return OK
     name, *rest = words
     if name not in COMMANDS:
         raise unknown_name("command", name, COMMANDS)
     return run_command(name, rest)
+
+
+def _completion(words: list[str]) -> str:
+    """Return the script that completes commands and options in a shell."""
+    from wlr_gym.cli import parsing
+
+    if len(words) != 1 or words[0] not in parsing.SHELLS:
+        raise InputError(f"--completion: expected one of {', '.join(parsing.SHELLS)}, such as: wlr --completion bash")
+    return parsing.completion(words[0], "wlr", {name: options_of(name) for name in COMMANDS})
 
 
 def _import_modules(words: list[str]) -> list[str]:
@@ -102,24 +114,32 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     """Parse the arguments of one command and run it."""
     if (name, *arguments[:1]) in NESTED:
         name, arguments = f"{name}_{arguments[0]}", arguments[1:]
-    return _module(name).run(parse(name, arguments))
+    from wlr_gym.cli.results import only_results
+
+    options = parse(name, arguments)
+    with only_results(getattr(options, "json", False)):
+        return _module(name).run(options)
 
 
 def parse(name: str, arguments: Sequence[str]) -> Any:
-    """Return the options of one command; SystemExit after ``--help`` and arguments that do not parse.
+    """Return the options of one command; SystemExit after ``--help``.
 
     Raises:
-        InputError: an option given twice, of which the parser would drop all but the last.
+        InputError: arguments that do not parse.
     """
-    import tyro
+    from wlr_gym.cli import parsing
 
-    given = [word.partition("=")[0] for word in arguments if word.startswith("--")]
-    for option in given:
-        if given.count(option) > 1:
-            raise InputError(f"wlr {name}: {option} is given twice; all its values go behind one: {option} FIRST SECOND")
+    module, program = _module(name), f"wlr {name.replace('_', ' ')}"
+    kind = options_of(name)
+    if isinstance(kind, dict):
+        return parsing.chosen(program, kind, arguments, module.__doc__ or "")
+    return parsing.parse(kind, program, arguments, module.__doc__ or "")
+
+
+def options_of(name: str) -> Any:
+    """Return the options of one command, a dataclass; of one with commands of its own: name -> options and what it does."""
     module = _module(name)
-    kind = getattr(module, "".join(part.capitalize() for part in name.split("_")) + "Options")
-    return tyro.cli(kind, prog=f"wlr {name.replace('_', ' ')}", description=module.__doc__, args=list(arguments))
+    return getattr(module, "COMMANDS", None) or getattr(module, f"{''.join(map(str.capitalize, name.split('_')))}Options")
 
 
 def _module(name: str) -> Any:
@@ -129,10 +149,14 @@ def _module(name: str) -> Any:
 
 def usage() -> str:
     """Return the help text of ``wlr``."""
-    width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items()]
-    hint = "wlr COMMAND --help explains one; wlr --version\nwlr --import MODULE COMMAND first imports what adds to the library"
-    return "\n".join(["usage: wlr COMMAND [OPTIONS]", "", *lines, "", hint])
+    from wlr_gym.cli import parsing
+
+    hints = (
+        "wlr COMMAND --help explains one; wlr --version",
+        "wlr --import MODULE COMMAND first imports what adds to the library",
+        "wlr --completion bash (or zsh, fish) prints what completes commands and options",
+    )
+    return "\n".join([parsing.usage("wlr", COMMANDS), "", *hints])
 
 
 def _say(message: str, colour: str) -> None:

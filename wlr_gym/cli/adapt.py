@@ -20,8 +20,9 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption, SensorsOption
+from wlr_gym.cli.options import JsonOption, PatchOption, SensorsOption
 from wlr_gym.cli.progress import progress
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ _NONE_CHOSEN = "nothing to adapt to: give measured runs (--robot-runs DATA), an 
 
 
 @dataclass(frozen=True)
-class AdaptOptions(PatchOption, SensorsOption):
+class AdaptOptions(JsonOption, PatchOption, SensorsOption):
     policy: tyro.conf.Positional[str]
     """Policy that PPO trained: shipped, a file, or a policy or run folder."""
     robot_runs: Path | None = None
@@ -76,8 +77,6 @@ class AdaptOptions(PatchOption, SensorsOption):
     """Seed of everything random."""
     threads: int | None = None
     """Worker threads; default: one per core."""
-    json: bool = False
-    """Print the numbers of adapt.json instead of the table."""
 
 
 def run(options: AdaptOptions) -> int:
@@ -119,7 +118,7 @@ def run(options: AdaptOptions) -> int:
     if options.json:
         from wlr_gym.learning.adaptation.page import NUMBERS_FILE
 
-        print((found.page.parent / NUMBERS_FILE).read_text(encoding="utf-8"), end="")
+        print_json(json.loads((found.page.parent / NUMBERS_FILE).read_text(encoding="utf-8")))
         return OK
     _print(found, console)
     return OK

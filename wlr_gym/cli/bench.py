@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,9 +13,11 @@ from rich.console import Console
 from rich.table import Table
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.files import write_json
+from wlr_gym.base.files import refuse_existing, write_json
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import ray_address
+from wlr_gym.cli.options import ForceOption, JsonOption, ray_address
+from wlr_gym.cli.progress import progress
+from wlr_gym.cli.results import print_json
 from wlr_gym.studies.bench.measure import Measurement, Size, machine
 
 if TYPE_CHECKING:
@@ -52,15 +54,14 @@ SCHEMA = 1
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class BenchOptions(JsonOption, ForceOption):
     what: tyro.conf.Positional[tuple[str, ...]] = ()
     """Measurements to make, as with --only."""
     only: tuple[str, ...] = ()
-    """engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, camera, perception, vision,
-    sysid.
-    gap (the blind test of the gap workflow), adapt (what adaptation wins back): alone, with --out"""
-    json: Path | None = None
-    """File for all numbers."""
+    """Some of engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, camera, perception,
+    vision, sysid. gap (the blind test of the gap workflow), adapt (what adaptation wins back): alone, with --out."""
+    save: Path | None = None
+    """File (.json) for all numbers; the picture of the engine is written beside it."""
     rounds: int = 5
     """Rounds of every pair."""
     quick: bool = False
@@ -94,8 +95,10 @@ def run(options: BenchOptions) -> int:
             raise unknown_name("measurement", name, (*MEASUREMENTS, BLIND_TEST, ADAPT_STUDY))
     if options.rounds < 1:
         raise InputError(f"--rounds {options.rounds}: expected 1 or more")
-    if options.json is not None and not options.json.parent.is_dir():
-        raise InputError(f"--json {options.json}: folder {options.json.parent} does not exist")
+    if options.save is not None and not options.save.parent.is_dir():
+        raise InputError(f"--save {options.save}: folder {options.save.parent} does not exist")
+    if options.save is not None:
+        refuse_existing(options.save, options.force, "--save")
     if ADAPT_STUDY in asked:
         return _adapt_study(options, asked)
     if BLIND_TEST in asked:
@@ -106,27 +109,36 @@ def run(options: BenchOptions) -> int:
     report: dict[str, Any] = {"schema": SCHEMA, "machine": machine(), "rounds": options.rounds, "quick": options.quick}
     report |= {"measurements": [], "convergence": [], "vision": []}
     console.print(_machine_line(report["machine"]))
-    for name in asked or [name for name in MEASUREMENTS if name not in _ON_REQUEST]:
-        with console.status(f"measuring {name}"):
-            rows = _measure(name, size)
+    names = asked or tuple(name for name in MEASUREMENTS if name not in _ON_REQUEST)
+    for name, rows in _measured(names, size, console):
         if name == "engine":
-            rows = _engine_pairs(rows, report, console, options.json)
+            rows = _engine_pairs(rows, report, console, options.save)
         report[name if name in _OWN_ROWS else "measurements"] += [row.as_dict() for row in rows]
         _print(console, _TABLES.get(name, _speed_table)(rows))
-    if options.json is not None:
-        write_json(options.json, report)
-        print(f"written: {options.json}")
+    if options.json:
+        print_json(report)
+    if options.save is not None:
+        write_json(options.save, report)
+        print(f"written: {options.save}")
     return OK
 
 
-def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console, json: Path | None) -> list[Measurement]:
+def _measured(names: Sequence[str], size: Size, console: Console) -> Iterator[tuple[str, Any]]:
+    """Yield each measurement and what came of it, under a bar with the remaining time."""
+    with progress(console) as tell:
+        for done, name in enumerate(names):
+            tell("", f"measuring {name}", done / len(names))
+            yield name, _measure(name, size)
+
+
+def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console, save: Path | None) -> list[Measurement]:
     """Put accuracy and speed of all settings into the report, print them, draw them beside it; return the ratios."""
     from wlr_gym.studies.bench import engine_report
 
     report["engine"] = found.as_dict()
     console.print("\n".join(engine_report.lines(report["engine"])), markup=False, highlight=False, soft_wrap=True)
-    if json is not None:
-        picture = json.with_name(f"{json.stem}_engine.png")
+    if save is not None:
+        picture = save.with_name(f"{save.stem}_engine.png")
         engine_report.save_picture(report["engine"], picture)
         print(f"written: {picture}")
     return engine_report.pairs(found.results)
@@ -153,8 +165,10 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     text = markdown(report)
     (options.out / "score.md").write_text(text, encoding="utf-8")
     console.print(text, markup=False, highlight=False)
-    if options.json is not None:
-        write_json(options.json, report)
+    if options.save is not None:
+        write_json(options.save, report)
+    if options.json:
+        print_json(report)
     console.print(f"written: {', '.join(str(options.out / name) for name in ('score.json', 'score.md', 'answers.json'))}")
     return OK
 
@@ -179,6 +193,8 @@ def _adapt_study(options: BenchOptions, asked: tuple[str, ...]) -> int:
     text = markdown(lines)
     (options.out / "adapt.md").write_text(text, encoding="utf-8")
     console.print(text, markup=False)
+    if options.json:
+        print_json(lines)
     console.print(f"written: {options.out / adapt_study.LINES_FILE}, {options.out / 'adapt.md'}")
     return OK
 
@@ -196,12 +212,14 @@ def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
     results = run_lab_films(options.out, count, lambda text: console.print(text, markup=False))
     found = score(results)
     report = {"machine": machine(), "score": found, "films": [asdict(result) for result in results]}
-    for path in (options.out / "score.json", *([] if options.json is None else [options.json])):
+    for path in (options.out / "score.json", *([] if options.save is None else [options.save])):
         write_json(path, report)
     table = Table("what", "found", "bar", "met", box=None, title=f"{count} films of a lab", title_justify="left")
     for what, value, bar, met in bars(found):
         table.add_row(what, value, bar, _YES_NO[met])
     console.print(table)
+    if options.json:
+        print_json(report)
     console.print(f"written: {options.out / 'score.json'}")
     return OK
 
@@ -267,7 +285,10 @@ def _gap_speed(options: BenchOptions) -> int:
 
     console = Console(soft_wrap=True)
     found = time_analyses(options.speed, options.threads, lambda line: console.print(line, markup=False, highlight=False))
-    if options.json is not None:
-        write_json(options.json, {"machine": machine(), "threads": options.threads, "analyses": [asdict(one) for one in found]})
-        console.print(f"written: {options.json}")
+    report = {"machine": machine(), "threads": options.threads, "analyses": [asdict(one) for one in found]}
+    if options.json:
+        print_json(report)
+    if options.save is not None:
+        write_json(options.save, report)
+        console.print(f"written: {options.save}")
     return OK

@@ -12,10 +12,12 @@ from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.cli import OK
 from wlr_gym.cli.calibrate_flow import FlowOptions, calibrate_flow
 from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions, calibrate_imu, calibrate_joints, set_up_servo
+from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.results import print_json
 
 
 @dataclass(frozen=True)
-class CameraOptions:
+class CameraOptions(JsonOption, ForceOption):
     """Calibrate a camera from views of the printed board.
 
     Attributes:
@@ -23,7 +25,7 @@ class CameraOptions:
         out: camera file to write (YAML).
         columns: squares of the board along its longer side.
         rows: squares along its shorter side.
-        square: m, side of a square as measured on the print.
+        square: side of a square as measured on the print, m.
         every: use every n-th frame of a video.
     """
 
@@ -36,7 +38,7 @@ class CameraOptions:
 
 
 @dataclass(frozen=True)
-class TargetsOptions:
+class TargetsOptions(JsonOption, ForceOption):
     """Write the sheets to print, as PDF and SVG to scale: markers on the robot, markers on the floor, calibration board.
 
     Attributes:
@@ -50,14 +52,15 @@ class TargetsOptions:
     floor: str = "floor"
 
 
-CalibrateOptions = (
-    Annotated[CameraOptions, tyro.conf.subcommand("camera", description="lens of a camera, from views of a board")]
-    | Annotated[TargetsOptions, tyro.conf.subcommand("targets", description="sheets to print: markers and calibration board")]
-    | Annotated[ServoOptions, tyro.conf.subcommand("servo", description="id and baud rate of a new servo")]
-    | Annotated[JointsOptions, tyro.conf.subcommand("joints", description="sign and zero of each servo, by hand")]
-    | Annotated[ImuOptions, tyro.conf.subcommand("imu", description="biases, scale and mounting of the IMU")]
-    | Annotated[FlowOptions, tyro.conf.subcommand("flow", description="scale and mounting of the optical-flow sensor")]
-)
+#: Command -> its options, and what it does.
+COMMANDS = {
+    "camera": (CameraOptions, "lens of a camera, from views of a board"),
+    "targets": (TargetsOptions, "sheets to print: markers and calibration board"),
+    "servo": (ServoOptions, "id and baud rate of a new servo"),
+    "joints": (JointsOptions, "sign and zero of each servo, by hand"),
+    "imu": (ImuOptions, "biases, scale and mounting of the IMU"),
+    "flow": (FlowOptions, "scale and mounting of the optical-flow sensor"),
+}
 
 
 def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions | ImuOptions | FlowOptions) -> int:
@@ -75,6 +78,7 @@ def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions |
 
 
 def _camera(options: CameraOptions) -> int:
+    from wlr_gym.base.files import refuse_existing
     from wlr_gym.perception.markers.calibration import Board, calibrate
     from wlr_gym.perception.markers.camera import save_camera
     from wlr_gym.perception.vision.video import Frames
@@ -85,6 +89,7 @@ def _camera(options: CameraOptions) -> int:
         raise InputError("--columns and --rows: expected 3 or more; --every: 1 or more")
     if options.out.suffix not in {".yaml", ".yml"} or not options.out.parent.is_dir():
         raise InputError(f"--out {options.out}: expected a .yaml file in a folder that exists")
+    refuse_existing(options.out, options.force)
     step = 1 if Path(options.images).is_dir() else options.every
     frames = Frames(options.images)
     views = ((f"{options.images}, frame {f.index}", f.image) for f in frames if f.index % step == 0)
@@ -103,20 +108,26 @@ def _camera(options: CameraOptions) -> int:
     if quality.rms > 0.5:
         print("corners off by more than 0.5 px: blurred views, a board that is not flat, or a lens this model does not fit")
     print(f"written: {options.out}")
+    if options.json:
+        print_json({"camera": options.out, "quality": quality})
     return OK
 
 
 def _targets(options: TargetsOptions) -> int:
-    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.base.files import make_output_folder, refuse_existing
     from wlr_gym.perception.markers.calibration import Board
     from wlr_gym.perception.markers.targets import load_target
     from wlr_gym.perception.vision.sheets import board_page, target_pages, write_pages
 
     body, floor = load_target(options.markers), load_target(options.floor)
+    for name in (f"{body.name}_markers", f"{floor.name}_markers", "calibration_board"):
+        refuse_existing(options.out / f"{name}.pdf", options.force)
     make_output_folder(options.out)
     paths = write_pages(options.out, f"{body.name}_markers", target_pages(body))
     paths += write_pages(options.out, f"{floor.name}_markers", target_pages(floor))
     paths += write_pages(options.out, "calibration_board", [board_page(Board())])
     print(f"in {options.out}: {', '.join(path.name for path in paths)}")
     print("print at 100 %, then measure the ruler on every page")
+    if options.json:
+        print_json(paths)
     return OK

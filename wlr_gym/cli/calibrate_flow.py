@@ -22,7 +22,7 @@ class FlowOptions(RobotOption):
     Attributes:
         run: the run.
         out: hardware file to write; may be the one of --hardware.
-        distance: m that the robot moved straight ahead, by a tape measure (negative: back); default: what its wheels rolled.
+        distance: way straight ahead by a tape measure, m (negative: back); default: what the wheels rolled.
         yes: do not ask before the file is written.
     """
 

@@ -57,7 +57,7 @@ class ImuOptions(RobotOption):
         out: hardware file to write; may be the one of --hardware.
         poses: 1 = gyroscope's bias, and accelerometer's offset on a level floor; 6 = its offset and scale from six sides up.
         mounting: find how the sensor is mounted, from a level pose and one with the nose down.
-        seconds: of listening per pose.
+        seconds: how long to listen per pose, s.
     """
 
     out: Path

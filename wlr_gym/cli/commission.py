@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import PatchOption
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import RobotOption, ask_terminal
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ _DIGITS = 3
 
 
 @dataclass(frozen=True)
-class CommissionOptions(RobotOption, PatchOption):
+class CommissionOptions(JsonOption, ForceOption, RobotOption, PatchOption):
     """Test a robot on a stand.
 
     Attributes:
@@ -46,7 +47,6 @@ class CommissionOptions(RobotOption, PatchOption):
         fault: with --emulated: what goes wrong, as in wlr emulate: "delay legs value=0.015".
         list: show the tests.
         yes: do not ask before each test, and write the hardware file; what hands have to do is asked for all the same.
-        json: print the results as JSON instead of a table.
     """
 
     out: Path | None = None
@@ -54,7 +54,6 @@ class CommissionOptions(RobotOption, PatchOption):
     fault: tuple[str, ...] = ()
     list: bool = False
     yes: bool = False
-    json: bool = False
 
 
 def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> int:
@@ -69,7 +68,7 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.base.files import make_output_folder, refuse_existing
     from wlr_gym.hardware.commissioning.registry import choose
 
     console = Console(soft_wrap=True, highlight=False, stderr=options.json)
@@ -82,6 +81,7 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
         raise InputError("--out: expected a folder for runs and results")
     if options.fault and not options.emulated:
         raise InputError("--fault is for the emulated robot: add --emulated")
+    refuse_existing(options.out / REPORT, options.force)
     make_output_folder(options.out)
     return _commission(options, options.out, tests, ask or partial(ask_terminal, what="commissioning"), console)
 
@@ -109,7 +109,7 @@ def _commission(
             write_json(out / REPORT, [content_of(one) for one in results])
     findings = [finding for result in results for finding in result.findings]
     if options.json:
-        print((out / REPORT).read_text(encoding="utf-8"))
+        print_json([content_of(one) for one in results])
     else:
         _print_table(findings, console)
     if findings:

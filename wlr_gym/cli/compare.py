@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli.options import PatchOption
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
+from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class CompareOptions(PatchOption):
+class CompareOptions(JsonOption, ForceOption, PatchOption):
     out: Path
     """Folder for the report; made if it is not there."""
     plants: tuple[str, str] = ("gibbs_appell", "mujoco")
@@ -39,13 +40,13 @@ class CompareOptions(PatchOption):
     runs: Path | None = None
     """Drive the commands of this measured run, or folder of runs, instead."""
     seed: int = 0
-    """Of the excitations: another seed, another motion of the same kind."""
+    """Seed of the excitations: another seed, another motion of the same kind."""
     seconds: float | None = None
     """Cut every motion off after this long."""
     robot: str | None = None
     """Robot file or config name; default: the one the runs' meta.yaml names, else the nominal one."""
     physics_step: float = 0.001
-    """s per substep of both plants."""
+    """Substep of both plants, s."""
     halve: bool = False
     """Repeat at half of both steps: shows whether the difference shrinks, and each plant's own step error."""
     every_effect: bool = False
@@ -69,7 +70,7 @@ def run(options: CompareOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder, write_json, write_text
+    from wlr_gym.base.files import make_output_folder, refuse_existing, write_json, write_text
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.cli import FAILED, OK
     from wlr_gym.data.compared_plants import parse_plant
@@ -80,15 +81,19 @@ def run(options: CompareOptions) -> int:
         raise InputError(f"--threshold {options.threshold:g}: expected more than 0 units of sensor noise")
     motions, robot = _motions(options)
     patches = _patches(options, motions, robot)
+    refuse_existing(options.out / "compare.json", options.force)
     make_output_folder(options.out)
     console, comparisons = Console(), []
     for comparison in _compare_all(options, motions, (first, second), robot, patches, console):
         comparisons.append(comparison)
-        if len(patches) == 1:
+        if len(patches) == 1 and not options.json:
             _print_all(console, comparison)
-    if len(patches) > 1:
+    found = [comparison.as_dict() for comparison in comparisons]
+    if options.json:
+        print_json(found)
+    elif len(patches) > 1:
         _print(console, summary_table(comparisons))
-    write_json(options.out / "compare.json", [comparison.as_dict() for comparison in comparisons])
+    write_json(options.out / "compare.json", found)
     text = markdown(comparisons, f"{first.label} and {second.label}")
     write_text(options.out / "report.md", text)
     record_provenance(options.out, _resolved(options, motions, robot, patches[0]))

@@ -16,10 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.files import make_output_folder, refuse_existing
 from wlr_gym.base.provenance import PROVENANCE_FILE, record_provenance
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
+from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.progress import progress
+from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
     from wlr_gym.studies.demo.settings import Demo
@@ -30,9 +32,9 @@ QUICK_STEPS = 16_384
 
 
 @dataclass(frozen=True)
-class DemoOptions:
+class DemoOptions(JsonOption, ForceOption):
     out: Path = Path("out/demo")
-    """Folder for the page and everything it was made from; a demo already in it is replaced."""
+    """Folder for the page and everything it was made from; --force replaces a demo that is in it."""
     seed: int = 0
     """Seed of everything random: training, episodes, and the hidden fault."""
     steps: int | None = None
@@ -56,6 +58,7 @@ def run(options: DemoOptions) -> int:
     from wlr_gym.studies.demo.workers import WORKERS, run_workers
 
     demo = _demo(options)
+    refuse_existing(demo.page, options.force)
     _clear(demo.out)
     record_provenance(demo.out, {"seed": demo.seed, "steps": demo.steps, "quick": options.quick}, demo.seed)
     console, began = Console(highlight=False, soft_wrap=True), time.monotonic()
@@ -69,6 +72,9 @@ def run(options: DemoOptions) -> int:
         console.print(f"{one.title}: {one.headline or one.verdict}", markup=False)
     console.print(f"{'stopped' if outcome.interrupted else 'done'} after {duration(time.monotonic() - began)}; the page:")
     console.print(str(demo.page), markup=False)
+    if options.json:
+        found = [{name: getattr(one, name) for name in ("title", "headline", "verdict")} for one in outcome.sections]
+        print_json({"page": demo.page, "interrupted": outcome.interrupted, "sections": found})
     return INTERRUPTED if outcome.interrupted else _code(outcome.sections)
 
 

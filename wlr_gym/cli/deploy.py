@@ -19,7 +19,8 @@ from rich.console import Console
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.options import PatchOption, environment_of, pairs
+from wlr_gym.cli.options import JsonOption, PatchOption, environment_of, pairs
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import port_pairs, read_camera, wait_for_enter
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ _STATUS_TICKS = 10
 
 
 @dataclass(frozen=True)
-class DeployOptions(PatchOption):
+class DeployOptions(JsonOption, PatchOption):
     policy: tyro.conf.Positional[str]
     """Policy file or folder, run folder, or name of an agent or shipped policy."""
     env: str | None = None
@@ -125,7 +126,11 @@ def run(options: DeployOptions) -> int:
         stack.enter_context(stop_on_signals(loop.operator))
         stack.enter_context(_serving(loop, core, [keys, *pads], options.status and console.is_terminal, console))
         result = deploy(core, policy, options.seed, command, pads[0].command if pads else None)
-    _report(result, loop, console)
+    if options.json:
+        found = {name: getattr(result, name) for name in ("reason", "well", "ticks", "run", "statistics")}
+        print_json(found | {"limited": dict(loop.interventions)})
+    else:
+        _report(result, loop, console)
     if stream is not None:
         _report_stream(stream, console)
     console.print(busy_note(options, result.reason), style="yellow", end="")
@@ -264,8 +269,8 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
         if robot is not None:
             write_robot(Path(folder) / "robot.yaml", load_robot(robot))
             words += ["--robot", str(Path(folder) / "robot.yaml")]
-        for fault in options.fault:
-            words += ["--fault", fault]
+        if options.fault:
+            words += ["--fault", *options.fault]
         if options.effects:
             words += ["--effects", *options.effects]
         modules = [word for module in IMPORTED for word in ("--import", module)]

@@ -8,13 +8,14 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.options import JsonOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import CameraOption, wait_for_enter
 
 if TYPE_CHECKING:
@@ -30,21 +31,19 @@ _MEND_PASSES = 2
 
 
 @dataclass(frozen=True)
-class DoctorOptions(CameraOption):
+class DoctorOptions(JsonOption, CameraOption):
     """Look at a robot.
 
     Attributes:
         policy: policy file or folder, run folder or shipped policy that is to drive it: does it fit this robot?
         mend: write the register values that mend what is wrong; says which, and asks first (servos' torque must be off).
         scan: search every bus at every baud rate for servos, whatever their ids.
-        json: file for all checks.
         verbose: show every check of every joint.
     """
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
     mend: bool = False
     scan: bool = False
-    json: Path | None = None
     verbose: bool = False
 
 
@@ -52,14 +51,10 @@ def run(options: DoctorOptions) -> int:
     """Look and print; 0 when nothing stands against driving.
 
     Raises:
-        InputError: unknown robot or hardware, ``--json`` in a folder that does not exist, nothing to scan.
+        InputError: unknown robot or hardware, nothing to scan.
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import write_json
-
-    if options.json is not None and not options.json.parent.is_dir():
-        raise InputError(f"--json {options.json}: folder {options.json.parent} does not exist")
     if options.scan and options.emulated:
         raise InputError("--scan: the emulated robot of this process has no ports; name those of wlr emulate")
     console = Console(soft_wrap=True, highlight=False)
@@ -71,9 +66,10 @@ def run(options: DoctorOptions) -> int:
         link.close()
     if options.policy is not None:
         checks += check_policy(options.policy, options.robot_name(options.robot), options.camera is not None)
-    _print(checks, console, options)
-    if options.json is not None:
-        write_json(options.json, [check._asdict() for check in checks])
+    if options.json:
+        print_json([check._asdict() for check in checks])
+    else:
+        _print(checks, console, options)
     return FAILED if any(check.is_fatal and not check.ok for check in checks) else OK
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import tyro
 from rich.console import Console
@@ -16,6 +17,8 @@ from rich.table import Table
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.paths import config_names
 from wlr_gym.cli import OK
+from wlr_gym.cli.options import JsonOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Effect, Patch, PatchEffect, apply_patch, load_patch
 from wlr_gym.physics.effects.document import places
 from wlr_gym.physics.plants.forces import COORDINATES, FEATURES
@@ -25,7 +28,7 @@ from wlr_gym.robot.parameters import Parameters
 
 
 @dataclass(frozen=True)
-class EffectsOptions:
+class EffectsOptions(JsonOption):
     words: tyro.conf.Positional[tuple[str, ...]] = ()
     """Names of effects, or: check FILE ..."""
     robot: str = "nominal"
@@ -35,13 +38,17 @@ class EffectsOptions:
 def run(options: EffectsOptions) -> int:
     """Print the library, one effect, or what patch files change."""
     match options.words:
+        case () if options.json:
+            print_json([_content(effect) for effect in EFFECTS.values()])
         case ():
             _show(_library())
             print("one of them: wlr effects NAME; what is beyond the library: wlr effects unknown_effect; docs/effects.md")
         case ("check",):
             raise InputError("wlr effects check: give the patch files to check")
         case ("check", *files):
-            _check([load_patch(file) for file in files], load_patch(list(files)), options.robot)
+            _check([load_patch(file) for file in files], load_patch(list(files)), options)
+        case names if options.json:
+            print_json([_content(_effect(name)) for name in names])
         case names:
             for name in names:
                 _explain(name)
@@ -78,15 +85,40 @@ def _plain(text: str) -> str:
     return escape(text)
 
 
+def _content(effect: Effect) -> dict[str, Any]:
+    """Return an effect as JSON has it."""
+    parameters = {name: {field: getattr(p, field) for field in _FIELDS} for name, p in effect.parameters.items()}
+    return {
+        "name": effect.name,
+        "what": effect.doc,
+        "equation": effect.equation,
+        "where": effect.where,
+        "parameters": parameters,
+    }
+
+
+#: Of a parameter, as JSON.
+_FIELDS = ("unit", "doc", "low", "high", "prior", "neutral", "severity", "optional")
+
+
 def _explain(name: str) -> None:
     if name == UNKNOWN_EFFECT:
         _explain_formulas()
-    elif name in EFFECTS:
-        _explain_effect(EFFECTS[name])
-    elif name.endswith((".yaml", ".yml")) or name in config_names("effects"):
-        raise InputError(f"'{name}' is a patch, not an effect: wlr effects check {name}")
     else:
-        raise unknown_name("effect", name, [*EFFECTS, UNKNOWN_EFFECT])
+        _explain_effect(_effect(name))
+
+
+def _effect(name: str) -> Effect:
+    """Return an effect of the library.
+
+    Raises:
+        InputError: no such effect.
+    """
+    if name in EFFECTS:
+        return EFFECTS[name]
+    if name.endswith((".yaml", ".yml")) or name in config_names("effects"):
+        raise InputError(f"'{name}' is a patch, not an effect: wlr effects check {name}")
+    raise unknown_name("effect", name, [*EFFECTS, UNKNOWN_EFFECT])
 
 
 def _explain_effect(effect: Effect) -> None:
@@ -112,20 +144,27 @@ def _explain_formulas() -> None:
     _show(where, features)
 
 
-def _check(patches: Sequence[Patch], together: Patch, robot_name: str) -> None:
-    robot = load_robot(robot_name)
+def _check(patches: Sequence[Patch], together: Patch, options: EffectsOptions) -> None:
+    robot = load_robot(options.robot)
     nominal = Parameters.nominal(robot)
     patched = apply_patch(together, nominal)
+    changed = {
+        name: {"nominal": before, "patched": after, "unit": spec_of(name).unit}
+        for name, before, after in zip(ELEMENTS, nominal.values[0], patched.values[0], strict=True)
+        if before != after
+    }
+    if options.json:
+        print_json({"robot": robot.name, "effects": together.content()["effects"], "changes": changed})
+        return
     table = _table("", "effect", "where", "parameters", "from")
     for patch in patches:
         for effect in patch.effects:
             table.add_row(effect.name, ", ".join(effect.where), _plain(_numbers(effect)), patch.source)
     _show(table)
     changes = _table(f"what changes in robot '{robot.name}'", "parameter", "nominal", "patched", "unit")
-    for name, before, after in zip(ELEMENTS, nominal.values[0], patched.values[0], strict=True):
-        if before != after:
-            changes.add_row(_plain(name), f"{before:.6g}", f"{after:.6g}", spec_of(name).unit)
-    if changes.row_count:
+    for name, one in changed.items():
+        changes.add_row(_plain(name), f"{one['nominal']:.6g}", f"{one['patched']:.6g}", one["unit"])
+    if changed:
         _show(changes)
     else:
         print("no parameter changes")

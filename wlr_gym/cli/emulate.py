@@ -25,18 +25,18 @@ class EmulateOptions(PatchOption):
 
     Attributes:
         backend: simulator behind the servos.
-        robot: robot file or config name.
+        robot: robot file or config name; default: the one that the hardware file names.
         hardware: wiring and mounting: file or config name.
         links: folder for links to the ports with fixed names (one per bus, imu, and flow); made if it is not there.
         control: path of a Unix socket that takes command lines.
-        fault: faults to start with; may be given several times.
+        fault: faults to start with, each in quotes.
         stepped: time passes only by the command ``step SECONDS``; answers then come at once.
-        tick: s of emulated time per step.
-        usb_latency: s the adapter holds back unfilled packets (16 ms is an FTDI adapter's default, 1 ms the advised setting).
+        tick: emulated time per step, s.
+        usb_latency: how long the adapter holds back unfilled packets, s (16 ms as an FTDI adapter comes, 1 ms as advised).
         wire_time: let bytes take their time on the wire.
         factory: servos as out of the box: id 1, 57600 bit/s. They then answer all at once, as real ones do.
         firmware: version the servos report; fast reads need 45.
-        seed: of sensor noise and faults.
+        seed: seed of sensor noise and faults.
         seconds: stop after this long; 0 = run until Ctrl-C.
         poses: file that the true pose goes into, for a camera that films by rendering (wlr deploy --camera).
     """

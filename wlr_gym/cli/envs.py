@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.files import make_output_folder, refuse_existing
 from wlr_gym.cli import OK
+from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
-from wlr_gym.envs.tasks import Randomization, describe, describe_randomization, load_randomization, load_task
+from wlr_gym.envs.tasks import Randomization, Task, describe, describe_randomization, load_randomization, load_task
 from wlr_gym.envs.tasks.describe import describe_scaling
 from wlr_gym.envs.tasks.task_config import read_task
 
@@ -21,7 +24,7 @@ PICTURES = (".png", ".svg", ".pdf")
 
 
 @dataclass(frozen=True)
-class EnvsOptions:
+class EnvsOptions(JsonOption, ForceOption):
     env: tyro.conf.Positional[str | None] = None
     """Environment id to describe; without one all are listed."""
     robot: str | None = None
@@ -40,29 +43,51 @@ def run(options: EnvsOptions) -> int:
         texts = [options.env, describe(task), describe_randomization(randomization.config)]
         if options.robot is not None:
             texts.append(describe_scaling(read_task(task_source_of(options.env)), task.robot))
-        print("\n\n".join(texts))
         if options.picture is not None:
-            _draw(options.picture, randomization)
+            _draw(options.picture, randomization, options.force)
+        if options.json:
+            print_json(_content(options.env, task, randomization))
+        else:
+            print("\n\n".join(texts))
         return OK
     if any(value is not None for value in (options.robot, options.randomization, options.picture)):
         raise InputError("name the environment too, such as: wlr envs WLR-Velocity-v0 --randomization wide")
-    table = Table("id", "action", "observation", "control", "episode", "commands", box=None)
-    for env_id in ENVIRONMENTS:
-        task = load_task(task_source_of(env_id))
-        config = task.config
-        table.add_row(
-            env_id, f"Box({len(task.actions)})", f"Box({len(task.policy)})", f"{1 / config.control_period:g} Hz",
-            f"{config.episode_length:g} s", ", ".join(task.commands),
-        )  # fmt: skip
+    found = [_summary(env_id, load_task(task_source_of(env_id))) for env_id in ENVIRONMENTS]
+    if options.json:
+        print_json(found)
+        return OK
+    table = Table("id", "action", "observation", "control", "episode", box=None)
+    for one in found:
+        rate, length = f"{1 / one['control_period']:g} Hz", f"{one['episode_length']:g} s"
+        table.add_row(one["id"], f"Box({one['action']})", f"Box({one['observation']})", rate, length)
     Console().print(table)
     return OK
 
 
-def _draw(path: Path, randomization: Randomization) -> None:
+def _summary(env_id: str, task: Task) -> dict[str, Any]:
+    """Return what the list says of an environment: sizes, s, names of the commands."""
+    config = task.config
+    return {
+        "id": env_id,
+        "action": len(task.actions),
+        "observation": len(task.policy),
+        "control_period": config.control_period,
+        "episode_length": config.episode_length,
+        "commands": list(task.commands),
+    }
+
+
+def _content(env_id: str, task: Task, randomization: Randomization) -> dict[str, Any]:
+    own = {"task": task.config.model_dump(mode="json"), "randomization": randomization.config.model_dump(mode="json")}
+    return _summary(env_id, task) | {"robot": task.robot.name} | own
+
+
+def _draw(path: Path, randomization: Randomization, force: bool) -> None:
     from wlr_gym.learning.evaluation.floor_plots import draw_floors
 
     if path.suffix not in PICTURES:
         raise InputError(f"--picture {path}: expected a file that ends in {', '.join(PICTURES)}")
+    refuse_existing(path, force, "--picture")
     make_output_folder(path.parent, "--picture")
     draw_floors(path, [randomization])
     print(f"written: {path}")

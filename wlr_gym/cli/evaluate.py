@@ -16,10 +16,11 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.files import make_output_folder, refuse_existing
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import PatchOption, SensorsOption, environment_of
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of
+from wlr_gym.cli.results import print_json
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.evaluation import (
@@ -46,6 +47,7 @@ from wlr_gym.learning.evaluation import (
     write_samples,
 )
 from wlr_gym.learning.evaluation.acceptance import ACCEPTANCE_FILE, accept, acceptance_rows, write_acceptance
+from wlr_gym.learning.evaluation.card_report import content
 from wlr_gym.learning.evaluation.scoring import (
     BACKENDS,
     BASELINES,
@@ -68,7 +70,7 @@ FULL_SEEDS = 5
 
 
 @dataclass(frozen=True)
-class EvaluateOptions(PatchOption, SensorsOption):
+class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     policy: tyro.conf.Positional[tuple[str, ...]]
     """Agent, policy file (.onnx), policy or run folder, or shipped policy; NAME=POLICY names it. Several, NAME=POLICY,POLICY, a
     pattern ('out/trials/lr=1e-3-*') or a folder of run folders: trainings of one recipe with different seeds, as one column."""
@@ -125,9 +127,13 @@ def run(options: EvaluateOptions) -> int:
     _check(options)
     patch = options.patch()
     if options.out is not None:
+        refuse_existing(options.out / "card.json", options.force)
         make_output_folder(options.out)
     card, samples = _play(options, patch)
-    print_card(card)
+    if options.json:
+        print_json(content(card))
+    else:
+        print_card(card)
     robot = options.robot or common_robot(read_subjects([options.policy, *(options.baselines or ())]))
     keywords = {
         "randomization": options.randomization, "robot": robot, "effects": patch, "threads": options.threads,
@@ -158,6 +164,7 @@ def _accept(options: EvaluateOptions) -> int:
     if given:
         raise InputError(f"--accept: {given[0]} is of the card; leave it out")
     if options.out is not None:
+        refuse_existing(options.out / ACCEPTANCE_FILE, options.force)
         make_output_folder(options.out)
     with progress(options.progress) as tell:
         result = accept(
@@ -173,6 +180,8 @@ def _accept(options: EvaluateOptions) -> int:
             threads=options.threads,
             tell=tell,
         )
+    if options.json:
+        print_json(result)
     _print(
         f"acceptance of {result.policy}: {result.episodes} episodes x {result.seeds} seeds a family", acceptance_rows(result)
     )
@@ -224,6 +233,7 @@ def _check(options: EvaluateOptions) -> None:
         raise InputError(f"--record {options.record}: expected 0 to {options.episodes} (--episodes), and --out for the runs")
     if options.video is not None:
         check_video(options.video)
+        refuse_existing(options.video, options.force, "--video")
         if not 0 < options.video_seconds < float("inf"):
             raise InputError(f"--video-seconds {options.video_seconds:g}: expected more than 0")
 

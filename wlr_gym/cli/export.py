@@ -6,6 +6,7 @@ With --to, write measured runs as MCAP files or as rosbag2, which Foxglove, Plot
 from __future__ import annotations
 
 import shlex
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,9 +18,10 @@ import tyro
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.files import make_output_folder, refuse_existing
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import environment_of
+from wlr_gym.cli.options import ForceOption, JsonOption, environment_of
+from wlr_gym.cli.results import print_json
 
 #: Episodes whose observations are compared, and their length, s.
 ROBOTS = 16
@@ -29,7 +31,7 @@ ELSEWHERE = ("--out", "--resume", "--max-minutes")
 
 
 @dataclass(frozen=True)
-class ExportOptions:
+class ExportOptions(JsonOption, ForceOption):
     policy: tyro.conf.Positional[tuple[str, ...]]
     """Policy folder, run folder, or archive of Stable-Baselines3 (.zip, with --env); with --card: policy file, or name of a
     shipped policy; with --reseal: any of these; with --to: runs, or folders of runs."""
@@ -54,30 +56,42 @@ class ExportOptions:
 
 def run(options: ExportOptions) -> int:
     """Export and compare, or write the card, or reseal; say what was written."""
-    if options.to is not None:
-        _export_runs(options, options.to)
-        return OK
-    if options.reseal:
-        _reseal(options)
-        return OK
-    if len(options.policy) != 1:
-        raise InputError(f"expected one policy, got {len(options.policy)}; several go with --reseal")
-    if options.policy[0].endswith(".zip"):
-        _import(options)
-    elif options.robot is not None:
-        raise InputError("--robot: of archives (.zip) and with --reseal only; other policies carry the robot of their training")
-    elif options.env or options.config or options.normalizer:
-        raise InputError("--env, --config and --normalizer: of archives (.zip) only; other policies say themselves")
-    elif options.card is None:
-        _export(options.policy[0], options.out or Path("policy.onnx"))
-    elif options.out is None:
-        _write_card(options.policy[0], options.card)
-    else:
-        raise InputError("--card and --out: one or the other; a card is written beside its policy file")
+    found = _do(options)
+    if options.json:
+        print_json(found)
     return OK
 
 
-def _export_runs(options: ExportOptions, form: str) -> None:
+def _do(options: ExportOptions) -> Any:
+    """Do it, say so, and return what came of it."""
+    if options.to is not None:
+        return _export_runs(options, options.to)
+    if options.reseal:
+        return _reseal(options)
+    if len(options.policy) != 1:
+        raise InputError(f"expected one policy, got {len(options.policy)}; several go with --reseal")
+    if options.policy[0].endswith(".zip"):
+        return _import(options)
+    if options.robot is not None:
+        raise InputError("--robot: of archives (.zip) and with --reseal only; other policies carry the robot of their training")
+    if options.env or options.config or options.normalizer:
+        raise InputError("--env, --config and --normalizer: of archives (.zip) only; other policies say themselves")
+    if options.card is None:
+        return _export(options.policy[0], _target(options))
+    if options.out is None:
+        return _write_card(options.policy[0], options.card, options.force)
+    raise InputError("--card and --out: one or the other; a card is written beside its policy file")
+
+
+def _target(options: ExportOptions) -> Path:
+    """Return the file to write, whose folder is made."""
+    out = options.out or Path("policy.onnx")
+    refuse_existing(out, options.force)
+    make_output_folder(out.parent)
+    return out
+
+
+def _export_runs(options: ExportOptions, form: str) -> list[Path]:
     from wlr_gym.data.logs import export_run
     from wlr_gym.data.logs.write import FORMATS
     from wlr_gym.data.read import read_run, run_files
@@ -88,50 +102,61 @@ def _export_runs(options: ExportOptions, form: str) -> None:
     if not paths:
         raise InputError("--to: expected runs, or folders of runs")
     targets = [(options.out or path.parent) / f"{path.stem}{FORMATS[form]}" for path in paths]
-    _check_targets(paths, targets)
+    _check_targets(paths, targets, options.force)
     if options.out is not None:
         make_output_folder(options.out)
     for path, target in zip(paths, targets, strict=True):
+        _clear(target)
         print(f"written: {export_run(read_run(path), target, form)}")
+    return targets
 
 
-def _check_targets(paths: Sequence[Path], targets: Sequence[Path]) -> None:
+def _clear(target: Path) -> None:
+    """Remove what is to be replaced; rosbag2 is a folder."""
+    if target.is_dir():
+        shutil.rmtree(target)
+    target.unlink(missing_ok=True)
+
+
+def _check_targets(paths: Sequence[Path], targets: Sequence[Path], force: bool) -> None:
     """Refuse runs that would go to one place, or over what is there."""
     taken: dict[Path, Path] = {}
     for path, target in zip(paths, targets, strict=True):
         if target in taken:
             raise InputError(f"{path} and {taken[target]}: both would be {target}: export them to folders of their own (--out)")
-        if target.exists():
-            raise InputError(f"{target}: is there already: move it away, or name another folder (--out)")
+        refuse_existing(target, force)
         taken[target] = path
 
 
-def _reseal(options: ExportOptions) -> None:
+def _reseal(options: ExportOptions) -> dict[str, list[str]]:
     from wlr_gym.policy import find_policy, reseal
 
     if options.out is not None or options.card is not None:
         raise InputError("--reseal rewrites policies where they are: neither --out nor --card goes with it")
     if not options.policy:
         raise InputError("--reseal: expected policies: files, folders or names of shipped ones")
+    changes = {}
     for source in options.policy:
         place = find_policy(source)
-        print("\n  ".join([f"{place}:", *(reseal(place, options.robot) or ["nothing changed"])]))
+        changes[str(place)] = list(reseal(place, options.robot))
+        print("\n  ".join([f"{place}:", *(changes[str(place)] or ["nothing changed"])]))
+    return changes
 
 
-def _export(source: str, out: Path) -> None:
+def _export(source: str, out: Path) -> dict[str, Any]:
     from wlr_gym.policy import export_policy, find_policy
 
     folder = find_policy(source)
-    make_output_folder(out.parent)
     parity = export_policy(folder, out, real_observations(folder), training_facts(folder))
     print(
         f"written: {out} ({out.stat().st_size / 1000:.0f} kB)\n"
         f"answers as the policy does: actions differ by at most {parity.random:.1e} on random observations, "
         f"{parity.real:.1e} on those of {ROBOTS} episodes"
     )
+    return {"policy": out, "parity": parity}
 
 
-def _import(options: ExportOptions) -> None:
+def _import(options: ExportOptions) -> dict[str, Any]:
     import gymnasium
 
     from wlr_gym.envs.registry import task_name_of
@@ -141,8 +166,7 @@ def _import(options: ExportOptions) -> None:
     if options.env is None:
         raise InputError(f"{options.policy[0]}: an archive does not say what it was trained in: give --env ID")
     settings = load_agent_config(options.config, (), task_name_of(options.env)) if options.config else {}
-    out = options.out or Path("policy.onnx")
-    make_output_folder(out.parent)
+    out = _target(options)
     env = gymnasium.make(options.env, robot=options.robot, **fed_environment(settings.get("environment") or {}))
     parity = import_policy(options.policy[0], env, out, normalizer=options.normalizer)
     print(
@@ -150,16 +174,21 @@ def _import(options: ExportOptions) -> None:
         f"answers as the archive does: actions differ by at most {parity.random:.1e} on random observations, "
         f"{parity.real:.1e} on those of robots that it drives"
     )
+    return {"policy": out, "parity": parity}
 
 
-def _write_card(source: str, evaluation: Path) -> None:
+def _write_card(source: str, evaluation: Path, force: bool) -> dict[str, Any]:
     from wlr_gym.policy import find_policy, write_model_card
 
+    policy = find_policy(source)
+    refuse_existing(policy.with_suffix(".md"), force, "--card")
     try:
         text = (evaluation / "card.md").read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"--card {evaluation}: no card.md of wlr evaluate there: {error.strerror}") from None
-    print(f"written: {write_model_card(find_policy(source), text)}")
+    card = write_model_card(policy, text)
+    print(f"written: {card}")
+    return {"card": card}
 
 
 def real_observations(source: Path) -> NDArray[np.float32]:

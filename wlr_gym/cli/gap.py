@@ -7,6 +7,7 @@ folder of its own.
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Iterator
@@ -20,8 +21,9 @@ import tyro
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.gap_decide import DecideOptions, print_rounds, recorder_of
-from wlr_gym.cli.options import PatchOption
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
 from wlr_gym.cli.progress import progress
+from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,11 +33,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class GapOptions(DecideOptions, PatchOption):
+class GapOptions(DecideOptions, JsonOption, ForceOption, PatchOption):
     data: tyro.conf.Positional[Path]
     """Folder of measured runs; with --rig, of recordings of the rig."""
     out: Path
-    """Folder for the results; made if it is not there. Results of an earlier analysis are replaced."""
+    """Folder for the results; made if it is not there."""
     rig: str | None = None
     """Recordings of a test rig instead of runs of the robot: pendulum (one servo that swings a weight)."""
     robot: str | None = None
@@ -56,9 +58,11 @@ def run(options: GapOptions) -> int:
     """
     from rich.console import Console
 
+    from wlr_gym.base.files import refuse_existing
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.gap.analysis import BAD_DATA
     from wlr_gym.gap.report.folder import check_folder
+    from wlr_gym.gap.report.result import RESULT_FILE
     from wlr_gym.gap.workflow import analyse
 
     _check(options)
@@ -66,6 +70,7 @@ def run(options: GapOptions) -> int:
     console = Console(soft_wrap=True, highlight=False)
     if options.until_decided:
         return _decide(options, known, console)
+    refuse_existing(options.out / RESULT_FILE, options.force)
     check_folder(options.out)
     with progress(console) as tell:
         analysis = analyse(
@@ -82,7 +87,10 @@ def run(options: GapOptions) -> int:
     settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
     settings |= {"heldout": list(options.heldout), "hidden": list(options.hidden)}
     record_provenance(options.out, settings | {"effects": known.content()["effects"]})
-    _print(analysis, options.out, console)
+    if options.json:
+        print_json(json.loads((options.out / RESULT_FILE).read_text(encoding="utf-8")))
+    else:
+        _print(analysis, options.out, console)
     return FAILED if analysis.verdict == BAD_DATA else OK
 
 
@@ -93,6 +101,7 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
     from wlr_gym.gap.analysis import BAD_DATA
     from wlr_gym.gap.decision import Budget, decide
     from wlr_gym.gap.report.folder import REPORT_FILE
+    from wlr_gym.gap.report.result import RESULT_FILE
 
     budget = Budget(options.budget_runs, math.inf if options.budget_seconds is None else options.budget_seconds)
     robot = robot_of(read_dataset(options.data).runs[0], options.robot)
@@ -111,6 +120,8 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
     print_rounds(decision, console)
     if decision.result is None:
         return FAILED
+    if options.json:
+        print_json(json.loads((decision.folder / RESULT_FILE).read_text(encoding="utf-8")))
     console.print(decision.result.summary, markup=False)
     console.print(f"report: {decision.folder / REPORT_FILE}", markup=False)
     return FAILED if decision.result.verdict == BAD_DATA else OK

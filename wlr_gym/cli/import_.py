@@ -16,6 +16,8 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
+from wlr_gym.cli.options import JsonOption
+from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,7 +28,7 @@ _COLOURS = {"sure": "green", "likely": "yellow", "guess": "red"}
 
 
 @dataclass(frozen=True)
-class ImportOptions:
+class ImportOptions(JsonOption):
     log: tyro.conf.Positional[tuple[Path, ...]]
     """Logs: .mcap, .db3, .bag, .csv or .parquet files, folders of rosbag2, LeRobot data sets (version 3)."""
     map: Path | None = None
@@ -41,7 +43,7 @@ class ImportOptions:
     robot: str | None = None
     """Robot file or config name; default: the one that the map's meta names, else the nominal one."""
     format: Literal["parquet", "csv"] = "parquet"
-    """Of the runs."""
+    """Format of the runs."""
 
 
 def run(options: ImportOptions) -> int:
@@ -61,15 +63,21 @@ def run(options: ImportOptions) -> int:
     if options.suggest:
         found = _suggest(options, given or {}, console)
         if options.out is None:
+            if options.json:
+                print_json({"map": found})
             return OK
         given = found
     assert options.out is not None
     if given is None and not (options.out / MAP_FILE).is_file():
         _check_own([log for log in options.log if not is_own(log)])
+    runs: list[ImportedRun] = []
     for log in options.log:
         with _reading(console, log) as tell:
             imported = import_log(log, options.out, given, options.robot, options.split, f".{options.format}", tell)
         _report(imported, console)
+        runs += imported
+    if options.json:
+        print_json({"runs": runs})
     return OK
 
 

@@ -32,6 +32,22 @@ class PatchOption:
 
 
 @dataclass(frozen=True, kw_only=True)
+class JsonOption:
+    """``--json`` of every command that prints results."""
+
+    json: bool = False
+    """Print the results as JSON; everything else goes to the standard error."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceOption:
+    """``--force`` of every command that writes results under a given name."""
+
+    force: bool = False
+    """Replace results that are there."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SensorsOption:
     """``--sensors`` of commands that make robots."""
 

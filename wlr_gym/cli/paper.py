@@ -14,6 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.progress import Tell, progress
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import HardwareOption, confirm
 
 if TYPE_CHECKING:
@@ -24,8 +27,12 @@ if TYPE_CHECKING:
     from wlr_gym.studies.paper.slip_search import SearchFinding
 
 
+#: Share of the work that is done after each part, about.
+_SHARES = {"tests": 0.15, "claims": 0.2, "search": 0.85, "decided": 0.9}
+
+
 @dataclass(frozen=True)
-class PaperOptions(HardwareOption):
+class PaperOptions(JsonOption, ForceOption, HardwareOption):
     out: Path
     """Folder for the report; made if it is not there."""
     plant: tuple[str, ...] = ("reduced", "gibbs_appell", "mujoco")
@@ -35,15 +42,17 @@ class PaperOptions(HardwareOption):
     robot: str | None = None
     """Robot file or config name; default: the nominal one."""
     draws: int = 8
-    """Of the search for what could explain the paper's slip: draws per combination at first; 0 = no search."""
+    """Search for what could explain the paper's slip: draws per combination at first; 0 = no search."""
     levels: int = 2
     """Most departures from the nominal robot at once in the search: 1 to 3."""
     seed: int = 0
-    """Of the search."""
+    """Seed of the search."""
     threads: int = 2
     """Worker threads of the engine."""
     plots: bool = True
     """Write figures."""
+    progress: bool = True
+    """Show progress and the remaining time."""
 
 
 def run(options: PaperOptions) -> int:
@@ -54,7 +63,7 @@ def run(options: PaperOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.base.files import make_output_folder, refuse_existing
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.cli import FAILED, OK
     from wlr_gym.hardware.loop import StoppedError
@@ -66,27 +75,35 @@ def run(options: PaperOptions) -> int:
 
     _check(options)
     robot = load_robot(options.robot) if options.robot else load_robot()
+    refuse_existing(options.out / "report.md", options.force)
     make_output_folder(options.out)
     write_tests(options.out / "commands")
-    console = Console()
-    try:
-        records = {model: _drive(model, robot, options, console) for model in options.plant}
-    except StoppedError as error:
-        console.print(f"the robot has stopped: {error}", style="red")
-        return FAILED
-    reference = records.get("gibbs_appell") or _drive("gibbs_appell", robot, options, console)
-    console.print("claims")
-    evidence = gather(robot, reference, options.threads)
-    claims = check_all(evidence)
-    findings = _search(robot, options, console)
-    decisive = report.what_would_decide(robot, findings, options.threads)
-    if options.plots:
-        console.print("figures")
-        report.write_figures(options.out, records, evidence, findings)
+    console, records = Console(), {}
+    with progress(console, shown=options.progress) as tell:
+        try:
+            for done, model in enumerate(options.plant):
+                tell("", f"both tests: {model}", _SHARES["tests"] * done / len(options.plant))
+                records[model] = _drive(model, robot, options, console)
+        except StoppedError as error:
+            console.print(f"the robot has stopped: {error}", style="red")
+            return FAILED
+        reference = records.get("gibbs_appell") or _drive("gibbs_appell", robot, options, console)
+        tell("", "claims", _SHARES["tests"])
+        evidence = gather(robot, reference, options.threads)
+        claims = check_all(evidence)
+        findings = _search(robot, options, tell)
+        tell("", "what would decide it", _SHARES["search"])
+        decisive = report.what_would_decide(robot, findings, options.threads)
+        if options.plots:
+            tell("", "figures", _SHARES["decided"])
+            report.write_figures(options.out, records, evidence, findings)
     report.write_report(options.out, robot, records, claims, findings, decisive)
     given = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
     record_provenance(options.out, given | {"plant": list(options.plant), "robot": robot.name}, options.seed)
-    _show(console, claims)
+    if options.json:
+        print_json(claims)
+    else:
+        _show(console, claims)
     console.print(f"report: {options.out / 'report.md'}", soft_wrap=True)
     return OK
 
@@ -114,7 +131,6 @@ def _drive(model: str, robot: Robot, options: PaperOptions, console: Console) ->
     from wlr_gym.physics.plants import REAL
     from wlr_gym.studies.paper.experiments import drive_both
 
-    console.print(f"both tests: {model}")
     return _drive_robot(options, console) if model in REAL else drive_both(model, robot)
 
 
@@ -139,13 +155,18 @@ def _drive_robot(options: PaperOptions, console: Console) -> dict[str, Record]:
     return records
 
 
-def _search(robot: Robot, options: PaperOptions, console: Console) -> list[SearchFinding]:
+def _search(robot: Robot, options: PaperOptions, tell: Tell) -> list[SearchFinding]:
     from wlr_gym.studies.paper.slip_search import search
 
     if options.draws == 0:
         return []
-    console.print("open question: what slips as the paper's robot did?")
-    return search(robot, options.draws, options.levels, options.seed, threads=options.threads)
+    begin, end = _SHARES["claims"], _SHARES["search"]
+
+    def told(share: float) -> None:
+        tell("", "open question: what slips as the paper's robot did?", begin + (end - begin) * share)
+
+    told(0.0)
+    return search(robot, options.draws, options.levels, options.seed, threads=options.threads, tell=told)
 
 
 def _show(console: Console, claims: Sequence[object]) -> None:
@@ -154,12 +175,11 @@ def _show(console: Console, claims: Sequence[object]) -> None:
 
     from wlr_gym.studies.paper.claims import FAILS, CheckedClaim
 
-    table = Table(title="The paper's claims", title_justify="left", title_style="bold", box=box.SIMPLE)
+    table = Table(title="The paper's claims", title_justify="left", title_style="bold", box=box.SIMPLE, padding=(0, 1, 0, 0))
     for heading in ("#", "claim", "paper", "here", "verdict"):
         table.add_column(heading, overflow="fold")
     for claim in claims:
         assert isinstance(claim, CheckedClaim)
         style = "red" if claim.verdict == FAILS else None
         table.add_row(str(claim.number), claim.text, claim.paper, claim.ours, claim.verdict, style=style)
-    console.width = max(console.width, 120)
     console.print(table)

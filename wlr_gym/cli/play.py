@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import refuse_existing
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption, SensorsOption, environment_of
+from wlr_gym.cli.options import ForceOption, PatchOption, SensorsOption, environment_of
 from wlr_gym.render.display import require_display
 from wlr_gym.render.view import View
 from wlr_gym.render.web.page import HOST, PORT
@@ -35,7 +36,7 @@ FPS = 25.0
 
 
 @dataclass(frozen=True)
-class PlayOptions(PatchOption, SensorsOption):
+class PlayOptions(ForceOption, PatchOption, SensorsOption):
     env: tyro.conf.Positional[str | None] = None
     """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
     agent: str = "pid"
@@ -43,7 +44,7 @@ class PlayOptions(PatchOption, SensorsOption):
     beside: str | None = None
     """A second one, in the same episode, beside the first in a video."""
     backend: str = "gibbs_appell"
-    """Simulator."""
+    """Simulator: gibbs_appell or mujoco."""
     randomization: str | None = None
     """Name in configs/randomization/ or path; default: the task's."""
     robot: str | None = None
@@ -51,7 +52,7 @@ class PlayOptions(PatchOption, SensorsOption):
     seed: int = 0
     """Seed of the first episode."""
     command: str | None = None
-    """Commands by schedule instead of keys: 0.1,0 for good, or 0:0.1,0; 3:0.05,0.3 from these times (s) on."""
+    """Commands by schedule instead of keys: '0.1,0' for good, or '0:0.1,0; 3:0.05,0.3' from these times (s) on."""
     gamepad: bool = False
     """Take commands from the first gamepad instead of the keys."""
     web: bool = False
@@ -67,7 +68,7 @@ class PlayOptions(PatchOption, SensorsOption):
     fps: float = FPS
     """Pictures per second of a video, where the control period allows."""
     camera: str = "follow"
-    """follow, chase, side or top."""
+    """View: follow, chase, side or top."""
     size: tuple[int, int] = (640, 480)
     """Width and height of the video, pixels."""
     forces: bool = False
@@ -123,6 +124,7 @@ def _check(options: PlayOptions) -> None:
         raise InputError("--web and --video: one or the other")
     if options.video is not None:
         check_video(options.video)
+        refuse_existing(options.video, options.force, "--video")
     elif not options.web:
         require_display()
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import PatchOption
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import CameraOption, confirm
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RecordOptions(CameraOption, PatchOption):
+class RecordOptions(JsonOption, ForceOption, CameraOption, PatchOption):
     """Record runs.
 
     Attributes:
@@ -35,7 +36,7 @@ class RecordOptions(CameraOption, PatchOption):
         commands: files with setpoints to drive: of --commands-only, or of whole runs.
         out: folder for the runs; made if it is not there.
         backend: dynamixel = the robot (with --emulated an emulated one), or a simulator: gibbs_appell, mujoco.
-        seed: of the motions, and of a simulator's noise.
+        seed: seed of the motions, and of a simulator's noise.
         seconds: cut each motion off after this long.
         commands_only: write the setpoints only, one file per motion.
         list: show the excitations.
@@ -65,6 +66,7 @@ def run(options: RecordOptions) -> int:
     """
     from rich.console import Console
 
+    from wlr_gym.base.files import refuse_existing
     from wlr_gym.data.format import RunMeta
     from wlr_gym.data.record import meta_of, same_profile, write_commands
     from wlr_gym.physics.plants import REAL, check_backend
@@ -75,7 +77,7 @@ def run(options: RecordOptions) -> int:
     chosen = options.robot_name(options.robot) if options.backend in REAL else options.robot or "nominal"
     robot = load_robot(chosen)
     if options.list:
-        _list(console, robot)
+        _list(console, robot, options.json)
         return OK
     if options.backend not in REAL and (options.emulated or options.port or options.camera):
         raise InputError(f"--emulated, --port and --camera are about the robot: leave --backend {options.backend} out")
@@ -85,7 +87,11 @@ def run(options: RecordOptions) -> int:
     same_profile(motions)
     if options.commands_only:
         for motion in motions:
-            console.print(f"written: {write_commands(options.out, motion)}")
+            refuse_existing(options.out / f"{motion.name}.csv", options.force)
+        written = [write_commands(options.out, motion) for motion in motions]
+        for path in written:
+            console.print(f"written: {path}")
+        _results(options, [{"motion": motion.name, "commands": path} for motion, path in zip(motions, written, strict=True)])
         return OK
     meta = meta_of(motions[0], robot, RunMeta(ground=options.ground, notes=options.notes))
     if options.backend in REAL:
@@ -119,7 +125,7 @@ def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robo
     from wlr_gym.hardware.driving import drive_robot
 
     assert options.out is not None
-    well = True
+    well, found = True, []
     for motion in motions:
         if not (options.emulated or options.yes):
             confirm(motion, robot, console)
@@ -129,10 +135,19 @@ def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robo
         finally:
             plant.close()
         _report(motion, drive, console)
+        found.append(
+            {"motion": motion.name, "run": drive.run, "reason": drive.reason, "well": drive.well, "ticks": drive.ticks}
+        )
         well = well and drive.well
         if drive.reason:
             break
+    _results(options, found)
     return OK if well else FAILED
+
+
+def _results(options: RecordOptions, found: Sequence[dict[str, object]]) -> None:
+    if options.json:
+        print_json(found)
 
 
 def _report(motion: Motion, drive: DriveResult, console: Console) -> None:
@@ -164,21 +179,31 @@ def _record_simulations(
 
     assert options.out is not None
     make_output_folder(options.out)
-    patch = options.patch()
+    patch, found = options.patch(), []
     for motion in motions:
         path = next_run(options.out)
         seed = int(spawn_seeds(options.seed, 1, path.stem)[0])  # no two runs of a folder have the same noise
         record_simulation(path, motion, robot, options.backend, seed, patch, meta)
         console.print(f"{motion.name}: {motion.duration:.1f} s on {options.backend}; written: {path}")
+        found.append({"motion": motion.name, "run": path})
+    _results(options, found)
     return OK
 
 
-def _list(console: Console, robot: Robot) -> None:
+def _list(console: Console, robot: Robot, as_json: bool) -> None:
     from rich import box
     from rich.table import Table
 
     from wlr_gym.data.excitations import EXCITATIONS, excite
 
+    if as_json:
+        print_json(
+            [
+                {"name": name, "seconds": excite(name, robot=robot).duration, "does": one.doc, "shows": one.shows}
+                for name, one in EXCITATIONS.items()
+            ]
+        )
+        return
     table = Table("excitation", "seconds", "what the robot does", "what it shows", box=box.SIMPLE)
     for name, excitation in EXCITATIONS.items():
         table.add_row(name, f"{excite(name, robot=robot).duration:.0f}", excitation.doc, excitation.shows)

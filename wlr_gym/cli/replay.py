@@ -17,7 +17,8 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import PatchOption
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import HardwareOption, confirm
 
 if TYPE_CHECKING:
@@ -32,16 +33,16 @@ ERRORS_FILE = "errors.json"
 
 
 @dataclass(frozen=True)
-class ReplayOptions(HardwareOption, PatchOption):
+class ReplayOptions(JsonOption, ForceOption, HardwareOption, PatchOption):
     """Replay measured runs.
 
     Attributes:
         runs: a run (CSV or Parquet) or a folder of runs.
         out: folder for errors.json, plots and provenance; made if it is not there.
         backend: simulator, or dynamixel for the robot.
-        robot: robot file or config name; left out, the one meta.yaml names, else the nominal one; of a real robot the one
+        robot: robot file or config name; default: the one meta.yaml names, else the nominal one; of a real robot the one
             that its hardware file names.
-        segment: s between the points at which a segment starts anew from the measured state.
+        segment: time between the points at which a segment starts anew from the measured state, s.
         plots: write overlay plots.
         video: file (.webp, .gif, .png, .mp4) for a film of the run beside its simulation; with several runs, one film each,
             named FILE_<run>.
@@ -66,7 +67,7 @@ def run(options: ReplayOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder, write_json
+    from wlr_gym.base.files import make_output_folder, refuse_existing, write_json
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.data.replay import prepare
     from wlr_gym.data.replay_plots import save_plots
@@ -84,6 +85,9 @@ def run(options: ReplayOptions) -> int:
         check_video(options.video)
     runs = _read(options.runs)
     patch = options.patch()
+    refuse_existing(options.out / ERRORS_FILE, options.force)
+    for film in _films(options, [one.name for one in runs]):
+        refuse_existing(film, options.force, "--video")
     for measured in runs:  # a refusal leaves no folder behind
         prepare(measured, options.robot, effects=patch, segment=options.segment)
     make_output_folder(options.out)
@@ -94,26 +98,35 @@ def run(options: ReplayOptions) -> int:
             save_plots(result, options.out)
     if not results:
         return FAILED
-    _print(results, patch, console, "repeated" if on_robot else "simulated")
     errors = {result.run.name: {name: error.as_dict() for name, error in result.errors.items()} for result in results}
+    if options.json:
+        print_json(errors)
+    else:
+        _print(results, patch, console, "repeated" if on_robot else "simulated")
     write_json(options.out / ERRORS_FILE, errors)
     record_provenance(options.out, _resolved(options, results, patch))
     console.print(f"errors, plots and provenance: {options.out}")
     if options.video is not None:
-        _film(options, options.video, results, patch, console)
+        _film(options, results, patch, console)
     return OK if len(results) == len(runs) else FAILED
 
 
-def _film(options: ReplayOptions, path: Path, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
+def _films(options: ReplayOptions, names: Sequence[str]) -> list[Path]:
+    """Return a film for each run that is named; none without --video."""
+    if (path := options.video) is None:
+        return []
+    return [path] if len(names) == 1 else [path.with_name(f"{path.stem}_{name}{path.suffix}") for name in names]
+
+
+def _film(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
     from rich.progress import track
 
     from wlr_gym.data.film import FPS, film_length, replay_film
     from wlr_gym.data.replay import prepare
     from wlr_gym.render import write_video
 
-    for result in results:
+    for result, target in zip(results, _films(options, [result.run.name for result in results]), strict=True):
         _, parameters = prepare(result.run, options.robot, effects=patch, segment=options.segment)
-        target = path if len(results) == 1 else path.with_name(f"{path.stem}_{result.run.name}{path.suffix}")
         count = film_length(result.run)
         pictures = replay_film(result, parameters, options.backend)
         described = f"drawing {result.run.name}"

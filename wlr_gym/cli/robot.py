@@ -5,15 +5,17 @@ Exit code 0: done, nothing stands against the robot; 1: it cannot stand, drive o
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import refuse_existing
 from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_exchange import RobotExportOptions, RobotImportOptions, export_robot, import_robot
 from wlr_gym.cli.robot_new import NewOptions, new_robot, print_findings
 
@@ -24,42 +26,39 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 @dataclass(frozen=True)
-class CheckOptions:
+class CheckOptions(JsonOption):
     """Look for what is wrong or odd about a robot: units, masses, inertias, and what it cannot do, with numbers.
 
     Attributes:
         robot: name in configs/robot/ or path.
         strict: warnings too give exit code 1.
-        json: print the findings as JSON.
     """
 
     robot: Annotated[str, tyro.conf.Positional] = "nominal"
     strict: bool = False
-    json: bool = False
 
 
 @dataclass(frozen=True)
-class ShowOptions:
+class ShowOptions(JsonOption, ForceOption):
     """Show what a robot is and what it can do.
 
     Attributes:
         robot: name in configs/robot/ or path.
         picture: picture to write (.png, .jpg, .webp): standing, and with its legs at their limits.
-        json: print the numbers as JSON.
     """
 
     robot: Annotated[str, tyro.conf.Positional] = "nominal"
     picture: Path | None = None
-    json: bool = False
 
 
-RobotOptions = (
-    Annotated[NewOptions, tyro.conf.subcommand("new", description="a robot file from a few questions")]
-    | Annotated[CheckOptions, tyro.conf.subcommand("check", description="what is wrong or odd about a robot, with numbers")]
-    | Annotated[ShowOptions, tyro.conf.subcommand("show", description="what a robot is and can do; a picture")]
-    | Annotated[RobotImportOptions, tyro.conf.subcommand("import", description="a robot file from MJCF or URDF")]
-    | Annotated[RobotExportOptions, tyro.conf.subcommand("export", description="a robot as MJCF or URDF")]
-)
+#: Command -> its options, and what it does.
+COMMANDS = {
+    "new": (NewOptions, "a robot file from a few questions"),
+    "check": (CheckOptions, "what is wrong or odd about a robot, with numbers"),
+    "show": (ShowOptions, "what a robot is and can do; a picture"),
+    "import": (RobotImportOptions, "a robot file from MJCF or URDF"),
+    "export": (RobotExportOptions, "a robot as MJCF or URDF"),
+}
 
 
 def run(options: NewOptions | CheckOptions | ShowOptions | RobotImportOptions | RobotExportOptions) -> int:
@@ -84,7 +83,7 @@ def _check(options: CheckOptions) -> int:
     robot = load_robot(options.robot, check=False)
     findings = examine_robot(robot)
     if options.json:
-        print(json.dumps({"robot": robot.name, "findings": [asdict(finding) for finding in findings]}, indent=2))
+        print_json({"robot": robot.name, "findings": findings})
     else:
         print_findings(robot, findings)
     against = findings if options.strict else [finding for finding in findings if finding.level == "fault"]
@@ -98,10 +97,12 @@ def _show(options: ShowOptions) -> int:
         raise InputError(f"--picture {options.picture}: expected a file that ends in {', '.join(PICTURES)}")
     if options.picture is not None and not options.picture.parent.is_dir():
         raise InputError(f"--picture {options.picture}: folder {options.picture.parent} does not exist")
+    if options.picture is not None:
+        refuse_existing(options.picture, options.force, "--picture")
     robot = load_robot(options.robot)
     numbers = _numbers(robot)
     if options.json:
-        print(json.dumps({"robot": robot.name, "fingerprint": robot_hash(robot), "numbers": numbers}, indent=2))
+        print_json({"robot": robot.name, "fingerprint": robot_hash(robot), "numbers": numbers})
     else:
         print(f"{robot.name}, fingerprint {robot_hash(robot)}")
         for name, number in numbers.items():
@@ -110,8 +111,7 @@ def _show(options: ShowOptions) -> int:
         from wlr_gym.render.portrait import draw_portrait
 
         draw_portrait(options.picture, robot)
-        if not options.json:
-            print(f"written: {options.picture}")
+        print(f"written: {options.picture}")
     return OK
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -11,6 +10,8 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_new import print_findings
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ SUFFIXES: dict[str, Format] = {".xml": "mjcf", ".mjcf": "mjcf", ".urdf": "urdf"}
 
 
 @dataclass(frozen=True)
-class RobotImportOptions:
+class RobotImportOptions(JsonOption, ForceOption):
     """Write a robot file of a robot with four legs of one hinge and a driven wheel on each; others are refused.
 
     Attributes:
@@ -31,8 +32,6 @@ class RobotImportOptions:
         name: of the robot; default: that in the file.
         base: robot that has what the format cannot hold: name in configs/robot/ or path.
         idealise: accept that numbers are averaged or left out which change the robot by more than 5 %.
-        force: replace a file that is there.
-        json: print what was read, and how joints correspond, as JSON.
     """
 
     file: Annotated[Path, tyro.conf.Positional]
@@ -40,27 +39,21 @@ class RobotImportOptions:
     name: str | None = None
     base: str = "nominal"
     idealise: bool = False
-    force: bool = False
-    json: bool = False
 
 
 @dataclass(frozen=True)
-class RobotExportOptions:
+class RobotExportOptions(JsonOption, ForceOption):
     """Write a robot as MJCF (the MuJoCo plant's own model) or URDF.
 
     Attributes:
         robot: name in configs/robot/ or path.
         out: file to write; .xml or .mjcf: MJCF, .urdf: URDF.
-        format: mjcf or urdf; default: by the end of --out.
-        force: replace a file that is there.
-        json: print what the format cannot hold as JSON.
+        format: of the file, mjcf or urdf; default: by the end of --out.
     """
 
     robot: Annotated[str, tyro.conf.Positional]
     out: Path
     format: Format | None = None
-    force: bool = False
-    json: bool = False
 
 
 def import_robot(options: RobotImportOptions) -> int:
@@ -82,8 +75,7 @@ def import_robot(options: RobotImportOptions) -> int:
     write_text(options.out, robot_text(name, base_beside(options.base, options.out), found.numbers, title=title))
     findings = examine_robot(robot)
     if options.json:
-        report = {"out": str(options.out), **asdict(found), "findings": [asdict(finding) for finding in findings]}
-        print(json.dumps(report, indent=2))
+        print_json({"out": options.out, **asdict(found), "findings": findings})
     else:
         print("\n".join([f"written: {options.out}", *_explained(found, options.base)]))
         print_findings(robot, findings)
@@ -130,7 +122,7 @@ def export_robot(options: RobotExportOptions) -> int:
     text, lost = (mjcf_text(robot), NOT_IN_MJCF) if kind == "mjcf" else (urdf_text(robot), NOT_IN_URDF)
     write_text(options.out, text)
     if options.json:
-        print(json.dumps({"out": str(options.out), "format": kind, "not_held": lost}, indent=2))
+        print_json({"out": options.out, "format": kind, "not_held": lost})
     else:
         print(f"written: {options.out}\n{kind.upper()} does not hold: {', '.join(lost)}")
     return OK

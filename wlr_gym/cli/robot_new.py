@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import pairs
+from wlr_gym.cli.options import ForceOption, pairs
 from wlr_gym.cli.robot_options import ask_terminal
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class NewOptions:
+class NewOptions(ForceOption):
     """Write a robot file over a base. Asks for what --set does not give; Enter takes the default.
 
     Attributes:
@@ -28,7 +28,6 @@ class NewOptions:
         base: robot that has all other numbers: name in configs/robot/ or path.
         set: answers, such as body.mass=12 leg.length="300 mm" servo.wheel.no_load_speed="77 rpm"; units may be left out (SI).
         yes: take the default of everything that --set does not give, and ask nothing.
-        force: replace a file that is there.
     """
 
     out: Path
@@ -36,7 +35,6 @@ class NewOptions:
     base: str = "nominal"
     set: tuple[str, ...] = ()
     yes: bool = False
-    force: bool = False
 
 
 def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> int:

@@ -14,7 +14,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config, parse_yaml
 from wlr_gym.base.text import counted, number
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.options import ray_address
+from wlr_gym.cli.options import JsonOption, ray_address
+from wlr_gym.cli.results import print_json
 from wlr_gym.learning.sweep.page import PAGE_FILE, name_of
 from wlr_gym.learning.sweep.plan import SweepPlan, read_plan
 from wlr_gym.learning.sweep.results import TABLE_FILE
@@ -22,7 +23,7 @@ from wlr_gym.learning.sweep.running import SweepResult, resume_sweep, start_swee
 
 
 @dataclass(frozen=True)
-class SweepOptions:
+class SweepOptions(JsonOption):
     what: tyro.conf.Positional[str | None] = None
     """File of a sweep (YAML; see docs/sweep.md) or environment id (see: wlr envs)."""
     config: str | None = None
@@ -59,7 +60,7 @@ def run(options: SweepOptions) -> int:
         plan = _plan(options)
         out = options.out or Path("runs_out") / f"sweep_{Path(options.what or '').stem.rpartition(':')[2]}"
         found = start_sweep(plan, out, ray=ray, workers=options.workers, say=_say)
-    return _report(found)
+    return _report(found, options.json)
 
 
 def _say(line: str) -> None:
@@ -117,7 +118,11 @@ def _nest(settings: dict[str, Any], path: list[str], value: Any) -> None:
     settings[path[-1]] = value
 
 
-def _report(found: SweepResult) -> int:
+def _report(found: SweepResult, as_json: bool) -> int:
+    if as_json:
+        files = {"folder": found.folder, "table": found.folder / TABLE_FILE, "page": found.folder / PAGE_FILE}
+        print_json(files | {"ranking": found.ranking, "failed": len(found.failed)})
+        return FAILED if found.failed else OK
     if found.ranking:
         best = found.ranking[0]
         _say(f"best: {name_of(best.settings)}: {number(best.mean)} over {counted(len(best.values), 'seed')}")

@@ -12,7 +12,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption, environment_of
+from wlr_gym.cli.options import JsonOption, PatchOption, environment_of
+from wlr_gym.cli.results import print_json
 from wlr_gym.learning.training import resume_training, run_training, settings_of, unused, with_robot
 from wlr_gym.policy import Training
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class TrainOptions(PatchOption):
+class TrainOptions(JsonOption, PatchOption):
     env: tyro.conf.Positional[str | None] = None
     """Environment id (see: wlr envs); default: that of --init, else WLR-Velocity-v0."""
     agent: str = "ppo"
@@ -67,8 +68,11 @@ def run(options: TrainOptions) -> int:
         folder = unused(options.out or default_folder(options, environment, config))
         training = Training(environment, folder, config, False, seconds, options.progress, options.init)
         policy = run_training(options.agent, training)
-    print(f"policy: {policy}\nscore it: wlr evaluate {policy} --env {environment}")
     best = policy.with_name("best")
+    if options.json:
+        print_json({"environment": environment, "policy": policy, "best": best if best.is_dir() else None})
+        return OK
+    print(f"policy: {policy}\nscore it: wlr evaluate {policy} --env {environment}")
     if best.is_dir():
         print(f"best on held-out episodes: {best}")
     return OK

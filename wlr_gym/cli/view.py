@@ -31,9 +31,9 @@ class ViewOptions(PatchOption):
     Attributes:
         runs: runs (CSV or Parquet), or folders of runs.
         backend: simulator of the ghost.
-        robot: robot file or config name; left out, the one meta.yaml names, else the nominal one.
+        robot: robot file or config name; default: the one meta.yaml names, else the nominal one.
         ghost: replay the run, and show that robot, too.
-        segment: s between the points at which the ghost starts anew from the measured robot; inf = never.
+        segment: time between the points at which the ghost starts anew from the measured robot, s; inf = never.
         host: name or address to listen on; localhost = this machine, and ssh to it, only.
         port: where it is taken, the next free one.
         seconds: end after this time; default: at Ctrl-C.

@@ -6,15 +6,20 @@ A live camera (its number) is filmed first, to film.avi and film.csv, until Ctrl
 
 from __future__ import annotations
 
+import math
 import shutil
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import tyro
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.cli import OK
+from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.progress import progress
+from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class VisionOptions:
+class VisionOptions(JsonOption, ForceOption):
     """Video to pose and slip.
 
     Attributes:
@@ -37,13 +42,13 @@ class VisionOptions:
         camera: calibration file; make one with: wlr calibrate camera.
         markers: markers on the robot: name in configs/vision/ or path.
         floor: markers on the floor: name in configs/vision/ or path.
-        robot: robot file or config name; left out, the one meta.yaml names, else the nominal one.
-        offset: s, servo time minus camera time, exactly; left out, found from the motion.
-        around: s, servo time minus camera time to 1 s: where the offset is looked for.
+        robot: robot file or config name; default: the one meta.yaml names, else the nominal one.
+        offset: servo time minus camera time, s; default: found from the motion.
+        around: where the offset is looked for: servo time minus camera time to within 1 s, s.
         origin: frame of cam_*: start (0, 0, 0 at the start, as in simulated runs) or floor.
-        rate: Hz, frames evenly spaced; left out, the times in the video.
+        rate: of evenly spaced frames, Hz; default: the times in the video.
         times: CSV with one time (s) per frame, before --rate.
-        seconds: of the video to use; left out, all.
+        seconds: how much of the video to use, s; default: all.
         annotate: write annotated.mp4.
     """
 
@@ -72,7 +77,7 @@ def run(options: VisionOptions) -> int:
     require_package("cv2", "vision")
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder
+    from wlr_gym.base.files import make_output_folder, refuse_existing
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.data import read_run
     from wlr_gym.perception.vision import load_camera, load_target, save_video_analysis
@@ -84,6 +89,7 @@ def run(options: VisionOptions) -> int:
     camera, body, floor = load_camera(options.camera), load_target(options.markers), load_target(options.floor)
     if options.out.resolve() == options.run.resolve().parent:
         raise InputError(f"--out {options.out}: is the run's own folder; the run would be overwritten")
+    refuse_existing(options.out / "summary.json", options.force)
     fresh = not options.out.exists()
     make_output_folder(options.out)
     console = Console(highlight=False, soft_wrap=True)
@@ -99,7 +105,10 @@ def run(options: VisionOptions) -> int:
     paths = save_video_analysis(analysis, options.out)
     settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
     record_provenance(options.out, settings | {"robot": analysis.robot.name})
-    _print(analysis, console)
+    if options.json:
+        print_json(analysis.summary())
+    else:
+        _print(analysis, console)
     console.print(f"in {options.out}: {', '.join(path.name for path in paths)}{', annotated.mp4' if options.annotate else ''}")
     return OK
 
@@ -125,15 +134,19 @@ def _analyse(
     from wlr_gym.perception.vision import Frames, analyse
     from wlr_gym.perception.vision.video import AnnotatedVideo
 
+    began: float | None = None
     frames = Frames(options.video, options.rate, options.times, options.seconds)
     writer = AnnotatedVideo(options.out / "annotated.mp4", body) if options.annotate else nullcontext()
-    with writer as video, console.status("tracking") as status:
+    length = min(float(np.ptp(measured["t"])), options.seconds or math.inf)  # a film is about as long as its run
+    with writer as video, progress(console) as tell:
 
         def watch(frame: VideoFrame, sample: Sample) -> None:
+            nonlocal began
+            began = frame.time if began is None else began
             if video is not None:
                 video.add(frame, sample)
             if frame.index % 30 == 0:
-                status.update(f"tracking, frame {frame.index}: {sample.status}")
+                tell("", f"tracking: frame {frame.index}, {sample.status}", min((frame.time - began) / length, 0.99))
 
         return analyse(
             frames, measured, camera, body, floor, options.robot, options.offset, options.origin, watch, options.around

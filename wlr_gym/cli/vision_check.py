@@ -10,13 +10,15 @@ import tyro
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.options import JsonOption
+from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
     from wlr_gym.perception.vision.sheet_check import SheetCheck
 
 
 @dataclass(frozen=True)
-class VisionCheckOptions:
+class VisionCheckOptions(JsonOption):
     """Sheets in one photograph.
 
     Attributes:
@@ -56,10 +58,18 @@ def run(options: VisionCheckOptions) -> int:
     if image is None:
         raise InputError(f"{options.photo}: no such picture, or it cannot be read as one")
     checks = check_sheets(grey(image), camera, targets)
+    if options.json:
+        print_json([_content(check) for check in checks])
     for check in checks:
         print(_line(check))
         print("".join(f"  {warning}\n" for warning in check.warnings), end="")
     return FAILED if any(check.warnings for check in checks) else OK
+
+
+def _content(check: SheetCheck) -> dict[str, object]:
+    """Return a check as JSON has it: m, shares."""
+    names = ("seen", "fault", "stretch", "stretch_std", "difference_std", "misfit", "warnings")
+    return {"target": check.target.name, "markers": len(check.target.markers), **{name: getattr(check, name) for name in names}}
 
 
 def _line(check: SheetCheck) -> str:

@@ -69,7 +69,7 @@ def test_exports_overwrite_nothing(tmp_path, capsys):
     assert main(["export", str(runs[0]), "--to", "mcap", "--out", str(out)]) == OK
     first = (out / "run_01.mcap").read_bytes()
     assert main(["export", str(runs[1]), "--to", "mcap", "--out", str(out)]) == BAD_INPUT
-    assert "run_01.mcap: is there already" in capsys.readouterr().err
+    assert "run_01.mcap: exists; choose another name" in capsys.readouterr().err
     assert (out / "run_01.mcap").read_bytes() == first
 
 

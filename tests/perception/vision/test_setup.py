@@ -348,7 +348,7 @@ def test_bad_input_is_named(arguments, message, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_bench_reports_every_bar(tmp_path):
     file = tmp_path / "bench.json"
-    assert main(["bench", "vision", "--quick", "--rounds", "1", "--json", str(file)]) == 0
+    assert main(["bench", "vision", "--quick", "--rounds", "1", "--save", str(file)]) == 0
     rows = json.loads(file.read_text())["vision"]
     assert {row["method"].split()[0] for row in rows} == {"ours", "paper's", "tags"}
     assert all(row["met"] for row in rows if row["bar"] is not None and "frames per second" not in row["what"])

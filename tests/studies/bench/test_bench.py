@@ -26,7 +26,7 @@ from wlr_gym.studies.bench.mujoco_loop import MujocoLoopPlant
 )
 def test_measurement_runs_and_reports(name, tmp_path, capsys):
     file = tmp_path / "bench.json"
-    assert main(["bench", "--quick", "--rounds", "1", "--only", name, "--json", str(file)]) == 0
+    assert main(["bench", "--quick", "--rounds", "1", "--only", name, "--save", str(file)]) == 0
     assert name in capsys.readouterr().out
     report = json.loads(file.read_text())
     assert report["schema"] == 1

@@ -117,7 +117,7 @@ def test_command_reports_both_systems(monkeypatch, tmp_path):
     monkeypatch.setattr(sysid_rig, "rig_contest", lambda seconds: toy_contest("pendulum"))
     monkeypatch.setattr(sysid_robot, "robot_contest", lambda seconds: toy_contest("robot"))
     file = tmp_path / "bench.json"
-    assert main(["bench", "--rounds", "1", "--only", "sysid", "--json", str(file)]) == 0
+    assert main(["bench", "--rounds", "1", "--only", "sysid", "--save", str(file)]) == 0
     found = json.loads(file.read_text())["measurements"]
     assert [row["bar"] for row in found if row["peer"]] == [1.0, None, 1.0, None]
     assert {row["what"].split(",")[0] for row in found} == {"pendulum", "robot"}

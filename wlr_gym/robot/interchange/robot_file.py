@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.settings import overlay, parse_config
 from wlr_gym.robot.description import Robot, load_robot
 
@@ -74,7 +75,6 @@ def new_file(path: Path, *, force: bool) -> None:
     Raises:
         InputError: naming it.
     """
-    if path.exists() and not force:
-        raise InputError(f"--out {path}: exists; choose another name, or replace it with --force")
+    refuse_existing(path, force)
     if not path.parent.is_dir():
         raise InputError(f"--out {path}: folder {path.parent} does not exist")

@@ -8,7 +8,7 @@ numbers. What is reported are the ranges of all draws that give all four at once
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,6 +97,7 @@ def search(
     seed: int = 0,
     candidates: Sequence[SlipCandidate] = CANDIDATES,
     threads: int = 2,
+    tell: Callable[[float], None] = lambda share: None,
 ) -> list[SearchFinding]:
     """Try every candidate alone, every pair, then the pairs that came closest together with every third.
 
@@ -111,12 +112,14 @@ def search(
         seed: another seed, other draws.
         candidates: what to try.
         threads: of the engine.
+        tell: told the share of the batches that are driven.
 
     Returns:
         One finding per combination; no choice is made among them.
     """
     findings: list[SearchFinding] = []
     matched: list[_Trial] = []
+    driven, batches = itertools.count(1), levels * (ROUNDS + 2) + 1
     for level in range(1, levels + 1):
         if level < 3:
             combos = list(itertools.combinations(candidates, level))
@@ -124,13 +127,16 @@ def search(
             combos = _extended(_survivors([found for found in findings if len(found.names) == 2]), candidates)
         trials = [_Trial(combo, generator(seed, "paper", *(c.name for c in combo)), draws) for combo in combos]
         _drive_all(robot, trials, threads)
+        tell(next(driven) / batches)
         for turn in range(ROUNDS):
             near = {found.names for found in _survivors([trial.finding() for trial in trials])}
             chosen = [trial for trial in trials if trial.names in near]
             for trial in chosen:
                 trial.close_in(4 * draws, 0.2 / 2.0**turn)
             _drive_all(robot, chosen, threads)
+            tell(next(driven) / batches)
         _drive_again(robot, trials, threads)
+        tell(next(driven) / batches)
         matched += [trial for trial in trials if trial.matches]
         findings += [trial.finding() for trial in trials]
     _spread(robot, matched, 16 * draws, threads)

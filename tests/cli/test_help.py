@@ -1,0 +1,87 @@
+"""What ``--help`` shows on a terminal of 80 columns, and what completes commands and options in a shell."""
+
+import contextlib
+import io
+import re
+import shutil
+import subprocess
+
+import pytest
+
+from wlr_gym import cli
+from wlr_gym.cli import parsing
+
+WORDS = [[name] for name in cli.COMMANDS] + [list(words) for words in cli.NESTED]
+WORDS += [[name, word] for name in ("robot", "calibrate") for word in cli.options_of(name)]
+
+
+@pytest.fixture(params=WORDS, ids=" ".join, scope="module")
+def shown(request):
+    out = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):
+        patch.setenv("COLUMNS", "80")
+        with pytest.raises(SystemExit, match="0"):
+            cli.main([*request.param, "--help"])
+    return out.getvalue()
+
+
+def test_help_fits_80_columns(shown):
+    assert max(map(len, shown.splitlines())) <= 80
+
+
+def test_help_has_no_markup_and_no_types_of_python(shown):
+    assert not re.search(r"`|\*\*|:\w+:|\{None\}|None|\(\)|True|False", shown)
+
+
+def test_a_default_is_said_once(shown):
+    for option in re.split(r"\n(?=  (?:-|\[|[A-Z]))", shown):
+        described = " ".join(option.split())
+        assert not ("(default:" in described and re.search(r"[^(]default[ :]", described.partition("(default:")[0])), described
+        assert described.count("(default:") <= 1, described
+
+
+def test_every_option_is_described(shown):
+    for line in re.findall(r"\n  (?:--\S.*|\[?[A-Z]+\]?(?: \.\.\.\]?)?)(?=\n)", shown.partition("\n options\n")[2]):
+        following = shown.partition(line)[2]
+        assert re.match(r"\n {8,}\S", following), line
+
+
+def test_own_options_come_before_shared_ones():
+    names = list(parsing.options_of(cli.options_of("evaluate")))
+    assert names[0] == "policy"
+    assert names[-2:] == ["effects", "sensors"]
+
+
+def test_usage_fits_80_columns(capsys):
+    cli.main([])
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("shell", parsing.SHELLS)
+def test_a_shell_takes_the_completion(shell, capsys, tmp_path):
+    assert cli.main(["--completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert all(word in script for word in ("evaluate", "--episodes", "calibrate", "joints"))
+    if program := shutil.which(shell):
+        file = tmp_path / "wlr"
+        file.write_text(script)
+        subprocess.run([program, "-n", str(file)], check=True, timeout=60)
+
+
+def test_bash_completes_commands_and_options(capsys, tmp_path):
+    if shutil.which("bash") is None:
+        pytest.skip("no bash here")
+    cli.main(["--completion", "bash"])
+    (tmp_path / "wlr").write_text(capsys.readouterr().out)
+    ask = 'source "$0"; {}; COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); _tyro_wlr; printf "%s\\n" "${{COMPREPLY[@]}}"'
+    for words, expected in (("wlr ev", "evaluate"), ("wlr evaluate --epi", "--episodes"), ("wlr calibrate jo", "joints")):
+        script = ask.format(f"COMP_WORDS=({words})")
+        answer = subprocess.run(
+            ["bash", "-c", script, str(tmp_path / "wlr")], capture_output=True, text=True, check=True, timeout=60
+        )
+        assert expected in answer.stdout.split(), (words, answer.stdout)
+
+
+def test_an_unknown_shell_is_refused(capsys):
+    assert cli.main(["--completion", "tcsh"]) == 2
+    assert "expected one of bash, zsh, fish" in capsys.readouterr().err

@@ -1,0 +1,160 @@
+"""``--json``: valid JSON on the standard output and nothing else; ``--force``: nothing is replaced without it."""
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wlr_gym import cli
+from wlr_gym.cli import main, parsing
+from wlr_gym.cli.results import only_results, plain, print_json
+
+#: Commands that end in no results: they run until they are ended, or ask their way through.
+WITHOUT_RESULTS = {
+    "play",
+    "view",
+    "emulate",
+    "calibrate servo",
+    "calibrate joints",
+    "calibrate imu",
+    "calibrate flow",
+    "robot new",
+}
+
+
+def all_options():
+    for name in (*cli.COMMANDS, *("_".join(words) for words in cli.NESTED)):
+        kind = cli.options_of(name)
+        if isinstance(kind, dict):
+            yield from ((f"{name} {word}", one) for word, (one, _) in kind.items())
+        else:
+            yield name, kind
+
+
+def test_every_command_with_results_has_json():
+    lacking = {name for name, kind in all_options() if "json" not in parsing.options_of(kind)}
+    assert lacking == WITHOUT_RESULTS
+
+
+@dataclass
+class Found:
+    path: Path
+    value: float
+
+
+def test_json_has_no_numbers_that_are_not_finite(capsys):
+    print_json({"found": Found(Path("a/b"), math.nan), "array": np.array([1.0, np.inf]), "count": np.int64(3), 4: (True, None)})
+    assert json.loads(capsys.readouterr().out) == {
+        "found": {"path": "a/b", "value": None}, "array": [1.0, None], "count": 3, "4": [True, None],
+    }  # fmt: skip
+    with pytest.raises(TypeError, match="JSON has no such value"):
+        plain(object())
+
+
+def test_only_results_reach_the_standard_output(capsys):
+    with only_results(True):
+        print("a message")
+        print_json([1])
+    print("later")
+    shown = capsys.readouterr()
+    assert shown.out == "[\n  1\n]\nlater\n"
+    assert shown.err == "a message\n"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["envs"],
+        ["envs", "WLR-Velocity-v0"],
+        ["effects"],
+        ["effects", "backlash"],
+        ["effects", "check", "worn_wheels"],
+        ["robot", "show"],
+        ["robot", "check"],
+        ["record", "--list"],
+        ["doctor", "--emulated"],
+        ["evaluate", "do_nothing", "--baselines", "--episodes", "2", "--randomization", "none"],
+    ],
+    ids=" ".join,
+)
+def test_the_output_is_json(words, capsys):
+    main([*words, "--json"])
+    assert json.loads(capsys.readouterr().out)
+
+
+def test_json_of_a_mistake_is_nothing(capsys):
+    assert main(["evaluate", "pdi", "--json"]) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert "did you mean 'pid'?" in shown.err
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    words = ["--excitation", "straight", "--backend", "gibbs_appell", "--seconds", "1", "--json"]
+    assert main(["record", *words, "--out", str(folder)]) == 0
+    return folder
+
+
+def refused(words, capsys, *, option="--out"):
+    """Run a command twice: the second time it is refused, and what is there is as before."""
+    assert main(words) == 0
+    out = Path(words[words.index(option) + 1])
+    before = {path: path.read_bytes() for path in ([out] if out.is_file() else out.rglob("*")) if path.is_file()}
+    capsys.readouterr()
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert f"{option} {out}" in error
+    assert "exists; choose another name, or replace it with --force" in error
+    assert before == {path: path.read_bytes() for path in before}
+    assert main([*words, "--force"]) == 0
+
+
+def test_a_card_is_not_replaced(tmp_path, capsys):
+    words = ["evaluate", "do_nothing", "--baselines", "--episodes", "2", "--randomization", "none", "--no-progress"]
+    refused([*words, "--out", str(tmp_path / "card")], capsys)
+
+
+def test_a_replay_is_not_replaced(tmp_path, runs, capsys):
+    refused(["replay", str(runs), "--no-plots", "--out", str(tmp_path / "replayed")], capsys)
+
+
+def test_exported_runs_are_not_replaced(tmp_path, runs, capsys):
+    pytest.importorskip("mcap")
+    refused(["export", str(runs), "--to", "rosbag2", "--out", str(tmp_path / "bags")], capsys)
+
+
+def test_a_comparison_is_not_replaced(tmp_path, capsys):
+    words = ["compare", "--excitation", "straight", "--seconds", "0.2", "--no-plots"]
+    refused([*words, "--plants", "gibbs_appell", "gibbs_appell:physics_step=0.0005", "--out", str(tmp_path / "c")], capsys)
+
+
+def test_setpoints_are_not_replaced(tmp_path, capsys):
+    refused(["record", "--excitation", "straight", "--commands-only", "--out", str(tmp_path / "motions")], capsys)
+
+
+def test_a_film_is_not_replaced(tmp_path, capsys):
+    words = ["play", "--seconds", "0.1", "--size", "64", "64", "--randomization", "none"]
+    refused([*words, "--video", str(tmp_path / "film.webp")], capsys, option="--video")
+
+
+def test_an_analysis_a_policy_and_a_picture_are_not_replaced(tmp_path, runs, capsys):
+    for name in ("report/result.json", "mine.onnx", "page.png", "demo/demo.html", "paper/report.md", "bench.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("{}")
+    (tmp_path / "demo" / "provenance.yaml").write_text("{}")
+    for words in (
+        ["gap", str(runs), "--out", str(tmp_path / "report")],
+        ["export", "velocity_blind", "--out", str(tmp_path / "mine.onnx")],
+        ["envs", "WLR-Velocity-v0", "--picture", str(tmp_path / "page.png")],
+        ["robot", "show", "--picture", str(tmp_path / "page.png")],
+        ["demo", "--quick", "--out", str(tmp_path / "demo")],
+        ["paper", "--out", str(tmp_path / "paper")],
+        ["bench", "import", "--save", str(tmp_path / "bench.json")],
+    ):
+        assert main(words) == 2, words
+        assert "exists; choose another name, or replace it with --force" in capsys.readouterr().err, words

@@ -1,0 +1,96 @@
+"""Mistakes that a newcomer makes: one line that names what was wrong, what was expected, and the nearest valid name."""
+
+import gymnasium
+import pytest
+import yaml
+
+from wlr_gym.cli import main
+
+COMMANDS = {
+    "a command": (["trian"], "unknown command 'trian' (did you mean 'train'?)"),
+    "a command of a command": (["robot", "shwo"], "unknown command of wlr robot 'shwo' (did you mean 'show'?)"),
+    "an option": (["evaluate", "pid", "--epsiodes", "3"], "unknown option '--epsiodes' (did you mean '--episodes'?)"),
+    "one dash": (["record", "-list"], "unknown option '-list' (did you mean '--list'?)"),
+    "a number in words": (["evaluate", "pid", "--episodes", "ten"], "--episodes ten: expected a whole number"),
+    "half a number": (["play", "--seconds", "1,5"], "--seconds 1,5: expected a number"),
+    "no value": (["evaluate", "pid", "--env"], "--env: expected a value"),
+    "one value of two": (["play", "--size", "640"], "--size: expected 2 values: INT INT"),
+    "a value that is none": (
+        ["evaluate", "pid", "--sensors", "camra"],
+        "unknown value 'camra' (did you mean 'camera'?)",
+    ),
+    "what must be there": (["compare"], "expected --out PATH; see: wlr compare --help"),
+    "nothing to work on": (["gap", "--out", "x"], "expected DATA"),
+    "too many words": (["envs", "WLR-Path-v0", "WLR-Slope-v0"], "more words than it takes: WLR-Slope-v0; see: wlr envs --help"),
+    "a value of a switch": (["evaluate", "pid", "--full=yes"], "--full takes no value"),
+    "a policy": (["evaluate", "pdi"], "did you mean 'pid'?"),
+    "an environment": (["train", "WLR-Velocty-v0"], "did you mean 'WLR-Velocity-v0'?"),
+    "a setting": (["train", "--set", "learning_rat=1"], "did you mean 'learning_rate'?"),
+    "an effect": (["effects", "stribek"], "did you mean 'stribeck_friction'?"),
+    "an effect where a patch goes": (["evaluate", "pid", "--effects", "backlash"], "'backlash' is an effect"),
+    "a robot": (["robot", "show", "nominall"], "did you mean 'nominal'?"),
+    "a motion": (["record", "--excitation", "strait", "--out", "x"], "did you mean 'straight'?"),
+    "a shell": (["--completion", "bsh"], "expected one of bash, zsh, fish"),
+}
+
+
+@pytest.mark.parametrize(("words", "expected"), COMMANDS.values(), ids=COMMANDS)
+def test_a_mistake_on_the_command_line(words, expected, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if words[0] == "train":
+        pytest.importorskip("torch")
+    assert main(words) == 2
+    shown = capsys.readouterr()
+    assert expected in shown.err
+    assert shown.err.strip().splitlines()[-1].startswith("wlr: ")
+    assert "Traceback" not in shown.err
+    assert not shown.out.strip()
+    assert not list(tmp_path.iterdir())
+
+
+KEYWORDS = {
+    "an option": ({"bakend": "mujoco"}, "did you mean 'backend'?"),
+    "a simulator": ({"backend": "mujco"}, "did you mean 'mujoco'?"),
+    "a randomization": ({"randomization": "wyde"}, "did you mean 'wide'?"),
+    "a robot": ({"robot": "nominall"}, "did you mean 'nominal'?"),
+    "a precision": ({"precision": "float16"}, "valid: float64, float32"),
+    "a time in words": ({"episode_length": "long"}, "episode_length = 'long': expected a time above 0 s"),
+    "a task": ({"task": "velocty"}, "did you mean 'velocity'?"),
+    "an effect where a patch goes": ({"effects": ["backlash"]}, "'backlash' is an effect"),
+    "what an effect acts on": (
+        {"effects": [{"name": "weak_motor", "where": ["wheel_fl"], "parameters": {"scale": 0.9}}]}, "did you mean 'wheel_lf'?",
+    ),
+    "what an effect has": (
+        {"effects": [{"name": "weak_motor", "where": ["wheel_lf"], "parameters": {"scal": 0.9}}]}, "did you mean 'scale'?",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("keywords", "expected"), KEYWORDS.values(), ids=KEYWORDS)
+def test_a_mistake_in_make(keywords, expected):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - InputError, or what Gymnasium makes of it
+        gymnasium.make("WLR-Velocity-v0", **keywords)
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (
+            {"effects": [{"name": "weak_moter", "where": ["wheel_lf"], "parameters": {"scale": 0.9}}]},
+            "did you mean 'weak_motor'?",
+        ),
+        ({"effect": []}, "did you mean 'effects'?"),
+        ({"effects": [{"name": "weak_motor", "where": ["wheel_lf"], "parameters": {"scale": "0,9"}}]}, "scale"),
+    ],
+    ids=["a name", "a key", "a number"],
+)
+def test_a_mistake_in_a_file(content, expected, tmp_path, capsys):
+    file = tmp_path / "mine.yaml"
+    file.write_text(yaml.safe_dump(content))
+    assert main(["effects", "check", str(file)]) == 2
+    error = capsys.readouterr().err
+    assert expected in error
+    assert str(file) in error
+    assert error.count("\n") == 1
