@@ -109,7 +109,9 @@ def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
         travel = velocity - yaw_rate * side
         rolling = ops.clip(forward - turn * side, travel - allowed, travel + allowed)
         inward = gain("legs_inward") * front
-        reach, reach_rate = (inward, 0.0) if motion.sweeping else _reach_under(signals, f"{name}[{LEGS[index]}]", index, shifted)
+        reach, reach_rate = (
+            (inward, 0.0) if motion.sweeping else _reach_under(signals, f"{name}[{LEGS[index]}]", index, shifted)
+        )
         offset = offset + reach + lean
         rate = rate + reach_rate
         setpoint = offset
