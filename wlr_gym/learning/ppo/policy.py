@@ -165,7 +165,7 @@ def policy_keywords(config: PpoConfig, contract: Mapping[str, Any]) -> dict[str,
     from torch import nn
 
     activation = {"tanh": nn.Tanh, "elu": nn.ELU, "relu": nn.ReLU}[config.activation]
-    keywords = {"net_arch": list(config.hidden_layers), "activation_fn": activation, "log_std_init": config.initial_log_std}
+    keywords = {"net_arch": list(config.hidden_layers), "activation_fn": activation}
     if not _is_layered(config):
         return keywords
     from wlr_gym.learning.ppo.layers import Layers, controller_columns

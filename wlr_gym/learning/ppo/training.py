@@ -140,6 +140,8 @@ def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
         device="cpu",
         **mirrored_samples(config, asymmetric=asymmetric),
     )
+    with torch.no_grad():
+        model.policy.get_parameter("log_std").copy_(torch.tensor(config.initial_log_stds()))
     if config.mirror:
         set_mirror(model.rollout_buffer, env)
     return model
