@@ -159,6 +159,14 @@ def test_episodes_of_the_robots_end_at_different_times():
     assert ended == [2] * 30
 
 
+def test_exploration_noise_of_legs_and_wheels_can_differ():
+    env = Sb3VecEnv(ENVIRONMENT, 2)
+    config = PpoConfig(num_envs=2, steps_per_env=8, batch_size=16, initial_log_std=(-4.0, -2.0))
+    noise = make_model(env, config).policy.get_parameter("log_std").tolist()
+    env.close()
+    assert noise == [-4.0] * 4 + [-2.0] * 4
+
+
 def test_a_run_with_a_curriculum_resumes_exactly(tmp_path):
     curriculum = {"commands": {"start": 0.1, "steps": 384}, "randomization": {"start": 0.1, "steps": 384}}
     settings = {"environment": SETTINGS["environment"] | {"task": {"curriculum": curriculum}}}
