@@ -150,7 +150,8 @@ class PidGains(SettingsModel):
         lateral: yaw rate per lateral error, rad/(m s). heading: yaw rate per heading error, 1/s.
         uphill: yaw rate per specific force to the left, rad s/m: turns the robot uphill on a slope.
         legs_inward: rad by which the legs reach under the body: a shorter wheelbase turns with less slip.
-        lean_time: s from the start of an episode in which they do, evenly; at once, they jerk the body.
+        lean_time: s that they take for it, evenly, from where they stand when an episode begins; at once, they jerk the body.
+            0 = at once, as always where legs sweep.
         leg_i: on the integral of the error of a leg's measured angle, 1/s: servos give way to loads. Only where legs sweep.
         integral_limit: bound of the corrections by integrals, m/s, rad/s and rad.
     """
@@ -217,7 +218,7 @@ class Integral:
 
 
 class Pid:
-    """The controller; integrals and the time since the start of each robot's episode are what it remembers."""
+    """The controller; integrals and how far the legs reach under the body are what it remembers."""
 
     def __init__(self, contract: Mapping[str, Any], config: PidConfig, agent: str = "pid") -> None:
         self.config = config
@@ -237,26 +238,38 @@ class Pid:
         period = contract["control_period"]
         self._yaw_rate_integral = Integral(config.yaw_rate_i, period, config.integral_limit)
         self._velocity_integral = Integral(config.velocity_i, period, config.integral_limit)
-        sweeping = f"leg_reference[{LEGS[0]}]" in read
-        self._leg_integral = Integral(config.leg_i if sweeping else 0.0, period, config.integral_limit)
-        self._clock = Integral(1.0, period, np.inf)
+        self._sweeping = f"leg_reference[{LEGS[0]}]" in read
+        self._leg_integral = Integral(config.leg_i if self._sweeping else 0.0, period, config.integral_limit)
+        self._period = period
+        self._sees_legs = f"leg_position[{LEGS[0]}]" in read
+        self._sent: Array = np.zeros((0, 4))
 
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return actions (N, 8) for observations (N, D)."""
         forward, turn = self.motion(observations)
-        lean, lean_rate = self._lean(len(observations))
-        legs = self.legs(observations) + lean
+        reach, reach_rate = self._reach_under(observations)
+        legs = self.legs(observations) + reach
         rolling = self.rolling_speed(observations, forward, turn)
-        wheels = self.chassis.wheel_rate(rolling, legs, self.leg_rate(observations) + lean_rate)
+        wheels = self.chassis.wheel_rate(rolling, legs, self.leg_rate(observations) + reach_rate)
         return self.chassis.actions(legs + self._leg_integral.add(legs - self.leg_angle(observations)), wheels)
 
-    def _lean(self, count: int) -> tuple[Array, Array]:
-        """Return by how much the legs reach under the body after this step (N, 4), rad, and how fast they move, rad/s."""
-        config, period = self.config, self._clock.step
-        done = self._clock.add(np.ones(count))
-        share = np.minimum(done / max(config.lean_time, period), 1.0)
-        rate = np.where(config.lean_time - done > -0.5 * period, config.legs_inward / max(config.lean_time, period), 0.0)
-        return config.legs_inward * share[:, None] * self.chassis.front, rate[:, None] * self.chassis.front
+    def _reach_under(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
+        """Return how far the legs reach under the body after this step (N, 4), rad from home, and how fast they move, rad/s."""
+        config = self.config
+        wanted = np.broadcast_to(config.legs_inward * self.chassis.front, (len(observations), 4))
+        if config.lean_time == 0.0 or self._sweeping:
+            return wanted, np.zeros(wanted.shape)
+        if len(self._sent) != len(observations):
+            self._sent = np.full(wanted.shape, np.nan)
+        before = np.where(np.isnan(self._sent), self._leg_error(observations), self._sent)
+        step = abs(config.legs_inward) * self._period / max(config.lean_time, self._period)
+        self._sent = before + np.clip(wanted - before, -step, step)
+        return self._sent, (self._sent - before) / self._period
+
+    def _leg_error(self, observations: NDArray[np.floating]) -> Array:
+        """Return how far the legs stand from home (N, 4), rad; zeros where they are not observed."""
+        angle = self.leg_angle(observations)
+        return angle - self.chassis.robot.home.leg_angle if self._sees_legs else np.zeros(angle.shape)
 
     def motion(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
         """Return the forward velocity and turn (N,) to roll at: what is wanted, with corrections."""
@@ -289,7 +302,8 @@ class Pid:
         self._yaw_rate_integral.reset(mask)
         self._velocity_integral.reset(mask)
         self._leg_integral.reset(mask)
-        self._clock.reset(mask)
+        if len(self._sent) == len(mask):
+            self._sent[mask] = np.nan
 
 
 def task_settings(model: type[Settings], contract: Mapping[str, Any], config: Mapping[str, Any], agent: str) -> Settings:

@@ -111,6 +111,31 @@ def test_legs_reach_under_the_body_evenly_from_the_start():
     assert (np.sign(leaned[-1]) == [1, 1, -1, -1]).all() or (np.sign(leaned[-1]) == [1, -1, 1, -1]).all()
 
 
+def test_legs_are_not_thrown_from_where_an_episode_begins():
+    """The first leg setpoints are where the legs stand; on they go at the rate of the gain."""
+    changes = {
+        "latency": PROMPT,
+        "controller": {"legs_inward": 0.2, "lean_time": 1.0},
+        "observations": {"velocity_controller": {}},
+    }
+    start = {"name": "crooked", "base": "none", "initial_state": {"leg_angle": 0.1}}
+    core = make_core("WLR-Velocity-v0", 3, {"task": changes, "randomization": start})
+    columns = [k for k, column in enumerate(core.task.policy) if column.term == "velocity_controller"]
+    for row in range(3):
+        core.seed(row, row)
+    core.begin_episodes(core.everyone)
+    stand, sent = core.state.joint_position[:, :4] - core.task.robot.home.leg_angle, []
+    for _ in range(100):
+        action = core.observation[:, columns[: len(JOINTS)]].copy()
+        sent.append(action[:, :4] * core.task.actions[0].scale)
+        core.step(action, core.everyone)
+    core.close()
+    assert np.ptp(stand) > 0.05
+    assert np.abs(sent[0] - stand).max() < 0.2 * 0.02 + 0.002  # the encoder's resolution
+    assert np.abs(np.diff(sent, axis=0)).max() < 0.2 * 0.02 + 1e-6
+    np.testing.assert_allclose(np.abs(sent[-1]), 0.2, atol=1e-6)
+
+
 def test_legs_that_sweep_are_held_against_loads():
     """With the integral the servos' sag under load goes from the legs' angles; without it, it stays."""
     errors = {}

@@ -15,7 +15,10 @@ from waiting import wait_until
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
+from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.ppo.config import PpoConfig
+from wlr_gym.learning.ppo.training import begin_episodes, make_model
 from wlr_gym.learning.ppo.training_log import TrainingLog
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
@@ -133,8 +136,6 @@ def test_a_plant_whose_state_cannot_be_set_is_trained_on_and_resumed_with_new_ep
 
 def test_the_environment_is_told_how_far_training_is(run, tmp_path, monkeypatch):
     """Before the first episodes and every update, after a resume too: curricula follow it."""
-    from wlr_gym.envs import Sb3VecEnv
-
     told = []
     monkeypatch.setattr(Sb3VecEnv, "set_progress", lambda env, steps: told.append(steps))
     train(tmp_path / "run")
@@ -143,6 +144,27 @@ def test_the_environment_is_told_how_far_training_is(run, tmp_path, monkeypatch)
     told.clear()
     train(tmp_path / "run", resume=True)
     assert told == [256, 320]
+
+
+def test_episodes_of_the_robots_end_at_different_times():
+    """Each robot starts anew once per length of an episode, a like number of them in every step, from the first episode on."""
+    env = Sb3VecEnv(ENVIRONMENT, 20, episode_length=0.2)
+    model = make_model(env, PpoConfig(num_envs=20, steps_per_env=8, batch_size=32))
+    begin_episodes(model, env, 0)
+    ended = []
+    for _ in range(30):
+        env.step_async(np.zeros((20, 8), np.float32))
+        ended.append(env.step_wait()[2].sum())
+    env.close()
+    assert ended == [2] * 30
+
+
+def test_exploration_noise_of_legs_and_wheels_can_differ():
+    env = Sb3VecEnv(ENVIRONMENT, 2)
+    config = PpoConfig(num_envs=2, steps_per_env=8, batch_size=16, initial_log_std=(-4.0, -2.0))
+    noise = make_model(env, config).policy.get_parameter("log_std").tolist()
+    env.close()
+    assert noise == [-4.0] * 4 + [-2.0] * 4
 
 
 def test_a_run_with_a_curriculum_resumes_exactly(tmp_path):

@@ -1,5 +1,6 @@
 """Scores on held-out episodes while training, and starts from trained policies."""
 
+import json
 import os
 import pickle
 import random
@@ -134,14 +135,35 @@ def test_a_start_from_a_run_is_that_run_to_the_bit(run, tmp_path):
     assert settings["learning_rate"] == settings["final_learning_rate"] == 1e-4
 
 
-def test_a_start_from_a_file_acts_like_it(run, tmp_path):
-    """The critic is fitted first: its steps count, the actor stays, and the noise is small."""
-    from wlr_gym.learning.ppo.policy import LOG_STD
-
-    file = tmp_path / "policy.onnx"
+def exported(run, file):
     core = make_core(ENVIRONMENT, 4, {})
     export_policy(run, file, core.observation.copy())
     core.close()
+    return file
+
+
+def test_a_start_from_a_file_is_that_run_to_the_bit(run, tmp_path):
+    """A policy file holds critic and exploration noise too."""
+    file = exported(run, tmp_path / "policy.onnx")
+    policy = wlr_gym.train(ENVIRONMENT, tmp_path / "more", init=file, settings={"total_steps": 1}, max_seconds=1e-9)
+    assert_same_weights(policy, run / "policy")
+
+
+def test_a_start_from_a_file_without_a_critic_acts_like_it(run, tmp_path):
+    """The critic is fitted first: its steps count, the actor stays, and the noise is small."""
+    import onnx
+
+    from wlr_gym.learning.ppo.policy import LOG_STD
+    from wlr_gym.policy.onnx_file import CONTRACT_KEY, seal
+
+    file = exported(run, tmp_path / "policy.onnx")
+    model = onnx.load(file)
+    content = json.loads({one.key: one.value for one in model.metadata_props}[CONTRACT_KEY])
+    acting_only = [one for one in model.graph.initializer if not one.name.startswith("learner.")]
+    assert len(acting_only) < len(model.graph.initializer)
+    del model.graph.initializer[:]
+    model.graph.initializer.extend(acting_only)
+    file.write_bytes(seal(model.SerializeToString(), content))
     policy = wlr_gym.train(ENVIRONMENT, tmp_path / "more", init=file, settings={"total_steps": 1}, max_seconds=1e-9)
     first, second = weights(run / "policy"), weights(policy)
     acting = [name for name in first if name.startswith(("mlp_extractor.policy_net", "action_net"))]

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from wlr_gym.base.settings import SettingsModel
+from wlr_gym.robot import LEGS, WHEELS
 
 
 class PpoConfig(SettingsModel):
@@ -29,7 +30,7 @@ class PpoConfig(SettingsModel):
         normalise: bring the observations to mean 0 and deviation 1, as the untrained policy meets them, inside the network.
         residual: the network's output times this is added to the action of the task's ``controller``; None = no controller.
         mirror: learn from the left-right mirror image of every other sample.
-        initial_log_std: logarithm of the exploration noise at the start, in actions.
+        initial_log_std: logarithm of the exploration noise at the start, in actions: of all joints, or of (legs, wheels).
         teacher: agent whose actions the actor learns before PPO starts (``warm_start.py``); None = from nothing.
         evaluate_every: environment steps between scores on held-out episodes (``held_out.py``); 0 = never.
         evaluation_episodes: how many these are.
@@ -63,7 +64,7 @@ class PpoConfig(SettingsModel):
     mirror: bool = False
     hidden_layers: tuple[int, ...] = (64, 64)
     activation: Literal["tanh", "elu", "relu"] = "tanh"
-    initial_log_std: float = 0.0
+    initial_log_std: float | tuple[float, float] = 0.0
     teacher: str | None = None
     evaluate_every: int = Field(500_000, ge=0)
     evaluation_episodes: int = Field(64, gt=0)
@@ -72,6 +73,12 @@ class PpoConfig(SettingsModel):
     torch_threads: int = Field(1, gt=0)
     environment: dict[str, Any] = Field(default_factory=dict)
     tasks: dict[str, dict[str, Any]] = Field(default_factory=dict)
+
+    def initial_log_stds(self) -> tuple[float, ...]:
+        """Return the logarithm of the exploration noise of each joint at the start."""
+        given = self.initial_log_std
+        legs, wheels = given if isinstance(given, tuple) else (given, given)
+        return (legs,) * len(LEGS) + (wheels,) * len(WHEELS)
 
     @model_validator(mode="after")
     def _whole_batches(self) -> PpoConfig:

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from wlr_gym.learning.ppo.policy import ACTOR
+
 if TYPE_CHECKING:
     import onnx
+
+
+#: Before the names of weights that do not act.
+LEARNER = "learner."
 
 
 def to_onnx(actor: torch.nn.Module, width: int) -> bytes:
@@ -35,6 +41,22 @@ def to_onnx(actor: torch.nn.Module, width: int) -> bytes:
         )
     assert program is not None
     return _bare(program.model_proto).SerializeToString(deterministic=True)
+
+
+def with_learner(graph: bytes, weights: Mapping[str, torch.Tensor]) -> bytes:
+    """Return an ONNX model that also holds what only a training needs: critic and exploration noise, as constants nobody reads.
+
+    Args:
+        graph: serialised model. weights: of the whole network, by their names in it.
+    """
+    import onnx
+    from onnx import numpy_helper
+
+    model = onnx.load_from_string(graph)
+    for name, value in weights.items():
+        if not name.startswith(ACTOR):
+            model.graph.initializer.append(numpy_helper.from_array(value.numpy(), LEARNER + name))
+    return model.SerializeToString(deterministic=True)
 
 
 def _bare(model: onnx.ModelProto) -> onnx.ModelProto:

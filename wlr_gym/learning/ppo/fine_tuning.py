@@ -6,11 +6,11 @@ from pathlib import Path
 
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.save_util import load_from_zip_file
 
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.ppo.config import PpoConfig
-from wlr_gym.learning.ppo.policy import MODEL_FILE, actor, contract_to_start_from, load_actor
+from wlr_gym.learning.ppo.export import LEARNER
+from wlr_gym.learning.ppo.policy import ACTOR, actor, contract_to_start_from, load_actor, saved_weights
 from wlr_gym.learning.ppo.warm_start import fit_critic
 from wlr_gym.policy import check_contract, find_policy, load_policy
 
@@ -23,24 +23,24 @@ def start_from(model: PPO, env: Sb3VecEnv, config: PpoConfig, source: str | Path
     """
     place = find_policy(source)
     check_contract(contract_to_start_from(source)["environment"], env.contract(), str(source))
-    weights = _weights(place)
-    own = model.policy.state_dict()
-    if weights.keys() == own.keys() and all(weights[name].shape == own[name].shape for name in own):
-        model.policy.load_state_dict(weights)
-        return
-    if place.is_file():
-        actor(model.policy).load_state_dict(weights)
+    acting, learner = _file_weights(place) if place.is_file() else (None, saved_weights(place))
+    if acting is None:
+        load_actor(model.policy, learner)
     else:
-        load_actor(model.policy, weights)
-    fit_critic(model, env, config, load_policy(source, env.contract()))
+        actor(model.policy).load_state_dict(acting)
+    own = model.policy.state_dict()
+    rest = {name: learner[name] for name in own if not name.startswith(ACTOR) and name in learner}
+    if all(name in rest and rest[name].shape == value.shape for name, value in own.items() if not name.startswith(ACTOR)):
+        model.policy.load_state_dict({**own, **rest})
+    else:
+        fit_critic(model, env, config, load_policy(source, env.contract()))
 
 
-def _weights(place: Path) -> dict[str, torch.Tensor]:
-    """Return the weights of a policy folder, all of the network, or of a policy file, those that act."""
-    if not place.is_file():
-        return load_from_zip_file(place / MODEL_FILE, device="cpu", load_data=False)[1]["policy"]  # type: ignore[return-value]
+def _file_weights(place: Path) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    """Return the weights of a policy file: those that act, as the graph names them, and those that a training needs."""
     import onnx
     from onnx import numpy_helper
 
-    initializers = onnx.load(place).graph.initializer
-    return {one.name: torch.from_numpy(numpy_helper.to_array(one).copy()) for one in initializers if one.name[0].isdigit()}
+    constants = {one.name: torch.from_numpy(numpy_helper.to_array(one).copy()) for one in onnx.load(place).graph.initializer}
+    acting = {name: value for name, value in constants.items() if name[0].isdigit()}
+    return acting, {name.removeprefix(LEARNER): value for name, value in constants.items() if name.startswith(LEARNER)}

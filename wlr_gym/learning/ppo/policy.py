@@ -67,28 +67,32 @@ def load_policy(folder: Path, contract: Mapping[str, Any]) -> PpoPolicy:
         InputError: the model file is absent, broken, or of another network.
     """
     network = _network(contract["environment"], parse_settings(contract["config"]))
-    path = folder / MODEL_FILE
-    from stable_baselines3.common.save_util import load_from_zip_file
-
     try:
-        _, parameters, _ = load_from_zip_file(path, device="cpu", load_data=False)
-        load_actor(network, parameters["policy"])  # type: ignore[arg-type]
+        load_actor(network, saved_weights(folder))
     except Exception as error:  # zip, pickle and torch each raise their own kinds for a broken file
-        raise InputError(f"{path}: not a readable model: {error}") from None
+        raise InputError(f"{folder / MODEL_FILE}: not a readable model: {error}") from None
     return PpoPolicy(network)
 
 
+def saved_weights(folder: Path) -> Mapping[str, Any]:
+    """Return the weights of the whole network in a policy folder, by their names."""
+    from stable_baselines3.common.save_util import load_from_zip_file
+
+    return load_from_zip_file(folder / MODEL_FILE, device="cpu", load_data=False)[1]["policy"]  # type: ignore[return-value]
+
+
 def export_network(folder: Path, contract: Mapping[str, Any]) -> bytes:
-    """Return the ONNX model of the trained policy of a folder: observations (N, D) to actions (N, 8).
+    """Return the ONNX model of the trained policy of a folder: observations (N, D) to actions (N, 8); see ``with_learner``.
 
     Raises:
         MissingPackageError: a package is not installed.
     """
     require_package("torch", "train")
     require_package("onnxscript", "export")
-    from wlr_gym.learning.ppo.export import to_onnx
+    from wlr_gym.learning.ppo.export import to_onnx, with_learner
 
-    return to_onnx(actor(load_policy(folder, contract).network), len(contract["environment"]["observation"]))
+    graph = to_onnx(actor(load_policy(folder, contract).network), len(contract["environment"]["observation"]))
+    return with_learner(graph, saved_weights(folder))
 
 
 def settings_to_start_from(source: str | Path) -> dict[str, Any]:
@@ -165,7 +169,7 @@ def policy_keywords(config: PpoConfig, contract: Mapping[str, Any]) -> dict[str,
     from torch import nn
 
     activation = {"tanh": nn.Tanh, "elu": nn.ELU, "relu": nn.ReLU}[config.activation]
-    keywords = {"net_arch": list(config.hidden_layers), "activation_fn": activation, "log_std_init": config.initial_log_std}
+    keywords = {"net_arch": list(config.hidden_layers), "activation_fn": activation}
     if not _is_layered(config):
         return keywords
     from wlr_gym.learning.ppo.layers import Layers, controller_columns

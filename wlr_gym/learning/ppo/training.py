@@ -25,6 +25,7 @@ from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.provenance import provenance, record_provenance, write_yaml
 from wlr_gym.envs import Sb3VecEnv
+from wlr_gym.envs.core import Core
 from wlr_gym.learning.ppo import checkpoint
 from wlr_gym.learning.ppo.config import PpoConfig
 from wlr_gym.learning.ppo.curve import Meter, losses
@@ -139,6 +140,8 @@ def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
         device="cpu",
         **mirrored_samples(config, asymmetric=asymmetric),
     )
+    with torch.no_grad():
+        model.policy.get_parameter("log_std").copy_(torch.tensor(config.initial_log_stds()))
     if config.mirror:
         set_mirror(model.rollout_buffer, env)
     return model
@@ -221,7 +224,16 @@ def begin_episodes(model: PPO, env: Sb3VecEnv, seed: int) -> None:
     env.set_progress(model.num_timesteps)
     env.seed(int(np.random.SeedSequence([seed, model.num_timesteps]).generate_state(1, np.uint32)[0]))
     model._last_obs = env.reset()
+    spread_ends(env.core)
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+
+
+def spread_ends(core: Core) -> None:
+    """Let the present episodes of N robots end evenly over the length of an episode.
+
+    Otherwise all robots start anew in the same update, a start is in one update of some thirty, and each update unlearns it.
+    """
+    core.episodes.steps[:] = np.arange(core.count) * core.limit // core.count
 
 
 def update(model: PPO, meter: Meter, config: PpoConfig) -> dict[str, float]:

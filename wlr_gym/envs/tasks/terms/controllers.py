@@ -96,20 +96,24 @@ def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
     velocity_integral = _integral(signals, velocity_integral, gain("velocity_i") * error)
     forward = motion.forward + gain("velocity_p") * error + velocity_integral
     share = ops.where_positive(gain("load_shift"), ops.minimum(signals.control_period / gain("load_shift_time"), 1.0), 0.0)
+    shifted = _lean(signals, slip_difference)
     slip_difference = slip_difference + share * (_slip_difference(signals) - slip_difference)
     hip_x, hip_y = signals.robot("hip_position.x"), signals.robot("hip_position.y")
     reach = hip_x * hip_x / hip_y
     allowed = gain("slip_limit") + reach * ops.absolute(turn / ops.maximum(gain("steering"), 1.0))
     lean = _lean(signals, slip_difference)
-    inward, inward_rate = _inward(signals)
     legs, wheels = [], []
     corrections: list[Value] = []
     for index, ((front, left), (offset, rate)) in enumerate(zip(CORNER_SIGNS, motion.legs, strict=True)):
         side = hip_y * left
         travel = velocity - yaw_rate * side
         rolling = ops.clip(forward - turn * side, travel - allowed, travel + allowed)
-        offset = offset + inward * front + lean
-        rate = rate + inward_rate * front
+        inward = gain("legs_inward") * front
+        reach, reach_rate = (
+            (inward, 0.0) if motion.sweeping else _reach_under(signals, f"{name}[{LEGS[index]}]", index, shifted)
+        )
+        offset = offset + reach + lean
+        rate = rate + reach_rate
         setpoint = offset
         if motion.sweeping:
             corrections.append(_leg_correction(signals, name, index, offset))
@@ -131,12 +135,21 @@ def _leg_correction(signals: Signals, name: str, leg: int, offset: Value) -> Val
     return _integral(signals, signals.remembered(f"{name}[{LEG_MEMORY[leg]}]"), signals.gain("leg_i") * error)
 
 
-def _inward(signals: Signals) -> tuple[Value, Value]:
-    """Angle (rad) by which the legs reach under the body after the next step, and how fast they move (rad/s)."""
-    wanted, within, period = signals.gain("legs_inward"), signals.gain("lean_time"), signals.control_period
-    longest = ops.maximum(within, period)
-    share = ops.minimum((signals.time + period) / longest, 1.0)
-    return wanted * share, ops.where_positive(within - signals.time - 0.5 * period, wanted / longest, 0.0)
+def _reach_under(signals: Signals, action: str, leg: int, shifted: Value) -> tuple[Value, Value]:
+    """How far a leg reaches under the body after the next step (rad from home), and how fast it moves (rad/s).
+
+    Args:
+        action: name of the leg's action in what the controller remembers: it says where the leg was sent.
+        leg: index. shifted: what of that was load shift, rad.
+    """
+    gain, period = signals.gain, signals.control_period
+    wanted, within = gain("legs_inward") * CORNER_SIGNS[leg][0], gain("lean_time")
+    start = signals.sensors("joint_position")[LEG_SLICE][leg] - signals.robot("home.leg_angle")
+    sent = signals.remembered(action) * signals.task("action.leg_scale") - shifted
+    before = ops.where_positive(signals.time - 0.5 * period, sent, start)
+    step = ops.absolute(wanted) * period / ops.maximum(within, period)
+    after = before + ops.clip(wanted - before, 0.0 - step, step)
+    return ops.where_positive(within, after, wanted), ops.where_positive(within, (after - before) / period, 0.0)
 
 
 def _integral(signals: Signals, value: Value, rate: Value) -> Value:

@@ -1,0 +1,140 @@
+"""The result tables of docs/learning.md: kept in docs/data/learning.json, from trained seeds of each recipe.
+
+``python .ci/docs/learning.py TASK POLICIES BLIND`` scores the seeds of a task's slip-aware recipe (a folder or pattern of run
+folders) and of its blind one beside the hand-written controllers, as ``wlr evaluate`` does, row by row, and takes the numbers
+over; without arguments only the tables are written anew. An interrupted scoring goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.base.provenance import git_commit
+from wlr_gym.learning.evaluation.card import Card
+from wlr_gym.learning.evaluation.scoring import evaluate
+from wlr_gym.learning.evaluation.statistics import Estimate
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ROOT / "docs" / "data" / "learning.json"
+PAGE = ROOT / "docs" / "learning.md"
+EPISODES = 256
+CONTROLLERS = ("slip_compensating", "pid")
+#: Policies are named so in data and tables.
+OURS, BLIND = "ours", "blind"
+LATE = {"name": "slippery, 40 ms late", "base": "slippery", "events": {"command_delay": {"distribution": "uniform", "operation": "set", "low": 0.04, "high": 0.04}}}
+#: Task -> sensors that a robot has ("none", "camera" or "flow"), and floors.
+ROWS: Mapping[str, tuple[tuple[str, Any], ...]] = {
+    "velocity": (
+        *(("none", floors) for floors in ("slippery", "ice", "split", "patches", "nominal", "wide", "stripes", "ribbed")),
+        *(("camera", floors) for floors in ("slippery", "ice", "split", "patches", "wide", LATE)),
+        ("flow", "slippery"),
+    ),
+    "path": (
+        *(("none", floors) for floors in ("slippery", "split")),
+        *(("camera", floors) for floors in ("slippery", "nominal", "split", "ice")),
+        ("flow", "slippery"),
+    ),
+    "posture": tuple((sensors, floors) for sensors in ("camera", "none") for floors in ("asymmetric", "nominal")),
+    "slope": (("none", "slope"), ("camera", "slope")),
+}
+_TITLES = ("robot has", "floors", "tracking error", "median seed, spread", "success (%)", "slip (mm/s)", "`blind`, better (%)")
+_TITLES += ("`slip_compensating`, better (%)", "`pid`, better (%)", "slips less than blind (%)", "than `pid` (%)")
+
+
+# ---- scoring ---------------------------------------------------------------------------------------------------------
+
+
+def score(task: str, ours: str, blind: str) -> None:
+    """Score what is not scored yet of a task; every row is written when it is done."""
+    data = read_data()
+    recipes = {OURS: ours, BLIND: blind}
+    if data.get(task, {}).get("recipes") != recipes:
+        data[task] = {"recipes": recipes, "commit": git_commit(), "date": str(datetime.date.today()), "rows": []}
+    rows = data[task]["rows"]
+    for sensors, floors in ROWS[task][len(rows) :]:
+        card = evaluate(
+            f"{OURS}={ours}",
+            f"WLR-{task.title()}-v0",
+            baselines=[f"{BLIND}={blind}", *CONTROLLERS],
+            episodes=EPISODES,
+            randomization=floors,
+            sensors=() if sensors == "none" else (sensors,),
+            precision="float32",
+        )
+        rows.append(row_of(card, sensors, floors if isinstance(floors, str) else floors["name"]))
+        DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+        print(" | ".join(cells(rows[-1])), flush=True)
+
+
+def row_of(card: Card, sensors: str, floors: str) -> dict[str, Any]:
+    """Return the numbers of a row."""
+    scores, better, seeds = card.scores["main"], card.comparison["main"], card.seed_scores
+    row: dict[str, Any] = {"sensors": sensors, "floors": floors}
+    row |= {key: _numbers(scores[OURS][key]) for key in ("tracking_error", "success", "slip_speed")}
+    if OURS in seeds:
+        row |= {"median": seeds[OURS].median("tracking_error"), "spread": seeds[OURS].spread("tracking_error")}
+    row["others"] = {
+        name: {
+            "tracking_error": scores[name]["tracking_error"].mean,
+            "slip_speed": scores[name]["slip_speed"].mean,
+            "better": _numbers(better[name]["tracking_error"]),
+            "slips_less": _numbers(better[name]["slip_speed"]),
+        }
+        for name in (BLIND, *CONTROLLERS)
+    }
+    return row
+
+
+def _numbers(estimate: Estimate) -> list[float]:
+    return [estimate.mean, estimate.low, estimate.high]
+
+
+# ---- tables ----------------------------------------------------------------------------------------------------------
+
+
+def table(task: Mapping[str, Any]) -> list[str]:
+    """Return the table of a task as lines of Markdown."""
+    lines = [f"| {' | '.join(_TITLES)} |", "|---" * len(_TITLES) + "|"]
+    return [*lines, *(f"| {' | '.join(cells(row))} |" for row in task["rows"])]
+
+
+def cells(row: Mapping[str, Any]) -> list[str]:
+    """Return the cells of a row."""
+    error, low, high = row["tracking_error"]
+    others = row["others"]
+    spread = f"{row['median']:.3f}, {row['spread']:.0f} %" if "median" in row else "-"
+    found = ["neither" if row["sensors"] == "none" else row["sensors"], row["floors"]]
+    found += [f"**{error:.3f} [{low:.3f}, {high:.3f}]**", spread, f"{row['success'][0]:.0f}", f"{1000 * row['slip_speed'][0]:.1f}"]
+    found += [f"{others[name]['tracking_error']:.3f}, {_percent(others[name]['better'])}" for name in (BLIND, *CONTROLLERS)]
+    return found + [_percent(others[name]["slips_less"]) for name in (BLIND, "pid")]
+
+
+def _percent(numbers: list[float]) -> str:
+    mean, low, high = (f"{value:.0f}".replace("-", "\N{MINUS SIGN}") for value in numbers)
+    return f"{mean} [{low}, {high}]"
+
+
+def write_page(text: str, data: Mapping[str, Any]) -> str:
+    """Return the page with the tables of the data between their marks."""
+    for task, found in data.items():
+        before, rest = text.split(f"<!-- results of {task}: made by .ci/docs/learning.py -->\n", 1)
+        _, after = rest.split(f"<!-- end of {task} -->", 1)
+        text = f"{before}<!-- results of {task}: made by .ci/docs/learning.py -->\n"
+        text += "\n".join(["", *table(found), "", f"<!-- end of {task} -->"]) + after
+    return text
+
+
+def read_data() -> dict[str, Any]:
+    """Return the kept numbers: task -> recipes, commit, date, rows."""
+    return json.loads(DATA.read_text(encoding="utf-8")) if DATA.is_file() else {}
+
+
+if __name__ == "__main__":
+    if sys.argv[1:]:
+        score(*sys.argv[1:])
+    PAGE.write_text(write_page(PAGE.read_text(encoding="utf-8"), read_data()), encoding="utf-8")
