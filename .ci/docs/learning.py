@@ -26,7 +26,11 @@ EPISODES = 256
 CONTROLLERS = ("slip_compensating", "pid")
 #: Policies are named so in data and tables.
 OURS, BLIND = "ours", "blind"
-LATE = {"name": "slippery, 40 ms late", "base": "slippery", "events": {"command_delay": {"distribution": "uniform", "operation": "set", "low": 0.04, "high": 0.04}}}
+LATE = {
+    "name": "slippery, 40 ms late",
+    "base": "slippery",
+    "events": {"command_delay": {"distribution": "uniform", "operation": "set", "low": 0.04, "high": 0.04}},
+}
 #: Task -> sensors that a robot has ("none", "camera" or "flow"), and floors.
 ROWS: Mapping[str, tuple[tuple[str, Any], ...]] = {
     "velocity": (
@@ -109,7 +113,8 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     others = row["others"]
     spread = f"{row['median']:.3f}, {row['spread']:.0f} %" if "median" in row else "-"
     found = ["neither" if row["sensors"] == "none" else row["sensors"], row["floors"]]
-    found += [f"**{error:.3f} [{low:.3f}, {high:.3f}]**", spread, f"{row['success'][0]:.0f}", f"{1000 * row['slip_speed'][0]:.1f}"]
+    found += [f"**{error:.3f} [{low:.3f}, {high:.3f}]**", spread]
+    found += [f"{row['success'][0]:.0f}", f"{1000 * row['slip_speed'][0]:.1f}"]
     found += [f"{others[name]['tracking_error']:.3f}, {_percent(others[name]['better'])}" for name in (BLIND, *CONTROLLERS)]
     return found + [_percent(others[name]["slips_less"]) for name in (BLIND, "pid")]
 

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from wlr_gym.learning.ppo.policy import ACTOR
-
 if TYPE_CHECKING:
     import onnx
 
@@ -47,15 +45,14 @@ def with_learner(graph: bytes, weights: Mapping[str, torch.Tensor]) -> bytes:
     """Return an ONNX model that also holds what only a training needs: critic and exploration noise, as constants nobody reads.
 
     Args:
-        graph: serialised model. weights: of the whole network, by their names in it.
+        graph: serialised model. weights: those that do not act, by their names in the network.
     """
     import onnx
     from onnx import numpy_helper
 
     model = onnx.load_from_string(graph)
     for name, value in weights.items():
-        if not name.startswith(ACTOR):
-            model.graph.initializer.append(numpy_helper.from_array(value.numpy(), LEARNER + name))
+        model.graph.initializer.append(numpy_helper.from_array(value.numpy(), LEARNER + name))
     return model.SerializeToString(deterministic=True)
 
 

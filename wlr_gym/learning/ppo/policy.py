@@ -92,7 +92,8 @@ def export_network(folder: Path, contract: Mapping[str, Any]) -> bytes:
     from wlr_gym.learning.ppo.export import to_onnx, with_learner
 
     graph = to_onnx(actor(load_policy(folder, contract).network), len(contract["environment"]["observation"]))
-    return with_learner(graph, saved_weights(folder))
+    weights = saved_weights(folder)
+    return with_learner(graph, {name: value for name, value in weights.items() if not name.startswith(ACTOR)})
 
 
 def settings_to_start_from(source: str | Path) -> dict[str, Any]:
