@@ -47,11 +47,11 @@ def test_finished_films_are_not_made_again(tmp_path, monkeypatch):
     pytest.importorskip("imageio_ffmpeg")
     made = []
     monkeypatch.setattr(lab_films, "measure_film", lambda film: made.append(film.index) or result(film))
-    first = run_lab_films(tmp_path, 3, lambda text: None)
+    first = run_lab_films(tmp_path, 3, say=lambda text: None)
     (tmp_path / "film_01.json").unlink()
     broken = json.loads((tmp_path / "film_02.json").read_text())
     broken["film"]["speed"] = 1.0  # of another plan
     (tmp_path / "film_02.json").write_text(json.dumps(broken))
-    again = run_lab_films(tmp_path, 3, lambda text: None)
+    again = run_lab_films(tmp_path, 3, say=lambda text: None)
     assert made == [0, 1, 2, 1, 2]
     assert [r.worst for r in again] == [r.worst for r in first]
