@@ -42,10 +42,21 @@ def test_jitter_of_the_times_is_told_from_noise_and_widens_along_the_motion(driv
     assert after[2, 2] < 4 * before[2, 2]
 
 
-def test_a_repeated_picture_has_no_pose_unless_the_robot_stands(drive):
-    places = np.cumsum([0, 3, 3, 0, 6, 3, 0, 0, 0])
+@pytest.mark.parametrize(
+    ("steps", "repeated"),
+    [
+        ([3, 3, 0, 6, 3, 0, 0, 0], [3]),
+        ([0.3, 0.3, 0.002, 0.6, 0.3], [3]),  # hardly moving
+        ([0.02, 0.01, -0.001, 0.03, -0.02], []),  # standing, with noise
+        ([0.6, 0.3, 0.01, -0.3, -0.6], []),  # turning back
+        ([0.3, 0.2, 0.08, 0.2, 0.3], []),  # slower for a moment
+    ],
+    ids=["fast", "slow", "standing", "turning back", "slower"],
+)
+def test_a_repeated_picture_has_no_pose_unless_the_robot_stands(steps, repeated, drive):
+    places = np.cumsum([0, *steps])
     samples = [replace(s, centres=np.full((4, 2), float(p))) for s, p in zip(samples_of(drive), places, strict=False)]
-    assert [k for k, sample in enumerate(without_repeats(samples)) if sample.status == REPEATED] == [3]
+    assert [k for k, sample in enumerate(without_repeats(samples)) if sample.status == REPEATED] == repeated
 
 
 def test_time_that_is_lost_without_a_trace_shows_against_the_gyroscope(drive):

@@ -28,8 +28,8 @@ _JITTERS = np.array([0.0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 6, 8, 12]) * 1e-3
 _FACTORS = 0.6 * 1.15 ** np.arange(15)
 #: Twice the gain in log likelihood that an error of the times must bring.
 _WORTH = 12.0
-#: px; markers that move by less than the first between frames that move by more than the second are the picture before.
-_SAME, _MOVING = 0.1, 0.5
+#: px, and share of the steps before and after, that markers move by at most in a picture shown once more; px, of those steps.
+_SAME, _SAME_SHARE, _MOVING = 0.1, 0.2, 0.1
 #: rad, and sigmas, by which the camera's turns may differ from the gyroscope's.
 _TURN_ERROR, _TURN_SIGMAS = 0.006, 6.0
 _TOGETHER = 5  # frames over which that difference is averaged
@@ -69,12 +69,23 @@ def widened(samples: Sequence[Sample], noise: FrameNoise) -> tuple[Sample, ...]:
 
 
 def without_repeats(samples: Sequence[Sample]) -> Iterator[Sample]:
-    """Take the pose off frames that show the picture before once more, while the robot moves."""
-    steps = np.array([_step(a, b) for a, b in pairwise(samples)])
+    """Take the pose off frames that show the picture before once more, while robot or camera move.
+
+    The markers then stay for a step between two steps the same way; where a motion turns back, these are opposite.
+    """
+    steps = [b.centres - a.centres for a, b in pairwise(samples)]
     for k, sample in enumerate(samples):
         inside = 2 <= k < len(samples) - 1
-        repeated = inside and steps[k - 1] < _SAME and steps[k - 2] > _MOVING and steps[k] > _MOVING
-        yield without_pose(sample, REPEATED) if repeated else sample
+        yield without_pose(sample, REPEATED) if inside and _stays(*steps[k - 2 : k + 1]) else sample
+
+
+def _stays(before: Array, step: Array, after: Array) -> bool:
+    known = np.isfinite(before + step + after)
+    if not known.any():
+        return False
+    least = min(float(np.abs(moved[known]).max()) for moved in (before, after))
+    same = min(_SAME, _SAME_SHARE * least)
+    return least > _MOVING and float(np.abs(step[known]).max()) < same and float(before[known] @ after[known]) > 0
 
 
 def turn_difference(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> tuple[float, float] | None:
@@ -125,10 +136,3 @@ def _jitter(rest: Array, edges: Array, late: Array) -> float:
     best = cost.min(axis=0)
     least = int(np.argmin(best))
     return float(_JITTERS[least]) if best[0] - best[least] > _WORTH else 0.0
-
-
-def _step(a: Sample, b: Sample) -> float:
-    """How far (px) the markers moved between two frames; infinite when none is seen in both."""
-    moved = np.linalg.norm(b.centres - a.centres, axis=1)
-    known = moved[np.isfinite(moved)]
-    return float(known.max()) if len(known) else math.inf
