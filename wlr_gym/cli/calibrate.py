@@ -140,8 +140,8 @@ def _shutter(camera: Camera, told: Readout) -> str:
     if camera.readout is None:
         seen = f" (found {1e3 * told.value:.1f} ± {1e3 * told.std:.1f} ms)" if math.isfinite(told.std) else ""
         return (
-            f"readout not known{seen}: films of the robot tell it themselves, a live camera needs it. Calibrate from a video in "
-            "which the board moves to and fro, up and down, or give --readout (0 for a global shutter)"
+            f"readout not known{seen}: films of the robot tell it themselves, a live camera needs it. Calibrate from a video "
+            "in which the board moves to and fro, up and down, or give --readout (0 for a global shutter)"
         )
     known = f" (found {1e3 * told.value:.1f} ± {1e3 * told.std:.1f} ms)" if math.isfinite(told.std) and told.std else " (given)"
     if camera.readout == 0:

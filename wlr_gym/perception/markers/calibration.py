@@ -62,12 +62,10 @@ def calibrate_film(
     views = {k: view for k in middles if (view := found[k]) is not None}
     camera = _calibrated(list(views.values()), len(middles), size, board)
     told = Readout() if readout is None else Readout(readout, 0.0)
-    for _ in range(_TURNS if told.value or readout is None else 0):
+    for _ in range(_TURNS):
         moving = {k: motion for k in views if (motion := _motion(found, k, camera)) is not None}
-        before, told = (
-            told,
-            told if readout is not None else readout_of([(views[k], motion) for k, motion in moving.items()], camera),
-        )
+        before = told
+        told = readout_of([(views[k], motion) for k, motion in moving.items()], camera) if readout is None else told
         still = [at_frame_time(v, moving[k], camera, told.value) if k in moving else v for k, v in views.items()]
         camera = _calibrated(still, len(middles), size, board)
         if abs(told.value - before.value) < _SAME_READOUT:
@@ -88,9 +86,9 @@ def _motion(found: Sequence[BoardView | None], k: int, camera: Camera) -> Array 
 def _calibrated(views: Sequence[BoardView], pictures: int, size: tuple[int, int], board: Board) -> Camera:
     if len(views) < MINIMUM_VIEWS:
         raise InputError(
-            f"the board ({board.kind}, {board.columns} x {board.rows} squares) is seen well in {len(views)} of {pictures} images; "
-            f"at least {MINIMUM_VIEWS} are needed, each with {min(MINIMUM_CORNERS, board.corners)} corners, sharp, from different "
-            "angles"
+            f"the board ({board.kind}, {board.columns} x {board.rows} squares) is seen well in {len(views)} of {pictures} "
+            f"images; at least {MINIMUM_VIEWS} are needed, each with {min(MINIMUM_CORNERS, board.corners)} corners, sharp, "
+            "from different angles"
         )
     object_points = [np.asarray(view.places, np.float32) for view in views]
     image_points = [np.asarray(view.pixels, np.float32) for view in views]

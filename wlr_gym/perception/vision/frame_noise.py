@@ -30,6 +30,7 @@ _FACTORS = 0.6 * 1.15 ** np.arange(15)
 _WORTH = 12.0
 #: px, and share of the steps before and after, that markers move by at most in a picture shown once more; px, of those steps.
 _SAME, _SAME_SHARE, _MOVING = 0.1, 0.2, 0.1
+_MOST_REPEATS = 3  # in a row; then the robot stands
 #: rad, and sigmas, by which the camera's turns may differ from the gyroscope's.
 _TURN_ERROR, _TURN_SIGMAS = 0.006, 6.0
 _TOGETHER = 5  # frames over which that difference is averaged
@@ -71,21 +72,26 @@ def widened(samples: Sequence[Sample], noise: FrameNoise) -> tuple[Sample, ...]:
 def without_repeats(samples: Sequence[Sample]) -> Iterator[Sample]:
     """Take the pose off frames that show the picture before once more, while robot or camera move.
 
-    The markers then stay for a step between two steps the same way; where a motion turns back, these are opposite.
+    The markers then stay for a step, or a few, between two steps the same way; where a motion turns back, these are opposite.
     """
     steps = [b.centres - a.centres for a, b in pairwise(samples)]
+    repeats = {k for first in range(1, len(steps)) for k in _repeats(steps, first)}
     for k, sample in enumerate(samples):
-        inside = 2 <= k < len(samples) - 1
-        yield without_pose(sample, REPEATED) if inside and _stays(*steps[k - 2 : k + 1]) else sample
+        yield without_pose(sample, REPEATED) if k in repeats else sample
 
 
-def _stays(before: Array, step: Array, after: Array) -> bool:
-    known = np.isfinite(before + step + after)
-    if not known.any():
-        return False
-    least = min(float(np.abs(moved[known]).max()) for moved in (before, after))
-    same = min(_SAME, _SAME_SHARE * least)
-    return least > _MOVING and float(np.abs(step[known]).max()) < same and float(before[known] @ after[known]) > 0
+def _repeats(steps: Sequence[Array], first: int) -> range:
+    """Frames that show the picture before once more, where the markers stay from step ``first`` on."""
+    last = first
+    while last < len(steps) and _length(steps[last]) < _SAME:
+        last += 1
+    if not 0 < last - first <= _MOST_REPEATS or last == len(steps):
+        return range(0)
+    before, after = steps[first - 1], steps[last]
+    least = float(np.minimum(_length(before), _length(after)))
+    if not least > _MOVING or max(_length(step) for step in steps[first:last]) > _SAME_SHARE * least:
+        return range(0)
+    return range(first + 1, last + 1) if float(np.nansum(before * after)) > 0 else range(0)
 
 
 def turn_difference(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> tuple[float, float] | None:
@@ -136,3 +142,9 @@ def _jitter(rest: Array, edges: Array, late: Array) -> float:
     best = cost.min(axis=0)
     least = int(np.argmin(best))
     return float(_JITTERS[least]) if best[0] - best[least] > _WORTH else 0.0
+
+
+def _length(step: Array) -> float:
+    """Largest coordinate (px) of the markers' moves between two frames; NaN when no marker is seen in both."""
+    moved = np.abs(step[np.isfinite(step)])
+    return float(moved.max()) if moved.size else math.nan
