@@ -56,6 +56,14 @@ def test_clocks_are_aligned_within_2_ms(turn, seed):
     assert "yaw" in found.parts
 
 
+@pytest.mark.parametrize("pace", [4.0, 8.0, 0.5])
+def test_slow_motion_is_named_with_the_rate_to_give(turn, pace):
+    """A film whose times run slower than the camera's clock did."""
+    samples = [replace(sample, time=pace * sample.time) for sample in samples_of(turn)]
+    with pytest.raises(InputError, match=f"times run {pace:g} times as fast: slow motion.*--rate 30$"):
+        aligned(turn, samples)
+
+
 @pytest.mark.parametrize("offset", [1.2, 2.0, 3.0, -2.5])
 def test_clocks_far_apart_are_refused_and_found_around_a_guess(turn, offset):
     samples = samples_of(turn, offset=offset)
