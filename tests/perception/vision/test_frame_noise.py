@@ -1,12 +1,15 @@
 """Noise, jitter, repeated pictures and lost time of a film, from samples made of a simulated drive; no pictures."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from test_measure import OFFSET, samples_of
 
-from wlr_gym.perception.vision.frame_noise import frame_noise, turn_difference, widened, without_repeats
+from wlr_gym.perception.vision.frame_noise import frame_noise, widened, without_repeats
+from wlr_gym.perception.vision.imu_check import _angle_rates, imu_differences
 from wlr_gym.perception.vision.tracking import REPEATED
 from wlr_gym.robot import load_robot
 from wlr_gym.studies.bench.vision_drives import skid_turn
@@ -63,10 +66,41 @@ def test_a_repeated_picture_has_no_pose_unless_the_robot_stands(steps, repeated,
 
 def test_time_that_is_lost_without_a_trace_shows_against_the_gyroscope(drive):
     samples = samples_of(drive)
-    assert turn_difference(samples, OFFSET, drive.run, drive.robot) is None
+    assert not list(imu_differences(samples, OFFSET, drive.run, drive.robot))
     middle = len(samples) // 2
     late = [*samples[:middle], *(replace(sample, time=sample.time - 0.1) for sample in samples[middle + 3 :])]
-    found = turn_difference(late, OFFSET, drive.run, drive.robot)
-    assert found is not None
-    assert found[0] == pytest.approx(samples[middle].time + OFFSET, abs=1.5)
-    assert found[1] > 0.01
+    found = next(imu_differences(late, OFFSET, drive.run, drive.robot))
+    assert found.axis == "yaw"
+    assert found.time == pytest.approx(samples[middle].time + OFFSET, abs=1.5)
+    assert found.size > 0.01
+
+
+def tilted(samples, tilt, start=-math.inf, stop=math.inf):
+    """With another tilt (yaw, pitch, roll; rad) between two times."""
+    poses = [s.pose + np.concatenate([np.zeros(3), tilt if start < s.time < stop else np.zeros(3)]) for s in samples]
+    return [replace(sample, pose=pose) for sample, pose in zip(samples, poses, strict=True)]
+
+
+@pytest.mark.parametrize(("axis", "tilt"), [("pitch", (0, 0.05, 0)), ("roll", (0, 0, -0.05))])
+def test_a_tilt_that_the_imu_does_not_know_is_found(axis, tilt, drive):
+    """For a second in the drive by the gyroscope, all the time by the accelerometer."""
+    samples = samples_of(drive)
+    middle = samples[len(samples) // 2].time
+    found = list(imu_differences(tilted(samples, np.array(tilt), middle, middle + 1.0), OFFSET, drive.run, drive.robot))
+    assert axis in {difference.axis for difference in found if not difference.level}
+    found = list(imu_differences(tilted(samples, np.array(tilt)), OFFSET, drive.run, drive.robot))
+    assert [(difference.axis, difference.level) for difference in found] == [(axis, True)]
+    assert found[0].size == pytest.approx(0.05, abs=0.01)
+
+
+def test_rates_of_the_angles_are_those_of_a_turning_body():
+    """Against a difference of rotations."""
+    angles, rates, step = np.array([0.4, 0.2, -0.3]), np.array([0.7, -0.4, 0.5]), 1e-6
+    before, after = (rotation_of_angles(*(angles + sign * step / 2 * rates)) for sign in (-1, 1))
+    spin = before.T @ after / step
+    body = np.array([[spin[2, 1], spin[0, 2], spin[1, 0]]])
+    assert _angle_rates(body, angles[[1]], angles[[2]])[:, 0] == pytest.approx(rates, abs=1e-5)
+
+
+def rotation_of_angles(yaw, pitch, roll):
+    return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()

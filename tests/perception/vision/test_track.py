@@ -67,7 +67,7 @@ def test_after_a_jump_the_markers_are_not_taken_for_their_mirror_image(studio, t
 
 def test_the_mirrored_pose_has_the_normal_mirrored_at_the_line_of_sight():
     turn, place = rotation_of(0.4, 0.15) @ np.diag([1.0, -1.0, -1.0]), np.array([0.3, 0.1, 1.5])
-    found = TargetPose(turn, place, np.eye(6), 0.0, np.ones(4, bool))
+    found = TargetPose(turn, place, np.eye(6), np.ones(4, bool), 0.0, 1.0)
     mirrored, same = _mirrored(found)
     sight = place / np.linalg.norm(place)
     assert mirrored[:, 2] == pytest.approx(2 * (turn[:, 2] @ sight) * sight - turn[:, 2])

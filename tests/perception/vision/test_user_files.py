@@ -16,8 +16,16 @@ from wlr_gym.perception.vision.video import Frames, VideoFile
 
 LENS = Camera(width=640, height=480, focal=(620.0, 615.0), centre=(325.0, 236.0))
 COUNT = 10
-CODECS = {"h264": ["-c:v", "libx264", "-pix_fmt", "yuv420p"],
-          "hevc": ["-c:v", "libx265", "-pix_fmt", "yuv420p10le", "-tag:v", "hvc1", "-x265-params", "log-level=none"]}  # fmt: skip
+CODECS = {
+    "h264": ["-c:v", "libx264", "-pix_fmt", "yuv420p"],
+    "hevc": ["-c:v", "libx265", "-pix_fmt", "yuv420p10le", "-tag:v", "hvc1", "-x265-params", "log-level=none"],
+}
+BOARDS = {
+    "chess": Board(6, 5, 0.04, CHESSBOARD),
+    "few": Board(5, 4, 0.045),
+    "many": Board(12, 9, 0.02, dictionary="4X4_100"),
+    "legacy": Board(9, 6, 0.028, LEGACY, marker=0.02),
+}
 
 
 @pytest.fixture(scope="module")
@@ -107,12 +115,10 @@ def test_what_is_known_of_a_readout():
     assert Readout(0.0009, 0.0001).known == 0.0
 
 
-@pytest.mark.parametrize("board", [Board(6, 5, 0.04, CHESSBOARD), Board(5, 4, 0.045), Board(12, 9, 0.02, dictionary="4X4_100"),
-                                   Board(9, 6, 0.028, LEGACY, marker=0.02)], ids=["chess", "few", "many", "legacy"])  # fmt: skip
-def test_boards_of_any_size_calibrate(board):
-    views = [
-        (f.name, f.image) if hasattr(f, "name") else (f"view {f.index}", f.image) for f in board_film(board, LENS, 0.0, 20, 2.0)
-    ]
+@pytest.mark.parametrize("name", BOARDS)
+def test_boards_of_any_size_calibrate(name):
+    board = BOARDS[name]
+    views = [(f"view {frame.index}", frame.image) for frame in board_film(board, LENS, 0.0, 20, 2.0)]
     found = calibrate(views, board)
     assert found.focal == pytest.approx(LENS.focal, rel=0.006)
     assert found.centre == pytest.approx(LENS.centre, abs=4.0)

@@ -95,8 +95,8 @@ def align(time: Array, poses: Array, run: Run, robot: Robot, parameters: Paramet
             raise
         rate = pace / float(np.median(np.diff(time)))
         raise InputError(
-            f"{run.path}: camera and gyroscope see the same turns if the video's times run {pace:g} times as fast: slow motion, or "
-            f"sped up? Give the rate at which it was filmed: --rate {rate:.6g}"
+            f"{run.path}: camera and gyroscope see the same turns if the video's times run {pace:g} times as fast: slow "
+            f"motion, or sped up? Give the rate at which it was filmed: --rate {rate:.6g}"
         ) from error
 
 

@@ -14,10 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.read import Run
 from wlr_gym.perception.vision.tracking import REPEATED, Sample, without_pose
-from wlr_gym.robot import Robot
-from wlr_gym.robot.slip import accumulate
 
 Array = NDArray[np.float64]
 
@@ -31,9 +28,6 @@ _WORTH = 12.0
 #: px, and share of the steps before and after, that markers move by at most in a picture shown once more; px, of those steps.
 _SAME, _SAME_SHARE, _MOVING = 0.1, 0.2, 0.1
 _MOST_REPEATS = 3  # in a row; then the robot stands
-#: rad, and sigmas, by which the camera's turns may differ from the gyroscope's.
-_TURN_ERROR, _TURN_SIGMAS = 0.006, 6.0
-_TOGETHER = 5  # frames over which that difference is averaged
 
 
 @dataclass(frozen=True)
@@ -92,28 +86,6 @@ def _repeats(steps: Sequence[Array], first: int) -> range:
     if not least > _MOVING or max(_length(step) for step in steps[first:last]) > _SAME_SHARE * least:
         return range(0)
     return range(first + 1, last + 1) if float(np.nansum(before * after)) > 0 else range(0)
-
-
-def turn_difference(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> tuple[float, float] | None:
-    """Where (s, servo clock) and by how much (rad) the camera's turns differ from the gyroscope's; None = they agree.
-
-    Constant, drift and scale of the gyroscope are left open.
-    """
-    seen = [sample for sample in samples if math.isfinite(sample.pose[0])]
-    if "gyro_z" not in run or not np.isfinite(run["gyro_z"]).all() or len(seen) < _LEAST_FRAMES:
-        return None
-    time = np.array([sample.time for sample in seen]) + offset
-    inside = (time > run["t"][0]) & (time < run["t"][-1])
-    yaw = np.unwrap([sample.pose[3] for sample in seen])[inside]
-    std = float(np.median([math.sqrt(sample.covariance[3, 3]) for sample in seen]))
-    late = 1 / (2 * math.pi * robot.sensors.imu.bandwidth)
-    turned = np.interp(time[inside], run["t"] - late, accumulate(run["gyro_z"], run["t"]))
-    known = np.column_stack([np.ones(len(yaw)), time[inside], turned])
-    rest = yaw - known @ np.linalg.lstsq(known, yaw, rcond=None)[0]
-    mean = np.convolve(rest, np.full(_TOGETHER, 1 / _TOGETHER), mode="valid")
-    worst = int(np.argmax(np.abs(mean)))
-    limit = max(_TURN_ERROR, _TURN_SIGMAS * std)
-    return (float(time[inside][worst + _TOGETHER // 2]), float(abs(mean[worst]))) if abs(mean[worst]) > limit else None
 
 
 def _signals(seen: Sequence[Sample]) -> tuple[Array, Array, Array, Array]:
