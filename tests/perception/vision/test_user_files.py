@@ -86,7 +86,7 @@ def named(film):
     return ((f"frame {frame.index}", frame.time, frame.image) for frame in film)
 
 
-@pytest.mark.parametrize("readout", [0.0, 0.018, -0.012])
+@pytest.mark.parametrize("readout", [0.018, *(pytest.param(value, marks=pytest.mark.slow) for value in (0.0, -0.012))])
 def test_a_film_of_a_moving_board_tells_the_shutter(readout):
     camera, told = calibrate_film(named(board_film(Board(), LENS, readout, 150)), Board(), 8)
     assert told.std < 3e-4
