@@ -28,6 +28,14 @@ def test_the_plan_fills_the_space_and_repeats():
     floors = np.sort([film.lab.floor_error for film in films])
     assert np.all(np.abs(floors - 0.003 * (np.arange(20) + 0.5) / 20) <= 0.003 / 20)  # one in every twentieth
     assert max(film.lab.readout for film in films) > 0.02
+    assert sum(film.lab.kick is not None for film in films) == 4
+    assert sum(film.lab.doubled > 0 for film in films) == 6
+
+
+def test_another_seed_gives_other_films():
+    films, others = plan(5), plan(5, seed=29)
+    assert not {film.lab.seed for film in films} & {film.lab.seed for film in others}
+    assert [film.lab.floor_error for film in films] != [film.lab.floor_error for film in others]
 
 
 def test_the_score_counts_what_the_bars_are_about():
