@@ -110,6 +110,7 @@ def test_a_board_that_stands_in_every_view_does_not_tell_the_shutter():
 def test_what_is_known_of_a_readout():
     assert Readout().known is None
     assert Readout(0.02, 0.0004).known is None
+    assert Readout(0.2, 0.0001).known is None
     assert Readout(0.02, 0.0001).known == 0.02
     assert Readout(-0.02, 0.0001).known == -0.02
     assert Readout(0.0009, 0.0001).known == 0.0

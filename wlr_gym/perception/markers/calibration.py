@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.perception.markers.boards import MINIMUM_CORNERS, Board
 from wlr_gym.perception.markers.camera import Camera, Quality
-from wlr_gym.perception.markers.shutter import BoardView, Readout, at_frame_time, board_motion, readout_of
+from wlr_gym.perception.markers.shutter import LONGEST, BoardView, Readout, at_frame_time, board_motion, readout_of
 
 Array = NDArray[np.float64]
 
@@ -21,6 +21,8 @@ MINIMUM_VIEWS = 6
 _OUTLYING_VIEW = 3.0
 #: rad rms, of the board's tilts about their mean. Parallel views do not tell the focal length, nor does its sigma tell that.
 _LEAST_TILT = math.radians(8)
+#: s; a readout less certain than this is not followed.
+_LOOSEST_STD = 0.005
 #: Lens and shutter are found in turns, at most so many, until the readout stays (s).
 _TURNS, _SAME_READOUT = 8, 2e-5
 
@@ -60,16 +62,20 @@ def calibrate_film(
     size, found = _find_corners(wanted, board)
     middles = range(0, len(found), min(3, every))
     views = {k: view for k in middles if (view := found[k]) is not None}
-    camera = _calibrated(list(views.values()), len(middles), size, board)
+    camera = plain = _calibrated(list(views.values()), len(middles), size, board)
     told = Readout() if readout is None else Readout(readout, 0.0)
     for _ in range(_TURNS):
         moving = {k: motion for k in views if (motion := _motion(found, k, camera)) is not None}
         before = told
         told = readout_of([(views[k], motion) for k, motion in moving.items()], camera) if readout is None else told
+        if readout is None and not (abs(told.value) < LONGEST and told.std < _LOOSEST_STD):
+            break  # a board that hardly moves
         still = [at_frame_time(v, moving[k], camera, told.value) if k in moving else v for k, v in views.items()]
         camera = _calibrated(still, len(middles), size, board)
         if abs(told.value - before.value) < _SAME_READOUT:
             break
+    if not told.known:
+        camera = plain
     quality = camera.quality and camera.quality.model_copy(update={"readout_std": told.std or None})
     return camera.model_copy(
         update={"readout": told.known, "quality": quality if told.known is not None else camera.quality}

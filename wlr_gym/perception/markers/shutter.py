@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 #: s, 1 sigma up to which a readout counts as known; from where on a shutter is not global, and by so many sigmas.
 LARGEST_STD, LEAST_READOUT, SURE = 0.00025, 0.001, 4.0
+LONGEST = 0.1  # s; longer ones are not readouts
 #: Share of the image's width that corners may move by from the frame before to the frame after; more is another board.
 _LARGEST_MOTION = 0.5
 _FEWEST_VIEWS = 3
@@ -46,7 +47,7 @@ class Readout:
     @property
     def known(self) -> float | None:
         """The readout to write into a camera file, 0 = a global shutter; None = these views do not tell."""
-        if not self.std <= LARGEST_STD:
+        if not (self.std <= LARGEST_STD and abs(self.value) < LONGEST):
             return None
         return self.value if abs(self.value) > max(LEAST_READOUT, SURE * self.std) else 0.0
 

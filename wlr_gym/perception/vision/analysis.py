@@ -106,6 +106,7 @@ class VideoAnalysis:
             "body_lateral_slip_m": float(slip.body_slip[-1, 1]),
             "no_slip_error": slip.no_slip_error,
             "wheels": wheels,
+            "slip_covariance_m2": slip.covariance.tolist(),
             "findings": list(self.findings),
         }
 
