@@ -17,9 +17,10 @@ from camera_rig import FORWARD, TURN, CameraRig, small_camera
 from robot_rig import HARDWARE, ROBOT
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.cli.robot_status import camera_line, camera_state
 from wlr_gym.data.read import read_run
 from wlr_gym.hardware.camera import process
-from wlr_gym.hardware.camera.config import load_camera_file
+from wlr_gym.hardware.camera.config import UNKNOWN_READOUT, load_camera_file
 from wlr_gym.hardware.camera.feed import PoseFeed, RobotPose, scene_pose
 from wlr_gym.hardware.camera.live import LiveCamera
 from wlr_gym.hardware.camera.reading import SIZE, CameraReading, pack, unpack
@@ -32,6 +33,7 @@ from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.log import read_events
 from wlr_gym.hardware.safety import camera as rules
 from wlr_gym.hardware.safety.camera import CameraWatch, camera_statistics
+from wlr_gym.hardware.safety.camera_check import check_camera
 
 PERIOD = 0.02
 HEIGHT = ROBOT.leg.length + ROBOT.wheel.radius - ROBOT.hip_position.z
@@ -330,6 +332,28 @@ def test_the_camera_is_part_of_the_run(tmp_path):
     events = [event["no_pose"] for event in read_events(tmp_path / "run_01.csv") if event["event"] == "camera"]
     assert "the picture is dark or blank: lens covered?" in events
     rig.loop.close()
+
+
+def test_a_camera_whose_readout_is_not_stated_is_doubted(tmp_path):
+    """In the live status, the statistics, the log and the doctor; not where the shutter is known."""
+    known = small_camera(clutter=0, samples=2)
+    unknown = known.model_copy(update={"calibration": known.calibration.model_copy(update={"readout": None})})
+    assert not known.doubt
+    rig = CameraRig(unknown, log=tmp_path, tick=0.004)
+    rig.loop.start()
+    rig.drive(0.1, FORWARD)
+    rig.loop.stop()
+    assert rig.loop.status is not None
+    assert UNKNOWN_READOUT in camera_state(rig.loop.status)
+    assert UNKNOWN_READOUT in camera_line(rig.loop.statistics()["camera"])
+    events = [event for event in read_events(tmp_path / "run_01.csv") if event["event"] == "camera"]
+    assert events[0]["doubt"] == UNKNOWN_READOUT
+    rig.loop.close()
+    assert rig.link.camera is not None
+    shutter = next(check for check in check_camera(rig.link.camera, unknown, rig.link.clock) if check.what == "shutter")
+    assert not shutter.ok
+    assert not shutter.is_fatal
+    assert shutter.found == UNKNOWN_READOUT
 
 
 @pytest.mark.slow

@@ -67,7 +67,7 @@ def test_the_doctor_looks_at_the_camera(capsys, camera_file):
     words = [POLICY, "--emulated", "--camera", str(camera_file), "--json"]
     assert run_command("doctor", words) == OK
     checks = [check for check in json.loads(capsys.readouterr().out) if check["where"].startswith("camera")]
-    assert [check["what"] for check in checks] == ["frames", "rate", "age", "floor", "robot", "accuracy"]
+    assert [check["what"] for check in checks] == ["frames", "rate", "age", "shutter", "floor", "robot", "accuracy"]
     assert all(check["ok"] for check in checks)
 
 

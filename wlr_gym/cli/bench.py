@@ -75,6 +75,8 @@ class BenchOptions(JsonOption, ForceOption):
     """adapt: none, truth, wide, ours, calibrated; default: all."""
     sets: int | None = None
     """gap: data sets (240). vision with --out: films (60)."""
+    seed: int | None = None
+    """vision with --out: of the films (28); another one gives other films."""
     processes: int = 2
     """gap: data sets at a time."""
     ray: tuple[str, ...] | None = None
@@ -201,7 +203,7 @@ def _adapt_study(options: BenchOptions, asked: tuple[str, ...]) -> int:
 
 def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
     """Film a lab that is not perfect; print and write the score."""
-    from wlr_gym.studies.bench.lab_films import FILMS, bars, run_lab_films, score
+    from wlr_gym.studies.bench.lab_films import FILMS, SEED, bars, run_lab_films, score
 
     if asked != ("vision",) or options.out is None:
         raise InputError(f"--out: for gap, adapt or vision, alone; got {', '.join(asked) or 'nothing'}")
@@ -209,9 +211,12 @@ def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
     count = FILMS if options.sets is None else options.sets
     if count < 1:
         raise InputError(f"--sets {count}: expected 1 or more")
-    results = run_lab_films(options.out, count, lambda text: console.print(text, markup=False))
+    seed = SEED if options.seed is None else options.seed
+    if seed < 0:
+        raise InputError(f"--seed {seed}: expected 0 or more")
+    results = run_lab_films(options.out, count, seed, lambda text: console.print(text, markup=False))
     found = score(results)
-    report = {"machine": machine(), "score": found, "films": [asdict(result) for result in results]}
+    report = {"machine": machine(), "seed": seed, "score": found, "films": [asdict(result) for result in results]}
     for path in (options.out / "score.json", *([] if options.save is None else [options.save])):
         write_json(path, report)
     table = Table("what", "found", "bar", "met", box=None, title=f"{count} films of a lab", title_justify="left")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -15,26 +16,41 @@ from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions,
 from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.results import print_json
 
+if TYPE_CHECKING:
+    from wlr_gym.perception.markers.boards import Board
+    from wlr_gym.perception.markers.camera import Camera
+    from wlr_gym.perception.markers.shutter import Readout
+    from wlr_gym.perception.vision.video import Frames
+
 
 @dataclass(frozen=True)
 class CameraOptions(JsonOption, ForceOption):
     """Calibrate a camera from views of the printed board.
 
     Attributes:
-        images: folder of images, or a video, of the board: 15 or more views, tilted, in every corner of the image, sharp.
+        images: folder of images, or a video, of the board: 15 or more views, tilted, in every corner of the image, sharp. In a
+            video a board that moves tells a rolling shutter.
         out: camera file to write (YAML).
+        board: charuco (as written by wlr calibrate targets), charuco-legacy (as OpenCV drew them before 4.6), or chessboard.
         columns: squares of the board along its longer side.
         rows: squares along its shorter side.
         square: side of a square as measured on the print, m.
+        marker: side of a ChArUco board's markers, m; left out, 0.7 of a square.
+        dictionary: of a ChArUco board's markers, as OpenCV names it without DICT_.
         every: use every n-th frame of a video.
+        readout: s from the first row's exposure to the last row's, where it is known; 0 = global shutter.
     """
 
     images: Annotated[str, tyro.conf.Positional]
     out: Path
+    board: Literal["charuco", "charuco-legacy", "chessboard"] = "charuco"
     columns: int = 9
     rows: int = 6
     square: float = 0.028
+    marker: float | None = None
+    dictionary: str = "5X5_100"
     every: int = 15
+    readout: float | None = None
 
 
 @dataclass(frozen=True)
@@ -79,7 +95,7 @@ def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions |
 
 def _camera(options: CameraOptions) -> int:
     from wlr_gym.base.files import refuse_existing
-    from wlr_gym.perception.markers.calibration import Board, calibrate
+    from wlr_gym.perception.markers.boards import Board
     from wlr_gym.perception.markers.camera import save_camera
     from wlr_gym.perception.vision.video import Frames
 
@@ -87,13 +103,14 @@ def _camera(options: CameraOptions) -> int:
         raise InputError(f"--square {options.square:g}: expected metres, as measured on the print (28 mm = 0.028)")
     if min(options.columns, options.rows) < 3 or options.every < 1:
         raise InputError("--columns and --rows: expected 3 or more; --every: 1 or more")
+    if options.readout is not None and not -0.1 < options.readout < 0.1:
+        raise InputError(f"--readout {options.readout:g}: expected seconds, less than 0.1 (20 ms = 0.02)")
     if options.out.suffix not in {".yaml", ".yml"} or not options.out.parent.is_dir():
         raise InputError(f"--out {options.out}: expected a .yaml file in a folder that exists")
     refuse_existing(options.out, options.force)
-    step = 1 if Path(options.images).is_dir() else options.every
+    board = Board(options.columns, options.rows, options.square, options.board, options.marker, options.dictionary)
     frames = Frames(options.images)
-    views = ((f"{options.images}, frame {f.index}", f.image) for f in frames if f.index % step == 0)
-    camera = calibrate(views, Board(options.columns, options.rows, options.square))
+    camera, told = _calibrated(options, frames, board)
     save_camera(options.out, camera)
     quality = camera.quality
     assert quality is not None
@@ -103,6 +120,7 @@ def _camera(options: CameraOptions) -> int:
         f"focal length {camera.focal[0]:.1f}, {camera.focal[1]:.1f} px (± {max(quality.focal_std):.1f}); centre "
         f"{camera.centre[0]:.1f}, {camera.centre[1]:.1f} px (± {max(quality.centre_std):.1f})"
     )
+    print(_shutter(camera, told))
     if frames.missing:
         print(f"the video is cut off or damaged: its last {frames.missing} frames could not be decoded")
     if quality.rms > 0.5:
@@ -113,9 +131,34 @@ def _camera(options: CameraOptions) -> int:
     return OK
 
 
+def _calibrated(options: CameraOptions, frames: Frames, board: Board) -> tuple[Camera, Readout]:
+    from wlr_gym.perception.markers.calibration import calibrate, calibrate_film
+    from wlr_gym.perception.markers.shutter import Readout
+
+    named = ((f"{options.images}, frame {f.index}", f.time, f.image) for f in frames)
+    if not Path(options.images).is_dir():
+        return calibrate_film(named, board, options.every, options.readout)
+    camera = calibrate(((name, image) for name, _, image in named), board)
+    return camera.model_copy(update={"readout": options.readout}), Readout()
+
+
+def _shutter(camera: Camera, told: Readout) -> str:
+    """What is known of the shutter, in words."""
+    if camera.readout is None:
+        seen = f" (found {1e3 * told.value:.1f} ± {1e3 * told.std:.1f} ms)" if math.isfinite(told.std) else ""
+        return (
+            f"readout not known{seen}: films of the robot tell it themselves, a live camera needs it. Calibrate from a video "
+            "in which the board moves to and fro, up and down, or give --readout (0 for a global shutter)"
+        )
+    known = f" (found {1e3 * told.value:.1f} ± {1e3 * told.std:.1f} ms)" if math.isfinite(told.std) and told.std else " (given)"
+    if camera.readout == 0:
+        return f"global shutter{known}"
+    return f"rolling shutter: {1e3 * camera.readout:.1f} ms from the first row to the last{known}"
+
+
 def _targets(options: TargetsOptions) -> int:
     from wlr_gym.base.files import make_output_folder, refuse_existing
-    from wlr_gym.perception.markers.calibration import Board
+    from wlr_gym.perception.markers.boards import Board
     from wlr_gym.perception.markers.targets import load_target
     from wlr_gym.perception.vision.sheets import board_page, target_pages, write_pages
 

@@ -85,6 +85,8 @@ def camera_state(status: RobotStatus) -> str:
     assert camera is not None
     x, y, yaw = camera.pose
     found = f"camera: x {x:+.3f} m  y {y:+.3f} m  yaw {yaw:+.3f} rad, {1e3 * (status.time - camera.time):.0f} ms old"
+    if camera.doubt:
+        found += f"; {camera.doubt}"
     if not camera.reason:
         return found
     return f"{found}; {'wrong: ' if camera.is_wrong else 'no pose: '}{camera.reason}"
@@ -101,4 +103,5 @@ def camera_line(found: dict[str, Any]) -> str:
     reasons = ", ".join(
         f"{reason} {count}" for reason, count in sorted(found["without_pose"].items(), key=lambda item: -item[1])
     )
-    return f"{line}; frames without a believed pose: {reasons or 'none'}"
+    doubt = f"; {found['doubt']}" if "doubt" in found else ""
+    return f"{line}; frames without a believed pose: {reasons or 'none'}{doubt}"

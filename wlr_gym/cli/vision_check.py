@@ -43,21 +43,20 @@ def run(options: VisionCheckOptions) -> int:
         InputError: unreadable photograph, camera or target; wrong image size.
     """
     require_package("cv2", "vision")
-    import cv2
 
     from wlr_gym.perception.vision import load_camera, load_target
     from wlr_gym.perception.vision.sheet_check import check_sheets
-    from wlr_gym.perception.vision.video import grey
+    from wlr_gym.perception.vision.video import read_image
 
     if options.only not in (None, "markers", "floor"):
         raise InputError(f"--only {options.only}: expected markers or floor")
     files = {"markers": options.markers, "floor": options.floor}
     targets = [load_target(file) for name, file in files.items() if options.only in (None, name)]
     camera = load_camera(options.camera)
-    image = cv2.imread(str(options.photo), cv2.IMREAD_GRAYSCALE) if options.photo.is_file() else None
+    image = read_image(options.photo) if options.photo.is_file() else None
     if image is None:
         raise InputError(f"{options.photo}: no such picture, or it cannot be read as one")
-    checks = check_sheets(grey(image), camera, targets)
+    checks = check_sheets(image, camera, targets)
     if options.json:
         print_json([_content(check) for check in checks])
     for check in checks:

@@ -255,7 +255,9 @@ class RunRecorder:
         status = record.status
         if status.camera is not None and status.camera.reason != self._camera:
             self._camera = status.camera.reason
-            self.log.event(status.time, "camera", row=record.count, no_pose=self._camera or None)
+            self.log.event(
+                status.time, "camera", row=record.count, no_pose=self._camera or None, doubt=status.camera.doubt or None
+            )
 
     def _note_flow(self, record: StepRecord) -> None:
         """Write an event where optical flow begins to be missing, for a reason, or is odd, and where it is well again."""

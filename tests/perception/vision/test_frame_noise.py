@@ -1,12 +1,15 @@
 """Noise, jitter, repeated pictures and lost time of a film, from samples made of a simulated drive; no pictures."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from test_measure import OFFSET, samples_of
 
-from wlr_gym.perception.vision.frame_noise import frame_noise, turn_difference, widened, without_repeats
+from wlr_gym.perception.vision.frame_noise import frame_noise, widened, without_repeats
+from wlr_gym.perception.vision.imu_check import _angle_rates, imu_differences
 from wlr_gym.perception.vision.tracking import REPEATED
 from wlr_gym.robot import load_robot
 from wlr_gym.studies.bench.vision_drives import skid_turn
@@ -42,18 +45,62 @@ def test_jitter_of_the_times_is_told_from_noise_and_widens_along_the_motion(driv
     assert after[2, 2] < 4 * before[2, 2]
 
 
-def test_a_repeated_picture_has_no_pose_unless_the_robot_stands(drive):
-    places = np.cumsum([0, 3, 3, 0, 6, 3, 0, 0, 0])
+@pytest.mark.parametrize(
+    ("steps", "repeated"),
+    [
+        ([3, 3, 0, 6, 3, 0, 0, 0], [3]),
+        ([0.3, 0.3, 0.002, 0.6, 0.3], [3]),  # hardly moving
+        ([3, 3, 0, 0, 9, 3, 0, 6, 0, 6], [3, 4, 7, 9]),  # twice in a row, and every other one
+        ([3, 0, 0, 0, 0, 3, 3], []),  # standing for a while
+        ([0.02, 0.01, -0.001, 0.03, -0.02], []),  # standing, with noise
+        ([0.6, 0.3, 0.01, -0.3, -0.6], []),  # turning back
+        ([0.3, 0.2, 0.08, 0.2, 0.3], []),  # slower for a moment
+    ],
+    ids=["fast", "slow", "in a row", "a while", "standing", "turning back", "slower"],
+)
+def test_a_repeated_picture_has_no_pose_unless_the_robot_stands(steps, repeated, drive):
+    places = np.cumsum([0, *steps])
     samples = [replace(s, centres=np.full((4, 2), float(p))) for s, p in zip(samples_of(drive), places, strict=False)]
-    assert [k for k, sample in enumerate(without_repeats(samples)) if sample.status == REPEATED] == [3]
+    assert [k for k, sample in enumerate(without_repeats(samples)) if sample.status == REPEATED] == repeated
 
 
 def test_time_that_is_lost_without_a_trace_shows_against_the_gyroscope(drive):
     samples = samples_of(drive)
-    assert turn_difference(samples, OFFSET, drive.run, drive.robot) is None
+    assert not list(imu_differences(samples, OFFSET, drive.run, drive.robot))
     middle = len(samples) // 2
     late = [*samples[:middle], *(replace(sample, time=sample.time - 0.1) for sample in samples[middle + 3 :])]
-    found = turn_difference(late, OFFSET, drive.run, drive.robot)
-    assert found is not None
-    assert found[0] == pytest.approx(samples[middle].time + OFFSET, abs=1.5)
-    assert found[1] > 0.01
+    found = next(imu_differences(late, OFFSET, drive.run, drive.robot))
+    assert found.axis == "yaw"
+    assert found.time == pytest.approx(samples[middle].time + OFFSET, abs=1.5)
+    assert found.size > 0.01
+
+
+def tilted(samples, tilt, start=-math.inf, stop=math.inf):
+    """With another tilt (yaw, pitch, roll; rad) between two times."""
+    poses = [s.pose + np.concatenate([np.zeros(3), tilt if start < s.time < stop else np.zeros(3)]) for s in samples]
+    return [replace(sample, pose=pose) for sample, pose in zip(samples, poses, strict=True)]
+
+
+@pytest.mark.parametrize(("axis", "tilt"), [("pitch", (0, 0.05, 0)), ("roll", (0, 0, -0.05))])
+def test_a_tilt_that_the_imu_does_not_know_is_found(axis, tilt, drive):
+    """For a second in the drive by the gyroscope, all the time by the accelerometer."""
+    samples = samples_of(drive)
+    middle = samples[len(samples) // 2].time
+    found = list(imu_differences(tilted(samples, np.array(tilt), middle, middle + 1.0), OFFSET, drive.run, drive.robot))
+    assert axis in {difference.axis for difference in found if not difference.level}
+    found = list(imu_differences(tilted(samples, np.array(tilt)), OFFSET, drive.run, drive.robot))
+    assert [(difference.axis, difference.level) for difference in found] == [(axis, True)]
+    assert found[0].size == pytest.approx(0.05, abs=0.01)
+
+
+def test_rates_of_the_angles_are_those_of_a_turning_body():
+    """Against a difference of rotations."""
+    angles, rates, step = np.array([0.4, 0.2, -0.3]), np.array([0.7, -0.4, 0.5]), 1e-6
+    before, after = (rotation_of_angles(*(angles + sign * step / 2 * rates)) for sign in (-1, 1))
+    spin = before.T @ after / step
+    body = np.array([[spin[2, 1], spin[0, 2], spin[1, 0]]])
+    assert _angle_rates(body, angles[[1]], angles[[2]])[:, 0] == pytest.approx(rates, abs=1e-5)
+
+
+def rotation_of_angles(yaw, pitch, roll):
+    return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()

@@ -56,6 +56,34 @@ def test_clocks_are_aligned_within_2_ms(turn, seed):
     assert "yaw" in found.parts
 
 
+def test_the_wheels_errors_are_correlated_as_the_covariance_says(turn):
+    """Against the errors of other draws of the frames' noise; its diagonal is that of the sigmas."""
+    draws = [
+        measure_slip(samples_of(turn, seed=seed), OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+        for seed in range(8)
+    ]
+    truth = true_slip(turn, draws[0].time)[-1].ravel()
+    errors = np.stack([found.slip[-1].ravel() - truth for found in draws])
+    root = np.linalg.cholesky(draws[0].covariance)
+    whitened = np.linalg.solve(root, (errors - errors.mean(axis=0)).T)
+    assert 0.5 < np.sqrt(np.mean(whitened**2)) < 1.5
+    lateral = draws[0].covariance[1::2, 1::2]
+    assert np.all(lateral > 0.8 * lateral[0, 0])  # all wheels are off alike
+    with_layout = measure_slip(
+        samples_of(turn), OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot), 0.0, (0.002, 0.003)
+    )
+    std = np.hypot(with_layout.slip_std, with_layout.slip_layout_std)[-1].ravel()
+    assert np.sqrt(np.diag(with_layout.covariance)) == pytest.approx(std, rel=1e-6)
+
+
+@pytest.mark.parametrize("pace", [4.0, 8.0, 0.5])
+def test_slow_motion_is_named_with_the_rate_to_give(turn, pace):
+    """A film whose times run slower than the camera's clock did."""
+    samples = [replace(sample, time=pace * sample.time) for sample in samples_of(turn)]
+    with pytest.raises(InputError, match=f"times run {pace:g} times as fast: slow motion.*--rate 30$"):
+        aligned(turn, samples)
+
+
 @pytest.mark.parametrize("offset", [1.2, 2.0, 3.0, -2.5])
 def test_clocks_far_apart_are_refused_and_found_around_a_guess(turn, offset):
     samples = samples_of(turn, offset=offset)

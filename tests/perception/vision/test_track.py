@@ -9,8 +9,9 @@ from vision_studio import Studio, hand, pose_of, wrapped
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.perception.markers.camera import Camera
-from wlr_gym.perception.scene import ScenePose
-from wlr_gym.perception.vision.tracking import LOST, MOVED, OK, PARTIAL, Tracker, VideoFrame, locate_floor, track
+from wlr_gym.perception.markers.pose import TargetPose
+from wlr_gym.perception.scene import ScenePose, rotation_of
+from wlr_gym.perception.vision.tracking import LOST, MOVED, OK, PARTIAL, Tracker, VideoFrame, _mirrored, locate_floor, track
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +53,26 @@ def test_45_degrees():
         assert np.hypot(*(sample.pose[:2] - moving(index).position[:2])) < 0.6e-3
         yaw = math.atan2(moving(index).rotation[1, 0], moving(index).rotation[0, 0])
         assert abs(math.degrees(wrapped(sample.pose[3] - yaw))) < 0.03
+
+
+def test_after_a_jump_the_markers_are_not_taken_for_their_mirror_image(studio, tracker):
+    """A frame comes twice, so the next is predicted wrongly; every later one still has the right tilt."""
+    for index in range(12):
+        shown = index - (index == 4)
+        pose = moving(4 * shown)
+        sample = tracker(replace(studio.frame(pose, 4 * shown), index=index, time=index / 30))
+        assert abs(wrapped(sample.pose[5])) < 0.03
+        assert np.abs(sample.pose[:3] - pose.position).max() < 1e-3
+
+
+def test_the_mirrored_pose_has_the_normal_mirrored_at_the_line_of_sight():
+    turn, place = rotation_of(0.4, 0.15) @ np.diag([1.0, -1.0, -1.0]), np.array([0.3, 0.1, 1.5])
+    found = TargetPose(turn, place, np.eye(6), np.ones(4, bool), 0.0, 1.0)
+    mirrored, same = _mirrored(found)
+    sight = place / np.linalg.norm(place)
+    assert mirrored[:, 2] == pytest.approx(2 * (turn[:, 2] @ sight) * sight - turn[:, 2])
+    assert mirrored.T @ mirrored == pytest.approx(np.eye(3))
+    assert same is place
 
 
 def test_a_hidden_marker_gives_a_flagged_pose(studio, tracker):

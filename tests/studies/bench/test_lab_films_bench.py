@@ -28,6 +28,14 @@ def test_the_plan_fills_the_space_and_repeats():
     floors = np.sort([film.lab.floor_error for film in films])
     assert np.all(np.abs(floors - 0.003 * (np.arange(20) + 0.5) / 20) <= 0.003 / 20)  # one in every twentieth
     assert max(film.lab.readout for film in films) > 0.02
+    assert sum(film.lab.kick is not None for film in films) == 4
+    assert sum(film.lab.doubled > 0 for film in films) == 6
+
+
+def test_another_seed_gives_other_films():
+    films, others = plan(5), plan(5, seed=29)
+    assert not {film.lab.seed for film in films} & {film.lab.seed for film in others}
+    assert [film.lab.floor_error for film in films] != [film.lab.floor_error for film in others]
 
 
 def test_the_score_counts_what_the_bars_are_about():
@@ -47,11 +55,11 @@ def test_finished_films_are_not_made_again(tmp_path, monkeypatch):
     pytest.importorskip("imageio_ffmpeg")
     made = []
     monkeypatch.setattr(lab_films, "measure_film", lambda film: made.append(film.index) or result(film))
-    first = run_lab_films(tmp_path, 3, lambda text: None)
+    first = run_lab_films(tmp_path, 3, say=lambda text: None)
     (tmp_path / "film_01.json").unlink()
     broken = json.loads((tmp_path / "film_02.json").read_text())
     broken["film"]["speed"] = 1.0  # of another plan
     (tmp_path / "film_02.json").write_text(json.dumps(broken))
-    again = run_lab_films(tmp_path, 3, lambda text: None)
+    again = run_lab_films(tmp_path, 3, say=lambda text: None)
     assert made == [0, 1, 2, 1, 2]
     assert [r.worst for r in again] == [r.worst for r in first]

@@ -13,6 +13,9 @@ from wlr_gym.base.settings import SettingsModel, parse_config, read_config
 from wlr_gym.perception.markers.camera import Camera, load_camera
 from wlr_gym.perception.markers.targets import Target, load_target
 
+#: What a calibration without a readout costs: a film tells it, a live pose cannot.
+UNKNOWN_READOUT = "its calibration states no readout: with a rolling shutter its poses are off while the robot moves"
+
 
 class EmulatedScene(SettingsModel):
     """How the camera of an emulated robot is set up; of no meaning to a real one.
@@ -61,6 +64,11 @@ class CameraFile(SettingsModel):
     rate: float = Field(default=30.0, gt=1.0, le=500.0)
     delay: float = Field(default=0.0, ge=0.0, le=0.2)
     emulated: EmulatedScene = EmulatedScene()
+
+    @property
+    def doubt(self) -> str:
+        """What is not known of the camera that its poses suffer from; empty = nothing."""
+        return "" if self.calibration.readout is not None else UNKNOWN_READOUT
 
     @property
     def is_film(self) -> bool:

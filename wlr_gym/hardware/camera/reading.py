@@ -65,6 +65,11 @@ class CameraReader(Protocol):
         ...
 
     @property
+    def doubt(self) -> str:
+        """What is not known of the camera that its poses suffer from; empty = nothing."""
+        ...
+
+    @property
     def trouble(self) -> str:
         """Why no reading will come any more; empty = nothing is known of that."""
         ...

@@ -96,6 +96,11 @@ class EmulatedCamera:
         return min(self._poses, key=lambda pose: abs(pose.time - time))
 
     @property
+    def doubt(self) -> str:
+        """What is not known of the camera that its poses suffer from; empty = nothing."""
+        return self.file.doubt
+
+    @property
     def trouble(self) -> str:
         """Why no reading will come any more; empty = nothing is known of that."""
         return "the camera process has ended (exit code -9)" if self._is_dead else ""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -82,7 +83,7 @@ class CameraWatch:
     """Judges the camera's readings, control step by control step, and shows poses in the frame of the run.
 
     Args:
-        robot: its geometry.
+        robot: its geometry. doubt: of the camera, see :class:`wlr_gym.hardware.camera.reading.CameraReader`.
 
     Attributes:
         status: what is known now.
@@ -90,11 +91,11 @@ class CameraWatch:
         latencies: s from exposure to the control step, of believed ones. work: s from a picture to its pose, of all.
     """
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, doubt: str = "") -> None:
         hip = robot.hip_position
         self._side = np.array([sign * hip.y for _, sign in CORNER_SIGNS])
         self._hip_height, self._leg, self._radius = hip.z, robot.leg.length, robot.wheel.radius
-        self.status: CameraStatus = CameraStatus()
+        self.status: CameraStatus = CameraStatus(doubt=doubt)
         self.frames = self.poses = 0
         self.reasons: Counter[str] = Counter()
         self.latencies: list[float] = []
@@ -133,7 +134,7 @@ class CameraWatch:
         self._frame = self._table = None
         if self._believed:
             self._place(self._believed[-1])
-        self.status = CameraStatus(np.zeros(3), time, False, self.status.reason, self.status.is_wrong)
+        self.status = replace(self.status, pose=np.zeros(3), time=time, is_new=False)
 
     def next(
         self, now: float, joints: tuple[Array, Array], gyro: Array, reading: CameraReading | None, trouble: str
@@ -166,9 +167,9 @@ class CameraWatch:
             self._correct(exposed, pose)
             self.poses += 1
             self.latencies.append(now - exposed)
-            self.status = CameraStatus(pose, exposed, True, "", False)
+            self.status = replace(self.status, pose=pose, time=exposed, is_new=True, reason="", is_wrong=False)
         else:
-            self.status = CameraStatus(self.status.pose, self.status.time, False, reason, is_wrong)
+            self.status = replace(self.status, is_new=False, reason=reason, is_wrong=is_wrong)
         return self.status
 
     # ---- the robot's own motion ----
@@ -362,6 +363,8 @@ def camera_statistics(watch: CameraWatch) -> dict[str, Any]:
             found[name] = dict(zip(("p50", "p95", "p99", "max"), points, strict=True))
     if (lag := watch.lag) is not None:
         found["lag"] = {"ms": round(1e3 * lag[0], 2), "std": round(1e3 * lag[1], 2)}
+    if watch.status.doubt:
+        found["doubt"] = watch.status.doubt
     return {**found, "without_pose": dict(watch.reasons)}
 
 

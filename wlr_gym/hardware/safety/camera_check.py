@@ -21,6 +21,7 @@ _TIME, _LOOK = 1.5, 0.005
 _LEAST_RATE, _LEAST_POSES = 0.8, 0.8
 _REMEDIES = {
     "rate": "Lower the resolution or the exposure time, or write the rate that comes into the camera's file (rate).",
+    "shutter": "Calibrate from a video of a moving board, or write its readout (s; 0 = global shutter) into that file.",
     "floor": "Are all floor markers in the picture, flat, lit, and where the floor's file says?",
     "robot": "Is the robot in the picture, its plate on, and its markers as the body's file says?",
     "age": "Use USB 3, fewer pixels, a shorter exposure; find out who else uses the computer.",
@@ -51,6 +52,8 @@ def check_camera(camera: CameraReader, file: CameraFile, clock: Clock) -> list[C
     checks.append(
         _warning(where, "age", age < LARGEST_AGE / 2, f"{1e3 * age:.0f} ms{stamps}", f"< {1e3 * LARGEST_AGE / 2:.0f} ms")
     )
+    found = file.doubt or f"readout {1e3 * (file.calibration.readout or 0.0):g} ms"
+    checks.append(_warning(where, "shutter", not file.doubt, found, "its readout"))
     return [*checks, *_check_poses(where, readings)]
 
 

@@ -53,6 +53,7 @@ class CameraStatus:
         is_new: it came in this control step.
         reason: why no pose comes; empty = nothing is wrong.
         is_wrong: there are poses, and they contradict the robot's other sensors: they are kept back.
+        doubt: what is not known of the camera that its poses suffer from; empty = nothing.
     """
 
     pose: Array = field(default_factory=lambda: np.zeros(3))
@@ -60,6 +61,7 @@ class CameraStatus:
     is_new: bool = False
     reason: str = ""
     is_wrong: bool = False
+    doubt: str = ""
 
 
 @dataclass(frozen=True)

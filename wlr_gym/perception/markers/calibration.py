@@ -1,46 +1,34 @@
-"""Calibrate a camera from views of a ChArUco board."""
+"""Calibrate a camera from views of a board: its lens, and from a film of a moving board its shutter."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.perception.markers.boards import MINIMUM_CORNERS, Board
 from wlr_gym.perception.markers.camera import Camera, Quality
+from wlr_gym.perception.markers.shutter import LONGEST, BoardView, Readout, at_frame_time, board_motion, readout_of
 
 Array = NDArray[np.float64]
 
 MINIMUM_VIEWS = 6
-MINIMUM_CORNERS = 12
 #: A view whose corners miss by more than this many times the median of all views is left out.
 _OUTLYING_VIEW = 3.0
 #: rad rms, of the board's tilts about their mean. Parallel views do not tell the focal length, nor does its sigma tell that.
 _LEAST_TILT = math.radians(8)
-
-
-@dataclass(frozen=True)
-class Board:
-    """A ChArUco board: squares along and across, their side (m). A marker's side is 0.7 of it."""
-
-    columns: int = 9
-    rows: int = 6
-    square: float = 0.028
-
-    def aruco(self) -> Any:
-        """Return OpenCV's board."""
-        import cv2
-
-        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, 0.7 * self.square, dictionary)
+#: s; a readout less certain than this is not followed.
+_LOOSEST_STD = 0.005
+#: Lens and shutter are found in turns, at most so many, until the readout stays (s).
+_TURNS, _SAME_READOUT = 8, 2e-5
 
 
 def calibrate(images: Iterable[tuple[str, NDArray[np.uint8]]], board: Board) -> Camera:
-    """Calibrate from views of a ChArUco board.
+    """Calibrate from pictures of a board.
 
     Args:
         images: (name, grey image) pairs, all of one size.
@@ -50,13 +38,66 @@ def calibrate(images: Iterable[tuple[str, NDArray[np.uint8]]], board: Board) -> 
         InputError: images of different sizes, too few views with enough corners, corners only in part of the image, or tilts
             too much alike to tell the focal length.
     """
-    size, points, names = _find_corners(images, board)
-    if len(points) < MINIMUM_VIEWS:
+    size, views = _find_corners(((name, 0.0, image) for name, image in images), board)
+    return _calibrated([view for view in views if view is not None], len(views), size, board)
+
+
+def calibrate_film(
+    frames: Iterable[tuple[str, float, NDArray[np.uint8]]], board: Board, every: int, readout: float | None = None
+) -> tuple[Camera, Readout]:
+    """Calibrate from a film: lens and shutter.
+
+    Args:
+        frames: (name, time in s, grey image) of every frame. board: the board that was printed.
+        every: each n-th frame is a view; the ones before and after it tell how the board moves.
+        readout: s, where it is known; None = the film tells it, if the board moves fast enough.
+
+    Returns:
+        The camera, with its readout where that is known, and what the film tells of it.
+
+    Raises:
+        InputError: see :func:`calibrate`.
+    """
+    wanted = (frame for k, frame in enumerate(frames) if min(k % every, -k % every) <= 1)
+    size, found = _find_corners(wanted, board)
+    middles = range(0, len(found), min(3, every))
+    views = {k: view for k in middles if (view := found[k]) is not None}
+    camera = plain = _calibrated(list(views.values()), len(middles), size, board)
+    told = Readout() if readout is None else Readout(readout, 0.0)
+    for _ in range(_TURNS):
+        moving = {k: motion for k in views if (motion := _motion(found, k, camera)) is not None}
+        before = told
+        told = readout_of([(views[k], motion) for k, motion in moving.items()], camera) if readout is None else told
+        if readout is None and not (abs(told.value) < LONGEST and told.std < _LOOSEST_STD):
+            break  # a board that hardly moves
+        still = [at_frame_time(v, moving[k], camera, told.value) if k in moving else v for k, v in views.items()]
+        camera = _calibrated(still, len(middles), size, board)
+        if abs(told.value - before.value) < _SAME_READOUT:
+            break
+    if not told.known:
+        camera = plain
+    quality = camera.quality and camera.quality.model_copy(update={"readout_std": told.std or None})
+    return camera.model_copy(
+        update={"readout": told.known, "quality": quality if told.known is not None else camera.quality}
+    ), told
+
+
+def _motion(found: Sequence[BoardView | None], k: int, camera: Camera) -> Array | None:
+    before, view, after = (found[i] if 0 <= i < len(found) else None for i in (k - 1, k, k + 1))
+    if before is None or view is None or after is None:
+        return None
+    return board_motion(before, view, after, camera)
+
+
+def _calibrated(views: Sequence[BoardView], pictures: int, size: tuple[int, int], board: Board) -> Camera:
+    if len(views) < MINIMUM_VIEWS:
         raise InputError(
-            f"the board ({board.columns} x {board.rows} squares) is seen well in {len(points)} of {len(names)} images; "
-            f"at least {MINIMUM_VIEWS} are needed, each with {MINIMUM_CORNERS} corners, sharp, from different angles"
+            f"the board ({board.kind}, {board.columns} x {board.rows} squares) is seen well in {len(views)} of {pictures} "
+            f"images; at least {MINIMUM_VIEWS} are needed, each with {min(MINIMUM_CORNERS, board.corners)} corners, sharp, "
+            "from different angles"
         )
-    object_points, image_points = [places for places, _ in points], [corners for _, corners in points]
+    object_points = [np.asarray(view.places, np.float32) for view in views]
+    image_points = [np.asarray(view.pixels, np.float32) for view in views]
     coverage = _coverage(np.concatenate(image_points), size)
     if coverage < 0.5:
         raise InputError(
@@ -91,27 +132,22 @@ def calibrate(images: Iterable[tuple[str, NDArray[np.uint8]]], board: Board) -> 
     )
 
 
-def _find_corners(images: Iterable[tuple[str, NDArray[np.uint8]]], board: Board) -> tuple[tuple[int, int], list, list[str]]:
-    import cv2
-
-    detector = cv2.aruco.CharucoDetector(board.aruco())
+def _find_corners(
+    images: Iterable[tuple[str, float, NDArray[np.uint8]]], board: Board
+) -> tuple[tuple[int, int], list[BoardView | None]]:
+    """Size of the images, and what each shows of the board; None = too little."""
     size: tuple[int, int] | None = None
-    points, names = [], []
-    for name, image in images:
+    views: list[BoardView | None] = []
+    for name, time, image in images:
         height, width = image.shape
         if size is not None and size != (width, height):
             raise InputError(f"{name}: {width} x {height} px, the images before it {size[0]} x {size[1]}; use one camera mode")
         size = (width, height)
-        names.append(name)
-        corners, ids, _, _ = detector.detectBoard(image)
-        if ids is None or len(ids) < MINIMUM_CORNERS:
-            continue
-        corners = np.asarray(corners, np.float32).reshape(-1, 2)
-        places = np.asarray(board.aruco().getChessboardCorners(), np.float32)[np.asarray(ids, np.intp).reshape(-1)]
-        points.append((places, corners))
+        found = board.find(image)
+        views.append(None if found is None else BoardView(name, time, *(np.asarray(part, np.float64) for part in found)))
     if size is None:
         raise InputError("no images to calibrate from")
-    return size, points, names
+    return size, views
 
 
 def _solve(object_points: list, image_points: list, size: tuple[int, int]) -> dict[str, Any]:

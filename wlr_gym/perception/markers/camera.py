@@ -33,6 +33,7 @@ class Quality(SettingsModel):
         rms: px, of the corners against the model.
         coverage: share of a 4 x 4 grid over the image that has corners in it.
         focal_std: px, 1 sigma of fx and fy; centre_std: px, of cx and cy.
+        readout_std: s, 1 sigma of the readout; None = it was given, or is not known.
     """
 
     model_config: ClassVar[ConfigDict] = ConfigDict(allow_inf_nan=True)
@@ -43,6 +44,7 @@ class Quality(SettingsModel):
     coverage: float
     focal_std: tuple[float, float]
     centre_std: tuple[float, float]
+    readout_std: float | None = None
 
 
 class Camera(SettingsModel):
@@ -52,7 +54,7 @@ class Camera(SettingsModel):
         width, height: px; images of another size are refused.
         focal: (fx, fy) px. centre: (cx, cy) px.
         distortion: (k1, k2, p1, p2, k3).
-        readout: s from the first row's exposure to the last row's; 0 = global shutter, None = not known, films tell it.
+        readout: s from the first row's exposure to the last row's; 0 = global shutter, None = not known: films tell it.
         quality: of the calibration; None for parameters from elsewhere.
     """
 

@@ -41,6 +41,8 @@ _ROLLS = 20.0  # a wheel that rolls explains the distance this many times better
 _DISTINCT = 0.1  # s; a second minimum this far off
 #: rad rms; a turn seen by the camera that the gyroscope must explain.
 _TURN = 0.02
+#: Slow motion and time lapse that are looked for where nothing fits: how many times as fast as the film the clock ran.
+_PACES = (2.0, 4.0, 8.0, 16.0, 32.0, 0.5, 0.25)
 #: The part of it that stays unexplained is at most one over this.
 _SAME_TURN = 10.0
 
@@ -82,10 +84,23 @@ def align(time: Array, poses: Array, run: Run, robot: Robot, parameters: Paramet
 
     Raises:
         InputError: too few poses in common, no motion that fixes the offset to :data:`LARGEST_STD`, or turns that camera and
-            gyroscope saw differently at every offset tried.
+            gyroscope saw differently at every offset tried; slow motion is named.
     """
     known = np.isfinite(poses).all(axis=1)
     time, poses = time[known], poses[known]
+    try:
+        return _aligned(time, poses, run, robot, parameters, around)
+    except InputError as error:
+        if (pace := _pace(time, poses, run, robot, parameters, around)) is None:
+            raise
+        rate = pace / float(np.median(np.diff(time)))
+        raise InputError(
+            f"{run.path}: camera and gyroscope see the same turns if the video's times run {pace:g} times as fast: slow "
+            f"motion, or sped up? Give the rate at which it was filmed: --rate {rate:.6g}"
+        ) from error
+
+
+def _aligned(time: Array, poses: Array, run: Run, robot: Robot, parameters: Parameters, around: float) -> Alignment:
     inside = (time + around - SEARCH > run["t"][0]) & (time + around + SEARCH < run["t"][-1])
     if inside.sum() < 30:
         inside = (time + around > run["t"][0]) & (time + around < run["t"][-1])
@@ -112,6 +127,26 @@ def align(time: Array, poses: Array, run: Run, robot: Robot, parameters: Paramet
     useful = _agreeing(useful)
     costs = np.sum([cost for _, cost, _, _ in useful], axis=0) if useful else np.zeros(len(grid))
     return _combined(costs, grid, {name: (offset, std) for name, _, offset, std in useful}, run)
+
+
+def _pace(time: Array, poses: Array, run: Run, robot: Robot, parameters: Parameters, around: float) -> float | None:
+    """How many times as fast as the film the camera's clock ran, if that explains its turns; None = it does not."""
+    grid = around + np.arange(-SEARCH, SEARCH + 1e-9, 4 * _GRID)
+    for pace in _PACES:
+        moments = time[0] + (time - time[0]) / pace
+        inside = (moments + around > run["t"][0]) & (moments + around < run["t"][-1])
+        if inside.sum() < 30:
+            continue
+        moments = moments[inside]
+        pair = next((p for p in _pairs(moments, poses[inside], run, robot, parameters, around) if p.name == "yaw"), None)
+        if pair is None:
+            return None
+        project = _without_slow(moments, pair.slowest)
+        seen = project(pair.seen)
+        curve = np.array([_cost(pair, moments + offset, project) for offset in grid])
+        if float(seen @ seen) > _TURN**2 * len(seen) and not _contradicts(seen, curve):
+            return pace
+    return None
 
 
 def _contradicts(seen: Array, curve: Array) -> bool:

@@ -24,7 +24,8 @@ from wlr_gym.perception.markers.detection import detect
 from wlr_gym.perception.markers.sheet_fault import sheet_fault
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.alignment import Alignment, align, joint_signals
-from wlr_gym.perception.vision.frame_noise import turn_difference, without_repeats
+from wlr_gym.perception.vision.frame_noise import without_repeats
+from wlr_gym.perception.vision.imu_check import imu_differences
 from wlr_gym.perception.vision.self_calibration import UNSURE, SelfCalibration, calibration_findings, self_calibrated
 from wlr_gym.perception.vision.slip import SlipResult, measure_slip, smoothed_poses
 from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, REPEATED, Sample, VideoFrame, track
@@ -105,6 +106,7 @@ class VideoAnalysis:
             "body_lateral_slip_m": float(slip.body_slip[-1, 1]),
             "no_slip_error": slip.no_slip_error,
             "wheels": wheels,
+            "slip_covariance_m2": slip.covariance.tolist(),
             "findings": list(self.findings),
         }
 
@@ -161,7 +163,7 @@ def analyse(
     missing = frames.missing if isinstance(frames, Frames) else 0
     findings = (
         *_findings(samples, slip, height_error, missing), *calibration_findings(calibration),
-        *_turn_findings(samples, offset, run, found),
+        *_imu_findings(samples, offset, run, found),
     )  # fmt: skip
     return VideoAnalysis(
         measured, samples, alignment, offset, slip, found, origin, height_error, missing, findings, calibration
@@ -306,13 +308,24 @@ def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, 
         yield f"about {dropped} frames were dropped by the camera"
 
 
-def _turn_findings(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> Iterator[str]:
-    difference = turn_difference(samples, offset, run, robot)
-    if difference is not None:
-        yield (
-            f"camera and gyroscope see turns that differ by {1e3 * difference[1]:.0f} mrad, most at {difference[0]:.2f} s: "
-            f"frame times that jump (frames dropped without a trace?), or a wrong run; {UNSURE}"
-        )
+def _imu_findings(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> Iterator[str]:
+    for difference in imu_differences(samples, offset, run, robot):
+        size, axis = f"{1e3 * difference.size:.0f} mrad", difference.axis
+        if difference.level:
+            yield (
+                f"at rest the {axis} differs from the accelerometer's by {size}: floor markers not level, a plate or an IMU "
+                "that is tilted, or a wrong calibration"
+            )
+        elif axis == "yaw":
+            yield (
+                f"camera and gyroscope see turns that differ by {size}, most at {difference.time:.2f} s: frame times that jump "
+                f"(frames dropped without a trace?), or a wrong run; {UNSURE}"
+            )
+        else:
+            yield (
+                f"the {axis} differs from the gyroscope's by {size}, most at {difference.time:.2f} s: a marker that gives way, "
+                f"a wrong readout or frame times that jump; {UNSURE}"
+            )
 
 
 # --- plots ------------------------------------------------------------------------------------------------------------

@@ -14,10 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.read import Run
 from wlr_gym.perception.vision.tracking import REPEATED, Sample, without_pose
-from wlr_gym.robot import Robot
-from wlr_gym.robot.slip import accumulate
 
 Array = NDArray[np.float64]
 
@@ -28,11 +25,9 @@ _JITTERS = np.array([0.0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 6, 8, 12]) * 1e-3
 _FACTORS = 0.6 * 1.15 ** np.arange(15)
 #: Twice the gain in log likelihood that an error of the times must bring.
 _WORTH = 12.0
-#: px; markers that move by less than the first between frames that move by more than the second are the picture before.
-_SAME, _MOVING = 0.1, 0.5
-#: rad, and sigmas, by which the camera's turns may differ from the gyroscope's.
-_TURN_ERROR, _TURN_SIGMAS = 0.006, 6.0
-_TOGETHER = 5  # frames over which that difference is averaged
+#: px, and share of the steps before and after, that markers move by at most in a picture shown once more; px, of those steps.
+_SAME, _SAME_SHARE, _MOVING = 0.1, 0.2, 0.1
+_MOST_REPEATS = 3  # in a row; then the robot stands
 
 
 @dataclass(frozen=True)
@@ -69,34 +64,28 @@ def widened(samples: Sequence[Sample], noise: FrameNoise) -> tuple[Sample, ...]:
 
 
 def without_repeats(samples: Sequence[Sample]) -> Iterator[Sample]:
-    """Take the pose off frames that show the picture before once more, while the robot moves."""
-    steps = np.array([_step(a, b) for a, b in pairwise(samples)])
-    for k, sample in enumerate(samples):
-        inside = 2 <= k < len(samples) - 1
-        repeated = inside and steps[k - 1] < _SAME and steps[k - 2] > _MOVING and steps[k] > _MOVING
-        yield without_pose(sample, REPEATED) if repeated else sample
+    """Take the pose off frames that show the picture before once more, while robot or camera move.
 
-
-def turn_difference(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> tuple[float, float] | None:
-    """Where (s, servo clock) and by how much (rad) the camera's turns differ from the gyroscope's; None = they agree.
-
-    Constant, drift and scale of the gyroscope are left open.
+    The markers then stay for a step, or a few, between two steps the same way; where a motion turns back, these are opposite.
     """
-    seen = [sample for sample in samples if math.isfinite(sample.pose[0])]
-    if "gyro_z" not in run or not np.isfinite(run["gyro_z"]).all() or len(seen) < _LEAST_FRAMES:
-        return None
-    time = np.array([sample.time for sample in seen]) + offset
-    inside = (time > run["t"][0]) & (time < run["t"][-1])
-    yaw = np.unwrap([sample.pose[3] for sample in seen])[inside]
-    std = float(np.median([math.sqrt(sample.covariance[3, 3]) for sample in seen]))
-    late = 1 / (2 * math.pi * robot.sensors.imu.bandwidth)
-    turned = np.interp(time[inside], run["t"] - late, accumulate(run["gyro_z"], run["t"]))
-    known = np.column_stack([np.ones(len(yaw)), time[inside], turned])
-    rest = yaw - known @ np.linalg.lstsq(known, yaw, rcond=None)[0]
-    mean = np.convolve(rest, np.full(_TOGETHER, 1 / _TOGETHER), mode="valid")
-    worst = int(np.argmax(np.abs(mean)))
-    limit = max(_TURN_ERROR, _TURN_SIGMAS * std)
-    return (float(time[inside][worst + _TOGETHER // 2]), float(abs(mean[worst]))) if abs(mean[worst]) > limit else None
+    steps = [b.centres - a.centres for a, b in pairwise(samples)]
+    repeats = {k for first in range(1, len(steps)) for k in _repeats(steps, first)}
+    for k, sample in enumerate(samples):
+        yield without_pose(sample, REPEATED) if k in repeats else sample
+
+
+def _repeats(steps: Sequence[Array], first: int) -> range:
+    """Frames that show the picture before once more, where the markers stay from step ``first`` on."""
+    last = first
+    while last < len(steps) and _length(steps[last]) < _SAME:
+        last += 1
+    if not 0 < last - first <= _MOST_REPEATS or last == len(steps):
+        return range(0)
+    before, after = steps[first - 1], steps[last]
+    least = float(np.minimum(_length(before), _length(after)))
+    if not least > _MOVING or max(_length(step) for step in steps[first:last]) > _SAME_SHARE * least:
+        return range(0)
+    return range(first + 1, last + 1) if float(np.nansum(before * after)) > 0 else range(0)
 
 
 def _signals(seen: Sequence[Sample]) -> tuple[Array, Array, Array, Array]:
@@ -127,8 +116,7 @@ def _jitter(rest: Array, edges: Array, late: Array) -> float:
     return float(_JITTERS[least]) if best[0] - best[least] > _WORTH else 0.0
 
 
-def _step(a: Sample, b: Sample) -> float:
-    """How far (px) the markers moved between two frames; infinite when none is seen in both."""
-    moved = np.linalg.norm(b.centres - a.centres, axis=1)
-    known = moved[np.isfinite(moved)]
-    return float(known.max()) if len(known) else math.inf
+def _length(step: Array) -> float:
+    """Largest coordinate (px) of the markers' moves between two frames; NaN when no marker is seen in both."""
+    moved = np.abs(step[np.isfinite(step)])
+    return float(moved.max()) if moved.size else math.nan

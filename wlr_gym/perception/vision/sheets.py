@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from wlr_gym.base.files import replace_file, write_text
-from wlr_gym.perception.markers.calibration import Board
+from wlr_gym.perception.markers.boards import Board
 from wlr_gym.perception.markers.targets import QUIET_ZONE, Marker, Target, ring_radii
 
 # Landscape, mm.

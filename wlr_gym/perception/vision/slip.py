@@ -55,6 +55,7 @@ class SlipResult:
         slip: (K, 4, 2) m, slip velocity accumulated from the first row. slip_std: 1 sigma, random errors.
         slip_radius_std: (K, 4) m, 1 sigma of the longitudinal slip from the wheel radius.
         slip_layout_std: (K, 4, 2) m, 1 sigma of both from the places of the markers on the body.
+        covariance: (8, 8) m2 of the slip at the end, longitudinal and lateral of each wheel in turn: random errors and layout.
         ratio, angle: (K, 4) slip ratio and angle (rad).
         no_slip_error: share of the predicted path that ignoring slip gets wrong (the paper's measure).
         covered: (K,) False where no frame with a pose is near.
@@ -71,6 +72,7 @@ class SlipResult:
     slip_std: Array
     slip_radius_std: Array
     slip_layout_std: Array
+    covariance: Array
     ratio: Array
     angle: Array
     no_slip_error: float
@@ -144,17 +146,22 @@ def measure_slip(
     heading_speed = rate[:, 0] * np.cos(value[:, 3]) + rate[:, 1] * np.sin(value[:, 3])
     slip = accumulate(velocity, rows)
     encoder = _encoder_variance(joints[0], robot, parameters)
-    velocity_std, slip_std = np.zeros_like(velocity), np.zeros_like(slip)
+    velocity_std, slip_std, covariance = np.zeros_like(velocity), np.zeros_like(slip), np.zeros((8, 8))
     for change, turn in _drawn_motions(samples, outliers, time, rows, signals, offset_std):
         drawn = _contacts(value + change, rate + turn, joints, batch)[0]
         velocity_std += (drawn - velocity) ** 2 / _DRAWS
-        slip_std += (accumulate(drawn, rows) - slip) ** 2 / _DRAWS
+        error = accumulate(drawn, rows) - slip
+        slip_std += error**2 / _DRAWS
+        covariance += np.outer(error[-1], error[-1]) / _DRAWS
     velocity_std[:, :, 0] += _ENCODER_PACE**2 * encoder
     slip_std[:, :, 0] += encoder + encoder[0]
+    covariance[range(0, 8, 2), range(0, 8, 2)] += encoder[-1] + encoder[0]
     known = robot.tolerances.get("wheel.radius")
     share = 0.0 if known is None else known.share("wheel.radius", robot.wheel.radius)
     side_speed = rate[:, 1] * np.cos(value[:, 3]) - rate[:, 0] * np.sin(value[:, 3])
     way = np.stack([accumulate(heading_speed, rows), accumulate(side_speed, rows)], axis=1)
+    for std, shift in zip(layout_std, (way[-1], way[-1, ::-1] * (1, -1)), strict=True):  # the same for all wheels
+        covariance += std**2 * np.outer(np.tile(shift, 4), np.tile(shift, 4))
     layout = np.hypot(layout_std[0] * way, layout_std[1] * way[:, ::-1])  # wrong scales err along the way, headings across
     return SlipResult(
         time=rows,
@@ -167,6 +174,7 @@ def measure_slip(
         slip_std=np.sqrt(slip_std),
         slip_radius_std=share * np.abs(accumulate(rolling, rows)),
         slip_layout_std=np.repeat(layout[:, None], 4, axis=1),
+        covariance=covariance,
         ratio=slip_ratio(travel, rolling),
         angle=slip_angle(travel, velocity[:, :, 1]),
         no_slip_error=float(no_slip_error(accumulate(heading_speed, rows)[-1], accumulate(no_slip_speed, rows)[-1])),

@@ -146,12 +146,20 @@ class Tracker:
         """Look where the markers should be."""
         if not self._track:
             return None, {}
-        rotation, position = self._predicted(frame.time)
+        found, seen = self._solved_at(frame.image, *self._predicted(frame.time))
+        if found is None or found.used.all():
+            return found, seen
+        # the prediction may have been off, or three markers seen from the wrong side of their plane's two likely tilts
+        tries = [(found, seen), *(self._solved_at(frame.image, *start) for start in (_seat(found), _mirrored(found)))]
+        return max(tries, key=lambda t: (-1, 0.0) if t[0] is None else (int(t[0].used.sum()), -t[0].residual))
+
+    def _solved_at(self, image: Image, rotation: Array, position: Array) -> tuple[TargetPose | None, dict[int, Detection]]:
+        """The pose from the markers near where this one puts them."""
         seen = {}
         for index in range(len(self.body.markers)):
             ellipse = expected_ellipse(self.body, index, self._values, rotation, position)
             if ellipse is not None:
-                detection = refine(frame.image, self._values, ellipse, int(self.body.codes[index]))
+                detection = refine(image, self._values, ellipse, int(self.body.codes[index]))
                 if detection is not None:
                     seen[index] = detection
         found = solve_pose(seen, self.body, self.camera, rotation, position)
@@ -239,6 +247,24 @@ class Tracker:
         ellipse = expected_ellipse(self.floor, index, self._values, pose.rotation, pose.position)
         seen = None if ellipse is None else refine(image, self._values, ellipse, int(self.floor.codes[index]))
         return math.nan if seen is None else math.hypot(*(seen.ellipse[:2] - self._homes[index]))
+
+
+def _seat(pose: TargetPose) -> tuple[Array, Array]:
+    return pose.rotation, pose.position
+
+
+def _mirrored(pose: TargetPose) -> tuple[Array, Array]:
+    """The other pose in which a small plane target looks nearly the same: its normal mirrored at the line of sight."""
+    from scipy.spatial.transform import Rotation
+
+    sight = pose.position / np.linalg.norm(pose.position)
+    normal = pose.rotation[:, 2]
+    turn = 2.0 * float(normal @ sight) * np.cross(normal, sight)  # sine of twice the angle between them, along its axis
+    sine, cosine = float(np.linalg.norm(turn)), 2 * float(normal @ sight) ** 2 - 1
+    if sine < 1e-12:
+        return pose.rotation, pose.position
+    angle = math.atan2(sine, cosine)
+    return Rotation.from_rotvec(turn * (angle / sine)).as_matrix() @ pose.rotation, pose.position
 
 
 def track(frames: Iterable[VideoFrame], camera: Camera, body: Target, floor: Target) -> Iterator[Sample]:

@@ -25,6 +25,9 @@ _FRAMES_FOR_RATE = 10
 class Frames:
     """The frames of a video file or of a folder of images (in order of name); an iterator.
 
+    A note on how the camera was held (a phone's) is not followed: frames are as the sensor read them, so one calibration and
+    one readout hold for films taken upright, lying and upside down.
+
     Args:
         source: path.
         rate: Hz; frames are evenly spaced by it. Default: the times in the video; 30 for images.
@@ -82,6 +85,7 @@ class Frames:
         import cv2
 
         video = cv2.VideoCapture(str(path))
+        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as the sensor read it: lens and shutter belong to that
         if not video.isOpened():
             raise InputError(f"{path}: cannot be read as a video; expected a format that OpenCV reads (AVI, MP4, MKV)")
         rate, announced = video.get(cv2.CAP_PROP_FPS), video.get(cv2.CAP_PROP_FRAME_COUNT)
@@ -104,16 +108,22 @@ class Frames:
 
 
 def _folder(folder: Path) -> Iterator[tuple[float, Image]]:
-    import cv2
-
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
     if not files:
         raise InputError(f"{folder}: no images ({', '.join(IMAGES)})")
     for index, path in enumerate(files):
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        image = read_image(path)
         if image is None:
             raise InputError(f"{path}: cannot be read as an image")
-        yield index / 30.0, np.asarray(image, np.uint8)
+        yield index / 30.0, image
+
+
+def read_image(path: Path) -> Image | None:
+    """A picture in grey as the sensor read it, however the camera was held; None = it cannot be read."""
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    return None if image is None else np.asarray(image, np.uint8)
 
 
 def grey(image: Any) -> Image:

@@ -1,8 +1,8 @@
 """Slip from films of a lab that is not perfect, drawn by the second renderer: how far off, and how many sigmas.
 
 The films fill the space of what can be wrong evenly: hand-laid markers, stretched prints, rolling shutters, codecs, cameras
-that stand, drift or are held in the hands, uneven frame times, dropped frames. Every finished film is one file, so
-the work resumes.
+that stand, drift or are held in the hands, uneven frame times, dropped and doubled frames, kicked sheets. Every finished film
+is one file, so the work resumes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from wlr_gym.studies.bench.vision_drives import FilmedDrive, lab_drive, pose_at,
 
 Array = NDArray[np.float64]
 
-FILMS = 60
+FILMS, SEED = 60, 28
 SECONDS, RATE, OFFSET = 5.0, 30.0, 0.137
 CAMERAS = ("steady", "drifting", "hand-held")
 #: kbit/s at 1280 x 720; films of fewer pixels get as much per pixel.
@@ -105,15 +105,15 @@ class LabResult:
         return any(UNSURE in finding for finding in self.findings)
 
 
-def plan(count: int, seed: int = 28) -> list[LabFilm]:
+def plan(count: int, seed: int = SEED) -> list[LabFilm]:
     """Films that fill the space evenly (a Latin hypercube with low discrepancy)."""
     from scipy.stats import qmc
 
-    points = qmc.LatinHypercube(16, optimization="random-cd", rng=np.random.default_rng(seed)).random(count)
-    return [_film(index, point) for index, point in enumerate(points)]
+    points = qmc.LatinHypercube(18, optimization="random-cd", rng=np.random.default_rng(seed)).random(count)
+    return [_film(index, point, 100_000 * seed + 100 * index) for index, point in enumerate(points)]
 
 
-def _film(index: int, p: Array) -> LabFilm:
+def _film(index: int, p: Array, seed: int) -> LabFilm:
     camera = CAMERAS[int(3 * p[0])]
     hand_laid = bool(p[1] < 0.2)
     bit_rate = BIT_RATES[0] * (BIT_RATES[1] / BIT_RATES[0]) ** p[2]
@@ -122,7 +122,8 @@ def _film(index: int, p: Array) -> LabFilm:
         stretch=(0.005 * (2 * p[5] - 1), 0.005 * (2 * p[6] - 1)), readout=0.025 * p[7] if p[7] > 0.1 else 0.0,
         drift=0.004 * p[8] if camera == "drifting" else 0.0, hand=0.2 + 0.8 * p[8] if camera == "hand-held" else 0.0,
         noise=2 + 3 * p[9], blur=0.5 + 0.6 * p[10], gradient=0.4 * (2 * p[11] - 1), above=1.35 + 0.25 * p[12],
-        uneven=0.006 * p[13] if p[13] > 0.5 else 0.0, dropped=0.05 * (p[13] > 0.75), seed=100 * index,
+        uneven=0.006 * p[13] if p[13] > 0.5 else 0.0, dropped=0.05 * (p[13] > 0.75),
+        doubled=0.05 * (p[17] > 0.7), kick=(0.5 + 20.0 * p[16], 0.003 + 0.012 * p[17]) if p[16] < 0.2 else None, seed=seed,
     )  # fmt: skip
     codec = ("none", "h264", "hevc")[int(3 * p[14])]
     return LabFilm(
@@ -130,12 +131,12 @@ def _film(index: int, p: Array) -> LabFilm:
     )  # fmt: skip
 
 
-def run_lab_films(folder: Path, count: int, say: Callable[[str], None] = print) -> list[LabResult]:
+def run_lab_films(folder: Path, count: int, seed: int = SEED, say: Callable[[str], None] = print) -> list[LabResult]:
     """Film and analyse what is not finished yet; return all results. Each is kept in ``folder`` as ``film_NN.json``."""
     require_package("imageio_ffmpeg", "video")
     folder.mkdir(parents=True, exist_ok=True)
     results = []
-    for film in plan(count):
+    for film in plan(count, seed):
         path = folder / f"film_{film.index:02d}.json"
         known = LabResult(**json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else None
         if known is None or known.film != json.loads(json.dumps(asdict(film))):

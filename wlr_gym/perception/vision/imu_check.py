@@ -1,0 +1,113 @@
+"""Hold a film's turns and tilts against the IMU: what gyroscope and accelerometer contradict is no motion of the body.
+
+Turns are compared as angles. Of each axis the gyroscope's constant, drift and scale are left open; of pitch and roll also how
+the IMU is turned on the body (which shows along the yaw) and how the floor markers' plane is tilted (along its cosine and
+sine).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.data.read import Run
+from wlr_gym.perception.vision.tracking import Sample
+from wlr_gym.robot import Robot
+from wlr_gym.robot.slip import accumulate
+
+Array = NDArray[np.float64]
+
+#: rad, and sigmas of a frame, by which turn and tilt may differ from the gyroscope's.
+TURN_ERROR, TILT_ERROR, SIGMAS = 0.006, 0.012, 6.0
+#: rad by which the tilt at rest may differ from the accelerometer's: floors are level to 1 cm per metre, IMUs mounted as well.
+LEVEL_ERROR = 0.025
+_AT_REST = 0.03  # rad/s of any axis, and m/s2 about the gravity
+_FEWEST = 30
+_TOGETHER = 5  # frames over which a difference is averaged
+_GRAVITY = 9.80665
+
+
+@dataclass(frozen=True)
+class TurnDifference:
+    """Where film and IMU differ most about one axis: ``yaw``, ``pitch``, ``roll``; time s (servo clock); size rad.
+
+    ``level``: it is the tilt at rest, against the accelerometer; else the turn, against the gyroscope.
+    """
+
+    axis: str
+    time: float
+    size: float
+    level: bool = False
+
+
+def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> Iterator[TurnDifference]:
+    """Yield what of a film's attitude the IMU contradicts.
+
+    Args:
+        samples: of the film. offset: servo time minus camera time, s. run: with gyroscope; without one nothing is compared.
+        robot: its IMU's bandwidth delays what it says.
+    """
+    seen = [sample for sample in samples if math.isfinite(sample.pose[0])]
+    late = 1 / (2 * math.pi * robot.sensors.imu.bandwidth)
+    t = run["t"] - late
+    seen = [sample for sample in seen if t[0] < sample.time + offset < t[-1]]
+    if not _known(run, "gyro") or len(seen) < _FEWEST:
+        return
+    time = np.array([sample.time for sample in seen]) + offset
+    film = np.unwrap(np.stack([sample.pose[3:] for sample in seen]), axis=0)
+    std = np.sqrt(np.median([np.diag(sample.covariance)[3:] for sample in seen], axis=0))
+    gyro = np.stack([run[f"gyro_{axis}"] for axis in "xyz"], axis=1)
+    pitch, roll = (np.interp(t, time, film[:, k]) for k in (1, 2))
+    turned = np.stack([np.interp(time, t, accumulate(rate, t)) for rate in _angle_rates(gyro, pitch, roll)], axis=1)
+    yaw = film[:, 0]
+    around = [turned[:, 0], np.cos(yaw), np.sin(yaw)]
+    for k, axis in enumerate(("yaw", "pitch", "roll")):
+        known = np.column_stack([np.ones(len(time)), time, turned[:, k], *(around if k else [])])
+        limit = max(TILT_ERROR if k else TURN_ERROR, SIGMAS * float(std[k]))
+        yield from _largest(axis, time, _rest(film[:, k], known), limit)
+    if _known(run, "acc"):
+        yield from _level(time, film, std, run, t, gyro)
+
+
+def _known(run: Run, name: str) -> bool:
+    return all(f"{name}_{axis}" in run and np.isfinite(run[f"{name}_{axis}"]).all() for axis in "xyz")
+
+
+def _angle_rates(gyro: Array, pitch: Array, roll: Array) -> Array:
+    """Rates (3, K) of yaw, pitch and roll from body rates (K, 3); the inverse of a body's rates from its angles."""
+    x, y, z = gyro.T
+    about = y * np.sin(roll) + z * np.cos(roll)
+    return np.stack([about / np.cos(pitch), y * np.cos(roll) - z * np.sin(roll), x + about * np.tan(pitch)])
+
+
+def _rest(values: Array, known: Array) -> Array:
+    size = np.maximum(np.linalg.norm(known, axis=0), 1e-12)
+    return values - known @ (np.linalg.lstsq(known / size, values, rcond=1e-6)[0] / size)
+
+
+def _largest(axis: str, time: Array, rest: Array, limit: float) -> Iterator[TurnDifference]:
+    mean = np.convolve(rest, np.full(_TOGETHER, 1 / _TOGETHER), mode="valid")
+    worst = int(np.argmax(np.abs(mean)))
+    if abs(mean[worst]) > limit:
+        yield TurnDifference(axis, float(time[worst + _TOGETHER // 2]), float(abs(mean[worst])))
+
+
+def _level(time: Array, film: Array, std: Array, run: Run, t: Array, gyro: Array) -> Iterator[TurnDifference]:
+    """Tilt while the robot rests, against the direction of gravity."""
+    force = np.stack([run[f"acc_{axis}"] for axis in "xyz"], axis=1)
+    size = np.linalg.norm(force, axis=1)
+    rests = (np.abs(gyro).max(axis=1) < _AT_REST) & (np.abs(size - _GRAVITY) < 10 * _AT_REST)
+    x, y, z = force.T
+    down = np.stack([np.arctan2(-x, np.hypot(y, z)), np.arctan2(y, z)])
+    near = np.interp(time, t, rests.astype(float)) == 1.0
+    if near.sum() < _TOGETHER:
+        return
+    for k, axis in enumerate(("pitch", "roll")):
+        apart = (film[:, k + 1] - np.interp(time, t, down[k]))[near]
+        off = float(abs(np.median(apart)))
+        if off > max(LEVEL_ERROR, SIGMAS * float(std[k + 1])):
+            yield TurnDifference(axis, float(time[near][len(apart) // 2]), off, level=True)
