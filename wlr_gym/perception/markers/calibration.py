@@ -98,7 +98,7 @@ def _calibrated(views: Sequence[BoardView], pictures: int, size: tuple[int, int]
         )
     object_points = [np.asarray(view.places, np.float32) for view in views]
     image_points = [np.asarray(view.pixels, np.float32) for view in views]
-    coverage = _coverage(np.concatenate(image_points), size)
+    coverage = _coverage(np.concatenate([view.pixels for view in views]), size)
     if coverage < 0.5:
         raise InputError(
             f"the board's corners cover {100 * coverage:.0f} % of the image; show it in every corner (50 % or more)"

@@ -114,7 +114,7 @@ def _board_pose(view: BoardView, camera: Camera) -> Array | None:
     import cv2
 
     solved, turn, place = cv2.solvePnP(view.places, view.pixels, camera.matrix, np.array(camera.distortion))
-    return np.concatenate([turn.ravel(), place.ravel()]) if solved else None
+    return np.concatenate([turn.ravel(), place.ravel()]).astype(np.float64) if solved else None
 
 
 def _slopes(view: BoardView, pose: Array, camera: Camera) -> tuple[Array, Array]:
