@@ -1,8 +1,8 @@
 """The whole loop in about four minutes: learn, drive on ice, find a hidden fault, train on with it; ends with one page.
 
 A policy learns; slip-aware and blind drive on the same ice; an emulated robot with a hidden fault is driven; the gap workflow
-names the fault; the patched simulator is tried on held-out runs; the policy trains on with it and drives the robot again, beside
-the old one. All pictures are in the page, demo.html.
+names the fault; the patched simulator is tried on held-out runs; the policy trains on with it and drives the robot again,
+beside the old one. All pictures are in the page, demo.html.
 
 Uses two cores. Parts whose packages are not installed are left out, and the page says how to install them; Ctrl-C leaves what
 was made until then.
@@ -62,8 +62,8 @@ def run(options: DemoOptions) -> int:
     record_provenance(demo.out, {"seed": demo.seed, "steps": demo.steps, "quick": options.quick}, demo.seed)
     console, began = Console(highlight=False, soft_wrap=True), time.monotonic()
     console.print(
-        "A policy learns; slip-aware and blind drive on ice; a robot has a hidden fault; the gap workflow looks for it; the policy "
-        "trains on."
+        "A policy learns; slip-aware and blind drive on ice; a robot has a hidden fault; the gap workflow looks for it; "
+        "the policy trains on."
     )
     with progress(console, tuple(WORKERS), options.progress) as tell:
         outcome = run_workers(demo, tell)

@@ -122,8 +122,10 @@ def worse_channels(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[
         before, after: channel -> error of each run, without the patch and with it.
     """
 
+    from wlr_gym.data.replay import pooled
+
     def error(runs: Sequence[Mapping[str, Any]], channel: str) -> float:
-        return float(np.sqrt(np.mean([(run[channel].segment_rms / run[channel].noise) ** 2 for run in runs])))
+        return pooled([run[channel] for run in runs], lambda one: one.segment_rms / one.noise)
 
     return [one for one in before[0] if error(after, one) > error(before, one) + _WORSE]
 

@@ -83,17 +83,17 @@ def outcome(numbers: dict[str, Any]) -> tuple[str, str]:
         numbers: tracking errors ``old`` and ``new`` of the same episodes, ``better_percent`` and ``better_ci95``.
     """
     better, (low, high) = numbers["better_percent"], numbers["better_ci95"]
-    if low > 0.0:
-        verb, verdict = f"{better:.0f} % lower", SHOWN
-    elif high < 0.0:
-        verb, verdict = f"{-better:.0f} % higher: training on made it worse", NOT_SHOWN
-    else:
-        verb, verdict = f"no different beyond the interval ({better:+.0f} % better)", NOT_SHOWN
     before, after = (number(_mean(numbers[name])) for name in ("old", "new"))
-    text = (
-        f"On the robot with the fault the tracking error went from {before} to {after} once the policy was trained on: {verb}"
-    )
-    return f"{text} (95 % interval {low:.0f} to {high:.0f} %, {len(numbers['old'])} pairs of episodes).", verdict
+    interval, verdict, tail = f"95 % interval {low:.0f} to {high:.0f} %", NOT_SHOWN, ""
+    if low > 0.0:
+        change, verdict = f"{better:.0f} % lower", SHOWN
+    elif high < 0.0:
+        change, interval = f"{-better:.0f} % higher", f"95 % interval {-high:.0f} to {-low:.0f} %"
+        tail = " Training on made it worse."
+    else:
+        change, tail = f"lower by {better:.0f} %", " No difference beyond the interval."
+    text = f"Tracking error on the robot with the fault {before} before and {after} after training on: {change}"
+    return f"{text} ({interval}, {len(numbers['old'])} pairs of episodes).{tail}", verdict
 
 
 def _mean(values: list[float]) -> float:
@@ -139,7 +139,7 @@ def _film(demo: Demo, hidden: Any, numbers: dict[str, Any], tell: Tell) -> str:
 
 
 _CAPTION = (
-    "The robot with the hidden fault, simulated, the same commands for both: drive on, turn right, turn left, stop. Above: each "
-    "policy's mean tracking error over the episodes of the table. Arrows: where each wheel slips to, 0.1 m for 0.05 m/s. Pink: "
-    "the path of the robot; dashed: the path that was commanded. One scene; what counts is the table."
+    "The robot with the hidden fault, simulated, the same commands for both: drive on, turn right, turn left, stop. Above: "
+    "each policy's mean tracking error over the episodes of the table. Arrows: where each wheel slips to, 0.1 m for 0.05 m/s. "
+    "Pink: the path of the robot; dashed: the path that was commanded. One scene; what counts is the table."
 )
