@@ -84,6 +84,7 @@ def test_training_on_is_ticked_only_where_the_interval_says_so():
 def test_without_numbers_of_the_gap_workflow_nothing_is_trained(tmp_path):
     demo = Demo(tmp_path)
     save_patch(load_patch([hidden_fault.hide(0)]), demo.hidden)
+    demo.gap.mkdir()
     write_json(demo.gap / RESULT_FILE, NO_NUMBERS)
     save_patch(load_patch(None), demo.gap / PATCH_FILE)
     section = retraining.retrain(demo, lambda text, share: None)
