@@ -17,11 +17,11 @@ from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section, Tell,
 TITLE = "6. What training on wins back"
 OLD, NEW = "old policy", "trained on"
 #: The film: drive on, turn both ways, stop.
-SCHEDULE = "0:0.1,0; 2:0.1,-0.4; 5:0.1,0.4; 8:0,0"
+SCHEDULE = "0:0.1,0; 1:0.1,-0.4; 3:0.1,0.4; 5:0,0"
 PICTURES_PER_SECOND = 10.0
 #: Pixels.
 SIZE = (400, 330)
-#: Shares of the stage, measured: training, driving; the film is the rest.
+#: Shares of the stage: training, driving; the film is the rest.
 _TRAINING, _DRIVING = 0.5, 0.3
 
 
@@ -126,7 +126,7 @@ def _film(demo: Demo, hidden: Any, numbers: dict[str, Any], tell: Tell) -> str:
             ENVIRONMENT,
             [Subject(f"{name}: tracking error {_mean(numbers[key]):.3f}", (source,)) for name, source, key in sources],
             FIRST_SEED + demo.seed,
-            0.75 * demo.film_seconds,
+            0.5 * demo.film_seconds,
             {"randomization": "none", "effects": hidden, **having(())},
             view=View(size=SIZE, path=True),
             schedule=SCHEDULE,

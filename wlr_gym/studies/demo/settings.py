@@ -31,7 +31,7 @@ class Demo:
     film_seconds: float = 12.0
     run_seconds: float = 10.0
     runs: int = 4
-    further_steps: int = 1_250_000
+    further_steps: int = 1_000_000
     drives: int = 8
     drive_seconds: float = 5.0
 
