@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.html import table
+from wlr_gym.base.html import commands, table
 from wlr_gym.base.text import number
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.gap.report.text import listed, places, plain
@@ -66,7 +66,7 @@ def retrain(demo: Demo, tell: Tell) -> Section:
         "the simulator with what the gap workflow found and calibrated, each number drawn from its interval. It is not told "
         "what was hidden."
     )
-    html += _said(model) + f"<p>The same by itself: <code>{training.command}</code></p>"
+    html += _said(model) + commands([training.command])
     html += paragraph(
         f"Then both drive the emulated robot with the hidden fault in turns: {demo.drives} episodes of "
         f"{demo.drive_seconds:g} s each, the same commands for both, none met in training. Tracking error: rms errors of "
