@@ -9,14 +9,20 @@ from functools import partial
 
 import pytest
 
+from wlr_gym.base.files import write_json
 from wlr_gym.cli import INTERRUPTED, main
 from wlr_gym.data import read_dataset
-from wlr_gym.physics.effects import load_patch
-from wlr_gym.studies.demo import workers
+from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
+from wlr_gym.physics.effects import load_patch, save_patch
+from wlr_gym.studies.demo import hidden_fault, retraining, workers
 from wlr_gym.studies.demo.settings import Demo
-from wlr_gym.studies.demo.stage import SKIPPED
+from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED
 
 COMMAND = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "demo", "--quick"]
+NO_NUMBERS = {
+    "verdict": "not_excited", "effects": [], "equivalent": [], "calibration": {}, "localisation": {}, "gap": None,
+    "runs": {"fit": [], "heldout": []}, "patch": "patch.yaml",
+}  # fmt: skip
 TITLES = [stage.title for stages in workers.WORKERS.values() for stage in stages]
 
 
@@ -38,6 +44,7 @@ def test_the_whole_loop_ends_in_one_page(tmp_path, capsys):
     assert (out / "gap" / "patch.yaml").is_file()
     for table in re.findall(r"<table>.*?</table>", page, re.DOTALL):
         assert "nan" not in table
+    assert "Left out" in page or (out / "trained_on.webp").is_file()
 
 
 def test_what_is_not_installed_is_left_out_and_said(tmp_path, monkeypatch):
@@ -54,6 +61,36 @@ def test_what_is_not_installed_is_left_out_and_said(tmp_path, monkeypatch):
     assert "pip install &#x27;wlr-gym[train]&#x27;" in sections[0]["html"]
     assert "the robot was not driven" in sections[3]["html"]
     assert "no result of the gap workflow" in sections[4]["html"]
+    assert sections[5]["verdict"] == SKIPPED
+
+
+def numbers(old, new, better, low, high):
+    return {"old": old, "new": new, "better_percent": better, "better_ci95": [low, high]}
+
+
+def test_training_on_is_ticked_only_where_the_interval_says_so():
+    sentence, verdict = retraining.outcome(numbers([0.4, 0.6], [0.3, 0.5], 20.0, 12.0, 31.0))
+    assert verdict == SHOWN
+    assert "0.5 before and 0.4 after training on: 20 % lower (95 % interval 12 to 31 %, 2 pairs" in sentence
+    sentence, verdict = retraining.outcome(numbers([0.4, 0.6], [0.4, 0.58], 2.0, -3.0, 5.0))
+    assert verdict == NOT_SHOWN
+    assert "No difference beyond the interval" in sentence
+    sentence, verdict = retraining.outcome(numbers([0.4, 0.6], [0.5, 0.7], -20.0, -31.0, -12.0))
+    assert verdict == NOT_SHOWN
+    assert "20 % higher (95 % interval 12 to 31 %" in sentence
+    assert "made it worse" in sentence
+
+
+def test_without_numbers_of_the_gap_workflow_nothing_is_trained(tmp_path):
+    demo = Demo(tmp_path)
+    save_patch(load_patch([hidden_fault.hide(0)]), demo.hidden)
+    demo.gap.mkdir()
+    write_json(demo.gap / RESULT_FILE, NO_NUMBERS)
+    save_patch(load_patch(None), demo.gap / PATCH_FILE)
+    section = retraining.retrain(demo, lambda text, share: None)
+    assert section.verdict == SKIPPED
+    assert "no numbers to train on with" in section.headline
+    assert "The verdict is 'not_excited'" in section.html.replace("&#x27;", "'")
 
 
 def test_a_stage_that_fails_does_not_take_the_others_with_it(tmp_path, monkeypatch, capsys):

@@ -1,8 +1,9 @@
 """The hidden fault of the demo's robot, and how a diagnosis is judged."""
 
+from wlr_gym.data.replay import ChannelError
 from wlr_gym.gap.report.entries import EffectEntry, ParameterEntry
 from wlr_gym.physics.effects import load_patch
-from wlr_gym.studies.demo.diagnosis import judge
+from wlr_gym.studies.demo.diagnosis import judge, worse_channels
 from wlr_gym.studies.demo.hidden_fault import hide
 
 
@@ -52,3 +53,12 @@ def test_what_is_named_besides_is_not_right():
     assert not answer.right
     assert answer.extra == ("payload",)
     assert "payload was named, too, but is not there" in answer.sentence
+
+
+def test_a_channel_that_got_worse_is_named():
+    def errors(**values):
+        return {channel: ChannelError(value, value, "rad", 0.5) for channel, value in values.items()}
+
+    before = [errors(pos_leg_lf=1.0, gyro_z=0.5), errors(pos_leg_lf=1.0, gyro_z=0.5)]
+    assert worse_channels(before, [errors(pos_leg_lf=0.6, gyro_z=0.5), errors(pos_leg_lf=0.6, gyro_z=0.54)]) == []
+    assert worse_channels(before, [errors(pos_leg_lf=0.6, gyro_z=0.5), errors(pos_leg_lf=0.6, gyro_z=0.9)]) == ["gyro_z"]

@@ -132,6 +132,7 @@ def film_beside(
     *,
     view: View | None = None,
     schedule: str | None = None,
+    title: str = "",
     fps: float = FPS,
     watch: Callable[[Iterable[Picture], int], Iterable[Picture]] = lambda pictures, count: pictures,
 ) -> Path:
@@ -146,6 +147,7 @@ def film_beside(
         keywords: of the environment.
         view: what to show.
         schedule: commands from given times on, see :class:`wlr_gym.render.teleop.Script`; None = the task's own.
+        title: first line of the text in the pictures.
         fps: pictures per second, where the control period allows.
         watch: is given the pictures and how many there will be, and yields them (progress bars).
 
@@ -163,7 +165,7 @@ def film_beside(
             stack.callback(core.close)
             driver = None if schedule is None else Script(schedule, core.task.commands)
             count, _, rate = film_length(core, seconds, fps)
-            films.append(film(core, policy, seed, seconds, view=view, driver=driver, fps=fps))
+            films.append(film(core, policy, seed, seconds, view=view, driver=driver, title=title, fps=fps))
         pictures = films[0] if len(films) == 1 else side_by_side(films[0], films[1], (subjects[0].name, subjects[1].name))
         return write_video(path, watch(pictures, count), rate, count)
 

@@ -1,1 +1,1 @@
-"""The whole loop in one go: learn, compare on ice, drive a robot with a hidden fault, name it, validate it; one page."""
+"""The whole loop: learn, compare on ice, drive a robot with a hidden fault, name it, validate it, train on; one page."""

@@ -30,6 +30,8 @@ NAME_TITLE = "4. What does the simulator lack?"
 CHECK_TITLE = "5. Does it hold?"
 #: Channels in the picture of a replay.
 _SHOWN = 3
+#: A channel has got worse where its error rises by more than this; 1 = sensor noise.
+_WORSE = 0.1
 
 
 def name(demo: Demo, tell: Tell) -> Section:
@@ -71,21 +73,21 @@ def check(demo: Demo, tell: Tell) -> Section:
     if not (demo.gap / RESULT_FILE).is_file():
         raise InputError("no result of the gap workflow to check")
     result = read_result(demo.gap / RESULT_FILE)
-    html, agrees = _replayed(demo, result, load_patch(demo.gap / PATCH_FILE), tell)
+    html, agrees, better = _replayed(demo, result, load_patch(demo.gap / PATCH_FILE), tell)
     hidden = load_patch(demo.hidden).effects[0]
     answer = judge(hidden, result.effects, result.equivalent)
     html += heading("The hidden fault") + _revealed(hidden, result.effects, answer)
-    return Section(CHECK_TITLE, f"{answer.sentence} {agrees}", html, SHOWN if answer.right else NOT_SHOWN)
+    return Section(CHECK_TITLE, f"{answer.sentence} {agrees}", html, SHOWN if answer.right and better else NOT_SHOWN)
 
 
-def _replayed(demo: Demo, result: Result, patch: Any, tell: Tell) -> tuple[str, str]:
-    """Return the part about the replays, and its sentence for the top of the page."""
+def _replayed(demo: Demo, result: Result, patch: Any, tell: Tell) -> tuple[str, str, bool]:
+    """Return the part about the replays, its sentence for the top of the page, and whether all of the simulator got better."""
     from wlr_gym.data import read_dataset
     from wlr_gym.data.replay import pooled, replay
 
     runs = [run for run in read_dataset(demo.measured).runs if run.name in result.runs.heldout]
     if not runs:
-        return paragraph("No run was held out."), ""
+        return paragraph("No run was held out."), "", False
     pairs = []
     for index, run in enumerate(runs):
         tell(f"replaying {run.name}, held out", index / len(runs))
@@ -106,9 +108,26 @@ def _replayed(demo: Demo, result: Result, patch: Any, tell: Tell) -> tuple[str, 
         demo.out / "replay.png",
         f"{runs[0].name}, which no fit has seen: the channels that were furthest off without the patch.",
     )
-    verb = "fell" if after < before else "rose"
-    numbers = f"from {number(before)} to {number(after)} (1 = sensor noise)"
-    return text, f"With the patch the simulator's error on held-out runs {verb} {numbers}."
+    worse = worse_channels(*([one.errors for one in several] for several in zip(*pairs, strict=True)))
+    verb = "fell" if after < before else "rose" if after > before else "stayed"
+    said = f"With the patch the simulator's error on held-out runs {verb} from {number(before)} to {number(after)} "
+    said += f"(1 = sensor noise){f', and rose in {listed(worse)}' if worse and after < before else ''}."
+    return text, said, after < before and not worse
+
+
+def worse_channels(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the channels whose error the patch makes larger, by more than a tenth of the sensor noise, over all runs.
+
+    Args:
+        before, after: channel -> error of each run, without the patch and with it.
+    """
+
+    from wlr_gym.data.replay import pooled
+
+    def error(runs: Sequence[Mapping[str, Any]], channel: str) -> float:
+        return pooled([run[channel] for run in runs], lambda one: one.segment_rms / one.noise)
+
+    return [one for one in before[0] if error(after, one) > error(before, one) + _WORSE]
 
 
 def _replay_picture(before: ReplayResult, after: ReplayResult) -> Figure:

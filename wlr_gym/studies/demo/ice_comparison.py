@@ -9,7 +9,7 @@ from wlr_gym.base.html import heading, table
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.evaluation import FIRST_SEED, MAIN, Card, Condition, Estimate, Subject, play, work
 from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
-from wlr_gym.studies.demo.stage import Section, Tell, paragraph, picture
+from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, Section, Tell, paragraph, picture
 
 TITLE = "2. On ice"
 OURS = "velocity_slip_aware"
@@ -57,7 +57,8 @@ def compare(demo: Demo, tell: Tell) -> Section:
         "the wheels beyond what turning needs. Mean ± half of the 95 % confidence interval."
     )
     html += "".join(heading(said) + _table(card, label) + paragraph(_against(card, label)) for label, said in FLOORS.items())
-    return Section(TITLE, _headline(card), html + _film(demo, tell))
+    better = all(card.comparison[label][BLIND]["tracking_error"].low > 0.0 for label in FLOORS)
+    return Section(TITLE, _headline(card), html + _film(demo, tell), SHOWN if better else NOT_SHOWN)
 
 
 def _play(demo: Demo, tell: Tell) -> Card:

@@ -12,7 +12,7 @@ import numpy as np
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
-from wlr_gym.studies.demo.stage import Section, Tell, drawn, paragraph
+from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, Section, Tell, drawn, paragraph
 
 if TYPE_CHECKING:
     from wlr_gym.learning.evaluation import Rollout
@@ -41,9 +41,11 @@ def train(demo: Demo, tell: Tell) -> Section:
     first, last = (row["reward_per_second"] for row in (curve[0], curve[-1]))
     robots, period = int(config["num_envs"]), 0.02
     hours = curve[-1]["steps"] * period / 3600.0
+    learnt = last > first
     headline = (
-        f"A new policy learnt from nothing in {curve[-1]['steps'] / 1e6:.1f} million environment steps: "
-        f"reward {first:.2f} to {last:.2f} per second of at most {BEST:g}."
+        f"A new policy {'learnt from nothing' if learnt else 'was trained, and did not get better,'} in "
+        f"{curve[-1]['steps'] / 1e6:.2g} million environment steps: reward {first:.2f} to {last:.2f} per second of at most "
+        f"{BEST:g}."
     )
     html = paragraph(
         f"PPO (Stable-Baselines3) drives {robots} simulated robots at once, on floors from slippery to grippy, and is to "
@@ -62,7 +64,7 @@ def train(demo: Demo, tell: Tell) -> Section:
         demo.out / "episode.png",
         "An episode of the new policy that it has not trained on, the one of the most driving and turning.",
     )
-    return Section(TITLE, headline, html)
+    return Section(TITLE, headline, html, SHOWN if learnt else NOT_SHOWN)
 
 
 @contextmanager

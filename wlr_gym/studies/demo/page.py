@@ -28,7 +28,7 @@ def write_page(demo: Demo, sections: Sequence[Section], interrupted: bool = Fals
 def page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> str:
     """Return the page."""
     worst = max((one.verdict for one in sections), key=_ORDER.index, default=SKIPPED)
-    title = "wlr_gym: from learning to a simulator that agrees with the robot"
+    title = "wlr_gym: learn, drive, find what the simulator lacks, train on"
     lines = "".join(_line(one) for one in sections)
     stopped = "<p><b>Stopped before it was over: the page has what was made until then.</b></p>" if interrupted else ""
     header = (

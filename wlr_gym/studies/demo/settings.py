@@ -20,6 +20,8 @@ class Demo:
         film_seconds: length of the film.
         run_seconds: length of each measured run.
         runs: how many of them, 3 to 4.
+        further_steps: environment steps to train on for, with what was found.
+        drives, drive_seconds: episodes of the old and the new policy on the robot, and their length.
     """
 
     out: Path
@@ -29,6 +31,9 @@ class Demo:
     film_seconds: float = 12.0
     run_seconds: float = 10.0
     runs: int = 4
+    further_steps: int = 1_000_000
+    drives: int = 8
+    drive_seconds: float = 5.0
 
     @property
     def training(self) -> Path:
@@ -44,6 +49,11 @@ class Demo:
     def gap(self) -> Path:
         """Folder of the gap workflow's results."""
         return self.out / "gap"
+
+    @property
+    def adapted(self) -> Path:
+        """Folder of the training with what was found, and of the drives after it."""
+        return self.out / "adapted"
 
     @property
     def hidden(self) -> Path:

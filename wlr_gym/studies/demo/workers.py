@@ -19,26 +19,27 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from wlr_gym.base.errors import InputError, MissingPackageError, require_package
-from wlr_gym.studies.demo import diagnosis, hidden_fault, ice_comparison, learn
+from wlr_gym.studies.demo import diagnosis, hidden_fault, ice_comparison, learn, retraining
 from wlr_gym.studies.demo.settings import Demo
 from wlr_gym.studies.demo.stage import FAILED, SKIPPED, DemoStage, Section, paragraph
 
 #: The shipped policies are ONNX files.
 _POLICIES = (("onnxruntime", "export"),)
+#: What training takes.
+_TRAINING = (("torch", "train"), ("stable_baselines3", "train"), ("tensorboard", "train"))
 #: The emulated robot is driven by the servo library.
 _ROBOT = (("dynamixel_sdk", "robot"), ("serial", "robot"))
 #: Worker -> its stages, one after the other. Shares: measured on a quiet core.
 WORKERS: Mapping[str, tuple[DemoStage, ...]] = {
     "policies": (
-        DemoStage(
-            learn.TITLE, learn.train, 0.6, (("torch", "train"), ("stable_baselines3", "train"), ("tensorboard", "train"))
-        ),
+        DemoStage(learn.TITLE, learn.train, 0.6, _TRAINING),
         DemoStage(ice_comparison.TITLE, ice_comparison.compare, 0.4, _POLICIES),
     ),
     "robot": (
-        DemoStage(hidden_fault.TITLE, hidden_fault.drive, 0.25, (*_POLICIES, *_ROBOT)),
-        DemoStage(diagnosis.NAME_TITLE, diagnosis.name, 0.7),
+        DemoStage(hidden_fault.TITLE, hidden_fault.drive, 0.15, (*_POLICIES, *_ROBOT)),
+        DemoStage(diagnosis.NAME_TITLE, diagnosis.name, 0.45),
         DemoStage(diagnosis.CHECK_TITLE, diagnosis.check, 0.05),
+        DemoStage(retraining.TITLE, retraining.retrain, 0.35, (*_TRAINING, *_POLICIES, *_ROBOT)),
     ),
 }
 #: Called with the worker, what it is doing, and the share of its work that is done.

@@ -1,0 +1,145 @@
+"""Last stage: the policy trains on with what was found, and drives the robot with the fault in turns with the old one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.html import commands, table
+from wlr_gym.base.text import number
+from wlr_gym.envs.tasks.task_config import having
+from wlr_gym.gap.report.text import listed, places, plain
+from wlr_gym.learning.evaluation import FIRST_SEED, Subject
+from wlr_gym.studies.demo.hidden_fault import POLICY
+from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
+from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section, Tell, paragraph, picture
+
+TITLE = "6. What training on wins back"
+OLD, NEW = "old policy", "trained on"
+#: The film: drive on, turn both ways, stop.
+SCHEDULE = "0:0.1,0; 1:0.1,-0.4; 3:0.1,0.4; 5:0,0"
+PICTURES_PER_SECOND = 10.0
+#: Pixels.
+SIZE = (400, 330)
+#: Shares of the stage: training, driving; the film is the rest.
+_TRAINING, _DRIVING = 0.5, 0.3
+
+
+def retrain(demo: Demo, tell: Tell) -> Section:
+    """Train on from the shipped policy, drive both on the robot with the fault, film them."""
+    from wlr_gym.gap.decision import Decided, History
+    from wlr_gym.gap.report.result import RESULT_FILE, read_result
+    from wlr_gym.learning.adaptation.driving import drive_after
+    from wlr_gym.learning.adaptation.identification import state_uncertainty
+    from wlr_gym.learning.adaptation.plan import Asked, Progress
+    from wlr_gym.learning.adaptation.retraining import train_on, trained_policy
+    from wlr_gym.learning.adaptation.robots import EmulatedRobot
+    from wlr_gym.physics.effects import load_patch
+    from wlr_gym.robot import load_robot, robot_hash
+
+    if not (demo.gap / RESULT_FILE).is_file():
+        raise InputError("no result of the gap workflow to train on with")
+    own, hidden = load_robot(), load_patch(demo.hidden)
+    asked = Asked(
+        policy=POLICY,
+        identity="",
+        environment=ENVIRONMENT,
+        robot=robot_hash(own),
+        driven="emulated",
+        drives=demo.drives,
+        drive_seconds=demo.drive_seconds,
+        steps=demo.further_steps,
+        seed=demo.seed,
+    )
+    progress = Progress(demo.adapted, asked, lambda text, share: tell(f"training on: {text}", _TRAINING * share))
+    result = read_result(demo.gap / RESULT_FILE)
+    history = History(data=str(demo.measured), robot=None, backend="gibbs_appell", known=[])
+    model, found = state_uncertainty(progress, Decided(history, result, demo.gap), own)
+    if found is None:
+        return Section(TITLE, "Left out: the gap workflow states no numbers to train on with.", _said(model), SKIPPED)
+    training = train_on(progress, found)
+    progress.tell = lambda text, share: tell(text, _TRAINING + _DRIVING * share)
+    after = drive_after(progress, EmulatedRobot(own, hidden), trained_policy(progress))
+    headline, verdict = outcome(after.numbers)
+    html = paragraph(
+        f"The shipped policy {POLICY}, which has driven this robot, trains on for {demo.further_steps:,} environment steps on "
+        "the simulator with what the gap workflow found and calibrated, each number drawn from its interval. It is not told "
+        "what was hidden."
+    )
+    html += _said(model) + commands([training.command])
+    html += paragraph(
+        f"Then both drive the emulated robot with the hidden fault in turns: {demo.drives} episodes of "
+        f"{demo.drive_seconds:g} s each, the same commands for both, none met in training. Tracking error: rms errors of "
+        "velocity and yaw rate in units of 10 % of the range of commands."
+    )
+    html += _episodes(after.numbers) + _said(after) + _film(demo, hidden, after.numbers, tell)
+    return Section(TITLE, headline, html, verdict)
+
+
+def outcome(numbers: dict[str, Any]) -> tuple[str, str]:
+    """Return the sentence for the top of the page, and whether training on has shown to help.
+
+    Args:
+        numbers: tracking errors ``old`` and ``new`` of the same episodes, ``better_percent`` and ``better_ci95``.
+    """
+    better, (low, high) = numbers["better_percent"], numbers["better_ci95"]
+    before, after = (number(_mean(numbers[name])) for name in ("old", "new"))
+    interval, verdict, tail = f"95 % interval {low:.0f} to {high:.0f} %", NOT_SHOWN, ""
+    if low > 0.0:
+        change, verdict = f"{better:.0f} % lower", SHOWN
+    elif high < 0.0:
+        change, interval = f"{-better:.0f} % higher", f"95 % interval {-high:.0f} to {-low:.0f} %"
+        tail = " Training on made it worse."
+    else:
+        change, tail = f"lower by {better:.0f} %", " No difference beyond the interval."
+    text = f"Tracking error on the robot with the fault {before} before and {after} after training on: {change}"
+    return f"{text} ({interval}, {len(numbers['old'])} pairs of episodes).{tail}", verdict
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _said(step: Any) -> str:
+    return "".join(paragraph(line) for line in step.said)
+
+
+def _episodes(numbers: dict[str, Any]) -> str:
+    rows = [
+        (f"{index + 1}", number(old), number(new), f"{100.0 * (1.0 - new / old):+.0f}")
+        for index, (old, new) in enumerate(zip(numbers["old"], numbers["new"], strict=True))
+    ]
+    return table(("episode", f"tracking error, {OLD}", f"tracking error, {NEW}", "better by (%)"), rows, range(1, 4))
+
+
+def _film(demo: Demo, hidden: Any, numbers: dict[str, Any], tell: Tell) -> str:
+    from wlr_gym.learning.adaptation.retraining import TRAINING
+    from wlr_gym.learning.evaluation.film import film_beside
+    from wlr_gym.render.view import View
+
+    sources = ((OLD, POLICY, "old"), (NEW, str(demo.adapted / TRAINING / "policy"), "new"))
+    fault = listed([f"{plain(one.name)}, {places(one.where)}" for one in hidden.effects])
+    tell("film: the old policy beside the new one", _TRAINING + _DRIVING)
+    try:
+        path = film_beside(
+            demo.out / "trained_on.webp",
+            ENVIRONMENT,
+            [Subject(f"{name}: tracking error {_mean(numbers[key]):.3f}", (source,)) for name, source, key in sources],
+            FIRST_SEED + demo.seed,
+            0.5 * demo.film_seconds,
+            {"randomization": "none", "effects": hidden, **having(())},
+            view=View(size=SIZE, path=True),
+            schedule=SCHEDULE,
+            title=f"fault: {fault}",
+            fps=PICTURES_PER_SECOND,
+        )
+    except InputError as error:
+        return paragraph(f"No film: {error}.")
+    return picture(path, _CAPTION)
+
+
+_CAPTION = (
+    "The robot with the hidden fault, simulated, the same commands for both: drive on, turn right, turn left, stop. Above: "
+    "each policy's mean tracking error over the episodes of the table. Arrows: where each wheel slips to, 0.1 m for 0.05 m/s. "
+    "Pink: the path of the robot; dashed: the path that was commanded. One scene; what counts is the table."
+)
