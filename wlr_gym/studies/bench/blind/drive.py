@@ -2,8 +2,8 @@
 
 Servos, friction and contacts are forces. Whatever resists motion is a damper whose coefficient is its bound over the speed, but
 never over less than the copy's ``floor_creep`` or ``gear_creep``: dry friction that creeps a little instead of sticking. All
-dampers and the floor's springs act implicitly: each step solves (M + h sum c J'J) v = M v_old + h f for the new velocities, again with new coefficients until they
-agree. No complementarity, no impulses, half a millisecond per step.
+dampers and the floor's springs act implicitly: each step solves (M + h sum c J'J) v = M v_old + h f for the new velocities,
+again with new coefficients until they agree. No complementarity, no impulses, half a millisecond per step.
 """
 
 # pyright: reportAttributeAccessIssue=false
