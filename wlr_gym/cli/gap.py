@@ -37,7 +37,8 @@ class GapOptions(DecideOptions, PatchOption):
     out: Path
     """Folder for the results; made if it is not there. Results of an earlier analysis are replaced."""
     rig: str | None = None
-    """Recordings of a test rig instead of runs of the robot: pendulum (one servo that swings a weight)."""
+    """Runs of something else than the robot: pendulum (one servo that swings a weight), or a Python file that describes a
+    system of your own (docs/own_rig.md)."""
     robot: str | None = None
     """Robot file or config name; default: the one meta.yaml names, else the nominal one."""
     backend: str = "gibbs_appell"
@@ -117,7 +118,7 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
 
 
 def _check(options: GapOptions) -> None:
-    from wlr_gym.gap.workflow import RIGS
+    from wlr_gym.gap.workflow import OWN_RIG, RIGS
     from wlr_gym.physics.plants import SIMULATORS
     from wlr_gym.robot import load_robot
 
@@ -126,7 +127,7 @@ def _check(options: GapOptions) -> None:
         raise InputError(f"{options.data}: {what}; expected a folder of runs")
     if options.backend not in SIMULATORS:
         raise unknown_name("simulator", options.backend, SIMULATORS, "--backend")
-    if options.rig is not None and options.rig not in RIGS:
+    if options.rig is not None and options.rig not in RIGS and not options.rig.endswith(OWN_RIG):
         raise unknown_name("rig", options.rig, RIGS)
     if options.rig is not None and (options.backend != GapOptions.backend or options.robot is not None):
         raise InputError(f"--rig {options.rig}: the rig has a simulator of its own: leave --backend and --robot out")
@@ -145,9 +146,16 @@ def _check(options: GapOptions) -> None:
 
 def _known(options: GapOptions) -> Patch:
     """The effects given as known, in the vocabulary of the robot or of the rig."""
+    from wlr_gym.gap.workflow import OWN_RIG
+
     try:
         if options.rig is None:
             return options.patch()
+        if options.rig.endswith(OWN_RIG):
+            from wlr_gym.gap.rig.own import load_rig
+            from wlr_gym.gap.rig.own_problem import own_patch
+
+            return own_patch(list(options.effects), load_rig(options.rig))
         from wlr_gym.gap.rig.open import rig_patch
 
         return rig_patch(list(options.effects))

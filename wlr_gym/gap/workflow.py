@@ -72,6 +72,8 @@ SCATTER = 5.0
 CONFOUNDED = "confounded with calibrated parameters"
 #: Kinds of rigs.
 RIGS = ("pendulum",)
+#: Ending of the file of a rig of one's own.
+OWN_RIG = ".py"
 #: Sums of several threads round otherwise, and a fit may end elsewhere.
 _one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 #: Share of the effects that must be visible within their plausible range for "nothing missing" to mean anything.
@@ -97,7 +99,8 @@ def analyse(
         data: folder of runs in the measured-run format (with ``rig``: recordings of the rig).
         out: where result, patch, pictures and report are written; None = nowhere.
         known: effects that are known already.
-        rig: None = the robot; ``pendulum`` = one servo that swings a pendulum.
+        rig: None = the robot; ``pendulum`` = one servo that swings a pendulum; a Python file = a system of one's own
+            (:mod:`wlr_gym.gap.rig.own`).
         robot: file or config name; None = the one the runs' meta data name, else the nominal one.
         backend: simulator.
         heldout: names of the runs to hold out; empty = chosen by how informative the other runs are.
@@ -123,6 +126,13 @@ def analyse(
 
         known = rig_patch(known)
         opened = open_rig(data, known)
+    elif rig.endswith(OWN_RIG):
+        from wlr_gym.gap.rig.own import load_rig
+        from wlr_gym.gap.rig.own_problem import open_own_rig, own_patch
+
+        own = load_rig(rig)
+        known = own_patch(known, own)
+        opened = open_own_rig(data, own, known.effects)
     else:
         raise unknown_name("rig", rig, RIGS)
     problem, findings = opened
