@@ -1,10 +1,10 @@
 """A system of your own in the gap workflow: a linear axis, its state equation, tolerances, laws to try and columns.
 
-``RIG`` is all that ``wlr gap RUNS --rig examples/linear_axis.py --out report`` needs. Run as a program, it records eight runs of
-a simulated axis (another integrator, friction that truly sticks) whose carriage runs harder forward than backward, and analyses
-them; the workflow is told none of it. A minute.
+``RIG`` is all that ``wlr gap RUNS --rig examples/linear_axis.py --out report`` needs. Run as a program, it records eight runs
+of a simulated axis (another integrator, friction that truly sticks) whose carriage runs harder forward than backward, and
+analyses them; the workflow is told none of it. Ten seconds.
 
-    python examples/linear_axis.py [--out FOLDER]
+    python examples/linear_axis.py [--out FOLDER] [--quick]
 """
 
 import argparse
@@ -105,22 +105,20 @@ def _moved(position, speed, push, mass, friction, difference, h):
     """One step of a carriage that sticks: friction stops it within a step, or holds it."""
     forward, backward = friction + 0.5 * difference, friction - 0.5 * difference
     free = speed + h * push / mass
-    if free > 0.0:
-        speed = max(free - h * forward / mass, 0.0)
-    else:
-        speed = min(free + h * backward / mass, 0.0)
+    speed = max(free - h * forward / mass, 0.0) if free > 0.0 else min(free + h * backward / mass, 0.0)
     return position + h * speed, speed
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="folder for the report")
-    out = parser.parse_args().out
+    parser.add_argument("--quick", action="store_true", help="four runs instead of eight")
+    options = parser.parse_args()
     from wlr_gym.gap import analyse
 
     with tempfile.TemporaryDirectory() as folder:
-        record(Path(folder))
-        found = analyse(folder, out, rig=__file__)
+        record(Path(folder), runs=4 if options.quick else 8)
+        found = analyse(folder, options.out, rig=__file__)
     print(f"verdict: {found.verdict}")
     for effect in found.effects:
         for name, one in effect.parameters.items():

@@ -150,7 +150,7 @@ def test_patches_are_read_by_the_rigs_own_laws(tmp_path):
     path = tmp_path / "patch.yaml"
     path.write_text(yaml.safe_dump({"effects": [{"name": "load", "where": ["axis"], "parameters": {"load": 0.4}}]}))
     assert own_patch(path, AXIS).effects[0].parameters == {"load": 0.4}
-    with pytest.raises(InputError, match="unknown effect of the test rig 'lod'.*load"):
+    with pytest.raises(InputError, match=r"unknown effect of the test rig 'lod'.*load"):
         own_patch({"name": "lod", "parameters": {}}, AXIS)
     with pytest.raises(InputError, match="the rig has one joint, axis"):
         own_patch({"name": "load", "where": ["servo"], "parameters": {"load": 0.4}}, AXIS)
