@@ -80,6 +80,9 @@ class BenchOptions:
     """gap: run on Ray: alone, it is started on this machine; with an address (auto, 10.0.0.1:6379), that cluster is used."""
     answers: Path | None = None
     """gap: answers.json of another folder; its sets are not analysed again, but for those that failed."""
+    classifier: int = 0
+    """gap: afterwards train the baseline, a classifier on the scores of the first screening, on so many sets of the engine
+    (kept in --out; half a minute each), and score its answers to the same data sets."""
     speed: tuple[Path, ...] = ()
     """gap: instead of the blind test, time the analysis of these folders of runs and show where the time goes."""
     threads: int = 2
@@ -144,8 +147,9 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     if options.out is None:
         raise InputError(f"{BLIND_TEST} needs --out DIR: finished data sets are kept there, so that it can be interrupted")
     console = Console(soft_wrap=True)
+    plan = gap.Plan(options.out, gap.ALL_SETS if options.sets is None else options.sets, options.processes)
     report = gap.run_blind_test(
-        gap.Plan(options.out, gap.ALL_SETS if options.sets is None else options.sets, options.processes),
+        plan,
         say=console.print,
         answers=options.answers,
         ray=ray_address(options.ray),
@@ -153,6 +157,10 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     text = markdown(report)
     (options.out / "score.md").write_text(text, encoding="utf-8")
     console.print(text, markup=False, highlight=False)
+    if options.classifier:
+        baseline = markdown(gap.score_classifier(plan, options.classifier, console.print))
+        (options.out / "score_classifier.md").write_text(baseline, encoding="utf-8")
+        console.print(baseline, markup=False, highlight=False)
     if options.json is not None:
         write_json(options.json, report)
     console.print(f"written: {', '.join(str(options.out / name) for name in ('score.json', 'score.md', 'answers.json'))}")

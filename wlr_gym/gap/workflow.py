@@ -187,9 +187,7 @@ def analyse_problem(
     clock.start("choosing runs")
     fitted, held_out, columns = _choose_runs(problem, heldout)
     clock.start("calibrating")
-    start, scatter = nominal_model(problem), SCATTER * problem.tempering
-    base = fit(problem, fitted, start, scatter=scatter, columns=columns, steps=problem.steps, tell=clock.detail)
-    base = widened(problem, fitted, base)
+    base = calibrated_fit(problem, fitted, columns, clock.detail)
     clock.start("naming")
     search = search_effects(problem, fitted, base, clock.detail, columns)
     base = search.calibrated
@@ -250,6 +248,18 @@ def analyse_problem(
 def _choose_runs(problem: Problem, heldout: Sequence[str]) -> tuple[list[int], list[int], list[NDArray[np.float32]] | None]:
     """Runs to fit, runs to hold out, and the columns of the first where they had to be simulated for the choice."""
     return (*named_split(problem.runs, heldout), None) if heldout else informative_split(problem)
+
+
+def calibrated_fit(
+    problem: Problem,
+    fitted: Sequence[int],
+    columns: list[NDArray[np.float32]] | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+) -> Fit:
+    """Fit the model without effects to runs, from its file's numbers; ``columns``: there, where they are known."""
+    start, scatter = nominal_model(problem), SCATTER * problem.tempering
+    base = fit(problem, fitted, start, scatter=scatter, columns=columns, steps=problem.steps, tell=tell)
+    return widened(problem, fitted, base)
 
 
 class _Clock:

@@ -54,7 +54,7 @@ def _run(path: Path, rig: Rig) -> RigRun:
     for name in (CLOCK, *rig.inputs, *columns):
         if name not in table:
             raise InputError(f"{path}: has no column '{name}'{nearest(name, list(table))}")
-        if not np.issubdtype(table[name].dtype, np.number):
+        if not pd.api.types.is_numeric_dtype(table[name].dtype):
             raise InputError(f"{path}: column '{name}' holds {table[name].dtype}: expected numbers")
     if len(table) < LEAST_ROWS:
         raise InputError(f"{path}: {len(table)} rows: expected {LEAST_ROWS} or more")

@@ -30,11 +30,12 @@ from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED, FURTHER_NULLS, SETS, BlindCase, case
 from wlr_gym.studies.bench.blind.score import FAILED, score
+from wlr_gym.studies.bench.gap_classifier import answers_of, first_screen, train, training_sets
 
 #: Folder of a data set, folder for the analysis' files -> contents of result.json.
 Analyser = Callable[[Path, Path], Mapping[str, Any]]
 #: Of a result: what the score is made of.
-_ANSWER = ("verdict", "message", "effects", "equivalent", "gap", "wall_seconds", "blind_test")
+_ANSWER = ("verdict", "message", "effects", "equivalent", "gap", "screen", "wall_seconds", "blind_test")
 _MODULE = "wlr_gym.studies.bench.gap"
 #: Sets of a whole test.
 ALL_SETS = SETS + FURTHER_NULLS
@@ -87,7 +88,8 @@ def analyse_folder(folder: Path, out: Path) -> Mapping[str, Any]:
     from wlr_gym.gap.workflow import analyse
 
     make_output_folder(out)
-    return read_result(write_result(analyse(folder, threads=1), out))
+    done = analyse(folder, threads=1)
+    return {**read_result(write_result(done, out)), "screen": first_screen(done.evidence)}
 
 
 def run_blind_test(
@@ -129,6 +131,18 @@ def run_blind_test(
     report = score(_kept(plan, cases), {one.name: one.as_dict() for one in cases})
     write_json(plan.out / "score.json", report)
     write_answers(plan.out)
+    return report
+
+
+def score_classifier(plan: Plan, sets: int, say: Callable[[str], None] = print) -> dict[str, Any]:
+    """Train the baseline on so many sets of the engine, and score its answers to the sets of a test that was run.
+
+    Training sets stay in ``plan.out``, and so does the score, as ``score_classifier.json``.
+    """
+    trained = train(training_sets(plan.out / "training", sets, say))
+    cases = plan.cases()
+    report = score(answers_of(trained, _kept(plan, cases)), {one.name: one.as_dict() for one in cases})
+    write_json(plan.out / "score_classifier.json", report)
     return report
 
 
