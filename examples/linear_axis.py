@@ -20,7 +20,7 @@ from wlr_gym.gap.rig.own import Law, Rig
 from wlr_gym.physics.effects import EffectParameter
 
 #: m/s; from here on dry friction is full.
-CREEP = 1e-3
+CREEP = 5e-4
 #: m; from one magnet of the motor to the next.
 PITCH = 0.03
 
@@ -45,7 +45,7 @@ RIG = Rig(
     readings=readings,
     states={"position": "position", "speed": "rate of position"},
     inputs={"current": "A"},
-    columns=(MeasuredSignal("position", "m", 5e-6, "position"),),
+    columns=(MeasuredSignal("position", "m", 2e-5, "position"),),
     parameters=(
         Quantity("mass", "kg", nominal=2.0, sigma=0.05, low=1.0, high=4.0),
         Quantity("force_constant", "N/A", nominal=10.0, sigma=0.3, low=5.0, high=20.0),
@@ -72,6 +72,7 @@ RIG = Rig(
             {"load": EffectParameter("kg", "more mass", 0.0, 10.0, 0.0, (0.0, 2.0), 0.3)},
         ),
     },
+    step=5e-4,
 )
 
 
@@ -93,7 +94,7 @@ def record(folder: Path, difference: float = 1.0, runs: int = 8, seed: int = 0) 
             error = goal(start) - position
             integral += 0.005 * error
             current = 40.0 * error + 100.0 * integral - 6.0 * speed
-            rows.append((start, current, np.rint((position + 3e-6 * rng.standard_normal()) / 1e-6) * 1e-6))
+            rows.append((start, current, np.rint((position + 2e-5 * rng.standard_normal()) / 1e-5) * 1e-5))
             until = t[row + 1] if row + 1 < len(t) else start
             while now < until - 1e-9:
                 position, speed = _moved(position, speed, constant * current, mass, friction, difference, min(h, until - now))

@@ -47,7 +47,7 @@ def test_nothing_is_missing_beside_what_is_given(runs, found):
     given = {"name": "asymmetric_friction", "where": ["axis"], "parameters": {"difference": 1.0}}
     again = analyse(runs, known=given, rig=str(FILE))
     assert (again.verdict, again.effects) == ("nothing_missing", ())
-    assert again.gap.heldout_calibrated == pytest.approx(found.gap.heldout_after, rel=0.05)
+    assert again.gap.heldout_calibrated < 0.5 * found.gap.heldout_calibrated
 
 
 def test_nothing_is_missing_of_an_axis_like_the_model(tmp_path):
@@ -78,7 +78,7 @@ def test_a_model_replays_its_own_runs_to_the_noise(runs):
     again = next(problem.remade(nominal, [0], 1))
     np.testing.assert_array_equal(made[0][0], again[0])
     assert not np.array_equal(made[0][0], made[1][0])
-    assert np.sqrt(np.nanmean(made[0][0][:, 0] ** 2)) < 3.0
+    assert 0.8 < np.sqrt(np.nanmean(made[0][0][:, 0] ** 2)) < 1.5, "first states are taken out"
 
 
 def test_two_runs_are_too_few(tmp_path):
@@ -140,10 +140,8 @@ def test_files_that_are_no_rig_are_refused(tmp_path, text, message):
 
 def test_equations_that_cannot_be_compiled_are_named(runs):
     broken = dataclasses.replace(AXIS, change=lambda x, u, p: (x.no_such_state, 0.0))
-    problem, _ = open_own_rig(runs, broken)
-    assert problem is not None
     with pytest.raises(InputError, match=r"rig 'axis': change or readings cannot be compiled: .*no_such_state"):
-        problem.residuals([Setting(np.array([one.nominal for one in AXIS.parameters]))], [0])
+        open_own_rig(runs, broken)
 
 
 def test_patches_are_read_by_the_rigs_own_laws(tmp_path):

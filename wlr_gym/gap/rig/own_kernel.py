@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import namedtuple
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +17,9 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.gap.rig.own import Rig
 
 Array = NDArray[np.float64]
+
+#: What numba colours its messages with.
+COLOURS = r"\x1b\[[0-9;]*m"
 
 _DRIVER = """
 def simulate(p, t, inputs, starts, begun, step, out):
@@ -71,7 +75,7 @@ class CompiledRig:
         try:
             self._simulate(self.numbers(**values), t, inputs, starts, begun, self.rig.step, out)
         except NumbaError as error:
-            reason = " ".join(str(error).split())
+            reason = " ".join(re.sub(COLOURS, "", str(error)).split())
             raise InputError(f"rig '{self.rig.name}': change or readings cannot be compiled: {reason}") from error
         return out if with_states else out[:, : len(self.rig.columns)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -28,6 +29,9 @@ Array = NDArray[np.float64]
 LOST = 1e4
 #: Noise units beyond which a residual counts no more in the gap's numbers.
 CAP = 50.0
+#: Step of finite differences in a state, as a share of its scatter, and at least.
+STATE_STEP = 1e-3
+LEAST_STATE_STEP = 1e-9
 #: Steps of finite differences per plausible range.
 STEPS_PER_RANGE = 50.0
 
@@ -50,7 +54,8 @@ def open_own_rig(
 class OwnRigProblem:
     """Runs of a system of one's own, and its simulator; see :class:`wlr_gym.gap.problem.Problem`.
 
-    Every run is replayed once per window length, and each measured column is a signal of each.
+    Every run is replayed once per window length, and each measured column is a signal of each. Where a window begins is known
+    with the noise of the columns only: what a change of its first state would explain is taken out of its residuals.
 
     Args:
         runs: of one system.
@@ -79,6 +84,7 @@ class OwnRigProblem:
         self._noise = np.array([signal.noise for signal in self.signals])
         self._runs, self._compiled = tuple(runs), compiled
         self._begun = [np.stack([_state(run, rig, name) for name in rig.states], axis=1) for run in runs]
+        self._first_states = [self._window_bases(run) for run in range(len(runs))]
 
     def times(self, run: int) -> Array:
         """Return the times (rows,) of a run, s."""
@@ -96,12 +102,34 @@ class OwnRigProblem:
     def _replayed(self, values: dict[str, float], run: int) -> Array:
         return np.concatenate([self._simulated(values, run, length) for length in self.rig.windows], axis=1)
 
-    def _simulated(self, values: dict[str, float], run: int, length: float, with_states: bool = False) -> Array:
-        """One replay (rows, columns) that begins anew after every ``length`` s."""
-        one = self._runs[run]
-        window = np.floor((one.t - one.t[0]) / length + 1e-9).astype(np.int64)
-        starts = np.where(np.diff(window, prepend=-1) > 0, np.arange(len(one.t)), -1)
-        return self._compiled.simulate(values, one.t, one.inputs, starts, self._begun[run], with_states)
+    def _simulated(
+        self, values: dict[str, float], run: int, length: float, with_states: bool = False, shift: Array | None = None
+    ) -> Array:
+        """One replay (rows, columns) that begins anew after every ``length`` s, with states (states) shifted there."""
+        one, begun = self._runs[run], self._begun[run]
+        starts = np.full(len(one.t), -1)
+        first = [window.start for window in _windows(one.t, length)]
+        starts[first] = first
+        begun = begun if shift is None else begun + shift
+        return self._compiled.simulate(values, one.t, one.inputs, starts, begun, with_states)
+
+    def _window_bases(self, run: int) -> list[tuple[slice, slice, Array]]:
+        """Windows of a run, their signals, and an orthonormal basis (rows x signals, states) of what its first state changes.
+
+        Of the model as the file says, in noise units; rows without a reading are 0.
+        """
+        values = self.rig.numbers | {name: float(v) for effect in self.known for name, v in effect.parameters.items()}
+        steps = STATE_STEP * self._begun[run].std(axis=0) + LEAST_STATE_STEP
+        missing, found = np.isnan(self._runs[run].measured), []
+        noise = np.array([column.noise for column in self.rig.columns])
+        for k, length in enumerate(self.rig.windows):
+            plain = self._simulated(values, run, length)
+            moved = [self._simulated(values, run, length, shift=step) for step in np.diag(steps)]
+            changes = np.stack([(one - plain) / noise for one in moved], axis=2)
+            changes = np.where(missing[:, :, None] | ~np.isfinite(changes), 0.0, changes)
+            columns = slice(k * len(noise), (k + 1) * len(noise))
+            found += [(window, columns, _basis(changes[window])) for window in _windows(self._runs[run].t, length)]
+        return found
 
     def _values(self, setting: Setting) -> dict[str, float]:
         values = self.rig.numbers
@@ -136,6 +164,10 @@ class OwnRigProblem:
         """Of one run; a setting whose simulation broke down is as far from the data as can be."""
         measured = self.measured(run)
         found = (measured - simulated) / self._noise
+        for rows, columns, basis in self._first_states[run]:
+            part = found[:, rows, columns]
+            flat = np.nan_to_num(part).reshape(len(part), -1)
+            found[:, rows, columns] = part - (flat @ basis @ basis.T).reshape(part.shape)
         lost = ~np.isfinite(simulated).all(axis=(1, 2))
         found[lost] = np.where(np.isfinite(measured), LOST, np.nan)
         return found
@@ -163,6 +195,19 @@ class OwnRigProblem:
             columns |= {f"time since reversal of {name} [s]": since_reversal(one.t, columns[name]) for name in rates}
             found.append({**columns, "time [s]": one.t - one.t[0]})
         return found
+
+
+def _windows(t: Array, length: float) -> list[slice]:
+    """Cut a run's rows into windows."""
+    window = np.floor((t - t[0]) / length + 1e-9)
+    edges = [*np.flatnonzero(np.diff(window, prepend=-1.0)).tolist(), len(t)]
+    return [slice(first, last) for first, last in itertools.pairwise(edges)]
+
+
+def _basis(changes: Array) -> Array:
+    """Orthonormal basis (rows x columns, at most states) of changes (rows, columns, states); none where nothing changes."""
+    left, sizes, _ = np.linalg.svd(changes.reshape(-1, changes.shape[-1]), full_matrices=False)
+    return left[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
 
 
 def _state(run: RigRun, rig: Rig, name: str) -> Array:
