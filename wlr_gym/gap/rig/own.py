@@ -55,6 +55,7 @@ class Rig:
         laws: what may be missing, by name.
         step: s, of the integration, at most.
         windows: s after which a replay starts again from what was measured: short ones show fast errors, long ones slow ones.
+        disagreement: share by which equation and system may differ on how large an effect is; widens intervals.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Rig:
     laws: Mapping[str, Law]
     step: float = 1e-3
     windows: tuple[float, ...] = (0.2, 1.0)
+    disagreement: float = 0.02
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -128,6 +130,7 @@ def check_rig(rig: Rig, place: str) -> None:
         _check(bool(sizes), f"{place}: laws: {law_name}: parameters", list(law.parameters), "one that says how large it is")
         for name, one in law.parameters.items():
             _check_law_number(one, f"{place}: laws: {law_name}: {name}")
+    _check(rig.disagreement >= 0.0, f"{place}: disagreement", rig.disagreement, "a number of 0 or more")
     _check(rig.step > 0.0, f"{place}: step", rig.step, "a number above 0")
     _check(bool(rig.windows) and min(rig.windows) > 0.0, f"{place}: windows", rig.windows, "lengths above 0")
 

@@ -63,7 +63,7 @@ class OwnRigProblem:
         known: laws that are in the model from the start.
     """
 
-    cap, steps, tempering, disagreement, threads, thorough, misfit = CAP, 20, 1.0, 0.0, 1, True, math.inf
+    cap, steps, tempering, threads, thorough, misfit = CAP, 20, 1.0, 1, True, math.inf
     held_out: tuple[str, ...] = ()
     turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})
     motions: Mapping[str, str] = MappingProxyType({})
@@ -71,6 +71,7 @@ class OwnRigProblem:
     def __init__(self, runs: Sequence[RigRun], compiled: CompiledRig, known: Sequence[PatchEffect] = ()) -> None:
         rig = compiled.rig
         self.rig: Rig = rig
+        self.disagreement: float = rig.disagreement
         self.known: tuple[PatchEffect, ...] = tuple(known)
         self.runs: tuple[str, ...] = tuple(run.name for run in runs)
         self.quantities: tuple[Quantity, ...] = rig.parameters
