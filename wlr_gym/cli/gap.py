@@ -118,7 +118,7 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
 
 
 def _check(options: GapOptions) -> None:
-    from wlr_gym.gap.workflow import OWN_RIG, RIGS
+    from wlr_gym.gap.opened import OWN_RIG, RIGS
     from wlr_gym.physics.plants import SIMULATORS
     from wlr_gym.robot import load_robot
 
@@ -146,19 +146,10 @@ def _check(options: GapOptions) -> None:
 
 def _known(options: GapOptions) -> Patch:
     """The effects given as known, in the vocabulary of the robot or of the rig."""
-    from wlr_gym.gap.workflow import OWN_RIG
+    from wlr_gym.gap.opened import known_patch
 
     try:
-        if options.rig is None:
-            return options.patch()
-        if options.rig.endswith(OWN_RIG):
-            from wlr_gym.gap.rig.own import load_rig
-            from wlr_gym.gap.rig.own_problem import own_patch
-
-            return own_patch(list(options.effects), load_rig(options.rig))
-        from wlr_gym.gap.rig.open import rig_patch
-
-        return rig_patch(list(options.effects))
+        return options.patch() if options.rig is None else known_patch(list(options.effects), options.rig)
     except InputError as error:
         raise InputError(f"--effects: {error}") from None
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import provenance
 from wlr_gym.gap.analysis import (
     BAD_DATA,
@@ -41,6 +41,7 @@ from wlr_gym.gap.analysis import (
 from wlr_gym.gap.estimation.fit import Fit, fit, widened
 from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.estimation.uncertainty import estimates, half_widths
+from wlr_gym.gap.opened import open_problem
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.report.recommendation import recommend, separating_run
 from wlr_gym.gap.report.relations import relations
@@ -70,10 +71,6 @@ STAGES = {"reading": 0.0, "choosing runs": 0.02, "calibrating": 0.1, "naming": 0
 SCATTER = 5.0
 #: Reason why a candidate is rejected at screening: calibration reproduces its response.
 CONFOUNDED = "confounded with calibrated parameters"
-#: Kinds of rigs.
-RIGS = ("pendulum",)
-#: Ending of the file of a rig of one's own.
-OWN_RIG = ".py"
 #: Sums of several threads round otherwise, and a fit may end elsewhere.
 _one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 #: Share of the effects that must be visible within their plausible range for "nothing missing" to mean anything.
@@ -116,26 +113,7 @@ def analyse(
 
         check_folder(Path(out))
     tell("reading", STAGES["reading"])
-    if rig is None:
-        from wlr_gym.gap.robot.open import open_robot
-
-        known = load_patch(known)
-        opened = open_robot(data, known, backend, threads, robot)
-    elif rig in RIGS:
-        from wlr_gym.gap.rig.open import open_rig, rig_patch
-
-        known = rig_patch(known)
-        opened = open_rig(data, known)
-    elif rig.endswith(OWN_RIG):
-        from wlr_gym.gap.rig.own import load_rig
-        from wlr_gym.gap.rig.own_problem import open_own_rig, own_patch
-
-        own = load_rig(rig)
-        known = own_patch(known, own)
-        opened = open_own_rig(data, own, known.effects)
-    else:
-        raise unknown_name("rig", rig, RIGS)
-    problem, findings = opened
+    known, problem, findings = open_problem(data, known, rig, backend, threads, robot)
     for finding in _first_of_every_run(findings):
         tell(f"left out {finding.place}: {finding.said}", STAGES["reading"])
     _refuse_left_out(heldout, findings)
