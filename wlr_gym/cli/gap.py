@@ -119,6 +119,7 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
 
 def _check(options: GapOptions) -> None:
     from wlr_gym.gap.opened import OWN_RIG, RIGS
+    from wlr_gym.gap.rig.own import load_rig
     from wlr_gym.physics.plants import SIMULATORS
     from wlr_gym.robot import load_robot
 
@@ -131,6 +132,8 @@ def _check(options: GapOptions) -> None:
         raise unknown_name("rig", options.rig, RIGS)
     if options.rig is not None and (options.backend != GapOptions.backend or options.robot is not None):
         raise InputError(f"--rig {options.rig}: the rig has a simulator of its own: leave --backend and --robot out")
+    if options.rig is not None and options.rig.endswith(OWN_RIG):
+        load_rig(options.rig)
     if options.robot is not None:
         load_robot(options.robot)
     for name in options.effects:
