@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from wlr_gym.gap.problem import MeasuredSignal, Quantity
-from wlr_gym.gap.rig.own import Law, Rig
+from wlr_gym.gap.rig.own import RigLaw, Rig
 from wlr_gym.physics.effects import EffectParameter
 
 #: m/s; from here on dry friction is full.
@@ -52,22 +52,22 @@ RIG = Rig(
         Quantity("friction", "N", nominal=3.0, sigma=0.5, low=0.0, high=10.0),
     ),
     laws={
-        "asymmetric_friction": Law(
+        "asymmetric_friction": RigLaw(
             "friction is larger forward than backward: friction + difference/2 and friction - difference/2",
             {"difference": EffectParameter("N", "forward less backward", -10.0, 10.0, 0.0, (-4.0, 4.0), 1.0)},
         ),
-        "viscous_friction": Law(
+        "viscous_friction": RigLaw(
             "friction that grows with speed: -viscous speed",
             {"viscous": EffectParameter("N s/m", "per speed", 0.0, 100.0, 0.0, (0.0, 20.0), 2.0)},
         ),
-        "cogging": Law(
+        "cogging": RigLaw(
             "the magnets pull: -cogging sin(2 pi position / pitch + phase)",
             {
                 "cogging": EffectParameter("N", "amplitude", 0.0, 10.0, 0.0, (0.0, 3.0), 0.5),
                 "phase": EffectParameter("rad", "at position 0", -7.0, 7.0, 0.0, (-3.2, 3.2), 0.5, is_size=False),
             },
         ),
-        "load": Law(
+        "load": RigLaw(
             "a mass on the carriage",
             {"load": EffectParameter("kg", "more mass", 0.0, 10.0, 0.0, (0.0, 2.0), 0.3)},
         ),

@@ -24,7 +24,7 @@ CLOCK = "t"
 
 
 @dataclass(frozen=True)
-class Law:
+class RigLaw:
     """A law that may be missing.
 
     Attributes:
@@ -65,7 +65,7 @@ class Rig:
     inputs: Mapping[str, str]
     columns: tuple[MeasuredSignal, ...]
     parameters: tuple[Quantity, ...]
-    laws: Mapping[str, Law]
+    laws: Mapping[str, RigLaw]
     step: float = 1e-3
     windows: tuple[float, ...] = (0.2, 1.0)
     disagreement: float = 0.02

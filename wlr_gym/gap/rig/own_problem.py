@@ -17,7 +17,7 @@ from wlr_gym.base.random import generator
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, Start, Unknown, since_reversal
 from wlr_gym.gap.rig.open import LEAST_RUNS, rig_patch
-from wlr_gym.gap.rig.own import RATE_OF, Law, Rig
+from wlr_gym.gap.rig.own import RATE_OF, RigLaw, Rig
 from wlr_gym.gap.rig.own_kernel import CompiledRig
 from wlr_gym.gap.rig.own_runs import RigRun, read_rig_runs
 from wlr_gym.gap.rig.replay import smoothed_state
@@ -223,7 +223,7 @@ def _state(run: RigRun, rig: Rig, name: str) -> Array:
     return rate if source.startswith(RATE_OF) else level
 
 
-def _candidate(rig: Rig, name: str, law: Law) -> tuple[list[Probe], Candidate]:
+def _candidate(rig: Rig, name: str, law: RigLaw) -> tuple[list[Probe], Candidate]:
     """A law with one probe for each number that says how large it is; the others are where they are clear."""
     neutral = {key: rig.numbers[key] for key in law.parameters}
     sizes = [key for key, one in law.parameters.items() if one.is_size]

@@ -362,7 +362,7 @@ def _without(out: Path, text: str) -> str:
 
 
 def make_data(folder: Path, one: BlindCase, runs: Sequence[int] = ()) -> str:
-    """Simulate one data set with its own runs, or with ``runs``, and write it; return its :func:`fingerprint`."""
+    """Simulate one data set with its own runs, or with ``runs``, and write it; return the hash of its data."""
     import numpy as np
 
     from wlr_gym.studies.bench.blind.copies import read_robot
