@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from wlr_gym.gap.problem import MeasuredSignal, Quantity
-from wlr_gym.gap.rig.own import RigLaw, Rig
+from wlr_gym.gap.rig.own import Rig, RigLaw
 from wlr_gym.physics.effects import EffectParameter
 
 #: m/s; from here on dry friction is full.

@@ -17,7 +17,7 @@ from wlr_gym.base.random import generator
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, Start, Unknown, since_reversal
 from wlr_gym.gap.rig.open import LEAST_RUNS, rig_patch
-from wlr_gym.gap.rig.own import RATE_OF, RigLaw, Rig
+from wlr_gym.gap.rig.own import RATE_OF, Rig, RigLaw
 from wlr_gym.gap.rig.own_kernel import CompiledRig
 from wlr_gym.gap.rig.own_runs import RigRun, read_rig_runs
 from wlr_gym.gap.rig.replay import smoothed_state
