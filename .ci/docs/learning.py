@@ -68,6 +68,7 @@ def score(task: str, ours: str, blind: str) -> None:
             episodes=EPISODES,
             randomization=floors,
             sensors=() if sensors == "none" else (sensors,),
+            robot="flow" if sensors == "flow" else None,
             precision="float32",
         )
         rows.append(row_of(card, sensors, floors if isinstance(floors, str) else floors["name"]))

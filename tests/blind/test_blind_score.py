@@ -278,6 +278,23 @@ def test_any_stretch_of_the_sequence_is_a_fair_sample():
     assert case(17) == case(17)
 
 
+def test_further_nulls_come_after_the_cycle():
+    more = [case(index) for index in range(240, 400)]
+    assert Counter(one.kind for one in more) == {"none": 80, "parameters": 80}
+    assert not any(one.effects for one in more)
+
+
+def test_half_of_all_sets_have_no_camera_and_some_fewer_runs():
+    cases = [case(index) for index in range(400)]
+    nulls = [one for one in cases if one.kind in ("none", "parameters")]
+    assert 0.42 < np.mean([not one.camera for one in cases]) < 0.58
+    assert 0.42 < np.mean([not one.camera for one in nulls]) < 0.58
+    assert all(one.camera for one in cases if any(effect["name"].startswith("camera") for effect in one.effects))
+    counts = Counter(len(one.runs) for one in cases)
+    assert set(counts) == {8, 6, 4}
+    assert min(counts.values()) > 40
+
+
 @pytest.mark.parametrize("name", [*NAMED, *STRANGE])
 def test_every_hidden_effect_reaches_the_simulator_and_grows_with_severity(name):
     robot = read_robot(data_directory("configs") / "robot" / "nominal.yaml")

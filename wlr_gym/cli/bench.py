@@ -74,7 +74,7 @@ class BenchOptions(JsonOption, ForceOption):
     contenders: tuple[str, ...] = ()
     """adapt: none, truth, wide, ours, calibrated; default: all."""
     sets: int | None = None
-    """gap: data sets (240). vision with --out: films (60)."""
+    """gap: data sets (400: 240 of all kinds, 160 more without an effect). vision with --out: films (60)."""
     seed: int | None = None
     """vision with --out: of the films (28); another one gives other films."""
     processes: int = 2
@@ -83,6 +83,9 @@ class BenchOptions(JsonOption, ForceOption):
     """gap: run on Ray: alone, it is started on this machine; with an address (auto, 10.0.0.1:6379), that cluster is used."""
     answers: Path | None = None
     """gap: answers.json of another folder; its sets are not analysed again, but for those that failed."""
+    classifier: int = 0
+    """gap: afterwards train the baseline, a classifier on the scores of the first screening, on so many sets of the engine
+    (kept in --out; half a minute each), and score its answers to the same data sets."""
     speed: tuple[Path, ...] = ()
     """gap: instead of the blind test, time the analysis of these folders of runs and show where the time goes."""
     threads: int = 2
@@ -158,8 +161,9 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     if options.out is None:
         raise InputError(f"{BLIND_TEST} needs --out DIR: finished data sets are kept there, so that it can be interrupted")
     console = Console(soft_wrap=True)
+    plan = gap.Plan(options.out, gap.ALL_SETS if options.sets is None else options.sets, options.processes)
     report = gap.run_blind_test(
-        gap.Plan(options.out, 240 if options.sets is None else options.sets, options.processes),
+        plan,
         say=console.print,
         answers=options.answers,
         ray=ray_address(options.ray),
@@ -167,6 +171,10 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     text = markdown(report)
     (options.out / "score.md").write_text(text, encoding="utf-8")
     console.print(text, markup=False, highlight=False)
+    if options.classifier:
+        baseline = markdown(gap.score_classifier(plan, options.classifier, console.print))
+        (options.out / "score_classifier.md").write_text(baseline, encoding="utf-8")
+        console.print(baseline, markup=False, highlight=False)
     if options.save is not None:
         write_json(options.save, report)
     if options.json:

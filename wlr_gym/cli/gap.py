@@ -39,7 +39,8 @@ class GapOptions(DecideOptions, JsonOption, ForceOption, PatchOption):
     out: Path
     """Folder for the results; made if it is not there."""
     rig: str | None = None
-    """Recordings of a test rig instead of runs of the robot: pendulum (one servo that swings a weight)."""
+    """Runs of something else than the robot: pendulum (one servo that swings a weight), or a Python file that describes a
+    system of your own (docs/own_rig.md)."""
     robot: str | None = None
     """Robot file or config name; default: the one meta.yaml names, else the nominal one."""
     backend: str = "gibbs_appell"
@@ -128,7 +129,8 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
 
 
 def _check(options: GapOptions) -> None:
-    from wlr_gym.gap.workflow import RIGS
+    from wlr_gym.gap.opened import OWN_RIG, RIGS
+    from wlr_gym.gap.rig.own import load_rig
     from wlr_gym.physics.plants import SIMULATORS
     from wlr_gym.robot import load_robot
 
@@ -137,10 +139,12 @@ def _check(options: GapOptions) -> None:
         raise InputError(f"{options.data}: {what}; expected a folder of runs")
     if options.backend not in SIMULATORS:
         raise unknown_name("simulator", options.backend, SIMULATORS, "--backend")
-    if options.rig is not None and options.rig not in RIGS:
+    if options.rig is not None and options.rig not in RIGS and not options.rig.endswith(OWN_RIG):
         raise unknown_name("rig", options.rig, RIGS)
     if options.rig is not None and (options.backend != GapOptions.backend or options.robot is not None):
         raise InputError(f"--rig {options.rig}: the rig has a simulator of its own: leave --backend and --robot out")
+    if options.rig is not None and options.rig.endswith(OWN_RIG):
+        load_rig(options.rig)
     if options.robot is not None:
         load_robot(options.robot)
     for name in options.effects:
@@ -156,12 +160,10 @@ def _check(options: GapOptions) -> None:
 
 def _known(options: GapOptions) -> Patch:
     """The effects given as known, in the vocabulary of the robot or of the rig."""
-    try:
-        if options.rig is None:
-            return options.patch()
-        from wlr_gym.gap.rig.open import rig_patch
+    from wlr_gym.gap.opened import known_patch
 
-        return rig_patch(list(options.effects))
+    try:
+        return options.patch() if options.rig is None else known_patch(list(options.effects), options.rig)
     except InputError as error:
         raise InputError(f"--effects: {error}") from None
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import provenance
 from wlr_gym.gap.analysis import (
     BAD_DATA,
@@ -41,6 +41,7 @@ from wlr_gym.gap.analysis import (
 from wlr_gym.gap.estimation.fit import Fit, fit, widened
 from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.estimation.uncertainty import estimates, half_widths
+from wlr_gym.gap.opened import open_problem
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.report.recommendation import recommend, separating_run
 from wlr_gym.gap.report.relations import relations
@@ -70,8 +71,6 @@ STAGES = {"reading": 0.0, "choosing runs": 0.02, "calibrating": 0.1, "naming": 0
 SCATTER = 5.0
 #: Reason why a candidate is rejected at screening: calibration reproduces its response.
 CONFOUNDED = "confounded with calibrated parameters"
-#: Kinds of rigs.
-RIGS = ("pendulum",)
 #: Sums of several threads round otherwise, and a fit may end elsewhere.
 _one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 #: Share of the effects that must be visible within their plausible range for "nothing missing" to mean anything.
@@ -97,7 +96,8 @@ def analyse(
         data: folder of runs in the measured-run format (with ``rig``: recordings of the rig).
         out: where result, patch, pictures and report are written; None = nowhere.
         known: effects that are known already.
-        rig: None = the robot; ``pendulum`` = one servo that swings a pendulum.
+        rig: None = the robot; ``pendulum`` = one servo that swings a pendulum; a Python file = a system of one's own
+            (:mod:`wlr_gym.gap.rig.own`).
         robot: file or config name; None = the one the runs' meta data name, else the nominal one.
         backend: simulator.
         heldout: names of the runs to hold out; empty = chosen by how informative the other runs are.
@@ -113,19 +113,7 @@ def analyse(
 
         check_folder(Path(out))
     tell("reading", STAGES["reading"])
-    if rig is None:
-        from wlr_gym.gap.robot.open import open_robot
-
-        known = load_patch(known)
-        opened = open_robot(data, known, backend, threads, robot)
-    elif rig in RIGS:
-        from wlr_gym.gap.rig.open import open_rig, rig_patch
-
-        known = rig_patch(known)
-        opened = open_rig(data, known)
-    else:
-        raise unknown_name("rig", rig, RIGS)
-    problem, findings = opened
+    known, problem, findings = open_problem(data, known, rig, backend, threads, robot)
     for finding in _first_of_every_run(findings):
         tell(f"left out {finding.place}: {finding.said}", STAGES["reading"])
     _refuse_left_out(heldout, findings)
@@ -177,9 +165,7 @@ def analyse_problem(
     clock.start("choosing runs")
     fitted, held_out, columns = _choose_runs(problem, heldout)
     clock.start("calibrating")
-    start, scatter = nominal_model(problem), SCATTER * problem.tempering
-    base = fit(problem, fitted, start, scatter=scatter, columns=columns, steps=problem.steps, tell=clock.detail)
-    base = widened(problem, fitted, base)
+    base = calibrated_fit(problem, fitted, columns, clock.detail)
     clock.start("naming")
     search = search_effects(problem, fitted, base, clock.detail, columns)
     base = search.calibrated
@@ -240,6 +226,18 @@ def analyse_problem(
 def _choose_runs(problem: Problem, heldout: Sequence[str]) -> tuple[list[int], list[int], list[NDArray[np.float32]] | None]:
     """Runs to fit, runs to hold out, and the columns of the first where they had to be simulated for the choice."""
     return (*named_split(problem.runs, heldout), None) if heldout else informative_split(problem)
+
+
+def calibrated_fit(
+    problem: Problem,
+    fitted: Sequence[int],
+    columns: list[NDArray[np.float32]] | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+) -> Fit:
+    """Fit the model without effects to runs, from its file's numbers; ``columns``: there, where they are known."""
+    start, scatter = nominal_model(problem), SCATTER * problem.tempering
+    base = fit(problem, fitted, start, scatter=scatter, columns=columns, steps=problem.steps, tell=tell)
+    return widened(problem, fitted, base)
 
 
 class _Clock:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.paths import find_config
@@ -46,11 +46,22 @@ def open_rig(data: str | Path, known: Patch | None = None) -> tuple[RigProblem |
     return RigProblem(good, known.effects if known else ()), found
 
 
-def rig_patch(source: Source) -> Patch:
-    """Load a patch of the rig, as its analyses write it: effects of :data:`RIG_EFFECTS` at its joint.
+class Parametrised(Protocol):
+    """What has numbers: an effect or a law of a rig."""
+
+    @property
+    def parameters(self) -> Mapping[str, EffectParameter]:
+        """Its numbers, by name."""
+        ...
+
+
+def rig_patch(source: Source, effects: Mapping[str, Parametrised] = RIG_EFFECTS, joint: str = JOINT) -> Patch:
+    """Load a patch of a rig, as its analyses write it.
 
     Args:
         source: as for :func:`wlr_gym.physics.effects.load_patch`.
+        effects: what the rig knows; formulas only :data:`RIG_EFFECTS` can have beside them.
+        joint: the one place where they act.
 
     Raises:
         InputError: naming file, effect, key and the nearest valid name.
@@ -63,39 +74,39 @@ def rig_patch(source: Source) -> Patch:
     elif isinstance(source, Mapping):
         content, name = {"effects": [source]} if "name" in source else source, "effects"
     elif isinstance(source, Sequence):
-        return compose(*(rig_patch(one) for one in source))
+        return compose(*(rig_patch(one, effects, joint) for one in source))
     else:
         raise InputError(f"effects = {source!r}: expected a path, a mapping or a list of effects")
     entries = content.get("effects") if isinstance(content, Mapping) else None
     if not isinstance(entries, list | tuple):
         raise InputError(f"{name}: expected a mapping with 'effects', a list of effects")
-    effects = tuple(_effect(entry, f"{name}: effect {k}") for k, entry in enumerate(entries, 1))
-    return Patch(effects, _mapping(content, "provenance", name), name)
+    found = tuple(_effect(entry, f"{name}: effect {k}", effects, joint) for k, entry in enumerate(entries, 1))
+    return Patch(found, _mapping(content, "provenance", name), name)
 
 
-def _effect(entry: Any, place: str) -> PatchEffect:
+def _effect(entry: Any, place: str, effects: Mapping[str, Parametrised], joint: str) -> PatchEffect:
     if not isinstance(entry, Mapping) or not isinstance(entry.get("parameters", {}), Mapping):
         raise InputError(f"{place}: expected a mapping with 'name', 'where' and 'parameters', got {entry!r}")
     name, given = str(entry.get("name")), dict(entry.get("parameters", {}))
-    if name not in (*RIG_EFFECTS, UNKNOWN_EFFECT):
-        raise unknown_name("effect of the test rig", name, RIG_EFFECTS, place)
-    if entry.get("where", JOINT) not in (JOINT, [JOINT], (JOINT,)):
-        raise InputError(f"{place} ({name}): where = {entry['where']!r}: the rig has one joint, {JOINT}")
+    if name not in effects and not (name == UNKNOWN_EFFECT and effects is RIG_EFFECTS):
+        raise unknown_name("effect of the test rig", name, effects, place)
+    if entry.get("where", joint) not in (joint, [joint], (joint,)):
+        raise InputError(f"{place} ({name}): where = {entry['where']!r}: the rig has one joint, {joint}")
     if name == UNKNOWN_EFFECT:
         place = f"{place} ({name})"
         if not isinstance(entry.get("formula"), str):
             raise InputError(
                 f"{place}: formula = {entry.get('formula')!r}: expected a formula of the torque, such as '-b * rate'"
             )
-        effect = PatchEffect(name, (JOINT,), given, entry["formula"], _mapping(entry, "units", place), place)
+        effect = PatchEffect(name, (joint,), given, entry["formula"], _mapping(entry, "units", place), place)
         rig_force(effect)
         return effect
-    known = RIG_EFFECTS[name].parameters
+    known = effects[name].parameters
     for key in given:
         if key not in known:
             raise unknown_name("parameter", str(key), known, f"{place} ({name})")
     numbers = {key: _number(given.get(key), spec, f"{place} ({name}): {key}") for key, spec in known.items()}
-    return PatchEffect(name, (JOINT,), numbers, place=place)
+    return PatchEffect(name, (joint,), numbers, place=place)
 
 
 def _mapping(entry: Mapping[str, Any], key: str, place: str) -> dict[str, Any]:

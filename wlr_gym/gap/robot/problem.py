@@ -179,24 +179,35 @@ class RobotProblem:
 
     def remade(self, setting: Setting, runs: Sequence[int], count: int) -> Iterator[list[Array]]:
         """Replay data sets that a model itself would have recorded; see :meth:`wlr_gym.gap.problem.Problem.remade`."""
-        forces, constants = self._forces([setting])
-        whole = [RunClock(self.clocks[r].run, window=math.inf) for r in runs]  # without anchors
-        table = self.parameters([setting])
-        clean = replay_batch(self.robot, whole, table, self.backend, forces, constants, threads=self.threads)
-        if not all(np.isfinite(replays.values).all() for replays in clean):
-            return
         draws = [generator(r, "gap", "floor") for r in runs]
+        whole = self._whole(setting, runs)
         at_once = max(1, MOST_REMADE // len(runs))
-        for first in range(0, count, at_once):
+        for first in range(0, count if whole else 0, at_once):
             sets = min(at_once, count - first)
-            made = [
-                self._read(r, replays.values[0], rng)
-                for _ in range(sets)
-                for r, replays, rng in zip(runs, clean, draws, strict=True)
-            ]
+            made = [self._read(r, values, rng) for _ in range(sets) for r, values, rng in zip(runs, whole, draws, strict=True)]
             twin = RobotProblem(made, self.robot, self.known, self.backend, self._window, self.threads)
             found = [residual[0] for residual in twin.residuals([setting], range(len(made)))]
             yield from (found[k * len(runs) : (k + 1) * len(runs)] for k in range(sets))
+
+    def recorded(self, setting: Setting, seed: int) -> list[Run]:
+        """Return the runs as they would be if the robot were this model: same commands, other readings.
+
+        Nothing where its simulation breaks down; ``seed``: of the sensors' noise.
+        """
+        values = self._whole(setting, range(len(self.clocks)))
+        return [self._read(r, one, generator(seed, "gap", "recorded", r)) for r, one in enumerate(values)]
+
+    def _whole(self, setting: Setting, runs: Sequence[int]) -> list[Array]:
+        """What sensors would read (rows, signals) per run without anything that leads back to what was measured.
+
+        Nothing where the simulation of a run breaks down.
+        """
+        forces, constants = self._forces([setting])
+        clocks = [RunClock(self.clocks[r].run, window=math.inf) for r in runs]  # without anchors
+        table = self.parameters([setting])
+        clean = replay_batch(self.robot, clocks, table, self.backend, forces, constants, threads=self.threads)
+        whole = [replays.values[0] for replays in clean]
+        return whole if all(np.isfinite(values).all() for values in whole) else []
 
     def _read(self, r: int, values: Array, rng: np.random.Generator) -> Run:
         """Return run ``r`` with ``values`` (rows, signals) in place of what was measured, noisy and rounded as sensors do."""

@@ -23,7 +23,7 @@ from wlr_gym.gap.selection.equivalence import equivalents
 from wlr_gym.gap.selection.evidence import credible_names, probabilities
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.refit import refit, refit_thoroughly
-from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, is_visible, least_gain, responses, screen
+from wlr_gym.gap.selection.screening import LEAST_GAIN, Responses, Score, is_visible, least_gain, responses, screen
 from wlr_gym.gap.selection.threshold import acceptance_threshold, largest_by_chance
 
 Array = NDArray[np.float64]
@@ -109,6 +109,35 @@ def with_proposals(chosen: Sequence[Score], alone: Sequence[Score]) -> list[Scor
     return [*chosen, *new[:MOST_PROPOSED]]
 
 
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """What screening says of the candidates of one round.
+
+    Attributes:
+        scores: under the noise that each candidate would leave, best first.
+        alone: the best of each group of signals, best first.
+        linear: to first order under the noise of the model without them, best first.
+        found, products: responses of the model's numbers and the candidates' probes, and their products.
+    """
+
+    scores: list[Score]
+    alone: list[Score]
+    linear: list[Score]
+    found: Responses
+    products: Products
+
+
+def screened(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = lambda text: None) -> Screened:
+    """Score all candidates beyond a fitted model."""
+    probes, candidates = problem.candidates(current.model.setting, current.residuals, runs)
+    candidates = [candidate for candidate in candidates if not _is_explained(current.model, candidate)]
+    tell(f"screening {len(candidates)} candidates")
+    found = responses(problem, current, runs, probes)
+    products = Products.of(current, found)
+    linear = screen(candidates, found)
+    return Screened(*rescored(problem, current, found, products, linear), linear, found, products)
+
+
 def search_effects(
     problem: Problem,
     runs: Sequence[int],
@@ -130,16 +159,11 @@ def search_effects(
     current, calibrated, rounds, again = start, start, [], None
     models = [start.model]
     while True:
-        probes, candidates = problem.candidates(current.model.setting, current.residuals, runs)
-        candidates = [candidate for candidate in candidates if not _is_explained(current.model, candidate)]
-        tell(f"screening {len(candidates)} candidates")
-        found = responses(problem, current, runs, probes)
-        products = Products.of(current, found)
-        screened = screen(candidates, found)
-        scores, alone = rescored(problem, current, found, products, screened)
+        first = screened(problem, runs, current, tell)
+        scores, alone, found, products = first.scores, first.alone, first.found, first.products
         by_chance = np.zeros(0) if problem.thorough else largest_by_chance(problem, runs, current, found, products, scores)
         threshold = acceptance_threshold(current.cost, by_chance)
-        visible = {score.candidate.label for score in screened if is_visible(score, threshold)}
+        visible = {score.candidate.label for score in first.linear if is_visible(score, threshold)}
         scores = [replace(score, visible=score.candidate.label in visible) for score in scores]
         chosen = scores if problem.thorough else with_proposals(shortlist(scores, threshold), alone)
         tell(f"refitting {len(chosen)} hypotheses")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,9 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.gap.estimation.fit import linearise
 from wlr_gym.gap.estimation.model import nominal_model
-from wlr_gym.gap.problem import Problem
+from wlr_gym.gap.problem import Candidate, Problem
+
+Array = NDArray[np.float64]
 
 #: Share of the runs that is held out.
 HELD_OUT_SHARE = 0.3
@@ -19,6 +22,8 @@ HELD_OUT_SHARE = 0.3
 LEAST_FITTED = 2
 #: Integrated autocorrelation time of a channel in rows, assumed before any residual is known.
 AUTOCORRELATION_TIME = 10.0
+#: An exchange of two runs must be better by more than rounding.
+LEAST_BETTER = 1e-6
 
 
 def named_split(runs: Sequence[str], heldout: Sequence[str]) -> tuple[list[int], list[int]]:
@@ -38,9 +43,12 @@ def named_split(runs: Sequence[str], heldout: Sequence[str]) -> tuple[list[int],
 
 
 def informative_split(problem: Problem) -> tuple[list[int], list[int], list[NDArray[np.float32]] | None]:
-    """Hold out 30 % of the runs: those without which the rest is still most informative about the model's numbers.
+    """Hold out 30 % of the runs: so that the rest is informative about the model's numbers, and both sides show each effect.
 
-    Judged by the model as its file says (D-optimality of the runs that are left), not by what was measured.
+    An effect that the fitted runs hardly show cannot be found; one that the held-out runs hardly show cannot be validated.
+    Judged by the model as its file says, not by what was measured: by the information, as the logarithm of its determinant,
+    about the numbers in the runs to fit (D-optimality), and about the size of each effect in the side that tells less of it,
+    its response less what the numbers imitate.
 
     Returns:
         Runs to fit, held-out runs, and the columns (:func:`wlr_gym.gap.estimation.fit.linearise`) of the runs to fit where they
@@ -55,14 +63,91 @@ def informative_split(problem: Problem) -> tuple[list[int], list[int], list[NDAr
     if count <= LEAST_FITTED:
         raise InputError(f"{count} runs: at least {LEAST_FITTED + 1} are needed, so that one can be held out")
     held_out = min(math.ceil(HELD_OUT_SHARE * count), count - LEAST_FITTED)
-    _, columns = linearise(problem, nominal_model(problem), range(count))
-    information = [(column @ column.T).astype(np.float64) / AUTOCORRELATION_TIME for column in columns]
+    residuals, columns = linearise(problem, nominal_model(problem), range(count))
+    shown = information_of(problem, residuals, columns)
     kept = list(range(count))
     while len(kept) > count - held_out:
-        kept.remove(max(kept, key=lambda k: _log_information(information, [other for other in kept if other != k])))
+        kept.remove(max(kept, key=lambda k: shown.of_numbers([other for other in kept if other != k])))
+    kept = _exchanged(shown, kept, count)
     return kept, [k for k in range(count) if k not in kept], [columns[k] for k in kept]
 
 
-def _log_information(information: Sequence[np.ndarray], kept: Sequence[int]) -> float:
-    total = np.eye(len(information[0])) + np.sum([information[k] for k in kept], axis=0)
-    return float(np.linalg.slogdet(total)[1])
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What each run tells, in products of responses.
+
+    Attributes:
+        numbers: (runs, numbers, numbers) of the model's numbers.
+        across: (runs, numbers, effects) of those and the effects.
+        effects: (runs, effects) squares of the effects.
+        added: effects that add to numbers, in their tolerances: which numbers.
+    """
+
+    numbers: Array
+    across: Array
+    effects: Array
+    added: tuple[list[int], ...]
+
+    def of_numbers(self, runs: Sequence[int]) -> float:
+        """Information that runs add about the numbers to their tolerances, twice the nats."""
+        total = np.eye(self.numbers.shape[1]) + self.numbers[runs].sum(axis=0)
+        return float(np.linalg.slogdet(total)[1])
+
+    def of_effects(self, runs: Sequence[int]) -> Array:
+        """The same about each effect's size (effects), of which one probe is known beforehand; its own numbers stay."""
+        spread = np.linalg.inv(np.eye(self.numbers.shape[1]) + self.numbers[runs].sum(axis=0))
+        across = self.across[runs].sum(axis=0)
+        own = self.effects[runs].sum(axis=0) - (across * (spread @ across)).sum(axis=0)
+        free = [np.linalg.inv(spread[np.ix_(rows, rows)]).sum() - len(rows) for rows in self.added]
+        return np.log1p(np.maximum([*own, *free], 0.0))
+
+    def worth(self, kept: Sequence[int], held_out: Sequence[int]) -> float:
+        """How good a split is."""
+        return self.of_numbers(kept) + float(np.minimum(self.of_effects(kept), self.of_effects(held_out)).sum())
+
+
+def _exchanged(shown: Information, kept: list[int], count: int) -> list[int]:
+    """The runs to fit after exchanging one for a held-out one as long as that makes the split better."""
+    best = shown.worth(kept, [k for k in range(count) if k not in kept])
+    while True:
+        held_out = [k for k in range(count) if k not in kept]
+        tries = [sorted({*kept, new} - {old}) for old in kept for new in held_out]
+        worths = [shown.worth(one, [k for k in range(count) if k not in one]) for one in tries]
+        place = int(np.argmax(worths))
+        if worths[place] <= best + LEAST_BETTER:
+            return kept
+        kept, best = tries[place], worths[place]
+
+
+def information_of(problem: Problem, residuals: Sequence[Array], columns: Sequence[NDArray[np.float32]]) -> Information:
+    """Return what each run tells of the numbers, and of each named effect at its largest set of places.
+
+    Args:
+        problem: the system.
+        residuals: of the model as its file says, all runs.
+        columns: of its numbers there.
+    """
+    model, runs = nominal_model(problem), range(len(problem.runs))
+    _, candidates = problem.candidates(model.setting, [np.zeros_like(residual) for residual in residuals], runs)
+    largest: dict[str, Candidate] = {}
+    for candidate in sorted(candidates, key=lambda one: -len(one.where)):
+        if not candidate.formula:
+            largest.setdefault(candidate.name, candidate)
+    places = {quantity.name: k for k, quantity in enumerate(problem.quantities)}
+    added = {name: rows for name, candidate in largest.items() if (rows := _numbers_of(candidate, places))}
+    more = [candidate for name, candidate in largest.items() if name not in added]
+    settings = [model.with_effect(one, one.probed(one.starts[0])).setting for one in more]
+    found = problem.residuals(settings, runs) if settings else [np.zeros((0, *residual.shape)) for residual in residuals]
+    own = [np.nan_to_num(r - base).reshape(len(r), -1) for r, base in zip(found, residuals, strict=True)]
+    return Information(
+        np.stack([column @ column.T for column in columns]).astype(np.float64) / AUTOCORRELATION_TIME,
+        np.stack([column @ one.T for column, one in zip(columns, own, strict=True)]) / AUTOCORRELATION_TIME,
+        np.stack([(one * one).sum(axis=1) for one in own]) / AUTOCORRELATION_TIME,
+        tuple(added.values()),
+    )
+
+
+def _numbers_of(candidate: Candidate, places: Mapping[str, int]) -> list[int]:
+    """Which numbers an effect adds to, if its first guess needs nothing else; empty otherwise."""
+    keys = {key: None for direction in candidate.starts[0].directions for key in direction}
+    return [places[key] for key in keys] if keys.keys() <= places.keys() else []

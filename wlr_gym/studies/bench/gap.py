@@ -28,14 +28,17 @@ from wlr_gym.base.files import make_output_folder, write_json, write_text
 from wlr_gym.base.jobs import Ended, Job, Send, serve, spread
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
-from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED, BlindCase, case
+from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED, FURTHER_NULLS, SETS, BlindCase, case
 from wlr_gym.studies.bench.blind.score import FAILED, score
+from wlr_gym.studies.bench.gap_classifier import answers_of, first_screen, train, training_sets
 
 #: Folder of a data set, folder for the analysis' files -> contents of result.json.
 Analyser = Callable[[Path, Path], Mapping[str, Any]]
 #: Of a result: what the score is made of.
-_ANSWER = ("verdict", "message", "effects", "equivalent", "gap", "wall_seconds", "blind_test")
+_ANSWER = ("verdict", "message", "effects", "equivalent", "gap", "screen", "wall_seconds", "blind_test")
 _MODULE = "wlr_gym.studies.bench.gap"
+#: Sets of a whole test.
+ALL_SETS = SETS + FURTHER_NULLS
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Plan:
         processes: how many of them at a time.
         first_seed: of the first set; the others follow.
         keep_data: leave the data sets there (3 MB each); they can be made again from their seeds.
-        runs: which of the eight kinds of runs a set has.
+        runs: which of the eight kinds of runs every set has; empty = its own.
     """
 
     out: Path
@@ -56,7 +59,7 @@ class Plan:
     processes: int = 2
     first_seed: int = FIRST_SCORED_SEED
     keep_data: bool = False
-    runs: tuple[int, ...] = tuple(range(8))
+    runs: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
@@ -66,8 +69,13 @@ class Plan:
             raise InputError(f"--processes {self.processes}: expected 1 or more")
 
     def cases(self) -> list[BlindCase]:
-        """Return the data sets."""
-        return [case(index, self.first_seed) for index in range(self.sets)]
+        """Return the data sets, in the order they are analysed: the further nulls spread among the others."""
+        cases = [case(index, self.first_seed) for index in range(self.sets)]
+        return sorted(cases, key=self._turn)
+
+    def _turn(self, one: BlindCase) -> float:
+        index = one.seed - self.first_seed
+        return index / SETS if index < SETS else (index - SETS) / FURTHER_NULLS
 
     def result_file(self, one: BlindCase) -> Path:
         """Return where the result of a set is kept."""
@@ -80,7 +88,8 @@ def analyse_folder(folder: Path, out: Path) -> Mapping[str, Any]:
     from wlr_gym.gap.workflow import analyse
 
     make_output_folder(out)
-    return read_result(write_result(analyse(folder, threads=1), out))
+    done = analyse(folder, threads=1)
+    return {**read_result(write_result(done, out)), "screen": first_screen(done.evidence)}
 
 
 def run_blind_test(
@@ -122,6 +131,18 @@ def run_blind_test(
     report = score(_kept(plan, cases), {one.name: one.as_dict() for one in cases})
     write_json(plan.out / "score.json", report)
     write_answers(plan.out)
+    return report
+
+
+def score_classifier(plan: Plan, sets: int, say: Callable[[str], None] = print) -> dict[str, Any]:
+    """Train the baseline on so many sets of the engine, and score its answers to the sets of a test that was run.
+
+    Training sets stay in ``plan.out``, and so does the score, as ``score_classifier.json``.
+    """
+    trained = train(training_sets(plan.out / "training", sets, say))
+    cases = plan.cases()
+    report = score(answers_of(trained, _kept(plan, cases)), {one.name: one.as_dict() for one in cases})
+    write_json(plan.out / "score_classifier.json", report)
     return report
 
 
@@ -210,7 +231,8 @@ def _origin(plan: Plan, one: BlindCase) -> dict[str, Any]:
 
 def _subject(plan: Plan, one: BlindCase) -> dict[str, Any]:
     truth = json.dumps(_plain(one.as_dict()), sort_keys=True)
-    return {"truth_sha256": hashlib.sha256(truth.encode()).hexdigest(), "runs": list(plan.runs)}
+    runs, camera = list(plan.runs or one.runs), one.camera
+    return {"truth_sha256": hashlib.sha256(truth.encode()).hexdigest(), "runs": runs, "camera": camera}
 
 
 def _kept(plan: Plan, cases: Sequence[BlindCase]) -> dict[str, dict[str, Any]]:
@@ -231,7 +253,7 @@ def _kept(plan: Plan, cases: Sequence[BlindCase]) -> dict[str, dict[str, Any]]:
 def _check_origin(plan: Plan, one: BlindCase, result: Mapping[str, Any], file: Path, advice: str) -> None:
     """Refuse a result of other data; results that do not say what they are about are taken as they are."""
     made, now = result.get("blind_test") or {}, _subject(plan, one)
-    for key, what in (("truth_sha256", "another hidden truth"), ("runs", "other runs")):
+    for key, what in (("truth_sha256", "another hidden truth"), ("runs", "other runs"), ("camera", "other sensors")):
         if key in made and made[key] != now[key]:
             raise InputError(f"{file}: is about {what} ({made[key]}) than set {one.name} has now ({now[key]}); {advice}")
 
@@ -318,7 +340,7 @@ def run_case(plan: Plan, one: BlindCase, analyser: Analyser) -> None:
     Whatever the analysis raises is its answer: an :class:`InputError` refuses the data, anything else is a failure.
     """
     folder, out, origin = plan.out / "data" / one.name, plan.out / "work" / one.name, _origin(plan, one)
-    make_data(folder, one, plan.runs)
+    origin["data_sha256"] = make_data(folder, one, plan.runs)
     begin = time.monotonic()
     try:
         result: dict[str, Any] = dict(analyser(folder, out))
@@ -339,20 +361,21 @@ def _without(out: Path, text: str) -> str:
     return text.replace(f"{out}{os.sep}", "")
 
 
-def make_data(folder: Path, one: BlindCase, runs: Sequence[int] = range(8)) -> None:
-    """Simulate one data set and write it."""
+def make_data(folder: Path, one: BlindCase, runs: Sequence[int] = ()) -> str:
+    """Simulate one data set with its own runs, or with ``runs``, and write it; return the hash of its data."""
     import numpy as np
 
     from wlr_gym.studies.bench.blind.copies import read_robot
-    from wlr_gym.studies.bench.blind.dataset import simulate_runs, write
+    from wlr_gym.studies.bench.blind.dataset import fingerprint, simulate_runs, write
     from wlr_gym.studies.bench.blind.spoil import SPOIL
 
     robot = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
-    tables, meta, _ = simulate_runs(robot, one.effects, one.seed, runs, exact=one.kind == "none")
+    tables, meta, _ = simulate_runs(robot, one.effects, one.seed, runs or one.runs, one.kind == "none", True, one.camera)
     if one.spoilt:
         tables = SPOIL[one.spoilt](tables, np.random.default_rng([one.seed, 5]))
     shutil.rmtree(folder, ignore_errors=True)
     write(folder, tables, meta)
+    return fingerprint(tables)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,10 @@ from wlr_gym.studies.bench.blind.truth import NAMED, STRANGE
 #: In units of what tolerances and noise hide.
 SEVERITIES = (0.5, 1.0, 2.0, 4.0)
 #: The first seed of sets that are scored; smaller ones are for tuning.
-FIRST_SCORED_SEED = 4000
+FIRST_SCORED_SEED = 5000
+#: Sets of the cycle below; the sets after them are :data:`FURTHER_NULLS` without an effect, for the bound on false alarms.
+SETS = 240
+FURTHER_NULLS = 160
 #: Kinds of sets in the order they come round; any stretch of the sequence is a fair sample.
 CYCLE = (
     "effect", "parameters", "effect", "pair", "effect", "none",
@@ -23,6 +26,14 @@ CYCLE = (
     "effect", "parameters", "effect", "stranger", "none", "parameters",
 )  # fmt: skip
 BAD = ("wrong_unit", "mis_ordered", "nan_ridden", "flipped_sign", "stuck_encoder", "too_short", "too_few", "motionless")
+
+#: Kinds of runs of a set by how many there are, and how often: most have all eight, some what a shorter session records.
+RUNS = {8: tuple(range(8)), 6: (0, 1, 2, 4, 5, 7), 4: (0, 1, 2, 7)}
+RUNS_SHARE = {8: 0.6, 6: 0.25, 4: 0.15}
+#: Share of the sets that a camera has seen.
+CAMERA_SHARE = 0.5
+#: Effects of the camera itself: it is there.
+OF_CAMERA = ("camera_misalignment", "camera_delay")
 
 Draw = np.random.Generator
 Effect = dict[str, Any]
@@ -40,6 +51,8 @@ class BlindCase:
         severity: 0 where nothing is hidden.
         effects: what is hidden.
         spoilt: how, for ``bad``.
+        runs: which of the eight kinds of runs it has.
+        camera: whether one has seen it.
     """
 
     name: str
@@ -48,17 +61,24 @@ class BlindCase:
     severity: float
     effects: tuple[Effect, ...]
     spoilt: str = ""
+    runs: tuple[int, ...] = RUNS[8]
+    camera: bool = True
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields as plain data."""
-        return {**vars(self), "effects": [dict(effect) for effect in self.effects]}
+        """Return what is hidden as plain data: how it is recorded shows in the data."""
+        told = {name: value for name, value in vars(self).items() if name not in ("runs", "camera")}
+        return {**told, "effects": [dict(effect) for effect in self.effects]}
 
 
 def case(index: int, first_seed: int = FIRST_SCORED_SEED) -> BlindCase:
-    """Return number ``index`` of the sequence."""
-    seed, kind = first_seed + index, CYCLE[index % len(CYCLE)]
-    before = sum(other == kind for other in CYCLE[: index % len(CYCLE)])
-    count = (index // len(CYCLE)) * CYCLE.count(kind) + before  # how many of this kind came before
+    """Return number ``index`` of the sequence: :data:`SETS` that go round :data:`CYCLE`, then nulls."""
+    seed = first_seed + index
+    if index >= SETS:
+        kind, count = ("none", "parameters")[index % 2], index
+    else:
+        kind = CYCLE[index % len(CYCLE)]
+        before = sum(other == kind for other in CYCLE[: index % len(CYCLE)])
+        count = (index // len(CYCLE)) * CYCLE.count(kind) + before  # how many of this kind came before
     rng = np.random.default_rng([seed, 4])
     severity, effects, spoilt = 0.0, (), ""
     if kind == "effect":
@@ -71,7 +91,15 @@ def case(index: int, first_seed: int = FIRST_SCORED_SEED) -> BlindCase:
         effects = (strange(list(STRANGE)[count % len(STRANGE)], severity, rng),)
     elif kind == "bad":
         spoilt = BAD[count % len(BAD)]
-    return BlindCase(f"set_{seed:04d}", seed, kind, severity, effects, spoilt)
+    return BlindCase(f"set_{seed:04d}", seed, kind, severity, effects, spoilt, *_recorded(seed, effects))
+
+
+def _recorded(seed: int, effects: Sequence[Effect]) -> tuple[tuple[int, ...], bool]:
+    """Which kinds of runs a set has, and whether with a camera."""
+    rng = np.random.default_rng([seed, 6])
+    count = int(rng.choice(list(RUNS_SHARE), p=list(RUNS_SHARE.values())))
+    camera = bool(rng.random() < CAMERA_SHARE)
+    return RUNS[count], camera or any(effect["name"] in OF_CAMERA for effect in effects)
 
 
 def _grid(count: int, names: list[str]) -> tuple[str, float]:

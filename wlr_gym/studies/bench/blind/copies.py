@@ -18,6 +18,15 @@ JOINTS = LEGS + WHEELS
 CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 #: Draws are cut at this many standard deviations.
 CUT = 2.0
+#: m/s; dry friction of the floor is full from this speed on where nothing yields.
+FLOOR_CREEP = 5e-6
+#: rad/s; the same in gears.
+GEAR_CREEP = 2e-5
+#: Ranges of the same where tyres, floor and gears yield as those of a simulator with soft contacts do.
+YIELDING_FLOOR = (0.5e-3, 2e-3)
+YIELDING_GEAR = (1e-3, 1e-2)
+#: Range of the stiffness of such tyres, as a share of the robot file's.
+SOFTNESS = (0.3, 1.0)
 
 
 @dataclass(frozen=True)
@@ -50,6 +59,8 @@ class Copy:
     mu: float
     slope: Array  # (2,) rad: x uphill, y uphill
     normal_stiffness: float
+    floor_creep: float
+    gear_creep: float
     joint_zero: Array  # (4,)
     camera_yaw: float
     camera_age: float
@@ -103,6 +114,8 @@ def nominal(robot: dict[str, Any]) -> Copy:
         mu=float(robot["ground"]["mu_x"]),
         slope=np.zeros(2),
         normal_stiffness=float(robot["ground"]["normal_stiffness"]),
+        floor_creep=FLOOR_CREEP,
+        gear_creep=GEAR_CREEP,
         joint_zero=np.zeros(4),
         camera_yaw=0.0,
         camera_age=0.0,
@@ -152,6 +165,19 @@ def draw(robot: dict[str, Any], rng: np.random.Generator) -> Copy:
         command_delay=float(absolute("command.delay") * np.abs(cut())),
         gyro_bias=float(imu["gyro_bias"]) * cut(3),
         accel_bias=float(imu["accel_bias"]) * cut(3),
+    )
+
+
+def yielding(copy: Copy, rng: np.random.Generator) -> Copy:
+    """Return the copy on soft tyres, with friction that creeps: what no robot file says and no two simulators share."""
+
+    def drawn(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    return copy.moved(
+        floor_creep=drawn(*YIELDING_FLOOR),
+        gear_creep=drawn(*YIELDING_GEAR),
+        normal_stiffness=copy.normal_stiffness * drawn(*SOFTNESS),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pandas as pd
 import yaml
 
 from wlr_gym.studies.bench.blind import commands, sensors
-from wlr_gym.studies.bench.blind.copies import Copy, draw, nominal, with_body_of
+from wlr_gym.studies.bench.blind.copies import Copy, draw, nominal, with_body_of, yielding
 from wlr_gym.studies.bench.blind.simulation import BlindProfile, simulate
 from wlr_gym.studies.bench.blind.truth import hide
 from wlr_gym.studies.bench.blind.world import build
@@ -22,6 +23,10 @@ ACCELERATIONS = (0.0, 7.490150, 11.235225, 14.980301, 22.470451)
 SPEEDS = (0.959233, 1.438849, 1.918466)
 #: Legs, rad/s2.
 LEG_ACCELERATIONS = (0.0, 7.490150, 14.980301)
+#: SI units; of a fingerprint.
+RESOLUTION = 1e-4
+#: Stands for what was not measured there.
+UNSEEN = -(2.0**53)
 
 
 def simulate_runs(
@@ -30,6 +35,8 @@ def simulate_runs(
     seed: int,
     runs: Sequence[int] = range(8),
     exact: bool = False,
+    soft: bool = False,
+    camera: bool = True,
 ) -> tuple[list[pd.DataFrame], dict[str, Any], Copy]:
     """Simulate runs of a data set.
 
@@ -39,12 +46,15 @@ def simulate_runs(
         seed: of the copy, the commands and the noise. With other effects it is the same robot with the same commands.
         runs: which of the eight kinds.
         exact: the nominal robot, but for its clocks and its sensors' biases, instead of a copy within tolerances.
+        soft: tyres and gears yield, which differs from one set to the next and is in no robot file.
+        camera: whether one was there.
 
     Returns:
         Tables of the runs, contents of ``meta.yaml``, the robot copy.
     """
     copy = draw(dict(robot), np.random.default_rng([seed, 1]))
     copy = with_body_of(copy, nominal(dict(robot))) if exact else copy
+    copy = yielding(copy, np.random.default_rng([seed, 7])) if soft else copy
     choose = np.random.default_rng([seed, 2])
     geometry = commands.Geometry(float(robot["leg"]["length"]), float(robot["wheel"]["radius"]))
     scripts = commands.scripts(choose, geometry)
@@ -60,7 +70,8 @@ def simulate_runs(
         setpoints = script.setpoints(times)
         start = setpoints[0, :4] + 0.02 * noise.standard_normal(4)
         records = simulate(build(copy, hidden), copy, hidden, profile, times, setpoints, start, times[-1] + 0.01)
-        tables.append(sensors.log(records, times, setpoints, copy, hidden, dict(robot), noise))
+        table = sensors.log(records, times, setpoints, copy, hidden, dict(robot), noise)
+        tables.append(table if camera else table.drop(columns=[name for name in table if name.startswith("cam_")]))
     return tables, _meta(robot, profile, runs), copy
 
 
@@ -74,6 +85,16 @@ def _meta(robot: Mapping[str, Any], profile: BlindProfile, runs: Sequence[int]) 
         "marker_offset": [0.0, 0.0, 0.0],
         "notes": f"runs in order: {notes}",
     }
+
+
+def fingerprint(tables: Sequence[pd.DataFrame]) -> str:
+    """Return a SHA-256 of what runs hold, to :data:`RESOLUTION`: below it, processors differ."""
+    digest = hashlib.sha256()
+    for table in tables:
+        digest.update(",".join(table.columns).encode())
+        values = table.to_numpy(np.float64)
+        digest.update(np.where(np.isnan(values), UNSEEN, np.rint(np.nan_to_num(values) / RESOLUTION)).astype("<i8").tobytes())
+    return digest.hexdigest()
 
 
 def write(folder: Path, tables: Sequence[pd.DataFrame], meta: Mapping[str, Any]) -> None:

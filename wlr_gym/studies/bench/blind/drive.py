@@ -1,9 +1,9 @@
 """One run of the robot, in one compiled loop: MuJoCo's C functions give inertia and Coriolis forces, everything else is here.
 
 Servos, friction and contacts are forces. Whatever resists motion is a damper whose coefficient is its bound over the speed, but
-never over less than ``CREEP``: dry friction that creeps a little instead of sticking. All dampers and the floor's springs act
-implicitly: each step solves (M + h sum c J'J) v = M v_old + h f for the new velocities, again with new coefficients until they
-agree. No complementarity, no impulses, half a millisecond per step.
+never over less than the copy's ``floor_creep`` or ``gear_creep``: dry friction that creeps a little instead of sticking. All
+dampers and the floor's springs act implicitly: each step solves (M + h sum c J'J) v = M v_old + h f for the new velocities,
+again with new coefficients until they agree. No complementarity, no impulses, half a millisecond per step.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -27,10 +27,6 @@ SAMPLE = 1e-3
 SETTLE = 1.5
 #: Corner frequency of the IMU, Hz.
 BANDWIDTH = 44.0
-#: Dry friction is full from this speed on: on the floor, m/s.
-CREEP = 5e-6
-#: The same in gears, rad/s.
-GEAR_CREEP = 2e-5
 #: Of the tyres, N s/m.
 NORMAL_DAMPING = 60.0
 #: Solutions of the velocity equation per step, at most.
@@ -187,6 +183,7 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
     drag, veer, pull, pull_frequency, pull_phase = general[11], general[12], general[13], general[14], general[15]
     patch, mu_ratio, mu_k, weak_speed = general[16:21], general[21], general[22], general[23]
     gravity, stiffness = general[24:27], general[27]
+    floor_creep, gear_creep = general[28], general[29]
     filter_share = 1.0 - np.exp(-2.0 * np.pi * BANDWIDTH * STEP)
 
     size = qvel.shape[0]
@@ -199,8 +196,8 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
     bias, force, right, base = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
     rows, columns, depth = np.zeros((12, 8)), np.zeros((4, 8), dtype=np.int64), np.zeros(4)
     mu_x, pressed = np.zeros(4), np.zeros(4, dtype=np.bool_)
-    slow = np.full(4, CREEP)
-    slow_gear, slow_roll = np.full(8, GEAR_CREEP), np.full(4, GEAR_CREEP)
+    slow = np.full(4, floor_creep)
+    slow_gear, slow_roll = np.full(8, gear_creep), np.full(4, gear_creep)
     for j in range(4):
         reference[j] = qpos[position[j]] + zero[j]
     drawn, supply = 0.0, full_supply
@@ -350,13 +347,13 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
                 change = max(change, abs(right[i] - qvel[i]))
                 qvel[i] = right[i]
             for j in range(8):
-                slow_gear[j] = max(abs(qvel[motor_rate[j]]), GEAR_CREEP)
+                slow_gear[j] = max(abs(qvel[motor_rate[j]]), gear_creep)
             for w in range(4):
                 ahead, aside = _along(rows[3 * w], columns[w], qvel), _along(rows[3 * w + 1], columns[w], qvel)
                 up = _along(rows[3 * w + 2], columns[w], qvel)
-                slow[w] = max(np.hypot(mu_x[w] * ahead, mu_x[w] * mu_ratio * aside), mu_x[w] * CREEP)
+                slow[w] = max(np.hypot(mu_x[w] * ahead, mu_x[w] * mu_ratio * aside), mu_x[w] * floor_creep)
                 slip[w] = np.hypot(ahead, aside)
-                slow_roll[w] = max(abs(qvel[rate[4 + w]] + qvel[rate[w]] + qvel[4]), GEAR_CREEP)
+                slow_roll[w] = max(abs(qvel[rate[4 + w]] + qvel[rate[w]] + qvel[4]), gear_creep)
                 normal[w] = 0.0
                 if depth[w] > 0.0:
                     normal[w] = max(stiffness * depth[w] - (NORMAL_DAMPING + STEP * stiffness) * up, 0.0)

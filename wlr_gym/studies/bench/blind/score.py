@@ -186,14 +186,17 @@ def score(results: Mapping[str, Result], truths: Mapping[str, Truth]) -> dict[st
     scored = [(dict(truths[name]), dict(results[name])) for name in sorted(results) if name in truths]
     of = {kind: [pair for pair in scored if pair[0]["kind"] == kind] for kind in _KINDS}
     clear = [pair for pair in of["effect"] if pair[0]["severity"] >= CLEAR]
+    nulls = [*of["none"], *of["parameters"]]
     return {
         "sets": len(scored),
         "commits": dict(Counter(_commit(result) for _, result in scored).most_common()),
         "false_alarms": {
             "none": _share(at_most, [_alarm(result) for _, result in of["none"] if _answered(result)]),
             "parameters": _share(at_most, [_alarm(result) for _, result in of["parameters"] if _answered(result)]),
+            "all": _share(at_most, [_alarm(result) for _, result in nulls if _answered(result)]),
             "refused_good_data": _share(at_most, [_refused(r) for t, r in scored if t["kind"] != "bad"]),
         },
+        "by_recording": _by_recording(nulls, clear),
         "single": _single(of["effect"], clear),
         "pairs": _pairs(of["pair"]),
         "outside": _outside(of["stranger"]),
@@ -263,6 +266,7 @@ def _single(pairs: Sequence[tuple[Truth, Result]], clear: Sequence[tuple[Truth, 
     return {
         "by_severity": by_severity,
         "top1": _share(at_least, [_top(truth, result) for truth, result in clear]),
+        "top1_at_one": _share(at_least, [_top(truth, result) for truth, result in pairs if truth["severity"] == 1.0]),
         "in_set": _share(at_least, [_in_set(truth, result) for truth, result in clear]),
         "mean_set_size": _mean([len(equivalence_set(r)) for _, r in clear if _alarm(r)]),
         "place": _share(at_least, [_same_place(true, found) for true, found in matched]),
@@ -276,6 +280,25 @@ def _single(pairs: Sequence[tuple[Truth, Result]], clear: Sequence[tuple[Truth, 
         "gap_grew_surely": _share(at_most, [high < 0 for gap in gaps if (high := _upper_end(gap)) is not None]),
         "gap_grew": _share(at_most, [_grew(gap) for gap in gaps]),
         "confidence": _calibration(clear),
+    }
+
+
+def _by_recording(
+    nulls: Sequence[tuple[Truth, Result]], clear: Sequence[tuple[Truth, Result]]
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """False alarms and right names by what a set was recorded with, as its result says."""
+
+    def recorded(result: Result) -> list[str]:
+        made = result.get("blind_test") or {}
+        return ["with a camera" if made.get("camera", True) else "without a camera", f"{len(made.get('runs', ()))} runs"]
+
+    words = sorted({word for _, result in [*nulls, *clear] for word in recorded(result)})
+    return {
+        word: {
+            "alarms": _share(at_most, [_alarm(r) for _, r in nulls if word in recorded(r) and _answered(r)]),
+            "top1": _share(at_least, [_top(t, r) for t, r in clear if word in recorded(r)]),
+        }
+        for word in words
     }
 
 

@@ -132,5 +132,7 @@ def _general_table(copy: Copy, hidden: Hidden, profile: BlindProfile) -> Array:
             *hidden.weak_slip,
             *floor_gravity(copy, hidden),
             copy.normal_stiffness,
+            copy.floor_creep,
+            copy.gear_creep,
         ]
     )

@@ -1,0 +1,37 @@
+"""docs/learning.md has the numbers of docs/data/learning.json, and README's of Velocity are among them."""
+
+from __future__ import annotations
+
+import importlib.util
+from types import ModuleType
+
+from blocks import ROOT
+
+
+def _load() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("learning_page", ROOT / ".ci" / "docs" / "learning.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+learning = _load()
+
+
+def test_the_page_is_what_the_numbers_make():
+    text = learning.PAGE.read_text(encoding="utf-8")
+    assert learning.write_page(text, learning.read_data()) == text
+
+
+def test_every_row_that_is_promised_is_there():
+    for task, found in learning.read_data().items():
+        wanted = [(sensors, floors if isinstance(floors, str) else floors["name"]) for sensors, floors in learning.ROWS[task]]
+        assert [(row["sensors"], row["floors"]) for row in found["rows"]] == wanted
+
+
+def test_the_readme_has_the_numbers_of_velocity():
+    rows = {(row["sensors"], row["floors"]): row for row in learning.read_data()["velocity"]["rows"]}
+    error, low, high = rows["none", "slippery"]["tracking_error"]
+    assert f"{error:.3f} [{low:.3f}, {high:.3f}]" in (ROOT / "README.md").read_text(encoding="utf-8")

@@ -1,0 +1,156 @@
+"""A system of one's own: the linear axis of the examples."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.gap.problem import Setting
+from wlr_gym.gap.rig.own import check_rig, load_rig
+from wlr_gym.gap.rig.own_kernel import CompiledRig
+from wlr_gym.gap.rig.own_problem import OwnRigProblem, open_own_rig, own_patch
+from wlr_gym.gap.rig.own_runs import read_rig_runs
+from wlr_gym.gap.workflow import analyse
+
+FILE = Path(__file__).resolve().parents[2] / "examples" / "linear_axis.py"
+AXIS = load_rig(FILE)
+AXIS_FILE = sys.modules["wlr_gym_rig_linear_axis"]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("axis")
+    AXIS_FILE.record(folder, runs=4, seed=3)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(runs):
+    return analyse(runs, rig=str(FILE))
+
+
+def test_asymmetric_friction_is_named_and_sized(found):
+    (effect,) = found.effects
+    assert (found.verdict, effect.name, effect.where) == ("effect_found", "asymmetric_friction", ("axis",))
+    difference = effect.parameters["difference"]
+    assert difference.value == pytest.approx(1.0, abs=0.05)
+    assert difference.low < 1.0 < difference.high
+    assert found.gap.reduction > 0.8
+
+
+def test_nothing_is_missing_beside_what_is_given(runs, found):
+    given = {"name": "asymmetric_friction", "where": ["axis"], "parameters": {"difference": 1.0}}
+    again = analyse(runs, known=given, rig=str(FILE))
+    assert (again.verdict, again.effects) == ("nothing_missing", ())
+    assert again.gap.heldout_calibrated < 0.5 * found.gap.heldout_calibrated
+
+
+def test_nothing_is_missing_of_an_axis_like_the_model(tmp_path):
+    AXIS_FILE.record(tmp_path, difference=0.0, runs=4, seed=5)
+    assert analyse(tmp_path, rig=str(FILE)).verdict == "nothing_missing"
+
+
+def test_equation_is_integrated_between_rows_and_begins_anew_where_windows_do():
+    """A constant force on a carriage without friction: a parabola from each start."""
+    t = np.cumsum([0.0, 0.01, 0.017, 0.005, 0.02])
+    values = AXIS.numbers | {"friction": 0.0}
+    begun = np.array([[0.1, -0.2], [0.5, 0.3]])
+    starts = np.array([0, -1, -1, 1, -1])
+    out = CompiledRig(AXIS).simulate(values, t, np.full((5, 1), 4.0), starts, begun, with_states=True)
+    acceleration = 4.0 * values["force_constant"] / values["mass"]
+    since = np.array([t[0], t[1], t[2], 0.0, t[4] - t[3]])
+    first = begun[[0, 0, 0, 1, 1]]
+    assert out[:, 0] == pytest.approx(first[:, 0] + first[:, 1] * since + 0.5 * acceleration * since**2, abs=1e-12)
+    assert out[:, 2] == pytest.approx(first[:, 1] + acceleration * since, abs=1e-12)
+
+
+def test_a_model_replays_its_own_runs_to_the_noise(runs):
+    problem, findings = open_own_rig(runs, AXIS)
+    assert isinstance(problem, OwnRigProblem)
+    assert findings == []
+    nominal = Setting(np.array([one.nominal for one in AXIS.parameters]))
+    made = list(problem.remade(nominal, [0, 1], 2))
+    again = next(problem.remade(nominal, [0], 1))
+    np.testing.assert_array_equal(made[0][0], again[0])
+    assert not np.array_equal(made[0][0], made[1][0])
+    assert 0.8 < np.sqrt(np.nanmean(made[0][0][:, 0] ** 2)) < 1.5, "first states are taken out"
+
+
+def test_two_runs_are_too_few(tmp_path):
+    AXIS_FILE.record(tmp_path, runs=2)
+    done = analyse(tmp_path, rig=str(FILE))
+    assert (done.verdict, done.intake[0].kind) == ("bad_data", "few_runs")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda table: table.rename(columns={"position": "positon"}), r"has no column 'position'.*positon"),
+        (lambda table: table.assign(current="much"), r"column 'current' holds"),
+        (lambda table: table.assign(current=np.nan), r"column 'current', row 0: expected a finite number"),
+        (lambda table: table.assign(t=table["t"].to_numpy()[::-1]), r"column 't', row 1: expected times that rise"),
+        (lambda table: table.assign(position=np.nan), r"column 'position' holds no number"),
+        (lambda table: table[:5], r"5 rows: expected 20 or more"),
+    ],
+)
+def test_runs_that_are_none_are_refused_with_file_and_column(runs, tmp_path, change, message):
+    change(pd.read_csv(runs / "run_01.csv")).to_csv(tmp_path / "run_07.csv", index=False)
+    with pytest.raises(InputError, match=rf"run_07\.csv: {message}"):
+        read_rig_runs(tmp_path, AXIS)
+
+
+def without_sigma():
+    return (dataclasses.replace(AXIS.parameters[0], sigma=0.0),)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"states": {"position": "positon"}}, r"states: position.*unknown column 'positon'.*position"),
+        ({"states": {}}, r"states = \[\]: expected one name or more"),
+        ({"inputs": {"position": "m"}}, r"'position' is an input or the clock"),
+        ({"inputs": {"a b": "m"}}, r"inputs = 'a b': expected a name of letters"),
+        ({"parameters": without_sigma()}, r"parameters: mass: sigma = 0\.0: expected a number above 0"),
+        ({"parameters": AXIS.parameters * 2}, r"parameters and laws = 'mass': expected every name once"),
+        ({"windows": ()}, r"windows = \(\): expected lengths above 0"),
+        ({"step": 0.0}, r"step = 0\.0: expected a number above 0"),
+    ],
+)
+def test_rigs_that_contradict_themselves_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        check_rig(dataclasses.replace(AXIS, **changes), "axis.py")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [(None, "no such file"), ("1 / 0", "does not run: ZeroDivisionError"), ("RIG = 3", r"RIG = 3: expected")],
+)
+def test_files_that_are_no_rig_are_refused(tmp_path, text, message):
+    path = tmp_path / "rig.py"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(InputError, match=rf"rig\.py: {message}"):
+        load_rig(path)
+
+
+def test_equations_that_cannot_be_compiled_are_named(runs):
+    broken = dataclasses.replace(AXIS, change=lambda x, u, p: (x.no_such_state, 0.0))
+    with pytest.raises(InputError, match=r"rig 'axis': change or readings cannot be compiled: .*no_such_state"):
+        open_own_rig(runs, broken)
+
+
+def test_patches_are_read_by_the_rigs_own_laws(tmp_path):
+    path = tmp_path / "patch.yaml"
+    path.write_text(yaml.safe_dump({"effects": [{"name": "load", "where": ["axis"], "parameters": {"load": 0.4}}]}))
+    assert own_patch(path, AXIS).effects[0].parameters == {"load": 0.4}
+    with pytest.raises(InputError, match=r"unknown effect of the test rig 'lod'.*load"):
+        own_patch({"name": "lod", "parameters": {}}, AXIS)
+    with pytest.raises(InputError, match="the rig has one joint, axis"):
+        own_patch({"name": "load", "where": ["servo"], "parameters": {"load": 0.4}}, AXIS)
+    with pytest.raises(InputError, match="unknown effect of the test rig 'unknown_effect'"):
+        own_patch({"name": "unknown_effect", "formula": "-b * rate"}, AXIS)
