@@ -27,6 +27,8 @@ def load(tmp_path, monkeypatch):
 
     def load():
         spec = importlib.util.spec_from_file_location("kept_pair", path)
+        assert spec is not None
+        assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         monkeypatch.setitem(sys.modules, "kept_pair", module)
         spec.loader.exec_module(module)

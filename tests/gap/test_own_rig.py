@@ -47,6 +47,7 @@ def test_nothing_is_missing_beside_what_is_given(runs, found):
     given = {"name": "asymmetric_friction", "where": ["axis"], "parameters": {"difference": 1.0}}
     again = analyse(runs, known=given, rig=str(FILE))
     assert (again.verdict, again.effects) == ("nothing_missing", ())
+    assert again.gap is not None
     assert again.gap.heldout_calibrated < 0.5 * found.gap.heldout_calibrated
 
 

@@ -17,7 +17,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.evaluation import make_core
-from wlr_gym.learning.ppo.config import PpoConfig
+from wlr_gym.learning.ppo.policy import parse_settings
 from wlr_gym.learning.ppo.training import begin_episodes, make_model
 from wlr_gym.learning.ppo.training_log import TrainingLog
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
@@ -149,7 +149,7 @@ def test_the_environment_is_told_how_far_training_is(run, tmp_path, monkeypatch)
 def test_episodes_of_the_robots_end_at_different_times():
     """Each robot starts anew once per length of an episode, a like number of them in every step, from the first episode on."""
     env = Sb3VecEnv(ENVIRONMENT, 20, episode_length=0.2)
-    model = make_model(env, PpoConfig(num_envs=20, steps_per_env=8, batch_size=32))
+    model = make_model(env, parse_settings({"num_envs": 20, "steps_per_env": 8, "batch_size": 32}))
     begin_episodes(model, env, 0)
     ended = []
     for _ in range(30):
@@ -161,7 +161,7 @@ def test_episodes_of_the_robots_end_at_different_times():
 
 def test_exploration_noise_of_legs_and_wheels_can_differ():
     env = Sb3VecEnv(ENVIRONMENT, 2)
-    config = PpoConfig(num_envs=2, steps_per_env=8, batch_size=16, initial_log_std=(-4.0, -2.0))
+    config = parse_settings({"num_envs": 2, "steps_per_env": 8, "batch_size": 16, "initial_log_std": (-4.0, -2.0)})
     noise = make_model(env, config).policy.get_parameter("log_std").tolist()
     env.close()
     assert noise == [-4.0] * 4 + [-2.0] * 4

@@ -30,7 +30,7 @@ def motion(t: np.ndarray, speed: float, seed: int) -> tuple[np.ndarray, np.ndarr
     phase = np.random.default_rng(seed).uniform(0, 2 * math.pi, 6)
     pace = speed * np.array([2.6, 3.7, 1.9, 2.3, 3.1, 1.3])
     wave = np.sin(t[:, None] * pace + phase)
-    places = [-0.11, -0.08, 0.42] + [0.1, 0.08, 0.06] * wave[:, :3]
+    places = np.array([-0.11, -0.08, 0.42]) + [0.1, 0.08, 0.06] * wave[:, :3]
     return places, Rotation.from_rotvec([0.45, 0.45, 0.3] * wave[:, 3:]).as_matrix()
 
 

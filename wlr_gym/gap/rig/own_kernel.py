@@ -106,4 +106,5 @@ def _compiled(rig: Rig) -> Callable[..., None]:
         "readings": njit(rig.readings),
     }
     exec(compile(source, f"<rig {rig.name}>", "exec"), scope)  # the driver above, and names that were checked
-    return njit(scope["simulate"])
+    simulate: Any = njit(scope["simulate"])
+    return simulate

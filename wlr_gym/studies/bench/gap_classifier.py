@@ -105,10 +105,11 @@ def training_screen(runs: Path, seed: int) -> dict[str, Any]:
     every = range(len(template.runs))
     zeros = [np.zeros_like(template.measured(run)) for run in every]
     _, candidates = template.candidates(nominal, zeros, every)
-    made: list[Any] = []
-    while not made:
+    while True:
         setting, name = drawn_setting(template, candidates, rng)
         made = template.recorded(setting, seed)
+        if made:
+            break
     problem = RobotProblem(made, template.robot)
     fitted, _, columns = informative_split(problem)
     base = calibrated_fit(problem, fitted, columns)
@@ -183,15 +184,16 @@ def train(sets: Sequence[Mapping[str, Any]]) -> Classifier:
         raise InputError(f"{len(sets)} training sets of {len(classes)} classes: expected two classes or more")
     x = features([one["screen"] for one in sets], names)
     y = np.array([classes.index(one["missing"]) for one in sets])
-    wanted = np.eye(len(classes))[y]
+    wanted: Array = np.eye(len(classes))[y]
     shape = (len(classes), len(names) + 1)
 
     def loss(flat: Array) -> tuple[float, Array]:
         both = flat.reshape(shape)
         weight, bias = both[:, :-1], both[:, -1]
         logits = x @ weight.T + bias
-        missed = np.exp(logits - logsumexp(logits, axis=1, keepdims=True)) - wanted
-        value = float((logsumexp(logits, axis=1) - logits[np.arange(len(y)), y]).mean() + 0.5 * RIDGE * (weight**2).sum())
+        total = np.asarray(logsumexp(logits, axis=1))
+        missed = np.exp(logits - total[:, None]) - wanted
+        value = float((total - logits[np.arange(len(y)), y]).mean() + 0.5 * RIDGE * (weight**2).sum())
         slope = np.concatenate([missed.T @ x / len(y) + RIDGE * weight, missed.mean(axis=0)[:, None]], axis=1)
         return value, slope.ravel()
 
