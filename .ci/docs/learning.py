@@ -14,10 +14,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.learning.evaluation.card import Card
 from wlr_gym.learning.evaluation.scoring import evaluate
 from wlr_gym.learning.evaluation.statistics import Estimate
+from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "docs" / "data" / "learning.json"
@@ -56,11 +58,14 @@ _TITLES += ("`slip_compensating`, better (%)", "`pid`, better (%)", "slips less 
 def score(task: str, ours: str, blind: str) -> None:
     """Score what is not scored yet of a task; every row is written when it is done."""
     data = read_data()
-    recipes = {OURS: ours, BLIND: blind}
-    if data.get(task, {}).get("recipes") != recipes:
-        data[task] = {"recipes": recipes, "commit": git_commit(), "date": str(datetime.date.today()), "rows": []}
+    policies = [identity(one) for one in read_subjects([f"{OURS}={ours}", f"{BLIND}={blind}"])]
+    if data.get(task, {}).get("policies") != policies:
+        data[task] = {"policies": policies, "commit": git_commit(), "date": str(datetime.date.today()), "rows": []}
     rows = data[task]["rows"]
-    for sensors, floors in ROWS[task][len(rows) :]:
+    there = {(row["sensors"], row["floors"]) for row in rows}
+    for sensors, floors in ROWS[task]:
+        if (sensors, _name(floors)) in there:
+            continue
         card = evaluate(
             f"{OURS}={ours}",
             f"WLR-{task.title()}-v0",
@@ -71,9 +76,13 @@ def score(task: str, ours: str, blind: str) -> None:
             robot="flow" if sensors == "flow" else None,
             precision="float32",
         )
-        rows.append(row_of(card, sensors, floors if isinstance(floors, str) else floors["name"]))
-        DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+        rows.append(row_of(card, sensors, _name(floors)))
+        write_json(DATA, data)
         print(" | ".join(cells(rows[-1])), flush=True)
+
+
+def _name(floors: Any) -> str:
+    return floors if isinstance(floors, str) else floors["name"]
 
 
 def row_of(card: Card, sensors: str, floors: str) -> dict[str, Any]:
@@ -136,7 +145,7 @@ def write_page(text: str, data: Mapping[str, Any]) -> str:
 
 
 def read_data() -> dict[str, Any]:
-    """Return the kept numbers: task -> recipes, commit, date, rows."""
+    """Return the kept numbers: task -> SHA-256 of the policies, commit, date, rows."""
     return json.loads(DATA.read_text(encoding="utf-8")) if DATA.is_file() else {}
 
 

@@ -10,6 +10,7 @@ from functools import partial
 import pytest
 
 from wlr_gym.base.files import write_json
+from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import INTERRUPTED, main
 from wlr_gym.data import read_dataset
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
@@ -153,3 +154,11 @@ def test_demo_does_not_remove_what_is_not_its_own(tmp_path, capsys):
     assert main(["demo", "--out", str(tmp_path / "demo")]) == 2
     assert "'thesis.txt' is in the way" in capsys.readouterr().err
     assert mine.read_text() == "years of work"
+
+
+def test_demo_does_not_remove_a_training(tmp_path, capsys):
+    run = tmp_path / "run"
+    record_provenance(run, {"environment": "WLR-Velocity-v0", "agent": "ppo", "settings": {}}, 0)
+    assert main(["demo", "--force", "--out", str(run)]) == 2
+    assert "is in the way" in capsys.readouterr().err
+    assert (run / "config.yaml").is_file()

@@ -33,5 +33,6 @@ def compiled(function: Callable[..., Any], *signatures: Any) -> Any:
     dispatcher._cache = _Kept(function)  # pyright: ignore[reportAttributeAccessIssue]
     for signature in signatures:
         dispatcher.compile(signature)
+    if signatures:
         dispatcher.disable_compile()
     return dispatcher

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing
-from wlr_gym.base.provenance import PROVENANCE_FILE, record_provenance
+from wlr_gym.base.provenance import CONFIG_FILE, record_provenance
+from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.progress import progress
@@ -30,8 +31,7 @@ if TYPE_CHECKING:
 
 STEPS = 3_000_000
 QUICK_STEPS = 16_384
-#: The critic takes the first 128,000 of the further steps.
-_QUICK = {"further_steps": 150_000, "drives": 2, "drive_seconds": 1.0}
+_QUICK = {"further_steps": 32_768, "drives": 2, "drive_seconds": 1.0}
 
 
 @dataclass(frozen=True)
@@ -100,11 +100,16 @@ def _code(sections: list[Section]) -> int:
     return FAILED if any(one.verdict == stage.FAILED for one in sections) else OK
 
 
+def _is_demo(folder: Path) -> bool:
+    path = folder / CONFIG_FILE
+    return path.is_file() and "quick" in read_yaml(path)
+
+
 def _clear(folder: Path) -> None:
     """Make the folder anew; one that holds anything but a demo is refused."""
     make_output_folder(folder)
     inside = list(folder.iterdir())
-    if inside and not (folder / PROVENANCE_FILE).is_file():
+    if inside and not _is_demo(folder):
         raise InputError(
             f"{folder}: '{inside[0].name}' is in the way, and this is not the folder of a demo; give another --out"
         )

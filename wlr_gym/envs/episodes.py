@@ -18,7 +18,7 @@ Rows = NDArray[np.intp]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count_step(mask: Any, limit: int, over: Any, steps: Any, terminated: Any, truncated: Any) -> bool:
+def _count_step(mask: Any, limit: int, over: Any, steps: Any, sooner: Any, terminated: Any, truncated: Any) -> bool:
     """Count a step and set the end flags. Returns whether any episode ended."""
     any_done = False
     for i in range(len(mask)):
@@ -29,7 +29,7 @@ def _count_step(mask: Any, limit: int, over: Any, steps: Any, terminated: Any, t
         for k in range(over.shape[1]):
             if over[i, k] > 0.0:
                 terminated[i] = True
-        truncated[i] = steps[i] >= limit
+        truncated[i] = steps[i] >= limit - sooner[i]
         any_done = any_done or terminated[i] or truncated[i]
     return any_done
 
@@ -40,7 +40,7 @@ class Episodes:
     Attributes:
         robot_seeds: the robots' own seeds. number: which episode of the robot this is, from 0. seeds: of the episodes.
         seeded: whether the robot has a seed. begun: whether its first episode has begun.
-        steps: control steps since the episode began.
+        steps: control steps since the episode began. sooner: by how many steps before the limit the present one is truncated.
         terminated, truncated: flags of the last step.
     """
 
@@ -52,6 +52,7 @@ class Episodes:
         self.begun: Mask = np.zeros(count, bool)
         self._all_begun = False
         self.steps: NDArray[np.int64] = np.zeros(count, np.int64)
+        self.sooner: NDArray[np.int64] = np.zeros(count, np.int64)
         self.terminated: Mask = np.zeros(count, bool)
         self.truncated: Mask = np.zeros(count, bool)
 
@@ -73,13 +74,13 @@ class Episodes:
         """Begin the next episodes of some robots, which have these seeds."""
         self.number[rows] += 1
         self.seeds[rows] = seeds
-        self.steps[rows] = 0
+        self.steps[rows] = self.sooner[rows] = 0
         self.terminated[rows] = self.truncated[rows] = False
 
     def count_step(self, mask: Mask, limit: int, over: NDArray[np.float64]) -> bool:
         """Count a step of the robots in ``mask``: any of their termination terms ``over`` (N, K) above 0 ends the episode, as
         does step ``limit``. Returns whether any episode ended."""
-        return _count_step(mask, limit, over, self.steps, self.terminated, self.truncated)
+        return _count_step(mask, limit, over, self.steps, self.sooner, self.terminated, self.truncated)
 
     def note_begun(self, mask: Mask) -> None:
         """Say that the episodes of the robots in ``mask`` can be stepped."""
@@ -88,7 +89,7 @@ class Episodes:
 
     def stores(self) -> dict[str, RowStore]:
         """Return what snapshots hold."""
-        names = ("robot_seeds", "number", "seeds", "seeded", "begun", "steps", "terminated", "truncated")
+        names = ("robot_seeds", "number", "seeds", "seeded", "begun", "steps", "sooner", "terminated", "truncated")
         return {name: getattr(self, name) for name in names}
 
     def require_begun(self, what: str, rows: Rows | None = None) -> None:

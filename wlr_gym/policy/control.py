@@ -120,6 +120,11 @@ class Chassis:
         wheel, leg = self.robot.wheel.radius, self.robot.leg.length
         return (rolling_speed - leg * np.sin(leg_angle) * leg_rate) / wheel - leg_rate
 
+    def within(self, leg_angle: Array) -> Array:
+        """Return leg setpoints (N, 4), rad, as far as actions reach."""
+        centre, scale = self._centre[: len(LEGS)], self._scale[: len(LEGS)]
+        return np.clip(leg_angle, centre - scale, centre + scale)
+
     def actions(self, leg_angle: Array, wheel_rate: Array) -> NDArray[np.float32]:
         """Return the actions (N, 8) for setpoints (N, 4) in rad and (N, 4) in rad/s, clipped to [-1, 1]."""
         setpoints = np.concatenate([leg_angle, wheel_rate], axis=1)
@@ -150,8 +155,8 @@ class PidGains(SettingsModel):
         lateral: yaw rate per lateral error, rad/(m s). heading: yaw rate per heading error, 1/s.
         uphill: yaw rate per specific force to the left, rad s/m: turns the robot uphill on a slope.
         legs_inward: rad by which the legs reach under the body: a shorter wheelbase turns with less slip.
-        lean_time: s that they take for it, evenly, from where they stand when an episode begins; at once, they jerk the body.
-            0 = at once, as always where legs sweep.
+        lean_time: s for a way of ``legs_inward``: so fast, evenly, legs go there from where they stand when an episode begins.
+            At once, they jerk the body. 0 = at once, as always where legs sweep or ``legs_inward`` is 0.
         leg_i: on the integral of the error of a leg's measured angle, 1/s: servos give way to loads. Only where legs sweep.
         integral_limit: bound of the corrections by integrals, m/s, rad/s and rad.
     """
@@ -248,7 +253,9 @@ class Pid:
         """Return actions (N, 8) for observations (N, D)."""
         forward, turn = self.motion(observations)
         reach, reach_rate = self._reach_under(observations)
-        legs = self.legs(observations) + reach
+        shifted = self.legs(observations)
+        legs = shifted + reach
+        self._sent = self.chassis.within(legs) - shifted
         rolling = self.rolling_speed(observations, forward, turn)
         wheels = self.chassis.wheel_rate(rolling, legs, self.leg_rate(observations) + reach_rate)
         return self.chassis.actions(legs + self._leg_integral.add(legs - self.leg_angle(observations)), wheels)
@@ -257,14 +264,14 @@ class Pid:
         """Return how far the legs reach under the body after this step (N, 4), rad from home, and how fast they move, rad/s."""
         config = self.config
         wanted = np.broadcast_to(config.legs_inward * self.chassis.front, (len(observations), 4))
-        if config.lean_time == 0.0 or self._sweeping:
+        if config.lean_time * config.legs_inward == 0.0 or self._sweeping:
             return wanted, np.zeros(wanted.shape)
         if len(self._sent) != len(observations):
             self._sent = np.full(wanted.shape, np.nan)
         before = np.where(np.isnan(self._sent), self._leg_error(observations), self._sent)
         step = abs(config.legs_inward) * self._period / max(config.lean_time, self._period)
-        self._sent = before + np.clip(wanted - before, -step, step)
-        return self._sent, (self._sent - before) / self._period
+        change = np.clip(wanted - before, -step, step)
+        return before + change, change / self._period
 
     def _leg_error(self, observations: NDArray[np.floating]) -> Array:
         """Return how far the legs stand from home (N, 4), rad; zeros where they are not observed."""
@@ -298,7 +305,7 @@ class Pid:
         return self.chassis.rolling_speed(forward, turn)
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
-        """Forget the integrals of the robots in ``mask`` (N,)."""
+        """Forget the integrals of the robots in ``mask`` (N,), and where their legs were sent."""
         self._yaw_rate_integral.reset(mask)
         self._velocity_integral.reset(mask)
         self._leg_integral.reset(mask)

@@ -44,7 +44,7 @@ class SlipCompensatingConfig(SlipGains, PidConfig):
 
 
 class SlipCompensating(Pid):
-    """The controller; it remembers the integrals of ``pid`` and the smoothed difference of the axles' slip."""
+    """The controller; it remembers what ``pid`` does and the smoothed difference of the axles' slip."""
 
     def __init__(self, contract: Mapping[str, Any], config: SlipCompensatingConfig) -> None:
         super().__init__(contract, config, "slip_compensating")

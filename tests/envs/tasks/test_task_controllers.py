@@ -21,9 +21,9 @@ GAINS = {
 TASKS = ("velocity", "path", "posture", "slope")
 
 
-def core_with_controller(task: str, count: int = 4):
+def core_with_controller(task: str, count: int = 4, gains=GAINS, **more):
     term = f"{task}_controller"
-    changes = {"latency": PROMPT, "controller": GAINS, "observations": {term: {}}}
+    changes = {"latency": PROMPT, "controller": gains, "observations": {term: {}}, **more}
     core = make_core(f"WLR-{task.title()}-v0", count, {"task": changes})
     columns = [k for k, column in enumerate(core.task.policy) if column.term == term]
     for row in range(count):
@@ -32,8 +32,8 @@ def core_with_controller(task: str, count: int = 4):
     return core, columns
 
 
-def agent_of(core) -> Policy:
-    policy = load_agent("slip_compensating").make_policy(core.contract(), GAINS)
+def agent_of(core, gains=GAINS) -> Policy:
+    policy = load_agent("slip_compensating").make_policy(core.contract(), gains)
     policy.reset(core.everyone)
     return policy
 
@@ -50,6 +50,33 @@ def test_action_is_that_of_the_agent(task):
         core.step(actions, core.everyone)
     core.close()
     assert np.ptp(seen, axis=0).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"lean_time": 0.0},
+        {"legs_inward": -0.1},
+        {"legs_inward": 0.0},
+        {"legs_inward": 0.35, "load_shift": 0.0},
+        {"legs_inward": 0.2},
+    ],
+    ids=["at once", "outward", "home", "beyond the action", "beyond the action with load shift"],
+)
+def test_legs_of_agent_and_task_agree_whatever_the_gains(changes):
+    """Also where the action does not reach as far as the legs are to go, and after one robot alone begins anew."""
+    gains = GAINS | changes
+    core, columns = core_with_controller("velocity", 4, gains, action={"leg_scale": 0.15})
+    agent = agent_of(core, gains)
+    for tick in range(90):
+        actions = agent.act(core.observation)
+        np.testing.assert_allclose(core.observation[:, columns[: len(JOINTS)]], actions, atol=2e-6)
+        core.step(actions, core.everyone)
+        if tick == 40:
+            second = np.arange(4) == 1
+            core.begin_episodes(second)
+            agent.reset(second)
+    core.close()
 
 
 def test_memory_is_of_the_episode_and_in_snapshots():

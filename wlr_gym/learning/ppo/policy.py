@@ -21,8 +21,8 @@ from wlr_gym.policy import contract_of
 MODEL_FILE = "model.zip"
 #: Settings that make the network.
 NETWORK = ("hidden_layers", "activation", "normalise", "residual")
-#: Logarithm of the exploration noise of a start from a file, which does not say that of each joint. The mean over joints of
-#: what shipped ones had in the end, e**-3.5, costs 5 % of the reward on the legs, and made policies worse; docs/learning.md.
+#: Logarithm of the exploration noise of a start from a file without a critic, which does not say that of each joint either.
+#: The mean over joints of what shipped ones had in the end, e**-3.5, costs 5 % of the reward on the legs.
 LOG_STD = -4.6
 #: Divergence that ends the passes of an update early, where little noise makes a small step of the weights a large one.
 TARGET_KL = 0.02

@@ -233,7 +233,7 @@ def spread_ends(core: Core) -> None:
 
     Otherwise all robots start anew in the same update, a start is in one update of some thirty, and each update unlearns it.
     """
-    core.episodes.steps[:] = np.arange(core.count) * core.limit // core.count
+    core.episodes.sooner[:] = np.arange(core.count) * core.limit // core.count
 
 
 def update(model: PPO, meter: Meter, config: PpoConfig) -> dict[str, float]:

@@ -149,7 +149,8 @@ def _reach_under(signals: Signals, action: str, leg: int, shifted: Value) -> tup
     before = ops.where_positive(signals.time - 0.5 * period, sent, start)
     step = ops.absolute(wanted) * period / ops.maximum(within, period)
     after = before + ops.clip(wanted - before, 0.0 - step, step)
-    return ops.where_positive(within, after, wanted), ops.where_positive(within, (after - before) / period, 0.0)
+    even = within * ops.absolute(wanted)  # positive = not at once
+    return ops.where_positive(even, after, wanted), ops.where_positive(even, (after - before) / period, 0.0)
 
 
 def _integral(signals: Signals, value: Value, rate: Value) -> Value:
