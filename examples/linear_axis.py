@@ -15,9 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from wlr_gym.gap.problem import MeasuredSignal, Quantity
-from wlr_gym.gap.rig.own import Rig, RigLaw
-from wlr_gym.physics.effects import EffectParameter
+from wlr_gym.gap.rig.own import EffectParameter, MeasuredSignal, Quantity, Rig, RigLaw
 
 #: m/s; from here on dry friction is full.
 CREEP = 5e-4

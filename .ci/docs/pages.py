@@ -44,6 +44,7 @@ API = {
     "Pictures": "wlr_gym.render",
     "Vision": "wlr_gym.perception.vision",
     "Gap workflow": "wlr_gym.gap",
+    "A rig of one's own": "wlr_gym.gap.rig.own",
     "Errors": "wlr_gym.base.errors",
 }
 

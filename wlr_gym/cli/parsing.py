@@ -18,8 +18,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-import tyro
-
 from wlr_gym.base.errors import InputError, nearest, unknown_name
 
 #: Columns of a help text.
@@ -38,6 +36,8 @@ def parse(kind: type, program: str, arguments: Sequence[str], description: str) 
     Raises:
         InputError: a mistake in the arguments, in one line.
     """
+    import tyro
+
     options = options_of(kind)
     _check(options, program, arguments)
     shown, said = io.StringIO(), io.StringIO()
@@ -86,6 +86,7 @@ def completion(shell: str, program: str, commands: Mapping[str, Any]) -> str:
         program: what is completed.
         commands: name -> options, or the same of a command with commands of its own.
     """
+    import tyro
 
     script = io.StringIO()
     words = ["--tyro-print-completion", shell]
@@ -96,6 +97,8 @@ def completion(shell: str, program: str, commands: Mapping[str, Any]) -> str:
 
 def _one_of(commands: Mapping[str, Any]) -> Any:
     """Return what the parser takes for several commands, some of them with commands of their own."""
+    import tyro
+
     members = []
     for name, kind in commands.items():
         if isinstance(kind, Mapping):
@@ -133,6 +136,8 @@ def builder(kind: type) -> Callable[..., Any]:
 
 
 def _option(field: dataclasses.Field[Any], hint: Any, text: str) -> inspect.Parameter:
+    import tyro
+
     has_default = field.default is not dataclasses.MISSING
     default = field.default if has_default else inspect.Parameter.empty
     value = _value_type(hint)
@@ -160,6 +165,8 @@ def _default_shown(default: Any) -> str:
 
 
 def _is_positional(hint: Any) -> bool:
+    import tyro
+
     return get_origin(hint) is Annotated and any(one is tyro.conf.Positional for one in hint.__metadata__)
 
 

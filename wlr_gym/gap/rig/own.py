@@ -17,6 +17,8 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.gap.problem import MeasuredSignal, Quantity
 from wlr_gym.physics.effects.effect import EffectParameter
 
+__all__ = ["EffectParameter", "MeasuredSignal", "Quantity", "Rig", "RigLaw"]
+
 #: Before the name of a column, for a state that is its rate.
 RATE_OF = "rate of "
 #: The clock of a run, s.

@@ -26,8 +26,8 @@ from wlr_gym.robot import Robot
 
 #: Share of the learning rate that is left at the end of the training.
 FALLS_TO = 0.2
-#: Logarithm of the exploration noise of legs and wheels at the start, where the policy's file has none of its own: that at which
-#: trainings of the recipe end.
+#: Logarithm of the exploration noise of legs and wheels at the start, where the policy's file has none of its own: that at
+#: which trainings of the recipe end.
 LOG_STD = (-4.2, -2.1)
 #: Environment steps between scores on held-out episodes, and between checkpoints, as shares of the training.
 _SCORES = 4

@@ -12,8 +12,8 @@ which follows from its dual conic M diag(1, 1, -1) M^T, M = [r e1, r e2, C], so 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations
 from typing import Any
 
@@ -120,6 +120,15 @@ def solve_pose(
             return TargetPose(turn, place, covariance * max(1.0, chi_square), used, residual, chi_square)
         indices = [i for i in indices if i != suspicious[0]]
     return None
+
+
+def solved_floor(seen: Mapping[int, Detection], floor: Target, camera: Camera, start: TargetPose) -> TargetPose | None:
+    """The floor's pose, with the tolerance of its markers' places in the weights and in the covariance."""
+    std = floor.tolerance / start.position[2]  # in undistorted coordinates; a marker's circles share it
+    tolerated = {
+        k: replace(one, covariances=one.covariances + len(one.covariances) * std**2 * np.eye(2)) for k, one in seen.items()
+    }
+    return solve_pose(tolerated, floor, camera, start.rotation, start.position)
 
 
 def expected_ellipse(target: Target, index: int, camera: Array, rotation: Array, position: Array) -> Array | None:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import Detection
-from wlr_gym.perception.markers.pose import MINIMUM_MARKERS, TargetPose, solve_pose
+from wlr_gym.perception.markers.pose import MINIMUM_MARKERS, TargetPose, solve_pose, solved_floor
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.adjustment import LONGEST_STEP, TargetView, adjust, at_frame_time, velocity_between
-from wlr_gym.perception.vision.tracking import Sample, mean_detection, solved_floor
+from wlr_gym.perception.vision.tracking import Sample, mean_detection
 
 Array = NDArray[np.float64]
 

@@ -25,6 +25,7 @@ from wlr_gym.perception.markers.pose import (
     expected_ellipse,
     find_target,
     solve_pose,
+    solved_floor,
 )
 from wlr_gym.perception.markers.sheet_fault import sheet_fault, target_pixels
 from wlr_gym.perception.markers.targets import Target
@@ -395,14 +396,3 @@ def mean_detection(found: Sequence[Detection]) -> Detection:
     spread = np.where(known[:, None, None], covariances.mean(axis=0) / len(found), np.nan)
     shape, ellipse = np.mean([d.shape for d in found], axis=0), np.mean([d.ellipse for d in found], axis=0)
     return replace(found[0], centres=mean, covariances=spread, shape=shape, ellipse=ellipse)
-
-
-def solved_floor(seen: dict[int, Detection], floor: Target, camera: Camera, start: TargetPose) -> TargetPose | None:
-    """The floor's pose, with the tolerance of its markers' places in the weights and in the covariance."""
-    tolerated = {index: _tolerant(marker, floor.tolerance / start.position[2]) for index, marker in seen.items()}
-    return solve_pose(tolerated, floor, camera, start.rotation, start.position)
-
-
-def _tolerant(detection: Detection, std: float) -> Detection:
-    """With the tolerance of the marker's place (1 sigma, undistorted coordinates), which its circles share."""
-    return replace(detection, covariances=detection.covariances + len(detection.covariances) * std**2 * np.eye(2))
