@@ -46,7 +46,7 @@ def test_steps_are_timed_by_the_wall_and_by_the_processor(analysed, tmp_path):
 
 def test_the_command_writes_them(analysed, tmp_path, capsys):
     numbers = tmp_path / "speed.json"
-    assert run(BenchOptions(what=("gap",), speed=(tmp_path,), threads=1, json=numbers)) == 0
+    assert run(BenchOptions(what=("gap",), speed=(tmp_path,), threads=1, save=numbers)) == 0
     found = json.loads(numbers.read_text())
     assert found["threads"] == 1
     assert found["analyses"][0]["steps"][0]["step"] == "reading"

@@ -252,7 +252,9 @@ def test_command_line(trained, exported, tmp_path, capsys):
     assert content["training"]["seconds"] > 0
     metadata = {entry.key: entry.value for entry in onnx.load(out).metadata_props}
     assert metadata.keys() == {CONTRACT_KEY, FINGERPRINT_KEY}
-    assert main(["export", str(tmp_path), "--out", str(out)]) == 2
+    assert main(["export", str(trained), "--out", str(out)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert main(["export", str(tmp_path), "--out", str(tmp_path / "other.onnx")]) == 2
     assert "no policy there" in capsys.readouterr().err
     assert main(["export", "pid", "--out", str(out)]) == 2
     assert main(["export", str(trained), "--out", str(tmp_path / "p.pt")]) == 2

@@ -79,7 +79,9 @@ def test_the_wheels_errors_are_correlated_as_the_covariance_says(turn):
 @pytest.mark.parametrize("pace", [4.0, 8.0, 0.5])
 def test_slow_motion_is_named_with_the_rate_to_give(turn, pace):
     """A film whose times run slower than the camera's clock did."""
-    samples = [replace(sample, time=pace * sample.time) for sample in samples_of(turn)]
+    samples = samples_of(turn)
+    first = samples[0].time
+    samples = [replace(sample, time=first + pace * (sample.time - first)) for sample in samples]
     with pytest.raises(InputError, match=f"times run {pace:g} times as fast: slow motion.*--rate 30$"):
         aligned(turn, samples)
 

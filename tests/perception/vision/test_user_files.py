@@ -152,7 +152,7 @@ def test_command_writes_the_readout_into_the_camera_file(tmp_path, capsys):
     assert found.readout == pytest.approx(0.018, abs=0.0015)
     assert found.quality is not None
     assert found.quality.readout_std is not None
-    assert main([*words, "--readout", "0"]) == 0
+    assert main([*words, "--readout", "0", "--force"]) == 0
     assert load_camera(tmp_path / "camera.yaml").readout == 0.0
-    assert main([*words, "--readout", "18"]) == 2
+    assert main([*words, "--readout", "18", "--force"]) == 2
     assert "--readout 18: expected seconds" in capsys.readouterr().err.replace("\n", "")

@@ -24,7 +24,7 @@ def test_report_is_written(tmp_path, capsys):
     assert len(json.loads((out / "claims.json").read_text())) == 25
     text = (out / "report.md").read_text()
     assert "| gibbs_appell | test_2 |" in text
-    assert "| (30) |" in text
+    assert "(30)" in text
     assert "does not hold" in capsys.readouterr().out
     for name, test in TESTS.items():
         motion = read_commands(out / "commands" / f"{name}.csv")

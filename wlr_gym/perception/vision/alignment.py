@@ -140,7 +140,7 @@ def _pace(time: Array, poses: Array, run: Run, robot: Robot, parameters: Paramet
         moments = moments[inside]
         pair = next((p for p in _pairs(moments, poses[inside], run, robot, parameters, around) if p.name == "yaw"), None)
         if pair is None:
-            return None
+            continue
         project = _without_slow(moments, pair.slowest)
         seen = project(pair.seen)
         curve = np.array([_cost(pair, moments + offset, project) for offset in grid])
