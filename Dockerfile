@@ -2,7 +2,7 @@
 # build is yours. docs/quickstart.md says how to use it.
 #
 #   docker build -t wlr_gym .
-#   docker run --rm -v "$PWD/out:/work/out" wlr_gym demo --quick
+#   docker run --rm -v "$PWD/results:/results/out" wlr_gym demo --quick
 FROM python:3.11-slim
 
 # What MuJoCo draws pictures with, on a GPU's driver (EGL) or on the processor (OSMesa).
@@ -12,15 +12,15 @@ RUN apt-get update \
     && rm -rf /var/lib/apt/lists/*
 
 RUN useradd --create-home --uid 1000 wlr \
-    && mkdir -p /work/out /home/wlr/.cache \
-    && chown -R wlr:wlr /work /home/wlr/.cache
+    && mkdir -p /results/out /home/wlr/.cache \
+    && chown -R wlr:wlr /results /home/wlr/.cache
 WORKDIR /source
 COPY . /source
 RUN pip install --no-cache-dir -c constraints.txt ".[demo,vision,video,export,logs]"
 
 # Nothing runs as root. Compiled kernels stay in the cache: keep it in a volume, or the first step of each container compiles.
 USER 1000
-WORKDIR /work
+WORKDIR /results
 ENV MUJOCO_GL=osmesa \
     MPLBACKEND=agg \
     OMP_NUM_THREADS=1 \

@@ -11,11 +11,13 @@ A comment before a block says what else than "run it" is to be done with it:
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from wlr_gym.cli import main
@@ -38,6 +40,16 @@ SMALLER = {
     "record": "--seconds 4",
     "paper": "--plant gibbs_appell --draws 0",
 }
+
+
+def site_script(name: str) -> ModuleType:
+    """Return a script of ``.ci/docs``, loaded as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / ".ci" / "docs" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @dataclass(frozen=True)

@@ -2,22 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
-from types import ModuleType
+from blocks import ROOT, site_script
 
-from blocks import ROOT
-
-
-def _load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("learning_page", ROOT / ".ci" / "docs" / "learning.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-learning = _load()
+learning = site_script("learning")
 
 
 def test_the_page_is_what_the_numbers_make():

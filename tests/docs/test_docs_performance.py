@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-from types import ModuleType
 
 import pytest
-from blocks import ROOT
+from blocks import ROOT, site_script
 
 from wlr_gym.cli.bench import MEASUREMENTS
 from wlr_gym.studies.bench.measure import Measurement, machine
 
-
-def _load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("performance", ROOT / ".ci" / "docs" / "performance.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-performance = _load()
+performance = site_script("performance")
 DATA = json.loads((ROOT / "docs" / "data" / "bench.json").read_text(encoding="utf-8"))
 ROWS = DATA["rows"]
 

@@ -4,26 +4,16 @@ from __future__ import annotations
 
 import ast
 import importlib
-import importlib.util
 import inspect
 import re
 from typing import Any
 
 import pytest
-from blocks import PAGES, ROOT, blocks
+from blocks import PAGES, ROOT, blocks, site_script
 
 import wlr_gym
 from wlr_gym.envs.registry import ENVIRONMENTS
 from wlr_gym.envs.tasks.task_config import read_task
-
-
-def _pages() -> Any:
-    spec = importlib.util.spec_from_file_location("pages", ROOT / ".ci" / "docs" / "pages.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def _public(module: Any) -> dict[str, Any]:
@@ -44,7 +34,7 @@ def test_the_table_is_that_of_the_task_files():
     assert block.splitlines()[3:] == rows
 
 
-@pytest.mark.parametrize("name", _pages().API.values())
+@pytest.mark.parametrize("name", site_script("pages").API.values())
 def test_public_names_are_documented_and_typed(name):
     module = importlib.import_module(name)
     assert module.__doc__
@@ -65,7 +55,7 @@ def _imported(text: str) -> set[tuple[str, str]]:
 
 
 def test_examples_and_pages_use_what_is_public():
-    modules = {"wlr_gym", *_pages().API.values()}
+    modules = {"wlr_gym", *site_script("pages").API.values()}
     programs = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "examples").glob("*.py")}
     for page in PAGES:
         found = [block.text for block in blocks(page) if block.language == "python"]
@@ -82,7 +72,7 @@ def test_examples_and_pages_use_what_is_public():
 
 
 def test_roles_of_docstrings_are_links_on_the_site():
-    shown, found = _pages().on_page_content, set()
+    shown, found = site_script("pages").on_page_content, set()
     for path in (ROOT / "wlr_gym").rglob("*.py"):
         found |= set(re.findall(r":[a-z]+:`[^`]+`", path.read_text(encoding="utf-8")))
     assert len(found) > 100
@@ -94,10 +84,10 @@ def test_roles_of_docstrings_are_links_on_the_site():
 def test_formulas_are_mathml_on_the_site():
     pytest.importorskip("latex2mathml")
     page = (ROOT / "docs" / "derivation.md").read_text(encoding="utf-8")
-    shown = _pages().on_page_markdown(page)
+    shown = site_script("pages").on_page_markdown(page)
     assert "$" not in shown
     assert shown.count('display="block"') == page.count("$$") // 2
-    assert _pages().on_page_markdown("`$WLR_GYM_CACHE`, else `$HOME`") == "`$WLR_GYM_CACHE`, else `$HOME`"
+    assert site_script("pages").on_page_markdown("`$WLR_GYM_CACHE`, else `$HOME`") == "`$WLR_GYM_CACHE`, else `$HOME`"
 
 
 def test_the_package_says_that_it_is_typed():

@@ -20,13 +20,12 @@ from wlr_gym.gap.rig.open import LEAST_RUNS, rig_patch
 from wlr_gym.gap.rig.own import RATE_OF, Rig, RigLaw
 from wlr_gym.gap.rig.own_kernel import CompiledRig
 from wlr_gym.gap.rig.own_runs import RigRun, read_rig_runs
+from wlr_gym.gap.rig.problem import with_lost
 from wlr_gym.gap.rig.replay import smoothed_state
 from wlr_gym.physics.effects import EffectParameter, Patch, PatchEffect, Source
 
 Array = NDArray[np.float64]
 
-#: Noise units that every residual of a simulation that broke down counts.
-LOST = 1e4
 #: Noise units beyond which a residual counts no more in the gap's numbers.
 CAP = 50.0
 #: Step of finite differences in a state, as a share of its scatter, and at least.
@@ -169,9 +168,7 @@ class OwnRigProblem:
             part = found[:, rows, columns]
             flat = np.nan_to_num(part).reshape(len(part), -1)
             found[:, rows, columns] = part - (flat @ basis @ basis.T).reshape(part.shape)
-        lost = ~np.isfinite(simulated).all(axis=(1, 2))
-        found[lost] = np.where(np.isfinite(measured), LOST, np.nan)
-        return found
+        return with_lost(found, measured, simulated)
 
     def candidates(
         self, setting: Setting, residuals: Sequence[Array], runs: Sequence[int]

@@ -33,6 +33,13 @@ HORIZONS: Mapping[str, float | None] = {"position": None, "position_within_0.2s"
 _ANGLE = OUTPUTS.index("angle")
 
 
+def with_lost(found: Array, measured: Array, simulated: Array) -> Array:
+    """Return residuals (S, T, C) in which a setting whose simulation broke down is as far from the data as can be."""
+    lost = ~np.isfinite(simulated).all(axis=(1, 2))
+    found[lost] = np.where(np.isfinite(measured), LOST, np.nan)
+    return found
+
+
 class RigProblem:
     """Recordings of one servo with a pendulum, and a simulator of it; see :class:`wlr_gym.gap.problem.Problem`.
 
@@ -112,10 +119,7 @@ class RigProblem:
     def _residuals(self, run: int, simulated: Array) -> Array:
         """Of one run; a setting whose simulation broke down is as far from the data as can be."""
         measured = self.measured(run)
-        found = (measured - simulated) / ENCODER_NOISE
-        lost = ~np.isfinite(simulated).all(axis=(1, 2))
-        found[lost] = np.where(np.isfinite(measured), LOST, np.nan)
-        return found
+        return with_lost((measured - simulated) / ENCODER_NOISE, measured, simulated)
 
     def candidates(
         self, setting: Setting, residuals: Sequence[Array], runs: Sequence[int]
