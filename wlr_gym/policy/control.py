@@ -253,9 +253,9 @@ class Pid:
         """Return actions (N, 8) for observations (N, D)."""
         forward, turn = self.motion(observations)
         reach, reach_rate = self._reach_under(observations)
-        shifted = self.legs(observations)
-        legs = shifted + reach
-        self._sent = self.chassis.within(legs) - shifted
+        without = self.legs(observations)
+        legs = without + reach
+        self._sent = self.chassis.within(legs) - without
         rolling = self.rolling_speed(observations, forward, turn)
         wheels = self.chassis.wheel_rate(rolling, legs, self.leg_rate(observations) + reach_rate)
         return self.chassis.actions(legs + self._leg_integral.add(legs - self.leg_angle(observations)), wheels)

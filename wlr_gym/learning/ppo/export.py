@@ -42,7 +42,7 @@ def to_onnx(actor: torch.nn.Module, width: int) -> bytes:
 
 
 def with_learner(graph: bytes, weights: Mapping[str, torch.Tensor]) -> bytes:
-    """Return an ONNX model that also holds what only a training needs: critic and exploration noise, as constants nobody reads.
+    """Return an ONNX model that also holds what only a training needs: critic and exploration noise, beside the graph.
 
     Args:
         graph: serialised model. weights: those that do not act, by their names in the network.

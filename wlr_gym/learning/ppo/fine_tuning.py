@@ -29,9 +29,9 @@ def start_from(model: PPO, env: Sb3VecEnv, config: PpoConfig, source: str | Path
     else:
         actor(model.policy).load_state_dict(acting)
     own = model.policy.state_dict()
-    rest = {name: learner[name] for name in own if not name.startswith(ACTOR) and name in learner}
-    if all(name in rest and rest[name].shape == value.shape for name, value in own.items() if not name.startswith(ACTOR)):
-        model.policy.load_state_dict({**own, **rest})
+    needed = [name for name in own if not name.startswith(ACTOR)]
+    if all(name in learner and learner[name].shape == own[name].shape for name in needed):
+        model.policy.load_state_dict({**own, **{name: learner[name] for name in needed}})
     else:
         fit_critic(model, env, config, load_policy(source, env.contract()))
 
