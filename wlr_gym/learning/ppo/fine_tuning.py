@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from stable_baselines3 import PPO
 
+from wlr_gym.base.errors import require_package
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.ppo.config import PpoConfig
 from wlr_gym.learning.ppo.export import LEARNER
@@ -38,6 +39,7 @@ def start_from(model: PPO, env: Sb3VecEnv, config: PpoConfig, source: str | Path
 
 def _file_weights(place: Path) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
     """Return the weights of a policy file: those that act, as the graph names them, and those that a training needs."""
+    require_package("onnx", "export")
     import onnx
     from onnx import numpy_helper
 

@@ -25,6 +25,8 @@ from wlr_gym.studies.demo.stage import FAILED, SKIPPED, DemoStage, Section, para
 
 #: The shipped policies are ONNX files.
 _POLICIES = (("onnxruntime", "export"),)
+#: What training on from a policy file takes, to read its weights.
+_FILE_WEIGHTS = (("onnx", "export"),)
 #: What training takes.
 _TRAINING = (("torch", "train"), ("stable_baselines3", "train"), ("tensorboard", "train"))
 #: The emulated robot is driven by the servo library.
@@ -39,7 +41,7 @@ WORKERS: Mapping[str, tuple[DemoStage, ...]] = {
         DemoStage(hidden_fault.TITLE, hidden_fault.drive, 0.15, (*_POLICIES, *_ROBOT)),
         DemoStage(diagnosis.NAME_TITLE, diagnosis.name, 0.45),
         DemoStage(diagnosis.CHECK_TITLE, diagnosis.check, 0.05),
-        DemoStage(retraining.TITLE, retraining.retrain, 0.35, (*_TRAINING, *_POLICIES, *_ROBOT)),
+        DemoStage(retraining.TITLE, retraining.retrain, 0.35, (*_TRAINING, *_POLICIES, *_FILE_WEIGHTS, *_ROBOT)),
     ),
 }
 #: Called with the worker, what it is doing, and the share of its work that is done.
