@@ -71,6 +71,23 @@ def test_likelihood_is_rows_over_autocorrelation_time_times_log_level():
     assert minus_two_log_likelihood(residuals, np.array([4.0])) == pytest.approx(500 / 4.0 * np.log(square))
 
 
+class Constant(Toy):
+    """Its offset moves one channel by a constant, as a supply's voltage moves the voltage that is measured."""
+
+    def shape(self, name):
+        waves = super().shape(name)
+        return np.where(np.arange(waves.shape[-1]) == 2, 5.0, 0.0 * waves) if name == "offset" else waves
+
+
+def test_a_constant_error_that_a_number_can_remove_is_no_single_reading():
+    problem = Constant({"offset": 1.5})
+    found = fit(problem, all_runs(problem), nominal_model(problem), scatter=15.0)
+    assert scaled_numbers(problem, found.model)[1] - scaled_numbers(problem, nominal_model(problem))[1] == pytest.approx(
+        1.5, abs=0.05
+    )
+    assert found.noise.autocorrelation_time[2] / found.noise.scatter < 2.0
+
+
 def test_columns_are_the_responses():
     problem = Toy()
     model = nominal_model(problem).with_effect(candidate(problem, "drag", ["left"]), (0.3,))

@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 
 #: Step of finite differences in a quantity, in tolerances.
 STEP = 0.5
+#: Times that the noise follows the numbers before a descent.
+ROUNDS = 2
 #: Shares of a step that are tried; the best is used.
 SHARES = (2.0, 1.0, 0.5, 0.2, 0.05)
 #: Steps that are taken before the columns are simulated anew.
@@ -201,7 +203,7 @@ def _descend(
 ) -> tuple[FittedModel, list[Array], float]:
     """Go downhill from ``model``, whose residuals are given, with the columns simulated there; return also how far it went."""
     if autocorrelation_time is None:  # the same cost in all steps
-        autocorrelation_time = estimate_noise(residuals, scatter=scatter).autocorrelation_time
+        autocorrelation_time = _noise_within_reach(problem, model, columns, residuals, scatter).autocorrelation_time
     secant, cost = list(columns), total_cost(problem, model, residuals, autocorrelation_time)
     top = cost
     for _ in range(CHORDS):
@@ -220,6 +222,22 @@ def _descend(
             break
         secant = [corrected(c, taken, old, new) for c, old, new in zip(secant, before, residuals, strict=True)]
     return model, residuals, top - cost
+
+
+def _noise_within_reach(
+    problem: Problem, model: FittedModel, columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], scatter: float
+) -> Noise:
+    """Return the noise of what the model's numbers would leave if they moved, to first order.
+
+    An error that they can remove lasts until they do: with it, a constant error of any size counts as few readings, too few to
+    move a number against its tolerance (a supply that is measured 0.3 V lower than assumed).
+    """
+    noise = estimate_noise(residuals, np.full(residuals[0].shape[1], scatter), scatter)  # as if every row were independent
+    for _ in range(ROUNDS):
+        change = gauss_newton_step(problem, model, columns, residuals, noise).astype(np.float32)
+        left = [r + (change @ c).reshape(r.shape) for r, c in zip(residuals, columns, strict=True)]
+        noise = estimate_noise(left, scatter=scatter)
+    return noise
 
 
 def _relaxed(
