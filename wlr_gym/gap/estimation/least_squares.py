@@ -17,15 +17,18 @@ Array = NDArray[np.float64]
 
 
 def normal_equations(columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise) -> tuple[Array, Array]:
-    """Return ``C W C^T`` (numbers, numbers) and ``C W r`` (numbers) over all runs."""
+    """Return ``C W C^T`` (numbers, numbers) and ``C W r`` (numbers) over all runs.
+
+    Products of one run are sums of single precision, as the columns are.
+    """
     size = len(columns[0])
     matrix, vector = np.zeros((size, size)), np.zeros(size)
-    root = np.sqrt(noise.weight)
+    root = np.sqrt(noise.weight).astype(np.float32)
     for column, residual in zip(columns, residuals, strict=True):
         weights = np.broadcast_to(root, residual.shape).ravel()
         weighted = column * weights
         matrix += weighted @ weighted.T
-        vector += weighted @ (np.nan_to_num(residual).ravel() * weights)
+        vector += weighted @ (np.nan_to_num(residual).ravel().astype(np.float32) * weights)
     return matrix, vector
 
 

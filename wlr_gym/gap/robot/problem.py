@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import generator
+from wlr_gym.base.threads import in_threads
 from wlr_gym.data.format import CHANNELS, COLUMNS
 from wlr_gym.data.noise import channel_noise, noise_parts
 from wlr_gym.data.read import Run
@@ -90,7 +91,7 @@ class RobotProblem:
         self.robot: Robot = robot or robot_of(runs[0])
         self.known: Patch = load_patch(known)
         self.backend, self.threads = backend, threads
-        self.clocks: list[RunClock] = [RunClock(run, window) for run in runs]
+        self.clocks: list[RunClock] = in_threads(threads, lambda run: RunClock(run, window), runs)
         self.runs: tuple[str, ...] = tuple(run.name for run in runs)
         self._knobs: tuple[Knob, ...] = knobs(self.robot, PHYSICS_STEP)
         self.quantities: tuple[Quantity, ...] = tuple(knob.quantity for knob in self._knobs)
@@ -167,10 +168,11 @@ class RobotProblem:
 
     def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
         """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`."""
-        return [self._residuals(r, simulated) for r, simulated in zip(runs, self.simulate(settings, runs), strict=True)]
+        return in_threads(self.threads, self._residuals, zip(runs, self.simulate(settings, runs), strict=True))
 
-    def _residuals(self, r: int, simulated: Array) -> Array:
-        """Of one run; a setting whose simulation broke down is as far from the data as can be."""
+    def _residuals(self, replayed: tuple[int, Array]) -> Array:
+        """Of one run, replayed; a setting whose simulation broke down is as far from the data as can be."""
+        r, simulated = replayed
         lost = ~np.isfinite(simulated).all(axis=(1, 2))
         simulated[lost] = 0.0
         found = anchored_residuals(self.times(r), self._measured[r], simulated, self._noise, self.clocks[r].windows)
@@ -203,7 +205,7 @@ class RobotProblem:
         Nothing where the simulation of a run breaks down.
         """
         forces, constants = self._forces([setting])
-        clocks = [RunClock(self.clocks[r].run, window=math.inf) for r in runs]  # without anchors
+        clocks = in_threads(self.threads, lambda r: RunClock(self.clocks[r].run, window=math.inf), runs)  # without anchors
         table = self.parameters([setting])
         clean = replay_batch(self.robot, clocks, table, self.backend, forces, constants, threads=self.threads)
         whole = [replays.values[0] for replays in clean]

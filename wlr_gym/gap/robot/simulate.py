@@ -12,11 +12,11 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.threads import in_threads
 from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters
@@ -80,8 +80,7 @@ def replay_batch(
         return _replay_chunk(robot, longest_first, chosen, backend, forces, own, with_truth, 1 if workers > 1 else threads)
 
     parts = shared_out(len(parameters), len(clocks), workers)
-    with ThreadPoolExecutor(workers) as pool:
-        found = list(pool.map(replay_part, parts) if workers > 1 else map(replay_part, parts))
+    found = in_threads(workers, replay_part, parts)
     return [_joined([part[r] for part in found]) for r in np.argsort(order)]
 
 

@@ -9,15 +9,14 @@ needs the residuals themselves.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.threads import in_threads
 from wlr_gym.gap.estimation.fit import Fit
 from wlr_gym.gap.estimation.least_squares import bounded_minimum
 from wlr_gym.gap.estimation.likelihood import Noise, autocorrelation_times, channel_costs, run_scatter
@@ -25,7 +24,6 @@ from wlr_gym.gap.problem import Candidate, Problem, Start
 from wlr_gym.gap.selection.screening import Responses, Score, directions, shortened, with_tolerances
 
 Array = NDArray[np.float64]
-_T = TypeVar("_T")
 
 #: Times that the noise follows the candidate.
 ROUNDS = 2
@@ -160,19 +158,13 @@ class _System:
         first, scored under the alternative; and the rest.
         """
         bare = self._bare_costs()
-        rough = self._each(lambda score: max(self._rough(bare, start) for start in score.candidate.starts), scores)
+        threads = self.problem.threads
+        rough = in_threads(threads, lambda score: max(self._rough(bare, start) for start in score.candidate.starts), scores)
         lasting = np.argsort(rough)[::-1][:count].tolist()
         leading = np.argsort([score.gain for score in scores])[::-1][: count // 2].tolist()
         chosen = dict.fromkeys([*lasting, *leading])
-        best = self._each(self._scored, [scores[k] for k in chosen])
+        best = in_threads(threads, self._scored, [scores[k] for k in chosen])
         return sorted(best, key=lambda score: -score.gain), [s for k, s in enumerate(scores) if k not in chosen]
-
-    def _each(self, work: Callable[[Score], _T], scores: Sequence[Score]) -> list[_T]:
-        """What comes of each score, by as many threads as the problem may use."""
-        if self.problem.threads == 1:
-            return [work(score) for score in scores]
-        with ThreadPoolExecutor(self.problem.threads) as pool:
-            return list(pool.map(work, scores))
 
     def _bare_costs(self) -> float:
         """Minus two log likelihood without a candidate if every row were independent."""
