@@ -98,9 +98,11 @@ def test_a_joint_that_hardly_turns_tells_nothing():
     assert found_in(lambda angle, k: 5.0 * np.sin(angle), ways) is None
 
 
-def test_verdict_is_unknown_without_name_or_formula(tmp_path):
+def turning_toy(turning_runs):
+    """A system with an error that goes with the angle of a wheel, which turns far in some of its runs."""
     toy = problem()
-    ways = [np.linspace(0.0, 6.0, toy.rows) ** 2 * (1.0 + 0.1 * k) for k in range(len(toy.runs))]
+    far = [1.0 if k < turning_runs else 0.05 for k in range(len(toy.runs))]
+    ways = [np.linspace(0.0, 6.0, toy.rows) ** 2 * (1.0 + 0.1 * k) * far[k] for k in range(len(toy.runs))]
     toy.features = lambda setting, runs: [{"angle": ways[r]} for r in runs]
     plain = toy.residuals
     column = np.zeros(len(toy.signals))
@@ -108,7 +110,16 @@ def test_verdict_is_unknown_without_name_or_formula(tmp_path):
     toy.residuals = lambda settings, runs: [
         r + np.sin(ways[k])[None, :, None] * column for k, r in zip(runs, plain(settings, runs), strict=True)
     ]
-    done = analyse_problem(toy, "toy")
+    return toy
+
+
+def test_held_out_runs_tell_of_a_wheels_turning_too():
+    done = analyse_problem(turning_toy(3), "toy", heldout=("run_1",))
+    assert (done.verdict, done.effects[0].where) == (UNKNOWN, ("wheel_rr",))
+
+
+def test_verdict_is_unknown_without_name_or_formula(tmp_path):
+    done = analyse_problem(turning_toy(5), "toy")
     assert done.verdict == UNKNOWN
     (effect,) = done.effects
     assert (effect.name, effect.where, effect.formula) == ("unknown_effect", ("wheel_rr",), "")

@@ -184,7 +184,7 @@ def analyse_problem(
     )
     adequacy = adequacy_of(problem, fitted, search.fit)
     shown = detectable(search.rounds[-1].scores, search.rounds[-1].threshold)
-    turned = turning(problem, search.fit.residuals, features)
+    turned = _turning(problem, search.fit, base)
     effects = _effects(problem, search, fitted) or _turned(turned) or (_somewhere(problem, places) if nameless else ())
     kept = {candidate.label for candidate, _ in search.fit.model.effects}
     verdict, groups = _verdict(search, effects), _equivalent(problem, search)
@@ -295,6 +295,13 @@ def found_effect(candidate: Candidate, own: Mapping[str, ParameterEstimate], fre
     given = {name: ParameterEstimate(value, value, value, candidate.units[name]) for name, value in fixed.items()}
     parameters = {**own, **given}
     return FoundEffect(candidate.name, candidate.where, parameters, frequency, gain, candidate.formula, dict(candidate.units))
+
+
+def _turning(problem: Problem, final: Fit, base: Fit) -> Turning | None:
+    """What goes with a joint's turning in all runs: a few that turn far are needed, and held-out ones may be those."""
+    every = range(len(problem.runs))
+    left = [residual[0] for residual in problem.residuals([final.model.setting], every)]
+    return turning(problem, left, problem.features(base.model.setting, every))
 
 
 def _turned(turned: Turning | None) -> tuple[FoundEffect, ...]:

@@ -10,9 +10,20 @@ from numpy.typing import NDArray
 from wlr_gym.data.format import COMMANDS
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import held_setpoints
-from wlr_gym.data.run_states import CAMERA_WINDOW, JOINT_WINDOW, frame_near, has_camera, local_fit, starts_at_rest, unwrapped
+from wlr_gym.data.run_states import (
+    CAMERA_WINDOW,
+    JOINT_WINDOW,
+    frame_near,
+    has_camera,
+    local_fit,
+    start_state,
+    starts_at_rest,
+    unwrapped,
+)
 from wlr_gym.gap.robot.windows import WINDOW, window_rows
-from wlr_gym.robot import LEGS, WHEEL_SLICE, WHEELS
+from wlr_gym.physics.plants.base import PlantState
+from wlr_gym.robot import LEGS, WHEEL_SLICE, WHEELS, Robot
+from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
@@ -53,6 +64,13 @@ class RunClock:
         self.begin = self.t[0] - (LEAD if starts_at_rest(run) else 0.0)
         self.ticks: int = int(np.ceil((self.t[-1] - self.begin) / CLOCK)) + 1
         self.anchors: Anchors = self._anchors([window.start for window in self.windows[1:]])
+        self._started: tuple[Robot, PlantState] | None = None
+
+    def measured_start(self, robot: Robot, nominal: Parameters) -> PlantState:
+        """Return the robot's state at the first row, as it was measured; kept, as every replay begins with it."""
+        if self._started is None or self._started[0] is not robot:
+            self._started = (robot, start_state(self.run, robot, nominal))
+        return self._started[1]
 
     def _anchors(self, rows: list[int]) -> Anchors:
         run, times = self.run, self.t[rows]

@@ -42,6 +42,8 @@ LOST = 1e3
 #: See :class:`wlr_gym.gap.problem.Problem`: with 1, what two simulators of one robot do not share moves numbers by two to three
 #: tolerances.
 TEMPERING = 3.0
+#: What shows that the body rocks as a wheel turns.
+ROCKING = ("gyro_x", "gyro_y")
 #: Two simulators of one robot found sizes that differed by so much (root mean square over eight development sets).
 DISAGREEMENT = 0.04
 #: Error of fitted runs, in noise floors, that no simulator's own errors explain: of two simulators unlike the engine, sets
@@ -86,7 +88,8 @@ class RobotProblem:
         self.disagreement, self.misfit = DISAGREEMENT, MISFIT
         self.thorough, self.held_out, self.motions = False, (), shown_by()
         self.turning: Mapping[str, tuple[str, tuple[str, ...]]] = {
-            wheel: (f"joint_position[{wheel}]", tuple(f"{kind}_{wheel}" for kind in ("pos", "vel", "eff"))) for wheel in WHEELS
+            wheel: (f"joint_position[{wheel}]", (*(f"{kind}_{wheel}" for kind in ("pos", "vel", "eff")), *ROCKING))
+            for wheel in WHEELS
         }
         self.robot: Robot = robot or robot_of(runs[0])
         self.known: Patch = load_patch(known)

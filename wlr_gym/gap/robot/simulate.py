@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.threads import in_threads
 from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
-from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters
-from wlr_gym.data.run_states import start_state
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
 from wlr_gym.gap.robot.loop import follow
 from wlr_gym.gap.robot.recorder import POSE_TICKS, Recorder, Replays
@@ -134,7 +132,7 @@ def _replay_chunk(
     lanes["command.delay"] = 0.0
     setpoints = WrittenSetpoints(clocks, run_of, delay)
     plant.use_setpoints(setpoints)
-    first = _join([_start(clock.run, robot, parameters, clock.begin - clock.t[0]) for clock in clocks])
+    first = _join([_start(clock, robot, parameters) for clock in clocks])
     try:
         recorder = Recorder(clocks, settings, first, delay, with_truth)
         readings = plant.reset(parameters=lanes, state=first)
@@ -220,15 +218,14 @@ def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.boo
     state.quaternion[mine] = quaternion(heading, pitch, roll)
 
 
-def _start(run: Run, robot: Robot, parameters: Parameters, begin: float) -> PlantState:
-    """State of every setting at the run's start: the measured one, moved by what a setting means for reading and height.
-
-    ``begin`` is the time (s) since the run's first row.
-    """
-    base = profile_parameters(Parameters.nominal(robot), run.meta.profile)  # of no setting: results do not depend on company
+def _start(clock: RunClock, robot: Robot, parameters: Parameters) -> PlantState:
+    """State of every setting at the run's start: the measured one, moved by what a setting means for reading and height."""
+    base = profile_parameters(
+        Parameters.nominal(robot), clock.run.meta.profile
+    )  # of no setting: results do not depend on company
     parameters = Parameters(np.vstack([base.values, parameters.values]))
     count = len(parameters)
-    measured = start_state(run, robot, base)
+    measured = clock.measured_start(robot, base)
     state = PlantState(**{name: np.repeat(value, count, axis=0) for name, value in vars(measured).items() if value is not None})
     legs = base["joint.zero_offset"] - parameters["joint.zero_offset"]
     state.joint_position[:, LEG_SLICE] += legs
@@ -241,7 +238,7 @@ def _start(run: Run, robot: Robot, parameters: Parameters, begin: float) -> Plan
     wheels, reference = state.joint_position[:, WHEEL_SLICE], state.reference_position[:, WHEEL_SLICE]
     kp, own_kp = (position_gains(each)[:, WHEEL_SLICE] for each in (base, parameters))
     reference[...] = wheels + (reference - wheels) * kp / np.maximum(own_kp, 1e-9)
-    state.time = np.full(count, begin)
+    state.time = np.full(count, clock.begin - clock.t[0])
     return PlantState(**{name: value[1:] for name, value in vars(state).items() if value is not None})
 
 
