@@ -88,6 +88,15 @@ def test_a_constant_error_that_a_number_can_remove_is_no_single_reading():
     assert found.noise.autocorrelation_time[2] / found.noise.scatter < 2.0
 
 
+def test_runs_that_differ_by_what_the_numbers_can_explain_scatter_less_than_assumed():
+    problem = Toy({"gain": 2.0})
+    found = fit(problem, all_runs(problem), nominal_model(problem), scatter=100.0)
+    assert scaled_numbers(problem, found.model)[0] - scaled_numbers(problem, nominal_model(problem))[0] == pytest.approx(
+        2.0, abs=0.1
+    )
+    assert found.noise.scatter < 5.0
+
+
 def test_columns_are_the_responses():
     problem = Toy()
     model = nominal_model(problem).with_effect(candidate(problem, "drag", ["left"]), (0.3,))

@@ -136,9 +136,9 @@ def idle_numbers(
     return idle
 
 
-def equations_by_run(found: Fit) -> tuple[Array, Array]:
+def equations_by_run(columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise) -> tuple[Array, Array]:
     """Return each run's own normal equations: (runs, numbers, numbers) and (runs, numbers)."""
-    parts = [normal_equations([c], [r], found.noise) for c, r in zip(found.columns, found.residuals, strict=True)]
+    parts = [normal_equations([c], [r], noise) for c, r in zip(columns, residuals, strict=True)]
     return np.stack([matrix for matrix, _ in parts]), np.stack([vector for _, vector in parts])
 
 
@@ -162,7 +162,8 @@ def fit(
         runs: which of its runs.
         model: where to start, with the effects to be fitted.
         autocorrelation_time: of the models that this one is compared with; None = estimated where each descent begins.
-        scatter: of the runs; see :class:`wlr_gym.gap.estimation.likelihood.Noise`.
+        scatter: of the runs; see :class:`wlr_gym.gap.estimation.likelihood.Noise`. Without ``autocorrelation_time`` the most of
+            it: runs that differ by what the model's numbers can explain scatter less.
         columns: responses near ``model`` where they are known.
         near: a fit of the same numbers, or of all but the last of them, whose columns serve for idle ones.
         steps: at most this many Gauss-Newton steps.
@@ -177,7 +178,11 @@ def fit(
         residuals, columns = linearise(problem, model, runs)
     gained = np.inf
     for step in range(steps):
-        model, residuals, gained = _descend(problem, runs, model, columns, residuals, autocorrelation_time, scatter)
+        tau = autocorrelation_time
+        if tau is None:  # the same cost in all steps of a descent
+            reachable = _noise_within_reach(problem, model, columns, residuals, scatter)
+            tau, scatter = reachable.autocorrelation_time, reachable.scatter
+        model, residuals, gained = _descend(problem, runs, model, columns, residuals, tau, scatter)
         tell(f"step {step + 1} of {steps}: {gained:.0f} better")
         if gained < RENEWED or not renew or step == steps - 1:
             break
@@ -198,12 +203,10 @@ def _descend(
     model: FittedModel,
     columns: Sequence[NDArray[np.float32]],
     residuals: list[Array],
-    autocorrelation_time: Array | None,
+    autocorrelation_time: Array,
     scatter: float,
 ) -> tuple[FittedModel, list[Array], float]:
     """Go downhill from ``model``, whose residuals are given, with the columns simulated there; return also how far it went."""
-    if autocorrelation_time is None:  # the same cost in all steps
-        autocorrelation_time = _noise_within_reach(problem, model, columns, residuals, scatter).autocorrelation_time
     secant, cost = list(columns), total_cost(problem, model, residuals, autocorrelation_time)
     top = cost
     for _ in range(CHORDS):
@@ -230,14 +233,26 @@ def _noise_within_reach(
     """Return the noise of what the model's numbers would leave if they moved, to first order.
 
     An error that they can remove lasts until they do: with it, a constant error of any size counts as few readings, too few to
-    move a number against its tolerance (a supply that is measured 0.3 V lower than assumed).
+    move a number against its tolerance (a supply that is measured 0.3 V lower than assumed). So with the runs: as long as an
+    effect that some of them show is not in the model they differ, and what differs counts little. ``scatter``: the most assumed.
     """
     noise = estimate_noise(residuals, np.full(residuals[0].shape[1], scatter), scatter)  # as if every row were independent
     for _ in range(ROUNDS):
         change = gauss_newton_step(problem, model, columns, residuals, noise).astype(np.float32)
         left = [r + (change @ c).reshape(r.shape) for r, c in zip(residuals, columns, strict=True)]
         noise = estimate_noise(left, scatter=scatter)
+        noise = estimate_noise(left, scatter=min(scatter, _scatter(problem, model, columns, left, noise)))
     return noise
+
+
+def _scatter(
+    problem: Problem, model: FittedModel, columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise
+) -> float:
+    """Return the scatter of the runs, times what the simulator errs; that of ``noise`` where the data do not tell."""
+    free = ~on_bounds(problem, model)
+    matrices, vectors = equations_by_run(columns, residuals, noise)
+    differ = run_scatter(matrices[:, free][:, :, free], vectors[:, free])
+    return noise.scatter if differ is None else max(problem.tempering * noise.scatter * differ, 1.0)
 
 
 def _relaxed(
@@ -263,8 +278,5 @@ def _relaxed(
 
 def widened(problem: Problem, runs: Sequence[int], found: Fit) -> Fit:
     """Return the fit with a likelihood as wide as the runs differ and the simulator errs; its numbers follow."""
-    free = ~on_bounds(problem, found.model)
-    matrices, vectors = equations_by_run(found)
-    differ = run_scatter(matrices[:, free][:, :, free], vectors[:, free])
-    scatter = found.noise.scatter if differ is None else max(problem.tempering * found.noise.scatter * differ, 1.0)
+    scatter = _scatter(problem, found.model, found.columns, found.residuals, found.noise)
     return fit(problem, runs, found.model, scatter=scatter, columns=found.columns, steps=1)

@@ -30,7 +30,7 @@ def covariance(problem: Problem, fit: Fit) -> Array:
     is known to a few degrees of freedom only: it is multiplied by Student's t over 1.96.
     """
     curvature = fit.covariance()
-    matrices, vectors = equations_by_run(fit)
+    matrices, vectors = equations_by_run(fit.columns, fit.residuals, fit.noise)
     tight = prior_tightness(problem, fit.model)
     pull = tight * (scaled_numbers(problem, fit.model) - scaled_nominal(problem, fit.model))
     stiff = np.diag(tight + PINNED * on_bounds(problem, fit.model))

@@ -207,7 +207,7 @@ def _improvement(found: Sequence[Array], autocorrelation_time: Array) -> float:
 
 def without_each_run(problem: Problem, found: Fit) -> list[FittedModel]:
     """The model as it would be without each run in turn, to first order."""
-    matrices, vectors = equations_by_run(found)
+    matrices, vectors = equations_by_run(found.columns, found.residuals, found.noise)
     matrix, vector = matrices.sum(axis=0), vectors.sum(axis=0)
     whole = constrained_step(problem, found.model, matrix, vector)
     steps = [
