@@ -117,12 +117,13 @@ def _condition(found: Row) -> str:
 
 
 def engine_lines(engine: dict[str, Any] | None) -> list[str]:
-    """Return picture and table of accuracy against speed as lines of Markdown; a note before the first measurement."""
+    """Return the picture of accuracy against speed and the reference's limits; a note before the first measurement."""
     if engine is None:
         return ["Not measured yet on a quiet machine: `wlr bench --only engine`."]
     found = engine["measured"]
     head = f"Measured {_condition(found)}, {found['processor']}; speed: median [smallest..largest] of the rounds."
-    return [f"![accuracy against speed](figures/{PICTURE.name})", "", head, *engine_table(engine)]
+    limits, *_ = engine_table(engine)  # the table itself: tables.py
+    return [f"![accuracy against speed](figures/{PICTURE.name})", "", head, limits]
 
 
 def tables(rows: list[Row], engine: dict[str, Any] | None = None) -> dict[str, list[str]]:
