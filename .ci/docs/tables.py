@@ -5,11 +5,13 @@
 
 from __future__ import annotations
 
-import json
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+
+import performance
 
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.envs.registry import ENVIRONMENTS
@@ -22,10 +24,12 @@ from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.physics.effects.document import coordinates, parameter_text, places
 from wlr_gym.physics.plants.forces import FEATURES
 from wlr_gym.robot import load_robot
-from wlr_gym.studies.bench.engine_report import lines as engine_lines
+from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED
+from wlr_gym.studies.bench.gap import Plan, read_answers, run_blind_test
+from wlr_gym.studies.bench.gap_score_table import markdown
 from wlr_gym.studies.paper.verdicts import verdict_table
 
-DATA = Path(__file__).resolve().parents[2] / "docs" / "data"
+ANSWERS = Path(__file__).resolve().parents[2] / "docs" / "data" / "gap_answers.json"
 #: Randomisations that are laid over ``nominal``.
 PRESETS = ("ice", "split", "patches", "slippery", "asymmetric", "slope", "stripes", "ribbed")
 _OBSERVATION = ("numbers", "unit", "frame", "scale", "meaning")
@@ -64,10 +68,14 @@ def motion_table() -> list[str]:
     return _table(("motion", "what the robot does", "what it shows"), rows)
 
 
-def engine_table() -> list[str]:
-    """Return speed and error of every setting of engine and MuJoCo, as measured last."""
-    _, *table = engine_lines(json.loads((DATA / "bench.json").read_text(encoding="utf-8"))["engine"])
-    return table
+def blind_test_table() -> list[str]:
+    """Return the score of the stored answers of the blind test; its data are not needed."""
+    answers = read_answers(ANSWERS)
+    first = min(int(name.removeprefix("set_")) for name in answers)
+    runs = tuple(range(8)) if first < FIRST_SCORED_SEED else ()  # before, all sets had eight runs
+    with tempfile.TemporaryDirectory() as folder:
+        plan = Plan(Path(folder), sets=len(answers), first_seed=first, runs=runs)
+        return markdown(run_blind_test(plan, "no_module:nothing_is_analysed", lambda _: None, ANSWERS)).splitlines()
 
 
 def all_tasks() -> dict[str, Task]:
@@ -205,8 +213,9 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "nominal": partial(randomization_table, "nominal"),
     "wide": partial(randomization_table, "wide"),
     "presets": preset_table,
-    "engine": engine_table,
+    **{name: partial(lambda name: performance.made()[name], name) for name in ("speed", "batch", "machines", "engine")},
     "equations": verdict_table,
+    "blind_test": blind_test_table,
 }
 
 

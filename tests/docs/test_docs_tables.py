@@ -35,14 +35,15 @@ def test_every_table_has_its_place():
 @pytest.mark.parametrize("name", tables.TABLES)
 def test_the_site_has_whole_rows(name):
     lines = [line for line in tables.TABLES[name]() if line.startswith("|")]
-    assert len(lines) > 2
+    assert len(lines) > 2 or name == "machines"  # a list
     for block in "\n".join(tables.TABLES[name]()).split("\n\n"):
         inner = [len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines() if line.startswith("|")]
         assert len(set(inner)) <= 1
-    assert lines[0] in pages.on_page_markdown(f"<!-- table: {name} -->")
+    assert tables.TABLES[name]()[0] in pages.on_page_markdown(f"<!-- table: {name} -->")
 
 
-def test_wlr_effects_prints_the_library(capsys):
+def test_wlr_effects_prints_the_library(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
     assert main(["effects"]) == 0
     text = "".join(words(capsys.readouterr().out).split())
     for name, _, law, parameters, where in rows("effects"):
@@ -56,7 +57,7 @@ def test_wlr_effects_unknown_effect_prints_what_formulas_are_made_of(capsys):
     assert main(["effects", "unknown_effect"]) == 0
     text = words(capsys.readouterr().out)
     for names, unit, meaning in rows("coordinates"):
-        assert f"{words(names).split(',')[0]} {words(unit)} {words(meaning)}" in text
+        assert words(f"{names.split(',')[0]} {unit} {meaning}") in text
     for row in rows("features"):
         assert words(" ".join(row)) in text
 
