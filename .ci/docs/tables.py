@@ -5,9 +5,13 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +19,7 @@ import performance
 
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.envs.registry import ENVIRONMENTS
+from wlr_gym.envs.settings import EnvironmentOptions, Settings
 from wlr_gym.envs.tasks import load_randomization, load_task
 from wlr_gym.envs.tasks.describe import RANDOMIZATION_HEADER, limits_text, parameters_text, randomization_rows
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
@@ -29,7 +34,9 @@ from wlr_gym.studies.bench.gap import Plan, read_answers, run_blind_test
 from wlr_gym.studies.bench.gap_score_table import markdown
 from wlr_gym.studies.paper.verdicts import verdict_table
 
-ANSWERS = Path(__file__).resolve().parents[2] / "docs" / "data" / "gap_answers.json"
+ROOT = Path(__file__).resolve().parents[2]
+ANSWERS = ROOT / "docs" / "data" / "gap_answers.json"
+SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
 #: Randomisations that are laid over ``nominal``.
 PRESETS = ("ice", "split", "patches", "slippery", "asymmetric", "slope", "stripes", "ribbed")
 _OBSERVATION = ("numbers", "unit", "frame", "scale", "meaning")
@@ -76,6 +83,22 @@ def blind_test_table() -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         plan = Plan(Path(folder), sets=len(answers), first_seed=first, runs=runs)
         return markdown(run_blind_test(plan, "no_module:nothing_is_analysed", lambda _: None, ANSWERS)).splitlines()
+
+
+def keyword_table() -> list[str]:
+    """Return the keywords of ``gym.make`` with their defaults: ``help(wlr_gym.EnvironmentOptions)``."""
+    _, _, attributes = str(inspect.getdoc(EnvironmentOptions)).partition("Attributes:\n")
+    told = dict(re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", attributes, re.MULTILINE))
+    defaults = {field.name: field.default for field in fields(Settings)}
+    rows = [(f"`{name}`", f"`{defaults.get(name)!r}`", " ".join(text.split())) for name, text in told.items()]
+    return _table(("keyword", "default", "what it takes"), rows)
+
+
+def script_table() -> list[str]:
+    """Return the first sentence of every example."""
+    documents = {path.name: ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) for path in SCRIPTS}
+    rows = [(f"`{name}`", " ".join(str(text).split("\n\n")[0].split())) for name, text in documents.items()]
+    return _table(("script", "shows"), rows)
 
 
 def all_tasks() -> dict[str, Task]:
@@ -208,6 +231,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "coordinates": coordinate_table,
     "features": feature_table,
     "motions": motion_table,
+    "keywords": keyword_table,
     "terms": shared_tables,
     **{title: partial(task_tables, title) for title in ("Velocity", "Path", "Posture", "Slope")},
     "nominal": partial(randomization_table, "nominal"),
@@ -215,6 +239,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "presets": preset_table,
     **{name: partial(lambda name: performance.made()[name], name) for name in ("speed", "batch", "machines", "engine")},
     "equations": verdict_table,
+    "scripts": script_table,
     "blind_test": blind_test_table,
 }
 
