@@ -18,6 +18,7 @@ from pathlib import Path
 import performance
 
 from wlr_gym.data.excitations import EXCITATIONS
+from wlr_gym.data.format import COLUMNS, Column
 from wlr_gym.envs.registry import ENVIRONMENTS
 from wlr_gym.envs.settings import EnvironmentOptions, Settings
 from wlr_gym.envs.tasks import load_randomization, load_task
@@ -28,7 +29,7 @@ from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.physics.effects.document import coordinates, parameter_text, places
 from wlr_gym.physics.plants.forces import FEATURES
-from wlr_gym.robot import load_robot
+from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED
 from wlr_gym.studies.bench.gap import Plan, read_answers, run_blind_test
 from wlr_gym.studies.bench.gap_score_table import markdown
@@ -67,6 +68,21 @@ def feature_table() -> list[str]:
     """Return what a formula may depend on: ``wlr effects unknown_effect``."""
     rows = [(f"`{name}`", feature.unit, feature.doc, feature.scope) for name, feature in FEATURES.items()]
     return _table(("name", "unit", "meaning", "of the"), rows)
+
+
+def column_table() -> list[str]:
+    """Return the columns of a run; those of all joints, or of some axes, that are alike share a line."""
+    alike: dict[tuple[str, str], list[Column]] = {}
+    for column in COLUMNS.values():
+        alike.setdefault((column.name.partition("_")[0], column.doc), []).append(column)
+    rows = []
+    for (kind, doc), same in alike.items():
+        joints = same[0].name.endswith(JOINTS)
+        names = [f"{kind}_<j>"] if joints else [column.name for column in same]
+        units = list(dict.fromkeys(column.unit for column in same))
+        unit = f"{units[0]} (legs), {units[1]} (wheels)" if len(units) > 1 else units[0]
+        rows.append((_code(names), unit, doc, "no" if same[0].required else "yes"))
+    return _table(("column", "unit", "meaning", "may be missing"), rows)
 
 
 def motion_table() -> list[str]:
@@ -230,6 +246,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "effects": effect_table,
     "coordinates": coordinate_table,
     "features": feature_table,
+    "columns": column_table,
     "motions": motion_table,
     "keywords": keyword_table,
     "terms": shared_tables,
