@@ -30,6 +30,8 @@ from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.physics.effects.document import coordinates, parameter_text, places
 from wlr_gym.physics.plants.forces import FEATURES
 from wlr_gym.robot import JOINTS, load_robot
+from wlr_gym.studies.bench.adapt_study import read_lines
+from wlr_gym.studies.bench.adapt_table import markdown as markdown_of_cases
 from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED
 from wlr_gym.studies.bench.gap import Plan, read_answers, run_blind_test
 from wlr_gym.studies.bench.gap_score_table import markdown
@@ -99,6 +101,11 @@ def blind_test_table() -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         plan = Plan(Path(folder), sets=len(answers), first_seed=first, runs=runs)
         return markdown(run_blind_test(plan, "no_module:nothing_is_analysed", lambda _: None, ANSWERS)).splitlines()
+
+
+def adapt_table() -> list[str]:
+    """Return the cases of ``wlr bench adapt`` that were run."""
+    return markdown_of_cases(read_lines(ROOT / "docs" / "data" / "adapt.jsonl")).strip().splitlines()
 
 
 def keyword_table() -> list[str]:
@@ -256,6 +263,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "presets": preset_table,
     **{name: partial(lambda name: performance.made()[name], name) for name in ("speed", "batch", "machines", "engine")},
     "equations": verdict_table,
+    "adapt": adapt_table,
     "scripts": script_table,
     "blind_test": blind_test_table,
 }
