@@ -10,6 +10,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tables import TABLES
+
 if TYPE_CHECKING:
     from mkdocs.structure.files import Files
 
@@ -62,17 +64,26 @@ INTRODUCTION = (
 FORMULA = re.compile(r"\$\$(?P<display>.+?)\$\$|\$(?P<inline>[^$\s](?:[^$]*[^$\s])?)\$", re.S)
 
 
+#: Where a page has a table that is made.
+TABLE = re.compile(r"<!-- table: (\w+) -->")
+
+
 def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put in the tables that are made, and turn LaTeX into MathML."""
+    return mathml(TABLE.sub(lambda found: "\n".join(TABLES[found[1]]()), markdown))
+
+
+def mathml(markdown: str) -> str:
     """Turn LaTeX into MathML, which browsers draw without a script; only pages that display formulas have any."""
     if "$$" not in markdown:
         return markdown
     from latex2mathml.converter import convert
 
-    def mathml(found: re.Match[str]) -> str:
+    def drawn(found: re.Match[str]) -> str:
         display = found["display"]
         return convert(display, display="block") if display else convert(found["inline"])
 
-    return FORMULA.sub(mathml, markdown)
+    return FORMULA.sub(drawn, markdown)
 
 
 def on_page_content(html: str, **_: Any) -> str:

@@ -1,7 +1,7 @@
 """The numbers of docs/performance.md and README's of the engine: kept in docs/data/bench.json, from ``wlr bench --save``.
 
 ``python .ci/docs/performance.py bench.json ...`` takes the rows of the reports over, each with its machine, versions and date,
-and writes tables and picture anew; without a report only the tables. What is measured again replaces all of its older rows.
+and writes README's row and the picture anew. What is measured again replaces all of its older rows. tables.py has the tables.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from wlr_gym.studies.bench.engine_report import lines as engine_table
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "docs" / "data" / "bench.json"
-PAGE = ROOT / "docs" / "performance.md"
 README = ROOT / "README.md"
 PICTURE = ROOT / "docs" / "figures" / "accuracy_speed.png"
 #: The engine's ratios that README has.
@@ -116,28 +115,19 @@ def _condition(found: Row) -> str:
     return f"{found['date']}, {found['rounds']} round{'s' * (found['rounds'] > 1)}{load}"
 
 
-def engine_lines(engine: dict[str, Any] | None) -> list[str]:
-    """Return picture and table of accuracy against speed as lines of Markdown; a note before the first measurement."""
-    if engine is None:
-        return ["Not measured yet on a quiet machine: `wlr bench --only engine`."]
+def engine_lines(engine: dict[str, Any]) -> list[str]:
+    """Return when engine and MuJoCo were measured, the limits of the reference, and every setting, as lines of Markdown."""
     found = engine["measured"]
     head = f"Measured {_condition(found)}, {found['processor']}; speed: median [smallest..largest] of the rounds."
-    return [f"![accuracy against speed](figures/{PICTURE.name})", "", head, *engine_table(engine)]
+    return [head, *engine_table(engine)]
 
 
-def tables(rows: list[Row], engine: dict[str, Any] | None = None) -> dict[str, list[str]]:
-    """Return every generated part of the page by its marker."""
+def made() -> dict[str, list[str]]:
+    """Return every table of the page by its name."""
+    kept = json.loads(DATA.read_text(encoding="utf-8"))
+    rows = kept["rows"]
     parts = {"speed": speed_table(rows), "batch": batch_table(rows), "machines": machine_lines(rows)}
-    return {**parts, "engine": engine_lines(engine)}
-
-
-def write_page(text: str, rows: list[Row], engine: dict[str, Any] | None = None) -> str:
-    """Return the page with its generated parts replaced."""
-    for name, content in tables(rows, engine).items():
-        begin, end = f"<!-- {name}: made by .ci/docs/performance.py -->", f"<!-- end of {name} -->"
-        before, _, rest = text.partition(begin)
-        text = "\n".join([before + begin, *content, end]) + rest.partition(end)[2]
-    return text
+    return {**parts, "engine": engine_lines(kept["engine"])}
 
 
 def write_readme(text: str, rows: list[Row]) -> str:
@@ -156,7 +146,7 @@ def write_readme(text: str, rows: list[Row]) -> str:
 
 
 def main(reports: list[str]) -> None:
-    """Take reports over, write the page, README's row and the picture."""
+    """Take reports over, write README's row and the picture."""
     kept = json.loads(DATA.read_text(encoding="utf-8")) if DATA.is_file() else {"rows": []}
     rows, engine = kept["rows"], kept.get("engine")
     for path in reports:
@@ -165,7 +155,6 @@ def main(reports: list[str]) -> None:
         if "engine" in report:
             engine = {**report["engine"], "measured": {**report["machine"], "rounds": report["rounds"]}}
     DATA.write_text(json.dumps({"rows": rows} | ({"engine": engine} if engine else {}), indent=1) + "\n", encoding="utf-8")
-    PAGE.write_text(write_page(PAGE.read_text(encoding="utf-8"), rows, engine), encoding="utf-8")
     README.write_text(write_readme(README.read_text(encoding="utf-8"), rows), encoding="utf-8")
     if engine:
         save_picture(engine, PICTURE)

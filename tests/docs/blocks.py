@@ -20,6 +20,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import pytest
+
 from wlr_gym.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,7 +50,9 @@ def site_script(name: str) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(ROOT / ".ci" / "docs")  # as mkdocs does: scripts import each other
+        spec.loader.exec_module(module)
     return module
 
 

@@ -1,13 +1,12 @@
-"""The result in docs/gap_benchmark.md is the score of docs/data/gap_answers.json."""
+"""The numbers in docs/gap_benchmark.md are those of docs/data/gap_answers.json."""
 
 from __future__ import annotations
 
 import pytest
-from blocks import ROOT
+from blocks import ROOT, site_script
 
-from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED, case
-from wlr_gym.studies.bench.gap import Plan, make_data, read_answers, run_blind_test
-from wlr_gym.studies.bench.gap_score_table import markdown
+from wlr_gym.studies.bench.blind.cases import case
+from wlr_gym.studies.bench.gap import make_data, read_answers
 
 ANSWERS = ROOT / "docs" / "data" / "gap_answers.json"
 
@@ -20,15 +19,11 @@ def first_seed(answers):
     return min(int(name.removeprefix("set_")) for name in answers)
 
 
-def test_the_page_shows_the_score_of_the_answers(tmp_path):
-    answers = read_answers(ANSWERS)
-    first = first_seed(answers)
-    before = first < FIRST_SCORED_SEED  # all sets had eight runs
-    plan = Plan(tmp_path, sets=len(answers), first_seed=first, runs=tuple(range(8)) if before else ())
-    said: list[str] = []
-    report = run_blind_test(plan, "no_module:nothing_is_analysed", said.append, ANSWERS)
-    assert f"{plan.sets} of {plan.sets} results are there already" in said
-    assert markdown(report) in (ROOT / "docs" / "gap_benchmark.md").read_text(encoding="utf-8")
+def test_the_page_shows_numbers_of_the_score():
+    page = (ROOT / "docs" / "gap_benchmark.md").read_text(encoding="utf-8").partition("\n## Result")[2]
+    shown = [line for line in page.splitlines() if line.startswith("| ")]
+    assert len(shown) > 10
+    assert set(shown) <= set(site_script("tables").blind_test_table())
 
 
 @pytest.mark.slow

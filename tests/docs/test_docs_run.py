@@ -24,7 +24,7 @@ NOT_RUN = {
     "docs/randomization.md": 1,  # the result of an analysis
     "docs/emulator.md": 1,  # until Ctrl-C
     "docs/robot.md": 2,  # a robot
-    "docs/sweep.md": 3,  # a cluster
+    "docs/sweep.md": 1,  # a cluster
     "docs/vision.md": 4,  # installation, pictures, a film, a photograph
 }
 #: Pages whose blocks take most of a minute or more together; the slow suite runs them.

@@ -44,7 +44,6 @@ from wlr_gym.physics.effects import (
     apply_patch,
     load_patch,
 )
-from wlr_gym.physics.effects.document import effect_table
 from wlr_gym.physics.effects.effect import multiply
 from wlr_gym.physics.effects.search import WHEEL_SETS, Search, steps
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, load_robot
@@ -350,7 +349,6 @@ def test_an_effect_registered_in_one_place_is_all_that_it_takes(monkeypatch, cap
     assert shown_by()[hot.name] == "rear_legs"
     assert main(["effects"]) == main(["effects", hot.name]) == 0
     assert capsys.readouterr().out.count(hot.name) == 2
-    assert any(f"`{hot.name}`" in row for row in effect_table())
 
 
 # ---- formulas --------------------------------------------------------------------------------------------------------

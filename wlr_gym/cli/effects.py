@@ -20,8 +20,8 @@ from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption
 from wlr_gym.cli.results import print_json
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Effect, Patch, PatchEffect, apply_patch, load_patch
-from wlr_gym.physics.effects.document import places
-from wlr_gym.physics.plants.forces import COORDINATES, FEATURES
+from wlr_gym.physics.effects.document import coordinates, parameter_text, places
+from wlr_gym.physics.plants.forces import FEATURES
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameter_table import ELEMENTS, spec_of
 from wlr_gym.robot.parameters import Parameters
@@ -67,10 +67,10 @@ def _table(title: str, *headings: str) -> Table:
 
 
 def _library() -> Table:
-    table = _table("", "name", "what is missing", "where", "parameters, unit, plausible range")
+    table = _table("", "name", "what is missing, and its law", "where", "parameters, unit, plausible range (may be left out)")
     for effect in EFFECTS.values():
-        numbers = "\n".join(f"{name} {p.unit} {_range(p.prior)}" for name, p in effect.parameters.items())
-        table.add_row(effect.name, effect.doc, places(effect), _plain(numbers))
+        numbers = "\n".join(parameter_text(name, p) for name, p in effect.parameters.items())
+        table.add_row(effect.name, _plain(f"{effect.doc}\n  {effect.equation}"), places(effect), _plain(numbers))
     return table
 
 
@@ -135,9 +135,9 @@ def _neutral(value: float | str) -> str:
 
 
 def _explain_formulas() -> None:
-    where = _table("where a formula may act", "where", "unit")
-    for name, unit in COORDINATES.items():
-        where.add_row(name, unit)
+    where = _table("where a formula may act", "where", "unit", "meaning")
+    for names, unit, meaning in coordinates():
+        where.add_row("\n".join(names), unit, meaning)
     features = _table("what it may depend on", "name", "unit", "meaning", "of the")
     for name, feature in FEATURES.items():
         features.add_row(name, feature.unit, feature.doc, feature.scope)

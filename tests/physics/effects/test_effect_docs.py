@@ -10,24 +10,9 @@ import yaml
 
 from wlr_gym.physics.codegen.expression import UNITS
 from wlr_gym.physics.effects import EFFECTS, load_patch
-from wlr_gym.physics.effects.document import coordinate_table, effect_table, feature_table
 
 ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize(
-    ("name", "table"),
-    [("effects", effect_table), ("coordinates", coordinate_table), ("features", feature_table)],
-)
-def test_tables_are_those_of_the_code(name, table):
-    block = TEXT.split(f"<!-- {name}: ")[1].split(f"<!-- end of {name} -->")[0]
-    assert block.splitlines()[1:] == table()
-
-
-def test_every_table_has_whole_rows():
-    for table in (effect_table(), coordinate_table(), feature_table()):
-        assert len({line.count("|") for line in table}) == 1
 
 
 @pytest.mark.parametrize("number", range(len(re.findall("```yaml", TEXT))))

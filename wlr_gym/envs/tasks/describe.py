@@ -42,6 +42,7 @@ def describe(task: Task) -> str:
             *table(("index", "joint", "setpoint", "unit", "centre", "scale", "low", "high"), _action_rows(task)),
             f"**Observation** ``Box(({len(task.policy)},), float32)``: value = scale * clip(reading - offset, +-limit)",
             *table(_OBSERVATION_HEADER, _observation_rows(task)),
+            *table(("observation", "meaning"), observation_meanings(task)),
             f'**Privileged observation** (``observation="dict"``): ``Box(({len(task.privileged)},), float32)``',
             *table(("index", "name", "unit", "frame", "scale", "limit"), privileged_rows),
             *_sensors_text(config),
@@ -117,6 +118,12 @@ def _observation_rows(task: Task) -> list[tuple[str, ...]]:
         texts = [f"{value:.4g}" for value in numbers]
         rows.append((str(index), column_name(column), column.unit, column.frame, *texts, _delay(task, column), str(column.lag)))
     return rows
+
+
+def observation_meanings(task: Task) -> list[tuple[str, str]]:
+    """Return every term of the policy's observation with what it means."""
+    told = {column.term: column.doc for column in task.policy}
+    return list((told | {"command": "what the robot is asked to follow"} if "command" in told else told).items())
 
 
 def column_name(column: ObservationColumn) -> str:

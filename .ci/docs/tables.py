@@ -1,0 +1,274 @@
+"""Tables of the documentation that are made from code and data; pages say where: ``<!-- table: NAME -->``.
+
+``python .ci/docs/tables.py NAME ...`` prints them.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+
+import performance
+
+from wlr_gym.data.excitations import EXCITATIONS
+from wlr_gym.data.format import COLUMNS, Column
+from wlr_gym.envs.registry import ENVIRONMENTS
+from wlr_gym.envs.settings import EnvironmentOptions, Settings
+from wlr_gym.envs.tasks import load_randomization, load_task
+from wlr_gym.envs.tasks.describe import RANDOMIZATION_HEADER, limits_text, parameters_text, randomization_rows
+from wlr_gym.envs.tasks.randomization import RandomizationConfig
+from wlr_gym.envs.tasks.task import ObservationColumn, Task
+from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
+from wlr_gym.physics.effects import EFFECTS
+from wlr_gym.physics.effects.document import coordinates, parameter_text, places
+from wlr_gym.physics.plants.forces import FEATURES
+from wlr_gym.robot import JOINTS, load_robot
+from wlr_gym.studies.bench.adapt_study import read_lines
+from wlr_gym.studies.bench.adapt_table import markdown as markdown_of_cases
+from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED
+from wlr_gym.studies.bench.gap import Plan, read_answers, run_blind_test
+from wlr_gym.studies.bench.gap_score_table import markdown
+from wlr_gym.studies.paper.verdicts import verdict_table
+
+ROOT = Path(__file__).resolve().parents[2]
+ANSWERS = ROOT / "docs" / "data" / "gap_answers.json"
+SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
+#: Randomisations that are laid over ``nominal``.
+PRESETS = ("ice", "split", "patches", "slippery", "asymmetric", "slope", "stripes", "ribbed")
+_OBSERVATION = ("numbers", "unit", "frame", "scale", "meaning")
+
+
+def effect_table() -> list[str]:
+    """Return the library of effects: ``wlr effects``."""
+    rows = [
+        (
+            f"`{effect.name}`",
+            effect.doc,
+            f"`{effect.equation}`",
+            ", ".join(parameter_text(f"`{name}`", parameter) for name, parameter in effect.parameters.items()),
+            places(effect),
+        )
+        for effect in EFFECTS.values()
+    ]
+    return _table(("name", "what is missing", "law", "parameters [plausible range]", "where"), rows)
+
+
+def coordinate_table() -> list[str]:
+    """Return where a formula may act: ``wlr effects unknown_effect``."""
+    rows = [(_code(names), unit, meaning) for names, unit, meaning in coordinates()]
+    return _table(("where", "unit", "meaning"), rows)
+
+
+def feature_table() -> list[str]:
+    """Return what a formula may depend on: ``wlr effects unknown_effect``."""
+    rows = [(f"`{name}`", feature.unit, feature.doc, feature.scope) for name, feature in FEATURES.items()]
+    return _table(("name", "unit", "meaning", "of the"), rows)
+
+
+def column_table() -> list[str]:
+    """Return the columns of a run; those of all joints, or of some axes, that are alike share a line."""
+    alike: dict[tuple[str, str], list[Column]] = {}
+    for column in COLUMNS.values():
+        alike.setdefault((column.name.partition("_")[0], column.doc), []).append(column)
+    rows = []
+    for (kind, doc), same in alike.items():
+        joints = same[0].name.endswith(JOINTS)
+        names = [f"{kind}_<j>"] if joints else [column.name for column in same]
+        units = list(dict.fromkeys(column.unit for column in same))
+        unit = f"{units[0]} (legs), {units[1]} (wheels)" if len(units) > 1 else units[0]
+        rows.append((_code(names), unit, doc, "no" if same[0].required else "yes"))
+    return _table(("column", "unit", "meaning", "may be missing"), rows)
+
+
+def motion_table() -> list[str]:
+    """Return the excitations: ``wlr record --list``."""
+    rows = [(f"`{name}`", excitation.doc, excitation.shows) for name, excitation in EXCITATIONS.items()]
+    return _table(("motion", "what the robot does", "what it shows"), rows)
+
+
+def blind_test_table() -> list[str]:
+    """Return the score of the stored answers of the blind test; its data are not needed."""
+    answers = read_answers(ANSWERS)
+    first = min(int(name.removeprefix("set_")) for name in answers)
+    runs = tuple(range(8)) if first < FIRST_SCORED_SEED else ()  # before, all sets had eight runs
+    with tempfile.TemporaryDirectory() as folder:
+        plan = Plan(Path(folder), sets=len(answers), first_seed=first, runs=runs)
+        return markdown(run_blind_test(plan, "no_module:nothing_is_analysed", lambda _: None, ANSWERS)).splitlines()
+
+
+def adapt_table() -> list[str]:
+    """Return the cases of ``wlr bench adapt`` that were run."""
+    return markdown_of_cases(read_lines(ROOT / "docs" / "data" / "adapt.jsonl")).strip().splitlines()
+
+
+def keyword_table() -> list[str]:
+    """Return the keywords of ``gym.make`` with their defaults: ``help(wlr_gym.EnvironmentOptions)``."""
+    _, _, attributes = str(inspect.getdoc(EnvironmentOptions)).partition("Attributes:\n")
+    told = dict(re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", attributes, re.MULTILINE))
+    defaults = {field.name: field.default for field in fields(Settings)}
+    rows = [(f"`{name}`", f"`{defaults.get(name)!r}`", " ".join(text.split())) for name, text in told.items()]
+    return _table(("keyword", "default", "what it takes"), rows)
+
+
+def script_table() -> list[str]:
+    """Return the first sentence of every example."""
+    documents = {path.name: ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) for path in SCRIPTS}
+    rows = [(f"`{name}`", " ".join(str(text).split("\n\n")[0].split())) for name, text in documents.items()]
+    return _table(("script", "shows"), rows)
+
+
+def all_tasks() -> dict[str, Task]:
+    """Return the shipped tasks by their titles."""
+    return {env_id.split("-")[1]: load_task(name, load_robot()) for env_id, name in ENVIRONMENTS.items()}
+
+
+def shared_tables() -> list[str]:
+    """Return the tables of all tasks together: shared observations, rewards, terminations, measures."""
+    tasks = all_tasks()
+    policy = _shared([_terms(task.policy) for task in tasks.values()])
+    rewards = [
+        (
+            f"`{name}`",
+            *(f"{task.config.rewards[name]['weight']:g}" if name in task.config.rewards else "" for task in tasks.values()),
+            _parameters({title: task.config.rewards.get(name) for title, task in tasks.items()}, REWARDS[name].parameters),
+            REWARDS[name].doc,
+        )
+        for name in _names(task.config.rewards for task in tasks.values())
+    ]
+    terminations = [
+        (
+            f"`{name}`",
+            _parameters({title: task.config.terminations.get(name) for title, task in tasks.items()}, term.parameters),
+            term.doc,
+        )
+        for name, term in ((name, TERMINATIONS[name]) for name in _names(task.config.terminations for task in tasks.values()))
+    ]
+    measures = [
+        (f"`{name}`", MEASURES[name].unit, *(_measure_cell(task, name) for task in tasks.values()), MEASURES[name].doc)
+        for name in _names(task.measures for task in tasks.values())
+    ]
+    return [
+        *_table(("observation", *_OBSERVATION), policy),
+        "",
+        *_table(("reward: weight (1/s)", *tasks, "parameters", "meaning"), rewards),
+        "",
+        *_table(("termination", "parameters", "meaning"), terminations),
+        "",
+        *_table(("measure", "unit", *tasks, "meaning"), measures),
+    ]
+
+
+def task_tables(title: str) -> list[str]:
+    """Return the tables of one task: its commands, and the observations that not all tasks have."""
+    tasks = all_tasks()
+    task = tasks[title]
+    commands = [
+        (f"`{name}`", f"{low:g} to {high:g}", COMMANDS[name].unit, COMMANDS[name].doc)
+        for name, (low, high) in task.config.commands.terms.items()
+    ]
+    shared = _shared([_terms(other.policy) for other in tasks.values()])
+    own = [row for row in _terms(task.policy) if row not in shared]
+    header = ("command", "range", "unit", "meaning")
+    return [*_table(header, commands), "", *_table(("observation", *_OBSERVATION), own)]
+
+
+def randomization_table(name: str) -> list[str]:
+    """Return what a randomisation draws; events that are drawn alike share a line."""
+    alike: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for event, items, *rest in randomization_rows(_randomization(name)):
+        alike.setdefault(tuple(rest), []).append((event, items))
+    rows = [(_code(event for event, _ in same), _code(items for _, items in same), *rest) for rest, same in alike.items()]
+    return _table(RANDOMIZATION_HEADER, rows)
+
+
+def preset_table() -> list[str]:
+    """Return what presets draw otherwise than ``nominal``."""
+    known = randomization_rows(_randomization("nominal"))
+    rows = [
+        (f"`{preset}`", _code([name]), _code([items]), *rest)
+        for preset in PRESETS
+        for name, items, *rest in (row for row in randomization_rows(_randomization(preset)) if row not in known)
+    ]
+    return _table(("preset", *RANDOMIZATION_HEADER), rows)
+
+
+def _randomization(name: str) -> RandomizationConfig:
+    return load_randomization(name, load_robot()).config
+
+
+def _code(names: Iterable[str]) -> str:
+    return ", ".join(f"`{name}`" for text in names for name in text.split(", "))
+
+
+def _shared(groups: Sequence[list[tuple[str, ...]]]) -> list[tuple[str, ...]]:
+    return [row for row in groups[0] if all(row in group for group in groups)]
+
+
+def _names(groups: Iterable[Iterable[str]]) -> list[str]:
+    """Every name once, in the order of the first group that has it."""
+    return list(dict.fromkeys(name for group in groups for name in group))
+
+
+def _parameters(values: Mapping[str, Mapping[str, float] | None], defaults: Mapping[str, float]) -> str:
+    """Parameters of a term in the tasks that have it: once where all have the same, else task by task."""
+    texts = {title: parameters_text(dict(given), dict(defaults)) for title, given in values.items() if given is not None}
+    return next(iter(texts.values())) if len(set(texts.values())) == 1 else "; ".join(map(": ".join, texts.items()))
+
+
+def _measure_cell(task: Task, name: str) -> str:
+    return limits_text(task.config, name) if name in task.measures else ""
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    escaped = [[cell.replace("|", "\\|").replace("``", "`") for cell in row] for row in rows]
+    return [f"| {' | '.join(cells)} |" for cells in [header, ["---"] * len(header), *escaped]]
+
+
+def _terms(columns: Sequence[ObservationColumn]) -> list[tuple[str, ...]]:
+    groups: dict[str, list[ObservationColumn]] = {}
+    for column in columns:
+        groups.setdefault(column.term, []).append(column)
+    return [
+        (
+            f"`{term}`",
+            str(len(group)),
+            ", ".join(dict.fromkeys(column.unit for column in group)),
+            group[0].frame,
+            f"{group[0].scale:g}",
+            group[0].doc if term != "command" else "what the robot is asked to follow",
+        )
+        for term, group in groups.items()
+    ]
+
+
+#: Name in a page's mark -> what makes the lines of the table.
+TABLES: dict[str, Callable[[], list[str]]] = {
+    "effects": effect_table,
+    "coordinates": coordinate_table,
+    "features": feature_table,
+    "columns": column_table,
+    "motions": motion_table,
+    "keywords": keyword_table,
+    "terms": shared_tables,
+    **{title: partial(task_tables, title) for title in ("Velocity", "Path", "Posture", "Slope")},
+    "nominal": partial(randomization_table, "nominal"),
+    "wide": partial(randomization_table, "wide"),
+    "presets": preset_table,
+    **{name: partial(lambda name: performance.made()[name], name) for name in ("speed", "batch", "machines", "engine")},
+    "equations": verdict_table,
+    "adapt": adapt_table,
+    "scripts": script_table,
+    "blind_test": blind_test_table,
+}
+
+
+if __name__ == "__main__":
+    for name in sys.argv[1:]:
+        print("\n".join(TABLES[name]()), end="\n\n")

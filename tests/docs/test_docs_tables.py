@@ -1,0 +1,91 @@
+"""The tables that the site makes (.ci/docs/tables.py): each has its place, and commands print what they say."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+
+import pytest
+from blocks import PAGES, site_script
+
+from wlr_gym.cli import main
+from wlr_gym.envs.registry import ENVIRONMENTS
+
+tables, pages = site_script("tables"), site_script("pages")
+TEXTS = {page.stem: page.read_text(encoding="utf-8") for page in PAGES}
+
+
+def words(text: str) -> str:
+    """Text without the marks of Markdown, reStructuredText and tables."""
+    return " ".join(re.sub(r"[`|\\]", " ", text).split())
+
+
+def rows(name: str) -> list[list[str]]:
+    """Cells of a table's rows, without its heads."""
+    lines = [re.split(r"(?<!\\)\|", line)[1:-1] for line in tables.TABLES[name]() if line.startswith("|")]
+    rules = [k for k, line in enumerate(lines) if set("".join(line)) <= set("- ")]
+    return [line for k, line in enumerate(lines) if k not in rules and k + 1 not in rules]
+
+
+def test_every_table_has_its_place():
+    found = Counter(name for text in TEXTS.values() for name in pages.TABLE.findall(text))
+    assert found == dict.fromkeys(tables.TABLES, 1)
+
+
+@pytest.mark.parametrize("name", tables.TABLES)
+def test_the_site_has_whole_rows(name):
+    lines = [line for line in tables.TABLES[name]() if line.startswith("|")]
+    assert len(lines) > 2 or name == "machines"  # a list
+    for block in "\n".join(tables.TABLES[name]()).split("\n\n"):
+        inner = [len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines() if line.startswith("|")]
+        assert len(set(inner)) <= 1
+    assert tables.TABLES[name]()[0] in pages.on_page_markdown(f"<!-- table: {name} -->")
+
+
+def test_wlr_effects_prints_the_library(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    assert main(["effects"]) == 0
+    text = "".join(words(capsys.readouterr().out).split())
+    for name, _, law, parameters, where in rows("effects"):
+        assert "".join(words(law).split()) in text, name
+        assert where.strip() in text
+        for parameter in re.findall(r"\(?`[^]]*\]\)?", parameters):
+            assert "".join(words(parameter).split()) in text, name
+
+
+def test_wlr_effects_unknown_effect_prints_what_formulas_are_made_of(capsys):
+    assert main(["effects", "unknown_effect"]) == 0
+    text = words(capsys.readouterr().out)
+    for names, unit, meaning in rows("coordinates"):
+        assert words(f"{names.split(',')[0]} {unit} {meaning}") in text
+    for row in rows("features"):
+        assert words(" ".join(row)) in text
+
+
+def test_wlr_record_lists_the_motions(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "250")
+    assert main(["record", "--list"]) == 0
+    text = words(capsys.readouterr().out)
+    assert all(words(" ".join(row[1:])) in text for row in rows("motions"))
+
+
+def test_wlr_envs_prints_the_terms(capsys):
+    text = ""
+    for env_id in ENVIRONMENTS:
+        assert main(["envs", env_id]) == 0
+        text += words(capsys.readouterr().out)
+    for name in ("terms", *tables.all_tasks()):
+        for row in rows(name):
+            assert words(row[0]) in text
+            assert words(row[-1]) in text
+
+
+@pytest.mark.parametrize("name", ["nominal", "wide", *tables.PRESETS])
+def test_wlr_envs_prints_what_is_drawn(name, capsys):
+    assert main(["envs", "WLR-Velocity-v0", "--randomization", name]) == 0
+    text = words(capsys.readouterr().out)
+    found = rows(name) if name in tables.TABLES else [row[1:] for row in rows("presets") if words(row[0]) == name]
+    assert found
+    for events, _, *rest in found:
+        assert words(" ".join(rest)) in text, events
+        assert all(event in text for event in words(events).split(", "))
