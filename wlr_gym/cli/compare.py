@@ -182,13 +182,7 @@ def _print_all(console: Console, comparison: Comparison) -> None:
 
 
 def _print(console: Console, table: ReportTable) -> None:
-    from rich import box
-    from rich.table import Table
+    from wlr_gym.cli.tables import print_table
 
-    shown = Table(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE, padding=(0, 1, 0, 0))
-    for number, heading in enumerate(table.headings):
-        shown.add_column(heading, justify="left" if number == 0 else "right", overflow="fold")
-    for row in table.rows:
-        shown.add_row(*row, style="red" if any(cell.endswith(" !") for cell in row) else None)
-    console.width = max(console.width, 150)  # rather a wide line than a cut number
-    console.print(shown)
+    styles = ["red" if any(cell.endswith(" !") for cell in row) else "" for row in table.rows]
+    print_table(console, table.headings, table.rows, table.title, styles)
