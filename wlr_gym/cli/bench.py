@@ -76,7 +76,7 @@ class BenchOptions(JsonOption, ForceOption):
     sets: int | None = None
     """gap: data sets (400: 240 of all kinds, 160 more without an effect). vision with --out: films (60)."""
     seed: int | None = None
-    """vision with --out: of the films (28); another one gives other films."""
+    """vision: with --out, of the films (28); another one gives other films."""
     processes: int = 2
     """gap: data sets at a time."""
     ray: tuple[str, ...] | None = None
@@ -89,7 +89,7 @@ class BenchOptions(JsonOption, ForceOption):
     speed: tuple[Path, ...] = ()
     """gap: instead of the blind test, time the analysis of these folders of runs and show where the time goes."""
     threads: int = 2
-    """gap --speed: worker threads of an analysis."""
+    """gap: with --speed, worker threads of an analysis."""
 
 
 def run(options: BenchOptions) -> int:

@@ -39,14 +39,15 @@ class CameraOptions(JsonOption, ForceOption):
         images: folder of images, or a video, of the board: 15 or more views, tilted, in every corner of the image, sharp. In a
             video a board that moves tells a rolling shutter.
         out: camera file to write (YAML).
-        board: charuco (as written by wlr calibrate targets), charuco-legacy (as OpenCV drew them before 4.6), or chessboard.
+        board: what it is: charuco (as written by wlr calibrate targets), charuco-legacy (as OpenCV drew them before 4.6), or
+            chessboard.
         columns: squares of the board along its longer side.
         rows: squares along its shorter side.
         square: side of a square as measured on the print, m.
         marker: side of a ChArUco board's markers, m; left out, 0.7 of a square.
         dictionary: of a ChArUco board's markers, as OpenCV names it without DICT_.
         every: use every n-th frame of a video.
-        readout: s from the first row's exposure to the last row's, where it is known; 0 = global shutter.
+        readout: time from the first row's exposure to the last row's, s, where it is known; 0 = global shutter.
     """
 
     images: Annotated[str, tyro.conf.Positional]
