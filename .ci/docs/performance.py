@@ -13,8 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.studies.bench.engine_report import AT_DEFAULTS, LEVELS, level_name, save_picture
-from wlr_gym.studies.bench.engine_report import lines as engine_table
+from wlr_gym.studies.bench.engine_report import AT_DEFAULTS, LEVELS, level_name, reference_text, save_picture, settings_table
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "docs" / "data" / "bench.json"
@@ -119,7 +118,9 @@ def engine_lines(engine: dict[str, Any]) -> list[str]:
     """Return when engine and MuJoCo were measured, the limits of the reference, and every setting, as lines of Markdown."""
     found = engine["measured"]
     head = f"Measured {_condition(found)}, {found['processor']}; speed: median [smallest..largest] of the rounds."
-    return [head, *engine_table(engine)]
+    headings, rows = settings_table(engine)
+    table = [f"| {' | '.join(cells)} |" for cells in (headings, *rows)]
+    return [head, reference_text(engine), "", table[0], f"|{'---|' * len(headings)}", *table[1:]]
 
 
 def made() -> dict[str, list[str]]:

@@ -46,18 +46,26 @@ def test_wlr_effects_prints_the_library(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "300")
     assert main(["effects"]) == 0
     text = "".join(words(capsys.readouterr().out).split())
-    for name, _, law, parameters, where in rows("effects"):
+    for name, _, law, _, where in rows("effects"):
         assert "".join(words(law).split()) in text, name
         assert where.strip() in text
-        for parameter in re.findall(r"\(?`[^]]*\]\)?", parameters):
-            assert "".join(words(parameter).split()) in text, name
 
 
-def test_wlr_effects_unknown_effect_prints_what_formulas_are_made_of(capsys):
+def test_wlr_effects_of_a_name_prints_its_numbers(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    for name, _, _, parameters, _ in rows("effects"):
+        assert main(["effects", words(name)]) == 0
+        lines = [words(line) for line in capsys.readouterr().out.splitlines()]
+        for parameter, unit, plausible in re.findall(r"`(\w+)` ([^[]*)(\[[^]]*\])", parameters):
+            assert any(line.startswith(parameter) and unit.strip() in line and plausible in line for line in lines), parameter
+
+
+def test_wlr_effects_unknown_effect_prints_what_formulas_are_made_of(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "250")
     assert main(["effects", "unknown_effect"]) == 0
     text = words(capsys.readouterr().out)
     for names, unit, meaning in rows("coordinates"):
-        assert words(f"{names.split(',')[0]} {unit} {meaning}") in text
+        assert words(f"{names} {unit} {meaning}") in text
     for row in rows("features"):
         assert words(" ".join(row)) in text
 

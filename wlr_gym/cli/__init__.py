@@ -67,6 +67,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as interruption:
         _say(str(interruption) or "interrupted", "yellow")
         return INTERRUPTED
+    except BrokenPipeError:  # who reads the output has enough: wlr ... | head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
 
 
 def _dispatch(words: list[str]) -> int:

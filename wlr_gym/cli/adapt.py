@@ -160,18 +160,16 @@ def _real(options: AdaptOptions, console: Console) -> RealRobot:
 
 
 def _print(found: Adapted, console: Console) -> None:
-    from rich import box
-    from rich.table import Table
-
     from wlr_gym.base.text import duration
+    from wlr_gym.cli.tables import print_table
     from wlr_gym.learning.adaptation.page import NUMBERS_FILE, headline
 
     content = json.loads((found.page.parent / NUMBERS_FILE).read_text(encoding="utf-8"))
-    table = Table("step", "driving", "computing", "found", box=box.SIMPLE)
-    for name, one in found.steps.items():
-        said = one.said[0] if one.said else ""
-        table.add_row(name, duration(one.driving), duration(one.computing), said)
-    console.print(table)
+    rows = [
+        (name, duration(one.driving), duration(one.computing), one.said[0] if one.said else "")
+        for name, one in found.steps.items()
+    ]
+    print_table(console, ("step", "driving", "computing", "found"), rows)
     console.print(headline(content), markup=False)
     console.print(f"policy: {found.policy}", markup=False)
     console.print(f"page: {found.page}", markup=False)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import refuse_existing, write_json
@@ -18,6 +17,7 @@ from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption, ray_address
 from wlr_gym.cli.progress import progress
 from wlr_gym.cli.results import print_json
+from wlr_gym.cli.tables import print_table
 from wlr_gym.studies.bench.measure import Measurement, Size, machine
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class BenchOptions(JsonOption, ForceOption):
     sets: int | None = None
     """gap: data sets (400: 240 of all kinds, 160 more without an effect). vision with --out: films (60)."""
     seed: int | None = None
-    """vision with --out: of the films (28); another one gives other films."""
+    """vision: with --out, of the films (28); another one gives other films."""
     processes: int = 2
     """gap: data sets at a time."""
     ray: tuple[str, ...] | None = None
@@ -89,7 +89,7 @@ class BenchOptions(JsonOption, ForceOption):
     speed: tuple[Path, ...] = ()
     """gap: instead of the blind test, time the analysis of these folders of runs and show where the time goes."""
     threads: int = 2
-    """gap --speed: worker threads of an analysis."""
+    """gap: with --speed, worker threads of an analysis."""
 
 
 def run(options: BenchOptions) -> int:
@@ -119,7 +119,7 @@ def run(options: BenchOptions) -> int:
         if name == "engine":
             rows = _engine_pairs(rows, report, console, options.save)
         report[name if name in _OWN_ROWS else "measurements"] += [row.as_dict() for row in rows]
-        _print(console, _TABLES.get(name, _speed_table)(rows))
+        _TABLES.get(name, _print_speed)(rows, console)
     if options.json:
         print_json(report)
     if options.save is not None:
@@ -141,7 +141,8 @@ def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console,
     from wlr_gym.studies.bench import engine_report
 
     report["engine"] = found.as_dict()
-    console.print("\n".join(engine_report.lines(report["engine"])), markup=False, highlight=False, soft_wrap=True)
+    console.print(engine_report.reference_text(report["engine"]), markup=False, highlight=False)
+    print_table(console, *engine_report.settings_table(report["engine"]), "all settings")
     if save is not None:
         picture = save.with_name(f"{save.stem}_engine.png")
         engine_report.save_picture(report["engine"], picture)
@@ -227,10 +228,8 @@ def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
     report = {"machine": machine(), "seed": seed, "score": found, "films": [asdict(result) for result in results]}
     for path in (options.out / "score.json", *([] if options.save is None else [options.save])):
         write_json(path, report)
-    table = Table("what", "found", "bar", "met", box=None, title=f"{count} films of a lab", title_justify="left")
-    for what, value, bar, met in bars(found):
-        table.add_row(what, value, bar, _YES_NO[met])
-    console.print(table)
+    rows = [(what, value, bar, _YES_NO[met]) for what, value, bar, met in bars(found)]
+    print_table(console, ("what", "found", "bar", "met"), rows, f"{count} films of a lab")
     if options.json:
         print_json(report)
     console.print(f"written: {options.out / 'score.json'}")
@@ -247,49 +246,48 @@ def _machine_line(found: dict[str, Any]) -> str:
     return f"{found['processor']}, {found['cores']} cores, {found['system']}; {packages}"
 
 
-def _print(console: Console, table: Table) -> None:
-    console.width = max(console.width, 150)  # rather a wide line than a cut number
-    console.print(table)
-
-
-def _speed_table(rows: Sequence[Measurement]) -> Table:
-    table = Table("what", "ours", "peer", "ratio [min..max]", "bar", "met", box=None, title=rows[0].name, title_justify="left")
+def _print_speed(rows: Sequence[Measurement], console: Console) -> None:
+    """Print what was measured; a peer is named below what it is held against, one unit of all rows in the title."""
+    units = {row.unit for row in rows}
+    cells = []
     for row in rows:
         found = row.as_dict()
-        peer = f"{found['peer']['median']:,.0f} {row.unit} ({row.peer_name})" if row.peer else "-"
+        peer = f"{found['peer']['median']:,.0f}" if row.peer else "-"
         ratio = "{median:.3g} [{min:.3g}..{max:.3g}]".format(**found["ratio"]) if row.peer else "-"
         ratio = f">= {ratio}" if row.at_least else ratio
-        bar = "-" if row.bar is None else f">= {row.bar:.3g}x" if row.peer else f"< {row.bar:g} {row.unit}"
-        table.add_row(row.what, _number(found["ours"], row.unit), peer, ratio, bar, _YES_NO[row.met])
-    return table
+        bar = "-" if row.bar is None else f">= {row.bar:.3g}" if row.peer else f"< {row.bar:g}"
+        what = f"{row.what}\n  peer: {row.peer_name}" if row.peer else row.what
+        ours = _number(found["ours"], row.unit)
+        cells.append((what, ours if len(units) == 1 else f"{ours} {row.unit}", peer, ratio, bar, _YES_NO[row.met]))
+    title = f"{rows[0].name}, {units.pop()}" if len(units) == 1 else rows[0].name
+    print_table(console, ("what", "ours", "peer", "ratio [min..max]", "bar", "met"), cells, title)
 
 
 _YES_NO = {True: "yes", False: "NO", None: "-"}
 
 
 def _number(found: dict[str, Any], unit: str) -> str:
-    form = "{median:.2f} [{min:.2f}..{max:.2f}]" if unit in ("s", "-") else "{median:,.0f}"
-    return f"{form.format(**found)} {unit}"
+    return ("{median:.2f} [{min:.2f}..{max:.2f}]" if unit in ("s", "-") else "{median:,.0f}").format(**found)
 
 
-def _convergence_table(rows: Sequence[Deviation]) -> Table:
-    table = Table("case", "quantity", "value", "median", "90 %", "worst", box=None, title_justify="left")
-    table.title = "convergence: deviation of the position after 1 s, mm (64 robots)"
-    for row in rows:
-        millimetres = [f"{1e3 * value:.2g}" for value in (row.median, row.percentile_90, row.worst)]
-        table.add_row(row.case, row.quantity, str(row.value), *millimetres)
-    return table
+def _print_convergence(rows: Sequence[Deviation], console: Console) -> None:
+    cells = [
+        (row.case, row.quantity, str(row.value),
+         *(f"{1e3 * value:.2g}" for value in (row.median, row.percentile_90, row.worst))) for row in rows
+    ]  # fmt: skip
+    title = "convergence: deviation of the position after 1 s, mm (64 robots)"
+    print_table(console, ("case", "quantity", "value", "median", "90 %", "worst"), cells, title)
 
 
-def _vision_table(rows: Sequence[VisionResult]) -> Table:
-    table = Table("what", "method", "value", "bar", "met", "samples", box=None, title="vision (rendered)", title_justify="left")
+def _print_vision(rows: Sequence[VisionResult], console: Console) -> None:
+    cells = []
     for row in rows:
         bar = "-" if row.bar is None else f"{'>=' if row.least else '<='} {row.bar:g}"
-        table.add_row(row.what, row.method, f"{row.value:.3g} {row.unit}", bar, _YES_NO[row.met], str(row.count))
-    return table
+        cells.append((row.what, row.method, f"{row.value:.3g} {row.unit}", bar, _YES_NO[row.met], str(row.count)))
+    print_table(console, ("what", "method", "value", "bar", "met", "samples"), cells, "vision (rendered)")
 
 
-_TABLES = {"convergence": _convergence_table, "vision": _vision_table}
+_TABLES = {"convergence": _print_convergence, "vision": _print_vision}
 
 
 def _gap_speed(options: BenchOptions) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -17,10 +18,17 @@ from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from wlr_gym.perception.markers.boards import Board
     from wlr_gym.perception.markers.camera import Camera
     from wlr_gym.perception.markers.shutter import Readout
     from wlr_gym.perception.vision.video import Frames
+
+
+#: Share of the time that looking for the board takes, about; the computation of the lens takes the rest.
+_SEARCH = 0.8
 
 
 @dataclass(frozen=True)
@@ -31,14 +39,15 @@ class CameraOptions(JsonOption, ForceOption):
         images: folder of images, or a video, of the board: 15 or more views, tilted, in every corner of the image, sharp. In a
             video a board that moves tells a rolling shutter.
         out: camera file to write (YAML).
-        board: charuco (as written by wlr calibrate targets), charuco-legacy (as OpenCV drew them before 4.6), or chessboard.
+        board: what it is: charuco (as written by wlr calibrate targets), charuco-legacy (as OpenCV drew them before 4.6), or
+            chessboard.
         columns: squares of the board along its longer side.
         rows: squares along its shorter side.
         square: side of a square as measured on the print, m.
         marker: side of a ChArUco board's markers, m; left out, 0.7 of a square.
         dictionary: of a ChArUco board's markers, as OpenCV names it without DICT_.
         every: use every n-th frame of a video.
-        readout: s from the first row's exposure to the last row's, where it is known; 0 = global shutter.
+        readout: time from the first row's exposure to the last row's, s, where it is known; 0 = global shutter.
     """
 
     images: Annotated[str, tyro.conf.Positional]
@@ -132,14 +141,26 @@ def _camera(options: CameraOptions) -> int:
 
 
 def _calibrated(options: CameraOptions, frames: Frames, board: Board) -> tuple[Camera, Readout]:
+    from rich.console import Console
+
+    from wlr_gym.cli.progress import progress
     from wlr_gym.perception.markers.calibration import calibrate, calibrate_film
     from wlr_gym.perception.markers.shutter import Readout
 
-    named = ((f"{options.images}, frame {f.index}", f.time, f.image) for f in frames)
-    if not Path(options.images).is_dir():
-        return calibrate_film(named, board, options.every, options.readout)
-    camera = calibrate(((name, image) for name, _, image in named), board)
-    return camera.model_copy(update={"readout": options.readout}), Readout()
+    with progress(Console(highlight=False)) as tell:
+        named = _named(options.images, frames, lambda doing, share: tell("", doing, share))
+        if not Path(options.images).is_dir():
+            return calibrate_film(named, board, options.every, options.readout)
+        camera = calibrate(((name, image) for name, _, image in named), board)
+        return camera.model_copy(update={"readout": options.readout}), Readout()
+
+
+def _named(source: str, frames: Frames, tell: Callable[[str, float], None]) -> Iterator[tuple[str, float, NDArray[np.uint8]]]:
+    """Yield name, time and picture of each frame, and tell how many are done."""
+    for frame in frames:
+        tell(f"looking for the board: picture {frame.index + 1}", _SEARCH * min(frame.index / max(frames.announced, 1), 1.0))
+        yield f"{source}, frame {frame.index}", frame.time, frame.image
+    tell("computing the lens", _SEARCH)
 
 
 def _shutter(camera: Camera, told: Readout) -> str:

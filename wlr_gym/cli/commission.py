@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 #: File in ``--out`` with all results.
 REPORT = "commission.json"
-#: Columns that the table needs.
-_WIDTH = 110
 #: Digits of a value in the table.
 _DIGITS = 3
 
@@ -72,7 +70,6 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
     from wlr_gym.hardware.commissioning.registry import choose
 
     console = Console(soft_wrap=True, highlight=False, stderr=options.json)
-    console.width = max(console.width, _WIDTH)
     tests = choose(options.tests)
     if options.list:
         _list(tests, console)
@@ -156,29 +153,23 @@ def _save(
 
 
 def _list(tests: Sequence[StandTest], console: Console) -> None:
-    from rich import box
-    from rich.table import Table
+    from wlr_gym.cli.tables import print_table
 
-    table = Table("test", "what", "hands", "what moves", box=box.SIMPLE)
-    for test in tests:
-        table.add_row(test.name, test.title, test.asks or "off", test.moves)
-    console.print(table)
+    rows = [(test.name, test.title, test.asks or "off", test.moves) for test in tests]
+    print_table(console, ("test", "what", "hands", "what moves"), rows)
 
 
 def _print_table(findings: Sequence[StandFinding], console: Console) -> None:
     """One row for all places where a quantity is as expected, one for each where it differs; then what to do."""
-    from rich import box
-    from rich.table import Table
+    from wlr_gym.cli.tables import print_table
 
-    table = Table("quantity", "where", "measured", "expected", "verdict", box=box.SIMPLE)
-    for column in table.columns:
-        column.no_wrap = True
+    groups = []
     for quantity in dict.fromkeys(finding.quantity for finding in findings):
         alike = [finding for finding in findings if finding.quantity == quantity]
         good = [finding for finding in alike if finding.is_expected]
-        for group in ([good] if good else []) + [[finding] for finding in alike if not finding.is_expected]:
-            table.add_row(*_row(group), style="" if group[0].is_expected else "red")
-    console.print(table)
+        groups += ([good] if good else []) + [[finding] for finding in alike if not finding.is_expected]
+    styles = ["" if group[0].is_expected else "red" for group in groups]
+    print_table(console, ("quantity", "where", "measured", "expected", "verdict"), map(_row, groups), styles=styles)
     wrong = [finding for finding in findings if not finding.is_expected]
     for finding in wrong:
         console.print(
@@ -192,7 +183,7 @@ def _row(group: Sequence[StandFinding]) -> tuple[str, ...]:
     """Table row of findings of one quantity."""
     first, unit = group[0], group[0].quantity.unit
     where = first.where if len(group) == 1 else f"{len(group)} places"
-    expected = f"{_span([one.expected for one in group], unit)} +- {max(one.room for one in group):.2g}"
+    expected = f"{_span([one.expected for one in group], unit)} ± {max(one.room for one in group):.2g}"
     return first.quantity.name, where, _span([one.measured for one in group], unit), expected, first.verdict
 
 

@@ -7,7 +7,7 @@ says how to read them.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from wlr_gym.data.excitations import Motion
     from wlr_gym.physics.effects import Patch
     from wlr_gym.robot import Robot
+
+
+#: Share of the time that driving takes, about; drawing takes the rest.
+_DRIVES = 0.7
 
 
 @dataclass(frozen=True)
@@ -145,21 +149,34 @@ def _compare_all(
     patches: Sequence[Patch],
     console: Console,
 ) -> Iterator[Comparison]:
-    from rich.progress import track
-
+    from wlr_gym.cli.progress import progress
     from wlr_gym.data.comparison import compare
+
+    with progress(console) as tell:
+        for done, patch in enumerate(patches):
+
+            def told(doing: str, share: float, done: int = done, patch: Patch = patch) -> None:
+                of_them = f", effects: {patch.summary()}" if len(patches) > 1 else ""
+                tell("", f"{doing}{of_them}", (done + share) / len(patches))
+
+            drives = _DRIVES if options.plots else 1.0
+            found = compare(
+                motions, plants, robot, None, patch, options.threshold, halve=options.halve, threads=options.threads,
+                tell=lambda doing, share, told=told, drives=drives: told(doing, drives * share),
+            )  # fmt: skip
+            if options.plots:
+                _draw(found, options.out, lambda doing, share, told=told: told(doing, _DRIVES + (1.0 - _DRIVES) * share))
+            yield found
+
+
+def _draw(found: Comparison, out: Path, tell: Callable[[str, float], None]) -> None:
     from wlr_gym.data.comparison_report import save_map, save_motion_plot
 
-    for patch in track(patches, description="comparing", console=console, disable=len(patches) == 1):
-        found = compare(
-            motions, plants, robot, None, patch, options.threshold, halve=options.halve, threads=options.threads
-        )  # fmt: skip
-        if options.plots:
-            label = re.sub(r"[^\w]+", "_", found.effects)
-            save_map(found, options.out / f"{label}.png")
-            for index, motion in enumerate(found.motions):
-                save_motion_plot(found, index, options.out / f"{label}_{motion.name}.png")
-        yield found
+    label = re.sub(r"[^\w]+", "_", found.effects)
+    for index, motion in enumerate(found.motions):
+        tell("drawing", index / len(found.motions))
+        save_motion_plot(found, index, out / f"{label}_{motion.name}.png")
+    save_map(found, out / f"{label}.png")
 
 
 def _resolved(options: CompareOptions, motions: Sequence[Motion], robot: Robot, patch: Patch) -> dict[str, object]:
@@ -182,13 +199,7 @@ def _print_all(console: Console, comparison: Comparison) -> None:
 
 
 def _print(console: Console, table: ReportTable) -> None:
-    from rich import box
-    from rich.table import Table
+    from wlr_gym.cli.tables import print_table
 
-    shown = Table(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE, padding=(0, 1, 0, 0))
-    for number, heading in enumerate(table.headings):
-        shown.add_column(heading, justify="left" if number == 0 else "right", overflow="fold")
-    for row in table.rows:
-        shown.add_row(*row, style="red" if any(cell.endswith(" !") for cell in row) else None)
-    console.width = max(console.width, 150)  # rather a wide line than a cut number
-    console.print(shown)
+    styles = ["red" if any(cell.endswith(" !") for cell in row) else "" for row in table.rows]
+    print_table(console, table.headings, table.rows, table.title, styles)

@@ -332,21 +332,21 @@ def _serving(
 
 
 def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
-    from rich.table import Table
     from rich.text import Text
 
     from wlr_gym.cli.robot_status import camera_line
+    from wlr_gym.cli.tables import print_table
 
     colour = "green" if result.well else "red"
     console.print(Text.assemble(("ended: ", "bold"), (result.reason, colour)))
     statistics = result.statistics
-    table = Table(box=None, title=f"{statistics['ticks']} steps, {statistics['missed']} missed; ms", title_justify="left")
-    for name in ("", "p50", "p95", "p99", "max"):
-        table.add_column(name, justify="right")
-    for name, values in statistics.items():
-        if isinstance(values, dict) and "p50" in values:
-            table.add_row(name, *(f"{value:.2f}" for value in values.values()))
-    console.print(table)
+    rows = [
+        (name, *(f"{value:.2f}" for value in values.values()))
+        for name, values in statistics.items()
+        if isinstance(values, dict) and "p50" in values
+    ]
+    title = f"{statistics['ticks']} steps, {statistics['missed']} missed; ms"
+    print_table(console, ("", "p50", "p95", "p99", "max"), rows, title)
     limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
     console.print(f"command limiter, steps: {limited}")
     if camera := statistics.get("camera"):

@@ -6,21 +6,21 @@ what they may depend on); with "check FILE ..." patches are read and applied to 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.paths import config_names
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption
 from wlr_gym.cli.results import print_json
+from wlr_gym.cli.tables import print_table
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Effect, Patch, PatchEffect, apply_patch, load_patch
-from wlr_gym.physics.effects.document import coordinates, parameter_text, places
+from wlr_gym.physics.effects.document import coordinates, places
 from wlr_gym.physics.plants.forces import FEATURES
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameter_table import ELEMENTS, spec_of
@@ -41,8 +41,9 @@ def run(options: EffectsOptions) -> int:
         case () if options.json:
             print_json([_content(effect) for effect in EFFECTS.values()])
         case ():
-            _show(_library())
-            print("one of them: wlr effects NAME; what is beyond the library: wlr effects unknown_effect; docs/effects.md")
+            rows = [(one.name, places(one), f"{one.doc}\n  {one.equation}") for one in EFFECTS.values()]
+            _show(("name", "where", "what is missing, and its law"), rows)
+            print("one of them, with its numbers: wlr effects NAME; beyond the library: wlr effects unknown_effect")
         case ("check",):
             raise InputError("wlr effects check: give the patch files to check")
         case ("check", *files):
@@ -55,34 +56,12 @@ def run(options: EffectsOptions) -> int:
     return OK
 
 
-def _show(*tables: Table) -> None:
-    console = Console(highlight=False)
-    console.width = max(console.width, 160)  # rather a wide line than a broken one
-    for table in tables:
-        console.print(table)
-
-
-def _table(title: str, *headings: str) -> Table:
-    return Table(*map(_plain, headings), title=title, title_justify="left", box=None, padding=(0, 2, 0, 0))
-
-
-def _library() -> Table:
-    table = _table("", "name", "what is missing, and its law", "where", "parameters, unit, plausible range (may be left out)")
-    for effect in EFFECTS.values():
-        numbers = "\n".join(parameter_text(name, p) for name, p in effect.parameters.items())
-        table.add_row(effect.name, _plain(f"{effect.doc}\n  {effect.equation}"), places(effect), _plain(numbers))
-    return table
+def _show(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> None:
+    print_table(Console(highlight=False), headings, rows, title)
 
 
 def _range(bounds: tuple[float, float]) -> str:
     return f"[{bounds[0]:.3g}, {bounds[1]:.3g}]"
-
-
-def _plain(text: str) -> str:
-    """Keep rich from reading brackets as markup."""
-    from rich.markup import escape
-
-    return escape(text)
 
 
 def _content(effect: Effect) -> dict[str, Any]:
@@ -122,12 +101,12 @@ def _effect(name: str) -> Effect:
 
 
 def _explain_effect(effect: Effect) -> None:
-    table = _table("", "parameter", "unit", "meaning", "bounds", "plausible range", "neutral", "typical")
+    rows = []
     for name, p in effect.parameters.items():
         cells = (p.doc, _range((p.low, p.high)), _range(p.prior), _neutral(p.neutral), f"{p.severity:g}")
-        table.add_row(f"{name} (optional)" if p.optional else name, p.unit, *map(_plain, cells))
+        rows.append((f"{name} (optional)" if p.optional else name, p.unit, *cells))
     print(f"{effect.name}: {effect.doc}\n  {effect.equation}\n  where: {', '.join(effect.where)}\n")
-    _show(table)
+    _show(("parameter", "unit", "meaning", "bounds", "plausible range", "neutral", "typical"), rows)
 
 
 def _neutral(value: float | str) -> str:
@@ -135,13 +114,11 @@ def _neutral(value: float | str) -> str:
 
 
 def _explain_formulas() -> None:
-    where = _table("where a formula may act", "where", "unit", "meaning")
-    for names, unit, meaning in coordinates():
-        where.add_row("\n".join(names), unit, meaning)
-    features = _table("what it may depend on", "name", "unit", "meaning", "of the")
-    for name, feature in FEATURES.items():
-        features.add_row(name, feature.unit, feature.doc, feature.scope)
-    _show(where, features)
+    _show(
+        ("where", "unit", "meaning"), [(", ".join(n), unit, text) for n, unit, text in coordinates()], "where a formula may act"
+    )
+    features = [(name, one.unit, one.doc, one.scope) for name, one in FEATURES.items()]
+    _show(("name", "unit", "meaning", "of the"), features, "what it may depend on")
 
 
 def _check(patches: Sequence[Patch], together: Patch, options: EffectsOptions) -> None:
@@ -156,16 +133,11 @@ def _check(patches: Sequence[Patch], together: Patch, options: EffectsOptions) -
     if options.json:
         print_json({"robot": robot.name, "effects": together.content()["effects"], "changes": changed})
         return
-    table = _table("", "effect", "where", "parameters", "from")
-    for patch in patches:
-        for effect in patch.effects:
-            table.add_row(effect.name, ", ".join(effect.where), _plain(_numbers(effect)), patch.source)
-    _show(table)
-    changes = _table(f"what changes in robot '{robot.name}'", "parameter", "nominal", "patched", "unit")
-    for name, one in changed.items():
-        changes.add_row(_plain(name), f"{one['nominal']:.6g}", f"{one['patched']:.6g}", one["unit"])
-    if changed:
-        _show(changes)
+    rows = [(one.name, ", ".join(one.where), _numbers(one), patch.source) for patch in patches for one in patch.effects]
+    _show(("effect", "where", "parameters", "from"), rows)
+    changes = [(name, f"{one['nominal']:.6g}", f"{one['patched']:.6g}", one["unit"]) for name, one in changed.items()]
+    if changes:
+        _show(("parameter", "nominal", "patched", "unit"), changes, f"what changes in robot '{robot.name}'")
     else:
         print("no parameter changes")
 

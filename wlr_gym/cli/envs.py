@@ -8,13 +8,13 @@ from typing import Any
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.results import print_json
+from wlr_gym.cli.tables import print_table
 from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
 from wlr_gym.envs.tasks import Randomization, Task, describe, describe_randomization, load_randomization, load_task
 from wlr_gym.envs.tasks.describe import describe_scaling
@@ -56,11 +56,11 @@ def run(options: EnvsOptions) -> int:
     if options.json:
         print_json(found)
         return OK
-    table = Table("id", "action", "observation", "control", "episode", box=None)
-    for one in found:
-        rate, length = f"{1 / one['control_period']:g} Hz", f"{one['episode_length']:g} s"
-        table.add_row(one["id"], f"Box({one['action']})", f"Box({one['observation']})", rate, length)
-    Console().print(table)
+    rows = [
+        (one["id"], f"Box({one['action']})", f"Box({one['observation']})", f"{1 / one['control_period']:g} Hz",
+         f"{one['episode_length']:g} s") for one in found
+    ]  # fmt: skip
+    print_table(Console(), ("id", "action", "observation", "control", "episode"), rows)
     return OK
 
 

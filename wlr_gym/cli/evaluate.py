@@ -13,7 +13,6 @@ import tyro
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import make_output_folder, refuse_existing
@@ -21,6 +20,7 @@ from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of
 from wlr_gym.cli.results import print_json
+from wlr_gym.cli.tables import print_table
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.evaluation import (
@@ -332,9 +332,4 @@ def print_card(card: Card) -> None:
 
 def _print(title: str, table: Sequence[Sequence[str]]) -> None:
     header, *body = table
-    shown = Table(*header, box=None, title=f"\n{title}", title_justify="left")
-    for row in body:
-        shown.add_row(*row)
-    console = Console()
-    console.width = max(console.width, 60 + 20 * len(header))  # rather a wide line than a cut number
-    console.print(shown)
+    print_table(Console(), header, body, title)

@@ -113,18 +113,16 @@ def _emulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backen
 
 def print_rounds(decision: Decided, console: Console) -> None:
     """Print a row for every round, and how it ended."""
-    from rich import box
-    from rich.table import Table
-
     from wlr_gym.base.text import duration
+    from wlr_gym.cli.tables import print_table
     from wlr_gym.gap.report.text import plain
 
     history = decision.history
-    table = Table("round", "runs", "names left", "drive next", "seconds", "why", box=box.SIMPLE)
+    rows = []
     for one in history.rounds:
         left = ", ".join(f"{plain(name)} {share:.0%}" for name, share in one.names.items()) or plain(one.verdict)
         driven = one.excitation and f"{one.excitation}{f' ({one.run})' if one.run else ''}"
         why = "; ".join(filter(None, [one.why, one.stopped]))
-        table.add_row(str(one.number), str(len(one.runs)), left, driven, f"{one.seconds:.0f}" if one.run else "", why)
-    console.print(table)
+        rows.append((str(one.number), str(len(one.runs)), left, driven or "", f"{one.seconds:.0f}" if one.run else "", why))
+    print_table(console, ("round", "runs", "names left", "drive next", "seconds", "why"), rows)
     console.print(f"{history.ended}, after {len(history.driven)} further runs, {duration(history.seconds)} of driving")

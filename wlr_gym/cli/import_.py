@@ -137,14 +137,10 @@ def _suggest(options: ImportOptions, given: dict[str, Any], console: Console) ->
 
 
 def _print_proposal(found: Proposal, console: Console) -> None:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
+    from wlr_gym.cli.tables import print_table
 
-    table = Table("of the map", "how sure", "why", box=box.SIMPLE)
-    for reason in found.reasons:
-        table.add_row(reason.what, Text(reason.sure, _COLOURS[reason.sure]), Text(reason.why))
-    console.print(table)
+    rows = [(reason.what, reason.sure, reason.why) for reason in found.reasons]
+    print_table(console, ("of the map", "how sure", "why"), rows, styles=[_COLOURS[reason.sure] for reason in found.reasons])
     if found.unused:
         console.print(f"not used: {', '.join(found.unused)}", style="dim", markup=False)
     _print_costs(_columns(found), console)
@@ -171,7 +167,7 @@ def _report(imported: Sequence[ImportedRun], console: Console) -> None:
     for source, note in dict.fromkeys((one.source, note) for one in imported for note in one.notes):
         console.print(f"{source}: {note}", style="yellow", markup=False)
     if first.facts:
-        console.print(_facts_table(first))
+        _print_facts(first, console)
         _print_costs({fact.column for fact in first.facts}, console)
     for one in imported:
         console.print(f"written: {one.path}", markup=False)
@@ -179,11 +175,10 @@ def _report(imported: Sequence[ImportedRun], console: Console) -> None:
             console.print(f"  {finding.kind} in '{finding.column}': {finding.message}", style="yellow", markup=False)
 
 
-def _facts_table(one: ImportedRun) -> Any:
-    from rich import box
-    from rich.table import Table
+def _print_facts(one: ImportedRun, console: Console) -> None:
+    from wlr_gym.cli.tables import print_table
 
-    table = Table("channels", "topic", "unit", "samples/s", "rows", "moved, ms rms", "rows with a value", box=box.SIMPLE)
+    rows = []
     groups: dict[tuple[Any, ...], list[Any]] = {}
     for fact in one.facts:
         key = (fact.column.partition("_")[0], fact.topic, fact.unit, fact.how)
@@ -192,5 +187,6 @@ def _facts_table(one: ImportedRun) -> Any:
         columns = facts[0].column if len(facts) == 1 else f"{kind} ({len(facts)})"
         moved = max(fact.moved for fact in facts)
         known = min(fact.known for fact in facts)
-        table.add_row(columns, topic, unit, f"{facts[0].rate:.0f}", how, f"{1e3 * moved:.1f}", f"{100 * known:.0f} %")
-    return table
+        rows.append((columns, topic, unit, f"{facts[0].rate:.0f}", how, f"{1e3 * moved:.1f}", f"{100 * known:.0f} %"))
+    headings = ("channels", "topic", "unit", "samples/s", "rows", "moved, ms rms", "rows with a value")
+    print_table(console, headings, rows)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from wlr_gym.robot import Robot
+    from wlr_gym.studies.paper.claims import CheckedClaim
     from wlr_gym.studies.paper.experiments import Record
     from wlr_gym.studies.paper.slip_search import SearchFinding
 
@@ -169,17 +170,10 @@ def _search(robot: Robot, options: PaperOptions, tell: Tell) -> list[SearchFindi
     return search(robot, options.draws, options.levels, options.seed, threads=options.threads, tell=told)
 
 
-def _show(console: Console, claims: Sequence[object]) -> None:
-    from rich import box
-    from rich.table import Table
+def _show(console: Console, claims: Sequence[CheckedClaim]) -> None:
+    from wlr_gym.cli.tables import print_table
+    from wlr_gym.studies.paper.claims import FAILS
 
-    from wlr_gym.studies.paper.claims import FAILS, CheckedClaim
-
-    table = Table(title="The paper's claims", title_justify="left", title_style="bold", box=box.SIMPLE, padding=(0, 1, 0, 0))
-    for heading in ("#", "claim", "paper", "here", "verdict"):
-        table.add_column(heading, overflow="fold")
-    for claim in claims:
-        assert isinstance(claim, CheckedClaim)
-        style = "red" if claim.verdict == FAILS else None
-        table.add_row(str(claim.number), claim.text, claim.paper, claim.ours, claim.verdict, style=style)
-    console.print(table)
+    rows = [(str(claim.number), claim.text, claim.paper, claim.ours, claim.verdict) for claim in claims]
+    styles = ["red" if claim.verdict == FAILS else "" for claim in claims]
+    print_table(console, ("#", "claim", "paper", "here", "verdict"), rows, "The paper's claims", styles)

@@ -210,7 +210,7 @@ def _summary(kind: type) -> str:
 def _sentence(text: str) -> str:
     """Return a text as a sentence; names and units that it begins with stay as they are."""
     text = _plain(" ".join(text.split()))
-    if not re.match(r"\S*[,:=]|\S+ =", text):
+    if not re.match(r"\S*[:=]|\S+ =", text):
         text = text[:1].upper() + text[1:]
     return text + ("" if not text or text[-1] in ".?!)" else ".")
 

@@ -191,9 +191,7 @@ def _record_simulations(
 
 
 def _list(console: Console, robot: Robot, as_json: bool) -> None:
-    from rich import box
-    from rich.table import Table
-
+    from wlr_gym.cli.tables import print_table
     from wlr_gym.data.excitations import EXCITATIONS, excite
 
     if as_json:
@@ -204,7 +202,5 @@ def _list(console: Console, robot: Robot, as_json: bool) -> None:
             ]
         )
         return
-    table = Table("excitation", "seconds", "what the robot does", "what it shows", box=box.SIMPLE)
-    for name, excitation in EXCITATIONS.items():
-        table.add_row(name, f"{excite(name, robot=robot).duration:.0f}", excitation.doc, excitation.shows)
-    console.print(table)
+    rows = [(name, f"{excite(name, robot=robot).duration:.0f}", one.doc, one.shows) for name, one in EXCITATIONS.items()]
+    print_table(console, ("excitation", "seconds", "what the robot does", "what it shows"), rows)

@@ -23,7 +23,6 @@ from wlr_gym.cli.robot_options import HardwareOption, confirm
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
     from wlr_gym.data import Run
     from wlr_gym.data.replay import ChannelError, ReplayResult
@@ -202,20 +201,10 @@ def _print(results: Sequence[ReplayResult], patch: Patch, console: Console, othe
             console.print(line, style="yellow", highlight=False, soft_wrap=True)
     errors = [pair for result in results for pair in result.errors.items()]
     runs = f"{len(results)} run{'s' if len(results) > 1 else ''}"
-    console.print(_error_table(errors, f"Measured minus {other}, rms ({runs}, effects added: {patch.summary()})"))
-    console.print(_joint_table(errors))
+    _print_errors(errors, f"Measured minus {other}, rms ({runs}, effects added: {patch.summary()})", console)
+    _print_joints(errors, console)
     if len(results) > 1:
-        console.print(_run_table(results))
-
-
-def _table(title: str, headings: Sequence[str]) -> Table:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE, padding=(0, 1, 0, 0))
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading in {"channel", "unit", "run"} else "right", no_wrap=True)
-    return table
+        _print_runs(results, console)
 
 
 def _grouped(errors: Sequence[tuple[str, ChannelError]]) -> dict[str, list[ChannelError]]:
@@ -236,33 +225,35 @@ def _in_noise_units(errors: Sequence[ChannelError]) -> str:
     return f"{pooled(errors, lambda error: error.segment_rms / error.noise):.1f}" if errors else "-"
 
 
-def _error_table(errors: Sequence[tuple[str, ChannelError]], title: str) -> Table:
+def _print_errors(errors: Sequence[tuple[str, ChannelError]], title: str, console: Console) -> None:
+    from wlr_gym.cli.tables import print_table
     from wlr_gym.data.replay import pooled
 
-    headings = ("channel", "unit", "noise", "segment", "full run", "segment\n/noise", "full run\n/noise")
-    table = _table(title, headings)
+    rows = []
     for group, members in _grouped(errors).items():
         noise, unit = members[0].noise, members[0].unit
         segment, full = pooled(members, lambda e: e.segment_rms), pooled(members, lambda e: e.full_run_rms)
         ratios = (f"{segment / noise:.1f}", f"{full / noise:.1f}")
-        table.add_row(group, unit, f"{noise:.2g}", f"{segment:.3g}", f"{full:.3g}", *ratios)
-    return table
+        rows.append((group, unit, f"{noise:.2g}", f"{segment:.3g}", f"{full:.3g}", *ratios))
+    headings = ("channel", "unit", "noise", "segment", "full run", "segment / noise", "full run / noise")
+    print_table(console, headings, rows, title)
 
 
-def _joint_table(errors: Sequence[tuple[str, ChannelError]]) -> Table:
+def _print_joints(errors: Sequence[tuple[str, ChannelError]], console: Console) -> None:
+    from wlr_gym.cli.tables import print_table
     from wlr_gym.data.format import COLUMNS
     from wlr_gym.robot import CORNERS
 
-    table = _table("Segment error of each joint, in units of sensor noise", ("channel", *CORNERS))
-    for group in ("pos_leg", "vel_leg", "eff_leg", "pos_wheel", "vel_wheel", "eff_wheel"):
-        if any(COLUMNS[name].group == group for name, _ in errors):
-            table.add_row(
-                group, *(_in_noise_units([e for name, e in errors if name == f"{group}_{corner}"]) for corner in CORNERS)
-            )
-    return table
+    rows = [
+        (group, *(_in_noise_units([e for name, e in errors if name == f"{group}_{corner}"]) for corner in CORNERS))
+        for group in ("pos_leg", "vel_leg", "eff_leg", "pos_wheel", "vel_wheel", "eff_wheel")
+        if any(COLUMNS[name].group == group for name, _ in errors)
+    ]
+    print_table(console, ("channel", *CORNERS), rows, "Segment error of each joint, in units of sensor noise")
 
 
-def _run_table(results: Sequence[ReplayResult]) -> Table:
+def _print_runs(results: Sequence[ReplayResult], console: Console) -> None:
+    from wlr_gym.cli.tables import print_table
     from wlr_gym.data.format import COLUMNS
 
     def kind(name: str) -> str:
@@ -270,8 +261,8 @@ def _run_table(results: Sequence[ReplayResult]) -> Table:
         return group.partition("_")[0] if group.startswith("cam") else group
 
     kinds = list(dict.fromkeys(kind(name) for result in results for name in result.errors if name != "volt"))
-    table = _table("Segment error of each run, in units of sensor noise", ("run", *(name.replace("_", "\n") for name in kinds)))
+    rows = []
     for result in results:
         members = [[error for name, error in result.errors.items() if kind(name) == wanted] for wanted in kinds]
-        table.add_row(result.run.name, *map(_in_noise_units, members))
-    return table
+        rows.append((result.run.name, *map(_in_noise_units, members)))
+    print_table(console, ("run", *kinds), rows, "Segment error of each run, in units of sensor noise")

@@ -154,8 +154,7 @@ def _analyse(
 
 
 def _print(analysis: VideoAnalysis, console: Console) -> None:
-    from rich import box
-    from rich.table import Table
+    from wlr_gym.cli.tables import print_table
 
     found = analysis.summary()
     for finding in found["findings"]:
@@ -163,20 +162,17 @@ def _print(analysis: VideoAnalysis, console: Console) -> None:
     status = ", ".join(f"{count} {name}" for name, count in found["status"].items() if count)
     known = f" ± {1e3 * found['offset_std_s']:.1f}" if found["offset_std_s"] else " (given)"
     console.print(f"{found['frames']} frames ({status}); clocks differ by {1e3 * found['offset_s']:.1f}{known} ms")
-    table = Table(
-        title=f"Slip over {found['seconds']:.1f} s, mm ± 1 sigma", title_justify="left", title_style="bold", box=box.SIMPLE
-    )
-    for heading in ("wheel", "longitudinal", "± from radius", "lateral", "± from layout"):
-        table.add_column(heading, justify="left" if heading == "wheel" else "right")
-    for wheel, w in found["wheels"].items():
-        table.add_row(
+    rows = [
+        (
             wheel, f"{1e3 * w['longitudinal_slip_m']:+.2f} ± {1e3 * w['longitudinal_std_m']:.2f}",
             f"{1e3 * w['longitudinal_std_from_radius_m']:.2f}",
             f"{1e3 * w['lateral_slip_m']:+.2f} ± {1e3 * w['lateral_std_m']:.2f}",
             ", ".join(f"{1e3 * w[f'{axis}_std_from_layout_m']:.2f}" for axis in ("longitudinal", "lateral")),
-        )  # fmt: skip
+        ) for wheel, w in found["wheels"].items()
+    ]  # fmt: skip
     body = (f"{1e3 * found[f'body_{axis}_slip_m']:+.2f}" for axis in ("longitudinal", "lateral"))
     longitudinal, lateral = body
-    table.add_row("body", longitudinal, "", lateral, "")
-    console.print(table)
+    headings = ("wheel", "longitudinal", "± from radius", "lateral", "± from layout")
+    title = f"Slip over {found['seconds']:.1f} s, mm ± 1 sigma"
+    print_table(console, headings, [*rows, ("body", longitudinal, "", lateral, "")], title)
     console.print(f"share of the predicted path that ignoring slip gets wrong: {100 * found['no_slip_error']:.2f} %")

@@ -26,7 +26,7 @@ class VisionCheckOptions(JsonOption):
         camera: calibration file; make one with: wlr calibrate camera.
         markers: markers on the robot: name in configs/vision/ or path.
         floor: markers on the floor: name in configs/vision/ or path.
-        only: markers or floor, when the photograph shows one of them.
+        only: which of them the photograph shows, when it is one: markers or floor.
     """
 
     photo: Annotated[Path, tyro.conf.Positional]

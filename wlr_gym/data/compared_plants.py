@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 
 #: s at the first setpoints before time 0, not compared: until the bounce of being set down has died out.
 SETTLE = 0.5
+#: Steps between two calls with the share that is done.
+_TOLD = 50
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,7 @@ def drive(
     parameters: Parameters | None = None,
     patch: Patch | None = None,
     threads: int = 1,
+    tell: Callable[[float], None] = lambda share: None,
 ) -> Traces:
     """Drive all motions on one plant, one robot of a batch each; a shorter motion stays at its last setpoints.
 
@@ -153,6 +156,7 @@ def drive(
         parameters: (1) physical parameters; None = nominal. Each motion's servo profile is written into them.
         patch: effects to add.
         threads: of the plant.
+        tell: called with the share that is done.
     """
     patch = patch or Patch()
     batch = _parameters(motions, robot, parameters, patch)
@@ -169,6 +173,8 @@ def drive(
         for tick in range(len(setpoints) + 1):
             sensors.append(readings.values.copy())
             truth.append(simulator.truth().values.copy())
+            if tick % _TOLD == 0:
+                tell(tick / len(setpoints))
             if tick < len(setpoints):
                 readings = simulator.step(setpoints[tick], torque_on[tick])
     finally:

@@ -8,7 +8,7 @@ the models.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -153,6 +153,7 @@ def compare(
     threshold: float = 5.0,
     halve: bool = False,
     threads: int = 1,
+    tell: Callable[[str, float], None] = lambda doing, share: None,
 ) -> Comparison:
     """Drive the same motions on two plants and compare all they show.
 
@@ -166,6 +167,7 @@ def compare(
         threshold: two signals have diverged when they differ by more than this many units of resolution.
         halve: repeat at half of both steps.
         threads: of each plant.
+        tell: called with what is being done and the share that is done.
 
     Raises:
         InputError: no motions or of different periods, a threshold that is not positive, an unknown effect.
@@ -179,17 +181,21 @@ def compare(
     robot, patch = robot or load_robot(), load_patch(effects)
     signals = resolutions(robot)
 
-    def driven(plant: ComparedPlant) -> Traces:
-        return drive(plant, motions, robot, parameters, patch, threads)
+    driven = [*plants, *(plant.halved for plant in plants if halve)]
+
+    def traces(k: int) -> Traces:
+        doing = f"driving {driven[k].label}"
+        return drive(
+            driven[k], motions, robot, parameters, patch, threads, lambda share: tell(doing, (k + share) / len(driven))
+        )
 
     def between(a: Traces, b: Traces) -> tuple[MotionComparison, ...]:
         return tuple(_case(motion, k, a, b, signals, robot, threshold) for k, motion in enumerate(motions))
 
-    first, second = (driven(plant) for plant in plants)
+    first, second, *halves = map(traces, range(len(driven)))
     cases = between(first, second)
     half, own = None, None
     if halve:
-        halves = [driven(plant.halved) for plant in plants]
         half, own = between(*halves), (between(first, halves[0]), between(second, halves[1]))
     return Comparison(patch.summary(), threshold, tuple(motions), first, second, cases, signals, half, own)
 

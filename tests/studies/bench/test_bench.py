@@ -104,7 +104,7 @@ def test_a_peer_that_is_given_up_gives_a_lower_bound(monkeypatch, dummy, workers
 
 def test_a_lower_bound_is_printed_as_one(capsys):
     row = Measurement("learning", "w", "1/h", (20.0,), (2.0,), "peer", 5.0, at_least=True)
-    bench._print(Console(), bench._speed_table([row]))
+    bench._print_speed([row], Console())
     assert ">= 10 [10..10]" in capsys.readouterr().out
 
 

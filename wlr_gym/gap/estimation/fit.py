@@ -233,8 +233,8 @@ def _noise_within_reach(
     """Return the noise of what the model's numbers would leave if they moved, to first order.
 
     An error that they can remove lasts until they do: with it, a constant error of any size counts as few readings, too few to
-    move a number against its tolerance (a supply that is measured 0.3 V lower than assumed). So with the runs: as long as an
-    effect that some of them show is not in the model they differ, and what differs counts little. ``scatter``: the most assumed.
+    move a number against its tolerance (a supply that is measured 0.3 V lower than assumed). So with the runs: they differ as
+    long as the model lacks what some of them show, and what differs counts little. ``scatter``: the most that is assumed.
     """
     noise = estimate_noise(residuals, np.full(residuals[0].shape[1], scatter), scatter)  # as if every row were independent
     for _ in range(ROUNDS):

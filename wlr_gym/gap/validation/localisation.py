@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -69,33 +70,44 @@ def _dependence(residual: Array, features: Mapping[str, Array]) -> tuple[str, st
     best, best_share, text = "", LEAST_DEPENDENCE, "no clear dependence on the state"
     for name, values in features.items():
         edges = _edges(values[seen])
-        if len(edges) < 3:
+        if not edges.size:
             continue
-        bins = np.clip(np.searchsorted(edges, values[seen], side="right") - 1, 0, len(edges) - 2)
-        means = np.array([square[bins == b].mean() if (bins == b).any() else 0.0 for b in range(len(edges) - 1)])
+        bins = np.searchsorted(edges, values[seen], side="right")
+        means = np.array([square[bins == b].mean() if (bins == b).any() else 0.0 for b in range(len(edges) + 1)])
         share = float(np.var(means[bins]) / max(np.var(square), 1e-12))
         if share > best_share:
             top, low = int(np.argmax(means)), int(np.argmin(means))
             best, best_share = name, share
+            labels = _labels(edges)
             text = (
-                f"largest for {name} in [{edges[top]:.3g}, {edges[top + 1]:.3g}] ({np.sqrt(means[top]):.1f} noise units), "
-                f"smallest in [{edges[low]:.3g}, {edges[low + 1]:.3g}] ({np.sqrt(means[low]):.1f})"
+                f"largest for {name} {labels[top]} ({np.sqrt(means[top]):.1f} noise units), "
+                f"smallest {labels[low]} ({np.sqrt(means[low]):.1f})"
             )
     return text, best
 
 
 def _edges(values: Array) -> Array:
-    return np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1))) if values.size else np.zeros(0)
+    """Return what divides values into bins of about as many, in round figures; the first and the last bin are open."""
+    inner = np.quantile(values, np.linspace(0, 1, BINS + 1)[1:-1]) if values.size else np.zeros(1)
+    spread = np.ptp(inner)
+    if not spread:
+        return np.zeros(0)
+    decimals = 1 - math.floor(math.log10(spread))
+    return np.unique(np.round(inner, decimals) + 0.0)
+
+
+def _labels(edges: Array) -> tuple[str, ...]:
+    between = (f"{a:.6g} to {b:.6g}" for a, b in itertools.pairwise(edges))
+    return (f"below {edges[0]:.6g}", *between, f"above {edges[-1]:.6g}") if edges.size else ("all",)
 
 
 def _heat_map(problem: Problem, rows: Array, channels: Sequence[int], name: str, values: Array) -> HeatMap:
     edges = _edges(values)
-    bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
-    cells = np.full((len(channels), len(edges) - 1), np.nan)
+    bins = np.searchsorted(edges, values, side="right")
+    cells = np.full((len(channels), len(edges) + 1), np.nan)
     for k, c in enumerate(channels):
-        for b in range(len(edges) - 1):
+        for b in range(len(edges) + 1):
             inside = rows[bins == b, c]
             if np.isfinite(inside).any():
                 cells[k, b] = np.sqrt(np.nanmean(np.minimum(inside**2, problem.cap**2)))
-    labels = tuple(f"{a:.3g} .. {b:.3g}" for a, b in itertools.pairwise(edges))
-    return HeatMap(tuple(problem.signals[c].name for c in channels), labels, cells, name)
+    return HeatMap(tuple(problem.signals[c].name for c in channels), _labels(edges), cells, name)

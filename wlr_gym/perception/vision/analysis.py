@@ -32,6 +32,7 @@ from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PART
 from wlr_gym.perception.vision.video import Frames
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
+from wlr_gym.robot.joints import CORNER_NAMES
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -370,7 +371,7 @@ def _draw_pose(analysis: VideoAnalysis) -> Any:
 def _draw_slip(analysis: VideoAnalysis) -> Any:
     figure, panels = _new_figure(3, 8.5)
     slip = analysis.slip
-    for w, (wheel, colour) in enumerate(zip(WHEELS, _WHEEL_COLOURS, strict=True)):
+    for w, (wheel, colour) in enumerate(zip(CORNER_NAMES.values(), _WHEEL_COLOURS, strict=True)):
         for axes, a in ((panels[0], 0), (panels[1], 1)):
             spread = np.hypot(slip.slip_std[:, w, a], slip.slip_layout_std[:, w, a])
             spread = np.hypot(spread, slip.slip_radius_std[:, w]) if a == 0 else spread
@@ -379,9 +380,12 @@ def _draw_slip(analysis: VideoAnalysis) -> Any:
                               color=colour, alpha=0.12, linewidth=0)  # fmt: skip
         panels[2].plot(slip.time, slip.ratio[:, w], color=colour, linewidth=0.9)
     titles = (
-        ("accumulated longitudinal slip (+ skids forward, - spins); band: 2 sigma with wheel radius and marker layout", "mm"),
-        ("accumulated lateral slip (+ to the left); band: 2 sigma with marker layout", "mm"),
-        ("slip ratio (0 rolls freely, +1 spins on the spot, -1 locked)", "-"),
+        (
+            "accumulated longitudinal slip (+ skids forward, - spins); band: 2 sigma with wheel radius and marker layout",
+            "longitudinal slip (mm)",
+        ),
+        ("accumulated lateral slip (+ to the left); band: 2 sigma with marker layout", "lateral slip (mm)"),
+        ("slip ratio (0 rolls freely, +1 spins on the spot, -1 locked)", "slip ratio"),
     )
     for axes, (title, unit) in zip(panels, titles, strict=True):
         axes.set_title(title, fontsize=9, loc="left")

@@ -35,6 +35,7 @@ class Frames:
         seconds: stop this long after the first frame.
 
     Attributes:
+        announced: how many frames there should be; 0 = not known, or not yet read from.
         missing: how many frames a video announces that could not be decoded: it is cut off or damaged. Known at its end.
 
     Raises:
@@ -43,7 +44,7 @@ class Frames:
 
     def __init__(self, source: str, rate: float | None = None, times: Path | None = None, seconds: float | None = None) -> None:
         require_package("cv2", "vision")
-        self.missing = 0
+        self.announced = self.missing = 0
         self._frames = self._read(source, rate, times, seconds)
 
     def __iter__(self) -> Iterator[VideoFrame]:
@@ -76,7 +77,7 @@ class Frames:
     def _images(self, source: str) -> Iterator[tuple[float, Image]]:
         path = Path(source)
         if path.is_dir():
-            return _folder(path)
+            return self._folder(path)
         if not path.is_file():
             raise InputError(f"{source}: no such video or folder of images")
         return self._file(path)
@@ -90,6 +91,7 @@ class Frames:
             raise InputError(f"{path}: cannot be read as a video; expected a format that OpenCV reads (AVI, MP4, MKV)")
         rate, announced = video.get(cv2.CAP_PROP_FPS), video.get(cv2.CAP_PROP_FRAME_COUNT)
         rate = rate if 1 < rate < 2000 else 30.0
+        self.announced = max(round(announced), 0) if math.isfinite(announced) else 0
         index, before = 0, -math.inf
         while True:
             ok, image = video.read()
@@ -103,19 +105,19 @@ class Frames:
         video.release()
         if index == 0:
             raise InputError(f"{path}: opened, but no frame could be decoded; is the file whole?")
-        if math.isfinite(announced) and announced - index > max(1.0, _INEXACT * announced):
-            self.missing = round(announced) - index
+        if self.announced - index > max(1.0, _INEXACT * self.announced):
+            self.missing = self.announced - index
 
-
-def _folder(folder: Path) -> Iterator[tuple[float, Image]]:
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
-    if not files:
-        raise InputError(f"{folder}: no images ({', '.join(IMAGES)})")
-    for index, path in enumerate(files):
-        image = read_image(path)
-        if image is None:
-            raise InputError(f"{path}: cannot be read as an image")
-        yield index / 30.0, image
+    def _folder(self, folder: Path) -> Iterator[tuple[float, Image]]:
+        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
+        if not files:
+            raise InputError(f"{folder}: no images ({', '.join(IMAGES)})")
+        self.announced = len(files)
+        for index, path in enumerate(files):
+            image = read_image(path)
+            if image is None:
+                raise InputError(f"{path}: cannot be read as an image")
+            yield index / 30.0, image
 
 
 def read_image(path: Path) -> Image | None:

@@ -72,23 +72,26 @@ def _millimetres(value: float | None) -> str:
     return "lost" if value is None else f"{1e3 * value:.3g} mm" if value < 0.1 else f"{1e3 * value:.0f} mm"
 
 
-def lines(report: dict[str, Any]) -> list[str]:
-    """Return the reference and the table of all settings as lines of Markdown; ``report`` is ``EngineReport.as_dict()``."""
+def reference_text(report: dict[str, Any]) -> str:
+    """Return what the errors are against, and how far that is known; ``report`` is ``EngineReport.as_dict()``."""
     reference = report["reference"]
     apart, rest = reference["disagreement"], reference["convergence"]
     closed = "; ".join(f"{name}: {1e3 * value:+.2f} mm" for name, value in reference["closed_form"].items())
-    text = (
+    return (
         f"The limits of both simulators differ by {1e6 * apart['median']:.2g} µm (median) and {1e6 * apart['max']:.2g} µm "
         f"(largest) and lie {1e6 * rest['max']:.2g} µm at most beyond the finest step. Distance driven, reference minus the "
         f"closed form of a rigid robot: {closed}. {NOT_MEASURED}"
     )
-    rows = ["| side | setting | precision | error, rms | worst | x real time |", "|---|---|---|---|---|---|"]
+
+
+def settings_table(report: dict[str, Any]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return headings and rows: error and speed of every setting; ``report`` as for :func:`reference_text`."""
+    rows = []
     for one in report["settings"]:
         errors = [_millimetres(one[key]) if one["upright"] else "falls" for key in ("error", "worst")]
-        speed = one["speed"]
-        cells = (one["side"], one["label"], one["precision"], *errors)
-        rows.append(f"| {' | '.join(cells)} | {speed['median']:.4g} [{speed['min']:.4g}..{speed['max']:.4g}] |")
-    return [text, "", *rows]
+        speed = "{median:.4g} [{min:.4g}..{max:.4g}]".format(**one["speed"])
+        rows.append((one["side"], one["label"], one["precision"], *errors, speed))
+    return ("side", "setting", "precision", "error, rms", "worst", "x real time"), rows
 
 
 _COLOURS = {"float64": "#1f4e9c", "float32": "#e06c00"}

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from wlr_gym.base.files import replace_file
@@ -33,6 +34,8 @@ _STYLES: dict[str, dict[str, Any]] = {
 _IDEAL: dict[str, Any] = {"color": "0.6", "linewidth": 3.0, "alpha": 0.6}
 #: s; what is before, the robot settling on its legs, is not drawn.
 _FROM = -0.5
+#: s between two ticks.
+_TICK = 5.0
 _UNEVEN = ("tab:purple", "tab:green")
 _RPM = 60.0 / (2.0 * np.pi)
 #: A grid of axes.
@@ -65,8 +68,9 @@ def _over_time(figure: Figure, axes: Panels) -> Figure:
     """Finish a figure whose panels share the time."""
     for panel in axes.flat:
         panel.set_xlim(_FROM, duration() + 0.5)
+        panel.xaxis.set_major_locator(MultipleLocator(_TICK))
     for panel in axes[-1]:
-        panel.set_xlabel("t (s)", fontsize=9)
+        panel.set_xlabel("time (s)", fontsize=9)
     return _finish(figure, axes)
 
 
@@ -249,7 +253,7 @@ def question_figure(findings: Sequence[SearchFinding]) -> Figure:
     for panel in list(axes.flat)[len(alone) + len(best) :]:
         panel.set_axis_off()
     for panel in axes[:, 0]:
-        panel.set_ylabel("|lateral| (cm)", fontsize=9)
+        panel.set_ylabel("lateral displacement (cm)", fontsize=9)
     for panel in axes[-1]:
         panel.set_xlabel("error of ignoring slip (%)", fontsize=9)
     return _finish(figure, axes)

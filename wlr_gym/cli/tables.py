@@ -1,0 +1,125 @@
+"""The one table of all commands: it fits the terminal, wraps words and headings, and never breaks a number."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+#: Columns between two columns of a table, where there is room and where there is little.
+_GAPS = (2, 1)
+#: A column of a text is made no narrower than this to have another beside it.
+_LEAST_TEXT = 14
+_HARD_SPACE = "\N{NO-BREAK SPACE}"
+_SIZE = r"[-+]?[\d.,]*\d(e[-+]\d+)?%?"
+_UNIT = r"[^\W\d][^\s,;:.)]{0,4}(?![^\s,;:.)])"
+_ERROR = r"(±|\+-) ?[\d.]+"
+#: What stays together in a text: what is in brackets, a number with its unit and its error.
+_TOGETHER = re.compile(rf"\[[^][]*\]|{_SIZE}( {_UNIT})?( {_ERROR})?( {_UNIT})?|{_ERROR}")
+#: A cell of a column of numbers.
+_NUMBER = re.compile(rf"-?|([<>=]+ )?{_SIZE}( \.\. {_SIZE})?( {_UNIT})?( {_ERROR})?( {_UNIT})?( \[[^][]*\])?( !)?")
+
+
+class _Words(textwrap.TextWrapper):
+    """Breaks a text between words."""
+
+    wordsep_simple_re = re.compile(r"( +)")
+
+
+class _Names(textwrap.TextWrapper):
+    """Breaks a heading between words, and a name in it after an underscore, a comma or an equals sign."""
+
+    wordsep_simple_re = re.compile(r"( +|(?<=[_,=])(?=\w))")
+
+
+def print_table(
+    console: Console, headings: Sequence[str], rows: Iterable[Sequence[str]], title: str = "", styles: Sequence[str] = ()
+) -> None:
+    """Print a table in the width of the console.
+
+    Where all columns do not fit beside each other, those that are left follow below, each time with the first column.
+
+    Args:
+        console: where to.
+        headings: of the columns.
+        rows: of cells; a cell with line breaks has several lines.
+        title: above the table.
+        styles: of each row; none = plain.
+    """
+    table = [[str(cell).replace("\n", " ") for cell in headings], *([str(cell) for cell in row] for row in rows)]
+    columns = [list(column) for column in zip(*table, strict=True)]
+    if title:
+        console.print(title, style="bold", markup=False, highlight=False)
+    while columns:
+        count, gap = _fitting(columns, console.width)
+        console.print(_drawn(columns[:count], gap, console.width, styles))
+        console.print()
+        columns = [columns[0], *columns[count:]] if count < len(columns) else []
+
+
+def _fitting(columns: Sequence[Sequence[str]], width: int) -> tuple[int, int]:
+    """Return how many of the columns fit beside each other, two at least, and the gap between them."""
+    least = [_least(column) for column in columns]
+    for gap in _GAPS:
+        if sum(least) + gap * (len(columns) - 1) <= width:
+            return len(columns), gap
+    fitting = [k for k in range(2, len(columns)) if sum(least[:k]) + _GAPS[0] * (k - 1) <= width]
+    return max(fitting, default=min(2, len(columns))), _GAPS[0]
+
+
+def _drawn(columns: Sequence[Sequence[str]], gap: int, width: int, styles: Sequence[str]) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, padding=(0, gap, 0, 0), pad_edge=False)
+    widths = _widths(columns, width - gap * (len(columns) - 1))
+    for index, (column, wide) in enumerate(zip(columns, widths, strict=True)):
+        justify = "right" if index and _is_number(column[1:]) else "left"
+        heading = Text("\n".join(_lines(column[0], wide, _Names)))
+        table.add_column(heading, justify=justify, vertical="top", no_wrap=True, width=wide)
+    for index, row in enumerate(list(zip(*columns, strict=True))[1:]):
+        cells = (Text("\n".join(_lines(cell, wide, _Words))) for cell, wide in zip(row, widths, strict=True))
+        table.add_row(*cells, style=styles[index] if styles else "")
+    return table
+
+
+def _widths(columns: Sequence[Sequence[str]], room: int) -> list[int]:
+    """Return the widths of columns: the same upper bound for all, as large as there is room; none below what it needs."""
+    natural = [max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
+    least = [min(_least(column), most) for column, most in zip(columns, natural, strict=True)]
+    found = least
+    for bound in range(max(natural) + 1):
+        tried = [min(most, max(few, bound)) for most, few in zip(natural, least, strict=True)]
+        if sum(tried) > room:
+            break
+        found = tried
+    return found
+
+
+def _least(column: Sequence[str]) -> int:
+    """Return the least width of a column: its longest word or number; of texts, what can still be read."""
+    natural = max(len(line) for cell in column[1:] for line in cell.split("\n")) if column[1:] else 0
+    heading = max((len(line) for line in _lines(column[0], 1, _Names)), default=0)
+    words = max((len(line) for cell in column[1:] for line in _lines(cell, 1, _Words)), default=0)
+    return max(heading, words, min(natural, _LEAST_TEXT) if not _is_number(column[1:]) else 0)
+
+
+def _lines(text: str, width: int, wrapper: type[textwrap.TextWrapper]) -> list[str]:
+    """Return a cell's lines; numbers stay together, and what is indented stays so."""
+    found = []
+    for line in text.split("\n"):
+        kept = _TOGETHER.sub(lambda one: one[0].replace(" ", _HARD_SPACE), line)
+        indent = line[: len(line) - len(line.lstrip())]
+        broken = wrapper(max(width, 1), subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+        found += [part.replace(_HARD_SPACE, " ") for part in broken.wrap(kept) or [""]]
+    return found
+
+
+def _is_number(cells: Sequence[str]) -> bool:
+    """Tell whether a column holds numbers, some of which may be missing."""
+    return all(_NUMBER.fullmatch(cell) for cell in cells)
