@@ -12,8 +12,11 @@ from PIL import Image
 
 from wlr_gym.cli import main
 from wlr_gym.cli import play as play_module
+from wlr_gym.envs.tasks.signals import Signals
+from wlr_gym.envs.tasks.terms.geometry import PlanarPose
+from wlr_gym.envs.tasks.terms.references import path_error
 from wlr_gym.learning.evaluation import make_core
-from wlr_gym.learning.evaluation.film import Journey, drive, film, film_length
+from wlr_gym.learning.evaluation.film import Journey, commands, drive, film, film_length
 from wlr_gym.policy import make_policy
 from wlr_gym.render.teleop import RESET, UP, Script
 from wlr_gym.render.view import View
@@ -73,10 +76,33 @@ def test_a_path_is_where_the_robot_went_and_where_it_was_told_to_go():
     assert len(wanted) == len(driven) == 101
 
 
+@pytest.mark.parametrize("shape", [0.5, 1.5, 2.5])
+def test_a_commanded_path_is_drawn_on_the_floor_it_was_commanded_on(shape):
+    """A robot on a point of the dashed line has no error from the path; the line is as long as the speed makes it."""
+    core = make_core("WLR-Path-v0", 1, {"randomization": "none", "effects": ()})
+    bend = {"path_shape": shape, "path_curvature": 1.5, "path_wavelength": 1.0, "path_offset": 0.02, "path_heading": 0.1}
+    core.begin_episodes(core.everyone, {"command": {**bend, "linear_velocity_x": 0.1}})
+    path, given = Journey(), commands(core)
+    core.start[0] = (1.0, -2.0, 0.7)
+    for _ in range(500):
+        path.note(core)
+        core.episodes.steps += 1
+    wanted = path.trails()[0].points
+    core.close()
+    read = Signals({f"command.{name}": np.full(500, value) for name, value in given.items()}.__getitem__)
+    away = wanted - [1.0, -2.0]
+    pose = PlanarPose(away @ [np.cos(0.7), np.sin(0.7)], away @ [-np.sin(0.7), np.cos(0.7)], np.zeros(500))
+    assert np.abs(path_error(read, pose).lateral).max() < 1e-5
+    length = np.hypot(*np.diff(wanted, axis=0).T).sum()
+    assert length == pytest.approx(0.1 * 499 * core.task.config.control_period, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         ([], "no display here"),
+        (["--agent", "pidd"], "did you mean 'pid'?"),
+        (["WLR-Pth-v0"], "did you mean 'WLR-Path-v0'?"),
         (["--beside", "pid"], "--beside: two robots are shown in a video only"),
         (["--video", "film.webp", "--fps", "0"], "--fps 0: expected 1 to 1000"),
         (["--video", "film.avi"], "--video film.avi: expected a file that ends in"),

@@ -9,6 +9,14 @@ from wlr_gym.cli import main
 COMMANDS = {
     "a command": (["trian"], "unknown command 'trian' (did you mean 'train'?)"),
     "a command of a command": (["robot", "shwo"], "unknown command of wlr robot 'shwo' (did you mean 'show'?)"),
+    "a command beside what a command takes": (["vision", "chek"], "unknown word 'chek' (did you mean 'check'?)"),
+    "a policy to look at": (["doctor", "pidd", "--emulated"], "did you mean 'pid'?"),
+    "a policy on an emulated robot": (["deploy", "pidd", "--env", "WLR-Path-v0", "--emulated"], "did you mean 'pid'?"),
+    "an environment of an emulated robot": (
+        ["deploy", "pid", "--env", "WLR-Pth-v0", "--emulated"],
+        "did you mean 'WLR-Path-v0'?",
+    ),
+    "a command of an emulated robot": (["deploy", "pid", "--command", "yaw=1", "--emulated"], "did you mean 'yaw_rate'?"),
     "an option": (["evaluate", "pid", "--epsiodes", "3"], "unknown option '--epsiodes' (did you mean '--episodes'?)"),
     "one dash": (["record", "-list"], "unknown option '-list' (did you mean '--list'?)"),
     "a number in words": (["evaluate", "pid", "--episodes", "ten"], "--episodes ten: expected a whole number"),

@@ -10,10 +10,11 @@ import keyword
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from wlr_gym import __version__
-from wlr_gym.base.errors import InputError, MissingPackageError, unknown_name
+from wlr_gym.base.errors import InputError, MissingPackageError, nearest, unknown_name
 
 #: Exit codes; an interrupted command ends as a shell reports SIGINT (128 + 2).
 OK = 0
@@ -117,11 +118,20 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     """Parse the arguments of one command and run it."""
     if (name, *arguments[:1]) in NESTED:
         name, arguments = f"{name}_{arguments[0]}", arguments[1:]
+    _check_word(name, arguments)
     from wlr_gym.cli.results import only_results
 
     options = parse(name, arguments)
     with only_results(getattr(options, "json", False)):
         return _module(name).run(options)
+
+
+def _check_word(name: str, arguments: Sequence[str]) -> None:
+    """Refuse a first word that is neither a file nor a command of this command, but nearly one of the latter."""
+    word = next(iter(arguments), "")
+    hint = nearest(word, [inner for outer, inner in NESTED if outer == name])
+    if hint and not Path(word).suffix and not Path(word).exists():
+        raise InputError(f"unknown word '{word}'{hint}; see: wlr {name} --help")
 
 
 def parse(name: str, arguments: Sequence[str]) -> Any:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 from rich.console import Console
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import JsonOption, PatchOption, environment_of, pairs
 from wlr_gym.cli.results import print_json
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.gamepad import DrivingPad
     from wlr_gym.hardware.loop import ControlLoop
     from wlr_gym.hardware.operator import Keys
+    from wlr_gym.policy import Policy
 
 #: How a stop begins that an emulated robot in real time owes to a busy computer.
 _LATE = ("deadlines:", "silence:", "idle:", "watchdog:", "imu: no reading", "no answer from", "NoAnswerError:")
@@ -96,11 +97,12 @@ def run(options: DeployOptions) -> int:
     from wlr_gym.hardware.operator import Keys, stop_on_signals
     from wlr_gym.hardware.realtime import real_time
     from wlr_gym.learning.evaluation import make_core
-    from wlr_gym.policy import environment_for, make_policy
+    from wlr_gym.policy import environment_for
 
     command = _check(options)
     environment = environment_of(options.env, options.policy)
     robot = driven_robot(options)
+    policy = _make_policy(options, environment, robot)
     console = Console()
     with contextlib.ExitStack() as last, contextlib.ExitStack() as stack:  # the stream ends when the motors are off
         ports = port_pairs(options.port)
@@ -110,7 +112,6 @@ def run(options: DeployOptions) -> int:
         keywords = {"backend": "dynamixel", "hardware": _robot(options, ports, poses), "episode_length": options.seconds}
         core = make_core(environment, 1, environment_for(options.policy, keywords | {"robot": robot}))
         stack.callback(core.close)
-        policy = make_policy(options.policy, core.contract())
         _say_what_is_not_known(core, console)
         loop = loop_of(core)
         pads = [stack.enter_context(pad) for pad in _gamepads(options, core, loop, console)]
@@ -192,6 +193,26 @@ def driven_robot(options: DeployOptions) -> Any:
         return made_for
     is_same = robot_hash(load_robot(wired)) == robot_hash(load_robot(made_for))
     return made_for if options.hardware == DeployOptions.hardware and not is_same else wired
+
+
+def _make_policy(options: DeployOptions, environment: str, robot: Any) -> Policy:
+    """Return the policy; it needs no robot, so names and what does not fit are told before one is started.
+
+    Raises:
+        InputError: an unknown environment or command, or a policy that does not fit the environment.
+    """
+    from wlr_gym.envs.core import make_task
+    from wlr_gym.envs.registry import task_source_of
+    from wlr_gym.envs.settings import read_settings
+    from wlr_gym.envs.tasks import contract
+    from wlr_gym.policy import environment_for, make_policy
+
+    keywords = {"backend": "dynamixel", "hardware": {"hardware": options.hardware}, "robot": robot}
+    task = make_task(task_source_of(environment), read_settings(environment_for(options.policy, keywords)))
+    for name in pairs("--command", options.command, "yaw_rate=0.1"):
+        if name not in task.commands:
+            raise unknown_name("command", name, task.commands, "--command")
+    return make_policy(options.policy, contract(task, {}))
 
 
 def _robot(options: DeployOptions, ports: dict[str, str], poses: str | None) -> dict[str, Any]:

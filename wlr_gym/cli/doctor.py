@@ -51,10 +51,14 @@ def run(options: DoctorOptions) -> int:
     """Look and print; 0 when nothing stands against driving.
 
     Raises:
-        InputError: unknown robot or hardware, nothing to scan.
+        InputError: unknown robot, hardware or policy, nothing to scan.
     """
     from rich.console import Console
 
+    from wlr_gym.policy import find_policy
+
+    if options.policy is not None:
+        find_policy(options.policy)
     if options.scan and options.emulated:
         raise InputError("--scan: the emulated robot of this process has no ports; name those of wlr emulate")
     console = Console(soft_wrap=True, highlight=False)

@@ -91,6 +91,8 @@ def run(options: PlayOptions) -> int:
     core = make_core(environment_of(options.env, options.agent), 1, own)
     try:
         policy = make_policy(options.agent, core.contract())
+        if options.video is None and not options.web:
+            require_display()  # after all names, which are checked first
         driver = _driver(options, core)
         if options.beside is not None:
             _film_beside(options, keywords)
@@ -125,8 +127,6 @@ def _check(options: PlayOptions) -> None:
     if options.video is not None:
         check_video(options.video)
         refuse_existing(options.video, options.force, "--video")
-    elif not options.web:
-        require_display()
 
 
 def _view(options: PlayOptions) -> View:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
+from wlr_gym.envs.tasks.terms.references import path_point
 from wlr_gym.render.colours import DRIVEN, WANTED
 from wlr_gym.render.view import View
 
@@ -171,24 +172,31 @@ def film_beside(
 
 
 class Journey:
-    """Where the robot went in this episode, and where its commands would have taken it from the same start."""
+    """Where the robot went in this episode, and its commanded path, or where its commands would have taken it from its start.
+
+    Floor frame; a commanded path is as long as the commanded speed goes in the time that has passed.
+    """
 
     def __init__(self) -> None:
         self._driven: list[Array] = []
         self._wanted: list[Array] = []
         self._yaw = 0.0
+        self._way = 0.0
 
     def note(self, core: Core) -> None:
         """Note the present step."""
         truth, asked = core.plant.truth(), commands(core)
         place = truth.position[0, :2].copy()
         if core.episodes.steps[0] == 0 or not self._driven:
-            self._driven, self._wanted, self._yaw = [], [place], float(yaw_of(*truth["quaternion"].T)[0])
+            self._driven, self._yaw, self._way = [], float(yaw_of(*truth["quaternion"].T)[0]), 0.0
+            self._wanted = [on_floor(core, path_point(asked, 0.0)) if "path_shape" in asked else place]
         else:
             period = core.task.config.control_period
             step = period * asked.get("linear_velocity_x", 0.0)
+            self._way += step
             self._yaw += period * asked.get("yaw_rate", 0.0)
-            self._wanted.append(self._wanted[-1] + step * np.array([math.cos(self._yaw), math.sin(self._yaw)]))
+            ahead = self._wanted[-1] + step * np.array([math.cos(self._yaw), math.sin(self._yaw)])
+            self._wanted.append(on_floor(core, path_point(asked, self._way)) if "path_shape" in asked else ahead)
         self._driven.append(place)
 
     def trails(self) -> list[Trail]:
@@ -196,6 +204,13 @@ class Journey:
         from wlr_gym.render.marks import Trail
 
         return [Trail(np.array(self._wanted), WANTED, dashed=True), Trail(np.array(self._driven), DRIVEN)]
+
+
+def on_floor(core: Core, point: tuple[float, float]) -> Array:
+    """Return a point of the frame of the first robot's start in the floor frame, m."""
+    x, y, yaw = core.start[0]
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return np.array([x + cos * point[0] - sin * point[1], y + sin * point[0] + cos * point[1]])
 
 
 def present_time(core: Core) -> float:

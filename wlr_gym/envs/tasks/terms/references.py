@@ -6,7 +6,10 @@ Everything is a closed function of the held commands, the time and the pose, so 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+
+import numpy as np
 
 from wlr_gym.envs.tasks.signals import Signals, Value
 from wlr_gym.envs.tasks.terms.geometry import PlanarPose, wrapped
@@ -17,6 +20,8 @@ from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE
 PREVIEW = (0.0, 0.1, 0.2)
 #: Newton steps to the nearest point of an S-curve.
 NEWTON_STEPS = 4
+#: m along an S-curve from one point to the next, where its length is added up.
+LENGTH_STEP = 0.005
 #: s in which the legs go from home to the first posture.
 POSTURE_READY = 3.0
 #: s at which the sweep to the second posture begins.
@@ -62,6 +67,34 @@ def path_error(signals: Signals, pose: PlanarPose) -> PathError:
     lateral, direction = (chosen(a, b) for a, b in zip(circle[:2], curve[:2], strict=True))
     curvature = tuple(chosen(a, b) for a, b in zip(circle[2], curve[2], strict=True))
     return PathError(lateral, wrapped(pose.yaw - turn - direction), curvature)
+
+
+def path_point(command: Mapping[str, float], way: float) -> tuple[float, float]:
+    """Return the point (x, y) of the path of :func:`path_error` at a distance from its beginning along it, m.
+
+    Args:
+        command: name -> value of the path's commands.
+        way: distance, m.
+    """
+    shape, bend = command["path_shape"], command["path_curvature"]
+    if 1.0 < shape <= 2.0:
+        x, y = _s_curve_point(way, bend, 2.0 * math.pi / command["path_wavelength"])
+    else:
+        bend = bend if shape > 2.0 else 0.0
+        half = 0.5 * bend * way  # of the angle: chord and its direction
+        chord = way * float(np.sinc(half / math.pi))
+        x, y = chord * math.cos(half), chord * math.sin(half)
+    cos, sin = math.cos(command["path_heading"]), math.sin(command["path_heading"])
+    return cos * x - sin * y, sin * x + cos * y + command["path_offset"]
+
+
+def _s_curve_point(way: float, bend: float, k: float) -> tuple[float, float]:
+    amplitude = bend / (k * k)
+    ahead = np.linspace(0.0, way, 2 + int(abs(way) / LENGTH_STEP))  # the curve is no shorter than its x
+    y = amplitude * (1.0 - np.cos(k * ahead))
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(ahead), np.diff(y)))])
+    x = float(np.interp(way, length, ahead))
+    return x, amplitude * (1.0 - math.cos(k * x))
 
 
 def _circle(x: Value, y: Value, bend: Value) -> tuple[Value, Value, list[Value]]:
