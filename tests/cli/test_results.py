@@ -17,10 +17,6 @@ WITHOUT_RESULTS = {
     "play",
     "view",
     "emulate",
-    "calibrate servo",
-    "calibrate joints",
-    "calibrate imu",
-    "calibrate flow",
     "robot new",
 }
 

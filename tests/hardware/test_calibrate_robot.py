@@ -1,6 +1,7 @@
 """``wlr calibrate joints`` and ``wlr calibrate imu`` with a scripted operator on an emulated robot."""
 
 import io
+import json
 import re
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import main
 from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions, calibrate_imu, calibrate_joints, set_up_servo
+from wlr_gym.cli.results import only_results
 from wlr_gym.cli.robot_options import RobotOption
 from wlr_gym.hardware import calibration as find
 from wlr_gym.hardware.config import ImuCalibration, Mounting, load_hardware
@@ -92,6 +94,15 @@ def test_comments_and_limits_of_the_file_stay(monkeypatch, tmp_path):
     assert [line for line in kept if line not in text.splitlines()] == []
     assert re.search(r"# Signs and zeros by wlr calibrate joints, \d{4}-\d\d-\d\d", text)
     assert load_hardware(out) == find.with_mountings(NOMINAL, {"wheel_rf": Mounting(sign=1, zero=0)})
+
+
+def test_what_was_found_as_json(monkeypatch, tmp_path, capsys):
+    machine, out = make_machine(TRUE, monkeypatch), tmp_path / "mine.yaml"
+    with only_results(True):
+        assert calibrate_joints(JointsOptions(out=out, only=("wheel_rf",), json=True), Operator(machine)) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["hardware"], list(found["joints"])) == (str(out), ["wheel_rf"])
+    assert found["joints"]["wheel_rf"]["sign"] in (1, -1)
 
 
 def test_ports_of_the_command_line_are_not_written_and_comments_stay(monkeypatch, tmp_path):

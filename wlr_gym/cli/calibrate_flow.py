@@ -9,12 +9,15 @@ from typing import Annotated
 import tyro
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.cli import OK
 from wlr_gym.cli.calibrate_robot import save_calibration, source_of, today
+from wlr_gym.cli.options import JsonOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import RobotOption, ask_terminal
 
 
 @dataclass(frozen=True)
-class FlowOptions(RobotOption):
+class FlowOptions(JsonOption, RobotOption):
     """Find scale and mounting of the optical-flow sensor from a straight run on a floor that grips, driven or pushed.
 
     Record it with: wlr record --excitation straight
@@ -59,4 +62,8 @@ def calibrate_flow(options: FlowOptions) -> int:
     print(f"mount_yaw {before.mount_yaw:.4f} -> {found.mount_yaw:.4f} +- {fit.yaw_sigma:.4f} rad")
     note = f"Flow sensor calibrated by wlr calibrate flow, {today()}: scale, and rotation about body z from body to sensor."
     ask = (lambda text: "y") if options.yes else ask_terminal
-    return save_calibration(options.out, source, lambda file: with_flow_calibration(file, found), "flow", note, ask)
+    code = save_calibration(options.out, source, lambda file: with_flow_calibration(file, found), "flow", note, ask)
+    if options.json and code == OK:
+        sigma = {"scale": fit.scale_sigma, "mount_yaw": fit.yaw_sigma}
+        print_json({"hardware": options.out, "flow": found.model_dump(mode="json"), "sigma": sigma, "way": fit.way})
+    return code

@@ -14,6 +14,8 @@ import tyro
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.options import JsonOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import NobodyThereError, RobotOption, ask_terminal
 from wlr_gym.robot import JOINTS, LEGS, full_name
 
@@ -37,7 +39,7 @@ _READS = 20
 
 
 @dataclass(frozen=True)
-class JointsOptions(RobotOption):
+class JointsOptions(JsonOption, RobotOption):
     """Find sign and zero of each servo by moving the robot by hand, torque off. Put it on a stand, wheels off the ground.
 
     Attributes:
@@ -50,7 +52,7 @@ class JointsOptions(RobotOption):
 
 
 @dataclass(frozen=True)
-class ImuOptions(RobotOption):
+class ImuOptions(JsonOption, RobotOption):
     """Calibrate the IMU of a robot that stands still.
 
     Attributes:
@@ -67,7 +69,7 @@ class ImuOptions(RobotOption):
 
 
 @dataclass(frozen=True)
-class ServoOptions(RobotOption):
+class ServoOptions(JsonOption, RobotOption):
     """Give a new servo its id, registers and baud rate. Connect it alone, with power, to the adapter of its bus.
 
     Attributes:
@@ -113,6 +115,8 @@ def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
     with _dialogue():
         set_up(name, bus, servo, id)
     print(f"done: id {id} answers at {bus.baud_rate} bit/s; put a label on it")
+    if options.json:
+        print_json({"joint": options.joint, "bus": name, "id": id, "baud_rate": bus.baud_rate, "registers": bus.eeprom})
     return OK
 
 
@@ -150,7 +154,10 @@ def _calibrate_joints(options: JointsOptions, robot: Robot, hardware: Hardware, 
         old = hardware.joints[joint]
         print(f"{joint:9} sign {old.sign:+d} -> {new.sign:+d}, zero {old.zero} -> {new.zero}")
     note = f"Signs and zeros by wlr calibrate joints, {today()}: count = zero + sign * angle / (size of a count)."
-    return save_calibration(options.out, source, lambda file: with_mountings(file, mountings), "joints", note, ask)
+    code = save_calibration(options.out, source, lambda file: with_mountings(file, mountings), "joints", note, ask)
+    if options.json and code == OK:
+        print_json({"hardware": options.out, "joints": {name: one.model_dump() for name, one in mountings.items()}})
+    return code
 
 
 def _require_torque_off(servos: Servos, ask: Ask) -> None:
@@ -218,7 +225,10 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
         for name, value in calibration.model_dump(exclude_unset=True).items():
             print(f"{name:13} {value}")
         note = f"IMU calibrated by wlr calibrate imu, {today()}: mounting * scale * (measured - offset), SI units."
-        return save_calibration(options.out, source, lambda file: with_imu_calibration(file, calibration), "imu", note, ask)
+        code = save_calibration(options.out, source, lambda file: with_imu_calibration(file, calibration), "imu", note, ask)
+        if options.json and code == OK:
+            print_json({"hardware": options.out, "imu": calibration.model_dump(mode="json")})
+        return code
     except _StoppedError:
         return _stopped()
     finally:
