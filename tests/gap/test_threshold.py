@@ -1,10 +1,13 @@
 """By how much an effect must improve the fit: what chance gives on the same data, whatever the effect that they hold."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from toy_problem import Toy, sized
 
 from wlr_gym.gap.estimation.fit import fit
+from wlr_gym.gap.estimation.likelihood import estimate_noise
 from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.selection.alternative import Products, rescored
 from wlr_gym.gap.selection.screening import LEAST_GAIN, LEAST_SHARE, PER_UNKNOWN, responses, screen
@@ -17,7 +20,8 @@ ROWS = 1000
 
 def by_chance(problem, scatter=1.0):
     """Largest improvements of the draws, and that of the data themselves, to first order."""
-    found = fit(problem, RUNS, nominal_model(problem), scatter=scatter)
+    found = fit(problem, RUNS, nominal_model(problem))
+    found = replace(found, noise=estimate_noise(found.residuals, scatter=scatter))
     probes, candidates = problem.candidates(found.model.setting, found.residuals, RUNS)
     responded = responses(problem, found, RUNS, probes)
     products, first = Products.of(found, responded), screen(candidates, responded)

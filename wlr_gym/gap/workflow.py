@@ -57,7 +57,7 @@ from wlr_gym.gap.validation.held_out import compare_models, mean_of_runs, mean_s
 from wlr_gym.gap.validation.localisation import localise
 from wlr_gym.gap.validation.residual_tests import adequacy_of
 from wlr_gym.gap.validation.traces import informative_traces
-from wlr_gym.gap.validation.turning import turning
+from wlr_gym.gap.validation.turning import turning_in_all_runs
 from wlr_gym.physics.effects import Source, load_patch
 
 Array = NDArray[np.float64]
@@ -184,7 +184,7 @@ def analyse_problem(
     )
     adequacy = adequacy_of(problem, fitted, search.fit)
     shown = detectable(search.rounds[-1].scores, search.rounds[-1].threshold)
-    turned = _turning(problem, search.fit, base)
+    turned = turning_in_all_runs(problem, search.fit.model.setting, base.model.setting)
     effects = _effects(problem, search, fitted) or _turned(turned) or (_somewhere(problem, places) if nameless else ())
     kept = {candidate.label for candidate, _ in search.fit.model.effects}
     verdict, groups = _verdict(search, effects), _equivalent(problem, search)
@@ -295,13 +295,6 @@ def found_effect(candidate: Candidate, own: Mapping[str, ParameterEstimate], fre
     given = {name: ParameterEstimate(value, value, value, candidate.units[name]) for name, value in fixed.items()}
     parameters = {**own, **given}
     return FoundEffect(candidate.name, candidate.where, parameters, frequency, gain, candidate.formula, dict(candidate.units))
-
-
-def _turning(problem: Problem, final: Fit, base: Fit) -> Turning | None:
-    """What goes with a joint's turning in all runs: a few that turn far are needed, and held-out ones may be those."""
-    every = range(len(problem.runs))
-    left = [residual[0] for residual in problem.residuals([final.model.setting], every)]
-    return turning(problem, left, problem.features(base.model.setting, every))
 
 
 def _turned(turned: Turning | None) -> tuple[FoundEffect, ...]:

@@ -173,11 +173,12 @@ def test_settings_of_every_task_are_valid(name, task):
 @pytest.mark.parametrize("config", ["ppo_slip_aware", "ppo_blind"])
 @pytest.mark.parametrize("task", ["velocity", "path", "posture", "slope"])
 def test_what_is_learnt_from_comes_later_than_what_is_scored(task, config):
-    """Training draws commands 0 to 30 ms late, alike for all joints; scores have the task's own."""
+    """Training draws commands late, alike for all joints; scores have the task's own."""
+    latest = 0.045 if task == "velocity" else 0.03
     learnt, scored = _learnt_and_scored(task, config)
     late = learnt[:, DELAYS]
     assert late.min() < 0.005
-    assert 0.025 < late.max() <= 0.03
+    assert 0.8 * latest < late.max() <= latest
     np.testing.assert_array_equal(late, late[:, [0]].repeat(8, axis=1))
     assert scored[:, DELAYS].max() <= 0.01
 
