@@ -128,7 +128,7 @@ def made() -> dict[str, list[str]]:
     kept = json.loads(DATA.read_text(encoding="utf-8"))
     rows = kept["rows"]
     parts = {"speed": speed_table(rows), "batch": batch_table(rows), "machines": machine_lines(rows)}
-    return {**parts, "engine": engine_lines(kept["engine"])}
+    return {**parts, "engine": engine_lines(kept["engine"])} if "engine" in kept else parts
 
 
 def write_readme(text: str, rows: list[Row]) -> str:

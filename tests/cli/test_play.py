@@ -102,6 +102,7 @@ def test_a_commanded_path_is_drawn_on_the_floor_it_was_commanded_on(shape):
     [
         ([], "no display here"),
         (["--agent", "pidd"], "did you mean 'pid'?"),
+        (["--agent", "pid", "--command", "1"], "--command '1': expected linear_velocity_x,yaw_rate"),
         (["WLR-Pth-v0"], "did you mean 'WLR-Path-v0'?"),
         (["--beside", "pid"], "--beside: two robots are shown in a video only"),
         (["--video", "film.webp", "--fps", "0"], "--fps 0: expected 1 to 1000"),

@@ -41,3 +41,10 @@ def test_words_are_wrapped_and_a_number_keeps_its_unit():
 def test_a_narrow_table_is_as_wide_as_its_cells_and_aligns_numbers():
     printed = lines(80, ("name", "value"), [("a", "1.5 s"), ("b", "120 s"), ("c", "-")])
     assert [line.rstrip() for line in printed] == ["name  value", "a     1.5 s", "b     120 s", "c         -", ""]
+
+
+@pytest.mark.parametrize("text", ["/a/folder/" + 12 * "long_name_" + "end.yaml", "[" + 30 * "word " + "end]"])
+def test_nothing_is_cut_where_a_word_is_wider_than_the_terminal(text):
+    printed = lines(40, ("what", "where"), [("one", text)])
+    assert max(map(len, printed)) <= 40
+    assert text.replace(" ", "") in "".join("".join(line[5:].split()) for line in printed)

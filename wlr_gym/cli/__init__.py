@@ -68,9 +68,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as interruption:
         _say(str(interruption) or "interrupted", "yellow")
         return INTERRUPTED
-    except BrokenPipeError:  # who reads the output has enough: wlr ... | head
+    except BrokenPipeError:
+        if not _output_is_closed():
+            raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
+
+
+def _output_is_closed() -> bool:
+    """Whether nobody reads the output any more: ``wlr ... | head``."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        return True
+    return False
 
 
 def _dispatch(words: list[str]) -> int:

@@ -91,9 +91,9 @@ def run(options: PlayOptions) -> int:
     core = make_core(environment_of(options.env, options.agent), 1, own)
     try:
         policy = make_policy(options.agent, core.contract())
+        driver = _driver(options, core)
         if options.video is None and not options.web:
             require_display()  # after all names, which are checked first
-        driver = _driver(options, core)
         if options.beside is not None:
             _film_beside(options, keywords)
         elif options.video is not None:

@@ -19,8 +19,8 @@ _HARD_SPACE = "\N{NO-BREAK SPACE}"
 _SIZE = r"[-+]?[\d.,]*\d(e[-+]\d+)?%?"
 _UNIT = r"[^\W\d][^\s,;:.)]{0,4}(?![^\s,;:.)])"
 _ERROR = r"(±|\+-) ?[\d.]+"
-#: What stays together in a text: what is in brackets, a number with its unit and its error.
-_TOGETHER = re.compile(rf"\[[^][]*\]|{_SIZE}( {_UNIT})?( {_ERROR})?( {_UNIT})?|{_ERROR}")
+#: What stays together in a text: a little in brackets, a number with its unit and its error.
+_TOGETHER = re.compile(rf"\[[^][]{{0,40}}\]|{_SIZE}( {_UNIT})?( {_ERROR})?( {_UNIT})?|{_ERROR}")
 #: A cell of a column of numbers.
 _NUMBER = re.compile(rf"-?|([<>=]+ )?{_SIZE}( \.\. {_SIZE})?( {_UNIT})?( {_ERROR})?( {_UNIT})?( \[[^][]*\])?( !)?")
 
@@ -81,7 +81,7 @@ def _drawn(columns: Sequence[Sequence[str]], gap: int, width: int, styles: Seque
     for index, (column, wide) in enumerate(zip(columns, widths, strict=True)):
         justify = "right" if index and _is_number(column[1:]) else "left"
         heading = Text("\n".join(_lines(column[0], wide, _Names)))
-        table.add_column(heading, justify=justify, vertical="top", no_wrap=True, width=wide)
+        table.add_column(heading, justify=justify, vertical="top", overflow="fold", width=wide)
     for index, row in enumerate(list(zip(*columns, strict=True))[1:]):
         cells = (Text("\n".join(_lines(cell, wide, _Words))) for cell, wide in zip(row, widths, strict=True))
         table.add_row(*cells, style=styles[index] if styles else "")
@@ -89,10 +89,11 @@ def _drawn(columns: Sequence[Sequence[str]], gap: int, width: int, styles: Seque
 
 
 def _widths(columns: Sequence[Sequence[str]], room: int) -> list[int]:
-    """Return the widths of columns: the same upper bound for all, as large as there is room; none below what it needs."""
+    """Return the widths of columns: the same upper bound for all, as large as there is room; none below its least, if all fit."""
     natural = [max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
     least = [min(_least(column), most) for column, most in zip(columns, natural, strict=True)]
-    found = least
+    cap = next((c for c in range(max(least), 1, -1) if sum(min(few, c) for few in least) <= room), 1)
+    found = least = [min(few, cap) for few in least]  # a word that is wider than the terminal is broken
     for bound in range(max(natural) + 1):
         tried = [min(most, max(few, bound)) for most, few in zip(natural, least, strict=True)]
         if sum(tried) > room:

@@ -176,11 +176,11 @@ def fit(
         residuals, columns = linearise(problem, model, runs, near.columns, near.noise)
     else:
         residuals, columns = linearise(problem, model, runs)
-    gained = np.inf
+    gained, most = np.inf, scatter
     for step in range(steps):
         tau = autocorrelation_time
         if tau is None:  # the same cost in all steps of a descent
-            reachable = _noise_within_reach(problem, model, columns, residuals, scatter)
+            reachable = _noise_within_reach(problem, model, columns, residuals, most)
             tau, scatter = reachable.autocorrelation_time, reachable.scatter
         model, residuals, gained = _descend(problem, runs, model, columns, residuals, tau, scatter)
         tell(f"step {step + 1} of {steps}: {gained:.0f} better")
