@@ -89,7 +89,7 @@ def _drawn(columns: Sequence[Sequence[str]], gap: int, width: int, styles: Seque
 
 
 def _widths(columns: Sequence[Sequence[str]], room: int) -> list[int]:
-    """Return the widths of columns: the same upper bound for all, as large as there is room; none below its least, if all fit."""
+    """Return the widths of columns: one upper bound for all, as large as there is room; none below its least, if all fit."""
     natural = [max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
     least = [min(_least(column), most) for column, most in zip(columns, natural, strict=True)]
     cap = next((c for c in range(max(least), 1, -1) if sum(min(few, c) for few in least) <= room), 1)
