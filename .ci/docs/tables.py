@@ -22,7 +22,13 @@ from wlr_gym.data.format import COLUMNS, Column
 from wlr_gym.envs.registry import ENVIRONMENTS
 from wlr_gym.envs.settings import EnvironmentOptions, Settings
 from wlr_gym.envs.tasks import load_randomization, load_task
-from wlr_gym.envs.tasks.describe import RANDOMIZATION_HEADER, limits_text, parameters_text, randomization_rows
+from wlr_gym.envs.tasks.describe import (
+    RANDOMIZATION_HEADER,
+    limits_text,
+    observation_meanings,
+    parameters_text,
+    randomization_rows,
+)
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.task import ObservationColumn, Task
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
@@ -132,7 +138,7 @@ def all_tasks() -> dict[str, Task]:
 def shared_tables() -> list[str]:
     """Return the tables of all tasks together: shared observations, rewards, terminations, measures."""
     tasks = all_tasks()
-    policy = _shared([_terms(task.policy) for task in tasks.values()])
+    policy = _shared([_terms(task) for task in tasks.values()])
     rewards = [
         (
             f"`{name}`",
@@ -173,8 +179,8 @@ def task_tables(title: str) -> list[str]:
         (f"`{name}`", f"{low:g} to {high:g}", COMMANDS[name].unit, COMMANDS[name].doc)
         for name, (low, high) in task.config.commands.terms.items()
     ]
-    shared = _shared([_terms(other.policy) for other in tasks.values()])
-    own = [row for row in _terms(task.policy) if row not in shared]
+    shared = _shared([_terms(other) for other in tasks.values()])
+    own = [row for row in _terms(task) if row not in shared]
     header = ("command", "range", "unit", "meaning")
     return [*_table(header, commands), "", *_table(("observation", *_OBSERVATION), own)]
 
@@ -231,9 +237,9 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [f"| {' | '.join(cells)} |" for cells in [header, ["---"] * len(header), *escaped]]
 
 
-def _terms(columns: Sequence[ObservationColumn]) -> list[tuple[str, ...]]:
+def _terms(task: Task) -> list[tuple[str, ...]]:
     groups: dict[str, list[ObservationColumn]] = {}
-    for column in columns:
+    for column in task.policy:
         groups.setdefault(column.term, []).append(column)
     return [
         (
@@ -242,9 +248,9 @@ def _terms(columns: Sequence[ObservationColumn]) -> list[tuple[str, ...]]:
             ", ".join(dict.fromkeys(column.unit for column in group)),
             group[0].frame,
             f"{group[0].scale:g}",
-            group[0].doc if term != "command" else "what the robot is asked to follow",
+            meaning,
         )
-        for term, group in groups.items()
+        for (term, group), (_, meaning) in zip(groups.items(), observation_meanings(task), strict=True)
     ]
 
 

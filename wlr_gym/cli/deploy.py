@@ -207,7 +207,12 @@ def _make_policy(options: DeployOptions, environment: str, robot: Any) -> Policy
     from wlr_gym.envs.tasks import contract
     from wlr_gym.policy import environment_for, make_policy
 
-    keywords = {"backend": "dynamixel", "hardware": {"hardware": options.hardware}, "robot": robot}
+    keywords = {
+        "backend": "dynamixel",
+        "hardware": {"hardware": options.hardware},
+        "robot": robot,
+        "episode_length": options.seconds,
+    }
     task = make_task(task_source_of(environment), read_settings(environment_for(options.policy, keywords)))
     for name in pairs("--command", options.command, "yaw_rate=0.1"):
         if name not in task.commands:

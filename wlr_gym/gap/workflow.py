@@ -57,7 +57,7 @@ from wlr_gym.gap.validation.held_out import compare_models, mean_of_runs, mean_s
 from wlr_gym.gap.validation.localisation import localise
 from wlr_gym.gap.validation.residual_tests import adequacy_of
 from wlr_gym.gap.validation.traces import informative_traces
-from wlr_gym.gap.validation.turning import turning_in_all_runs
+from wlr_gym.gap.validation.turning import turning
 from wlr_gym.physics.effects import Source, load_patch
 
 Array = NDArray[np.float64]
@@ -174,17 +174,19 @@ def analyse_problem(
     floor = noise_floor(problem, search.fit.model.setting, held_out)
     gap, run_gaps, channel_gaps = compare_models(problem, fitted, held_out, models, floor)
     nameless = not search.fit.model.effects and gap.fit_after > problem.misfit * gap.noise_floor
-    features = problem.features(base.model.setting, fitted)
+    every = range(len(problem.runs))
+    features = problem.features(base.model.setting, every)
     places, maps = localise(
         problem,
         base.residuals,
         _expected(problem, search.fit, is_incomplete=nameless),
         search.fit.noise,
-        features,
+        [features[k] for k in fitted],
     )
     adequacy = adequacy_of(problem, fitted, search.fit)
     shown = detectable(search.rounds[-1].scores, search.rounds[-1].threshold)
-    turned = turning_in_all_runs(problem, search.fit.model.setting, base.model.setting)
+    left = [residual[0] for residual in problem.residuals([search.fit.model.setting], every)]
+    turned = turning(problem, left, features)  # few runs turn far, and held-out ones may be those
     effects = _effects(problem, search, fitted) or _turned(turned) or (_somewhere(problem, places) if nameless else ())
     kept = {candidate.label for candidate, _ in search.fit.model.effects}
     verdict, groups = _verdict(search, effects), _equivalent(problem, search)

@@ -9,13 +9,13 @@ corrected by what each step really changed (Broyden's secant update), which cost
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.estimation.least_squares import corrected, gauss_newton_step, normal_equations
-from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise, run_scatter
+from wlr_gym.gap.estimation.likelihood import Noise, autocorrelation_times, estimate_noise, run_scatter
 from wlr_gym.gap.estimation.model import (
     FittedModel,
     moved,
@@ -240,8 +240,10 @@ def _noise_within_reach(
     for _ in range(ROUNDS):
         change = gauss_newton_step(problem, model, columns, residuals, noise).astype(np.float32)
         left = [r + (change @ c).reshape(r.shape) for r, c in zip(residuals, columns, strict=True)]
-        noise = estimate_noise(left, scatter=scatter)
-        noise = estimate_noise(left, scatter=min(scatter, _scatter(problem, model, columns, left, noise)))
+        own = autocorrelation_times(left)
+        noise = estimate_noise(left, scatter * own, scatter)
+        less = min(scatter, _scatter(problem, model, columns, left, noise))
+        noise = replace(noise, autocorrelation_time=less * own, scatter=less)
     return noise
 
 

@@ -220,9 +220,8 @@ def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.boo
 
 def _start(clock: RunClock, robot: Robot, parameters: Parameters) -> PlantState:
     """State of every setting at the run's start: the measured one, moved by what a setting means for reading and height."""
-    base = profile_parameters(
-        Parameters.nominal(robot), clock.run.meta.profile
-    )  # of no setting: results do not depend on company
+    # of no setting: results do not depend on company
+    base = profile_parameters(Parameters.nominal(robot), clock.run.meta.profile)
     parameters = Parameters(np.vstack([base.values, parameters.values]))
     count = len(parameters)
     measured = clock.measured_start(robot, base)

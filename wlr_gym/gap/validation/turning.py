@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import Turning
-from wlr_gym.gap.problem import Problem, Setting
+from wlr_gym.gap.problem import Problem
 
 Array = NDArray[np.float64]
 
@@ -35,18 +35,6 @@ SAMPLES = 500
 LEAST_CONFIDENCE = 0.9
 #: Share of a signal's squared residual that must be periodic in the angle.
 LEAST_SHARE = 0.1
-
-
-def turning_in_all_runs(problem: Problem, final: Setting, base: Setting) -> Turning | None:
-    """Return what :func:`turning` finds in all runs: few turn far, and held-out ones may be those.
-
-    Args:
-        problem: the system.
-        final, base: the final model, and the calibrated one, whose angles count.
-    """
-    every = range(len(problem.runs))
-    left = [residual[0] for residual in problem.residuals([final], every)]
-    return turning(problem, left, problem.features(base, every))
 
 
 def turning(problem: Problem, residuals: Sequence[Array], features: Sequence[Mapping[str, Array]]) -> Turning | None:

@@ -189,14 +189,14 @@ class Journey:
         place = truth.position[0, :2].copy()
         if core.episodes.steps[0] == 0 or not self._driven:
             self._driven, self._yaw, self._way = [], float(yaw_of(*truth["quaternion"].T)[0]), 0.0
-            self._wanted = [on_floor(core, path_point(asked, 0.0)) if "path_shape" in asked else place]
+            self._wanted = [_on_floor(core, path_point(asked, 0.0)) if "path_shape" in asked else place]
         else:
             period = core.task.config.control_period
             step = period * asked.get("linear_velocity_x", 0.0)
             self._way += step
             self._yaw += period * asked.get("yaw_rate", 0.0)
             ahead = self._wanted[-1] + step * np.array([math.cos(self._yaw), math.sin(self._yaw)])
-            self._wanted.append(on_floor(core, path_point(asked, self._way)) if "path_shape" in asked else ahead)
+            self._wanted.append(_on_floor(core, path_point(asked, self._way)) if "path_shape" in asked else ahead)
         self._driven.append(place)
 
     def trails(self) -> list[Trail]:
@@ -206,7 +206,7 @@ class Journey:
         return [Trail(np.array(self._wanted), WANTED, dashed=True), Trail(np.array(self._driven), DRIVEN)]
 
 
-def on_floor(core: Core, point: tuple[float, float]) -> Array:
+def _on_floor(core: Core, point: tuple[float, float]) -> Array:
     """Return a point of the frame of the first robot's start in the floor frame, m."""
     x, y, yaw = core.start[0]
     cos, sin = math.cos(yaw), math.sin(yaw)
