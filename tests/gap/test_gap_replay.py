@@ -99,11 +99,15 @@ def test_company_and_order_do_not_change_a_bit(run, other):
 
 
 def test_robots_are_shared_out_evenly_where_a_thread_is_worth_it():
-    assert simulate.shared_out(5, 5, 2) == [slice(0, 2), slice(2, 5)]
-    assert simulate.shared_out(1, 5, 2) == [slice(0, 1)]
-    assert simulate.shared_out(200, 5, 1) == [slice(0, 100), slice(100, 200)]
-    assert simulate.shared_out(220, 5, 3) == [slice(0, 73), slice(73, 147), slice(147, 220)]
-    assert simulate.shared_out(3, simulate.MOST_ROBOTS + 1, 1) == [slice(0, 1), slice(1, 2), slice(2, 3)]
+    all_runs = slice(0, 5)
+    assert simulate.shared_out(5, 6, 2) == [(slice(0, 5), slice(0, 3)), (slice(0, 5), slice(3, 6))]  # a tile each
+    assert simulate.shared_out(1, 5, 2) == [(slice(0, 1), all_runs)]
+    assert simulate.shared_out(200, 5, 1) == [(slice(0, 100), all_runs), (slice(100, 200), all_runs)]
+    assert simulate.shared_out(220, 5, 3) == [
+        (slice(first, last), all_runs) for first, last in ((0, 73), (73, 147), (147, 220))
+    ]
+    most = simulate.MOST_ROBOTS + 1
+    assert simulate.shared_out(3, most, 1) == [(slice(k, k + 1), slice(0, most)) for k in range(3)]
 
 
 def test_threads_share_the_settings(other, monkeypatch):
@@ -144,6 +148,17 @@ def test_chunks_and_threads_do_not_change_a_bit(other, monkeypatch):
     chunked = replay_batch(ROBOT, [clock], table, with_truth=True)[0]
     assert np.array_equal(whole.values, threaded.values)
     assert np.array_equal(whole.values, chunked.values)
+
+
+def test_threads_share_the_runs_where_there_are_few_settings(run, other, monkeypatch):
+    clocks, table = [RunClock(run, window=0.3), RunClock(other)], several(3)
+    whole = replay_batch(ROBOT, clocks, table)
+    monkeypatch.setattr(simulate, "LEAST_ROBOTS", 2)
+    monkeypatch.setattr(simulate, "TILE", 3)
+    assert len(simulate.shared_out(3, 2, 2)) == 2
+    shared = replay_batch(ROBOT, clocks, table, threads=2)
+    for one, same in zip(whole, shared, strict=True):
+        assert np.array_equal(one.values, same.values)
     assert whole.truth is not None
     assert chunked.truth is not None
     assert np.array_equal(whole.truth, chunked.truth)

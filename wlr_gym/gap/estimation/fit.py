@@ -14,7 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.least_squares import corrected, gauss_newton_step, normal_equations
+from wlr_gym.base.threads import in_threads
+from wlr_gym.gap.estimation.least_squares import corrected, equations_by_run, gauss_newton_step, normal_equations
 from wlr_gym.gap.estimation.likelihood import Noise, autocorrelation_times, estimate_noise, run_scatter
 from wlr_gym.gap.estimation.model import (
     FittedModel,
@@ -111,15 +112,17 @@ def linearise(
                 break
         models.append(other)
     found = problem.residuals([m.setting for m in models], runs)
-    columns = []
-    for number, r in enumerate(found):
-        change = (r[1:] - r[0]) / np.where(taken == 0.0, np.inf, taken)[:, None, None]
+    taken[taken == 0.0] = np.inf
+
+    def columns_of(run: tuple[int, Array]) -> NDArray[np.float32]:
+        number, r = run
         own = np.zeros((model.size, r[0].size), np.float32)
         if near is not None:
             own[idle] = near[number][np.flatnonzero(idle)]
-        own[wanted] = np.nan_to_num(change).reshape(len(wanted), r[0].size)
-        columns.append(own)
-    return [r[0] for r in found], columns
+        own[wanted] = np.nan_to_num((r[1:] - r[0]) / taken[:, None, None]).reshape(len(wanted), r[0].size)
+        return own
+
+    return [r[0] for r in found], in_threads(problem.threads, columns_of, enumerate(found))
 
 
 def idle_numbers(
@@ -134,12 +137,6 @@ def idle_numbers(
     idle = np.zeros(model.size, bool)
     idle[:count] = information < IDLE * prior_tightness(problem, model)[:count]
     return idle
-
-
-def equations_by_run(columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise) -> tuple[Array, Array]:
-    """Return each run's own normal equations: (runs, numbers, numbers) and (runs, numbers)."""
-    parts = [normal_equations([c], [r], noise) for c, r in zip(columns, residuals, strict=True)]
-    return np.stack([matrix for matrix, _ in parts]), np.stack([vector for _, vector in parts])
 
 
 def fit(
@@ -189,7 +186,7 @@ def fit(
         residuals, columns = linearise(problem, model, runs, columns, estimate_noise(residuals, autocorrelation_time, scatter))
     model, residuals = _relaxed(problem, runs, model, columns, residuals, autocorrelation_time, scatter)
     noise = estimate_noise(residuals, autocorrelation_time, scatter)
-    matrix, _ = normal_equations(columns, residuals, noise)
+    matrix, _ = normal_equations(columns, residuals, noise, problem.threads)
     pinned = np.diag(PINNED * on_bounds(problem, model))
     hessian = matrix + np.diag(prior_tightness(problem, model)) + pinned
     precision = matrix / problem.tempering + np.diag(tightness_once(problem, model)) + pinned
@@ -252,7 +249,7 @@ def _scatter(
 ) -> float:
     """Return the scatter of the runs, times what the simulator errs; that of ``noise`` where the data do not tell."""
     free = ~on_bounds(problem, model)
-    matrices, vectors = equations_by_run(columns, residuals, noise)
+    matrices, vectors = equations_by_run(columns, residuals, noise, problem.threads)
     differ = run_scatter(matrices[:, free][:, :, free], vectors[:, free])
     return noise.scatter if differ is None else max(problem.tempering * noise.scatter * differ, 1.0)
 

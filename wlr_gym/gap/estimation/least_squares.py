@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
+from wlr_gym.base.threads import in_threads
 from wlr_gym.gap.estimation.likelihood import Noise
 from wlr_gym.gap.estimation.model import FittedModel, prior_tightness, room, scaled_nominal, scaled_numbers
 from wlr_gym.gap.problem import Problem
@@ -16,29 +17,42 @@ from wlr_gym.gap.problem import Problem
 Array = NDArray[np.float64]
 
 
-def normal_equations(columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise) -> tuple[Array, Array]:
-    """Return ``C W C^T`` (numbers, numbers) and ``C W r`` (numbers) over all runs.
+def normal_equations(
+    columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise, threads: int = 1
+) -> tuple[Array, Array]:
+    """Return ``C W C^T`` (numbers, numbers) and ``C W r`` (numbers) over all runs."""
+    matrices, vectors = equations_by_run(columns, residuals, noise, threads)
+    return matrices.sum(axis=0), vectors.sum(axis=0)
+
+
+def equations_by_run(
+    columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise, threads: int = 1
+) -> tuple[Array, Array]:
+    """Return each run's own normal equations: (runs, numbers, numbers) and (runs, numbers).
 
     Products of one run are sums of single precision, as the columns are.
     """
-    size = len(columns[0])
-    matrix, vector = np.zeros((size, size)), np.zeros(size)
     root = np.sqrt(noise.weight).astype(np.float32)
-    for column, residual in zip(columns, residuals, strict=True):
+
+    def of_one(run: tuple[NDArray[np.float32], Array]) -> tuple[Array, Array]:
+        column, residual = run
         weights = np.broadcast_to(root, residual.shape).ravel()
         weighted = column * weights
-        matrix += weighted @ weighted.T
-        vector += weighted @ (np.nan_to_num(residual).ravel().astype(np.float32) * weights)
-    return matrix, vector
+        return weighted @ weighted.T, weighted @ (np.nan_to_num(residual).ravel().astype(np.float32) * weights)
+
+    found = in_threads(threads, of_one, zip(columns, residuals, strict=True))
+    matrices, vectors = (np.stack(parts).astype(np.float64) for parts in zip(*found, strict=True))
+    return matrices, vectors
 
 
-def channel_products(columns: Sequence[NDArray[np.float32]], channels: int) -> Array:
+def channel_products(columns: Sequence[NDArray[np.float32]], channels: int, threads: int = 1) -> Array:
     """Return ``C C^T`` of each channel alone (channels, numbers, numbers), over all runs: weights come later."""
-    total: Array = np.zeros((channels, len(columns[0]), len(columns[0])))
-    for column in columns:
+
+    def of_one(column: NDArray[np.float32]) -> NDArray[np.float32]:
         own = np.ascontiguousarray(column.reshape(len(column), -1, channels).transpose(2, 0, 1))
-        total += own @ own.transpose(0, 2, 1)
-    return total
+        return own @ own.transpose(0, 2, 1)
+
+    return np.stack(in_threads(threads, of_one, columns)).sum(axis=0, dtype=np.float64)
 
 
 def cross_products(columns: Sequence[NDArray[np.float32]], others: Sequence[Array], noise: Noise) -> Array:
@@ -54,7 +68,7 @@ def gauss_newton_step(
     problem: Problem, model: FittedModel, columns: Sequence[NDArray[np.float32]], residuals: Sequence[Array], noise: Noise
 ) -> Array:
     """Step (numbers), scaled; numbers that would leave their bounds stay on them and the rest is solved anew."""
-    return constrained_step(problem, model, *normal_equations(columns, residuals, noise))
+    return constrained_step(problem, model, *normal_equations(columns, residuals, noise, problem.threads))
 
 
 def constrained_step(problem: Problem, model: FittedModel, matrix: Array, vector: Array) -> Array:

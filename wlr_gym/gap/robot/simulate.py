@@ -40,6 +40,8 @@ PHYSICS_STEP = 0.001
 PRECISION = {"gibbs_appell": "float32"}
 #: Robots simulated at once: what they read stays in the processor's cache.
 MOST_ROBOTS = 512
+#: Robots of a tile of the engine in single precision.
+TILE = 16
 #: Robots that a further thread is worth.
 LEAST_ROBOTS = 12
 #: Kernels that replay all robots, the faster first: each further one would be compiled, for longer than it saves.
@@ -72,26 +74,41 @@ def replay_batch(
     longest_first = [clocks[r] for r in order]
     workers = threads if backend in PRECISION else 1  # others have threads of their own
 
-    def replay_part(part: slice) -> list[Replays]:
-        own = None if constants is None or not forces else constants[part]
-        chosen = Parameters(parameters.values[part])
-        return _replay_chunk(robot, longest_first, chosen, backend, forces, own, with_truth, 1 if workers > 1 else threads)
+    def replay_part(part: tuple[slice, slice]) -> list[Replays]:
+        some, which = part
+        own = None if constants is None or not forces else constants[some]
+        chosen, followed = Parameters(parameters.values[some]), longest_first[which]
+        return _replay_chunk(robot, followed, chosen, backend, forces, own, with_truth, 1 if workers > 1 else threads)
 
     parts = shared_out(len(parameters), len(clocks), workers)
     found = in_threads(workers, replay_part, parts)
-    return [_joined([part[r] for part in found]) for r in np.argsort(order)]
+    of_run: list[list[Replays]] = [[] for _ in clocks]
+    for (_, which), replays in zip(parts, found, strict=True):
+        for own, replay in zip(of_run[which], replays, strict=True):
+            own.append(replay)
+    return [_joined(of_run[r]) for r in np.argsort(order)]
 
 
-def shared_out(settings: int, runs: int, workers: int) -> list[slice]:
-    """Return which settings are replayed together: at most :data:`MOST_ROBOTS` robots, and parts of equal size for each worker.
+def shared_out(settings: int, runs: int, workers: int) -> list[tuple[slice, slice]]:
+    """Return which settings of which runs are replayed together: equal parts, at most :data:`MOST_ROBOTS` robots.
 
-    Less than a tile of robots costs as much as a tile: few are not shared out.
+    Less than a tile of robots costs as much as a tile: few are not shared out, and runs are where that needs fewer tiles.
     """
     busy = max(1, min(workers, settings * runs // LEAST_ROBOTS))
     each = max(1, MOST_ROBOTS // runs)
     parts = busy * max(1, math.ceil(settings / (busy * each)))
-    edges = np.linspace(0, settings, min(parts, settings) + 1).round().astype(int)
+    by_settings = [(part, slice(0, runs)) for part in _even(settings, parts)]
+    by_runs = [(slice(0, settings), part) for part in _even(runs, busy)]
+    return by_runs if parts == busy and _most_tiles(by_runs) < _most_tiles(by_settings) else by_settings
+
+
+def _even(count: int, parts: int) -> list[slice]:
+    edges = np.linspace(0, count, min(parts, count) + 1).round().astype(int)
     return [slice(first, last) for first, last in itertools.pairwise(edges.tolist())]
+
+
+def _most_tiles(parts: Sequence[tuple[slice, slice]]) -> int:
+    return max(math.ceil((some.stop - some.start) * (which.stop - which.start) / TILE) for some, which in parts)
 
 
 def _joined(parts: Sequence[Replays]) -> Replays:

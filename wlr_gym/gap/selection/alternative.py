@@ -94,19 +94,21 @@ class Products:
     columns: list[NDArray[np.float32]] = field(repr=False)
 
     @staticmethod
-    def of(fit: Fit, found: Responses) -> Products:
+    def of(fit: Fit, found: Responses, threads: int = 1) -> Products:
         """Form the products of a fit's residuals with all columns of the responses."""
-        grams, pushes, columns, square = [], [], [], 0.0
-        for column, residual in zip(found.columns, fit.residuals, strict=True):
-            channels = residual.shape[1]
-            own = np.ascontiguousarray(column.reshape(len(column), -1, channels).transpose(2, 0, 1))
+
+        def of_one(run: tuple[NDArray[np.float32], Array]) -> tuple[NDArray[np.float32], NDArray[np.float32], Array, Array]:
+            column, residual = run
+            own = np.ascontiguousarray(column.reshape(len(column), -1, residual.shape[1]).transpose(2, 0, 1))
             known = np.nan_to_num(residual).T
-            columns.append(own)
-            grams.append(own @ own.transpose(0, 2, 1))
-            pushes.append((own @ known.astype(np.float32)[:, :, None])[:, :, 0].astype(np.float64))
-            square = square + (known * known).sum(axis=1)
+            push = (own @ known.astype(np.float32)[:, :, None])[:, :, 0].astype(np.float64)
+            return own, own @ own.transpose(0, 2, 1), push, (known * known).sum(axis=1)
+
+        parts = in_threads(threads, of_one, zip(found.columns, fit.residuals, strict=True))
+        columns = [own for own, *_ in parts]
+        by_run, push_by_run = np.stack([gram for _, gram, *_ in parts]), np.stack([push for *_, push, _ in parts])
+        square = np.sum([square for *_, square in parts], axis=0)
         rows = np.sum([np.isfinite(r).sum(axis=0) for r in fit.residuals], axis=0)
-        by_run, push_by_run = np.stack(grams), np.stack(pushes)
         gram, push = by_run.sum(axis=0, dtype=np.float64), push_by_run.sum(axis=0)
         known = len(found.tight)
         by_run_known = by_run[:, :, :known, :known].reshape(*by_run.shape[:2], -1)

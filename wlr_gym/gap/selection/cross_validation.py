@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.fit import Fit, cheapest, equations_by_run, fit
-from wlr_gym.gap.estimation.least_squares import constrained_step
+from wlr_gym.base.threads import in_threads
+from wlr_gym.gap.estimation.fit import Fit, cheapest, fit
+from wlr_gym.gap.estimation.least_squares import constrained_step, equations_by_run
 from wlr_gym.gap.estimation.likelihood import estimate_noise, minus_two_log_likelihood
 from wlr_gym.gap.estimation.model import FittedModel, moved, on_bounds, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
@@ -193,8 +194,8 @@ def cross_validated(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit
     fitted = minus_two_log_likelihood(bare.residuals, autocorrelation_time) - minus_two_log_likelihood(
         whole.residuals, autocorrelation_time
     )
-    pairs = zip(runs, without_each_run(problem, bare), without_each_run(problem, whole), strict=True)
-    found = [problem.residuals([without.setting, with_it.setting], [run])[0] for run, without, with_it in pairs]
+    pairs = zip(without_each_run(problem, bare), without_each_run(problem, whole), runs, strict=True)
+    found = in_threads(problem.threads, lambda pair: problem.residuals([m.setting for m in pair[:2]], [pair[2]])[0], pairs)
     kept = [found[:k] + found[k + 1 :] for k in range(len(found))] if len(runs) >= FORGIVING else [found]
     return max(_improvement(some, autocorrelation_time) for some in kept) > max(LEAST_VALIDATED * fitted, 0.0)
 
@@ -207,7 +208,7 @@ def _improvement(found: Sequence[Array], autocorrelation_time: Array) -> float:
 
 def without_each_run(problem: Problem, found: Fit) -> list[FittedModel]:
     """The model as it would be without each run in turn, to first order."""
-    matrices, vectors = equations_by_run(found.columns, found.residuals, found.noise)
+    matrices, vectors = equations_by_run(found.columns, found.residuals, found.noise, problem.threads)
     matrix, vector = matrices.sum(axis=0), vectors.sum(axis=0)
     whole = constrained_step(problem, found.model, matrix, vector)
     steps = [

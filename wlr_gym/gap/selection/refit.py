@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.threads import in_threads
 from wlr_gym.gap.estimation.fit import CONVERGED, Fit, fit
 from wlr_gym.gap.estimation.least_squares import channel_products, constrained_step, cross_products
 from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise
@@ -89,7 +90,8 @@ def refit(
 
 def _descended(problem: Problem, runs: Sequence[int], current: Fit, trials: list[_Trial], rounds: int) -> list[_Trial]:
     """The trials after so many steps; those that are far behind are removed or no longer improved."""
-    products = {id(t.known): channel_products(t.known, len(problem.signals)) for t in trials}
+    kinds = {id(trial.known): trial.known for trial in trials}
+    products = {key: channel_products(known, len(problem.signals), problem.threads) for key, known in kinds.items()}
     for done in range(rounds):
         autocorrelation_time = _best_autocorrelation_time(problem, current, trials)
         if done >= PATIENCE:
@@ -125,23 +127,27 @@ def _improved(
 
     ``products``: of the known columns of trials, channel by channel, by the columns' id.
     """
-    tries, owns = [], _own_columns(problem, trials, runs)
-    noises = [estimate_noise(trial.residuals, scatter=current.noise.scatter) for trial in trials]
-    for trial, own, noise in zip(trials, owns, noises, strict=True):
+    owns = _own_columns(problem, trials, runs)
+
+    def proposed(one: tuple[_Trial, list[Array]]) -> tuple[Noise, list[_Trial]]:
+        trial, own = one
+        noise = estimate_noise(trial.residuals, scatter=current.noise.scatter)
         equations = _equations(np.tensordot(noise.weight, products[id(trial.known)], 1), trial, own, noise)
         change = constrained_step(problem, trial.model, *equations)
-        tries += [replace(trial, model=moved(problem, trial.model, share * change)) for share in TRIED]
-    tries = _simulated(problem, tries, runs)
-    improved = []
-    for k, (trial, own, noise) in enumerate(zip(trials, owns, noises, strict=True)):
-        tau = noise.autocorrelation_time
-        own_tries = range(len(TRIED) * k, len(TRIED) * (k + 1))
-        costs = {i: total_cost(problem, tries[i].model, tries[i].residuals, tau) for i in own_tries}
-        best = min(costs, key=lambda i: costs[i])
-        gained = total_cost(problem, trial.model, trial.residuals, tau) - costs[best]
-        better = _corrected(problem, trial, own, tries[best]) if gained > 0.0 else trial
-        improved.append(replace(better, converged=gained < CONVERGED))
-    return improved
+        return noise, [replace(trial, model=moved(problem, trial.model, share * change)) for share in TRIED]
+
+    steps = in_threads(problem.threads, proposed, zip(trials, owns, strict=True))
+    tries = iter(_simulated(problem, [each for _, own in steps for each in own], runs))
+    shared = [[next(tries) for _ in TRIED] for _ in trials]
+
+    def best(one: tuple[_Trial, list[Array], tuple[Noise, list[_Trial]], list[_Trial]]) -> _Trial:
+        trial, own, (noise, _), tried = one
+        before, *costs = (total_cost(problem, t.model, t.residuals, noise.autocorrelation_time) for t in (trial, *tried))
+        gained = before - min(costs)
+        better = _corrected(problem, trial, own, tried[int(np.argmin(costs))]) if gained > 0.0 else trial
+        return replace(better, converged=gained < CONVERGED)
+
+    return in_threads(problem.threads, best, zip(trials, owns, steps, shared, strict=True))
 
 
 def _equations(matrix: Array, trial: _Trial, own: Sequence[Array], noise: Noise) -> tuple[Array, Array]:
@@ -303,14 +309,14 @@ def _best_autocorrelation_time(problem: Problem, current: Fit, trials: Sequence[
     """
     scatter = current.noise.scatter
     bare = [(t.model, t.residuals) for t in trials if t.of < 0] or [(current.model, current.residuals)]
-    best, most = current.noise.autocorrelation_time, 0.0
-    for trial in trials:
+
+    def own_gain(trial: _Trial) -> tuple[float, Array]:
         own = estimate_noise(trial.residuals, scatter=scatter).autocorrelation_time
         before = min(total_cost(problem, model, residuals, own) for model, residuals in bare)
-        gain = before - total_cost(problem, trial.model, trial.residuals, own)
-        if gain > most:
-            best, most = own, gain
-    return best
+        return before - total_cost(problem, trial.model, trial.residuals, own), own
+
+    gain, best = max(in_threads(problem.threads, own_gain, trials), key=lambda found: found[0])
+    return best if gain > 0.0 else current.noise.autocorrelation_time
 
 
 def _own_columns(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) -> list[list[Array]]:

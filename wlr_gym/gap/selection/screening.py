@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.threads import in_threads
 from wlr_gym.gap.estimation.fit import Fit
 from wlr_gym.gap.estimation.least_squares import bounded_minimum, normal_equations
 from wlr_gym.gap.estimation.model import prior_tightness, room, scaled_nominal, scaled_numbers
@@ -96,17 +97,19 @@ def responses(problem: Problem, fit: Fit, runs: Sequence[int], probes: Sequence[
     """Simulate all probes on top of a fitted model and project the fitted numbers out."""
     settings = [Setting(fit.model.quantities, (*fit.model.patch, *probe.effects)) for probe in probes]
     found = problem.residuals(settings, runs)
-    columns = []
-    for r, base, known in zip(found, fit.residuals, fit.columns, strict=True):
-        own = np.nan_to_num(r - base).reshape(len(probes), -1).astype(np.float32)
-        columns.append(np.vstack([known, own]))
+
+    def with_own(run: tuple[Array, Array, NDArray[np.float32]]) -> NDArray[np.float32]:
+        r, base, known = run
+        return np.vstack([known, np.nan_to_num(r - base).reshape(len(probes), -1).astype(np.float32)])
+
+    columns = in_threads(problem.threads, with_own, zip(found, fit.residuals, fit.columns, strict=True))
     return project(problem, fit, columns, [probe.key for probe in probes])
 
 
 def project(problem: Problem, fit: Fit, columns: Sequence[NDArray[np.float32]], keys: Sequence[str]) -> Responses:
     """Project the fitted numbers out of the probes' columns, which follow theirs."""
     known = fit.model.size
-    response, push = normal_equations(columns, fit.residuals, fit.noise)
+    response, push = normal_equations(columns, fit.residuals, fit.noise, problem.threads)
     tight = prior_tightness(problem, fit.model)
     away = scaled_numbers(problem, fit.model) - scaled_nominal(problem, fit.model)
     imitation = np.linalg.solve(fit.hessian, response[:known])  # how the fitted numbers would follow each column

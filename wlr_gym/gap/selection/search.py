@@ -133,7 +133,7 @@ def screened(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = l
     candidates = [candidate for candidate in candidates if not _is_explained(current.model, candidate)]
     tell(f"screening {len(candidates)} candidates")
     found = responses(problem, current, runs, probes)
-    products = Products.of(current, found)
+    products = Products.of(current, found, problem.threads)
     linear = screen(candidates, found)
     return Screened(*rescored(problem, current, found, products, linear), linear, found, products)
 

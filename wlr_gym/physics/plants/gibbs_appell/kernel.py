@@ -189,6 +189,7 @@ def _driver(start: Mapping[str, int], width: int, precision: str, apply_formulas
     return _DRIVER.format(**values, **parts)
 
 
+#: Arrays are copied by loops: numba's slice assignment takes four times as long.
 _DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
 _APPLY_FORMULAS = """
             sense(W)
@@ -221,14 +222,23 @@ _COUNT_ANEW = """
             W[{wheel_reference} + at] -= moved"""
 _DRIVER = """
 {decorator}
+def copy(source, target):
+    for i in range(len(target)):
+        target[i] = source[i]
+
+
+{decorator}
 def scatter(W, TRUTH, RAW, tile, count):
+    truth = W[{truth} : {truth} + {truth_count} * {width}].reshape({truth_count}, {width})
+    raw = W[{raw} : {raw} + {raw_count} * {width}].reshape({raw_count}, {width})
     for k in range(min({width}, count - tile * {width})):
         row = tile * {width} + k
+        to_truth, to_raw = TRUTH[row], RAW[row]
         for c in range({truth_count}):
-            TRUTH[row, c] = W[{truth} + c * {width} + k]
+            to_truth[c] = truth[c, k]
         for c in range({raw_count}):
-            RAW[row, c] = W[{raw} + c * {width} + k]
-        RAW[row, {raw_count}] = math.atan2(W[{sine} + k], W[{cosine} + k]){unwrap}
+            to_raw[c] = raw[c, k]
+        to_raw[{raw_count}] = math.atan2(W[{sine} + k], W[{cosine} + k]){unwrap}
 
 
 {decorator}
@@ -238,10 +248,11 @@ def tick(
 ):
     whole_registers()
     W = np.zeros({scratch}, F)
+    stored, parameters = W[:{stored}], W[{parameters} : {parameters} + {parameter_count}]
     half = F(0.5) * step
     for tile in range(first, last):
-        W[:{stored}] = X[tile]
-        W[{parameters}:{parameters} + {parameter_count}] = P[tile]
+        copy(X[tile], stored)
+        copy(P[tile], parameters)
         W[{sums}:{sums} + {sum_count}] = F(0.0)
         for k in range({width}):
             row = min(tile * {width} + k, count - 1)
@@ -260,7 +271,7 @@ def tick(
             drift(W, step if s + 1 < substeps else half){count_anew}
         observe(W, step)
         scatter(W, TRUTH, RAW, tile, count)
-        X[tile] = W[:{stored}]
+        copy(stored, X[tile])
 
 
 {decorator}
@@ -268,8 +279,8 @@ def look(X, P, TRUTH, RAW, tiles, count, step):
     whole_registers()
     W = np.zeros({scratch}, F)
     for tile in tiles:
-        W[:{stored}] = X[tile]
-        W[{parameters}:{parameters} + {parameter_count}] = P[tile]
+        copy(X[tile], W[:{stored}])
+        copy(P[tile], W[{parameters} : {parameters} + {parameter_count}])
         observe(W, step)
         scatter(W, TRUTH, RAW, tile, count)
 """
