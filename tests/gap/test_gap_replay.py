@@ -148,6 +148,9 @@ def test_chunks_and_threads_do_not_change_a_bit(other, monkeypatch):
     chunked = replay_batch(ROBOT, [clock], table, with_truth=True)[0]
     assert np.array_equal(whole.values, threaded.values)
     assert np.array_equal(whole.values, chunked.values)
+    assert whole.truth is not None
+    assert chunked.truth is not None
+    assert np.array_equal(whole.truth, chunked.truth)
 
 
 def test_threads_share_the_runs_where_there_are_few_settings(run, other, monkeypatch):
@@ -159,9 +162,6 @@ def test_threads_share_the_runs_where_there_are_few_settings(run, other, monkeyp
     shared = replay_batch(ROBOT, clocks, table, threads=2)
     for one, same in zip(whole, shared, strict=True):
         assert np.array_equal(one.values, same.values)
-    assert whole.truth is not None
-    assert chunked.truth is not None
-    assert np.array_equal(whole.truth, chunked.truth)
 
 
 def test_channels_begin_as_the_sensors_do():
