@@ -107,9 +107,23 @@ def run_scatter(matrices: Array, vectors: Array) -> float | None:
 
 def autocorrelation_times(residuals: Sequence[Array]) -> Array:
     """Integrated autocorrelation (channels) in rows: summed until it first falls below 0.05, over measured rows only."""
-    packed = [np.ascontiguousarray(residual.T, np.float64) for residual in residuals]
-    edges = np.cumsum([0, *(part.shape[1] for part in packed)])
-    return _integrated(np.concatenate(packed, axis=1), edges, LONGEST)
+    return series_times([residual.T for residual in residuals])
+
+
+def series_times(series: Sequence[Array]) -> Array:
+    """The same of residuals (channels, rows)."""
+    edges = np.cumsum([0, *(part.shape[1] for part in series)])
+    return _integrated(np.concatenate(series, axis=1, dtype=np.float64), edges, LONGEST)
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc"})
+def _lagged(values: Any, first: Any, last: Any, lag: Any) -> Any:
+    """Sum of products of values a lag apart, side by side in vector registers."""
+    late, early = values[first:last], values[first - lag : last - lag]
+    total = 0.0
+    for k in range(len(late)):
+        total += late[k] * early[k]
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -132,16 +146,13 @@ def _integrated(series: Any, edges: Any, longest: Any) -> Any:
                 ends[runs] = count
             else:
                 count = first
-        power = 0.0
-        for k in range(count):
-            power += values[k] * values[k]
+        power = _lagged(values, 0, count, 0)
         if power <= 0.0:
             continue
         for lag in range(1, longest):
             product = 0.0
             for r in range(runs):
-                for k in range(ends[r] + lag, ends[r + 1]):
-                    product += values[k] * values[k - lag]
+                product += _lagged(values, ends[r] + lag, ends[r + 1], lag)
             rho = product / power
             if rho < 0.05:
                 break

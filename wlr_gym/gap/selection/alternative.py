@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from wlr_gym.base.threads import in_threads
 from wlr_gym.gap.estimation.fit import Fit
 from wlr_gym.gap.estimation.least_squares import bounded_minimum
-from wlr_gym.gap.estimation.likelihood import Noise, autocorrelation_times, channel_costs, run_scatter
+from wlr_gym.gap.estimation.likelihood import Noise, channel_costs, run_scatter, series_times
 from wlr_gym.gap.problem import Candidate, Problem, Start
-from wlr_gym.gap.selection.screening import Responses, Score, directions, shortened, with_tolerances
+from wlr_gym.gap.selection.screening import Responses, Score, directions, shortened, stiffness, with_tolerances
 
 Array = NDArray[np.float64]
 
@@ -151,6 +151,17 @@ class _System:
         return self.products.gram[self.channels]
 
     @cached_property
+    def residuals(self) -> list[Array]:
+        """Residuals (channels, rows) of each run."""
+        return [np.ascontiguousarray(residual.T[self.channels]) for residual in self.fit.residuals]
+
+    @cached_property
+    def columns(self) -> list[NDArray[np.float32]]:
+        """Columns (channels, columns, rows) of each run."""
+        every = len(self.channels) == len(self.products.rows)
+        return self.products.columns if every else [columns[self.channels] for columns in self.products.columns]
+
+    @cached_property
     def gram_known(self) -> Array:
         """The same of the fitted numbers (channels, numbers, numbers)."""
         return np.ascontiguousarray(self.gram[:, : self.known, : self.known])
@@ -159,29 +170,38 @@ class _System:
         """Return the candidates that explain most squares, or gain most under the noise of the model without them, best
         first, scored under the alternative; and the rest.
         """
-        bare = self._bare_costs()
         threads = self.problem.threads
-        rough = in_threads(threads, lambda score: max(self._rough(bare, start) for start in score.candidate.starts), scores)
+        starts = [start for score in scores for start in score.candidate.starts]
+        edges = np.cumsum([0, *(len(score.candidate.starts) for score in scores)])
+        rough = np.maximum.reduceat(self._rough(starts), edges[:-1])
         lasting = np.argsort(rough)[::-1][:count].tolist()
         leading = np.argsort([score.gain for score in scores])[::-1][: count // 2].tolist()
         chosen = dict.fromkeys([*lasting, *leading])
         best = in_threads(threads, self._scored, [scores[k] for k in chosen])
         return sorted(best, key=lambda score: -score.gain), [s for k, s in enumerate(scores) if k not in chosen]
 
-    def _bare_costs(self) -> float:
-        """Minus two log likelihood without a candidate if every row were independent."""
-        weight, own, push = self._white().weight, self.gram_known, self.push[:, : self.known]
-        matrix, gradient = with_tolerances(np.tensordot(weight, own, 1), weight @ push, self.found)
-        x = -np.linalg.solve(matrix, gradient)
-        square = self.square + 2.0 * push @ x + (own @ x) @ x
-        return float(self.rows @ channel_costs(np.maximum(square, 0.0) / np.maximum(self.rows, 1)))
+    def _rough(self, starts: Sequence[Start]) -> Array:
+        """Improvement by each start if every row were independent: what orders candidates before their noise is known."""
+        weight, known = self._white().weight, self.known
+        whole, push = np.tensordot(weight, self.gram, 1), weight @ self.push
+        own, gradient = with_tolerances(whole[:known, :known].copy(), push[:known].copy(), self.found)
+        following = -np.linalg.solve(own, np.column_stack([gradient, whole[:known]]))  # how the fitted numbers follow
+        steps = np.zeros((len(starts) + 1, len(push)))  # the last one is that of the model without any
+        steps[:, :known] = following[:, 0]
+        for step, start in zip(steps, starts, strict=False):
+            mix = directions(start, self.found)
+            border, corner = mix @ whole[:, :known], mix @ whole @ mix.T
+            corner[np.diag_indices(len(mix))] += stiffness(np.diag(corner))
+            amplitude = -np.linalg.solve(corner + border @ (following[:, 1:] @ mix.T), mix @ push + border @ following[:, 0])
+            step += amplitude @ mix
+            step[:known] += following[:, 1:] @ (amplitude @ mix)
+        after = channel_costs(np.maximum(self._squares(steps), 0.0) / np.maximum(self.rows, 1)) @ self.rows
+        return after[-1] - after[:-1]
 
-    def _rough(self, bare: float, start: Start) -> float:
-        """Improvement if every row were independent: what orders candidates before their noise is known."""
-        parts = self._parts(start)
-        matrix, gradient = with_tolerances(*parts.normal(self._white().weight), self.found)
-        after = parts.mean_squares(-np.asarray(np.linalg.solve(matrix, gradient), np.float64))
-        return bare - float(self.rows @ channel_costs(after))
+    def _squares(self, steps: Array) -> Array:
+        """Squares of the residuals (steps, channels) after steps of all columns (steps, columns)."""
+        curved = in_threads(self.problem.threads, lambda gram: np.einsum("sm,sm->s", steps @ gram, steps), self.gram)
+        return self.square + 2.0 * steps @ self.push.T + np.stack(curved, axis=1)
 
     def _white(self) -> Noise:
         """The noise of the model without a candidate, every row independent."""
@@ -223,15 +243,15 @@ class _System:
 
     def _noise_after(self, parts: _Directions, start: Start, x: Array) -> Noise:
         """Noise of what is left after a step, the scatter of the runs under it included."""
-        known, mix, fit = self.known, directions(start, self.found), self.fit
+        known, mix = self.known, directions(start, self.found)
         used = np.flatnonzero(mix.any(axis=0))
         steps, change = x[:known].astype(np.float32), (x[known:] @ mix[:, used]).astype(np.float32)
-        left = []
-        for residual, columns in zip(fit.residuals, self.products.columns, strict=True):
-            moved = [steps @ columns[c, :known] + change @ columns[c, used] for c in self.channels]
-            left.append(residual[:, self.channels] + np.stack(moved, axis=1))
-        own = autocorrelation_times(left)
-        scatter = fit.noise.scatter
+        left = [
+            residual + steps @ columns[:, :known] + change @ columns[:, used]
+            for residual, columns in zip(self.residuals, self.columns, strict=True)
+        ]
+        own = series_times(left)
+        scatter = self.fit.noise.scatter
         noise = Noise(parts.mean_squares(x), scatter * own, parts.rows, scatter)
         if len(self.channels) == len(self.products.rows):
             scatter = min(scatter, self._scatter(noise, start, x))

@@ -78,8 +78,9 @@ def refit(
         return []
     trials = _simulated(problem, _starts(problem, current, scores, given), runs)
     trials = _descended(problem, runs, current, trials, rounds)
-    for plain in _simulated(problem, _without_effect(problem, current, trials), runs):
-        trials += _descended(problem, runs, current, [plain], rounds)
+    plain = _simulated(problem, _without_effect(problem, current, trials), runs)
+    nudged = in_threads(problem.threads, lambda one: _descended(problem, runs, current, [one], rounds), plain)
+    trials += [trial for own in nudged for trial in own]
     autocorrelation_time = _best_autocorrelation_time(problem, current, trials)
     costs = [total_cost(problem, t.model, t.residuals, autocorrelation_time) for t in trials]
     best = [

@@ -183,8 +183,13 @@ def with_tolerances(matrix: Array, gradient: Array, found: Responses) -> tuple[A
     own = np.arange(len(known), len(gradient))
     matrix[known, known] += found.tight
     gradient[known] += found.tight * found.away
-    matrix[own, own] += LEAST_OWN * matrix[own, own] + 1e-9  # a probe that does nothing gets nothing
+    matrix[own, own] += stiffness(matrix[own, own])
     return matrix, gradient
+
+
+def stiffness(information: Array) -> Array:
+    """Return a little stiffness of directions with this information: a probe that does nothing gets nothing."""
+    return LEAST_OWN * information + 1e-9
 
 
 def shortened(candidate: Candidate, start: Start, amplitude: Array, shares: Sequence[float]) -> tuple[tuple[float, ...], float]:
