@@ -6,8 +6,9 @@ around the engine than in it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numba import typeof, types
@@ -21,36 +22,39 @@ from wlr_gym.physics.plants.base import Plant, Sensors
 from wlr_gym.physics.plants.gibbs_appell.plant import CompiledTick, GibbsAppellPlant
 from wlr_gym.physics.plants.sensors import measure_rows
 
+#: First tick, last tick, which motors are on.
+Follow: TypeAlias = Callable[[int, int, NDArray[np.bool_] | None], None]
 
-def follow(
-    plant: Plant,
-    schedule: Schedule,
-    recorder: Recorder,
-    readings: Sensors,
-    torque_on: NDArray[np.bool_] | None,
-    first: int,
-    last: int,
-) -> None:
-    """Move a batch from tick ``first`` to tick ``last`` and record what is read before each.
+
+def follower(plant: Plant, schedule: Schedule, recorder: Recorder, readings: Sensors) -> Follow:
+    """Return what moves a batch from a tick to another and records what is read before each.
 
     Args:
         plant: the robots; its setpoints are those of ``schedule``.
         schedule: the setpoints.
         recorder: what takes the readings.
         readings: of the plant, which it overwrites.
-        torque_on: (robots, 8) which motors are on; None = all.
-        first, last: ticks.
+
+    Returns:
+        Function of first and last tick, and (robots, 8) which motors are on; None = all.
     """
     if not isinstance(plant, GibbsAppellPlant):
         idle = np.zeros((plant.count, 8))
-        for tick in range(first, last):
-            recorder.see(tick, readings, plant.truth())
-            plant.step(idle, torque_on)
-        return
-    function, batch = plant.compiled_tick()
-    batch.torque_on[...] = 1.0 if torque_on is None else torque_on
-    loop = _loop(function, batch, schedule, recorder.tape)
-    loop(function, batch, schedule, recorder.tape, first, last)
+
+        def step(first: int, last: int, torque_on: NDArray[np.bool_] | None) -> None:
+            for tick in range(first, last):
+                recorder.see(tick, readings, plant.truth())
+                plant.step(idle, torque_on)
+
+        return step
+    loop = _loop(*plant.compiled_tick(), schedule, recorder.tape)
+
+    def go(first: int, last: int, torque_on: NDArray[np.bool_] | None) -> None:
+        function, batch = plant.compiled_tick()  # fewer robots, where runs are over
+        batch.torque_on[...] = 1.0 if torque_on is None else torque_on
+        loop(function, batch, schedule, recorder.tape, first, last)
+
+    return go
 
 
 def _loop(function: Any, batch: CompiledTick, schedule: Schedule, tape: Tape) -> Any:

@@ -20,7 +20,7 @@ from wlr_gym.base.threads import in_threads
 from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
-from wlr_gym.gap.robot.loop import follow
+from wlr_gym.gap.robot.loop import follower
 from wlr_gym.gap.robot.recorder import POSE_TICKS, Recorder, Replays
 from wlr_gym.gap.robot.schedule import WrittenSetpoints
 from wlr_gym.physics.plants import drive, ground, make_plant
@@ -154,6 +154,7 @@ def _replay_chunk(
         recorder = Recorder(clocks, settings, first, delay, with_truth)
         readings = plant.reset(parameters=lanes, state=first)
         recorder.start(readings)
+        follow = follower(plant, setpoints.schedule, recorder, readings)
         last = POSE_TICKS * -(-max(clock.ticks for clock in clocks) // POSE_TICKS)  # the last pose is stored too
         anchors, ends = _anchors_by_tick(clocks), np.array([clock.ticks + POSE_TICKS for clock in clocks])
         torque_on: NDArray[np.bool_] | None = None
@@ -165,7 +166,7 @@ def _replay_chunk(
                 readings = _anchor(plant, clocks[r], window, run_of == r, lanes, readings)
                 recorder.start_anew(r, tick, readings, plant.truth())
             torque_on = recorder.torque.get(tick, torque_on)
-            follow(plant, setpoints.schedule, recorder, readings, torque_on, tick, until)
+            follow(tick, until, torque_on)
         recorder.see(last, readings, plant.truth())
     finally:
         plant.close()

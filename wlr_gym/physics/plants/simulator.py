@@ -119,7 +119,7 @@ class Simulator(ABC):
         self._time[rows] = 0.0 if start.time is None else start.time[rows]
         self._setpoints.reset(rows, start, self.parameters)
         self._look(rows)
-        self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)
+        self._sensors.reset(self._raw, self._readings.values, seeds, None if parameters is None else self.parameters, mask)
         return self._readings
 
     def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:

@@ -28,9 +28,22 @@ Array = NDArray[np.float64]
 SWEEPS = 4
 #: Threads take so many tiles at a time: fewer cost more than they save.
 TILES_AT_A_TIME = 8
-_LANE = {name: index for index, name in enumerate(STORED)}
-_ROTOR_LEAD = [_LANE[f"rotor_lead{j}"] for j in range(8)]
-_ROTOR_RATE = [_LANE[f"rotor_rate{j}"] for j in range(8)]
+
+
+#: Where the lanes of a state are among the stored ones, by the pattern of their names.
+_PLACE = {
+    pattern: np.array([STORED.index(pattern.format(label)) for label in labels])
+    for labels, patterns in (
+        ("xyz", ("p{}", "v{}", "w{}", "last_w{}", "gyro_{}", "acceleration_{}")),
+        ("wxyz", ("q{}",)),
+        ("xy", ("rounding_p{}",)),
+        (range(4), ("leg_angle{}", "leg_rate{}", "last_leg_rate{}", "wheel_angle{}", "wheel_rate{}", "last_wheel_rate{}")),
+        (range(4), ("turns{}", "zero_angle{}", "zero_rest{}")),
+        (range(8), ("reference_position{}", "reference_velocity{}", "rotor_lead{}", "rotor_rate{}")),
+        (range(1), ("supply_drop",)),
+    )
+    for pattern in patterns
+}
 
 
 class CompiledTick(NamedTuple):
@@ -144,9 +157,10 @@ class GibbsAppellPlant(Simulator):
         if (old == new).all():
             return
         lanes = _gather(self._lanes, self._width, rows).astype(np.float64)
-        lanes[:, _ROTOR_LEAD] = refitted_lead(lanes[:, _ROTOR_LEAD], old, new)
+        lead, rate = _PLACE["rotor_lead{}"], _PLACE["rotor_rate{}"]
+        lanes[:, lead] = refitted_lead(lanes[:, lead], old, new)
         turning = self._truth.joint_velocity[rows]
-        lanes[:, _ROTOR_RATE] = np.where((old == 0.0) & (new > 0.0), turning, lanes[:, _ROTOR_RATE])
+        lanes[:, rate] = np.where((old == 0.0) & (new > 0.0), turning, lanes[:, rate])
         _scatter(self._lanes, self._width, rows, lanes)
 
     def _choose_kernel(self) -> None:
@@ -182,38 +196,36 @@ class GibbsAppellPlant(Simulator):
         turns = np.rint(zero / TURN)
         zero = zero - TURN * turns
         groups = {
-            "p{}": (state.position[rows], "xyz"),
-            "q{}": (quaternion, "wxyz"),
-            "v{}": (state.linear_velocity_in_body[rows], "xyz"),
-            "w{}": (w, "xyz"),
-            "last_w{}": (w, "xyz"),
-            "gyro_{}": (w, "xyz"),
-            "leg_angle{}": (state.joint_position[rows, LEG_SLICE], range(4)),
-            "wheel_angle{}": (wheels, range(4)),
-            "turns{}": (turns, range(4)),
-            "zero_angle{}": (zero, range(4)),
-            "zero_rest{}": (zero - zero.astype(self._float), range(4)),
-            "rounding_p{}": (place.astype(self._float) - place, "xy"),
-            "leg_rate{}": (leg_rate, range(4)),
-            "last_leg_rate{}": (leg_rate, range(4)),
-            "wheel_rate{}": (wheel_rate, range(4)),
-            "last_wheel_rate{}": (wheel_rate, range(4)),
-            "reference_position{}": (reference, range(8)),
-            "reference_velocity{}": (state.reference_velocity[rows], range(8)),
-            "rotor_rate{}": ((state.joint_velocity if state.rotor_rate is None else state.rotor_rate)[rows], range(8)),
+            "p{}": state.position[rows],
+            "q{}": quaternion,
+            "v{}": state.linear_velocity_in_body[rows],
+            "w{}": w,
+            "last_w{}": w,
+            "gyro_{}": w,
+            "leg_angle{}": state.joint_position[rows, LEG_SLICE],
+            "wheel_angle{}": wheels,
+            "turns{}": turns,
+            "zero_angle{}": zero,
+            "zero_rest{}": zero - zero.astype(self._float),
+            "rounding_p{}": place.astype(self._float) - place,
+            "leg_rate{}": leg_rate,
+            "last_leg_rate{}": leg_rate,
+            "wheel_rate{}": wheel_rate,
+            "last_wheel_rate{}": wheel_rate,
+            "reference_position{}": reference,
+            "reference_velocity{}": state.reference_velocity[rows],
+            "rotor_rate{}": (state.joint_velocity if state.rotor_rate is None else state.rotor_rate)[rows],
         }
         if state.rotor_lead is not None:
-            groups["rotor_lead{}"] = (state.rotor_lead[rows], range(8))
+            groups["rotor_lead{}"] = state.rotor_lead[rows]
         if state.supply_drop is not None:
-            groups["supply_drop{}"] = (state.supply_drop[rows, None], ("",))
-        for pattern, (columns, labels) in groups.items():
-            for k, label in enumerate(labels):
-                values[:, _LANE[pattern.format(label)]] = columns[:, k]
+            groups["supply_drop"] = state.supply_drop[rows, None]
+        for name, columns in groups.items():
+            values[:, _PLACE[name]] = columns
         if not np.isfinite(values).all():
             raise InputError("state holds numbers that are not finite")
         still = -np.einsum("nji,nj->ni", rotation_matrix(quaternion), gravity_in_floor(self.parameters)[rows])
-        for k, axis in enumerate("xyz"):
-            values[:, _LANE[f"acceleration_{axis}"]] = still[:, k]
+        values[:, _PLACE["acceleration_{}"]] = still
         _scatter(self._lanes, self._width, rows, values)
         self._pad(self._lanes)
         wound = np.zeros((rows.size, 8)) if state.wind_up is None else state.wind_up[rows]
@@ -223,26 +235,26 @@ class GibbsAppellPlant(Simulator):
         """Return a copy of the mechanical and servo state."""
         values = _gather(self._lanes, self._width, np.arange(self._count)).astype(np.float64)
 
-        def columns(pattern: str, labels: object) -> Array:
-            return np.stack([values[:, _LANE[pattern.format(label)]] for label in labels], axis=1)  # type: ignore[union-attr]
+        def columns(name: str) -> Array:
+            return values[:, _PLACE[name]]
 
-        reference = columns("reference_position{}", range(8))
+        reference = columns("reference_position{}")
         reference[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
         if self._float is np.float32:
-            reference[:, WHEEL_SLICE] += self._truth.joint_position[:, WHEEL_SLICE] - columns("wheel_angle{}", range(4))
+            reference[:, WHEEL_SLICE] += self._truth.joint_position[:, WHEEL_SLICE] - columns("wheel_angle{}")
         has_play = self.parameters["servo.backlash"] > 0.0
         return PlantState(
             position=self._truth.position.copy(),
-            quaternion=columns("q{}", "wxyz"),
-            linear_velocity_in_body=columns("v{}", "xyz"),
-            angular_velocity_in_body=columns("w{}", "xyz"),
+            quaternion=columns("q{}"),
+            linear_velocity_in_body=columns("v{}"),
+            angular_velocity_in_body=columns("w{}"),
             joint_position=self._truth.joint_position.copy(),
             joint_velocity=self._truth.joint_velocity.copy(),
             reference_position=reference,
-            reference_velocity=columns("reference_velocity{}", range(8)),
-            rotor_lead=np.where(has_play, columns("rotor_lead{}", range(8)), 0.0),
-            rotor_rate=np.where(has_play, columns("rotor_rate{}", range(8)), self._truth.joint_velocity),
-            supply_drop=values[:, _LANE["supply_drop"]],
+            reference_velocity=columns("reference_velocity{}"),
+            rotor_lead=np.where(has_play, columns("rotor_lead{}"), 0.0),
+            rotor_rate=np.where(has_play, columns("rotor_rate{}"), self._truth.joint_velocity),
+            supply_drop=columns("supply_drop")[:, 0],
             time=self._time.copy(),
             wind_up=_gather(self._memory, self._width, self._all)[:, 1:].astype(np.float64),
         )
