@@ -26,6 +26,7 @@ from wlr_gym.gap.robot.schedule import WrittenSetpoints
 from wlr_gym.physics.plants import drive, ground, make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, Sensors, standing_state
 from wlr_gym.physics.plants.forces import Force
+from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.physics.plants.simulator import Simulator
 from wlr_gym.physics.servo import motor_constants, position_gains
@@ -38,6 +39,8 @@ Array = NDArray[np.float64]
 PHYSICS_STEP = 0.001
 #: Simulators that are twice as fast with numbers whose rounding (0.05 sensor noises after windows of 2 s) does not matter here.
 PRECISION = {"gibbs_appell": "float32"}
+#: Passes over the friction rows per substep of the engine: twice as many move readings by 0.02 sensor noises (rms).
+SWEEPS = 2
 #: Robots simulated at once: what they read stays in the processor's cache.
 MOST_ROBOTS = 512
 #: Robots of a tile of the engine in single precision.
@@ -141,6 +144,8 @@ def _replay_chunk(
     options = PlantOptions(CLOCK, PHYSICS_STEP, PRECISION.get(backend, "float64"), threads, sensor_noise=False)
     plant = make_plant(backend, robot, len(lanes), options, tuple(forces))
     assert isinstance(plant, Simulator)
+    if isinstance(plant, GibbsAppellPlant):
+        plant.sweeps = SWEEPS
     if forces or kernel_of(lanes) == KERNELS[-1]:
         plant.expect_all_effects()
     if constants is not None:
