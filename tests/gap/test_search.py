@@ -9,7 +9,7 @@ from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap.analysis import NOT_EXCITED
 from wlr_gym.gap.estimation.fit import Fit, fit, linearise
-from wlr_gym.gap.estimation.likelihood import estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.estimation.likelihood import estimate_noise
 from wlr_gym.gap.estimation.model import nominal_model, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
 from wlr_gym.gap.report.text import sentence
@@ -20,7 +20,7 @@ from wlr_gym.gap.selection.cross_validation import (
     converge,
     cross_validated,
     fit_finalists,
-    without_each_part,
+    without_each_run,
 )
 from wlr_gym.gap.selection.equivalence import EQUIVALENT, equivalents
 from wlr_gym.gap.selection.hypothesis import INSISTENT, Hypothesis
@@ -380,11 +380,11 @@ def test_finalists_are_compared_with_the_same_model(monkeypatch):
     assert bare.residuals[0][0, 0] == pytest.approx(3.2 * ones[0, 0])
 
 
-def test_model_without_each_part_is_the_fit_without_it():
+def test_model_without_each_run_is_the_fit_without_it():
     problem = Toy({"gain": 1.0}, [sized("drag", 0.8, "right")], rows=400)
     own = candidate(problem, "drag", ["right"])
     whole = fit(problem, RUNS, nominal_model(problem).with_effect(own, (0.5,)), steps=12)
-    for run, model in zip(RUNS, without_each_part(problem, whole), strict=True):
+    for run, model in zip(RUNS, without_each_run(problem, whole), strict=True):
         rest = [other for other in RUNS if other != run]
         anew = fit(problem, rest, whole.model, autocorrelation_time=whole.noise.autocorrelation_time, steps=12)
         assert model.effects[0][1] == pytest.approx(anew.model.effects[0][1], abs=0.01)
@@ -430,25 +430,11 @@ class Once(Toy):
 
 
 def test_what_one_run_alone_shows_is_reported_and_not_selected():
-    problem = Once({}, [sized("decoy_2", 0.25)], rows=400, runs=8, error=0.3)
+    problem = Once({}, [sized("decoy_2", 3.0)], rows=400, runs=8, error=0.3)
     analysis = analyse_problem(problem, "toy", heldout=("run_6", "run_7", "run_8"))
     assert analysis.verdict == NOT_EXCITED
     assert analysis.effects == ()
     assert sentence(analysis).startswith("Only run_1 shows decoy 2 (body): it fails cross-validation. Record more such runs")
-
-
-@pytest.mark.parametrize(("without", "passes"), [(0, True), (200, False)], ids=["whole run", "half of it"])
-def test_what_one_run_alone_shows_clearly_must_be_in_both_its_halves(without, passes):
-    """A robot that was knocked half-way through a run lacks nothing."""
-    problem = Once({}, [sized("decoy_2", 1.0)], rows=400)
-    problem._measured[0][:without] = Once({}, rows=400)._measured[0][:without]
-    own = candidate(problem, "decoy_2")
-    bare = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
-    whole = fit(problem, RUNS, bare.model.with_effect(own, (1.0,)), steps=problem.steps)
-    autocorrelation_time = whole.noise.autocorrelation_time
-    before, after = (minus_two_log_likelihood(f.residuals, autocorrelation_time) for f in (bare, whole))
-    assert before - after > cross_validation.CLEAR
-    assert cross_validated(problem, RUNS, bare, whole, autocorrelation_time) is passes
 
 
 def test_better_model_found_while_converging_is_calibrated_from(monkeypatch):

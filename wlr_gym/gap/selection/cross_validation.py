@@ -39,8 +39,6 @@ LEAST_VALIDATED = 0.3
 LEAST_RUNS = 3
 #: Of so many runs, the one that loses most is ignored: play and sticking make the cost rough, and a run may be thrown off.
 FORGIVING = 5
-#: Fall of minus two log likelihood that no mishap of one run has made so far (at most 27).
-CLEAR = 80.0
 #: Steps, at most, in which a model with a selected effect converges.
 CONVERGENCE_STEPS = 8
 #: Grid on which a better place is searched, in steps of every unknown that says where an effect is or over what it fades.
@@ -187,42 +185,19 @@ def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near:
 
 
 def cross_validated(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit, autocorrelation_time: Array) -> bool:
-    """Whether the effect passes cross-validation: runs left out one by one improve by a share of what they do when fitted.
+    """Whether the effect passes leave-one-run-out cross-validation: runs improve by a share of what they do when fitted.
 
-    Only the likelihood is compared, not the prior. Two runs are not tested; of :data:`FORGIVING` and more, one is ignored. What
-    one run alone shows cannot pass; if it is clear (:data:`CLEAR`), the halves of the runs are left out one by one.
+    Only the likelihood is compared, not the prior. Two runs are not tested; of :data:`FORGIVING` and more, one is ignored.
     """
     if len(runs) < LEAST_RUNS:
         return True
     fitted = minus_two_log_likelihood(bare.residuals, autocorrelation_time) - minus_two_log_likelihood(
         whole.residuals, autocorrelation_time
     )
-
-    def passes(parts: int) -> bool:
-        found = _left_out(problem, runs, bare, whole, parts)
-        kept = [found[:k] + found[k + 1 :] for k in range(len(found))] if len(found) >= FORGIVING * parts else [found]
-        return max(_improvement(some, autocorrelation_time) for some in kept) > max(LEAST_VALIDATED * fitted, 0.0)
-
-    return passes(1) or (fitted > CLEAR and passes(2))
-
-
-def _left_out(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit, parts: int) -> list[Array]:
-    """Residuals without and with the effect (2, rows, channels) of each part of each run, of models fitted without it."""
-
-    def of_one(part: tuple[int, slice, FittedModel, FittedModel]) -> Array:
-        run, rows, without, with_it = part
-        return problem.residuals([without.setting, with_it.setting], [run])[0][:, rows]
-
-    runs_of = [run for run in runs for _ in range(parts)]
-    rows = [own for residual in bare.residuals for own in _parts(len(residual), parts)]
-    models = (without_each_part(problem, found, parts) for found in (bare, whole))
-    return in_threads(problem.threads, of_one, zip(runs_of, rows, *models, strict=True))
-
-
-def _parts(rows: int, parts: int) -> list[slice]:
-    """Parts of equal length of so many rows."""
-    edges = [rows * k // parts for k in range(parts + 1)]
-    return [slice(first, last) for first, last in itertools.pairwise(edges)]
+    pairs = zip(without_each_run(problem, bare), without_each_run(problem, whole), runs, strict=True)
+    found = in_threads(problem.threads, lambda pair: problem.residuals([m.setting for m in pair[:2]], [pair[2]])[0], pairs)
+    kept = [found[:k] + found[k + 1 :] for k in range(len(found))] if len(runs) >= FORGIVING else [found]
+    return max(_improvement(some, autocorrelation_time) for some in kept) > max(LEAST_VALIDATED * fitted, 0.0)
 
 
 def _improvement(found: Sequence[Array], autocorrelation_time: Array) -> float:
@@ -231,15 +206,9 @@ def _improvement(found: Sequence[Array], autocorrelation_time: Array) -> float:
     return before - after
 
 
-def without_each_part(problem: Problem, found: Fit, parts: int = 1) -> list[FittedModel]:
-    """The model as it would be without each part of each run in turn, to first order; one part is the whole run."""
-    columns, residuals = [], []
-    for column, residual in zip(found.columns, found.residuals, strict=True):
-        known = column.reshape(len(column), *residual.shape)
-        for rows in _parts(len(residual), parts):
-            columns.append(known[:, rows].reshape(len(column), -1))
-            residuals.append(residual[rows])
-    matrices, vectors = equations_by_run(columns, residuals, found.noise, problem.threads)
+def without_each_run(problem: Problem, found: Fit) -> list[FittedModel]:
+    """The model as it would be without each run in turn, to first order."""
+    matrices, vectors = equations_by_run(found.columns, found.residuals, found.noise, problem.threads)
     matrix, vector = matrices.sum(axis=0), vectors.sum(axis=0)
     whole = constrained_step(problem, found.model, matrix, vector)
     steps = [
