@@ -1,12 +1,14 @@
 """``wlr envs``."""
 
+import re
+
 import matplotlib.image
 import pytest
 from matplotlib.figure import Figure
 
 from wlr_gym.cli import main
 from wlr_gym.envs.registry import ENVIRONMENTS
-from wlr_gym.envs.tasks import load_randomization
+from wlr_gym.envs.tasks import load_randomization, load_task
 from wlr_gym.learning.evaluation.floor_plots import draw_floors
 from wlr_gym.robot import load_robot
 
@@ -17,11 +19,26 @@ def test_list_has_every_environment(capsys):
     assert all(env_id in shown for env_id in ENVIRONMENTS)
 
 
-def test_description_has_units_and_terms(capsys):
-    assert main(["envs", "WLR-Velocity-v0"]) == 0
+@pytest.mark.parametrize("width", [60, 80, 130])
+@pytest.mark.parametrize("env_id", ["WLR-Velocity-v0", "WLR-Path-v0"])
+def test_description_fits_the_terminal_and_has_every_index_once(env_id, width, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(width))
+    assert main(["envs", env_id, "--randomization", "wide", "--robot", "nominal"]) == 0
     shown = capsys.readouterr().out
-    for text in ("command[linear_velocity_x]", "rad/s", "track_yaw_rate", "gyro[z]"):
-        assert text in shown
+    assert max(map(len, shown.splitlines())) <= width
+    assert not re.search(r"\*\*|`|==", shown)
+    task = load_task(ENVIRONMENTS[env_id], load_robot())
+    told = [_indices(block) for block in shown.split("\n\n") if "index" in block.partition("\n")[0].split()]
+    assert told == [list(range(len(columns))) for columns in (task.actions, task.policy, task.privileged)]
+    assert {column.term for column in (*task.policy, *task.privileged)} <= set(shown.split())
+
+
+def _indices(block: str) -> list[int]:
+    """Numbers of a block's index column, found by the place of its heading: ``6-9`` is four."""
+    head, *lines = block.splitlines()
+    cells = (line[head.index("index") :].partition(" ")[0] for line in lines)
+    spans = [[int(end) for end in cell.split("-")] for cell in cells if re.fullmatch(r"\d+(-\d+)?", cell)]
+    return [index for span in spans for index in range(span[0], span[-1] + 1)]
 
 
 def test_unknown_environment(capsys):
@@ -29,13 +46,20 @@ def test_unknown_environment(capsys):
     assert "did you mean 'WLR-Velocity-v0'?" in capsys.readouterr().err
 
 
-def test_description_shows_what_a_randomization_draws(capsys):
+def test_description_shows_what_a_randomization_draws(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     assert main(["envs", "WLR-Velocity-v0", "--randomization", "patches"]) == 0
     shown = capsys.readouterr().out
-    for text in ("``patches``", "drift 2..6 s", "area x_min -1.2..0.7 m", "tolerance x 1, cut at 2", "sensors.imu.gyro_bias"):
+    for text in (
+        "Randomization patches: ",
+        "drift 2..6 s: ",
+        "area x_min -1.2..0.7 m",
+        "tolerance x 1, cut at 2",
+        "sensors.imu.gyro_bias",
+    ):
         assert text in shown
     assert main(["envs", "WLR-Velocity-v0"]) == 0
-    assert "``slippery``" in capsys.readouterr().out
+    assert "Randomization slippery: " in capsys.readouterr().out
 
 
 def test_bad_randomization(capsys):

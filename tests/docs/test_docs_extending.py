@@ -19,7 +19,8 @@ def _parameters(env: gym.Env, name: str) -> np.ndarray:
 def test_the_page_makes_what_it_says(workplace):
     names = run_page(PAGE, slow=False, smaller=False)
     assert names["leg_rate_reward"] < 0.0
-    assert [names["described"].count(f"side_speed[{side}]") for side in ("left", "right")] == [3, 3]  # history: 3
+    rows = [line for line in names["described"].splitlines() if line.startswith("side_speed") and "left, right" in line]
+    assert [row.partition("  ")[0] for row in rows] == ["side_speed", *(f"side_speed, lag {k} (steps)" for k in (1, 2))]
     assert (names["env_id"], names["batch"].num_envs) == ("WLR-Spin-v0", 64)
     nominal = _parameters(gym.make("WLR-Velocity-v0", randomization="none"), "servo.stall_torque")
     for simulator in ("on_engine", "on_mujoco"):

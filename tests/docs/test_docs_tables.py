@@ -77,7 +77,8 @@ def test_wlr_record_lists_the_motions(capsys, monkeypatch):
     assert all(words(" ".join(row[1:])) in text for row in rows("motions"))
 
 
-def test_wlr_envs_prints_the_terms(capsys):
+def test_wlr_envs_prints_the_terms(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
     text = ""
     for env_id in ENVIRONMENTS:
         assert main(["envs", env_id]) == 0
@@ -89,7 +90,8 @@ def test_wlr_envs_prints_the_terms(capsys):
 
 
 @pytest.mark.parametrize("name", ["nominal", "wide", *tables.PRESETS])
-def test_wlr_envs_prints_what_is_drawn(name, capsys):
+def test_wlr_envs_prints_what_is_drawn(name, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
     assert main(["envs", "WLR-Velocity-v0", "--randomization", name]) == 0
     text = words(capsys.readouterr().out)
     found = rows(name) if name in tables.TABLES else [row[1:] for row in rows("presets") if words(row[0]) == name]

@@ -8,6 +8,7 @@ from typing import Any
 
 import tyro
 from rich.console import Console
+from rich.text import Text
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing
@@ -16,8 +17,8 @@ from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.tables import print_table
 from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
-from wlr_gym.envs.tasks import Randomization, Task, describe, describe_randomization, load_randomization, load_task
-from wlr_gym.envs.tasks.describe import describe_scaling
+from wlr_gym.envs.tasks import Randomization, Task, load_randomization, load_task
+from wlr_gym.envs.tasks.describe import Section, randomization_section, scaling_sections, task_sections
 from wlr_gym.envs.tasks.task_config import read_task
 
 PICTURES = (".png", ".svg", ".pdf")
@@ -38,30 +39,51 @@ class EnvsOptions(JsonOption, ForceOption):
 def run(options: EnvsOptions) -> int:
     """Print the list or the description."""
     if options.env is not None:
-        task = load_task(task_source_of(options.env), options.robot)
-        randomization = load_randomization(options.randomization or task.config.randomization, task.robot)
-        texts = [options.env, describe(task), describe_randomization(randomization.config)]
-        if options.robot is not None:
-            texts.append(describe_scaling(read_task(task_source_of(options.env)), task.robot))
-        if options.picture is not None:
-            _draw(options.picture, randomization, options.force)
-        if options.json:
-            print_json(_content(options.env, task, randomization))
-        else:
-            print("\n\n".join(texts))
-        return OK
-    if any(value is not None for value in (options.robot, options.randomization, options.picture)):
+        _describe(options.env, options)
+    elif any(value is not None for value in (options.robot, options.randomization, options.picture)):
         raise InputError("name the environment too, such as: wlr envs WLR-Velocity-v0 --randomization wide")
-    found = [_summary(env_id, load_task(task_source_of(env_id))) for env_id in ENVIRONMENTS]
-    if options.json:
-        print_json(found)
-        return OK
-    rows = [
-        (one["id"], f"Box({one['action']})", f"Box({one['observation']})", f"{1 / one['control_period']:g} Hz",
-         f"{one['episode_length']:g} s") for one in found
-    ]  # fmt: skip
-    print_table(Console(), ("id", "action", "observation", "control", "episode"), rows)
+    else:
+        _list(options)
     return OK
+
+
+def _list(options: EnvsOptions) -> None:
+    tasks = {env_id: load_task(task_source_of(env_id)) for env_id in ENVIRONMENTS}
+    if options.json:
+        print_json([_summary(env_id, task) for env_id, task in tasks.items()])
+        return
+    rows = [
+        (env_id, f"Box({len(task.actions)})", f"Box({len(task.policy)})", f"{1 / task.config.control_period:g} Hz",
+         f"{task.config.episode_length:g} s", _about(task)) for env_id, task in tasks.items()
+    ]  # fmt: skip
+    print_table(Console(), ("id", "action", "observation", "control", "episode", "what it asks for"), rows)
+    print("one of them, with all its numbers: wlr envs ID")
+
+
+def _about(task: Task) -> str:
+    return " ".join(task.config.summary.partition("\n\n")[0].split())
+
+
+def _describe(env_id: str, options: EnvsOptions) -> None:
+    written = task_source_of(env_id)
+    task = load_task(written, options.robot)
+    randomization = load_randomization(options.randomization or task.config.randomization, task.robot)
+    if options.picture is not None:
+        _draw(options.picture, randomization, options.force)
+    if options.json:
+        print_json(_content(env_id, task, randomization))
+        return
+    sections = [Section(env_id, _about(task)), *task_sections(task), randomization_section(randomization.config)]
+    if options.robot is not None:
+        sections += scaling_sections(read_task(written), task.robot)
+    for section in sections:
+        _print(Console(), section)
+
+
+def _print(console: Console, section: Section) -> None:
+    console.print(Text.assemble((section.title, "bold"), " ", section.sentence), end="\n\n")
+    if section.rows:
+        print_table(console, section.headings, [[cell.replace("``", "") for cell in row] for row in section.rows])
 
 
 def _summary(env_id: str, task: Task) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import overlay
 from wlr_gym.envs.tasks import contract, describe, load_task
+from wlr_gym.envs.tasks.describe import column_name, task_sections
 from wlr_gym.envs.tasks.task import bounds
 from wlr_gym.envs.tasks.terms import TERMINATIONS
 from wlr_gym.robot import load_robot
@@ -103,13 +105,36 @@ def test_only_measurable_quantities_are_policy_terms(robot):
     }
 
 
-def test_tables_list_every_column_in_order(robot):
-    task = load_task("velocity", robot)
-    text = describe(task)
-    rows = [line.split() for line in text.splitlines() if line[:1].isdigit()]
-    numbered = [int(row[0]) for row in rows]
-    assert numbered == [*range(8), *range(len(task.policy)), *range(len(task.privileged))]
-    assert rows[8][1] == "command[linear_velocity_x]"
+def test_sections_have_every_column_in_order(robot):
+    task = load_task("velocity", robot, {"observations": {"gyro": {"history": 2}, "leg_velocity": {"noise": 0.1, "bias": 0.2}}})
+    action, policy, privileged = (
+        [dict(zip(section.headings, row, strict=True)) for row in section.rows]
+        for section in task_sections(task)
+        if "index" in section.headings
+    )
+    assert ", ".join(row["joints"] for row in action) == ", ".join(robot.joints)
+    for rows, columns in ((policy, task.policy), (privileged, task.privileged)):
+        told = iter(enumerate(columns))
+        for row in rows:
+            parts = [part.split(", ") for part in row["components"].split(": each ")]
+            components = [] if parts == [["-"]] else [",".join(pair) for pair in product(*parts)]
+            same = [next(told) for _ in components or "-"]
+            assert row["index"] == "-".join(dict.fromkeys(str(index) for index in (same[0][0], same[-1][0])))
+            term, _, lag = row["name"].partition(", lag ")
+            assert [column_name(column) for _, column in same] == ([f"{term}[{one}]" for one in components] or [term])
+            units = row["unit"].split(", ")
+            assert [column.unit for _, column in same] == (units if len(units) > 1 else len(same) * units)
+            assert {(column.frame, column.lag) for _, column in same} == {(row["frame"], int(lag.split()[0] if lag else 0))}
+        assert not list(told)
+    assert {row["name"]: row["noise"] for row in policy}["leg_velocity"] == "0.02398 + 0.1, bias 0.2"
+
+
+def test_the_text_has_what_the_task_says(robot):
+    lines = describe(load_task("velocity", robot)).splitlines()
+    assert "**Observation** Box((52,), float32): value = scale * clip(reading - offset, +-limit)." in "\n".join(lines)
+    rule = next(k for k, line in enumerate(lines) if line.startswith("="))
+    assert lines[rule] == lines[rule + 2] == lines[rule + 5]
+    assert lines[rule + 3].split("  ")[0] == "leg_lf, leg_rf, leg_lr, leg_rr"
     changed = describe(
         load_task("velocity", robot, {"observations": {"gyro": {"scale": 0.123}}, "rewards": {"slip": {"speed": 0.777}}})
     )

@@ -113,11 +113,12 @@ def test_the_contract_describes_a_robot_that_is_not_the_nominal_one():
     assert load_robot(described) == load_robot(LARGE)
 
 
-def test_wlr_envs_prints_each_number_with_its_rule(capsys, tmp_path):
+def test_wlr_envs_prints_each_number_with_its_rule(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     file = tmp_path / "large.yaml"
     file.write_text("base: nominal\nname: wide\nhip_position: {x: 0.35, y: 0.32}\n")
     assert cli.main(["envs", "WLR-Velocity-v0", "--robot", str(file)]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert ["commands.terms.yaw_rate", "top_speed", "/", "track_width", "[-0.3,", "0.3]", "[-0.15,", "0.15]"] in lines
-    assert ["track_width", "m", "0.32", "0.64", "distance", "of", "left", "and", "right", "wheels"] in lines
+    assert ["commands.terms.yaw_rate", *["[-0.3,", "0.3]", "->", "[-0.15,", "0.15]", "top_speed", "/", "track_width"]] in lines
+    assert ["track_width", "m", "0.32", "->", "0.64", "distance", "of", "left", "and", "right", "wheels"] in lines
     assert cli.main(["envs", "--robot", str(file)]) == 2

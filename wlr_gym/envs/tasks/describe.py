@@ -1,8 +1,10 @@
-"""What a task is, for people (tables) and for machines (the contract a policy file carries)."""
+"""What a task is, for people (sections with tables) and for machines (the contract a policy file carries)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby, product
 from typing import Any
 
 from wlr_gym.envs.tasks.entries import AreaConfig, EventConfig
@@ -15,59 +17,79 @@ from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.robot import Robot, load_robot, robot_content, robot_hash, servo_hash
 
 
+@dataclass(frozen=True)
+class Section:
+    """Part of a description: a title, what it says in a sentence or two, and a table, which has no rows where there is none."""
+
+    title: str
+    sentence: str
+    headings: Sequence[str] = ()
+    rows: Sequence[Sequence[str]] = ()
+
+
 def describe(task: Task) -> str:
     """Return the task's action, observation, command, reward, termination and measure tables as text (reStructuredText)."""
+    return restructured_text(task_sections(task))
+
+
+def describe_randomization(config: RandomizationConfig) -> str:
+    """Return what a randomisation draws as text (reStructuredText): switches, initial state, and the table of its events."""
+    return restructured_text([randomization_section(config)])
+
+
+def restructured_text(sections: Sequence[Section]) -> str:
+    """Return sections as reStructuredText: titles in bold, simple tables."""
+    return "\n".join(line for one in sections for line in (f"**{one.title}** {one.sentence}", "", *_simple_table(one)))
+
+
+def _simple_table(section: Section) -> list[str]:
+    if not section.rows:
+        return []
+    widths = [max(map(len, column)) for column in zip(section.headings, *section.rows, strict=True)]
+    rule = ["=" * width for width in widths]
+    lines = (rule, section.headings, rule, *section.rows, rule, ())
+    return ["  ".join(map(str.ljust, line, widths)).rstrip() for line in lines]
+
+
+def task_sections(task: Task) -> list[Section]:
+    """Return what a task is: action, observation, commands, reward, end of the episode, measures."""
     config = task.config
-    command_rows = [
-        (name, COMMANDS[name].unit, COMMANDS[name].frame, f"[{low:g}, {high:g}]", _ramp(config, name), COMMANDS[name].doc)
+    commands = [
+        (name, COMMANDS[name].unit, COMMANDS[name].frame, f"[{low:g}, {high:g}]{_ramp(config, name)}", COMMANDS[name].doc)
         for name, (low, high) in config.commands.terms.items()
     ]
-    reward_rows = [
+    rewards = [
         (name, f"{values['weight']:g}", parameters_text(values, REWARDS[name].parameters), REWARDS[name].doc)
         for name, values in config.rewards.items()
     ]
-    termination_rows = [
+    terminations = [
         (name, parameters_text(values, TERMINATIONS[name].parameters), TERMINATIONS[name].doc)
         for name, values in config.terminations.items()
     ]
-    privileged_rows = [
-        (str(index), column_name(column), column.unit, column.frame, f"{column.scale:g}", f"{column.limit:g}")
-        for index, column in enumerate(task.privileged)
+    measures = [(name, MEASURES[name].unit, limits_text(config, name), MEASURES[name].doc) for name in task.measures]
+    policy, exact = _observation_rows(config, task.policy), _observation_rows(config, task.privileged)
+    sensors = [f"{name} with probability {share:g}" for name, share in config.sensors if share is not None]
+    boxes = [f"Box(({len(columns)},), float32)" for columns in (task.policy, task.privileged)]
+    space = f"Box(-1, 1, ({len(task.actions)},), float32): setpoint = clip(centre + scale * action, range)"
+    success = "in core.measures; an episode is a success when nothing terminated it and all limits hold"
+    end = f"after {config.episode_length:g} s ({task.episode_steps} control steps of {1000 * config.control_period:g} ms)"
+    return [
+        Section("Action", space, _ACTION, _action_rows(task)),
+        Section("Observation", f"{boxes[0]}: {_READING}", (*_COLUMNS, "noise", "delay (ms)"), policy),
+        Section("Observation", "what each reading is", ("name", "meaning"), observation_meanings(task)),
+        Section("Privileged observation", f'(observation="dict"): {boxes[1]}, exact', _COLUMNS, [row[:-2] for row in exact]),
+        *([Section("Sensors", f"present per episode: {', '.join(sensors)}")] if sensors else []),
+        Section("Commands", _timing(config), ("command", "unit", "frame", "range, largest rate", "meaning"), commands),
+        Section("Reward", "sum of weight * term * control period", ("term", "weight (1/s)", "parameters", "meaning"), rewards),
+        Section("Terminated", "when a term is greater than 0", ("term", "parameters", "meaning"), terminations),
+        Section("Measured", success, ("measure", "unit", "limits", "meaning"), measures),
+        Section("Truncated", end),
     ]
-    measure_rows = [(name, MEASURES[name].unit, limits_text(config, name), MEASURES[name].doc) for name in task.measures]
-    period = config.control_period * 1000
-    return "\n".join(
-        [
-            f"**Action** ``Box(-1, 1, ({len(task.actions)},), float32)``: setpoint = clip(centre + scale * action, low, high)",
-            *table(("index", "joint", "setpoint", "unit", "centre", "scale", "low", "high"), _action_rows(task)),
-            f"**Observation** ``Box(({len(task.policy)},), float32)``: value = scale * clip(reading - offset, +-limit)",
-            *table(_OBSERVATION_HEADER, _observation_rows(task)),
-            *table(("observation", "meaning"), observation_meanings(task)),
-            f'**Privileged observation** (``observation="dict"``): ``Box(({len(task.privileged)},), float32)``',
-            *table(("index", "name", "unit", "frame", "scale", "limit"), privileged_rows),
-            *_sensors_text(config),
-            f"**Commands** {_timing(config)}",
-            *table(("command", "unit", "frame", "range", "largest rate (1/s)", "meaning"), command_rows),
-            "**Reward** sum of weight * term * control period",
-            *table(("term", "weight (1/s)", "parameters", "meaning"), reward_rows),
-            "**Terminated** when a term is greater than 0",
-            *table(("term", "parameters", "meaning"), termination_rows),
-            "**Measured**, in ``core.measures``; an episode is a success when nothing terminated it and all limits hold",
-            *table(("measure", "unit", "limits", "meaning"), measure_rows),
-            f"**Truncated** after {config.episode_length:g} s ({task.episode_steps} control steps of {period:g} ms).",
-        ]
-    )
 
 
 def parameters_text(values: dict[str, float], defaults: dict[str, float]) -> str:
     """Return ``width 0.06, ...`` for the parameters of a term."""
     return ", ".join(f"{name} {values.get(name, default):g}" for name, default in defaults.items()) or "-"
-
-
-def _sensors_text(config: TaskConfig) -> list[str]:
-    """Return how often the robots have sensors, where the task says it."""
-    said = [f"{name} with probability {share:g}" for name, share in config.sensors if share is not None]
-    return [f"**Sensors** present per episode: {', '.join(said)}", ""] if said else []
 
 
 def _timing(config: TaskConfig) -> str:
@@ -77,7 +99,7 @@ def _timing(config: TaskConfig) -> str:
 
 
 def _ramp(config: TaskConfig, command: str) -> str:
-    return f"{config.commands.ramp[command]:g}" if command in config.commands.ramp else "-"
+    return f", {config.commands.ramp[command]:g} /s" if command in config.commands.ramp else ""
 
 
 def limits_text(config: TaskConfig, measure: str) -> str:
@@ -87,37 +109,55 @@ def limits_text(config: TaskConfig, measure: str) -> str:
     return ", ".join(f"{kind} at most {limit:g}" for kind, limit in limits.items()) or "-"
 
 
-def _action_rows(task: Task) -> list[tuple[str, ...]]:
-    return [
-        (str(i), a.joint, a.quantity, a.unit, f"{a.centre:.4g}", f"{a.scale:g}", f"{a.low:.4g}", f"{a.high:.4g}")
-        for i, a in enumerate(task.actions)
-    ]
-
-
-_OBSERVATION_HEADER = (
-    "index",
-    "name",
-    "unit",
-    "frame",
-    "offset",
-    "scale",
-    "limit",
-    "sensor noise",
-    "noise",
-    "bias",
-    "delay (ms)",
-    "lag (steps)",
+_ACTION = ("joints", "index", "setpoint", "unit", "range", "centre", "scale")
+_COLUMNS = ("name", "index", "unit", "frame", "range", "scale", "components")
+_READING = (
+    "value = scale * clip(reading - offset, +-limit). Range: offset +-limit. Noise: the sensor's own (1 sigma, or one count of "
+    "an encoder) + the task's, and the task's bias (1 sigma)."
 )
 
 
-def _observation_rows(task: Task) -> list[tuple[str, ...]]:
-    """Return one row per policy observation column. ``noise`` and ``bias`` are the task's, on top of the sensor's own noise."""
+def _action_rows(task: Task) -> list[tuple[str, ...]]:
+    return [
+        (", ".join(a.joint for a in same), index, one.quantity, one.unit, f"[{one.low:.4g}, {one.high:.4g}]",
+         f"{one.centre:.4g}", f"{one.scale:g}")
+        for index, one, same in _alike(task.actions, lambda column: replace(column, joint=""))
+    ]  # fmt: skip
+
+
+def _observation_rows(config: TaskConfig, columns: Sequence[ObservationColumn]) -> list[tuple[str, ...]]:
+    """Return one row per observation term and age: its columns differ in component, and some in unit."""
     rows = []
-    for index, column in enumerate(task.policy):
-        numbers = (column.offset, column.scale, column.limit, column.sensor_noise, column.noise, column.bias)
-        texts = [f"{value:.4g}" for value in numbers]
-        rows.append((str(index), column_name(column), column.unit, column.frame, *texts, _delay(task, column), str(column.lag)))
+    for index, one, same in _alike(columns, lambda column: (column.term, column.lag)):
+        name = f"{one.term}, lag {one.lag} (steps)" if one.lag else one.term
+        units = [column.unit for column in same]
+        unit = ", ".join(units if len(set(units)) > 1 else units[:1])
+        span = f"{one.offset:.4g} +-{one.limit:.4g}" if one.offset else f"+-{one.limit:.4g}"
+        components = _components([label for column in same if (label := _label(column))])
+        rows.append((name, index, unit, one.frame, span, f"{one.scale:.4g}", components, _noise(one), _delay(config, one)))
     return rows
+
+
+def _alike(columns: Sequence[Any], key: Callable[[Any], Any]) -> Iterator[tuple[str, Any, list[Any]]]:
+    """Return columns that follow each other and have the same key, each time their indices (``6-9``), the first, and all."""
+    first = 0
+    for _, group in groupby(columns, key):
+        same = list(group)
+        yield f"{first}-{first + len(same) - 1}" if same[1:] else str(first), same[0], same
+        first += len(same)
+
+
+def _components(labels: list[str]) -> str:
+    """Return ``leg_lf, leg_rf`` for labels; ``wheel_lf, wheel_rf: each x, y`` where they are all pairs of these."""
+    parts = [list(dict.fromkeys(part)) for part in zip(*(label.split(",") for label in labels), strict=False)]
+    paired = [",".join(pair) for pair in product(*parts)] == labels
+    return ": each ".join(map(", ".join, parts if paired else [labels])) or "-"
+
+
+def _noise(column: ObservationColumn) -> str:
+    """Return ``0.001 + 0.02, bias 0.1``: of the sensor, what the task adds, and its bias."""
+    added = f" + {column.noise:.4g}" if column.noise else ""
+    return f"{column.sensor_noise:.4g}{added}" + (f", bias {column.bias:.4g}" if column.bias else "")
 
 
 def observation_meanings(task: Task) -> list[tuple[str, str]]:
@@ -128,102 +168,89 @@ def observation_meanings(task: Task) -> list[tuple[str, str]]:
 
 def column_name(column: ObservationColumn) -> str:
     """Return ``leg_position[leg_lf]``: the term with the label of its element."""
-    label = column.element.partition("[")[2].rstrip("]") or (column.element if column.source in {"command", "action"} else "")
-    return f"{column.term}[{label}]" if label else column.term
+    return f"{column.term}[{label}]" if (label := _label(column)) else column.term
 
 
-def _delay(task: Task, column: ObservationColumn) -> str:
-    latency = task.config.latency.get(column.device)  # type: ignore[call-overload]
+def _label(column: ObservationColumn) -> str:
+    return column.element.partition("[")[2].rstrip("]") or (column.element if column.source in {"command", "action"} else "")
+
+
+def _delay(config: TaskConfig, column: ObservationColumn) -> str:
+    latency = config.latency.get(column.device)  # type: ignore[call-overload]
     return "0" if latency is None else f"{latency.delay[0] * 1000:g}..{latency.delay[1] * 1000:g}"
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return a reStructuredText simple table as lines, with an empty line before and after."""
-    widths = [max(len(str(row[k])) for row in [header, *rows]) for k in range(len(header))]
-    rule = "  ".join("=" * width for width in widths)
-
-    def line(row: Sequence[str]) -> str:
-        return "  ".join(str(cell).ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-
-    return ["", rule, line(header), rule, *(line(row) for row in rows), rule, ""]
+_DRAWN = (
+    "Drawn at each reset where nothing else is said, once per robot, label (joint, wheel, axis or patch) or element; a "
+    "tolerance of the robot's file scales or adds."
+)
+RANDOMIZATION_HEADER = ("event", "parameters", "draw", "per")
 
 
-RANDOMIZATION_HEADER = ("event", "parameters", "when", "operation", "distribution", "one draw per")
-
-
-def describe_randomization(config: RandomizationConfig) -> str:
-    """Return what a randomisation draws as text: switches, initial state, and the table of its events."""
+def randomization_section(config: RandomizationConfig) -> Section:
+    """Return what a randomisation draws: switches, initial state, and the table of its events."""
     state = ", ".join(f"{name} +-{width:.4g}" for name, width in config.initial_state if width) or "standing at home"
-    return "\n".join(
-        [
-            f"**Randomization** ``{config.name}``",
-            "",
-            f"Sensor noise {_on(config.sensor_noise)}, latency {_on(config.latency)}. Start: {state}.",
-            *(table(RANDOMIZATION_HEADER, randomization_rows(config)) if config.events else []),
-        ]
-    )
-
-
-def _on(switch: bool) -> str:
-    return "on" if switch else "off"
+    noise, latency = ("on" if switch else "off" for switch in (config.sensor_noise, config.latency))
+    sentence = f"{config.name}: sensor noise {noise}, latency {latency}, start: {state}"
+    rows = randomization_rows(config)
+    return Section("Randomization", f"{sentence}. {_DRAWN}" if rows else sentence, RANDOMIZATION_HEADER, rows)
 
 
 def randomization_rows(config: RandomizationConfig) -> list[tuple[str, ...]]:
     """Return one row of text per event, columns as in :data:`RANDOMIZATION_HEADER`."""
-    return [
-        (name, ", ".join(event.parameters), _when(event), event.operation or "scale or add", _distribution(event), event.per)
-        for name, event in config.events.items()
-    ]
+    return [(name, ", ".join(event.parameters), _draw(event), event.per) for name, event in config.events.items()]
 
 
-def _when(event: EventConfig) -> str:
-    return event.when if event.interval is None else f"{event.when} {_span(event.interval)} s"
+def _draw(event: EventConfig) -> str:
+    """Return ``interval 1..3 s: set uniform -2..2``: when, if not at each reset; operation, distribution, area."""
+    span = "" if event.interval is None else f" {_span(event.interval)} s"
+    when = "" if event.when == "reset" else f"{event.when}{span}: "
+    area = "" if event.area is None else f"; {_area(event.area)}"
+    return when + " ".join(filter(None, (event.operation, _distribution(event)))) + area
 
 
 def _span(limits: Sequence[float | str | None]) -> str:
-    texts = [f"{value:.4g}" if isinstance(value, int | float) else str(value) for value in limits]
-    return texts[0] if texts[0] == texts[1] else "..".join(texts)
+    return "..".join(dict.fromkeys(f"{value:.4g}" if isinstance(value, int | float) else str(value) for value in limits))
 
 
 def _distribution(event: EventConfig) -> str:
     match event.distribution:
         case "choice":
-            text = "choice of " + ", ".join(f"{value:.4g}" for value in event.values or ())
+            return "choice of " + ", ".join(f"{value:.4g}" for value in event.values or ())
         case "tolerance":
-            text = f"tolerance x {event.sigmas:g}, cut at {event.cut:g}"
+            return f"tolerance x {event.sigmas:g}, cut at {event.cut:g}"
         case "normal":
-            mean = "" if event.mean is None else f"{_span((event.mean, event.mean))} "
-            text = f"normal {mean}+- {_span((event.sigma, event.sigma))}, cut at {event.cut:g}"
+            mean = "" if event.mean is None else f"{_span([event.mean])} "
+            return f"normal {mean}+- {_span([event.sigma])}, cut at {event.cut:g}"
         case _:
-            text = f"{event.distribution} {_span((event.low, event.high))}"
-    return text if event.area is None else f"{text}; {_area(event.area)}"
+            return f"{event.distribution} {_span((event.low, event.high))}"
 
 
 def _area(area: AreaConfig) -> str:
     return "area " + ", ".join(f"{name} {_span(limits)} m" for name, limits in area if limits is not None)
 
 
-def describe_scaling(written: TaskConfig, robot: Robot) -> str:
-    """Return the table of a task's numbers that follow the robot: as written for the task's own one, by which rule, and now."""
+def scaling_sections(written: TaskConfig, robot: Robot) -> list[Section]:
+    """Return a task's numbers that follow the robot: as written for the task's own one, now, and by which rule."""
     reference = load_robot(written.robot)
-    rows = [
-        (number.place, number.rule, _numbers(number.before), _numbers(number.after))
+    both = f"{reference.name} -> {robot.name}"
+    numbers = [
+        (_broken(number.place), f"{_numbers(number.before)} -> {_numbers(number.after)}", number.rule)
         for number in scaled_numbers(written.model_dump(), written.scaling, robot, reference)
     ]
     asked = set[str]().union(*map(quantities_of, written.scaling.values()))
-    used = [name for name in QUANTITIES if name in asked]
-    quantities = [
-        (name, QUANTITIES[name].unit, *(f"{QUANTITIES[name].of(one):.4g}" for one in (reference, robot)), QUANTITIES[name].doc)
-        for name in used
+    used = [(name, one) for name, one in QUANTITIES.items() if name in asked]
+    quantities = [(name, one.unit, f"{one.of(reference):.4g} -> {one.of(robot):.4g}", one.doc) for name, one in used]
+    rules = f"by the rules of the task's file: times what the rule says of {robot.name} over {reference.name}, to three digits"
+    return [
+        Section("Follows the robot", rules, ("number", both, "rule"), numbers),
+        Section("Rules", "are products of these", ("quantity", "unit", both, "meaning"), quantities),
     ]
-    return "\n".join(
-        [
-            f"**Follows the robot** by the rules of the task's file: number for {robot.name} = number for {reference.name} x "
-            "what the rule says of the one over the other, to three digits",
-            *table(("number", "rule", reference.name, robot.name), rows),
-            *table(("quantity", "unit", reference.name, robot.name, "meaning"), quantities),
-        ]
-    )
+
+
+def _broken(place: str) -> str:
+    """Return a long place on two lines, so that there is room beside it."""
+    return place if len(place) < 40 else place.replace(".", ".\n", 1)
 
 
 def _numbers(value: Any) -> str:
@@ -265,18 +292,5 @@ def _contract_robot(robot: Robot) -> dict[str, Any]:
 
 
 def _contract_column(column: ObservationColumn) -> dict[str, Any]:
-    fields = (
-        "source",
-        "element",
-        "unit",
-        "frame",
-        "offset",
-        "scale",
-        "limit",
-        "sensor_noise",
-        "noise",
-        "bias",
-        "lag",
-        "device",
-    )
-    return {"name": column_name(column), **{field: getattr(column, field) for field in fields}}
+    names = "source element unit frame offset scale limit sensor_noise noise bias lag device"
+    return {"name": column_name(column), **{name: getattr(column, name) for name in names.split(" ")}}
