@@ -51,7 +51,7 @@ def test_description_shows_what_a_randomization_draws(capsys, monkeypatch):
     assert main(["envs", "WLR-Velocity-v0", "--randomization", "patches"]) == 0
     shown = capsys.readouterr().out
     for text in (
-        "Randomization patches: ",
+        "Randomization: patches; ",
         "drift 2..6 s: ",
         "area x_min -1.2..0.7 m",
         "tolerance x 1, cut at 2",
@@ -59,7 +59,7 @@ def test_description_shows_what_a_randomization_draws(capsys, monkeypatch):
     ):
         assert text in shown
     assert main(["envs", "WLR-Velocity-v0"]) == 0
-    assert "Randomization slippery: " in capsys.readouterr().out
+    assert "Randomization: slippery; " in capsys.readouterr().out
 
 
 def test_bad_randomization(capsys):

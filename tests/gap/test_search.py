@@ -114,6 +114,19 @@ def test_two_effects_are_both_named():
     assert [r.selected is None for r in found.rounds] == [False, False, True]
 
 
+def test_threads_do_not_change_a_bit():
+    found = []
+    for threads in (1, 3):
+        problem = Toy({"mass": 1.0}, [sized("drag", 0.8, "right"), sized("decoy_4", -0.7)], error=0.5)
+        problem.threads = threads
+        found.append(named(problem))
+    one, same = found
+    assert labels(one) == labels(same)
+    assert np.array_equal(one.fit.model.quantities, same.fit.model.quantities)
+    assert [values for _, values in one.fit.model.effects] == [values for _, values in same.fit.model.effects]
+    assert [[score.gain for score in r.scores] for r in one.rounds] == [[score.gain for score in r.scores] for r in same.rounds]
+
+
 def test_looking_for_a_second_effect_starts_from_how_numbers_act_beside_the_first(monkeypatch):
     """Also where the calibrated parameters are as the file says."""
     problem = Toy({}, [sized("play", 1.3), sized("decoy_4", -0.7)], error=0.5)
@@ -403,6 +416,22 @@ def test_effect_of_one_run_fails_cross_validation(seen_in, passes):
     gain = total_cost(problem, bare.model, bare.residuals, autocorrelation_time) - whole.cost
     assert gain > LEAST_GAIN
     assert cross_validated(problem, RUNS, bare, whole, autocorrelation_time) is passes
+
+
+def test_what_tolerances_nearly_do_is_no_effect(monkeypatch):
+    """An effect must beat them by more than the cost is rough."""
+    problem = Toy({}, [sized("drag", 0.5, "right")], rows=400)
+    problem.tempering = 3.0
+    own = candidate(problem, "drag", ["right"])
+    bare = fit(problem, RUNS, nominal_model(problem))
+    whole = fit(problem, RUNS, bare.model.with_effect(own, (0.5,)))
+    hypothesis = Hypothesis(own, whole.model, 30.0, np.ones(5), 30.0, whole.residuals, bare.model, bare.residuals)
+    said = {}
+    for short in (0.9, 1.2, 1.6):
+        costs = iter([short * LEAST_GAIN, 0.0])
+        monkeypatch.setattr(cross_validation, "fit", lambda *_, costs=costs, **__: replace(bare, cost=next(costs)))
+        said[short] = cross_validation._tolerances_do(problem, RUNS, LEAST_GAIN, Finalist(hypothesis, whole), bare)
+    assert said == {0.9: True, 1.2: True, 1.6: False}
 
 
 @pytest.mark.parametrize(("thrown_off", "passes"), [([3], True), ([1, 3], False)])

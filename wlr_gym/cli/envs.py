@@ -18,7 +18,7 @@ from wlr_gym.cli.results import print_json
 from wlr_gym.cli.tables import print_table
 from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
 from wlr_gym.envs.tasks import Randomization, Task, load_randomization, load_task
-from wlr_gym.envs.tasks.describe import Section, randomization_section, scaling_sections, task_sections
+from wlr_gym.envs.tasks.describe import DescriptionPart, randomization_section, scaling_sections, task_sections
 from wlr_gym.envs.tasks.task_config import read_task
 
 PICTURES = (".png", ".svg", ".pdf")
@@ -73,15 +73,15 @@ def _describe(env_id: str, options: EnvsOptions) -> None:
     if options.json:
         print_json(_content(env_id, task, randomization))
         return
-    sections = [Section(env_id, _about(task)), *task_sections(task), randomization_section(randomization.config)]
+    sections = [DescriptionPart(env_id, _about(task)), *task_sections(task), randomization_section(randomization.config)]
     if options.robot is not None:
         sections += scaling_sections(read_task(written), task.robot)
     for section in sections:
         _print(Console(), section)
 
 
-def _print(console: Console, section: Section) -> None:
-    console.print(Text.assemble((section.title, "bold"), " ", section.sentence), end="\n\n")
+def _print(console: Console, section: DescriptionPart) -> None:
+    console.print(Text.assemble((section.title, "bold"), ": ", section.sentence), end="\n\n")
     if section.rows:
         print_table(console, section.headings, [[cell.replace("``", "") for cell in row] for row in section.rows])
 

@@ -223,7 +223,7 @@ class Problem(Protocol):
             on it: the likelihood counts so many times less than the scatter of the runs would allow, the prior so many times
             more. 1 = the simulator is exact.
         disagreement: share by which a simulator and the system may differ on how large an effect is; widens intervals.
-        threads: how many may work at once; no result depends on it.
+        threads: how many share each piece of work; no result depends on it.
         thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
         motions: effect -> name of the motion that shows it best, for advice on what to record; may be empty.
         misfit: error of the fitted runs, in noise floors, from which on something is missing even if no effect explains it;

@@ -18,7 +18,7 @@ from wlr_gym.robot import Robot, load_robot, robot_content, robot_hash, servo_ha
 
 
 @dataclass(frozen=True)
-class Section:
+class DescriptionPart:
     """Part of a description: a title, what it says in a sentence or two, and a table, which has no rows where there is none."""
 
     title: str
@@ -37,12 +37,12 @@ def describe_randomization(config: RandomizationConfig) -> str:
     return restructured_text([randomization_section(config)])
 
 
-def restructured_text(sections: Sequence[Section]) -> str:
+def restructured_text(sections: Sequence[DescriptionPart]) -> str:
     """Return sections as reStructuredText: titles in bold, simple tables."""
     return "\n".join(line for one in sections for line in (f"**{one.title}** {one.sentence}", "", *_simple_table(one)))
 
 
-def _simple_table(section: Section) -> list[str]:
+def _simple_table(section: DescriptionPart) -> list[str]:
     if not section.rows:
         return []
     widths = [max(map(len, column)) for column in zip(section.headings, *section.rows, strict=True)]
@@ -51,7 +51,7 @@ def _simple_table(section: Section) -> list[str]:
     return ["  ".join(map(str.ljust, line, widths)).rstrip() for line in lines]
 
 
-def task_sections(task: Task) -> list[Section]:
+def task_sections(task: Task) -> list[DescriptionPart]:
     """Return what a task is: action, observation, commands, reward, end of the episode, measures."""
     config = task.config
     commands = [
@@ -74,16 +74,20 @@ def task_sections(task: Task) -> list[Section]:
     success = "in core.measures; an episode is a success when nothing terminated it and all limits hold"
     end = f"after {config.episode_length:g} s ({task.episode_steps} control steps of {1000 * config.control_period:g} ms)"
     return [
-        Section("Action", space, _ACTION, _action_rows(task)),
-        Section("Observation", f"{boxes[0]}: {_READING}", (*_COLUMNS, "noise", "delay (ms)"), policy),
-        Section("Observation", "what each reading is", ("name", "meaning"), observation_meanings(task)),
-        Section("Privileged observation", f'(observation="dict"): {boxes[1]}, exact', _COLUMNS, [row[:-2] for row in exact]),
-        *([Section("Sensors", f"present per episode: {', '.join(sensors)}")] if sensors else []),
-        Section("Commands", _timing(config), ("command", "unit", "frame", "range, largest rate", "meaning"), commands),
-        Section("Reward", "sum of weight * term * control period", ("term", "weight (1/s)", "parameters", "meaning"), rewards),
-        Section("Terminated", "when a term is greater than 0", ("term", "parameters", "meaning"), terminations),
-        Section("Measured", success, ("measure", "unit", "limits", "meaning"), measures),
-        Section("Truncated", end),
+        DescriptionPart("Action", space, _ACTION, _action_rows(task)),
+        DescriptionPart("Observation", f"{boxes[0]}: {_READING}", (*_COLUMNS, "noise", "delay (ms)"), policy),
+        DescriptionPart("Observation", "what each reading is", ("name", "meaning"), observation_meanings(task)),
+        DescriptionPart(
+            "Privileged observation", f'(observation="dict"): {boxes[1]}, exact', _COLUMNS, [row[:-2] for row in exact]
+        ),
+        *([DescriptionPart("Sensors", f"present per episode: {', '.join(sensors)}")] if sensors else []),
+        DescriptionPart("Commands", _timing(config), ("command", "unit", "frame", "range, largest rate", "meaning"), commands),
+        DescriptionPart(
+            "Reward", "sum of weight * term * control period", ("term", "weight (1/s)", "parameters", "meaning"), rewards
+        ),
+        DescriptionPart("Terminated", "when a term is greater than 0", ("term", "parameters", "meaning"), terminations),
+        DescriptionPart("Measured", success, ("measure", "unit", "limits", "meaning"), measures),
+        DescriptionPart("Truncated", end),
     ]
 
 
@@ -187,13 +191,13 @@ _DRAWN = (
 RANDOMIZATION_HEADER = ("event", "parameters", "draw", "per")
 
 
-def randomization_section(config: RandomizationConfig) -> Section:
+def randomization_section(config: RandomizationConfig) -> DescriptionPart:
     """Return what a randomisation draws: switches, initial state, and the table of its events."""
     state = ", ".join(f"{name} +-{width:.4g}" for name, width in config.initial_state if width) or "standing at home"
     noise, latency = ("on" if switch else "off" for switch in (config.sensor_noise, config.latency))
-    sentence = f"{config.name}: sensor noise {noise}, latency {latency}, start: {state}"
+    sentence = f"{config.name}; sensor noise {noise}, latency {latency}, start: {state}"
     rows = randomization_rows(config)
-    return Section("Randomization", f"{sentence}. {_DRAWN}" if rows else sentence, RANDOMIZATION_HEADER, rows)
+    return DescriptionPart("Randomization", f"{sentence}. {_DRAWN}" if rows else sentence, RANDOMIZATION_HEADER, rows)
 
 
 def randomization_rows(config: RandomizationConfig) -> list[tuple[str, ...]]:
@@ -230,21 +234,24 @@ def _area(area: AreaConfig) -> str:
     return "area " + ", ".join(f"{name} {_span(limits)} m" for name, limits in area if limits is not None)
 
 
-def scaling_sections(written: TaskConfig, robot: Robot) -> list[Section]:
+def scaling_sections(written: TaskConfig, robot: Robot) -> list[DescriptionPart]:
     """Return a task's numbers that follow the robot: as written for the task's own one, now, and by which rule."""
     reference = load_robot(written.robot)
     both = f"{reference.name} -> {robot.name}"
+    scaled = scaled_numbers(written.model_dump(), written.scaling, robot, reference)
     numbers = [
         (_broken(number.place), f"{_numbers(number.before)} -> {_numbers(number.after)}", number.rule)
-        for number in scaled_numbers(written.model_dump(), written.scaling, robot, reference)
+        for number in scaled
+        if number.before != number.after
     ]
     asked = set[str]().union(*map(quantities_of, written.scaling.values()))
     used = [(name, one) for name, one in QUANTITIES.items() if name in asked]
     quantities = [(name, one.unit, f"{one.of(reference):.4g} -> {one.of(robot):.4g}", one.doc) for name, one in used]
     rules = f"by the rules of the task's file: times what the rule says of {robot.name} over {reference.name}, to three digits"
+    rules += f"; {len(scaled) - len(numbers)} of {len(scaled)} stay as they are" if len(numbers) < len(scaled) else ""
     return [
-        Section("Follows the robot", rules, ("number", both, "rule"), numbers),
-        Section("Rules", "are products of these", ("quantity", "unit", both, "meaning"), quantities),
+        DescriptionPart("Follows the robot", rules, ("number", both, "rule"), numbers),
+        DescriptionPart("Rules", "products of these", ("quantity", "unit", both, "meaning"), quantities),
     ]
 
 

@@ -45,6 +45,9 @@ CONVERGENCE_STEPS = 8
 GRID = (-8.0, -4.0, 0.0, 4.0, 8.0)
 #: An improvement beyond this is not due to how tolerances are counted.
 TOLERANCES_CANNOT = 80.0
+#: What tolerances do instead must fall short by this many times what is asked of an effect: sticking friction makes the cost of
+#: either model rough by some ten units.
+CLEARLY = 1.5
 #: A named effect is preferred to a formula if it improves the fit by at least this share of what the formula does.
 NAMED_FIRST = 0.9
 
@@ -260,7 +263,7 @@ def _tolerances_do(problem: Problem, runs: Sequence[int], threshold: float, fina
         ).cost
         for found in (bare, final.fit)
     ]
-    return costs[0] - costs[1] < least_gain(len(final.hypothesis.values), threshold)
+    return costs[0] - costs[1] < CLEARLY * least_gain(len(final.hypothesis.values), threshold)
 
 
 def shown_by_some_runs_only(hypothesis: Hypothesis, threshold: float) -> bool:

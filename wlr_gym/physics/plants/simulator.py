@@ -23,6 +23,7 @@ from wlr_gym.physics.plants.base import (
     hold_where_off,
     standing_state,
 )
+from wlr_gym.physics.plants.flow import check_flow
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
 from wlr_gym.physics.plants.setpoints import SetpointHistory, Setpoints
 from wlr_gym.robot import LEG_SLICE, Robot, robot_hash
@@ -119,7 +120,7 @@ class Simulator(ABC):
         self._time[rows] = 0.0 if start.time is None else start.time[rows]
         self._setpoints.reset(rows, start, self.parameters)
         self._look(rows)
-        self._sensors.reset(self._raw, self._readings.values, seeds, None if parameters is None else self.parameters, mask)
+        self._sensors.reset(self._raw, self._readings.values, seeds, mask=mask)
         return self._readings
 
     def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
@@ -127,7 +128,6 @@ class Simulator(ABC):
         rows = self._rows(mask)
         self._take_parameters(parameters, rows)
         self._setpoints.set_delays(rows, self.parameters)
-        self._sensors.set_errors(rows, self.parameters)
 
     # ---- snapshots ----
 
@@ -210,10 +210,12 @@ class Simulator(ABC):
             raise InputError(f"parameters hold {len(parameters)} robots, the plant {self._count}")
         chosen = Parameters(parameters.values[rows])
         chosen.validate()
+        check_flow(self.robot, chosen)
         check_contact_resolution(chosen, self.options.physics_step)
         self._fit_rotors(rows, chosen)
         self.parameters.values[rows] = chosen.values
         self._use_parameters(rows, chosen)
+        self._sensors.set_errors(rows, self.parameters)
 
     def _present_setpoints(self) -> Array:
         """Setpoints that keep every joint as it is: leg angles as the servo reads them, wheels at rest."""
