@@ -31,12 +31,16 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def tidy(axes: Axes, grid: Literal["both", "x", "y"] = "both") -> None:
-    """Give axes a pale grid behind what is drawn, small numbers, and no frame above and on the right."""
+    """Give axes a pale grid behind what is drawn, small numbers at round values, and no frame above and on the right."""
+    from matplotlib.ticker import AutoLocator
+
     axes.grid(alpha=0.25, axis=grid)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8)
-    for label in (axes.xaxis.label, axes.yaxis.label):
-        label.set_fontsize(9)
+    for line in (axes.xaxis, axes.yaxis):
+        line.label.set_fontsize(9)
+        if isinstance(locator := line.get_major_locator(), AutoLocator):
+            locator.set_params(steps=[1, 2, 5, 10])
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
 
@@ -55,7 +59,7 @@ def legend_below(figure: Figure, columns: int = 4) -> None:
 def png(figure: Figure) -> bytes:
     """Return a figure as PNG."""
     stream = io.BytesIO()
-    figure.savefig(stream, dpi=_DPI, format="png", metadata={"Software": None})
+    figure.savefig(stream, dpi=_DPI, format="png", metadata={"Software": None}, pil_kwargs={"optimize": True})
     return stream.getvalue()
 
 
