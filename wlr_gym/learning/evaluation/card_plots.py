@@ -61,7 +61,7 @@ def _scale(metric: Metric) -> tuple[float, str]:
 def sweep_curves(card: Card, sweep: Sweep) -> Figure:
     """Draw tracking error, success and slip over a sweep, a curve with its interval per subject."""
     chosen = [metric for key in SWEPT for metric in card.metrics if metric.key == key]
-    figure = new_figure(4.2 * len(chosen), 3.8)
+    figure = new_figure(4.6 * len(chosen), 3.8)
     for axes, metric in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, strict=True):
         _draw_sweep(axes, card, sweep, metric)
     legend_below(figure, columns=6)
@@ -78,7 +78,7 @@ def _draw_sweep(axes: Axes, card: Card, sweep: Sweep, metric: Metric) -> None:
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter("{x:g}")
     else:
-        axes.set_ylim(bottom=0.0, top=102.0 if metric.unit == "%" else None)
+        axes.set_ylim(*((-2.0, 102.0) if metric.unit == "%" else (0.0, None)))
     if sweep.name in ("friction", "grip"):
         axes.set_xscale("log")
     axes.set_xticks([point.value for point in sweep.points], [point.label for point in sweep.points])

@@ -37,8 +37,8 @@ _TICK = 5.0
 _UNEVEN = (WINE, GREEN)
 #: How the paper's prediction may count the wheel angle: relative to the leg or not.
 _PREDICTIONS: dict[bool, dict[str, Any]] = {
-    True: {"color": BLUE, "marker": "o", "label": "prediction with the encoder's angle"},
-    False: {"color": ORANGE, "marker": "s", "label": "prediction of (3) as printed"},
+    True: {"color": BLUE, "marker": "o", "label": "prediction with the encoder's angle", "markersize": 5},
+    False: {"color": ORANGE, "marker": "s", "label": "prediction of (3) as printed", "fillstyle": "none", "markersize": 9},
 }
 #: Combinations in the figure of the open question.
 _COMBINATIONS = 8
@@ -228,7 +228,7 @@ def question_figure(findings: Sequence[SearchFinding]) -> Figure:
         for on_leg, style in _PREDICTIONS.items():
             readings = [reading for reading in READINGS if reading.encoder_on_leg is on_leg]
             misses = [min(map(finding.closest, readings)) for finding in shown]
-            panel.plot(misses, range(len(shown)), linestyle="", markersize=6, **style)
+            panel.plot(misses, range(len(shown)), linestyle="", markeredgewidth=1.5, **style)
         panel.set_yticks(range(len(shown)), [finding.label for finding in shown])
         panel.set_ylim(len(shown) - 0.4, -0.6)
         panel.set_xlim(left=0.0)
