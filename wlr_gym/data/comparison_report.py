@@ -215,5 +215,5 @@ def _map_figure(comparison: Comparison) -> Figure:
     )
     axes.set_xlabel("motion", fontsize=9)
     axes.set_ylabel("signal", fontsize=9)
-    figure.colorbar(image, ax=axes, shrink=0.8, label="rms difference (1 = sensor noise)")
+    figure.colorbar(image, ax=axes, shrink=0.8, format="%g", label="rms difference (1 = sensor noise)")
     return figure
