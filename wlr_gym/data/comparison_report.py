@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.plots import BLUE, GREEN, ORANGE, new_figure, save, tidy
 from wlr_gym.data.comparison import BOUNDS, HORIZON, Agreement, Comparison, MotionComparison, difference
 
 if TYPE_CHECKING:
@@ -23,9 +23,7 @@ _PANELS = (
     ("friction_across",),
 )  # fmt: skip
 # Colours of the first and the second plant, and of the threshold.
-_FIRST = "#1f4e9c"
-_SECOND = "#e06c00"
-_LIMIT = "#b03030"
+_FIRST, _SECOND, _LIMIT = BLUE, ORANGE, GREEN
 
 
 @dataclass(frozen=True)
@@ -147,28 +145,17 @@ def save_motion_plot(comparison: Comparison, index: int, path: Path) -> Path:
     """Write one motion's figure: both plants over each other, and below each panel their difference in noise units."""
     motion = comparison.motions[index]
     title = f"{motion.name}, effects: {comparison.effects}"
-    return _save(lambda: _motion_figure(comparison, index, title), path)
+    return save(_motion_figure(comparison, index, title), path)
 
 
 def save_map(comparison: Comparison, path: Path) -> Path:
     """Write the map of all differences: signals by motions, rms in noise units."""
-    return _save(lambda: _map_figure(comparison), path)
-
-
-def _save(draw: Callable[[], Figure], path: Path) -> Path:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    figure = draw()
-    FigureCanvasAgg(figure)
-    replace_file(path, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
-    return path
+    return save(_map_figure(comparison), path)
 
 
 def _motion_figure(comparison: Comparison, index: int, title: str) -> Figure:
-    from matplotlib.figure import Figure
-
     columns = 3
-    figure = Figure(figsize=(6.0 * columns, 3.3 * -(-len(_PANELS) // columns)), layout="constrained")
+    figure = new_figure(6.0 * columns, 3.3 * -(-len(_PANELS) // columns))
     outer = figure.add_gridspec(-(-len(_PANELS) // columns), columns)
     for number, names in enumerate(_PANELS):
         inner = outer[number // columns, number % columns].subgridspec(2, 1, height_ratios=(2, 1), hspace=0.05)
@@ -201,18 +188,16 @@ def _draw_panel(comparison: Comparison, index: int, names: Sequence[str], above:
     above.set_title(", ".join(f"{name} ({comparison.signals[name].unit})" for name in names), fontsize=9)
     above.tick_params(labelbottom=False)
     for axes in (above, below):
-        axes.tick_params(labelsize=8)
-        axes.grid(alpha=0.25)
+        tidy(axes)
         axes.margins(x=0.01)
 
 
 def _map_figure(comparison: Comparison) -> Figure:
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
     names = list(comparison.signals)
     values = np.array([[case.differences[name].rms_in_noise for case in comparison.cases] for name in names])
-    figure = Figure(figsize=(1.8 + 0.85 * len(comparison.cases), 0.9 + 0.32 * len(names)), layout="constrained")
+    figure = new_figure(1.8 + 0.85 * len(comparison.cases), 0.9 + 0.32 * len(names))
     axes = figure.subplots()
     image = axes.imshow(np.maximum(values, 1e-2), norm=LogNorm(1e-2, 1e2), cmap="RdYlBu_r", aspect="auto")
     axes.set_xticks(
@@ -230,5 +215,5 @@ def _map_figure(comparison: Comparison) -> Figure:
     )
     axes.set_xlabel("motion", fontsize=9)
     axes.set_ylabel("signal", fontsize=9)
-    figure.colorbar(image, ax=axes, shrink=0.8, label="rms difference (1 = sensor noise)")
+    figure.colorbar(image, ax=axes, shrink=0.8, format="%g", label="rms difference (1 = sensor noise)")
     return figure

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.plots import BLUE, GREY, ORANGE, new_figure, save, tidy
 from wlr_gym.data.format import COLUMNS
 from wlr_gym.data.replay import ReplayResult
 from wlr_gym.robot import LEGS, WHEELS
@@ -24,30 +24,23 @@ _BODY = [
     ["cam_z", "cam_pitch", "volt"],
 ]
 # Colours of the curves.
-_MEASURED = "#8c8c8c"
-_FULL = "#e06c00"
-_SEGMENTS = "#1f4e9c"
+_MEASURED, _FULL, _SEGMENTS = GREY, ORANGE, BLUE
 _CALM = 6.0  # noise units; flat channels are not blown up beyond this
 
 
 def save_plots(result: ReplayResult, folder: Path) -> list[Path]:
     """Write ``<run>_joints.png`` and ``<run>_body.png`` and return their paths."""
-    paths = []
-    for name, grid in (("joints", _JOINTS), ("body", _BODY)):
-        path = folder / f"{result.run.name}_{name}.png"
-        figure = _figure(result, grid, f"{result.run.name}: {name}, measured and replayed")
-        replace_file(path, lambda temporary, figure=figure: figure.savefig(temporary, dpi=110, format="png"))
-        paths.append(path)
-    return paths
+    return [
+        save(
+            _figure(result, grid, f"{result.run.name}: {name}, measured and replayed"), folder / f"{result.run.name}_{name}.png"
+        )
+        for name, grid in (("joints", _JOINTS), ("body", _BODY))
+    ]
 
 
 def _figure(result: ReplayResult, grid: list[list[str]], title: str) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     grid = [row for row in grid if any(name in result.errors for name in row)]
-    figure = Figure(figsize=(5.2 * len(grid[0]), 2.1 * len(grid) + 0.9), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(5.2 * len(grid[0]), 2.1 * len(grid) + 0.9)
     panels = figure.subplots(len(grid), len(grid[0]), squeeze=False, sharex=True)
     for axes, name in zip(panels.flat, (name for row in grid for name in row), strict=True):
         if name in result.errors:
@@ -55,7 +48,7 @@ def _figure(result: ReplayResult, grid: list[list[str]], title: str) -> Figure:
         else:
             axes.set_axis_off()
     for axes in panels[-1]:
-        axes.set_xlabel("t (s)")
+        axes.set_xlabel("time (s)")
     handles, labels = next(axes for axes in panels.flat if axes.has_data()).get_legend_handles_labels()
     figure.suptitle(title, fontsize=13)
     figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
@@ -80,7 +73,6 @@ def _draw(axes: Axes, result: ReplayResult, name: str) -> None:
         axes.set_ylim(middle - _CALM * error.noise, middle + _CALM * error.noise)
     ratio = error.segment_rms / error.noise
     axes.set_title(f"{name}: segment error {error.segment_rms:.2g} {error.unit} = {ratio:.1f} x noise", fontsize=9)
-    axes.set_ylabel(error.unit, fontsize=9)
-    axes.tick_params(labelsize=8)
-    axes.grid(alpha=0.25)
+    axes.set_ylabel(error.unit)
+    tidy(axes)
     axes.margins(x=0.01)

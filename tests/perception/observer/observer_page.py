@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
 from observed_runs import PERIOD, Runs, channel, observe, play, simulate, slip_in_truth_order
 
+from wlr_gym.base.plots import COLOURS, legend_below, new_figure, save, tidy
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 
@@ -50,11 +52,6 @@ def row(runs: Runs, name: str) -> str:
 
 def draw(path: str) -> None:
     """On split floors, the robot with the largest error without a camera: slip of both front wheels, estimates, 2 sigma."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     runs = simulate("gibbs_appell", "split", "commands", 64, 10.0, seed=SEED)
     time = PERIOD * np.arange(len(runs.sensors))
     true = slip_in_truth_order(runs.true("slip_velocity"))[..., 0]
@@ -67,18 +64,20 @@ def draw(path: str) -> None:
     errors = (estimates["without camera"][0] - true)[START:]
     shown = int(np.argmax(np.square(errors).mean(axis=(0, 2))))
     mu = runs.truth[:, shown, TRUTH_LAYOUT.slices["effective_friction"]][len(time) // 2, ::2]
-    figure, axes = plt.subplots(1, 2, figsize=(10.0, 3.6), sharey=True, layout="constrained")
+    figure = new_figure(10.0, 3.8)
+    axes = figure.subplots(1, 2, sharey=True)
     for ax, wheel, name in zip(axes, (0, 1), ("left", "right"), strict=True):
-        for (label, (slip, sigma)), color in zip(estimates.items(), ("tab:blue", "tab:orange"), strict=True):
+        for (label, (slip, sigma)), color in zip(estimates.items(), COLOURS, strict=False):
             value, width = slip[:, shown, wheel], 2 * sigma[:, shown, wheel]
-            ax.fill_between(time, value - width, value + width, color=color, alpha=0.25, lw=0)
-            ax.plot(time, value, color=color, lw=1.5, label=f"{label}, 2 sigma")
+            ax.fill_between(time, value - width, value + width, color=color, alpha=0.2, lw=0, label=f"{label}, 2 sigma")
+            ax.plot(time, value, color=color, lw=1.5, label=label)
         ax.plot(time, true[:, shown, wheel], color="black", lw=1.0, ls="--", label="truth")
-        ax.set(xlim=(0, 10), ylim=(-0.2, 0.2), xlabel="time (s)", title=f"{name} front wheel, friction {mu[wheel]:.2f}")
-        ax.grid(alpha=0.3)
+        ax.set(xlim=(0, 10), ylim=(-0.2, 0.2), yticks=np.linspace(-0.2, 0.2, 5), xlabel="time (s)")
+        ax.set_title(f"{name} front wheel, friction {mu[wheel]:.2f}", fontsize=10)
+        tidy(ax)
     axes[0].set_ylabel("longitudinal slip (m/s)")
-    axes[0].legend(loc="upper right")
-    figure.savefig(path, dpi=110)
+    legend_below(figure, columns=5)
+    save(figure, Path(path))
 
 
 def main() -> None:

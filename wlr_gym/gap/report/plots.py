@@ -5,14 +5,14 @@ Matplotlib only, drawn without a display.
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, PALE, new_figure, png, tidy
 from wlr_gym.gap.analysis import (
     EQUIVALENT,
     REJECTED,
@@ -37,17 +37,16 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 #: Colour of the measurement.
-MEASURED = "#8c8c8c"
+MEASURED = GREY
 #: Of the model as given.
 BEFORE = "#b0b0b0"
 #: Of the calibrated model.
-CALIBRATED = "#e06c00"
+CALIBRATED = ORANGE
 #: Of the model with the effects added.
-AFTER = "#1f4e9c"
+AFTER = BLUE
 #: Outcome of a candidate -> colour; :data:`_OTHER_OUTCOME` for all others.
-_COLOURS = {SELECTED: "#1f4e9c", EQUIVALENT: "#6d9bd1"}
-_OTHER_OUTCOME = "#c9c9c9"
-_DPI = 110
+_COLOURS = {SELECTED: BLUE, EQUIVALENT: "#6d9bd1"}
+_OTHER_OUTCOME = PALE
 #: Overlays in one figure.
 _PANELS = 6
 #: Effects shown in a round beside those that were fitted.
@@ -61,7 +60,7 @@ _MOST_RELATIONS = 12
 
 def draw(analysis: Analysis) -> dict[str, bytes]:
     """Return name -> PNG of every picture that the analysis has the numbers for."""
-    return {name: _png(figure) for name, figure in figures(analysis).items()}
+    return {name: png(figure) for name, figure in figures(analysis).items()}
 
 
 def figures(analysis: Analysis) -> dict[str, Figure]:
@@ -87,46 +86,23 @@ def figures(analysis: Analysis) -> dict[str, Figure]:
     return found
 
 
-def _png(figure: Figure) -> bytes:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
-    stream = io.BytesIO()
-    figure.savefig(stream, dpi=_DPI, format="png", metadata={"Software": None})
-    return stream.getvalue()
-
-
-def _new(width: float, height: float) -> Figure:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def _calm(axes: Axes, grid: Literal["both", "x", "y"] = "both") -> None:
-    axes.grid(alpha=0.25, axis=grid)
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-
-
 # ---- where -----------------------------------------------------------------------------------------------------------
 
 
 def _localisation(analysis: Analysis) -> Figure:
     found = sorted(analysis.localisation, key=lambda place: place.share)
-    figure = _new(9.0, 0.9 + 0.42 * len(found))
+    figure = new_figure(9.0, 0.9 + 0.42 * len(found))
     axes = figure.subplots()
     bars = axes.barh([place.name for place in found], [100.0 * place.share for place in found], color=CALIBRATED, height=0.6)
     axes.bar_label(bars, [percent(place.share) for place in found], padding=4, fontsize=8)
     axes.set_xlim(0.0, 115.0 * max(place.share for place in found) + 1.0)
     axes.set_xlabel("share of the gap of the calibrated model (%)", fontsize=9)
-    _calm(axes, "x")
+    tidy(axes, "x")
     return figure
 
 
 def _relations(shown: Sequence[Relation]) -> Figure:
-    figure = _new(9.0, 0.9 + 0.3 * len(shown))
+    figure = new_figure(9.0, 0.9 + 0.3 * len(shown))
     axes = figure.subplots()
     ordered = shown[::-1]
     bars = axes.barh([one.name for one in ordered], [one.gain for one in ordered], color=CALIBRATED, height=0.6)
@@ -134,7 +110,7 @@ def _relations(shown: Sequence[Relation]) -> Figure:
     axes.bar_label(bars, texts, padding=4, fontsize=8)
     axes.set_xlim(0.0, 1.7 * max(one.gain for one in shown))
     axes.set_xlabel("predicted improvement by the best law there (fall of minus two log posterior)", fontsize=9)
-    _calm(axes, "x")
+    tidy(axes, "x")
     return figure
 
 
@@ -142,7 +118,7 @@ def _heat_map(heat_map: HeatMap) -> Figure:
     from matplotlib.colors import LogNorm
 
     rows, columns = heat_map.values.shape
-    figure = _new(min(12.0, 3.4 + 0.75 * columns), 1.9 + 0.24 * rows)
+    figure = new_figure(min(12.0, 3.4 + 0.75 * columns), 1.9 + 0.24 * rows)
     axes = figure.subplots()
     hottest = max(_HOTTEST, float(np.nanmax(heat_map.values, initial=0.0)))
     norm = LogNorm(_COLDEST, hottest)
@@ -182,7 +158,7 @@ def _evidence(evidence: Sequence[Evidence]) -> Figure:
     rounds = sorted({one.round for one in evidence})
     shown = [_strongest([one for one in evidence if one.round == turn]) for turn in rounds]
     heights = [1.1 + 0.24 * len(members) for members in shown]
-    figure = _new(9.5, sum(heights) + 0.6)
+    figure = new_figure(9.5, sum(heights) + 0.6)
     panels = figure.subplots(len(rounds), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, turn, members in zip(panels, rounds, shown, strict=True):
         _draw_round(axes, members)
@@ -231,14 +207,14 @@ def _draw_round(axes: Axes, members: Sequence[Evidence]) -> None:
     low, high = min(sizes.min(), 0.0), max(sizes.max(), 1.0)
     axes.set_xlim(low - (0.05 * (high - low) if low < 0.0 else 0.0), high + 0.25 * (high - low))
     axes.set_ylim(-0.6, len(members) - 0.4)
-    _calm(axes, "x")
+    tidy(axes, "x")
 
 
 # ---- how much --------------------------------------------------------------------------------------------------------
 
 
 def _gap(gap: GapFigures, runs: Sequence[RunGap], *, with_effects: bool) -> Figure:
-    figure = _new(10.0, max(3.4, 1.7 + 0.3 * len(runs)) if runs else 3.2)
+    figure = new_figure(10.0, max(3.4, 1.7 + 0.3 * len(runs)) if runs else 3.2)
     left, *right = np.atleast_1d(figure.subplots(1, 2 if runs else 1, width_ratios=(1.0, 1.25) if runs else (1.0,)))
     _draw_gap_bars(left, gap, with_effects=with_effects)
     if runs:
@@ -267,15 +243,15 @@ def _draw_gap_bars(axes: Axes, gap: GapFigures, *, with_effects: bool) -> None:
         low, high = sorted(interval)
         axes.plot([low, high], [rows[-1]] * 2, color="black", linewidth=1.4, marker="|", markersize=9)
         end = max(end, high)
-    axes.axvline(gap.noise_floor, color="#2e7d32", linestyle="--", linewidth=1.2)
+    axes.axvline(gap.noise_floor, color=GREEN, linestyle="--", linewidth=1.2)
     axes.set_ylim(-0.55, len(bars) - 0.1)
-    axes.annotate("noise floor", (gap.noise_floor, len(bars) - 0.45), (4, 0), textcoords="offset points", color="#2e7d32",
+    axes.annotate("noise floor", (gap.noise_floor, len(bars) - 0.45), (4, 0), textcoords="offset points", color=GREEN,
                   fontsize=8)  # fmt: skip
     axes.set_yticks(rows, names)
     axes.set_xlim(0.0, 1.18 * max(end, gap.noise_floor))
     axes.set_xlabel("error of replayed runs (1 = sensor noise)", fontsize=9)
     axes.set_title("held-out runs", fontsize=10, loc="left")
-    _calm(axes, "x")
+    tidy(axes, "x")
     axes.tick_params(axis="y", labelsize=9)
 
 
@@ -291,14 +267,14 @@ def _draw_moves(
     handles: list[Artist] = [given, axes.scatter(calibrated, rows, s=26, color=CALIBRATED, label="calibrated", zorder=3)]
     if with_effects:
         handles.append(axes.scatter(after, rows, s=26, color=AFTER, label="effects added", zorder=4))
-    handles.append(axes.axvline(1.0, color="#2e7d32", linestyle="--", linewidth=1.2, label="sensor noise"))
+    handles.append(axes.axvline(1.0, color=GREEN, linestyle="--", linewidth=1.2, label="sensor noise"))
     axes.set_yticks(rows, labels)
     axes.set_ylim(-0.6, len(gaps) - 0.4)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(_plain_ticks)
     axes.xaxis.set_minor_formatter(_few_plain_ticks)
     axes.set_xlabel("error of replayed runs (1 = sensor noise)", fontsize=9)
-    _calm(axes)
+    tidy(axes)
     axes.tick_params(which="minor", labelsize=7)
     return handles
 
@@ -312,7 +288,7 @@ def _few_plain_ticks(value: float, position: float) -> str:
 
 
 def _channels(gaps: Sequence[ChannelGap], *, with_effects: bool) -> Figure:
-    figure = _new(9.0, 1.4 + 0.2 * len(gaps))
+    figure = new_figure(9.0, 1.4 + 0.2 * len(gaps))
     axes = figure.subplots()
     handles = _draw_moves(axes, [one.channel for one in gaps], gaps, with_effects=with_effects)
     figure.legend(handles=handles, loc="outside upper right", ncols=4, fontsize=8.5, frameon=False)
@@ -325,7 +301,7 @@ def _channels(gaps: Sequence[ChannelGap], *, with_effects: bool) -> Figure:
 def _overlays(traces: Sequence[Trace], noise: dict[str, float], *, with_effects: bool) -> Figure:
     columns = min(2, len(traces))
     lines = -(-len(traces) // columns)
-    figure = _new(6.2 * columns, 3.3 * lines + 0.5)
+    figure = new_figure(6.2 * columns, 3.3 * lines + 0.5)
     outer = figure.add_gridspec(lines, columns)
     for index, trace in enumerate(traces):
         inner = outer[index // columns, index % columns].subgridspec(2, 1, height_ratios=(2, 1), hspace=0.04)
@@ -352,12 +328,12 @@ def _draw_trace(above: Axes, below: Axes, trace: Trace, noise: float | None, *, 
         above.plot(t, values, color=colour, linewidth=1.0, label=label)
         below.plot(t[counted], left[counted], color=colour, linewidth=0.8)
     if noise is not None:
-        below.axhspan(-2.0 * noise, 2.0 * noise, color="#2e7d32", alpha=0.15, linewidth=0.0)
+        below.axhspan(-2.0 * noise, 2.0 * noise, color=GREEN, alpha=0.15, linewidth=0.0)
     below.axhline(0.0, color="black", linewidth=0.5)
     above.set_title(f"{trace.channel} ({channel(trace.channel)})\n{trace.run}, held out", fontsize=9, loc="left")
     above.set_ylabel(trace.unit, fontsize=9)
     below.set_ylabel(f"error\n{trace.unit}", fontsize=9)
     above.tick_params(labelbottom=False)
     for axes in (above, below):
-        _calm(axes)
+        tidy(axes)
         axes.margins(x=0.01)

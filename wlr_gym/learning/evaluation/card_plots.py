@@ -8,23 +8,27 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, MultipleLocator
 
+from wlr_gym.base.plots import COLOURS, GREY, legend_below, new_figure, save, tidy
 from wlr_gym.learning.evaluation.card import BY_DIFFERENCE, IDLE, MAIN, Card
-from wlr_gym.learning.evaluation.metrics import JITTER_FREQUENCY, Metric, has_limits
-from wlr_gym.learning.evaluation.plots import save
+from wlr_gym.learning.evaluation.metrics import JITTER_FREQUENCY, TRACKING, Metric, has_limits
 from wlr_gym.learning.evaluation.sweeps import Sweep
 
 #: Panels of a sweep, each a metric.
 SWEPT = ("tracking_error", "success", "excess_slip")
-COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive", "tab:cyan")
 #: Slip in the picture of tracking against slip.
-SLIP = ("slip_speed", "excess_slip", "slip_per_metre", "excess_slip_per_metre")
+SLIP = ("slip_speed", "excess_slip")
+#: Not among the improvements that are drawn: what another row says too, or shares that are often near 0 %.
+UNDRAWN = (*(metric.key for metric in TRACKING), "slip_per_metre", "excess_slip_per_metre", "saturation", "action_saturation")
 #: Drawn in grey: what any policy should beat.
 REFERENCES = (IDLE, "untrained")
 #: Distance between two subjects at one rank of a sweep without numbers.
 DODGE = 0.09
 MARKERS = "osD^vP*Xh"
+LINES = ("-", "-.")
+#: %; improvements beyond it are cut off.
+CUT = 100.0
 
 
 def draw_card(folder: Path, card: Card) -> dict[str, str]:
@@ -40,20 +44,27 @@ def draw_card(folder: Path, card: Card) -> dict[str, str]:
 
 def _style(card: Card, name: str) -> dict[str, Any]:
     if name in REFERENCES:
-        return {"color": "0.55", "marker": "", "linestyle": "--" if name == IDLE else ":"}
+        return {"color": GREY, "marker": "", "linestyle": "--" if name == IDLE else ":"}
     rank = [other for other in card.names if other not in REFERENCES].index(name)
-    return {"color": COLOURS[rank % len(COLOURS)], "marker": MARKERS[rank % len(MARKERS)]}
+    line = LINES[rank // len(COLOURS) % len(LINES)]
+    return {"color": COLOURS[rank % len(COLOURS)], "marker": MARKERS[rank % len(MARKERS)], "linestyle": line}
+
+
+def _scale(metric: Metric) -> tuple[float, str]:
+    """Return the factor and the axis label of a metric: slip in mm/s."""
+    name = metric.key.replace("_", " ")
+    if metric.key == "tracking_error":
+        return 1.0, f"{name} (1 = at the task's scales)"
+    return (1e3, f"{name} (mm/s)") if metric.key in SLIP else (1.0, f"{name} ({metric.unit})")
 
 
 def sweep_curves(card: Card, sweep: Sweep) -> Figure:
     """Draw tracking error, success and slip over a sweep, a curve with its interval per subject."""
     chosen = [metric for key in SWEPT for metric in card.metrics if metric.key == key]
-    figure = Figure(figsize=(4.6 * len(chosen), 4.2), layout="constrained")
-    panels = figure.subplots(1, len(chosen), squeeze=False)[0]
-    for axes, metric in zip(panels, chosen, strict=True):
+    figure = new_figure(4.6 * len(chosen), 3.8)
+    for axes, metric in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, strict=True):
         _draw_sweep(axes, card, sweep, metric)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)), fontsize=8)
+    legend_below(figure, columns=6)
     figure.suptitle(f"{sweep.doc}", fontsize=10)
     return figure
 
@@ -66,28 +77,31 @@ def _draw_sweep(axes: Axes, card: Card, sweep: Sweep, metric: Metric) -> None:
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_title("tracking error (1 = at the task's scales)", fontsize=9)
     else:
-        axes.set_ylim(bottom=0.0)
-        axes.set_title(f"{metric.key.replace('_', ' ')} ({metric.unit})", fontsize=9)
+        axes.set_ylim(*((-2.0, 102.0) if metric.unit == "%" else (0.0, None)))
     if sweep.name in ("friction", "grip"):
         axes.set_xscale("log")
-    axes.set_xticks([point.value for point in sweep.points], [point.label for point in sweep.points], fontsize=8)
+    axes.set_xticks([point.value for point in sweep.points], [point.label for point in sweep.points])
     axes.minorticks_off()
     if sweep.name == "slope":
         axes.invert_xaxis()  # the steepest on the right
-    axes.set_xlabel(sweep.axis, fontsize=9)
-    axes.grid(alpha=0.3)
+    axes.set(xlabel=sweep.axis, ylabel=_scale(metric)[1])
+    tidy(axes, "both" if sweep.numeric else "y")
+    if not sweep.numeric:
+        for left in np.arange(len(sweep.points) + 1) - 0.5:
+            axes.axvline(left, color="0.9", linewidth=0.8, zorder=0)
+        axes.set_xlim(-0.5, len(sweep.points) - 0.5)
 
 
 def _draw_subject(axes: Axes, card: Card, sweep: Sweep, metric: Metric, name: str) -> None:
     x = np.array([point.value for point in sweep.points])
     estimates = [card.scores[sweep.label(point)][name][metric.key] for point in sweep.points]
-    mean, low, high = ([getattr(estimate, end) for estimate in estimates] for end in ("mean", "low", "high"))
+    ends = np.array([[e.mean, e.low, e.high] for e in estimates])
+    mean, low, high = _scale(metric)[0] * ends.T
     style = _style(card, name)
     if sweep.numeric:
         axes.plot(x, mean, label=name, markersize=4, linewidth=1.3, **style)
-        axes.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
+        axes.fill_between(x, low, high, color=style["color"], alpha=0.15, linewidth=0)
         return
     x = x + DODGE * (card.names.index(name) - (len(card.names) - 1) / 2)
     axes.plot(x, mean, label=name, markersize=4, **(style | {"linestyle": "", "marker": style["marker"] or "_"}))
@@ -96,9 +110,9 @@ def _draw_subject(axes: Axes, card: Card, sweep: Sweep, metric: Metric, name: st
 
 def improvements(card: Card) -> Figure:
     """Draw by how much the first subject is better than each baseline that achieves something, in %, with intervals."""
-    metrics = [m for m in card.metrics if m.key not in BY_DIFFERENCE and _comparable(card, m)]
+    metrics = [m for m in card.metrics if m.key not in (*BY_DIFFERENCE, *UNDRAWN) and _comparable(card, m)]
     others = _rivals(card)
-    figure = Figure(figsize=(9, 0.9 + 0.16 * len(metrics) * (len(others) + 1)), layout="constrained")
+    figure = new_figure(9.0, 0.9 + 0.12 * len(metrics) * (len(others) + 1))
     axes = figure.subplots()
     height = 0.8 / len(others)
     for rank, name in enumerate(others):
@@ -117,30 +131,28 @@ def improvements(card: Card) -> Figure:
         )
     axes.axvline(0.0, color="black", linewidth=1)
     axes.set_yticks(range(len(metrics)), [metric.key.replace("_", " ") for metric in metrics])
-    axes.invert_yaxis()
-    axes.set_xlim(-110, 110)
-    axes.set_xlabel(f"{card.names[0]} is better by (%), 95 % interval, paired; beyond -100: cut")
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    axes.grid(alpha=0.3, axis="x")
+    axes.set_ylim(len(metrics) - 0.5, -0.5)
+    axes.set_xlim(-CUT, CUT)
+    axes.xaxis.set_major_locator(MultipleLocator(25))
+    axes.set_xlabel(f"{card.names[0]} is better by (%; left of 0 it is worse; cut at -{CUT:g}), paired, with 95 % interval")
+    tidy(axes, "x")
+    legend_below(figure)
     return figure
 
 
 def pareto(card: Card) -> Figure:
-    """Draw tracking error against slip, total and excess, per second and per metre: best is what is low and left."""
-    figure = Figure(figsize=(9, 7.4), layout="constrained")
-    metrics = [metric for key in SLIP for metric in card.metrics if metric.key == key]
-    for axes, metric in zip(figure.subplots(2, 2).flat, metrics, strict=True):
+    """Draw tracking error against slip, total and excess: best is what is low and left."""
+    figure = new_figure(9.0, 4.0)
+    error, *slips = [metric for key in ("tracking_error", *SLIP) for metric in card.metrics if metric.key == key]
+    for axes, slip in zip(figure.subplots(1, len(slips)), slips, strict=True):
         for name in [card.names[0], *_rivals(card)]:
-            error, slip = (card.scores[MAIN][name][key] for key in ("tracking_error", metric.key))
-            ends = [[[e.mean - e.low], [e.high - e.mean]] for e in (error, slip)]
+            scores = card.scores[MAIN][name]
+            x, y = (_scale(m)[0] * np.array([scores[m.key].mean, scores[m.key].low, scores[m.key].high]) for m in (error, slip))
             style = _style(card, name) | {"linestyle": "", "capsize": 2, "elinewidth": 1}
-            axes.errorbar(error.mean, slip.mean, xerr=np.abs(ends[0]), yerr=np.abs(ends[1]), label=name, **style)
-        axes.set(xlabel="tracking error", ylabel=f"{metric.key.replace('_', ' ')} ({metric.unit})")
-        axes.set_ylim(bottom=0.0)
-        axes.set_xlim(left=0.0)
-        axes.grid(alpha=0.3)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
+            axes.errorbar(x[0], y[0], xerr=np.abs(x[1:, None] - x[0]), yerr=np.abs(y[1:, None] - y[0]), label=name, **style)
+        axes.set(xlabel=_scale(error)[1], ylabel=_scale(slip)[1], xlim=(0.0, None), ylim=(0.0, None))
+        tidy(axes)
+    legend_below(figure, columns=5)
     return figure
 
 
@@ -154,7 +166,7 @@ def _comparable(card: Card, metric: Metric) -> bool:
 
 def spectra(card: Card) -> Figure:
     """Draw the power density of each subject's action."""
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    figure = new_figure(7.0, 4.2)
     axes = figure.subplots()
     for name, played in card.main.items():
         if np.nanmax(played.power, initial=0.0) > 0.0:
@@ -163,8 +175,9 @@ def spectra(card: Card) -> Figure:
             axes.plot(played.frequency[1:], played.power[1:], label=name, linewidth=1.4, **style)
     axes.axvline(JITTER_FREQUENCY, color="0.3", linestyle=":", linewidth=1.2)
     axes.set(xlabel="frequency (Hz)", ylabel="power density of the action (1/Hz)", xscale="log", yscale="log")
+    axes.set_xticks([0.5, 1, 2, 5, 10, 20], ["0.5", "1", "2", "5", "10", "20"])
     axes.set_title(f"Action, mean over joints; jitter is what lies right of {JITTER_FREQUENCY:g} Hz", fontsize=10)
-    axes.grid(alpha=0.3, which="both")
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(fontsize=8)
+    axes.minorticks_off()
+    tidy(axes)
+    legend_below(figure, columns=3)
     return figure

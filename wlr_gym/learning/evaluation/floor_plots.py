@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.plots import new_figure, save
 from wlr_gym.envs.tasks.draws import episode_seeds
 from wlr_gym.robot import CORNER_SIGNS
 from wlr_gym.robot.parameter_table import PATCHES
@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: Floors per row.
+#: Floors of one randomisation.
 COUNT = 8
+#: Floors of one randomisation beside each other, randomisations beside each other.
+_COLUMNS, _BLOCKS = 4, 3
 #: m from the start that is shown.
 _REACH = 1.3
 #: Friction coefficients at the ends of the colours.
@@ -34,33 +36,46 @@ _COLOURS = "viridis"
 
 
 def draw_floors(path: Path, randomizations: Sequence[Randomization], first_seed: int = 0, count: int = COUNT) -> None:
-    """Draw the floors of ``reset(seed=first_seed)`` and the next seeds, one row per randomisation, and write the picture."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    """Draw the floors of ``reset(seed=first_seed)`` and the next seeds, a block per randomisation, and write the picture."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
-    rows = len(randomizations)
-    figure = Figure(figsize=(1.45 * count + 0.9, 1.45 * rows + 0.55), layout="constrained")
-    FigureCanvasAgg(figure)
+    columns, beside = min(count, _COLUMNS), min(len(randomizations), _BLOCKS)
+    rows, below = -(-count // columns), -(-len(randomizations) // beside)
+    size = 2.2 if beside == 1 else 1.2
+    height = (size * rows + 0.2) * below + 0.3
+    figure = new_figure(size * (columns + 0.2) * beside + 0.4, height + 0.7)
     norm = LogNorm(_LOWEST, _HIGHEST, clip=True)
-    panels = figure.subplots(rows, count, squeeze=False, sharex=True, sharey=True)
+    floors, foot = figure.add_gridspec(2, 1, height_ratios=(height, 0.6))
+    widths = [*([1.0] * columns + [0.2]) * beside][:-1]  # a gap between blocks
+    grid = floors.subgridspec(rows * below, len(widths), width_ratios=widths)
     robot_seeds = first_seed + np.arange(count, dtype=np.uint64)
-    seeds = episode_seeds(robot_seeds, np.zeros(count, np.int64))
-    for row, randomization in zip(panels, randomizations, strict=True):
-        parameters = randomization.parameters(robot_seeds, seeds)
-        state = randomization.state(parameters, seeds)
-        yaw = 2 * np.arctan2(state.quaternion[:, 3], state.quaternion[:, 0])
-        for k, axes in enumerate(row):
-            _draw(axes, Parameters(parameters.values[k : k + 1]), float(yaw[k]), norm)
-        row[0].set_ylabel(f"{randomization.config.name}\ny (m)", fontsize=9)
-    for axes in panels[-1]:
-        axes.set_xlabel("x (m)", fontsize=8)
-    bar = figure.colorbar(ScalarMappable(norm, _COLOURS), ax=panels, pad=0.01, ticks=[0.05, 0.1, 0.2, 0.5, 1.0], format="%g")
-    bar.set_label("friction coefficient\nalong the heading", fontsize=9)
+    for block, randomization in enumerate(randomizations):
+        top, left = rows * (block // beside), (columns + 1) * (block % beside)
+        panels = [figure.add_subplot(grid[top + k // columns, left + k % columns]) for k in range(count)]
+        _draw_block(panels, randomization, robot_seeds, norm)
+        for k, axes in enumerate(panels):
+            is_first, is_last = left + k % columns == 0, block + beside >= len(randomizations) and k + columns >= count
+            axes.tick_params(labelleft=is_first, labelbottom=is_last)
+            axes.set_ylabel("y (m)" if is_first else "", fontsize=8)
+            axes.set_xlabel("x (m)" if is_last else "", fontsize=8)
+    place = figure.add_subplot(foot.subgridspec(1, 3, width_ratios=(1, 2, 1))[1])
+    ticks = [0.05, 0.1, 0.2, 0.5, 1.0]
+    bar = figure.colorbar(ScalarMappable(norm, _COLOURS), place, orientation="horizontal", ticks=ticks, format="%g")
+    bar.set_label("friction coefficient along the heading", fontsize=9)
     bar.ax.minorticks_off()
     bar.ax.tick_params(labelsize=8)
-    replace_file(path, lambda temporary: figure.savefig(temporary, dpi=100, format=path.suffix[1:] or "png"))
+    save(figure, path)
+
+
+def _draw_block(panels: Sequence[Axes], randomization: Randomization, robot_seeds: NDArray[np.uint64], norm: Normalize) -> None:
+    seeds = episode_seeds(robot_seeds, np.zeros(len(robot_seeds), np.int64))
+    parameters = randomization.parameters(robot_seeds, seeds)
+    state = randomization.state(parameters, seeds)
+    yaw = 2 * np.arctan2(state.quaternion[:, 3], state.quaternion[:, 0])
+    for k, axes in enumerate(panels):
+        _draw(axes, Parameters(parameters.values[k : k + 1]), float(yaw[k]), norm)
+    panels[0].set_title(randomization.config.name, fontsize=10, loc="left")
 
 
 def _draw(axes: Axes, parameters: Parameters, yaw: float, norm: Normalize) -> None:
@@ -71,6 +86,7 @@ def _draw(axes: Axes, parameters: Parameters, yaw: float, norm: Normalize) -> No
     colours = colormaps[_COLOURS]
     ground = float(parameters["ground.mu_x"].mean())
     axes.set_facecolor(colours(norm(ground)))
+    ink = "black" if norm(ground) > 0.6 else "white"
     areas = [_area(parameters, k) for k in range(len(PATCHES))]
     for mu, x_min, x_max, y_min, y_max in areas:
         if x_max > x_min and y_max > y_min:
@@ -83,10 +99,10 @@ def _draw(axes: Axes, parameters: Parameters, yaw: float, norm: Normalize) -> No
         x, y = sign_x * hip_x, sign_y * hip_y
         place = np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y
         mu = grip * next((area[0] for area in reversed(areas) if _holds(area, *place)), mu_x)
-        wheel = Rectangle((x - 0.11, y - 0.06), 0.22, 0.12, facecolor=colours(norm(mu)), edgecolor="white", linewidth=0.8)
+        wheel = Rectangle((x - 0.11, y - 0.06), 0.22, 0.12, facecolor=colours(norm(mu)), edgecolor=ink, linewidth=0.8)
         wheel.set_transform(turn)
         axes.add_patch(wheel)
-    axes.plot([0.0, 0.4], [0.0, 0.0], color="white", linewidth=1.2, transform=turn)
+    axes.plot([0.0, 0.4], [0.0, 0.0], color=ink, linewidth=1.2, transform=turn)
     axes.set(xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH), aspect="equal", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
     axes.tick_params(labelsize=7)
 

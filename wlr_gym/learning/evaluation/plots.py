@@ -3,34 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.plots import BLUE, COLOURS, new_figure, tidy
 from wlr_gym.learning.evaluation.rollout import Rollout
 from wlr_gym.robot import WHEELS
 
 Array = NDArray[np.float64]
 
 # Colours of curves.
-ACTUAL = "tab:blue"
+ACTUAL = BLUE
 COMMANDED = "black"
-WHEEL_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red")
 #: Seconds between the heading arrows along a path.
 ARROW_PERIOD = 2.0
-
-
-def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG."""
-    FigureCanvasAgg(figure)
-    replace_file(path, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
-    return path
 
 
 def learning_curve(curve: Sequence[Mapping[str, float]], references: Mapping[str, float]) -> Figure:
@@ -40,7 +30,7 @@ def learning_curve(curve: Sequence[Mapping[str, float]], references: Mapping[str
         curve: rows with ``steps``, ``reward_per_second``, ``slip_speed`` and ``term.*``.
         references: name -> reward per second of policies to compare with.
     """
-    figure = Figure(figsize=(10, 4), layout="constrained")
+    figure = new_figure(10.0, 4.0)
     left, right = figure.subplots(1, 2)
     steps = np.array([row["steps"] for row in curve]) / 1e6
     left.plot(steps, [row["reward_per_second"] for row in curve], color=ACTUAL, label="PPO, with its exploration")
@@ -58,6 +48,8 @@ def learning_curve(curve: Sequence[Mapping[str, float]], references: Mapping[str
             right.plot(steps, values, label=name.removeprefix("term."))
     right.set(xlabel="environment steps (millions)", ylabel="reward per second", title="Terms of the reward")
     right.legend(fontsize=7, ncols=2)
+    for axes in (left, right):
+        tidy(axes)
     return figure
 
 
@@ -65,7 +57,7 @@ def episode(rollout: Rollout, index: int, title: str) -> Figure:
     """Draw one episode: top view, commands against motion, and the slip of each wheel over time."""
     ticks = int(rollout.active[:, index].sum())
     time: Array = np.arange(1, ticks + 1) * np.float64(rollout.control_period)
-    figure = Figure(figsize=(12, 7.5), layout="constrained")
+    figure = new_figure(12.0, 7.5)
     figure.suptitle(title)
     grid = figure.add_gridspec(4, 2, width_ratios=(1.1, 1.0))
     _draw_path(figure.add_subplot(grid[:, 0]), rollout, index, ticks)
@@ -78,13 +70,13 @@ def episode(rollout: Rollout, index: int, title: str) -> Figure:
     for axes, component, name in ((longitudinal, 0, "longitudinal\nslip (m/s)"), (lateral, 1, "lateral\nslip (m/s)")):
         for wheel, label in enumerate(WHEELS):
             slip = rollout.slip_velocity[:ticks, index, wheel, component]
-            axes.plot(time, slip, color=WHEEL_COLOURS[wheel], label=label, linewidth=1)
+            axes.plot(time, slip, color=COLOURS[wheel], label=label, linewidth=1)
         axes.set_ylabel(name)
     longitudinal.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), fontsize=8, ncols=4, frameon=False)
     for axes in (velocity, yaw_rate, longitudinal):
         axes.tick_params(labelbottom=False)
     for axes in (velocity, yaw_rate, longitudinal, lateral):
-        axes.grid(alpha=0.3)
+        tidy(axes)
         axes.set_xlim(0, time[-1])
     lateral.set_xlabel("time (s)")
     return figure
@@ -106,10 +98,10 @@ def _draw_path(axes: Axes, rollout: Rollout, index: int, ticks: int) -> None:
         axes.plot(*path.T, color=colour, linestyle=style, label=label)
         tips: dict[str, Any] = {"angles": "xy", "color": colour, "width": 0.005, "scale": 18, "zorder": 3}
         axes.quiver(*path[::every].T, np.cos(heading[::every]), np.sin(heading[::every]), **tips)
-    axes.plot(*position[0], "o", color="tab:green", label="start", zorder=4)
+    axes.plot(*position[0], "o", color=BLUE, label="start", zorder=4)
     axes.set(xlabel="x (m)", ylabel="y (m)", title=f"Top view, heading every {ARROW_PERIOD:g} s")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(alpha=0.3)
+    tidy(axes)
     axes.legend(fontsize=8)
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from wlr_gym.base.plots import COLOURS, PALE, new_figure, tidy
 from wlr_gym.learning.sweep.plan import METRICS
 from wlr_gym.learning.sweep.results import Summary, TrialResult
 
@@ -15,10 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Colours of the best settings, best first; all others are grey.
-COLOURS = ("#1f4e9c", "#e06c00", "#2e7d32", "#7b3fa0", "#b03030")
-OTHERS = "#c9c9c9"
-_DPI = 110
 #: So many values of a setting have a tick each.
 _FEW = 5
 _WORDS = {
@@ -29,34 +25,24 @@ _WORDS = {
 }
 
 
-def png(figure: Figure) -> bytes:
-    """Return a figure as PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
-    target = io.BytesIO()
-    figure.savefig(target, dpi=_DPI, format="png")
-    return target.getvalue()
-
-
 def curves(ranking: Sequence[Summary], names: Sequence[str], metric: str) -> Figure:
     """Draw the deciding metric and success over the steps: mean over the seeds, and a band from the least to the largest.
+
+    The best settings have a colour each, best first; all others are grey.
 
     Args:
         ranking: best first.
         names: of the settings in ``ranking``, for the legend.
         metric: that decides.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    figure = new_figure(10.0, 4.6)
     shown = [metric, *(name for name in ("success", "reward") if name != metric and _is_scored(ranking, name))][:2]
     panels = figure.subplots(1, len(shown), squeeze=False)[0]
     for axes, name in zip(panels, shown, strict=True):
         for rank in reversed(range(len(ranking))):
-            _draw(axes, ranking[rank], names[rank], name, COLOURS[rank] if rank < len(COLOURS) else OTHERS)
+            _draw(axes, ranking[rank], names[rank], name, COLOURS[rank] if rank < len(COLOURS) else PALE)
         axes.set(xlabel="environment steps (millions)", ylabel=_WORDS[name])
-        axes.grid(alpha=0.3)
+        tidy(axes)
         if name == "success":
             axes.set_ylim(-2.0, 102.0)
         if name == "tracking_error":
@@ -78,7 +64,7 @@ def _draw(axes: Axes, summary: Summary, label: str, metric: str, colour: str) ->
     steps, rows = _aligned(summary.results, metric)
     if not len(steps):
         return
-    style: dict[str, Any] = {"color": colour, "linewidth": 1.6 if colour != OTHERS else 1.0}
+    style: dict[str, Any] = {"color": colour, "linewidth": 1.6 if colour != PALE else 1.0}
     axes.plot(steps / 1e6, np.nanmean(rows, axis=0), label=label, marker="o", markersize=3, **style)
     if len(rows) > 1:
         low, high = np.nanmin(rows, axis=0), np.nanmax(rows, axis=0)
@@ -96,14 +82,12 @@ def _aligned(results: Sequence[TrialResult], metric: str) -> tuple[np.ndarray, n
 
 def effects(results: Sequence[TrialResult], shares: Mapping[str, float], metric: str) -> Figure:
     """Draw the final scores of all trials over each setting, the most important first."""
-    from matplotlib.figure import Figure
-
     names = list(shares)[:4]
-    figure = Figure(figsize=(min(10.0, 3.3 * len(names)), 3.2), layout="constrained")
+    figure = new_figure(min(10.0, 3.3 * len(names)), 3.2)
     for axes, name in zip(figure.subplots(1, len(names), squeeze=False, sharey=True)[0], names, strict=True):
         _draw_effect(axes, [one for one in results if metric in one.final], name, metric)
         axes.set_title(f"{name}: {100 * shares[name]:.0f} %", fontsize=9)
-        axes.grid(alpha=0.3)
+        tidy(axes)
     figure.axes[0].set_ylabel(_WORDS[metric], fontsize=8)
     return figure
 

@@ -13,6 +13,7 @@ import numpy as np
 from wlr_gym import __version__
 from wlr_gym.base.files import write_text
 from wlr_gym.base.html import commands, document, folded, pictures_of, section, table
+from wlr_gym.base.plots import COLOURS, png
 from wlr_gym.base.text import duration, number
 from wlr_gym.learning.sweep import figures
 from wlr_gym.learning.sweep.plan import SweepPlan
@@ -148,10 +149,10 @@ def _curves(plan: SweepPlan, ranking: Sequence[Summary]) -> str:
     if not ranking:
         return ""
     names = [name_of(one.settings) for one in ranking]
-    picture = {"curves": figures.png(figures.curves(ranking, names, plan.metric))}
+    picture = {"curves": png(figures.curves(ranking, names, plan.metric))}
     caption = (
         "Scores on the held-out episodes over the training: mean over the seeds, band from the least to the largest. "
-        f"The best {min(len(figures.COLOURS), len(ranking))} settings in colour, the others grey."
+        f"The best {min(len(COLOURS), len(ranking))} settings in colour, the others grey."
     )
     return section("While they learn", pictures_of("curves", picture, caption))
 
@@ -161,7 +162,7 @@ def _importance(plan: SweepPlan, results: Sequence[TrialResult]) -> str:
     if not shares:
         return ""
     ended = [one for one in results if one.status == DONE]
-    picture = {"effects": figures.png(figures.effects(ended, shares, plan.metric))}
+    picture = {"effects": png(figures.effects(ended, shares, plan.metric))}
     left = max(0.0, 1.0 - sum(shares.values()))
     text = (
         f"<p>Share of the variance of the final {escape(_METRIC[plan.metric])} between trials that each setting explains alone "

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import replace_file, write_json
+from wlr_gym.base.plots import BLUE, COLOURS, GREY, legend_below, new_figure, save, tidy
 from wlr_gym.data.body_pose import rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import robot_of
@@ -214,9 +215,7 @@ def save_video_analysis(analysis: VideoAnalysis, folder: Path) -> list[Path]:
     write_json(folder / "summary.json", analysis.summary())
     paths.append(folder / "summary.json")
     for file, draw in (("pose.png", _draw_pose), ("slip.png", _draw_slip)):
-        figure = draw(analysis)
-        replace_file(folder / file, lambda temporary, figure=figure: figure.savefig(temporary, dpi=110, format="png"))
-        paths.append(folder / file)
+        paths.append(save(draw(analysis), folder / file))
     return paths
 
 
@@ -331,20 +330,13 @@ def _imu_findings(samples: Sequence[Sample], offset: float, run: Run, robot: Rob
 
 # --- plots ------------------------------------------------------------------------------------------------------------
 
-_WHEEL_COLOURS = ("#1f4e9c", "#e06c00", "#2a9d5c", "#b03060")
-
-
-def _new_figure(rows: int, height: float) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+#: Width and line of each wheel, so that curves that coincide are all seen: front wide, rear narrow, right dashed.
+_LINES = ((2.6, "-"), (2.6, "--"), (1.1, "-"), (1.1, "--"))
 
 
 def _draw_pose(analysis: VideoAnalysis) -> Any:
-    figure, panels = _new_figure(5, 9.5)
+    figure = new_figure(9.0, 9.5)
+    panels = figure.subplots(5, 1, sharex=True)
     slip, time = analysis.slip, np.array([s.time for s in analysis.samples]) + analysis.offset
     poses = np.stack([s.pose for s in analysis.samples])
     poses[:, 3] = np.unwrap(np.nan_to_num(poses[:, 3])) + 0 * poses[:, 3]
@@ -356,42 +348,43 @@ def _draw_pose(analysis: VideoAnalysis) -> Any:
         ("pitch", "deg", 180 / math.pi),
     )
     for axes, k, (name, unit, factor) in zip(panels, range(5), units, strict=True):
-        axes.plot(time, factor * poses[:, k], ".", color="#9a9a9a", markersize=3, label="frames")
-        axes.plot(slip.time, factor * slip.pose[:, k], color="#1f4e9c", linewidth=1.1, label="smoothed")
+        axes.plot(time, factor * poses[:, k], ".", color=GREY, markersize=3, label="frames")
+        axes.plot(slip.time, factor * slip.pose[:, k], color=BLUE, linewidth=1.1, label="smoothed")
         std = f"1 sigma of a smoothed pose: {factor * np.median(slip.pose_std[:, k]):.2g} {unit}"
         axes.set_title(f"{name} of the body in the floor frame; {std}", fontsize=9, loc="left")
-        axes.set_ylabel(unit)
-        axes.grid(alpha=0.25)
-    panels[0].legend(loc="upper left", frameon=False, fontsize=8, ncols=2)
-    panels[-1].set_xlabel("t (s)")
+        axes.set_ylabel(f"{name} ({unit})")
+        tidy(axes)
+    panels[-1].set_xlabel("time (s)")
+    legend_below(figure)
     figure.suptitle(f"{analysis.run.name}: pose from the camera", fontsize=13)
     return figure
 
 
 def _draw_slip(analysis: VideoAnalysis) -> Any:
-    figure, panels = _new_figure(3, 8.5)
+    figure = new_figure(9.0, 6.5)
+    panels = figure.subplots(3, 1, sharex=True)
     slip = analysis.slip
-    for w, (wheel, colour) in enumerate(zip(CORNER_NAMES.values(), _WHEEL_COLOURS, strict=True)):
+    for w, (wheel, colour, (width, line)) in enumerate(zip(CORNER_NAMES.values(), COLOURS, _LINES, strict=False)):
         for axes, a in ((panels[0], 0), (panels[1], 1)):
             spread = np.hypot(slip.slip_std[:, w, a], slip.slip_layout_std[:, w, a])
             spread = np.hypot(spread, slip.slip_radius_std[:, w]) if a == 0 else spread
-            axes.plot(slip.time, 1e3 * slip.slip[:, w, a], color=colour, linewidth=1.2, label=wheel)
+            axes.plot(slip.time, 1e3 * slip.slip[:, w, a], line, color=colour, linewidth=width, label=wheel)
             axes.fill_between(slip.time, 1e3 * (slip.slip[:, w, a] - 2 * spread), 1e3 * (slip.slip[:, w, a] + 2 * spread),
                               color=colour, alpha=0.12, linewidth=0)  # fmt: skip
-        panels[2].plot(slip.time, slip.ratio[:, w], color=colour, linewidth=0.9)
+        panels[2].plot(slip.time, slip.ratio[:, w], line, color=colour, linewidth=width)
     titles = (
         (
             "accumulated longitudinal slip (+ skids forward, - spins); band: 2 sigma with wheel radius and marker layout",
             "longitudinal slip (mm)",
         ),
         ("accumulated lateral slip (+ to the left); band: 2 sigma with marker layout", "lateral slip (mm)"),
-        ("slip ratio (0 rolls freely, +1 spins on the spot, -1 locked)", "slip ratio"),
+        ("slip ratio (0 rolls freely, +1 spins on the spot, -1 locked)", "slip ratio (-)"),
     )
     for axes, (title, unit) in zip(panels, titles, strict=True):
         axes.set_title(title, fontsize=9, loc="left")
         axes.set_ylabel(unit)
-        axes.grid(alpha=0.25)
-    panels[0].legend(frameon=False, fontsize=8, ncols=4)
-    panels[-1].set_xlabel("t (s)")
+        tidy(axes)
+    panels[-1].set_xlabel("time (s)")
+    legend_below(figure)
     figure.suptitle(f"{analysis.run.name}: slip of the wheels", fontsize=13)
     return figure

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, legend_below, new_figure, save, tidy
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import WHEELS
@@ -18,7 +19,7 @@ from wlr_gym.studies.bench.camera_chain import ChainDrive, ChainSetting, chain_c
 
 #: s of the drive that is drawn, from when on the lens is covered, and for how long.
 _SECONDS, _COVERED, _FOR = 12.0, 5.0, 3.0
-_TRUTH, _SEEN, _ESTIMATE, _FLOW = "0.1", "C1", "C0", "C2"
+_TRUTH, _SEEN, _ESTIMATE, _FLOW = "0.1", ORANGE, BLUE, GREEN
 
 
 def draw_chain(drive: ChainDrive, path: Path, title: str) -> None:
@@ -27,28 +28,26 @@ def draw_chain(drive: ChainDrive, path: Path, title: str) -> None:
     Args:
         drive: what was seen. path: of the picture. title: of it.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(5, 1, figsize=(10, 11), sharex=True, constrained_layout=True, height_ratios=(3, 3, 3, 3, 1.3))
-    _draw_pose(axes[0], drive, 0, "x from the start, m")
+    figure = new_figure(10.0, 9.5)
+    axes = figure.subplots(5, 1, sharex=True, height_ratios=(3, 3, 3, 3, 1.3))
+    _draw_pose(axes[0], drive, 0, "x from the start (m)")
     _draw_speed(axes[1], drive)
-    _draw_pose(axes[2], drive, 2, "heading, rad")
+    _draw_pose(axes[2], drive, 2, "heading (rad)")
     _draw_slip(axes[3], drive)
     axes[4].plot(drive.time, 1e3 * drive.sensed("camera_age"), color=_SEEN, lw=1.0)
-    axes[4].set_ylabel("age of the\npose, ms")
+    axes[4].set_ylabel("age of the\npose (ms)")
     axes[4].set_yscale("log")
-    axes[4].set_xlabel("time, s")
+    axes[4].yaxis.set_major_formatter("{x:g}")
+    axes[4].set_xlabel("time (s)")
     blind = np.array([bool(reason) for reason in drive.reasons])
     for axis in axes:
-        axis.fill_between(drive.time, 0, 1, where=blind, transform=axis.get_xaxis_transform(), color="0.9", lw=0, zorder=0)
-        axis.grid(alpha=0.3)
+        shade = {"transform": axis.get_xaxis_transform(), "color": "0.9", "lw": 0, "zorder": 0}
+        axis.fill_between(drive.time, 0, 1, where=blind, label="no pose", **shade)
+        tidy(axis)
         axis.set_xlim(0, drive.time[-1])
-    axes[0].set_title(title)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    axes[0].set_title(title, fontsize=10)
+    legend_below(figure, columns=6)
+    save(figure, path)
 
 
 def _estimate(drive: ChainDrive, name: str) -> Any:
@@ -64,43 +63,39 @@ def _draw_pose(axis: Any, drive: ChainDrive, k: int, label: str) -> None:
     axis.plot(drive.time, estimate, color=_ESTIMATE, lw=1.2, label="observer")
     axis.plot(exposed[is_new], drive.sensed("camera_pose")[is_new, k], ".", color=_SEEN, ms=4, label="camera, when exposed")
     axis.set_ylabel(label)
-    if k == 0:
-        axis.plot([], [], color="0.85", lw=8, label="no pose")
-        axis.legend(loc="lower left", ncols=4, fontsize=8)
 
 
-def _draw_band(axis: Any, time: Any, values: Any, sigma: Any, label: str) -> None:
-    axis.fill_between(time, values - 2 * sigma, values + 2 * sigma, color=_ESTIMATE, alpha=0.2, lw=0)
-    axis.plot(time, values, color=_ESTIMATE, lw=1.2, label=label)
+def _draw_band(axis: Any, time: Any, values: Any, sigma: Any) -> None:
+    axis.fill_between(time, values - 2 * sigma, values + 2 * sigma, color=_ESTIMATE, alpha=0.2, lw=0, label="2 sigma")
+    axis.plot(time, values, color=_ESTIMATE, lw=1.2, label="observer")
 
 
 def _draw_speed(axis: Any, drive: ChainDrive) -> None:
     speed, sigma = (_estimate(drive, f"linear_velocity_{name}")[:, 0] for name in ("in_body", "sigma"))
     axis.plot(drive.time, drive.true("linear_velocity_in_body")[:, 0], color=_TRUTH, lw=2.0, label="truth")
-    _draw_band(axis, drive.time, speed, sigma, "observer, ±2 sigma")
-    axis.plot(drive.time, drive.command[:, 0], "--", color="0.5", lw=1.0, label="command")
+    _draw_band(axis, drive.time, speed, sigma)
+    axis.plot(drive.time, drive.command[:, 0], "--", color=GREY, lw=1.0, label="command")
     if "flow" in SENSOR_LAYOUT.channels and (is_new := drive.sensed("flow_is_new") > 0.5).any():
         turned = drive.sensed("flow")[:, 0] + drive.sensed("gyro")[:, 1]
         height = drive.true("position")[:, 2]
         axis.plot(drive.time[is_new], (turned * height)[is_new], ".", color=_FLOW, ms=2, label="flow times height")
-    axis.set_ylabel("forward speed, m/s")
+    axis.set_ylabel("forward speed (m/s)")
     axis.set_ylim(*_limits(drive.true("linear_velocity_in_body")[:, 0], speed))
-    axis.legend(loc="upper left", ncols=4, fontsize=8)
 
 
 def _draw_slip(axis: Any, drive: ChainDrive, wheel: int = 0) -> None:
     slip, sigma = (_estimate(drive, name)[:, 2 * wheel] for name in ("slip_velocity", "slip_sigma"))
     true = drive.true("slip_velocity")[:, 2 * wheel]
     axis.plot(drive.time, true, color=_TRUTH, lw=2.0, label="truth")
-    _draw_band(axis, drive.time, slip, sigma, "observer, ±2 sigma")
-    axis.set_ylabel(f"slip of {WHEELS[wheel]}, m/s")
+    _draw_band(axis, drive.time, slip, sigma)
+    axis.set_ylabel(f"slip of {WHEELS[wheel]} (m/s)")
     axis.set_ylim(*_limits(true, slip))
 
 
 def _limits(*series: Any) -> tuple[float, float]:
     low, high = (function([function(values) for values in series]) for function in (np.min, np.max))
     margin = 0.25 * max(high - low, 0.01)
-    return float(low - margin), float(high + 2 * margin)
+    return float(low - margin), float(high + margin)
 
 
 def main(arguments: list[str]) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, WINE, legend_below, new_figure, save, tidy
 from wlr_gym.studies.bench.engine import KINDS, EngineResult
 from wlr_gym.studies.bench.measure import Measurement
 
@@ -94,41 +94,49 @@ def settings_table(report: dict[str, Any]) -> tuple[tuple[str, ...], list[tuple[
     return ("side", "setting", "precision", "error, rms", "worst", "x real time"), rows
 
 
-_COLOURS = {"float64": "#1f4e9c", "float32": "#e06c00"}
-_MUJOCO_COLOURS = ("#111111", "#7a7a7a", "#2a8a4a", "#8fc79f", "#b02a5b", "#7b3fb5", "#c39be6")
+#: Colour of an engine's precision and of a contact of MuJoCo.
+_COLOURS = {"float64": BLUE, "float32": ORANGE, "default": "black", "stiff friction": GREY, "matched": WINE, "tuned": GREEN}
 
 
 def save_picture(report: dict[str, Any], path: Path) -> None:
     """Write error against speed of every setting on one thread as a PNG; ``report`` is ``EngineReport.as_dict()``."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.5, 6.0), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9.5, 6.0)
     axes = figure.subplots()
-    shown = [one for one in report["settings"] if one["upright"] and one["threads"] == 1 and one["call"] == "step"]
-    for precision, colour in _COLOURS.items():
-        rows = [one for one in shown if one["side"] == "engine" and one["precision"] == precision]
-        _draw(axes, rows, f"engine, {precision}", colour, "o")
-    for kind, colour in zip(KINDS, _MUJOCO_COLOURS, strict=True):
-        rows = [one for one in shown if one["side"] == "MuJoCo" and (one["cone"], one["contact"], one["integrator"]) == kind]
-        _draw(axes, rows, f"MuJoCo float64, {kind[0]}, {kind[1]} contact, {kind[2]}", colour, "s")
     axes.set(xscale="log", yscale="log", xlabel="error of the pose after 2 s, rms of ten motions (mm)")
     axes.set_ylabel("simulated seconds of a robot per second of one core")
-    axes.grid(which="both", alpha=0.25)
-    axes.legend(fontsize=8)
-    axes.set_title("Accuracy against speed; numbers: step in ms. Crosses: fewer or more passes or iterations", fontsize=10)
-    replace_file(path, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
+    shown = [one for one in report["settings"] if one["upright"] and one["threads"] == 1 and one["call"] == "step"]
+    for precision in ("float64", "float32"):
+        rows = [one for one in shown if one["side"] == "engine" and one["precision"] == precision]
+        _draw(axes, rows, f"engine, {precision}", _COLOURS[precision], "o")
+    drawn: set[str] = set()
+    for cone, contact, integrator in KINDS:
+        kind = {"side": "MuJoCo", "cone": cone, "contact": contact, "integrator": integrator}
+        rows = [one for one in shown if all(one[name] == value for name, value in kind.items())]
+        label = f"MuJoCo: {contact}, {cone}, {integrator}"
+        _draw(axes, rows, label, _COLOURS[contact], "s", is_second=contact in drawn)
+        drawn.add(contact)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+    axes.set_title("Numbers: step in ms. Crosses: fewer or more passes or iterations", fontsize=9, loc="left")
+    tidy(axes)
+    legend_below(figure, columns=3)
+    save(figure, path)
 
 
-def _draw(axes: Any, rows: list[dict[str, Any]], label: str, colour: str, marker: str) -> None:
-    """One curve over the step; settings with another number of passes or iterations are crosses."""
+def _draw(axes: Any, rows: list[dict[str, Any]], label: str, colour: str, marker: str, *, is_second: bool = False) -> None:
+    """One curve over the step; settings with another number of passes or iterations are crosses.
+
+    The second of one colour is dashed, its markers are open, and its steps, which are those of the first, are not written.
+    """
     usual = [one for one in rows if one["is_usual"]]
     other = [one for one in rows if not one["is_usual"]]
-    for chosen, style in ((usual, {"marker": marker, "label": label}), (other, {"marker": "x", "linestyle": "none"})):
+    line = {"marker": marker, "label": label}
+    if is_second:
+        line |= {"linestyle": "--", "markerfacecolor": "white"}
+    for chosen, style in ((usual, line), (other, {"marker": "x", "linestyle": "none"})):
         if chosen:
             points = [(1e3 * one["error"], one["speed"]["median"]) for one in chosen]
             axes.plot(*zip(*points, strict=True), color=colour, markersize=5, linewidth=1.2, **style)
-    for one in usual:
+    for one in [] if is_second else usual:
         place = (1e3 * one["error"], one["speed"]["median"])
         axes.annotate(f"{1e3 * one['step']:g}", place, textcoords="offset points", xytext=(5, 3), fontsize=7, color=colour)

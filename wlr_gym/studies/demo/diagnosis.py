@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import heading, table
+from wlr_gym.base.plots import new_figure, tidy
 from wlr_gym.base.text import number
 from wlr_gym.gap.report.text import listed, places, plain, unit_of
 from wlr_gym.studies.demo.settings import Demo
@@ -131,14 +132,12 @@ def worse_channels(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[
 
 
 def _replay_picture(before: ReplayResult, after: ReplayResult) -> Figure:
-    from matplotlib.figure import Figure
-
     from wlr_gym.gap.report.plots import AFTER, CALIBRATED, MEASURED
 
     run = before.run
     seen = [name for name in before.errors if not name.startswith("pos_wheel")]  # in turns of a wheel no error is seen
     worst = sorted(seen, key=lambda name: -before.errors[name].segment_rms / before.errors[name].noise)[:_SHOWN]
-    figure = Figure(figsize=(10.0, 2.3 * len(worst) + 0.5), layout="constrained")
+    figure = new_figure(10.0, 2.3 * len(worst) + 0.5)
     rows = np.atleast_1d(figure.subplots(len(worst), 1, sharex=True))
     t = run["t"] - run["t"][0]
     for axes, channel in zip(rows, worst, strict=True):
@@ -151,7 +150,7 @@ def _replay_picture(before: ReplayResult, after: ReplayResult) -> Figure:
         before_text, after_text = (f"{one.segment_rms:.2g}{unit_of(one.unit)}" for one in (was, now))
         axes.set_title(f"{channel}: rms error {before_text}, with the patch {after_text}", fontsize=9, loc="left")
         axes.set_ylabel(was.unit)
-        axes.grid(alpha=0.3)
+        tidy(axes)
         axes.margins(x=0.01)
     rows[-1].set_xlabel("time (s)")
     figure.legend(*rows[0].get_legend_handles_labels(), loc="outside upper right", ncols=3, fontsize=9, frameon=False)

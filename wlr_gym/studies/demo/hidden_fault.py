@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.plots import COLOURS, new_figure, tidy
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
 from wlr_gym.studies.demo.stage import Section, Tell, drawn, paragraph
@@ -23,7 +24,6 @@ POLICY = "velocity_slip_aware"
 #: What each run is driven by: the policy, or a motion that brings out what a robot is made of.
 DRIVERS = ("posture", POLICY, "turns", "stop_and_go")
 Draw = np.random.Generator
-_CORNER_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red")
 
 
 def hide(seed: int) -> dict[str, Any]:
@@ -127,16 +127,14 @@ def _excite(demo: Demo, patch: Any, name: str) -> None:
 
 def _picture(run: Run) -> Figure:
     """Return wheel speeds, leg angles and turning rate of a run over time."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 6.0), layout="constrained")
+    figure = new_figure(10.0, 6.0)
     rows = figure.subplots(3, 1, sharex=True)
     t = run["t"] - run["t"][0]
     for axes, kind, joints, label in (
         (rows[0], "vel", WHEELS, "wheel speed (rad/s)"),
         (rows[1], "pos", LEGS, "leg angle (rad)"),
     ):
-        for joint, colour in zip(joints, _CORNER_COLOURS, strict=True):
+        for joint, colour in zip(joints, COLOURS, strict=False):
             axes.plot(t, run[f"{kind}_{joint}"], color=colour, linewidth=1.0, label=joint)
             axes.plot(t, run[f"cmd_{joint}"], color=colour, linewidth=0.7, linestyle=":")
         axes.set_ylabel(label)
@@ -146,6 +144,6 @@ def _picture(run: Run) -> Figure:
     rows[2].plot(t, run["gyro_z"], color="black", linewidth=1.0)
     rows[2].set(ylabel="yaw rate, gyro (rad/s)", xlabel="time (s)")
     for axes in rows:
-        axes.grid(alpha=0.3)
+        tidy(axes)
         axes.margins(x=0.01)
     return figure

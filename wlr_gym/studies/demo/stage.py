@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wlr_gym.base.plots import save
 from wlr_gym.studies.demo.settings import Demo
 
 if TYPE_CHECKING:
@@ -72,6 +73,4 @@ def picture(path: Path, caption: str) -> str:
 
 def drawn(figure: Figure, path: Path, caption: str) -> str:
     """Save a figure as PNG, and return it for the page."""
-    from wlr_gym.learning.evaluation import plots
-
-    return picture(plots.save(figure, path), caption)
+    return picture(save(figure, path), caption)

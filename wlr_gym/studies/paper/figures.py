@@ -6,17 +6,15 @@ Matplotlib only, drawn without a display.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import MultipleLocator
+from matplotlib.ticker import MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
 
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, WINE, legend_below, new_figure, tidy
 from wlr_gym.studies.paper import printed
 from wlr_gym.studies.paper.experiments import MODELS, REDUCED, PaperTest, Record, duration
 from wlr_gym.studies.paper.ideal import IdealMotion
@@ -27,8 +25,8 @@ from wlr_gym.studies.paper.slip_search import SearchFinding
 Array = NDArray[np.float64]
 
 _STYLES: dict[str, dict[str, Any]] = {
-    REDUCED: {"color": "tab:orange", "linewidth": 2.4, "alpha": 0.7},
-    "gibbs_appell": {"color": "tab:blue", "linewidth": 1.2},
+    REDUCED: {"color": ORANGE, "linewidth": 2.4, "alpha": 0.7},
+    "gibbs_appell": {"color": BLUE, "linewidth": 1.2},
     "mujoco": {"color": "black", "linewidth": 1.0, "linestyle": (0, (4, 3))},
 }
 _IDEAL: dict[str, Any] = {"color": "0.6", "linewidth": 3.0, "alpha": 0.6}
@@ -36,7 +34,14 @@ _IDEAL: dict[str, Any] = {"color": "0.6", "linewidth": 3.0, "alpha": 0.6}
 _FROM = -0.5
 #: s between two ticks.
 _TICK = 5.0
-_UNEVEN = ("tab:purple", "tab:green")
+_UNEVEN = (WINE, GREEN)
+#: How the paper's prediction may count the wheel angle: relative to the leg or not.
+_PREDICTIONS: dict[bool, dict[str, Any]] = {
+    True: {"color": BLUE, "marker": "o", "label": "prediction with the encoder's angle", "markersize": 5},
+    False: {"color": ORANGE, "marker": "s", "label": "prediction of (3) as printed", "fillstyle": "none", "markersize": 9},
+}
+#: Combinations in the figure of the open question.
+_COMBINATIONS = 8
 _RPM = 60.0 / (2.0 * np.pi)
 #: A grid of axes.
 Panels = NDArray[Any]
@@ -44,23 +49,15 @@ Series = Callable[[Record], Array]
 
 
 def _style(model: str) -> dict[str, Any]:
-    return _STYLES.get(model, {"color": "tab:green", "linewidth": 1.0})
-
-
-def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG."""
-    FigureCanvasAgg(figure)
-    replace_file(path, lambda temporary: figure.savefig(temporary, dpi=110, format="png"))
-    return path
+    return _STYLES.get(model, {"color": GREEN, "linewidth": 1.0})
 
 
 def _panels(title: str, rows: int, columns: int, height: float = 2.4) -> tuple[Figure, Panels]:
-    figure = Figure(figsize=(5.0 * columns, height * rows + 0.8), layout="constrained")
+    figure = new_figure(5.0 * columns, height * rows + 0.8)
     axes = figure.subplots(rows, columns, squeeze=False)
     figure.suptitle(title, fontsize=12)
     for panel in axes.flat:
-        panel.grid(alpha=0.25)
-        panel.tick_params(labelsize=8)
+        tidy(panel)
     return figure, axes
 
 
@@ -70,28 +67,17 @@ def _over_time(figure: Figure, axes: Panels) -> Figure:
         panel.set_xlim(_FROM, duration() + 0.5)
         panel.xaxis.set_major_locator(MultipleLocator(_TICK))
     for panel in axes[-1]:
-        panel.set_xlabel("time (s)", fontsize=9)
-    return _finish(figure, axes)
-
-
-def _finish(figure: Figure, axes: Panels, columns: int = 4) -> Figure:
-    handles: dict[str, Any] = {}
-    for panel in axes.flat:
-        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
-            handles.setdefault(label, handle)
-    if handles:
-        figure.legend(
-            list(handles.values()), list(handles), loc="outside lower center", ncols=columns, frameon=False, fontsize=9
-        )
+        panel.set_xlabel("time (s)")
+    legend_below(figure)
     return figure
 
 
-def _draw(axes: Axes, records: Sequence[Record], series: Series, title: str, unit: str) -> None:
+def _draw(axes: Axes, records: Sequence[Record], series: Series, title: str, label: str) -> None:
     for record in records:
         shown = record.time > _FROM
         axes.plot(record.time[shown], series(record)[shown], label=_label(record.model), **_style(record.model))
     axes.set_title(title, fontsize=9)
-    axes.set_ylabel(unit, fontsize=9)
+    axes.set_ylabel(label)
 
 
 def _label(model: str) -> str:
@@ -117,10 +103,10 @@ def rotation_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
     legs = (ideal.front, ideal.rear)
     for k, (joint, title) in enumerate(_LEGS):
         _draw_ideal(axes[0, k], ideal, np.degrees(legs[k]))
-        _draw(axes[0, k], records, lambda r, j=joint: np.degrees(r.joint_position[:, 0, j]), title, "degrees")
+        _draw(axes[0, k], records, lambda r, j=joint: np.degrees(r.joint_position[:, 0, j]), title, "rotation (degrees)")
     for k, (joint, title) in enumerate(_WHEELS):
         _draw_ideal(axes[1, k], ideal, ideal.wheels[:, joint - 4] / (2 * np.pi))
-        _draw(axes[1, k], records, lambda r, j=joint: r.joint_position[:, 0, j] / (2 * np.pi), title, "turns")
+        _draw(axes[1, k], records, lambda r, j=joint: r.joint_position[:, 0, j] / (2 * np.pi), title, "rotation (turns)")
     return _over_time(figure, axes)
 
 
@@ -131,7 +117,7 @@ def speed_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
     for row, joints in enumerate((_LEGS, _WHEELS)):
         for k, (joint, title) in enumerate(joints):
             _draw_ideal(axes[row, k], ideal, ideal.u[:, columns[joint]] * _RPM)
-            _draw(axes[row, k], records, lambda r, j=joint: r.joint_velocity[:, 0, j] * _RPM, title, "rpm")
+            _draw(axes[row, k], records, lambda r, j=joint: r.joint_velocity[:, 0, j] * _RPM, title, "speed (rpm)")
     return _over_time(figure, axes)
 
 
@@ -149,7 +135,7 @@ def torque_figure(records: Sequence[Record], ideal: IdealMotion, measured: FromM
         for k, (joint, title) in enumerate(joints):
             values = inverse.leg_torque[:, k] / 2 if row == 0 else inverse.wheel_torque[:, joint - 4]
             _draw_ideal(axes[row, k], ideal, values)
-            _draw(axes[row, k], records, lambda r, j=joint: r.torque[:, 0, j], title + ", each", "N m")
+            _draw(axes[row, k], records, lambda r, j=joint: r.torque[:, 0, j], title + ", each", "torque (N m)")
             if measured is None or source is None:
                 continue
             right = measured.right.leg_torque[:, k] / 2 if row == 0 else measured.right.wheel_torque[:, joint - 4]
@@ -157,11 +143,11 @@ def torque_figure(records: Sequence[Record], ideal: IdealMotion, measured: FromM
             axes[row, k].plot(
                 source.time,
                 right,
-                color="tab:red",
+                color=WINE,
                 linewidth=0.8,
                 label="corrected (19)-(24) from the motion: behind the gears",
             )
-            axes[row, k].plot(source.time, as_printed, color="tab:purple", linewidth=0.8, label="printed (19)-(24)")
+            axes[row, k].plot(source.time, as_printed, color=GREEN, linewidth=0.8, label="printed (19)-(24)")
     return _over_time(figure, axes)
 
 
@@ -172,14 +158,14 @@ def body_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
     for k, (axis, unit, factor) in enumerate((("x", "m", 1.0), ("y", "mm", 1e3), ("z", "cm", 100.0))):
         if k in ground:
             _draw_ideal(axes[0, k], ideal, ground[k])
-        _draw(axes[0, k], records, lambda r, j=k, f=factor: f * r.position[:, 0, j], f"position {axis}", unit)
+        _draw(axes[0, k], records, lambda r, j=k, f=factor: f * r.position[:, 0, j], "", f"position {axis} ({unit})")
     for k, column in enumerate((0, 1, 3)):
         _draw_ideal(axes[1, k], ideal, 1e3 * ideal.u[:, column])
-        _draw(axes[1, k], records, lambda r, j=k: 1e3 * r.velocity[:, 0, j], f"velocity {'xyz'[k]}", "mm/s")
+        _draw(axes[1, k], records, lambda r, j=k: 1e3 * r.velocity[:, 0, j], "", f"velocity {'xyz'[k]} (mm/s)")
     for k, name in enumerate(("yaw", "pitch", "roll")):
         if k == 1:
             _draw_ideal(axes[2, k], ideal, np.degrees(ideal.posture.pitch))
-        _draw(axes[2, k], records, lambda r, j=k: np.degrees(r.attitude[:, 0, j]), name, "degrees")
+        _draw(axes[2, k], records, lambda r, j=k: np.degrees(r.attitude[:, 0, j]), "", f"{name} (degrees)")
     for panel in (axes[0, 1], axes[2, 0], axes[2, 2], axes[1, 1]):
         low, high = panel.get_ylim()
         least = 0.5
@@ -204,11 +190,10 @@ def path_figure(records: Sequence[Record], variants: Mapping[str, Array], test: 
     for (label, path), colour in zip(variants.items(), _UNEVEN, strict=True):
         panel.plot(path[:, 0], 100 * path[:, 1], linewidth=1.4, color=colour, label=f"Gibbs-Appell, {label}")
     for sign in (1, -1):
-        panel.axhline(
-            100 * sign * test.lateral, color="tab:red", linestyle=":", linewidth=1.0, label="paper's lateral displacement"
-        )
+        panel.axhline(100 * sign * test.lateral, color=GREY, linestyle=":", linewidth=1.0, label="paper's lateral displacement")
     panel.set(xlabel="x (m)", ylabel="y (cm)")
-    return _finish(figure, axes, columns=3)
+    legend_below(figure, columns=3)
+    return figure
 
 
 def slip_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
@@ -220,43 +205,38 @@ def slip_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
         printed.eq17_normal_force_behind(ideal.constants, s),
     )
     for k, (wheel, title) in enumerate(((0, "left front"), (2, "left rear"))):
-        _draw(axes[0, k], records, lambda r, j=wheel: 1e3 * r.slip[:, 0, j, 0], f"{title} wheel, slip velocity along", "mm/s")
-        _draw(
-            axes[1, k],
-            records,
-            lambda r, j=wheel: 1e3 * r.slip_path[:, 0, j, 0],
-            f"{title} wheel, accumulated slip along",
-            "mm",
-        )
+        _draw(axes[0, k], records, lambda r, j=wheel: 1e3 * r.slip[:, 0, j, 0], f"{title} wheel", "longitudinal slip (mm/s)")
+        _draw(axes[1, k], records, lambda r, j=wheel: 1e3 * r.slip_path[:, 0, j, 0], "", "accumulated slip (mm)")
         axes[2, k].plot(ideal.time, static[k], label="(16), (17) as printed", zorder=1, **_IDEAL)
-        _draw(axes[2, k], records, lambda r, j=wheel: r.force[:, 0, j, 2], f"{title} wheel, normal force", "N")
+        _draw(axes[2, k], records, lambda r, j=wheel: r.force[:, 0, j, 2], "", "normal force (N)")
     return _over_time(figure, axes)
 
 
 def question_figure(findings: Sequence[SearchFinding]) -> Figure:
-    """What each departure from the nominal robot can do to the paper's four numbers: every draw, error against lateral."""
-    alone = [finding for finding in findings if len(finding.names) == 1]
-    best = sorted((f for f in findings if len(f.names) > 1), key=lambda f: min(f.closest(r) for r in READINGS))[:6]
-    figure, axes = _panels("What reaches the paper's numbers (crosses)? Every draw; first and second test", 4, 4, 2.5)
-    for panel, finding in zip(axes.flat, [*alone, *best], strict=False):
-        for k, colour in enumerate(("tab:blue", "tab:orange")):
-            values = finding.outcomes
-            panel.plot(
-                100 * values.error_encoder[:, k], 100 * np.abs(values.lateral[:, k]), ".", color=colour, markersize=2.5,
-                label=("first test", "second test")[k],
-            )  # fmt: skip
-        for (error, sideways), colour in zip(((11.5, 1.1), (5.0, 5.2)), ("tab:blue", "tab:orange"), strict=True):
-            panel.plot(error, sideways, "x", color=colour, markersize=9, markeredgewidth=2.5)
-        matches = max(len(finding.matches(reading)) for reading in READINGS)
-        panel.set_title(f"{finding.label}" + (f": {matches} match" if matches else ""), fontsize=9)
-        panel.set(xlim=(-25, 35), ylim=(-0.3, 12))
-    for panel in list(axes.flat)[len(alone) + len(best) :]:
-        panel.set_axis_off()
-    for panel in axes[:, 0]:
-        panel.set_ylabel("lateral displacement (cm)", fontsize=9)
-    for panel in axes[-1]:
-        panel.set_xlabel("error of ignoring slip (%)", fontsize=9)
-    return _finish(figure, axes)
+    """How near departures from the nominal robot come to the paper's four numbers: one at a time, and the best combinations."""
+    nearest = sorted(findings, key=lambda finding: min(map(finding.closest, READINGS)))
+    groups = {
+        "one departure": [finding for finding in nearest if len(finding.names) == 1],
+        "several at once: the closest": [finding for finding in nearest if len(finding.names) > 1][:_COMBINATIONS],
+    }
+    groups = {title: shown for title, shown in groups.items() if shown}
+    figure, axes = _panels(
+        "How near do departures from the nominal robot come to the paper's four numbers?", 1, len(groups), 2.6
+    )
+    for panel, (title, shown) in zip(axes.flat, groups.items(), strict=True):
+        panel.axvspan(0.0, 1.0, color=GREEN, alpha=0.2, linewidth=0.0, label="match: all four within tolerance")
+        for on_leg, style in _PREDICTIONS.items():
+            readings = [reading for reading in READINGS if reading.encoder_on_leg is on_leg]
+            misses = [min(map(finding.closest, readings)) for finding in shown]
+            panel.plot(misses, range(len(shown)), linestyle="", markeredgewidth=1.5, **style)
+        panel.set_yticks(range(len(shown)), [finding.label for finding in shown])
+        panel.set_ylim(len(shown) - 0.4, -0.6)
+        panel.set_xlim(left=0.0)
+        panel.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        panel.set_xlabel("largest of four errors, closest robot (1 = tolerance)")
+        panel.set_title(title, fontsize=9, loc="left")
+    legend_below(figure)
+    return figure
 
 
 def figures_of_test(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.files import write_json, write_text
+from wlr_gym.base.plots import save
 from wlr_gym.physics.plants import SIMULATORS
 from wlr_gym.robot import Robot
 from wlr_gym.studies.paper import slip_search
@@ -96,9 +97,9 @@ def write_figures(folder: Path, records: Records, evidence: PaperEvidence, findi
         }
         own = [record[name] for record in records.values()]
         for file, figure in figures.figures_of_test(own, evidence.ideal[name], measured, paths).items():
-            figures.save(figure, folder / file)
+            save(figure, folder / file)
     if findings:
-        figures.save(figures.question_figure(findings), folder / "open_question.png")
+        save(figures.question_figure(findings), folder / "open_question.png")
 
 
 def write_report(

@@ -1,0 +1,124 @@
+"""Figures of the documentation that no command of wlr makes: ``python .ci/docs/figures.py [NAME ...]``, all without a name."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.base.plots import BLUE, legend_below, new_figure, save, tidy
+from wlr_gym.envs.tasks import load_randomization
+from wlr_gym.envs.tasks.terms.references import path_point
+from wlr_gym.learning.evaluation.floor_plots import draw_floors
+from wlr_gym.learning.evaluation.rollout import roll_out, start_episodes
+from wlr_gym.learning.evaluation.subjects import make_player
+from wlr_gym.learning.evaluation.sweeps import SHAPES, SWEEPS
+from wlr_gym.render.view import View
+from wlr_gym.robot import load_robot
+
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "figures"
+#: Presets whose floors can be told by friction along the heading.
+PRESETS = ("nominal", "wide", "ice", "split", "patches", "slippery", "asymmetric", "slope", "stripes")
+DRAWS = 3
+EPISODES = 8
+#: Environment steps of a leg sweep that are shown.
+SHOWN = (190, 345, 525)
+
+
+def randomization_floors(path: Path) -> None:
+    """Floors that presets draw."""
+    robot = load_robot()
+    draw_floors(path, [load_randomization(name, robot) for name in PRESETS], count=DRAWS)
+
+
+def environment_path(path: Path) -> None:
+    """Episodes on a line, an S-curve and a circle, each seen from where its path begins."""
+    figure = new_figure(9.0, 3.4)
+    grid = figure.add_gridspec(2, 2, width_ratios=(2.2, 1.0))
+    for k, (shape, place) in enumerate(zip(SHAPES, (grid[0, 0], grid[1, 0], grid[:, 1]), strict=True)):
+        axes = figure.add_subplot(place)
+        bend = {"path_shape": k + 0.5, "path_curvature": 1.2, "path_wavelength": 1.4}
+        driven, length = _driven(bend)
+        axes.plot(*driven.transpose(2, 0, 1), color=BLUE, linewidth=0.9, label="driven")
+        straight = bend | {"path_heading": 0.0, "path_offset": 0.0}
+        wanted = np.array([path_point(straight, way) for way in np.linspace(0.0, length, 200)])
+        axes.plot(*wanted.T, "--", color="black", linewidth=1.2, label="path")
+        axes.set(title=shape, xlabel="x (m)", ylabel="y (m)", aspect="equal")
+        axes.title.set_fontsize(10)
+        if k < 2:
+            axes.set(xlim=(-0.1, 2.4), ylim=(-0.25, 0.35), yticks=(-0.2, 0.0, 0.2))
+        else:
+            axes.set(xlim=(-0.1, 1.0), xticks=(0.0, 0.5, 1.0), yticks=(0.0, 0.5, 1.0, 1.5))
+        tidy(axes)
+    legend_below(figure)
+    save(figure, path)
+
+
+def environment_posture(path: Path) -> None:
+    """The robot before, in and after the leg sweep of the paper's second test, from the side."""
+    from PIL import Image
+
+    from wlr_gym.render import Scene
+    from wlr_gym.render.overlay import banner
+
+    core, policy = make_player("WLR-Posture-v0", "slip_compensating", 1, {"randomization": "none"})
+    scene, pictures = Scene(core.task.robot, View(size=(420, 300), camera="side", text=False)), []
+    start_episodes(core, policy, 0, {"command": dict(SWEEPS["paper"].points[1].commands)})
+    for tick in range(1 + max(SHOWN)):
+        if tick in SHOWN:
+            title = banner(420, f"t = {tick * core.task.config.control_period:g} s", 20)
+            pictures.append(np.vstack([title, scene.draw(core.plant.truth(), core.parameters)]))
+        core.step(policy.act(core.observation), core.everyone)
+    scene.close()
+    core.close()
+    Image.fromarray(np.hstack(pictures)).quantize(128).save(path)
+
+
+def _driven(bend: dict[str, float]) -> tuple[NDArray[np.float64], float]:
+    """Return positions (T, N, 2) in the frame of each episode's path, NaN after its end, and the longest way, m."""
+    core, policy = make_player("WLR-Path-v0", "slip_compensating", EPISODES, {})
+    played = roll_out(core, policy, commands=bend)
+    x, y, yaw = core.start.T
+    core.close()
+    shifted = played.position - np.stack([x, y], axis=1)
+    offset, heading = (played.commanded(f"path_{name}")[0] for name in ("offset", "heading"))
+    placed = _turned(_turned(shifted, yaw) - np.stack([0.0 * offset, offset], axis=1), heading)
+    placed[~played.active] = np.nan
+    speed = played.commanded("linear_velocity_x") * played.active
+    return placed, float(speed.sum(axis=0).max() * played.control_period)
+
+
+def _turned(points: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points (T, N, 2) in frames that are turned by angles (N,)."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([cos * points[..., 0] + sin * points[..., 1], cos * points[..., 1] - sin * points[..., 0]], axis=-1)
+
+
+def vision_slip(path: Path) -> None:
+    """Slip in a rendered film of a skid turn, as ``wlr vision`` draws it."""
+    from wlr_gym.perception.markers.targets import load_target
+    from wlr_gym.perception.scene import Look, Renderer, floor_facets, view
+    from wlr_gym.perception.vision.analysis import analyse, save_video_analysis
+    from wlr_gym.studies.bench.vision import TRUE_OFFSET
+    from wlr_gym.studies.bench.vision_drives import film, skid_turn
+    from wlr_gym.studies.bench.vision_scenes import CAMERA
+
+    drive, body, floor = skid_turn(load_robot()), load_target("body"), load_target("floor")
+    frames = film(drive, Renderer(CAMERA, view(0.0, 2.0), floor_facets(floor)), body, Look(), TRUE_OFFSET)
+    with tempfile.TemporaryDirectory() as folder:
+        save_video_analysis(analyse(frames, drive.run, CAMERA, body, floor, drive.robot), Path(folder))
+        shutil.copyfile(Path(folder) / "slip.png", path)
+
+
+FIGURES: dict[str, Callable[[Path], None]] = {
+    draw.__name__: draw for draw in (randomization_floors, environment_path, environment_posture, vision_slip)
+}
+
+if __name__ == "__main__":
+    for name in sys.argv[1:] or FIGURES:
+        FIGURES[name](FOLDER / f"{name}.png")
