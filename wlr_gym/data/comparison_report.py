@@ -162,6 +162,8 @@ def _motion_figure(comparison: Comparison, index: int, title: str) -> Figure:
         above = figure.add_subplot(inner[0])
         below = figure.add_subplot(inner[1], sharex=above)
         _draw_panel(comparison, index, names, above, below)
+        if number >= len(_PANELS) - columns:
+            below.set_xlabel("time (s)", fontsize=9)
     labels = [traces.plant.label for traces in (comparison.first, comparison.second)]
     handles = [figure.axes[0].plot([], [], color=colour)[0] for colour in (_FIRST, _SECOND)]
     figure.legend(handles, labels, loc="outside upper right", ncols=2, frameon=False)
