@@ -1,6 +1,6 @@
 """Tasks as data: terms, randomisation and their checks. An environment (``wlr_gym.envs``) runs them on a plant."""
 
-from wlr_gym.envs.tasks.describe import contract, describe, describe_randomization
+from wlr_gym.envs.tasks.describe import contract, describe
 from wlr_gym.envs.tasks.randomization import Randomization, load_randomization
 from wlr_gym.envs.tasks.task import Task, load_task
 from wlr_gym.envs.tasks.task_config import TaskConfig
@@ -11,7 +11,6 @@ __all__ = [
     "TaskConfig",
     "contract",
     "describe",
-    "describe_randomization",
     "load_randomization",
     "load_task",
 ]

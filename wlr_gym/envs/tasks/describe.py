@@ -32,11 +32,6 @@ def describe(task: Task) -> str:
     return restructured_text(task_sections(task))
 
 
-def describe_randomization(config: RandomizationConfig) -> str:
-    """Return what a randomisation draws as text (reStructuredText): switches, initial state, and the table of its events."""
-    return restructured_text([randomization_section(config)])
-
-
 def restructured_text(sections: Sequence[DescriptionPart]) -> str:
     """Return sections as reStructuredText: titles in bold, simple tables."""
     return "\n".join(line for one in sections for line in (f"**{one.title}** {one.sentence}", "", *_simple_table(one)))
@@ -180,8 +175,8 @@ def _label(column: ObservationColumn) -> str:
 
 
 def _delay(config: TaskConfig, column: ObservationColumn) -> str:
-    latency = config.latency.get(column.device)  # type: ignore[call-overload]
-    return "0" if latency is None else f"{latency.delay[0] * 1000:g}..{latency.delay[1] * 1000:g}"
+    delays = {device: latency.delay for device, latency in config.latency.items() if device == column.device}
+    return "".join(f"{low * 1000:g}..{high * 1000:g}" for low, high in delays.values()) or "0"
 
 
 _DRAWN = (

@@ -45,11 +45,16 @@ def equations_by_run(
     return matrices, vectors
 
 
+def by_channel(columns: NDArray[np.float32], channels: int) -> NDArray[np.float32]:
+    """Return one run's columns (numbers, rows x channels) as (channels, numbers, rows)."""
+    return np.ascontiguousarray(columns.reshape(len(columns), -1, channels).transpose(2, 0, 1))
+
+
 def channel_products(columns: Sequence[NDArray[np.float32]], channels: int, threads: int = 1) -> Array:
     """Return ``C C^T`` of each channel alone (channels, numbers, numbers), over all runs: weights come later."""
 
     def of_one(column: NDArray[np.float32]) -> NDArray[np.float32]:
-        own = np.ascontiguousarray(column.reshape(len(column), -1, channels).transpose(2, 0, 1))
+        own = by_channel(column, channels)
         return own @ own.transpose(0, 2, 1)
 
     return np.stack(in_threads(threads, of_one, columns)).sum(axis=0, dtype=np.float64)

@@ -26,6 +26,7 @@ from wlr_gym.gap.robot.schedule import WrittenSetpoints
 from wlr_gym.physics.plants import drive, ground, make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, Sensors, standing_state
 from wlr_gym.physics.plants.forces import Force
+from wlr_gym.physics.plants.gibbs_appell.kernel import WIDTH
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.physics.plants.simulator import Simulator
@@ -44,7 +45,7 @@ SWEEPS = 2
 #: Robots simulated at once: what they read stays in the processor's cache.
 MOST_ROBOTS = 512
 #: Robots of a tile of the engine in single precision.
-TILE = 16
+TILE = WIDTH["float32"]
 #: Robots that a further thread is worth.
 LEAST_ROBOTS = 12
 #: Kernels that replay all robots, the faster first: each further one would be compiled, for longer than it saves.

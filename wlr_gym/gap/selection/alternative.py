@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.threads import in_threads
 from wlr_gym.gap.estimation.fit import Fit
-from wlr_gym.gap.estimation.least_squares import bounded_minimum
+from wlr_gym.gap.estimation.least_squares import bounded_minimum, by_channel
 from wlr_gym.gap.estimation.likelihood import Noise, channel_costs, run_scatter, series_times
 from wlr_gym.gap.problem import Candidate, Problem, Start
 from wlr_gym.gap.selection.screening import Responses, Score, directions, shortened, stiffness, with_tolerances
@@ -99,7 +99,7 @@ class Products:
 
         def of_one(run: tuple[NDArray[np.float32], Array]) -> tuple[NDArray[np.float32], NDArray[np.float32], Array, Array]:
             column, residual = run
-            own = np.ascontiguousarray(column.reshape(len(column), -1, residual.shape[1]).transpose(2, 0, 1))
+            own = by_channel(column, residual.shape[1])
             known = np.nan_to_num(residual).T
             push = (own @ known.astype(np.float32)[:, :, None])[:, :, 0].astype(np.float64)
             return own, own @ own.transpose(0, 2, 1), push, (known * known).sum(axis=1)
