@@ -7,7 +7,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
-from wlr_gym.gap.analysis import NOT_EXCITED
+from wlr_gym.gap.analysis import EFFECT_FOUND, NOT_EXCITED
 from wlr_gym.gap.estimation.fit import Fit, fit, linearise
 from wlr_gym.gap.estimation.likelihood import estimate_noise
 from wlr_gym.gap.estimation.model import nominal_model, total_cost, untouched
@@ -463,7 +463,22 @@ def test_what_one_run_alone_shows_is_reported_and_not_selected():
     analysis = analyse_problem(problem, "toy", heldout=("run_6", "run_7", "run_8"))
     assert analysis.verdict == NOT_EXCITED
     assert analysis.effects == ()
-    assert sentence(analysis).startswith("Only run_1 shows decoy 2 (body): it fails cross-validation. Record more such runs")
+    assert sentence(analysis).startswith("run_1 shows decoy 2 (body), other runs do not: it fails cross-validation. Record")
+
+
+@pytest.mark.parametrize("everywhere", [True, False])
+def test_effect_that_the_held_out_runs_contradict_is_reported_and_not_selected(everywhere):
+    problem = Toy({}, [sized("drag", 0.6, "right")], rows=400, runs=6)
+    if not everywhere:
+        without = Toy({}, [], rows=400, runs=6)
+        problem._measured[4:] = without._measured[4:]
+    analysis = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
+    assert analysis.verdict == (EFFECT_FOUND if everywhere else NOT_EXCITED)
+    assert [effect.name for effect in analysis.effects] == (["drag"] if everywhere else [])
+    best = analysis.evidence[0]
+    assert (best.name, best.outcome) == ("drag", "selected" if everywhere else "fails cross-validation")
+    assert analysis.gap is not None
+    assert (analysis.gap.heldout_after == analysis.gap.heldout_calibrated) is not everywhere
 
 
 def test_better_model_found_while_converging_is_calibrated_from(monkeypatch):

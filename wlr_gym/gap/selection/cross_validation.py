@@ -200,11 +200,11 @@ def cross_validated(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit
     pairs = zip(without_each_run(problem, bare), without_each_run(problem, whole), runs, strict=True)
     found = in_threads(problem.threads, lambda pair: problem.residuals([m.setting for m in pair[:2]], [pair[2]])[0], pairs)
     kept = [found[:k] + found[k + 1 :] for k in range(len(found))] if len(runs) >= FORGIVING else [found]
-    return max(_improvement(some, autocorrelation_time) for some in kept) > max(LEAST_VALIDATED * fitted, 0.0)
+    return max(improvement(some, autocorrelation_time) for some in kept) > max(LEAST_VALIDATED * fitted, 0.0)
 
 
-def _improvement(found: Sequence[Array], autocorrelation_time: Array) -> float:
-    """Fall of the likelihood from the first to the second of two residuals per run."""
+def improvement(found: Sequence[Array], autocorrelation_time: Array) -> float:
+    """Fall of minus two log likelihood from the first to the second of two residuals per run."""
     before, after = (minus_two_log_likelihood([r[k] for r in found], autocorrelation_time) for k in (0, 1))
     return before - after
 

@@ -1,4 +1,6 @@
-"""Validation on held-out runs, which no fit and no decision has used: how far are replays from measurements?
+"""Validation on held-out runs, which no fit has used: how far are replays from measurements?
+
+One decision has used them: effects that they clearly contradict are not selected (:func:`wlr_gym.gap.workflow.confirmed`).
 
 All numbers are root mean square residuals in units of sensor noise, over the channels of a run. A perfect model does not reach
 1.0: every window of a replay starts from measured, hence noisy, values. What it does reach is found by replaying data that the
