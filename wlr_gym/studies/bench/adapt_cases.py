@@ -1,9 +1,9 @@
 """Cases of ``wlr bench adapt``, fixed beforehand: faults on two copies of the robot each.
 
-Named faults are as large as the library holds for plausible: smaller ones cost the shipped policy nothing that eight episodes
-would show. Laws that no library names are drawn by the blind test, which shares no code with what names effects, and written
-here as formulas. What acts in the emulated robot is the library's own implementation, on another simulator and at another step
-than the training's: analyser and fault share the law of every named effect. ``shared`` says so, case by case.
+Named faults are as large as the library holds for plausible: smaller ones cost the shipped policy nothing that two dozen
+episodes would show. Laws that no library names are drawn by the blind test, which shares no code with what names effects, and
+written here as formulas. What acts in the emulated robot is the library's own implementation, on another simulator and at
+another step than the training's: analyser and fault share the law of every named effect. ``shared`` says so, case by case.
 """
 
 from __future__ import annotations

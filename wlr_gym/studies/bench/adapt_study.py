@@ -77,7 +77,7 @@ class AdaptStudy:
 
     out: Path
     cases: tuple[AdaptCase, ...]
-    drives: int = 8
+    drives: int = 24
     seconds: float = 10.0
     steps: int = 2_500_000
     episodes: int = 256
