@@ -32,7 +32,8 @@ Array = NDArray[np.float64]
 # Where the state's elements stand; those of the IMU per axis, the slope along x and y of the floor.
 _VALUE, _RATE, _ACCELERATION = slice(0, 6), slice(6, 12), slice(12, 18)
 _GYRO_BIAS, _GYRO_SCALE, _MOUNT, _LEAK, _SLOPE = slice(18, 21), slice(21, 24), slice(24, 27), slice(27, 30), slice(30, 32)
-_SLIP, _SIZE = slice(32, 40), 40
+_FIRST_SLIP, _SIZE = 32, 40
+_SLIP = slice(_FIRST_SLIP, _SIZE)
 _ANGLES, _MOTION = slice(3, 6), slice(0, 12)
 #: 1 sigma before anything is seen, about what the single smoothers found (m, rad), and of the IMU.
 _PRIOR = (
@@ -95,7 +96,7 @@ def imu_readings(run: Run, legs: Array, robot: Robot) -> ImuReadings:
             values[:, k] = run[name]
     step = float(np.median(np.diff(t)))
     known = constants(robot, step, camera=True)[0]
-    changed = np.abs(np.diff(values, axis=0, prepend=values[:1]))
+    changed = np.nan_to_num(np.abs(np.diff(values, axis=0, prepend=values[:1])))
     changed[:-1] = np.maximum(changed[:-1], changed[1:])
     legs = legs[:, None]
     gyro = rate_noise(known, changed[:, :3])
@@ -211,7 +212,7 @@ class _Measurements:
     def add_imu(self, at: NDArray[np.int64], imu: ImuReadings, rows: NDArray[np.int64], states: Array) -> None:
         """Add rows of the IMU's readings, their finite numbers, linear about the states (., _SIZE)."""
         expected = _expected(states, imu.gravity)
-        design = _derivatives(lambda x: _expected(x, imu.gravity), states, _SLIP.start)
+        design = _derivatives(lambda x: _expected(x, imu.gravity), states, _FIRST_SLIP)
         values = imu.values[rows] - expected + np.einsum("kij,kj->ki", design, states)
         for i, k in enumerate(at):
             fine = np.flatnonzero(np.isfinite(values[i]))
@@ -255,9 +256,9 @@ def _transition(step: float, density: Any, wander: Any, slope: Any, matrix: Any,
     matrix[:] = np.eye(_SIZE)
     noise[:] = np.diag(step * wander)
     of_value, of_rate = slope[:, :6], slope[:, 6:]
-    matrix[32:, :6] = step * of_value
-    matrix[32:, 6:12] = 0.5 * step**2 * of_value + step * of_rate
-    matrix[32:, 12:18] = step**3 / 6 * of_value + 0.5 * step**2 * of_rate
+    matrix[_FIRST_SLIP:, :6] = step * of_value
+    matrix[_FIRST_SLIP:, 6:12] = 0.5 * step**2 * of_value + step * of_rate
+    matrix[_FIRST_SLIP:, 12:18] = step**3 / 6 * of_value + 0.5 * step**2 * of_rate
     for k in range(6):
         v, r, a = k, 6 + k, 12 + k
         matrix[v, r] = matrix[r, a] = step
@@ -268,11 +269,10 @@ def _transition(step: float, density: Any, wander: Any, slope: Any, matrix: Any,
         noise[r, r] = density[k] * step**3 / 3
         noise[r, a] = noise[a, r] = density[k] * step**2 / 2
         noise[a, a] = density[k] * step
-        for i in range(8):  # what the body is moved by, it slips by
-            for part in (v, r, a):
-                noise[32 + i, part] = noise[part, 32 + i] = of_rate[i, k] * noise[v, part]
-            for j in range(8):
-                noise[32 + i, 32 + j] += of_rate[i, k] * of_rate[j, k] * noise[v, v]
+        moved, apart = of_rate[:, k], np.array([noise[v, v], noise[v, r], noise[v, a]])
+        noise[_FIRST_SLIP:, _FIRST_SLIP:] += noise[v, v] * np.outer(moved, moved)  # what the body is moved by, it slips by
+        noise[_FIRST_SLIP:, k:18:6] = np.outer(moved, apart)
+        noise[k:18:6, _FIRST_SLIP:] = np.outer(apart, moved)
 
 
 @njit(cache=True, nogil=True)
