@@ -27,6 +27,29 @@ _ACCEL = SENSOR_LAYOUT.slices["accelerometer"].start
 
 
 @njit(cache=True, nogil=True)
+def rate_noise(robot: Any, changed: Any) -> Any:
+    """Variance (rad2/s2) of a gyroscope's reading that has changed by so much, rad/s."""
+    missed = _ALIAS * changed
+    return robot.gyro_noise**2 + missed * missed
+
+
+@njit(cache=True, nogil=True)
+def shaking(robot: Any, changed: Any, square: Any) -> Any:
+    """Variance (m2/s4) of what one reading of the specific force per step misses.
+
+    Args:
+        robot: how much, learned. changed: by how much it has changed, m/s2. square: mean square of the legs' rates.
+    """
+    return (robot.alias * changed) ** 2 + robot.velocity_legs**2 * square
+
+
+@njit(cache=True, nogil=True)
+def leak_noise(robot: Any, square: Any) -> Any:
+    """Variance per s (m2/s5) of the walk of the accelerometer's leak; ``square``: mean square of the legs' rates."""
+    return robot.leak_wander**2 + robot.leak_legs**2 * square
+
+
+@njit(cache=True, nogil=True)
 def turn(robot: Any, r: Any) -> None:
     """Turn floor normal and heading with the gyroscope."""
     before, dt = r.yaw_rate, robot.period
@@ -43,8 +66,7 @@ def turn(robot: Any, r: Any) -> None:
     r.yaw += turned
     r.turned = turned
     c = r.yaw_covariance
-    missed = _ALIAS * (r.yaw_rate - before)
-    c[0] += dt * (dt * c[2] - 2.0 * c[1]) + dt * dt * (robot.gyro_noise**2 + missed * missed)
+    c[0] += dt * (dt * c[2] - 2.0 * c[1]) + dt * dt * rate_noise(robot, r.yaw_rate - before)
     c[1] -= dt * c[2]
     c[2] += _GYRO_WANDER**2 * dt
 
@@ -122,9 +144,8 @@ def spread(robot: Any, r: Any) -> None:
     # how bias and slope share what the accelerometer read at first is a guess, which shows as the robot turns
     guess = (robot.leak_turn * r.guess * r.turned) ** 2
     r.inclined = min(1.0, (r.slope[0] ** 2 + r.slope[1] ** 2) / robot.accel_bias**2)
-    wander = (robot.leak_wander**2 + robot.leak_legs**2 * square) * dt + guess
-    shaken = (robot.alias * r.shaken) ** 2 + robot.velocity_legs**2 * square
-    velocity_noise = dt * dt * (robot.accel_noise**2 + r.wander[0] * shaken)
+    wander = leak_noise(robot, square) * dt + guess
+    velocity_noise = dt * dt * (robot.accel_noise**2 + r.wander[0] * shaking(robot, r.shaken, square))
     for k in range(2):
         kalman.predict(r.covariance[k], dt, velocity_noise, r.wander[1] * wander)
 

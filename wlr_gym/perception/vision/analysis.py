@@ -27,8 +27,9 @@ from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.alignment import Alignment, align, joint_signals
 from wlr_gym.perception.vision.frame_noise import without_repeats
 from wlr_gym.perception.vision.imu_check import imu_differences
+from wlr_gym.perception.vision.motion import smoothed_poses
 from wlr_gym.perception.vision.self_calibration import UNSURE, SelfCalibration, calibration_findings, self_calibrated
-from wlr_gym.perception.vision.slip import SlipResult, measure_slip, smoothed_poses
+from wlr_gym.perception.vision.slip import SlipResult, measure_slip
 from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, REPEATED, Sample, VideoFrame, track
 from wlr_gym.perception.vision.video import Frames
 from wlr_gym.physics.plants.sensors import rotation

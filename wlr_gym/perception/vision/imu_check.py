@@ -51,11 +51,10 @@ def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: R
         samples: of the film. offset: servo time minus camera time, s. run: with gyroscope; without one nothing is compared.
         robot: its IMU's bandwidth delays what it says.
     """
-    seen = [sample for sample in samples if math.isfinite(sample.pose[0])]
     late = 1 / (2 * math.pi * robot.sensors.imu.bandwidth)
     t = run["t"] - late
-    seen = [sample for sample in seen if t[0] < sample.time + offset < t[-1]]
-    if not _known(run, "gyro") or len(seen) < _FEWEST:
+    seen = _comparable(samples, offset, run, t)
+    if not seen:
         return
     time = np.array([sample.time for sample in seen]) + offset
     film = np.unwrap(np.stack([sample.pose[3:] for sample in seen]), axis=0)
@@ -71,6 +70,18 @@ def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: R
         yield from _largest(axis, time, _rest(film[:, k], known), limit)
     if _known(run, "acc"):
         yield from _level(time, film, std, run, t, gyro)
+
+
+def imu_agrees(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> bool:
+    """Whether film and IMU can be compared and do not differ."""
+    comparable = bool(_comparable(samples, offset, run, run["t"]))
+    return comparable and next(imu_differences(samples, offset, run, robot), None) is None
+
+
+def _comparable(samples: Sequence[Sample], offset: float, run: Run, t: Array) -> list[Sample]:
+    """Samples with a pose within the gyroscope's times; none where they are too few or there is no gyroscope."""
+    seen = [sample for sample in samples if math.isfinite(sample.pose[0]) and t[0] < sample.time + offset < t[-1]]
+    return seen if _known(run, "gyro") and len(seen) >= _FEWEST else []
 
 
 def _known(run: Run, name: str) -> bool:

@@ -1,19 +1,18 @@
 """Slip of every wheel and of the body from the camera's poses and the encoders, with uncertainty.
 
-Poses and joint angles are smoothed onto the run's rows; their rates give each wheel's slip velocity by
-:mod:`wlr_gym.robot.slip`.
+Poses (with the IMU, :mod:`wlr_gym.perception.vision.motion`) and joint angles are smoothed onto the run's rows; their rates
+give each wheel's slip velocity by :mod:`wlr_gym.robot.slip`.
 
-Three kinds of error are kept apart. Random ones: motions that the frames allow as well are drawn (their noise with its
-covariance, the smoother's lag behind the motion, the offset of the clocks), and the spread of their slip is taken; so heading
-errors that turn the way driven sideways, and tilts that move the contacts, are in it. That of the wheels' radius
-(``tolerances`` of the robot file), and that of the layout of the markers on the body (its scale and heading): both grow with
-the distance driven and dominate long drives.
+Three kinds of error are kept apart. Random ones: of frames and IMU, of which the smoother knows the joint covariance of all
+slips, and of the offset of the clocks; so heading errors that turn the way driven sideways, and tilts that move the contacts,
+are in it. That of the wheels' radius (``tolerances`` of the robot file), and that of the layout of the markers on the body (its
+scale and heading): both grow with the distance driven and dominate long drives.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -24,7 +23,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data.body_pose import quaternion
 from wlr_gym.data.read import Run
 from wlr_gym.perception.vision.alignment import joint_signals, repeated
-from wlr_gym.perception.vision.smoothing import Smoothed, draw_error, smooth
+from wlr_gym.perception.vision.imu_check import imu_agrees
+from wlr_gym.perception.vision.motion import ImuReadings, body_rates, imu_readings, smooth_motion
 from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
@@ -38,10 +38,7 @@ Array = NDArray[np.float64]
 
 #: s; rows further than this from a frame with a pose are flagged.
 LONGEST_GAP = 0.15
-#: Deviations from its neighbours (m, rad) from which on a pose can be an outlier.
-_JUMP = (0.01, 0.01, 0.01, 0.03, 0.05, 0.05)
-_DRAWS = 64  # of the motion: 1 sigma is known to 9 %
-_ENCODER_PACE = 10.0  # 1/s; an encoder's error changes over about five control steps
+_ENCODER_PACE = 20.0  # 1/s; an encoder's error changes over two or three control steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,23 +133,22 @@ def measure_slip(
             f"{run.path}: {len(rows)} rows lie within the video, which covers {time[seen][0]:.2f} to {time[seen][-1]:.2f} s of "
             "the run's clock; does it belong to this run?"
         )
-    signals, outliers = smoothed_poses(samples, time, rows)
-    value, rate, value_std = (np.stack([getattr(f, name) for f in signals], 1) for name in ("value", "rate", "value_std"))
     joints = joint_signals(run, rows, robot)
     joints[0][:, LEG_SLICE] -= parameters["joint.zero_offset"]
     batch = repeated(parameters, len(rows))
+    imu = _believed_imu(samples, offset, run, robot)
+    motion = smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu)
+    value, rate = motion.value, motion.rate
     velocity, rolling, no_slip_speed = _contacts(value, rate, joints, batch)
     travel = velocity[:, :, 0] + rolling
     heading_speed = rate[:, 0] * np.cos(value[:, 3]) + rate[:, 1] * np.sin(value[:, 3])
     slip = accumulate(velocity, rows)
     encoder = _encoder_variance(joints[0], robot, parameters)
-    velocity_std, slip_std, covariance = np.zeros_like(velocity), np.zeros_like(slip), np.zeros((8, 8))
-    for change, turn in _drawn_motions(samples, outliers, time, rows, signals, offset_std):
-        drawn = _contacts(value + change, rate + turn, joints, batch)[0]
-        velocity_std += (drawn - velocity) ** 2 / _DRAWS
-        error = accumulate(drawn, rows) - slip
-        slip_std += error**2 / _DRAWS
-        covariance += np.outer(error[-1], error[-1]) / _DRAWS
+    late = _contacts(value + offset_std * rate, rate + offset_std * motion.acceleration, joints, batch)[0] - velocity
+    late_slip = accumulate(late, rows)
+    velocity_std = motion.velocity_variance.reshape(velocity.shape) + late**2
+    slip_std = np.diagonal(motion.slip_covariance, axis1=1, axis2=2).reshape(slip.shape) + late_slip**2
+    covariance = motion.slip_covariance[-1] + np.outer(late_slip[-1], late_slip[-1])
     velocity_std[:, :, 0] += _ENCODER_PACE**2 * encoder
     slip_std[:, :, 0] += encoder + encoder[0]
     covariance[range(0, 8, 2), range(0, 8, 2)] += encoder[-1] + encoder[0]
@@ -166,7 +162,7 @@ def measure_slip(
     return SlipResult(
         time=rows,
         pose=value,
-        pose_std=value_std,
+        pose_std=np.hypot(motion.value_std, offset_std * rate),
         rate=rate,
         slip_velocity=velocity,
         slip_velocity_std=np.sqrt(velocity_std),
@@ -179,7 +175,7 @@ def measure_slip(
         angle=slip_angle(travel, velocity[:, :, 1]),
         no_slip_error=float(no_slip_error(accumulate(heading_speed, rows)[-1], accumulate(no_slip_speed, rows)[-1])),
         covered=np.abs(rows[:, None] - time[seen][None]).min(axis=1) < LONGEST_GAP,
-        outliers=outliers,
+        outliers=motion.outliers,
     )
 
 
@@ -187,7 +183,7 @@ def _contacts(value: Array, rate: Array, joints: tuple[Array, Array], batch: Par
     """Slip velocity (K, 4, 2) and rolling speed (K, 4) of the wheels; and the body's speed (K,) if none of them slipped."""
     yaw, pitch, roll = value[:, 3:].T
     linear = np.einsum("nji,nj->ni", rotation(yaw, pitch, roll), rate[:, :3])
-    angular = _body_rates(pitch, roll, rate[:, 3:])
+    angular = body_rates(pitch, roll, rate[:, 3:])
     attitude = quaternion(yaw, pitch, roll)
     velocity = contact_slip_velocity(batch, attitude, linear, angular, *joints)
     predicted = contact_slip_velocity(batch, attitude, np.zeros_like(linear), angular, *joints)
@@ -201,47 +197,9 @@ def _encoder_variance(angle: Array, robot: Robot, parameters: Parameters) -> Arr
     return (radius**2 + height**2) * robot.sensors.encoder.position**2 / 12
 
 
-def _drawn_motions(
-    samples: Sequence[Sample],
-    outliers: NDArray[np.bool_],
-    time: Array,
-    rows: Array,
-    signals: Sequence[Smoothed],
-    offset_std: float,
-) -> Iterator[tuple[Array, Array]]:
-    """Yield errors of pose and rates, both (K, 6), as likely as the frames' noise and the clocks' offset make them."""
-    covariances = np.stack([sample.covariance for sample in samples])
-    covariances[outliers] = np.nan
-    known = np.isfinite(covariances[:, 0, 0])
-    roots, noise = np.linalg.cholesky(covariances[known]), np.full((len(samples), 6), np.nan)
-    std = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    rate = np.stack([signal.rate for signal in signals], axis=1)
-    acceleration = np.gradient(rate, rows, axis=0)
-    rng = np.random.default_rng(0)
-    for _ in range(_DRAWS):
-        noise[known] = np.einsum("nij,nj->ni", roots, rng.standard_normal((len(roots), 6)))
-        drawn = [draw_error(time, noise[:, k], std[:, k], rows, signals[k].density, rng) for k in range(6)]
-        late = offset_std * rng.standard_normal()
-        yield np.stack([d[0] for d in drawn], 1) + late * rate, np.stack([d[1] for d in drawn], 1) + late * acceleration
-
-
-def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> tuple[list[Smoothed], NDArray[np.bool_]]:
-    """Each of the six coordinates at the times ``at`` (K,), and which samples are outliers (F,)."""
-    poses = np.stack([sample.pose for sample in samples])
-    std = np.sqrt(np.stack([np.diag(sample.covariance) for sample in samples]))
-    known = np.isfinite(poses[:, 3])
-    poses[known, 3] = np.unwrap(poses[known, 3])
-    outliers = np.zeros(len(samples), bool)
-    for k in range(6):
-        outliers |= smooth(time, poses[:, k], std[:, k], time[:1], _JUMP[k]).outliers
-    poses[outliers] = np.nan
-    return [smooth(time, poses[:, k], std[:, k], at) for k in range(6)], outliers
-
-
-def _body_rates(pitch: Array, roll: Array, rates: Array) -> Array:
-    """Angular velocity in the body frame (K, 3) from rates of yaw, pitch, roll (K, 3)."""
-    yaw_rate, pitch_rate, roll_rate = rates.T
-    x = roll_rate - yaw_rate * np.sin(pitch)
-    y = pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll)
-    z = yaw_rate * np.cos(pitch) * np.cos(roll) - pitch_rate * np.sin(roll)
-    return np.stack([x, y, z], axis=1)
+def _believed_imu(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> ImuReadings | None:
+    """What the IMU said, unless the film contradicts it: then neither is to pull the other."""
+    if not imu_agrees(samples, offset, run, robot):
+        return None
+    legs = joint_signals(run, run["t"], robot)[1][:, LEG_SLICE]
+    return imu_readings(run, np.sqrt(np.mean(legs**2, axis=1)), robot)

@@ -22,8 +22,6 @@ Array = NDArray[np.float64]
 _DENSITIES = np.arange(-6.0, 8.1, 0.5)
 _GATE = 100.0  # squared deviations from the prediction, in its variance
 _MOST_REJECTED = 4  # in a row; then the signal has really jumped
-#: Root of the covariance of value, rate and acceleration after a unit step of unit white jerk.
-_JERK_ROOT = np.linalg.cholesky(np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +29,14 @@ class Smoothed:
     """A signal at the requested times.
 
     Attributes:
-        value, rate: (K,). value_std, rate_std: 1 sigma.
+        value, rate, acceleration: (K,). value_std, rate_std: 1 sigma.
         outliers: (T,) samples left out.
         density: spectral density of the jerk that was found, unit^2/s^5.
     """
 
     value: Array
     rate: Array
+    acceleration: Array
     value_std: Array
     rate_std: Array
     outliers: NDArray[np.bool_]
@@ -71,29 +70,8 @@ def smooth(time: ArrayLike, values: ArrayLike, std: ArrayLike | float, at: Array
     rows, outliers = places[len(t) :], np.zeros(len(time), np.bool_)
     outliers[np.flatnonzero(known)] = rejected[places[: len(t)]]
     deviations = np.sqrt(np.maximum(spreads[rows][:, [0, 1], [0, 1]], 0.0))
-    return Smoothed(states[rows, 0] + middle, states[rows, 1], deviations[:, 0], deviations[:, 1], outliers, density)
-
-
-def draw_error(
-    time: Array, noise: Array, std: Array, at: Array, density: float, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Draw one error of value and rate, both (K,), as :func:`smooth` makes them: right from one moment to the next.
-
-    A motion of the model is drawn, seen through the noise, and smoothed; the error is what comes out minus what went in.
-
-    Args:
-        time: (T,) s. noise: (T,) one draw of the samples' noise, NaN = no sample. std: (T,) 1 sigma that the smoother assumes.
-        at: (K,) s. density: of the jerk, found by :func:`smooth`. rng: of the motion.
-    """
-    known = np.isfinite(noise)
-    count = int(known.sum())
-    moments, order, places = _merged(time[known], at)
-    motion = np.empty((len(moments), 3))
-    _move(moments, density, _JERK_ROOT, rng.standard_normal((len(moments), 3)), motion)
-    seen = motion[places[:count], 0] + noise[known]
-    states, _ = _smoothed(moments, order, seen, std[known] ** 2, density, math.inf, np.zeros(len(moments), np.bool_))
-    error = (states - motion)[places[count:]]
-    return error[:, 0], error[:, 1]
+    value, rate, acceleration = states[rows].T
+    return Smoothed(value + middle, rate, acceleration, deviations[:, 0], deviations[:, 1], outliers, density)
 
 
 def _merged(time: Array, at: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
@@ -113,18 +91,6 @@ def _smoothed(
     _filter(moments, inputs, noise, density, jump, rejected, states, spreads)
     _smooth_back(moments, density, states, spreads)
     return states, spreads
-
-
-@njit(cache=True, nogil=True)
-def _move(time: Any, density: float, root: Any, normals: Any, states: Any) -> None:
-    """Draw a motion of the model from rest at 0: white jerk, integrated exactly from moment to moment."""
-    states[0] = 0.0
-    for i in range(1, time.shape[0]):
-        step = time[i] - time[i - 1]
-        kick = root @ normals[i] * math.sqrt(density * step)
-        states[i, 0] = states[i - 1, 0] + step * (states[i - 1, 1] + 0.5 * step * states[i - 1, 2]) + step * step * kick[0]
-        states[i, 1] = states[i - 1, 1] + step * states[i - 1, 2] + step * kick[1]
-        states[i, 2] = states[i - 1, 2] + kick[2]
 
 
 @njit(cache=True, nogil=True)

@@ -1,0 +1,148 @@
+"""One smoother over camera and IMU: a motion made of sines, whose IMU readings come from differences of its rotations."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_measure import OFFSET, samples_of
+
+from wlr_gym.data import Run
+from wlr_gym.perception.vision.motion import ImuReadings, smooth_motion
+from wlr_gym.perception.vision.slip import measure_slip
+from wlr_gym.perception.vision.tracking import OK, Sample
+from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import Parameters
+from wlr_gym.studies.bench.vision_drives import skid_turn, true_slip
+
+GRAVITY, SECONDS = 9.80665, 5.0
+SIZE = np.array([0.2, 0.1, 0.01, 0.9, 0.03, 0.02])
+PACE = np.array([2.1, 2.9, 4.3, 1.7, 3.7, 5.3])
+STD = np.array([8e-5, 8e-5, 2e-4, 2e-4, 1e-3, 1e-3])
+GYRO, FORCE = 1e-3, 0.03  # rad/s, m/s2, 1 sigma
+ROWS = np.arange(0.1, SECONDS - 0.1, 0.02)
+
+
+def truth(at):
+    return SIZE * np.sin(PACE * np.atleast_1d(at)[:, None])
+
+
+def rates(at):
+    return SIZE * PACE * np.cos(PACE * at[:, None])
+
+
+def frames(rng):
+    """Samples whose x errs with the pitch."""
+    root = np.diag(STD)
+    root[0, 4] = 1e-4
+    for index in range(int(30 * SECONDS)):
+        time = index / 30
+        pose = truth(time)[0] + root @ rng.standard_normal(6)
+        yield Sample(index, time, OK, pose, root @ root.T, 4, 0.02, np.zeros((4, 2)))
+
+
+def imu(rng, mount=(0.0, 0.0, 0.0)):
+    """Readings with a bias, of an IMU turned by ``mount`` (rad) on the body, over a floor with a slope."""
+    at, step = np.arange(0.0, SECONDS, 0.02), 1e-4
+    turned = Rotation.from_rotvec(mount).as_matrix()
+    readings = []
+    for t in at:
+        before, now, after = (Rotation.from_euler("ZYX", truth(t + d)[0, 3:]).as_matrix() for d in (-step, 0.0, step))
+        spin = now.T @ (after - before) / (2 * step)
+        force = (-(PACE**2) * truth(t)[0])[:3] + GRAVITY * np.array([0.004, -0.006, 1.0])
+        readings.append([*(turned.T @ [spin[2, 1], spin[0, 2], spin[1, 0]]), *(turned.T @ now.T @ force)])
+    noise = np.repeat([GYRO, FORCE], 3)
+    bias = np.array([0.002, 0.0, -0.003, 0.05, -0.04, 0.02])
+    values = np.array(readings) + bias + noise * rng.standard_normal((len(at), 6))
+    values[:, 1] = np.nan
+    return ImuReadings(at, values, np.tile(noise**2, (len(at), 1)), np.zeros(len(at)), GRAVITY)
+
+
+def slipping(value, rate):
+    """What would slip of wheels that do not turn: the body's speed, to the side further by the turn."""
+    ahead, aside = rate[:, 0], rate[:, 1] + 0.1 * rate[:, 3]
+    return np.stack([np.stack([ahead, aside], axis=1)] * 4, axis=1)
+
+
+def smoothed(seed, with_imu=True, **settings):
+    rng = np.random.default_rng(seed)
+    samples = list(frames(rng))
+    readings = imu(rng, **settings) if with_imu else None
+    return smooth_motion(samples, np.array([s.time for s in samples]), ROWS, slipping, readings)
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values), axis=0))
+
+
+def test_the_imu_makes_poses_and_rates_sharper_and_the_sigmas_hold():
+    value, rate = truth(ROWS), rates(ROWS)
+    alone, both = ([smoothed(seed, with_imu) for seed in range(4)] for with_imu in (False, True))
+    for found in (alone, both):
+        normalised = np.concatenate([(one.value - value) / one.value_std for one in found])
+        assert np.all((rms(normalised) > 0.75) & (rms(normalised) < 1.3))
+    gain = [rms(np.concatenate([m.rate - rate for m in found])) for found in (both, alone)]
+    assert np.all((gain[0] / gain[1])[[0, 1, 3, 5]] < 0.75)
+    assert np.all(rms(both[0].value_std)[[0, 1, 3, 5]] < 0.9 * rms(alone[0].value_std)[[0, 1, 3, 5]])
+
+
+@pytest.mark.parametrize("with_imu", [False, True])
+def test_the_covariance_of_slip_is_that_of_its_errors(with_imu):
+    """Slip is the change of x, and of y and yaw, since the first row; wheels that slip alike err alike."""
+    errors, stds = [], []
+    for seed in range(12):
+        found = smoothed(seed, with_imu)
+        off = found.value - truth(ROWS)
+        errors.append(
+            np.stack([off[:, 0], off[:, 1] + 0.1 * off[:, 3]], axis=1)[[120, -1]] - [off[0, 0], off[0, 1] + 0.1 * off[0, 3]]
+        )
+        stds.append(np.sqrt(np.diagonal(found.slip_covariance, axis1=1, axis2=2)[[120, -1], :2]))
+        assert found.slip_covariance[-1, 0, 2] == pytest.approx(found.slip_covariance[-1, 0, 0])
+    spread = rms((np.array(errors) / stds).reshape(-1, 2))
+    assert np.all((spread > 0.55) & (spread < 1.4))
+
+
+def test_mounting_of_the_imu_and_missing_readings_do_not_matter():
+    value = truth(ROWS)
+    turned = smoothed(1, mount=(0.02, -0.03, 0.025))
+    assert np.all(rms((turned.value - value) / turned.value_std) < 1.5)
+    rng = np.random.default_rng(2)
+    samples, readings = list(frames(rng)), imu(rng)
+    readings.values[:, 3:] = np.nan
+    readings.values[60:90] = np.nan
+    readings.values[200] = 5.0  # a blow
+    found = smooth_motion(samples, np.array([s.time for s in samples]), ROWS, slipping, readings)
+    assert np.all(rms((found.value - value) / found.value_std) < 1.4)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return skid_turn(load_robot())
+
+
+def measured(drive, samples=None, **columns):
+    run = Run(drive.run.table.assign(**columns), drive.run.meta, drive.run.path)
+    return measure_slip(samples or samples_of(drive), OFFSET, run, drive.robot, Parameters.nominal(drive.robot))
+
+
+def test_slip_to_the_side_is_sharper_with_the_imu(drive):
+    none = {f"{kind}_{axis}": math.nan for kind in ("gyro", "acc") for axis in "xyz"}
+    alone, both = measured(drive, **none), measured(drive)
+    true = true_slip(drive, both.time)
+    assert np.median(both.slip_std[:, :, 1]) < 0.8 * np.median(alone.slip_std[:, :, 1])
+    assert np.median(both.slip_velocity_std[:, :, 1]) < 0.95 * np.median(alone.slip_velocity_std[:, :, 1])
+    for found in (alone, both):
+        assert np.abs(found.slip - true).max() < 1e-3
+        assert np.sqrt(np.mean(np.square((found.slip - true)[-1] / found.slip_std[-1]))) < 2.0
+
+
+def test_an_imu_that_the_film_contradicts_pulls_nothing(drive):
+    """A gyroscope that loses counts for a second; and a film whose tilt jumps."""
+    none = {f"{kind}_{axis}": math.nan for kind in ("gyro", "acc") for axis in "xyz"}
+    lost = np.where(np.abs(drive.run["t"] - 4.5) < 0.5, 0.0, drive.run["gyro_z"])
+    assert np.array_equal(measured(drive, gyro_z=lost).pose, measured(drive, **none).pose)
+    tilt = np.array([0, 0, 0, 0, 0.05, 0])
+    jumped = [replace(s, pose=s.pose + tilt * (4 < s.time < 5)) for s in samples_of(drive)]
+    assert np.array_equal(measured(drive, jumped).pose, measured(drive, jumped, **none).pose)
+    assert not np.array_equal(measured(drive).pose, measured(drive, **none).pose)

@@ -1,0 +1,332 @@
+"""One smoother of the body's motion over camera and IMU: a Kalman filter forwards, what comes later added backwards.
+
+Each of x, y, z, yaw, pitch and roll moves with white jerk, as much as smoothing it alone finds (:mod:`.smoothing`). A frame
+measures all six, with its covariance. Gyroscope and accelerometer measure turn rates and the force on the body, with the noise
+that the slip observer gives them: more where a reading changes and where legs move. Left open are bias, scale and mounting of
+the IMU and the slope of the floor. The gyroscope's pitch rate is not used: legs and drives pitch the body in step with the
+log, whose samples then add up to milliradians of no motion. Wheels measure nothing: their slip is what is wanted. It is part of
+the state, so its covariance comes with it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from wlr_gym.data.read import Run
+from wlr_gym.perception.observer.prediction import leak_noise, rate_noise, shaking
+from wlr_gym.perception.observer.state import constants
+from wlr_gym.perception.vision.smoothing import Smoothed, smooth
+from wlr_gym.perception.vision.tracking import Sample
+from wlr_gym.physics.plants.sensors import rotation
+from wlr_gym.robot import Robot
+
+Array = NDArray[np.float64]
+
+# Where the state's elements stand; those of the IMU per axis, the slope along x and y of the floor.
+_VALUE, _RATE, _ACCELERATION = slice(0, 6), slice(6, 12), slice(12, 18)
+_GYRO_BIAS, _GYRO_SCALE, _MOUNT, _LEAK, _SLOPE = slice(18, 21), slice(21, 24), slice(24, 27), slice(27, 30), slice(30, 32)
+_FIRST_SLIP, _SIZE = 32, 40
+_SLIP = slice(_FIRST_SLIP, _SIZE)
+_ANGLES, _MOTION = slice(3, 6), slice(0, 12)
+#: 1 sigma before anything is seen, about what the single smoothers found (m, rad), and of the IMU.
+_PRIOR = (
+    (_VALUE, 0.01), (_RATE, 0.3), (_ACCELERATION, 5.0), (_GYRO_BIAS, 0.02), (_GYRO_SCALE, 0.02), (_MOUNT, 0.03), (_LEAK, 0.3),
+    (_SLOPE, 0.02),
+)  # fmt: skip
+#: How much noisier the IMU of a robot that drives is taken for than that of one at rest.
+_DRIVING = 2.0
+#: rad/s per root second: walk of the gyroscope's bias.
+_GYRO_WANDER = 1e-5
+#: Squared normalised innovation beyond which an IMU reading counts for less.
+_GATE = 36.0
+_STEP = 1e-5  # of derivatives
+_PITCH_RATE = 1  # place of the gyroscope's y
+#: Deviations from its neighbours (m, rad) from which on a pose can be an outlier.
+_JUMP = (0.01, 0.01, 0.01, 0.03, 0.05, 0.05)
+
+
+@dataclass(frozen=True, eq=False)
+class ImuReadings:
+    """What the IMU said.
+
+    Attributes:
+        time: (T,) s of the motion that it shows. values: (T, 6) gyroscope, accelerometer; NaN = none. variance: (T, 6).
+        leak_wander: (T,) variance per s of the accelerometer's bias. gravity: m/s2.
+    """
+
+    time: Array
+    values: Array
+    variance: Array
+    leak_wander: Array
+    gravity: float
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Motion at the run's rows.
+
+    Attributes:
+        value, rate, acceleration: (K, 6). value_std: 1 sigma.
+        velocity_variance: (K, 8) of what slips. slip_covariance: (K, 8, 8) of it accumulated from the first row.
+        outliers: (F,) samples left out.
+    """
+
+    value: Array
+    rate: Array
+    acceleration: Array
+    value_std: Array
+    velocity_variance: Array
+    slip_covariance: Array
+    outliers: NDArray[np.bool_]
+
+
+def imu_readings(run: Run, legs: Array, robot: Robot) -> ImuReadings:
+    """What a run's IMU said, and how far it is believed. ``legs``: (T,) rad/s, rms of their rates."""
+    t = run["t"]
+    values = np.full((len(t), 6), np.nan)
+    for k, name in enumerate(f"{kind}_{axis}" for kind in ("gyro", "acc") for axis in "xyz"):
+        if name in run:
+            values[:, k] = run[name]
+    step = float(np.median(np.diff(t)))
+    known = constants(robot, step, camera=True)[0]
+    changed = np.nan_to_num(np.abs(np.diff(values, axis=0, prepend=values[:1])))
+    changed[:-1] = np.maximum(changed[:-1], changed[1:])
+    legs = legs[:, None]
+    gyro = rate_noise(known, changed[:, :3])
+    force = known["accel_noise"] ** 2 + shaking(known, changed[:, 3:], legs**2)
+    time, variance = t - known["lag"] * step, _DRIVING**2 * np.concatenate([gyro, force], axis=1)
+    values[:, _PITCH_RATE] = np.nan
+    return ImuReadings(time, values, variance, leak_noise(known, legs[:, 0] ** 2), float(known["gravity"]))
+
+
+def smooth_motion(
+    samples: Sequence[Sample], time: Array, rows: Array, slipping: Callable[[Array, Array], Array], imu: ImuReadings | None
+) -> Motion:
+    """Smooth a body's motion.
+
+    Args:
+        samples: of the film. time: (F,) s of them, servo clock. rows: (K,) s, where the motion is wanted.
+        slipping: slip velocities (K, 4, 2) for values and rates (K, 6) at the rows.
+        imu: None = the camera alone.
+    """
+    outliers = _outliers(samples, time)
+    kept = np.array([math.isfinite(sample.pose[0]) for sample in samples]) & ~outliers
+    inside = np.zeros(0, np.int64)
+    if imu is not None:
+        inside = np.flatnonzero((imu.time > time[kept][0]) & (imu.time < time[kept][-1]))
+    moments = np.concatenate([time[kept], rows, imu.time[inside] if imu is not None else rows[:0]])
+    order = np.argsort(moments, kind="stable")
+    moments = moments[order]
+    frames, shown, read = np.split(np.argsort(order, kind="stable"), np.cumsum([kept.sum(), len(rows)]))
+    near = smoothed_poses(samples, time, moments)[0]
+    at = np.zeros((len(moments), _SIZE))  # near enough to be linear about
+    for part, name in ((_VALUE, "value"), (_RATE, "rate"), (_ACCELERATION, "acceleration")):
+        at[:, part] = np.stack([getattr(signal, name) for signal in near], axis=1)
+
+    seen = _Measurements.none(len(moments))
+    seen.add_frames(frames, _unwrapped(samples)[kept], np.stack([sample.covariance for sample in samples])[kept])
+    wander = np.zeros((len(moments), _SIZE))
+    if imu is not None:
+        seen.add_imu(read, imu, inside, at[read])
+        wander[:, _GYRO_BIAS], wander[:, _LEAK] = _GYRO_WANDER**2, np.interp(moments, imu.time, imu.leak_wander)[:, None]
+    slope = _derivatives(lambda x: slipping(x[:, _VALUE], x[:, _RATE]).reshape(-1, 8), at[shown], _MOTION.stop)
+    slope = np.ascontiguousarray(slope[:, :, _MOTION])
+    slipping_since = np.concatenate([np.zeros_like(slope[:1]), slope])  # nothing before the first row
+    last_row = np.searchsorted(shown, np.arange(len(moments)), side="right")
+    spread = np.zeros(_SIZE)
+    for part, std in _PRIOR:
+        spread[part] = std**2
+    density = np.array([signal.density for signal in near])
+    states, covariance = _smoothed(
+        moments, shown, density, wander, slipping_since, last_row, seen.count, seen.design, seen.values, seen.noise, seen.gate,
+        at[0], np.diag(spread),
+    )  # fmt: skip
+    return Motion(
+        value=states[:, _VALUE],
+        rate=states[:, _RATE],
+        acceleration=states[:, _ACCELERATION],
+        value_std=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[:, _VALUE]),
+        velocity_variance=np.einsum("kij,kjl,kil->ki", slope, covariance[:, _MOTION, _MOTION], slope),
+        slip_covariance=covariance[:, _SLIP, _SLIP],
+        outliers=outliers,
+    )
+
+
+def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> tuple[list[Smoothed], NDArray[np.bool_]]:
+    """Each of the six coordinates alone at the times ``at`` (K,), and which samples are outliers (F,)."""
+    outliers = _outliers(samples, time)
+    poses, std = _unwrapped(samples), _std(samples)
+    poses[outliers] = np.nan
+    return [smooth(time, poses[:, k], std[:, k], at) for k in range(6)], outliers
+
+
+def _outliers(samples: Sequence[Sample], time: Array) -> NDArray[np.bool_]:
+    poses, std = _unwrapped(samples), _std(samples)
+    return np.any([smooth(time, poses[:, k], std[:, k], time[:1], _JUMP[k]).outliers for k in range(6)], axis=0)
+
+
+def _std(samples: Sequence[Sample]) -> Array:
+    return np.sqrt(np.stack([np.diag(sample.covariance) for sample in samples]))
+
+
+def _unwrapped(samples: Sequence[Sample]) -> Array:
+    poses = np.stack([sample.pose for sample in samples])
+    known = np.isfinite(poses[:, 3])
+    poses[known, 3] = np.unwrap(poses[known, 3])
+    return poses
+
+
+@dataclass(frozen=True, eq=False)
+class _Measurements:
+    """What is measured at each of the moments, at most six numbers, linear in the state.
+
+    Attributes:
+        count: (M,) numbers. design: (M, 6, _SIZE). values: (M, 6). noise: (M, 6, 6).
+        gate: (M,) squared normalised innovation from which on they count for less.
+    """
+
+    count: NDArray[np.int64]
+    design: Array
+    values: Array
+    noise: Array
+    gate: Array
+
+    @staticmethod
+    def none(moments: int) -> _Measurements:
+        noise = np.tile(np.eye(6), (moments, 1, 1))
+        return _Measurements(
+            np.zeros(moments, np.int64), np.zeros((moments, 6, _SIZE)), np.zeros((moments, 6)), noise, np.full(moments, _GATE)
+        )
+
+    def add_frames(self, at: NDArray[np.int64], poses: Array, covariances: Array) -> None:
+        self.design[at, :, _VALUE], self.values[at], self.noise[at] = np.eye(6), poses, covariances
+        self.count[at], self.gate[at] = 6, math.inf
+
+    def add_imu(self, at: NDArray[np.int64], imu: ImuReadings, rows: NDArray[np.int64], states: Array) -> None:
+        """Add rows of the IMU's readings, their finite numbers, linear about the states (., _SIZE)."""
+        expected = _expected(states, imu.gravity)
+        design = _derivatives(lambda x: _expected(x, imu.gravity), states, _FIRST_SLIP)
+        values = imu.values[rows] - expected + np.einsum("kij,kj->ki", design, states)
+        for i, k in enumerate(at):
+            fine = np.flatnonzero(np.isfinite(values[i]))
+            self.count[k] = m = len(fine)
+            self.design[k, :m], self.values[k, :m] = design[i, fine], values[i, fine]
+            self.noise[k, range(m), range(m)] = imu.variance[rows[i], fine]
+
+
+def body_rates(pitch: Array, roll: Array, rates: Array) -> Array:
+    """Angular velocity in the body frame (K, 3) from rates of yaw, pitch, roll (K, 3)."""
+    yaw_rate, pitch_rate, roll_rate = rates.T
+    x = roll_rate - yaw_rate * np.sin(pitch)
+    y = pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll)
+    z = yaw_rate * np.cos(pitch) * np.cos(roll) - pitch_rate * np.sin(roll)
+    return np.stack([x, y, z], axis=1)
+
+
+def _expected(states: Array, gravity: float) -> Array:
+    """What the IMU says, (K, 6), of states (K, _SIZE)."""
+    yaw, pitch, roll = states[:, _ANGLES].T
+    turning = body_rates(pitch, roll, states[:, _RATE][:, _ANGLES])
+    force = states[:, _ACCELERATION][:, :3] + gravity * np.column_stack([states[:, _SLOPE], np.ones(len(states))])
+    force = np.einsum("kji,kj->ki", rotation(yaw, pitch, roll), force)
+    mount = states[:, _MOUNT]
+    turning, force = turning + np.cross(turning, mount), force + np.cross(force, mount)
+    return np.concatenate([turning * (1 + states[:, _GYRO_SCALE]) + states[:, _GYRO_BIAS], force + states[:, _LEAK]], axis=1)
+
+
+def _derivatives(function: Callable[[Array], Array], at: Array, columns: int) -> Array:
+    """Derivatives (K, M, _SIZE) of a function (K, M) of states (K, _SIZE), which depends on the first ``columns`` of them."""
+    result = np.zeros((*function(at).shape, _SIZE))
+    for column in range(columns):
+        change = _STEP * (np.arange(_SIZE) == column)
+        result[:, :, column] = (function(at + change) - function(at - change)) / (2 * _STEP)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _transition(step: float, density: Any, wander: Any, slope: Any, matrix: Any, noise: Any) -> None:
+    """Write the change of the state over a step and its noise; slip goes on with the ``slope`` (8, 12) of its velocity."""
+    matrix[:] = np.eye(_SIZE)
+    noise[:] = np.diag(step * wander)
+    of_value, of_rate = slope[:, :6], slope[:, 6:]
+    matrix[_FIRST_SLIP:, :6] = step * of_value
+    matrix[_FIRST_SLIP:, 6:12] = 0.5 * step**2 * of_value + step * of_rate
+    matrix[_FIRST_SLIP:, 12:18] = step**3 / 6 * of_value + 0.5 * step**2 * of_rate
+    for k in range(6):
+        v, r, a = k, 6 + k, 12 + k
+        matrix[v, r] = matrix[r, a] = step
+        matrix[v, a] = 0.5 * step**2
+        noise[v, v] = density[k] * step**5 / 20
+        noise[v, r] = noise[r, v] = density[k] * step**4 / 8
+        noise[v, a] = noise[a, v] = density[k] * step**3 / 6
+        noise[r, r] = density[k] * step**3 / 3
+        noise[r, a] = noise[a, r] = density[k] * step**2 / 2
+        noise[a, a] = density[k] * step
+        moved, apart = of_rate[:, k], np.array([noise[v, v], noise[v, r], noise[v, a]])
+        noise[_FIRST_SLIP:, _FIRST_SLIP:] += noise[v, v] * np.outer(moved, moved)  # what the body is moved by, it slips by
+        noise[_FIRST_SLIP:, k:18:6] = np.outer(moved, apart)
+        noise[k:18:6, _FIRST_SLIP:] = np.outer(apart, moved)
+
+
+@njit(cache=True, nogil=True)
+def _smoothed(
+    time: Any, shown: Any, density: Any, wander: Any, slope: Any, row: Any, count: Any, design: Any, seen: Any, noise: Any,
+    gate: Any, start: Any, spread: Any,
+) -> Any:  # fmt: skip
+    """States and covariances at the moments ``shown``.
+
+    Backwards by Bryson and Frazier's equations: what later measurements say is carried as a gradient and its variance, so no
+    covariance is inverted, and slip, which is certain at first, may be a state.
+    """
+    total = time.shape[0]
+    states, spreads = np.empty((shown.shape[0], _SIZE)), np.empty((shown.shape[0], _SIZE, _SIZE))
+    gains, weights, errors = np.zeros((total, _SIZE, 6)), np.zeros((total, 6, 6)), np.zeros((total, 6))
+    matrix, unsteady = np.empty((_SIZE, _SIZE)), np.empty((_SIZE, _SIZE))
+    x, p, k = start.copy(), spread.copy(), 0
+    for i in range(total):
+        if i > 0:
+            _transition(time[i] - time[i - 1], density, wander[i], slope[row[i - 1]], matrix, unsteady)
+            x = matrix @ x
+            p = matrix @ p @ matrix.T + unsteady
+        if k < shown.shape[0] and shown[k] == i:
+            states[k], spreads[k] = x, p
+            k += 1
+        m = count[i]
+        if m == 0:
+            continue
+        h = design[i, :m]
+        error = seen[i, :m] - h @ x
+        seen_by = p @ h.T
+        weight = np.linalg.inv(h @ seen_by + noise[i, :m, :m])
+        weight /= max(1.0, error @ weight @ error / gate[i])
+        gain = seen_by @ weight
+        x = x + gain @ error
+        p = p - gain @ seen_by.T
+        p = 0.5 * (p + p.T)
+        gains[i, :, :m], weights[i, :m, :m], errors[i, :m] = gain, weight, error
+    gradient, lent, k = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE)), shown.shape[0] - 1
+    for i in range(total - 1, -1, -1):
+        m = count[i]
+        if m > 0:
+            h, gain, weight = design[i, :m], np.ascontiguousarray(gains[i, :, :m]), np.ascontiguousarray(weights[i, :m, :m])
+            gradient = gradient - h.T @ (gain.T @ gradient + weight @ errors[i, :m])
+            kept = np.eye(_SIZE) - gain @ h
+            lent = kept.T @ lent @ kept + h.T @ weight @ h
+        if k >= 0 and shown[k] == i:
+            p = spreads[k].copy()
+            states[k] -= p @ gradient
+            spreads[k] = p - p @ lent @ p
+            k -= 1
+        if i > 0:
+            _transition(time[i] - time[i - 1], density, wander[i], slope[row[i - 1]], matrix, unsteady)
+            gradient = matrix.T @ gradient
+            lent = matrix.T @ lent @ matrix
+            lent = 0.5 * (lent + lent.T)
+    return states, spreads
