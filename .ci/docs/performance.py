@@ -138,9 +138,8 @@ def write_readme(text: str, rows: list[Row]) -> str:
     for what in README_RATIOS:
         if f"float64, {what}" not in ratios:
             return text
-        cells.append(
-            f"{what}: {ratios[f'float64, {what}']:.0f}{TIMES} (float64), {ratios[f'float32, {what}']:.0f}{TIMES} (float32)"
-        )
+        wide, narrow = (f"{ratios[f'{precision}, {what}']:.0f}{TIMES}" for precision in ("float64", "float32"))
+        cells.append(f"{what}: {wide} as fast (float64), {narrow} (float32)")
     command = "`wlr bench --only engine` ([performance](docs/performance.md))"
     row = f"| engine against MuJoCo, ten motions, one core | {'; '.join(cells)} | {command} |"
     return re.sub(r"^\| engine against .*$", lambda _: row, text, flags=re.MULTILINE)

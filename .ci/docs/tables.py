@@ -250,7 +250,7 @@ def _terms(task: Task) -> list[tuple[str, ...]]:
             f"{group[0].scale:g}",
             meaning,
         )
-        for (term, group), (_, meaning) in zip(groups.items(), observation_meanings(task), strict=True)
+        for (term, group), (_, meaning) in zip(groups.items(), observation_meanings(task.policy), strict=True)
     ]
 
 

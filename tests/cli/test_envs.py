@@ -62,6 +62,21 @@ def test_description_shows_what_a_randomization_draws(capsys, monkeypatch):
     assert "Randomization: slippery; " in capsys.readouterr().out
 
 
+def test_description_has_meanings_and_units(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert main(["envs", "WLR-Slope-v0"]) == 0
+    shown = capsys.readouterr().out
+    for text in (
+        "rms at most 0.006 m/s",
+        "below_friction_limit uniform 0.0262..0.21 rad",
+        "add normal +- sensors.imu.gyro_bias rad/s, cut at 3",
+        "leg_angle +-0.05 rad",
+        "contact_force             on the wheel: along its heading",
+        "env.unwrapped.contract()",
+    ):
+        assert text in shown
+
+
 def test_bad_randomization(capsys):
     assert main(["envs", "WLR-Velocity-v0", "--randomization", "wid"]) == 2
     assert "did you mean 'wide'?" in capsys.readouterr().err

@@ -74,7 +74,7 @@ def test_the_engine_is_taken_over_into_data_readme_and_picture(tmp_path, monkeyp
     performance.main([str(file)])
     taken = json.loads(performance.DATA.read_text(encoding="utf-8"))["engine"]
     assert "| engine | 1 ms | float64 | 0.02 mm | 0.04 mm | 90 [90..90] |" in performance.engine_lines(taken)
-    assert "90\N{MULTIPLICATION SIGN} (float64), 92\N{MULTIPLICATION SIGN} (float32)" in performance.README.read_text(
+    assert "90\N{MULTIPLICATION SIGN} as fast (float64), 92\N{MULTIPLICATION SIGN} (float32)" in performance.README.read_text(
         encoding="utf-8"
     )
     assert performance.PICTURE.is_file()

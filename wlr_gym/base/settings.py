@@ -150,7 +150,7 @@ def _explain(model: type[BaseModel], problem: Any, where: str) -> str:
     if isinstance(refused := problem.get("ctx", {}).get("error"), InputError):
         return f"{where}: {refused}"
     value = f"{field} = {problem['input']!r}: " if field else ""  # what is about the whole file does not repeat it
-    return f"{where}: {value}{problem['msg']}"
+    return f"{where}: {value}{problem['msg'].replace('Input should be', 'expected')}"
 
 
 def _fields_at(model: Any, path: list[str]) -> list[str]:

@@ -27,7 +27,7 @@ IMPORTED: list[str] = []
 
 #: Command -> what it does, in one line. The module of the same name is imported only when the command is used.
 COMMANDS = {
-    "demo": "the whole loop in about three minutes: learn, drive on ice, find a hidden fault",
+    "demo": "the whole loop in about three minutes: learn, drive on ice, find a hidden fault, adapt to it",
     "envs": "list the environments, or describe one",
     "effects": "list what can be added to the robot's model, explain it, or check patch files",
     "robot": "robot files: new, check, show; import from and export to MJCF and URDF",
@@ -50,7 +50,7 @@ COMMANDS = {
     "deploy": "drive the robot with a policy, through the command limiter",
     "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults",
     "paper": "repeat the paper's experiments in several models and check its claims",
-    "bench": "measure the speed of the engine, the environments and training",
+    "bench": "measure speed and accuracy; score gap and adapt on many hidden faults",
 }
 
 #: Words behind a command that name a module of their own (``vision_check``).

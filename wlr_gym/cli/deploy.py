@@ -199,12 +199,13 @@ def _make_policy(options: DeployOptions, environment: str, robot: Any) -> Policy
     """Return the policy; it needs no robot, so names and what does not fit are told before one is started.
 
     Raises:
-        InputError: an unknown environment or command, or a policy that does not fit the environment.
+        InputError: an unknown environment or command, a command out of range, or a policy that does not fit the environment.
     """
     from wlr_gym.envs.core import make_task
     from wlr_gym.envs.registry import task_source_of
     from wlr_gym.envs.settings import read_settings
     from wlr_gym.envs.tasks import contract
+    from wlr_gym.envs.tasks.terms import COMMANDS
     from wlr_gym.policy import environment_for, make_policy
 
     keywords = {
@@ -214,9 +215,14 @@ def _make_policy(options: DeployOptions, environment: str, robot: Any) -> Policy
         "episode_length": options.seconds,
     }
     task = make_task(task_source_of(environment), read_settings(environment_for(options.policy, keywords)))
-    for name in pairs("--command", options.command, "yaw_rate=0.1"):
+    for name, value in pairs("--command", options.command, "yaw_rate=0.1").items():
         if name not in task.commands:
             raise unknown_name("command", name, task.commands, "--command")
+        low, high = task.config.commands.terms[name]
+        if not low <= float(value) <= high:
+            raise InputError(
+                f"--command {name}={value}: expected {low:g} to {high:g} {COMMANDS[name].unit}, as the task commands"
+            )
     return make_policy(options.policy, contract(task, {}))
 
 

@@ -78,6 +78,7 @@ def _describe(env_id: str, options: EnvsOptions) -> None:
         sections += scaling_sections(read_task(written), task.robot)
     for section in sections:
         _print(Console(), section)
+    Console().print(Text("in a program: env.unwrapped.contract() (as data), .describe() (this text)"))
 
 
 def _print(console: Console, section: DescriptionPart) -> None:

@@ -229,7 +229,7 @@ def _check(options: EvaluateOptions) -> None:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
     if options.backend not in (*BACKENDS, "both"):
         raise unknown_name("backend", str(options.backend), (*BACKENDS, "both"), "--backend")
-    if not 0 <= options.record <= (options.episodes or 0) or (options.record and options.out is None):
+    if options.record and (options.out is None or not 0 < options.record <= (options.episodes or 0)):
         raise InputError(f"--record {options.record}: expected 0 to {options.episodes} (--episodes), and --out for the runs")
     if options.video is not None:
         check_video(options.video)

@@ -147,6 +147,7 @@ def _export(source: str, out: Path) -> dict[str, Any]:
     from wlr_gym.policy import export_policy, find_policy
 
     folder = find_policy(source)
+    print(f"exporting {source}, then comparing: some seconds", flush=True)
     parity = export_policy(folder, out, real_observations(folder), training_facts(folder))
     print(
         f"written: {out} ({out.stat().st_size / 1000:.0f} kB)\n"

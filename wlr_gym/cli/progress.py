@@ -23,14 +23,15 @@ def progress(console: Console, workers: Sequence[str] = ("",), shown: bool = Tru
     A stage's name ends at the first colon of its text.
     """
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.table import Column
 
     columns = (
-        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
-        TextColumn("{task.fields[left]}"),
+        BarColumn(bar_width=16), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
+        TextColumn("{task.description}", table_column=Column(ratio=1, no_wrap=True)),
     )  # fmt: skip
     begin, last = time.monotonic(), dict.fromkeys(workers, "")
     live = shown and console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=not live) as bar:
+    with Progress(*columns, console=console, transient=True, expand=True, disable=not live) as bar:
         tasks = {worker: bar.add_task("", total=1.0, left="") for worker in workers}
 
         def tell(worker: str, text: str, share: float) -> None:

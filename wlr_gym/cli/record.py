@@ -178,8 +178,8 @@ def _record_simulations(
     from wlr_gym.data.record import next_run, record_simulation
 
     assert options.out is not None
-    make_output_folder(options.out)
     patch, found = options.patch(), []
+    make_output_folder(options.out)
     for motion in motions:
         path = next_run(options.out)
         seed = int(spawn_seeds(options.seed, 1, path.stem)[0])  # no two runs of a folder have the same noise

@@ -77,7 +77,7 @@ def read_run(path: str | Path) -> Run:
 
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such file")
+        raise InputError(f"{path}: no such file; expected a run (CSV or Parquet)")
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: a run is a {' or '.join(SUFFIXES)} file")
     meta = read_meta(path.parent)

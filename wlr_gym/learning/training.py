@@ -11,7 +11,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.base.settings import merge_changes, read_yaml
 from wlr_gym.envs.registry import task_name_of
-from wlr_gym.policy.agents import Training, TrainingProgress, agent_function, apply_changes, load_agent_config
+from wlr_gym.policy.agents import Training, TrainingProgress, agent_function, apply_changes, load_agent, load_agent_config
 from wlr_gym.robot import RobotSource, robot_content
 
 
@@ -82,6 +82,7 @@ def settings_of(
         InputError: unknown names, or a change that is not ``key=value``.
     """
     if init is None or config is not None:
+        load_agent(agent)  # an unknown one is refused as that, not as settings
         return load_agent_config(config or agent, changes, task_name_of(env_id))
     chosen = dict(agent_function(agent, "settings_to_start_from")(init))
     apply_changes(chosen, changes)

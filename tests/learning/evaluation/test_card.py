@@ -79,7 +79,7 @@ def test_rows_show_nothing_where_there_is_nothing():
     assert table["power"] == "1.00 [1.00, 1.00]"
     better = {row[0]: row[2:] for row in comparison_rows(card())}
     assert better["slip_speed"] == ["-", "-"]
-    assert better["score, in % of its"] == ["-", "133.3 [133.3, 133.3]"]
+    assert better["score, % of the baseline's"] == ["-", "133.3 [133.3, 133.3]"]
     assert better["velocity_error"] == ["**80.0 [80.0, 80.0]**", "**50.0 [50.0, 50.0]**"]
     assert better["success"][0] == "0 [0, 0]"
 

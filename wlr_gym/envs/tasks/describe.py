@@ -15,6 +15,7 @@ from wlr_gym.envs.tasks.task import ObservationColumn, Task
 from wlr_gym.envs.tasks.task_config import TaskConfig
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.robot import Robot, load_robot, robot_content, robot_hash, servo_hash
+from wlr_gym.robot.parameter_table import spec_of
 
 
 @dataclass(frozen=True)
@@ -71,9 +72,12 @@ def task_sections(task: Task) -> list[DescriptionPart]:
     return [
         DescriptionPart("Action", space, _ACTION, _action_rows(task)),
         DescriptionPart("Observation", f"{boxes[0]}: {_READING}", (*_COLUMNS, "noise", "delay (ms)"), policy),
-        DescriptionPart("Observation", "what each reading is", ("name", "meaning"), observation_meanings(task)),
+        DescriptionPart("Observation", "what each reading is", ("name", "meaning"), observation_meanings(task.policy)),
         DescriptionPart(
-            "Privileged observation", f'(observation="dict"): {boxes[1]}, exact', _COLUMNS, [row[:-2] for row in exact]
+            "Privileged observation", f'{boxes[1]}, exact; with observation="dict"', _COLUMNS, [row[:-2] for row in exact]
+        ),
+        DescriptionPart(
+            "Privileged observation", "what each number is", ("name", "meaning"), observation_meanings(task.privileged)
         ),
         *([DescriptionPart("Sensors", f"present per episode: {', '.join(sensors)}")] if sensors else []),
         DescriptionPart("Commands", _timing(config), ("command", "unit", "frame", "range, largest rate", "meaning"), commands),
@@ -102,10 +106,10 @@ def _ramp(config: TaskConfig, command: str) -> str:
 
 
 def limits_text(config: TaskConfig, measure: str) -> str:
-    """Return ``rms at most 0.02`` for a measure that success depends on."""
+    """Return ``rms at most 0.02 m/s`` for a measure that success depends on."""
     bounds = config.success.get(measure)
     limits = {} if bounds is None else limits_within(bounds)
-    return ", ".join(f"{kind} at most {limit:g}" for kind, limit in limits.items()) or "-"
+    return ", ".join(f"{kind} at most {limit:g} {MEASURES[measure].unit}" for kind, limit in limits.items()) or "-"
 
 
 _ACTION = ("joints", "index", "setpoint", "unit", "range", "centre", "scale")
@@ -159,9 +163,9 @@ def _noise(column: ObservationColumn) -> str:
     return f"{column.sensor_noise:.4g}{added}" + (f", bias {column.bias:.4g}" if column.bias else "")
 
 
-def observation_meanings(task: Task) -> list[tuple[str, str]]:
-    """Return every term of the policy's observation with what it means."""
-    told = {column.term: column.doc for column in task.policy}
+def observation_meanings(columns: Sequence[ObservationColumn]) -> list[tuple[str, str]]:
+    """Return every term of an observation with what it means."""
+    told = {column.term: column.doc for column in columns}
     return list((told | {"command": "what the robot is asked to follow"} if "command" in told else told).items())
 
 
@@ -180,15 +184,17 @@ def _delay(config: TaskConfig, column: ObservationColumn) -> str:
 
 
 _DRAWN = (
-    "Drawn at each reset where nothing else is said, once per robot, label (joint, wheel, axis or patch) or element; a "
-    "tolerance of the robot's file scales or adds."
+    "Drawn at each reset where nothing else is said, once per robot, label (joint, wheel, axis or patch) or element. A "
+    "tolerance is that of the robot's file, scales or adds, and is cut at so many sigma."
 )
+_STATE_UNITS = {"leg_angle": "rad", "yaw": "rad", "linear_velocity": "m/s", "angular_velocity": "rad/s"}
 RANDOMIZATION_HEADER = ("event", "parameters", "draw", "per")
 
 
 def randomization_section(config: RandomizationConfig) -> DescriptionPart:
     """Return what a randomisation draws: switches, initial state, and the table of its events."""
-    state = ", ".join(f"{name} +-{width:.4g}" for name, width in config.initial_state if width) or "standing at home"
+    spread = ((name, width, _STATE_UNITS[name]) for name, width in config.initial_state if width)
+    state = ", ".join(f"{name} +-{width:.4g} {unit}" for name, width, unit in spread) or "standing at home"
     noise, latency = ("on" if switch else "off" for switch in (config.sensor_noise, config.latency))
     sentence = f"{config.name}; sensor noise {noise}, latency {latency}, start: {state}"
     rows = randomization_rows(config)
@@ -208,6 +214,12 @@ def _draw(event: EventConfig) -> str:
     return when + " ".join(filter(None, (event.operation, _distribution(event)))) + area
 
 
+def _unit(event: EventConfig) -> str:
+    """Return `` rad``: the unit of what is drawn; nothing for factors and pure numbers."""
+    unit = ", ".join(dict.fromkeys(spec_of(name).unit for name in event.parameters))
+    return "" if event.operation == "scale" or unit == "-" else f" {unit}"
+
+
 def _span(limits: Sequence[float | str | None]) -> str:
     return "..".join(dict.fromkeys(f"{value:.4g}" if isinstance(value, int | float) else str(value) for value in limits))
 
@@ -215,14 +227,14 @@ def _span(limits: Sequence[float | str | None]) -> str:
 def _distribution(event: EventConfig) -> str:
     match event.distribution:
         case "choice":
-            return "choice of " + ", ".join(f"{value:.4g}" for value in event.values or ())
+            return "choice of " + ", ".join(f"{value:.4g}" for value in event.values or ()) + _unit(event)
         case "tolerance":
             return f"tolerance x {event.sigmas:g}, cut at {event.cut:g}"
         case "normal":
             mean = "" if event.mean is None else f"{_span([event.mean])} "
-            return f"normal {mean}+- {_span([event.sigma])}, cut at {event.cut:g}"
+            return f"normal {mean}+- {_span([event.sigma])}{_unit(event)}, cut at {event.cut:g}"
         case _:
-            return f"{event.distribution} {_span((event.low, event.high))}"
+            return f"{event.distribution} {_span((event.low, event.high))}{_unit(event)}"
 
 
 def _area(area: AreaConfig) -> str:

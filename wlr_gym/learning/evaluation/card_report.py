@@ -55,7 +55,7 @@ def comparison_rows(card: Card, label: str = MAIN, *, short: bool = False) -> Ta
         table.append([metric.key, unit, *(_comparing(own[metric.key], digits, short) for own in others.values())])
     if label == MAIN and card.share_of:
         shares = [cell(card.share_of[name], 1, short) if name in card.share_of else "-" for name in others]
-        table.append(["score, in % of its", "%", *shares])
+        table.append(["score, % of the baseline's", "%", *shares])
     return table
 
 

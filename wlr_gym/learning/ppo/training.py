@@ -304,19 +304,19 @@ def _progress(training: Training, config: PpoConfig, first: int) -> Iterator[Cal
     """Show a progress bar over the steps; yields a function that is told how far the training is."""
     columns = (
         TextColumn("training"),
-        BarColumn(),
+        BarColumn(bar_width=16),  # all fits in 80 columns
         TaskProgressColumn(),
-        TextColumn("{task.fields[said]}"),
         TimeRemainingColumn(),
+        TextColumn("{task.fields[said]}"),
     )
     with Progress(*columns, disable=not training.progress) as bar:
         task = bar.add_task("", total=config.total_steps, completed=first, said="")
 
         def show(progress: TrainingProgress) -> None:
             row, held_out = progress.metrics, progress.held_out
-            said = f"{row['steps_per_second']:,.0f} steps/s, reward {row['reward_per_second']:.3f}/s"
+            score = f"reward {row['reward_per_second']:.3f}/s"
             if "tracking_error" in held_out:
-                said += f", held out: tracking error {held_out['tracking_error']:.3f}, success {held_out['success']:.0f} %"
-            bar.update(task, completed=progress.steps, said=said)
+                score = f"held-out error {held_out['tracking_error']:.3f}"
+            bar.update(task, completed=progress.steps, said=f"{row['steps_per_second']:,.0f} steps/s, {score}")
 
         yield show

@@ -11,15 +11,15 @@ ESTIMATE_LAYOUT = Layout(
     (
         Channel("position", ("x", "y"), "m", "body origin in the start frame: the floor frame as the body stood at the reset"),
         Channel("yaw", (), "rad", "heading in the start frame, unwrapped"),
-        Channel("yaw_sigma", (), "rad", "1 sigma of it"),
+        Channel("yaw_sigma", (), "rad", "1 sigma of the yaw"),
         Channel("linear_velocity_in_body", ("x", "y"), "m/s", "of the body origin, body frame"),
-        Channel("linear_velocity_sigma", ("x", "y"), "m/s", "1 sigma of it"),
+        Channel("linear_velocity_sigma", ("x", "y"), "m/s", "1 sigma of the linear velocity"),
         Channel("yaw_rate", (), "rad/s", "about the floor's normal"),
         Channel("gravity_in_body", ("x", "y", "z"), "-", "direction of gravity in the body frame, unit length"),
         Channel(
             "slip_velocity", _WHEEL_XY, "m/s", "of the contact point over the floor: along the wheel's heading, along its axle"
         ),
-        Channel("slip_sigma", _WHEEL_XY, "m/s", "1 sigma of it"),
+        Channel("slip_sigma", _WHEEL_XY, "m/s", "1 sigma of the slip velocity"),
         Channel("traction_force", WHEELS, "N", "of the floor on the wheel along its heading, from the wheel's effort"),
         Channel("normal_force", WHEELS, "N", "of the floor on the wheel, from leg angles and accelerometer"),
         Channel("traction_use", WHEELS, "-", "size of the traction force over the normal force"),

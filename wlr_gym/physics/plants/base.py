@@ -70,8 +70,8 @@ SENSOR_LAYOUT = Layout(
         Channel("joint_position", JOINTS, "rad", "encoder; wheels relative to their leg, unwrapped, zero at the run's start"),
         Channel("joint_velocity", JOINTS, "rad/s", "the servo's own velocity reading"),
         Channel("joint_effort", JOINTS, "N m", _EFFORT),
-        Channel("gyro", XYZ, "rad/s", "body frame"),
-        Channel("accelerometer", XYZ, "m/s2", "body frame, specific force (+9.81 on z at rest)"),
+        Channel("gyro", XYZ, "rad/s", "angular velocity, body frame"),
+        Channel("accelerometer", XYZ, "m/s2", "specific force (+9.81 on z at rest), body frame"),
         Channel("supply_voltage", (), "V", "at the servos"),
         Channel("camera_pose", ("x", "y", "yaw"), "m, m, rad", "last vision pose of the body origin, seen from the start pose"),
         Channel("joint_age", (), "s", "time since the joint readings were taken"),
@@ -90,9 +90,9 @@ SENSOR_LAYOUT = Layout(
 TRUTH_LAYOUT = Layout(
     (
         Channel("position", XYZ, "m", "body origin in the floor frame"),
-        Channel("quaternion", ("w", "x", "y", "z"), "-", "body to floor frame"),
+        Channel("quaternion", ("w", "x", "y", "z"), "-", "attitude: body to floor frame"),
         Channel("linear_velocity_in_body", XYZ, "m/s", "of the body origin, body frame"),
-        Channel("angular_velocity_in_body", XYZ, "rad/s", "body frame"),
+        Channel("angular_velocity_in_body", XYZ, "rad/s", "of the body, body frame"),
         Channel("joint_position", JOINTS, "rad", "true joint angles"),
         Channel("joint_velocity", JOINTS, "rad/s", "true joint rates, relative to the parent link"),
         Channel("motor_torque", JOINTS, "N m", "motor torque at the output shaft before gear friction, last substep"),
@@ -105,7 +105,7 @@ TRUTH_LAYOUT = Layout(
             "slip_velocity", _WHEEL_XY, "m/s", "of the contact point over the floor: along the wheel's heading, along its axle"
         ),
         Channel("slip_displacement", _WHEEL_XY, "m", "slip velocity integrated over the last control tick"),
-        Channel("effective_friction", _WHEEL_XY, "-", "friction coefficients acting at each wheel"),
+        Channel("effective_friction", _WHEEL_XY, "-", "friction coefficients at each wheel: along its heading, along its axle"),
         Channel("mechanical_energy", (), "J", "work of all motors on their shafts over the last control tick"),
         Channel(
             "electrical_energy", (), "J", "energy drawn from the supply over the last control tick (braking counts as negative)"

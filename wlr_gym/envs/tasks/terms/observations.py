@@ -72,7 +72,7 @@ _SENSED = {
         ObservationTerm("last_action", "action", (), "-", "-", 1.0, "the action given one control step before"),
         _sensor(
             "leg_position", "joint_position", "joint", 2.0, "joints", lambda r: r.sensors.encoder.position,
-            labels=LEGS, offset=lambda r: r.home.leg_angle, doc="leg encoder, from the home angle",
+            labels=LEGS, offset=lambda r: r.home.leg_angle, doc="leg encoder; the offset is the home angle",
         ),
         _sensor("leg_velocity", "joint_velocity", "joint", 20.0, "joints", lambda r: r.sensors.encoder.velocity, labels=LEGS),
         _sensor(

@@ -297,8 +297,7 @@ def load_kernel(features: frozenset[str], precision: str, width: int, formulas: 
     """
     tag = "_".join(["gibbs_appell", precision, str(width), *sorted(features)])
     message = (
-        f"wlr_gym: compiling the Gibbs-Appell engine ({precision}, {width} robots side by side); "
-        "some seconds, once on this machine"
+        f"wlr_gym: compiling the Gibbs-Appell engine ({precision}, robots at once: {width}); some seconds, once on this machine"
     )
     blocks = load_module(tag, lambda: kernel_source(features, precision, width), message, _SOURCE_KEY)
     if formulas is None:
