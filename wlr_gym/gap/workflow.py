@@ -45,15 +45,15 @@ from wlr_gym.gap.opened import open_problem
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.report.recommendation import recommend, separating_run
 from wlr_gym.gap.report.relations import relations
-from wlr_gym.gap.selection.cross_validation import improvement, shown_by_some_runs_only
+from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
 from wlr_gym.gap.selection.detectability import detectable
 from wlr_gym.gap.selection.equivalence import equivalents, selection_frequency
 from wlr_gym.gap.selection.hypothesis import Hypothesis
-from wlr_gym.gap.selection.screening import LEAST_GAIN, least_gain
+from wlr_gym.gap.selection.screening import least_gain
 from wlr_gym.gap.selection.search import Round, SearchResult, search_effects
 from wlr_gym.gap.selection.threshold import chance
 from wlr_gym.gap.validation.data_split import informative_split, named_split
-from wlr_gym.gap.validation.held_out import compare_models, mean_of_runs, mean_squares, noise_floor
+from wlr_gym.gap.validation.held_out import compare_models, confirmed, mean_of_runs, mean_squares, noise_floor
 from wlr_gym.gap.validation.localisation import localise
 from wlr_gym.gap.validation.residual_tests import adequacy_of
 from wlr_gym.gap.validation.traces import informative_traces
@@ -264,22 +264,6 @@ class _Clock:
     def stop(self) -> None:
         if self._stage:
             self.seconds[self._stage] = time.perf_counter() - self._since
-
-
-def confirmed(problem: Problem, held_out: Sequence[int], search: SearchResult) -> SearchResult:
-    """The search without its effects, if the runs that no fit has used are clearly less probable with them.
-
-    An effect must gain :data:`LEAST_GAIN` to be selected; losing as much there refutes it, as cross-validation does.
-    """
-    if not search.fit.model.effects:
-        return search
-    models = (search.calibrated.model, search.fit.model)
-    found = problem.residuals([model.setting for model in models], held_out)
-    if improvement(found, search.fit.noise.autocorrelation_time) > -LEAST_GAIN:
-        return search
-    first = search.rounds[0]
-    seen = [replace(one, cross_validated=False) if one is first.selected else one for one in first.hypotheses]
-    return SearchResult(search.calibrated, search.calibrated, [replace(first, hypotheses=seen, selected=None)], {})
 
 
 def _verdict(search: SearchResult, effects: Sequence[FoundEffect]) -> str:

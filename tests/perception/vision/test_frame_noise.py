@@ -10,7 +10,7 @@ from test_measure import OFFSET, samples_of
 
 from wlr_gym.perception.vision.frame_noise import frame_noise, widened, without_repeats
 from wlr_gym.perception.vision.imu_check import _angle_rates, imu_differences
-from wlr_gym.perception.vision.tracking import REPEATED
+from wlr_gym.perception.vision.tracking import REPEATED, without_pose
 from wlr_gym.robot import load_robot
 from wlr_gym.studies.bench.vision_drives import skid_turn
 
@@ -24,6 +24,11 @@ def jittered(drive, std):
     """Samples whose times are not those at which their poses were taken."""
     rng = np.random.default_rng(4)
     return [replace(sample, time=sample.time + std * rng.standard_normal()) for sample in samples_of(drive)]
+
+
+def test_a_film_without_poses_is_left_as_it_is(drive):
+    blind = [without_pose(sample, REPEATED) for sample in samples_of(drive)]
+    assert widened(blind, frame_noise(blind)) == tuple(blind)
 
 
 def test_the_frames_noise_is_found_from_one_to_the_next(drive):

@@ -1,6 +1,6 @@
 """Validation on held-out runs, which no fit has used: how far are replays from measurements?
 
-One decision has used them: effects that they clearly contradict are not selected (:func:`wlr_gym.gap.workflow.confirmed`).
+One decision has used them: effects that they clearly contradict are not selected (:func:`confirmed`).
 
 All numbers are root mean square residuals in units of sensor noise, over the channels of a run. A perfect model does not reach
 1.0: every window of a replay starts from measured, hence noisy, values. What it does reach is found by replaying data that the
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
 from wlr_gym.gap.estimation.model import FittedModel
 from wlr_gym.gap.estimation.uncertainty import two_sided_95
 from wlr_gym.gap.problem import Problem, Setting
+from wlr_gym.gap.selection.cross_validation import improvement
+from wlr_gym.gap.selection.screening import LEAST_GAIN
+from wlr_gym.gap.selection.search import SearchResult
 from wlr_gym.gap.validation.worse import worse_channels
 
 Array = NDArray[np.float64]
@@ -27,6 +31,22 @@ Array = NDArray[np.float64]
 LEAST_FOR_INTERVAL = 3
 #: Distance from the noise floor below which nothing is left to be removed.
 LEAST_ROOM = 1e-9
+
+
+def confirmed(problem: Problem, held_out: Sequence[int], search: SearchResult) -> SearchResult:
+    """The search without its effects, if the runs that no fit has used are clearly less probable with them.
+
+    An effect must gain :data:`LEAST_GAIN` to be selected; losing as much there refutes it, as cross-validation does.
+    """
+    if not search.fit.model.effects:
+        return search
+    models = (search.calibrated.model, search.fit.model)
+    found = problem.residuals([model.setting for model in models], held_out)
+    if improvement(found, search.fit.noise.autocorrelation_time) > -LEAST_GAIN:
+        return search
+    first = search.rounds[0]
+    seen = [replace(one, cross_validated=False) if one is first.selected else one for one in first.hypotheses]
+    return SearchResult(search.calibrated, search.calibrated, [replace(first, hypotheses=seen, selected=None)], {})
 
 
 def mean_squares(residuals: Sequence[Array], cap: float) -> Array:

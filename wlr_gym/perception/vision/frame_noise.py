@@ -56,6 +56,8 @@ def frame_noise(samples: Sequence[Sample]) -> FrameNoise:
 def widened(samples: Sequence[Sample], noise: FrameNoise) -> tuple[Sample, ...]:
     """The samples with that noise in their covariances."""
     seen = [k for k, sample in enumerate(samples) if math.isfinite(sample.pose[0])]
+    if len(seen) < 2:  # no rates: :func:`wlr_gym.perception.vision.slip.measure_slip` refuses so few
+        return tuple(samples)
     result = list(samples)
     for k, rate in zip(seen, _signals([samples[k] for k in seen])[3], strict=True):
         covariance = noise.scale**2 * samples[k].covariance + noise.jitter**2 * np.outer(rate, rate)

@@ -69,8 +69,8 @@ class ImuReadings:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
-    """Motion at the run's rows.
+class SmoothedMotion:
+    """SmoothedMotion at the run's rows.
 
     Attributes:
         value, rate, acceleration: (K, 6). value_std: 1 sigma.
@@ -108,7 +108,7 @@ def imu_readings(run: Run, legs: Array, robot: Robot) -> ImuReadings:
 
 def smooth_motion(
     samples: Sequence[Sample], time: Array, rows: Array, slipping: Callable[[Array, Array], Array], imu: ImuReadings | None
-) -> Motion:
+) -> SmoothedMotion:
     """Smooth a body's motion.
 
     Args:
@@ -148,7 +148,7 @@ def smooth_motion(
         moments, shown, density, wander, slipping_since, last_row, seen.count, seen.design, seen.values, seen.noise, seen.gate,
         at[0], np.diag(spread),
     )  # fmt: skip
-    return Motion(
+    return SmoothedMotion(
         value=states[:, _VALUE],
         rate=states[:, _RATE],
         acceleration=states[:, _ACCELERATION],
