@@ -70,7 +70,7 @@ class ImuReadings:
 
 @dataclass(frozen=True, eq=False)
 class SmoothedMotion:
-    """SmoothedMotion at the run's rows.
+    """Motion at the run's rows.
 
     Attributes:
         value, rate, acceleration: (K, 6). value_std: 1 sigma.
