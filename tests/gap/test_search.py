@@ -463,7 +463,7 @@ def test_what_one_run_alone_shows_is_reported_and_not_selected():
     analysis = analyse_problem(problem, "toy", heldout=("run_6", "run_7", "run_8"))
     assert analysis.verdict == NOT_EXCITED
     assert analysis.effects == ()
-    assert sentence(analysis).startswith("run_1 shows decoy 2 (body), other runs do not: it fails cross-validation. Record")
+    assert sentence(analysis).startswith("run_1 shows decoy 2 (body) most clearly, but runs left out of the fit do not")
 
 
 @pytest.mark.parametrize("everywhere", [True, False])

@@ -221,7 +221,7 @@ def _make_policy(options: DeployOptions, environment: str, robot: Any) -> Policy
         low, high = task.config.commands.terms[name]
         if not low <= float(value) <= high:
             raise InputError(
-                f"--command {name}={value}: expected {low:g} to {high:g} {COMMANDS[name].unit}, as the task commands"
+                f"--command {name}={value}: expected {low:g} to {high:g} ({COMMANDS[name].unit}), the range of the task"
             )
     return make_policy(options.policy, contract(task, {}))
 

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 from test_measure import OFFSET, samples_of
 
 from wlr_gym.data import Run
+from wlr_gym.perception.vision.imu_check import imu_differences, wrong_gravity
 from wlr_gym.perception.vision.motion import ImuReadings, smooth_motion
 from wlr_gym.perception.vision.slip import measure_slip
-from wlr_gym.perception.vision.tracking import OK, Sample
+from wlr_gym.perception.vision.tracking import OK, REPEATED, Sample, without_pose
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.vision_drives import skid_turn, true_slip
@@ -146,3 +147,46 @@ def test_an_imu_that_the_film_contradicts_pulls_nothing(drive):
     jumped = [replace(s, pose=s.pose + tilt * (4 < s.time < 5)) for s in samples_of(drive)]
     assert np.array_equal(measured(drive, jumped).pose, measured(drive, jumped, **none).pose)
     assert not np.array_equal(measured(drive).pose, measured(drive, **none).pose)
+
+
+NONE = {f"{kind}_{axis}": math.nan for kind in ("gyro", "acc") for axis in "xyz"}
+WRONG = {
+    "degrees per second": lambda run: {f"gyro_{axis}": np.rad2deg(run[f"gyro_{axis}"]) for axis in "xyz"},
+    "inverted": lambda run: {f"gyro_{axis}": -run[f"gyro_{axis}"] for axis in "xyz"},
+    "in g": lambda run: {f"acc_{axis}": run[f"acc_{axis}"] / 9.81 for axis in "xyz"},
+    "silent": lambda run: {f"acc_{axis}": 0.0 for axis in "xyz"},
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_wrong_imu_changes_nothing_and_is_a_finding(drive, wrong):
+    columns = WRONG[wrong](drive.run)
+    run = Run(drive.run.table.assign(**columns), drive.run.meta, drive.run.path)
+    assert np.array_equal(measured(drive, **columns).pose, measured(drive, **NONE).pose)
+    assert wrong_gravity(run) is not None or list(imu_differences(samples_of(drive), OFFSET, run, drive.robot))
+
+
+def test_one_missing_reading_does_not_matter(drive):
+    missing = drive.run["gyro_z"].copy()
+    missing[100] = math.nan
+    found, whole, alone = measured(drive, gyro_z=missing), measured(drive), measured(drive, **NONE)
+    assert np.abs(found.pose - whole.pose).max() < 0.05 * np.abs(alone.pose - whole.pose).max()
+
+
+def test_where_the_film_does_not_show_a_turn_the_imu_does_not_make_it_too_certain(drive):
+    """The density of the motion is that of what the film shows: with it the IMU's turn would be an outlier."""
+    samples = [without_pose(s, REPEATED) if 2.0 < s.time + OFFSET < 6.0 else s for s in samples_of(drive)]
+    whole, alone, found = measured(drive), measured(drive, samples, **NONE), measured(drive, samples)
+    off = [np.abs((one.pose - whole.pose)[:, 3] / one.pose_std[:, 3]).max() for one in (found, alone)]
+    assert off[0] < 1.1 * off[1]
+    error = (found.slip - true_slip(drive, found.time))[-1] / found.slip_std[-1]
+    assert np.abs(error).max() < 3.0
+
+
+def test_the_sigma_of_slip_velocity_is_that_of_its_error():
+    z = []
+    for seed in range(6):
+        found = smoothed(seed)
+        error = (slipping(found.value, found.rate) - slipping(truth(ROWS), rates(ROWS))).reshape(-1, 8)
+        z.append(error / np.sqrt(found.velocity_variance))
+    assert 0.75 < rms(np.concatenate(z).ravel()) < 1.3

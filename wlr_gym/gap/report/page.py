@@ -111,7 +111,7 @@ def _header(analysis: Analysis) -> str:
     if analysis.fit_runs:
         facts.append(f"fitted to {_runs(analysis.fit_runs)}")
     if analysis.heldout_runs:
-        facts.append(f"validated on {_runs(analysis.heldout_runs)}, held out from every fit and decision")
+        facts.append(f"validated on {_runs(analysis.heldout_runs)}, which no fit has used")
     known = [str(effect.get("name", "")) for effect in analysis.known_effects]
     if known:
         facts.append(f"known from the start: {escape(listed([plain(name) for name in known]))}")

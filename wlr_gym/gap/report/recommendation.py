@@ -118,7 +118,7 @@ def recommend(
     for hypothesis in last.hypotheses:
         name = hypothesis.candidate.name
         if name in motions and shown_by_some_runs_only(hypothesis, last.threshold):
-            found.setdefault(motions[name], f"only some runs show {name}: it fails cross-validation")
+            found.setdefault(motions[name], f"{name} fails cross-validation: runs left out of the fit do not show it")
     if verdict != EFFECT_FOUND:
         visible: dict[str, bool] = {}
         for score in last.scores:

@@ -248,7 +248,7 @@ def _not_excited(analysis: Analysis) -> str:
         run = max(shown.by_run, key=lambda name: shown.by_run[name])
         what = f"{plain(shown.name)} ({places(shown.where)})"
         more = f", and {wanted}" if wanted else ""
-        return f"{run} shows {what}, other runs do not: it fails cross-validation. Record more such runs{more}."
+        return f"{run} shows {what} most clearly, but runs left out of the fit do not: record more such runs{more}."
     return f"These runs excite too little to show whether the model lacks anything{f'; record {wanted}' if wanted else ''}."
 
 

@@ -1,8 +1,8 @@
 """Hold a film's turns and tilts against the IMU: what gyroscope and accelerometer contradict is no motion of the body.
 
-Turns are compared as angles. Of each axis the gyroscope's constant, drift and scale are left open; of pitch and roll also how
-the IMU is turned on the body (which shows along the yaw) and how the floor markers' plane is tilted (along its cosine and
-sine).
+Turns are compared as angles. Of each axis the gyroscope's constant, drift and scale (to 10 %) are left open; of pitch and roll
+also how the IMU is turned on the body (which shows along the yaw) and how the floor markers' plane is tilted (along its cosine
+and sine).
 """
 
 from __future__ import annotations
@@ -29,6 +29,10 @@ _AT_REST = 0.03  # rad/s of any axis, and m/s2 about the gravity
 _FEWEST = 30
 _TOGETHER = 5  # frames over which a difference is averaged
 _GRAVITY = 9.80665
+#: By which a gyroscope's scale may be off; m/s2 by which the median size of the specific force may differ from gravity.
+_SCALE_ERROR, _SIZE_ERROR = 0.1, 1.0
+#: Share of the readings that must be there; those between are interpolated for the comparison.
+_SHARE = 0.9
 
 
 @dataclass(frozen=True)
@@ -59,33 +63,48 @@ def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: R
     time = np.array([sample.time for sample in seen]) + offset
     film = np.unwrap(np.stack([sample.pose[3:] for sample in seen]), axis=0)
     std = np.sqrt(np.median([np.diag(sample.covariance)[3:] for sample in seen], axis=0))
-    gyro = np.stack([run[f"gyro_{axis}"] for axis in "xyz"], axis=1)
+    gyro = _readings(run, "gyro")
+    assert gyro is not None
     pitch, roll = (np.interp(t, time, film[:, k]) for k in (1, 2))
     turned = np.stack([np.interp(time, t, accumulate(rate, t)) for rate in _angle_rates(gyro, pitch, roll)], axis=1)
     yaw = film[:, 0]
     around = [turned[:, 0], np.cos(yaw), np.sin(yaw)]
     for k, axis in enumerate(("yaw", "pitch", "roll")):
-        known = np.column_stack([np.ones(len(time)), time, turned[:, k], *(around if k else [])])
+        known = np.column_stack([np.ones(len(time)), time, *(around if k else [])])
         limit = max(TILT_ERROR if k else TURN_ERROR, SIGMAS * float(std[k]))
-        yield from _largest(axis, time, _rest(film[:, k], known), limit)
-    if _known(run, "acc"):
-        yield from _level(time, film, std, run, t, gyro)
+        yield from _largest(axis, time, _without_turn(film[:, k], turned[:, k], known), limit)
+    force = _readings(run, "acc")
+    if force is not None:
+        yield from _level(time, film, std, force, t, gyro)
 
 
 def imu_agrees(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> bool:
     """Whether film and IMU can be compared and do not differ."""
-    comparable = bool(_comparable(samples, offset, run, run["t"]))
+    comparable = bool(_comparable(samples, offset, run, run["t"])) and wrong_gravity(run) is None
     return comparable and next(imu_differences(samples, offset, run, robot), None) is None
 
 
 def _comparable(samples: Sequence[Sample], offset: float, run: Run, t: Array) -> list[Sample]:
     """Samples with a pose within the gyroscope's times; none where they are too few or there is no gyroscope."""
     seen = [sample for sample in samples if math.isfinite(sample.pose[0]) and t[0] < sample.time + offset < t[-1]]
-    return seen if _known(run, "gyro") and len(seen) >= _FEWEST else []
+    return seen if _readings(run, "gyro") is not None and len(seen) >= _FEWEST else []
 
 
-def _known(run: Run, name: str) -> bool:
-    return all(f"{name}_{axis}" in run and np.isfinite(run[f"{name}_{axis}"]).all() for axis in "xyz")
+def wrong_gravity(run: Run) -> float | None:
+    """The median size (m/s2) of the specific force, where it cannot be that of a robot on the floor; else None."""
+    force = _readings(run, "acc")
+    size = _GRAVITY if force is None else float(np.median(np.linalg.norm(force, axis=1)))
+    return None if abs(size - _GRAVITY) <= _SIZE_ERROR else size
+
+
+def _readings(run: Run, name: str) -> Array | None:
+    """Readings (T, 3) of gyroscope or accelerometer, single missing ones interpolated; None where too many are missing."""
+    columns = [run[f"{name}_{axis}"] for axis in "xyz" if f"{name}_{axis}" in run]
+    found = [np.isfinite(column) for column in columns]
+    if len(columns) < 3 or min(float(fine.mean()) for fine in found) < _SHARE:
+        return None
+    t = run["t"]
+    return np.stack([np.interp(t, t[fine], column[fine]) for column, fine in zip(columns, found, strict=True)], axis=1)
 
 
 def _angle_rates(gyro: Array, pitch: Array, roll: Array) -> Array:
@@ -93,6 +112,13 @@ def _angle_rates(gyro: Array, pitch: Array, roll: Array) -> Array:
     x, y, z = gyro.T
     about = y * np.sin(roll) + z * np.cos(roll)
     return np.stack([about / np.cos(pitch), y * np.cos(roll) - z * np.sin(roll), x + about * np.tan(pitch)])
+
+
+def _without_turn(values: Array, turned: Array, known: Array) -> Array:
+    """What is left of an angle's values without the gyroscope's turn, of a scale near 1, and ``known`` (F, K)."""
+    left, own = _rest(values, known), _rest(turned, known)
+    scale = float(left @ own) / max(float(own @ own), 1e-12)
+    return left - float(np.clip(scale, 1.0 - _SCALE_ERROR, 1.0 + _SCALE_ERROR)) * own
 
 
 def _rest(values: Array, known: Array) -> Array:
@@ -107,9 +133,8 @@ def _largest(axis: str, time: Array, rest: Array, limit: float) -> Iterator[Turn
         yield TurnDifference(axis, float(time[worst + _TOGETHER // 2]), float(abs(mean[worst])))
 
 
-def _level(time: Array, film: Array, std: Array, run: Run, t: Array, gyro: Array) -> Iterator[TurnDifference]:
+def _level(time: Array, film: Array, std: Array, force: Array, t: Array, gyro: Array) -> Iterator[TurnDifference]:
     """Tilt while the robot rests, against the direction of gravity."""
-    force = np.stack([run[f"acc_{axis}"] for axis in "xyz"], axis=1)
     size = np.linalg.norm(force, axis=1)
     rests = (np.abs(gyro).max(axis=1) < _AT_REST) & (np.abs(size - _GRAVITY) < 10 * _AT_REST)
     x, y, z = force.T

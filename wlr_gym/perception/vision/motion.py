@@ -47,6 +47,8 @@ _GYRO_WANDER = 1e-5
 #: Squared normalised innovation beyond which an IMU reading counts for less.
 _GATE = 36.0
 _STEP = 1e-5  # of derivatives
+#: s between two frames beyond which the IMU is not used.
+_LONGEST_GAP = 0.5
 _PITCH_RATE = 1  # place of the gyroscope's y
 #: Deviations from its neighbours (m, rad) from which on a pose can be an outlier.
 _JUMP = (0.01, 0.01, 0.01, 0.03, 0.05, 0.05)
@@ -54,7 +56,7 @@ _JUMP = (0.01, 0.01, 0.01, 0.03, 0.05, 0.05)
 
 @dataclass(frozen=True, eq=False)
 class ImuReadings:
-    """What the IMU said.
+    """What the IMU read.
 
     Attributes:
         time: (T,) s of the motion that it shows. values: (T, 6) gyroscope, accelerometer; NaN = none. variance: (T, 6).
@@ -88,7 +90,7 @@ class SmoothedMotion:
 
 
 def imu_readings(run: Run, legs: Array, robot: Robot) -> ImuReadings:
-    """What a run's IMU said, and how far it is believed. ``legs``: (T,) rad/s, rms of their rates."""
+    """What a run's IMU read, and its variance. ``legs``: (T,) rad/s, rms of their rates."""
     t = run["t"]
     values = np.full((len(t), 6), np.nan)
     for k, name in enumerate(f"{kind}_{axis}" for kind in ("gyro", "acc") for axis in "xyz"):
@@ -120,7 +122,7 @@ def smooth_motion(
     kept = np.array([math.isfinite(sample.pose[0]) for sample in samples]) & ~outliers
     inside = np.zeros(0, np.int64)
     if imu is not None:
-        inside = np.flatnonzero((imu.time > time[kept][0]) & (imu.time < time[kept][-1]))
+        inside = np.flatnonzero(_between_frames(imu.time, time[kept]))
     moments = np.concatenate([time[kept], rows, imu.time[inside] if imu is not None else rows[:0]])
     order = np.argsort(moments, kind="stable")
     moments = moments[order]
@@ -154,9 +156,17 @@ def smooth_motion(
         acceleration=states[:, _ACCELERATION],
         value_std=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[:, _VALUE]),
         velocity_variance=np.einsum("kij,kjl,kil->ki", slope, covariance[:, _MOTION, _MOTION], slope),
-        slip_covariance=covariance[:, _SLIP, _SLIP],
+        slip_covariance=covariance[:, _SLIP, _SLIP].copy(),  # the rest is 25 times as large
         outliers=outliers,
     )
+
+
+def _between_frames(time: Array, frames: Array) -> NDArray[np.bool_]:
+    """Which times lie between two frames that follow closely: where none does, the motion's density is not known."""
+    after = np.searchsorted(frames, time)
+    inside = (after > 0) & (after < len(frames))
+    inside[inside] = (frames[after[inside]] - frames[after[inside] - 1]) < _LONGEST_GAP
+    return inside
 
 
 def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> tuple[list[Smoothed], NDArray[np.bool_]]:
@@ -231,7 +241,7 @@ def body_rates(pitch: Array, roll: Array, rates: Array) -> Array:
 
 
 def _expected(states: Array, gravity: float) -> Array:
-    """What the IMU says, (K, 6), of states (K, _SIZE)."""
+    """What the IMU reads, (K, 6), in states (K, _SIZE)."""
     yaw, pitch, roll = states[:, _ANGLES].T
     turning = body_rates(pitch, roll, states[:, _RATE][:, _ANGLES])
     force = states[:, _ACCELERATION][:, :3] + gravity * np.column_stack([states[:, _SLOPE], np.ones(len(states))])

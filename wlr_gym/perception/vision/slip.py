@@ -136,7 +136,7 @@ def measure_slip(
     joints = joint_signals(run, rows, robot)
     joints[0][:, LEG_SLICE] -= parameters["joint.zero_offset"]
     batch = repeated(parameters, len(rows))
-    imu = _believed_imu(samples, offset, run, robot)
+    imu = _usable_imu(samples, offset, run, robot)
     motion = smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu)
     value, rate = motion.value, motion.rate
     velocity, rolling, no_slip_speed = _contacts(value, rate, joints, batch)
@@ -174,7 +174,7 @@ def measure_slip(
         ratio=slip_ratio(travel, rolling),
         angle=slip_angle(travel, velocity[:, :, 1]),
         no_slip_error=float(no_slip_error(accumulate(heading_speed, rows)[-1], accumulate(no_slip_speed, rows)[-1])),
-        covered=np.abs(rows[:, None] - time[seen][None]).min(axis=1) < LONGEST_GAP,
+        covered=_apart(rows, time[seen]) < LONGEST_GAP,
         outliers=motion.outliers,
     )
 
@@ -197,8 +197,14 @@ def _encoder_variance(angle: Array, robot: Robot, parameters: Parameters) -> Arr
     return (radius**2 + height**2) * robot.sensors.encoder.position**2 / 12
 
 
-def _believed_imu(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> ImuReadings | None:
-    """What the IMU said, unless the film contradicts it: then neither is to pull the other."""
+def _apart(rows: Array, frames: Array) -> Array:
+    """How far (s) each of the rows is from the nearest frame."""
+    after = np.clip(np.searchsorted(frames, rows), 1, len(frames) - 1)
+    return np.minimum(np.abs(rows - frames[after - 1]), np.abs(frames[after] - rows))
+
+
+def _usable_imu(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> ImuReadings | None:
+    """What the IMU read; None where film and IMU differ: then the film alone counts."""
     if not imu_agrees(samples, offset, run, robot):
         return None
     legs = joint_signals(run, run["t"], robot)[1][:, LEG_SLICE]
