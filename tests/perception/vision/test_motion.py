@@ -23,6 +23,7 @@ PACE = np.array([2.1, 2.9, 4.3, 1.7, 3.7, 5.3])
 STD = np.array([8e-5, 8e-5, 2e-4, 2e-4, 1e-3, 1e-3])
 GYRO, FORCE = 1e-3, 0.03  # rad/s, m/s2, 1 sigma
 ROWS = np.arange(0.1, SECONDS - 0.1, 0.02)
+NONE = {f"{kind}_{axis}": math.nan for kind in ("gyro", "acc") for axis in "xyz"}
 
 
 def truth(at):
@@ -128,8 +129,7 @@ def measured(drive, samples=None, **columns):
 
 
 def test_slip_to_the_side_is_sharper_with_the_imu(drive):
-    none = {f"{kind}_{axis}": math.nan for kind in ("gyro", "acc") for axis in "xyz"}
-    alone, both = measured(drive, **none), measured(drive)
+    alone, both = measured(drive, **NONE), measured(drive)
     true = true_slip(drive, both.time)
     assert np.median(both.slip_std[:, :, 1]) < 0.8 * np.median(alone.slip_std[:, :, 1])
     assert np.median(both.slip_velocity_std[:, :, 1]) < 0.95 * np.median(alone.slip_velocity_std[:, :, 1])
@@ -140,16 +140,14 @@ def test_slip_to_the_side_is_sharper_with_the_imu(drive):
 
 def test_an_imu_that_the_film_contradicts_pulls_nothing(drive):
     """A gyroscope that loses counts for a second; and a film whose tilt jumps."""
-    none = {f"{kind}_{axis}": math.nan for kind in ("gyro", "acc") for axis in "xyz"}
     lost = np.where(np.abs(drive.run["t"] - 4.5) < 0.5, 0.0, drive.run["gyro_z"])
-    assert np.array_equal(measured(drive, gyro_z=lost).pose, measured(drive, **none).pose)
+    assert np.array_equal(measured(drive, gyro_z=lost).pose, measured(drive, **NONE).pose)
     tilt = np.array([0, 0, 0, 0, 0.05, 0])
     jumped = [replace(s, pose=s.pose + tilt * (4 < s.time < 5)) for s in samples_of(drive)]
-    assert np.array_equal(measured(drive, jumped).pose, measured(drive, jumped, **none).pose)
-    assert not np.array_equal(measured(drive).pose, measured(drive, **none).pose)
+    assert np.array_equal(measured(drive, jumped).pose, measured(drive, jumped, **NONE).pose)
+    assert not np.array_equal(measured(drive).pose, measured(drive, **NONE).pose)
 
 
-NONE = {f"{kind}_{axis}": math.nan for kind in ("gyro", "acc") for axis in "xyz"}
 WRONG = {
     "degrees per second": lambda run: {f"gyro_{axis}": np.rad2deg(run[f"gyro_{axis}"]) for axis in "xyz"},
     "inverted": lambda run: {f"gyro_{axis}": -run[f"gyro_{axis}"] for axis in "xyz"},

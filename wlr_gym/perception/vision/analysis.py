@@ -187,7 +187,7 @@ def camera_columns(
     time = np.array([s.time for s in kept]) + offset
     poses = np.stack([s.pose for s in kept])
     poses[:, 3] = np.unwrap(poses[:, 3])
-    rates = np.stack([signal.rate for signal in smoothed_poses(kept, time, time)[0]], axis=1)
+    rates = np.stack([signal.rate for signal in smoothed_poses(kept, time, time)], axis=1)
     marker = np.asarray(run.meta.marker_offset)
     place = poses[:, :3] + np.einsum("nij,j->ni", rotation(*poses[:, 3:].T), marker)
     columns = {name: np.full(len(t), np.nan) for name in ("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch")}

@@ -118,8 +118,9 @@ def smooth_motion(
         slipping: slip velocities (K, 4, 2) for values and rates (K, 6) at the rows.
         imu: None = the camera alone.
     """
-    outliers = _outliers(samples, time)
-    kept = np.array([math.isfinite(sample.pose[0]) for sample in samples]) & ~outliers
+    poses, std = _unwrapped(samples), _std(samples)
+    outliers = _outliers(poses, std, time)
+    kept = np.isfinite(poses[:, 0]) & ~outliers
     inside = np.zeros(0, np.int64)
     if imu is not None:
         inside = np.flatnonzero(_between_frames(imu.time, time[kept]))
@@ -127,13 +128,13 @@ def smooth_motion(
     order = np.argsort(moments, kind="stable")
     moments = moments[order]
     frames, shown, read = np.split(np.argsort(order, kind="stable"), np.cumsum([kept.sum(), len(rows)]))
-    near = smoothed_poses(samples, time, moments)[0]
+    near = _each_alone(poses, std, time, outliers, moments)
     at = np.zeros((len(moments), _SIZE))  # near enough to be linear about
     for part, name in ((_VALUE, "value"), (_RATE, "rate"), (_ACCELERATION, "acceleration")):
         at[:, part] = np.stack([getattr(signal, name) for signal in near], axis=1)
 
     seen = _Measurements.none(len(moments))
-    seen.add_frames(frames, _unwrapped(samples)[kept], np.stack([sample.covariance for sample in samples])[kept])
+    seen.add_frames(frames, poses[kept], np.stack([sample.covariance for sample in samples])[kept])
     wander = np.zeros((len(moments), _SIZE))
     if imu is not None:
         seen.add_imu(read, imu, inside, at[read])
@@ -169,16 +170,18 @@ def _between_frames(time: Array, frames: Array) -> NDArray[np.bool_]:
     return inside
 
 
-def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> tuple[list[Smoothed], NDArray[np.bool_]]:
-    """Each of the six coordinates alone at the times ``at`` (K,), and which samples are outliers (F,)."""
-    outliers = _outliers(samples, time)
+def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> list[Smoothed]:
+    """Each of the six coordinates alone at the times ``at`` (K,), without outliers."""
     poses, std = _unwrapped(samples), _std(samples)
-    poses[outliers] = np.nan
-    return [smooth(time, poses[:, k], std[:, k], at) for k in range(6)], outliers
+    return _each_alone(poses, std, time, _outliers(poses, std, time), at)
 
 
-def _outliers(samples: Sequence[Sample], time: Array) -> NDArray[np.bool_]:
-    poses, std = _unwrapped(samples), _std(samples)
+def _each_alone(poses: Array, std: Array, time: Array, outliers: NDArray[np.bool_], at: Array) -> list[Smoothed]:
+    kept = np.where(outliers[:, None], np.nan, poses)
+    return [smooth(time, kept[:, k], std[:, k], at) for k in range(6)]
+
+
+def _outliers(poses: Array, std: Array, time: Array) -> NDArray[np.bool_]:
     return np.any([smooth(time, poses[:, k], std[:, k], time[:1], _JUMP[k]).outliers for k in range(6)], axis=0)
 
 
