@@ -76,6 +76,15 @@ def test_what_further_runs_cannot_change_is_not_in_play():
     assert (only.name, only.effects) == ("nothing", ())
 
 
+def test_a_name_that_the_held_out_runs_refute_is_not_in_play_beside_one_that_was_found():
+    refuted, kept = (
+        candidate("coulomb_friction", 1.0, "fails cross-validation"),
+        candidate("viscous_friction", 1.0, "selected", 2),
+    )
+    (only,) = explanations(result("effect_found", (0.0, [refuted]), (0.0, [kept])))
+    assert (only.name, [effect.name for effect in only.effects]) == ("viscous_friction", ["viscous_friction"])
+
+
 def test_a_probable_name_that_was_not_selected_is_not_decided():
     entries = [candidate("coulomb_friction", 0.99, "fails cross-validation")]
     assert [one.name for one in explanations(result("not_excited", (0.01, entries)))] == ["coulomb_friction", "nothing"]

@@ -7,7 +7,9 @@ from toy_problem import CHANNELS, NOISE, Toy, candidate, sized
 from wlr_gym.gap.analysis import Place
 from wlr_gym.gap.estimation.fit import fit
 from wlr_gym.gap.estimation.model import nominal_model
-from wlr_gym.gap.validation.held_out import _interval, compare_models, level, mean_squares, reduction
+from wlr_gym.gap.selection.cross_validation import improvement
+from wlr_gym.gap.selection.screening import LEAST_GAIN
+from wlr_gym.gap.validation.held_out import _beyond_need, _interval, compare_models, level, mean_squares, reduction
 from wlr_gym.gap.validation.traces import MOST, informative_traces
 
 FITTED, HELD_OUT = [0, 1, 2, 4], [3, 5, 6]
@@ -158,3 +160,16 @@ def test_traces_show_held_out_runs_where_the_gap_is():
         assert trace.measured == pytest.approx(problem.measured(int(trace.run[-1]) - 1)[:, c])
         assert np.std(trace.measured - trace.after) == pytest.approx(NOISE[c], rel=0.15)
         assert np.std(trace.measured - trace.calibrated) > 1.2 * NOISE[c]
+
+
+@pytest.mark.parametrize(("before", "after", "refuted"), [(1.0, 1.1, True), (1.1, 1.0, False)])
+def test_effect_with_which_the_held_out_error_grows_must_gain_as_much_as_one_must_to_be_selected(before, after, refuted):
+    """Channels that hardly err may gain likelihood while the error of all together grows."""
+    problem, rng = Toy({}, []), np.random.default_rng(0)
+    noise = rng.standard_normal((1, 400, 3))
+    small = np.array([[1.3, 1.0, 10.0 * before], [1.2, 1.0, 10.0 * after]])
+    found = [noise * small[:, None, :]]
+    tau = np.array([10.0, 10.0, 100.0])
+    gain = improvement(found, tau)
+    assert 0.0 < gain < LEAST_GAIN
+    assert (_beyond_need(problem, found, tau) < 0.0) is refuted

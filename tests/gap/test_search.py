@@ -467,7 +467,7 @@ def test_what_one_run_alone_shows_is_reported_and_not_selected():
 
 
 @pytest.mark.parametrize("everywhere", [True, False])
-def test_effect_that_the_held_out_runs_contradict_is_reported_and_not_selected(everywhere):
+def test_effect_that_the_held_out_runs_refute_is_reported_and_not_selected(everywhere):
     problem = Toy({}, [sized("drag", 0.6, "right")], rows=400, runs=6)
     if not everywhere:
         without = Toy({}, [], rows=400, runs=6)
@@ -479,6 +479,20 @@ def test_effect_that_the_held_out_runs_contradict_is_reported_and_not_selected(e
     assert (best.name, best.outcome) == ("drag", "selected" if everywhere else "fails cross-validation")
     assert analysis.gap is not None
     assert (analysis.gap.heldout_after == analysis.gap.heldout_calibrated) is not everywhere
+
+
+@pytest.mark.parametrize(("right", "wrong"), [(1.5, 0.6), (0.6, 1.5)])
+def test_held_out_runs_refute_one_effect_and_not_the_one_beside_it(right, wrong):
+    both = [sized("drag", right, "right"), sized("decoy_1", wrong)]
+    problem, truth = (Toy({}, effects, rows=400, runs=6) for effects in (both, both[:1]))
+    problem._measured[4:] = truth._measured[4:]
+    analysis = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
+    assert [effect.name for effect in analysis.effects] == ["drag"]
+    assert analysis.effects[0].parameters["size"].value == pytest.approx(right, rel=0.2)
+    outcomes = {one.name: one.outcome for one in analysis.evidence if one.outcome in ("selected", "fails cross-validation")}
+    assert outcomes == {"drag": "selected", "decoy_1": "fails cross-validation"}
+    assert analysis.gap is not None
+    assert analysis.gap.heldout_after < analysis.gap.heldout_calibrated
 
 
 def test_better_model_found_while_converging_is_calibrated_from(monkeypatch):

@@ -170,7 +170,7 @@ def analyse_problem(
     search = search_effects(problem, fitted, base, clock.detail, columns)
     base = search.calibrated
     clock.start("proving")
-    search = confirmed(problem, held_out, search)
+    search = confirmed(problem, fitted, held_out, search)
     models = (nominal_model(problem), base.model, search.fit.model)
     floor = noise_floor(problem, search.fit.model.setting, held_out)
     gap, run_gaps, channel_gaps = compare_models(problem, fitted, held_out, models, floor)
@@ -376,7 +376,7 @@ def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int
 
 def _outcome(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Container[str]) -> tuple[str, str]:
     best = look.selected
-    if best is not None and hypothesis.candidate.label == best.candidate.label:
+    if best is not None and hypothesis.candidate.label == best.candidate.label and hypothesis.cross_validated:
         return (
             (SELECTED, "improves the fit most")
             if best.candidate.label in kept

@@ -67,8 +67,9 @@ class Round:
     @property
     def equivalents(self) -> list[Hypothesis]:
         """The best hypothesis of every other name that the data cannot distinguish from the selected one."""
-        names = credible_names(self.hypotheses, self.probabilities[0])
-        return [] if self.selected is None else equivalents(self.selected, self.hypotheses, names)
+        if self.selected is None or not self.selected.cross_validated:  # the latter: refuted by the held-out runs
+            return []
+        return equivalents(self.selected, self.hypotheses, credible_names(self.hypotheses, self.probabilities[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,35 +276,39 @@ def _same(one: FittedModel, other: FittedModel) -> bool:
 def remove_redundant(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = lambda text: None) -> Fit:
     """Remove effects that are redundant beside the others, one after the other, the least useful first."""
     while len(current.model.effects) > 1:
-        noise = current.noise
-        kept = len(problem.quantities)
-        trials = []
-        for index in range(len(current.model.effects)):
-            sizes = [len(values) for _, values in current.model.effects]
-            own = slice(kept + sum(sizes[:index]), kept + sum(sizes[: index + 1]))
-            silent = current.model.effects[index][0].replaced  # a number that an effect replaces has no columns beside it
-            columns = None if silent else [np.delete(column, own, axis=0) for column in current.columns]
-            model = current.model.without_effect(index)
-            trials.append(
-                fit(
-                    problem,
-                    runs,
-                    model,
-                    autocorrelation_time=noise.autocorrelation_time,
-                    scatter=noise.scatter,
-                    columns=columns,
-                    steps=problem.steps,
-                    renew=False,
-                )
-            )
+        trials = without_each(problem, runs, current)
         losses = [trial.cost - current.cost for trial in trials]
         least = int(np.argmin(losses))
         unknowns = len(current.model.effects[least][1])
         if losses[least] > least_gain(unknowns):
             return current
         tell(f"removed: {current.model.effects[least][0].label}")
-        current = fit(problem, runs, trials[least].model, scatter=noise.scatter, steps=1, tell=tell)
+        current = fit(problem, runs, trials[least].model, scatter=current.noise.scatter, steps=1, tell=tell)
     return current
+
+
+def without_each(problem: Problem, runs: Sequence[int], current: Fit) -> list[Fit]:
+    """Fit the model without each of its effects in turn, under the same noise."""
+    kept = len(problem.quantities)
+    sizes = [len(values) for _, values in current.model.effects]
+    trials = []
+    for index, (candidate, _) in enumerate(current.model.effects):
+        own = slice(kept + sum(sizes[:index]), kept + sum(sizes[: index + 1]))
+        silent = candidate.replaced  # a number that an effect replaces has no columns beside it
+        columns = None if silent else [np.delete(column, own, axis=0) for column in current.columns]
+        trials.append(
+            fit(
+                problem,
+                runs,
+                current.model.without_effect(index),
+                autocorrelation_time=current.noise.autocorrelation_time,
+                scatter=current.noise.scatter,
+                columns=columns,
+                steps=problem.steps,
+                renew=False,
+            )
+        )
+    return trials
 
 
 def _merged(

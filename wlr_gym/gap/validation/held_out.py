@@ -1,6 +1,6 @@
 """Validation on held-out runs, which no fit has used: how far are replays from measurements?
 
-One decision has used them: effects that they clearly contradict are not selected (:func:`confirmed`).
+One decision has used them: effects that they refute are not selected (:func:`confirmed`).
 
 All numbers are root mean square residuals in units of sensor noise, over the channels of a run. A perfect model does not reach
 1.0: every window of a replay starts from measured, hence noisy, values. What it does reach is found by replaying data that the
@@ -10,19 +10,20 @@ fitted model itself made, with the same sensors (:func:`noise_floor`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
+from wlr_gym.gap.estimation.fit import Fit, widened
 from wlr_gym.gap.estimation.model import FittedModel
 from wlr_gym.gap.estimation.uncertainty import two_sided_95
 from wlr_gym.gap.problem import Problem, Setting
 from wlr_gym.gap.selection.cross_validation import improvement
 from wlr_gym.gap.selection.screening import LEAST_GAIN
-from wlr_gym.gap.selection.search import SearchResult
+from wlr_gym.gap.selection.search import Round, SearchResult, without_each
 from wlr_gym.gap.validation.worse import worse_channels
 
 Array = NDArray[np.float64]
@@ -33,20 +34,53 @@ LEAST_FOR_INTERVAL = 3
 LEAST_ROOM = 1e-9
 
 
-def confirmed(problem: Problem, held_out: Sequence[int], search: SearchResult) -> SearchResult:
-    """The search without its effects, if the runs that no fit has used are clearly less probable with them.
+def confirmed(problem: Problem, fitted: Sequence[int], held_out: Sequence[int], search: SearchResult) -> SearchResult:
+    """The search without the effects that runs which no fit has used refute.
 
-    An effect must gain :data:`LEAST_GAIN` to be selected; losing as much there refutes it, as cross-validation does.
+    Each is judged beside the others. What is refuted most goes first: a wrong effect may spoil what a right one gains.
     """
-    if not search.fit.model.effects:
-        return search
-    models = (search.calibrated.model, search.fit.model)
-    found = problem.residuals([model.setting for model in models], held_out)
-    if improvement(found, search.fit.noise.autocorrelation_time) > -LEAST_GAIN:
-        return search
-    first = search.rounds[0]
-    seen = [replace(one, cross_validated=False) if one is first.selected else one for one in first.hypotheses]
-    return SearchResult(search.calibrated, search.calibrated, [replace(first, hypotheses=seen, selected=None)], {})
+    current, refuted = search.fit, set[str]()
+    while current.model.effects:
+        alone = len(current.model.effects) == 1
+        trials = [search.calibrated] if alone else without_each(problem, fitted, current)
+        found = problem.residuals([one.model.setting for one in (*trials, current)], held_out)
+        tau = current.noise.autocorrelation_time
+        beyond = [_beyond_need(problem, [r[[k, -1]] for r in found], tau) for k in range(len(trials))]
+        least = int(np.argmin(beyond))
+        if beyond[least] >= 0.0:
+            break
+        refuted.add(current.model.effects[least][0].label)
+        current = trials[least] if alone else widened(problem, fitted, trials[least])
+    return search if current is search.fit else _withdrawn(search, current, refuted)
+
+
+def _beyond_need(problem: Problem, found: Sequence[Array], autocorrelation_time: Array) -> float:
+    """How much more the held-out runs gain by an effect, in minus two log likelihood, than they must.
+
+    By chance they may lose, but not as much as an effect must gain to be selected (:data:`LEAST_GAIN`). Where their error
+    grows, they must gain as much.
+
+    Args:
+        problem: the system.
+        found: residuals (2, rows, channels), one array per run, without the effect and with it.
+        autocorrelation_time: of the model with it.
+    """
+    before, after = (level(mean_squares([r[k] for r in found], problem.cap)) for k in (0, 1))
+    return improvement(found, autocorrelation_time) - (LEAST_GAIN if after > before else -LEAST_GAIN)
+
+
+def _withdrawn(search: SearchResult, left: Fit, refuted: Container[str]) -> SearchResult:
+    """The search that ends with what is left; what was refuted counts as failing cross-validation."""
+    rounds = [_without_refuted(look, refuted) for look in search.rounds]
+    swaps = {label: rivals for label, rivals in search.swaps.items() if label not in refuted}
+    return SearchResult(search.calibrated, left, rounds if left.model.effects else rounds[:1], swaps)
+
+
+def _without_refuted(look: Round, refuted: Container[str]) -> Round:
+    if look.selected is None or look.selected.candidate.label not in refuted:
+        return look
+    seen = replace(look.selected, cross_validated=False)
+    return replace(look, hypotheses=[seen if one is look.selected else one for one in look.hypotheses], selected=seen)
 
 
 def mean_squares(residuals: Sequence[Array], cap: float) -> Array:
