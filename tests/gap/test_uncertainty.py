@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
-from wlr_gym.gap.estimation.fit import fit
+from wlr_gym.gap.estimation.fit import fit, widened
 from wlr_gym.gap.estimation.least_squares import normal_equations
 from wlr_gym.gap.estimation.model import nominal_model, on_bounds
 from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95, estimates, half_widths, two_sided_95
@@ -74,6 +74,24 @@ def test_few_runs_that_differ_tell_little_of_how_much_they_do():
         found = fit(problem, range(3), nominal_model(problem), steps=1)
         inside.append(abs(found.model.quantities[1]) <= half_widths(problem, found)[1])
     assert 0.9 <= np.mean(inside) <= 0.99
+
+
+def test_two_runs_are_helped_by_what_all_numbers_say_of_how_runs_scatter():
+    """Student's t of one degree of freedom, 12.7, would make half of the intervals too wide to be of use."""
+    inside, halves = [], []
+    for seed in range(150):
+        problem = Toy({}, seed=seed, runs=2, rows=200, reach=1000)
+        problem.quantities = tuple(replace(q, sigma=100 * q.sigma) for q in problem.quantities)
+        rng = np.random.default_rng([seed, 3])
+        for r in range(2):
+            for name in ("gain", "offset", "mass"):
+                problem._measured[r] = problem._measured[r] + NOISE * rng.normal(0.0, 1.0) * problem.shape(name)[r]
+        found = widened(problem, range(2), fit(problem, range(2), nominal_model(problem), steps=1))
+        half = half_widths(problem, found) / SIGMA
+        inside.append(np.abs(found.model.quantities - NOMINAL) / SIGMA <= half)
+        halves.append(half)
+    assert 0.85 <= np.mean(inside) <= 0.98
+    assert np.quantile(halves, 0.9) < 8.0  # 15 with one degree of freedom; the truth scatters by 0.7
 
 
 def test_jackknife_is_leaving_one_run_out():

@@ -16,6 +16,8 @@ from wlr_gym.physics.effects import EFFECTS
 Array = NDArray[np.float64]
 
 TWO_SIDED_95 = 1.96
+#: Least degrees of freedom of a spread. Two runs have one (Student's t is 12.7): the curvature counts as another.
+LEAST_DEGREES = 2
 
 
 def two_sided_95(degrees: int) -> float:
@@ -28,7 +30,8 @@ def covariance(problem: Problem, fit: Fit) -> Array:
 
     From the curvature of the likelihood; where leaving out one run after the other (jackknife, one Newton step each) shows more
     spread, which is what differs from run to run, the number's row and column are widened to that. A spread of a few runs
-    is known to a few degrees of freedom only: it is multiplied by Student's t over 1.96.
+    is known to a few degrees of freedom only: it is multiplied by Student's t over 1.96; that of two runs is averaged
+    with the curvature, which knows from all numbers together how much runs scatter.
     """
     curvature = fit.covariance()
     matrices, vectors = equations_by_run(fit.columns, fit.residuals, fit.noise)
@@ -41,9 +44,11 @@ def covariance(problem: Problem, fit: Fit) -> Array:
     ]
     spread = np.stack(shifts) - np.mean(shifts, axis=0)
     jackknife = (runs - 1) / runs * (spread**2).sum(axis=0)
-    wider = np.sqrt(jackknife / np.maximum(np.diag(curvature), 1e-300))
-    few = two_sided_95(runs - 1) / TWO_SIDED_95 if runs > 1 else 1.0
-    scale = scales(problem, fit.model) * np.where(wider > 1.0, few * wider, 1.0)
+    wider = jackknife / np.maximum(np.diag(curvature), 1e-300)
+    missing = max(LEAST_DEGREES - (runs - 1), 0)
+    weighed = np.sqrt((missing + (runs - 1) * wider) / (missing + runs - 1))
+    few = two_sided_95(missing + runs - 1) / TWO_SIDED_95
+    scale = scales(problem, fit.model) * np.where(wider > 1.0, few * weighed, 1.0)
     return curvature * np.outer(scale, scale)
 
 
