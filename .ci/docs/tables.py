@@ -1,6 +1,6 @@
 """Tables of the documentation that are made from code and data; pages say where: ``<!-- table: NAME -->``.
 
-``python .ci/docs/tables.py NAME ...`` prints them.
+``python .ci/docs/tables.py --write`` writes all of them into docs/tables, for readers of the repository; NAME ... prints some.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from wlr_gym.studies.bench.gap_score_table import markdown
 from wlr_gym.studies.paper.verdicts import verdict_table
 
 ROOT = Path(__file__).resolve().parents[2]
+FOLDER = ROOT / "docs" / "tables"
 ANSWERS = ROOT / "docs" / "data" / "gap_answers.json"
 SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
 #: Randomisations that are laid over ``nominal``.
@@ -275,6 +276,16 @@ TABLES: dict[str, Callable[[], list[str]]] = {
 }
 
 
+def table_files() -> dict[str, str]:
+    """Return the text of every file of docs/tables."""
+    note = "*Made by `python .ci/docs/tables.py --write`.*"
+    return {f"{name}.md": "\n".join([note, "", *lines()]) + "\n" for name, lines in TABLES.items()}
+
+
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        print("\n".join(TABLES[name]()), end="\n\n")
+    if sys.argv[1:] == ["--write"]:
+        for file, text in table_files().items():
+            (FOLDER / file).write_text(text, encoding="utf-8")
+    else:
+        for name in sys.argv[1:]:
+            print("\n".join(TABLES[name]()), end="\n\n")
