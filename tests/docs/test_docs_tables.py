@@ -6,7 +6,7 @@ import re
 from collections import Counter
 
 import pytest
-from blocks import PAGES, site_script
+from blocks import PAGES, ROOT, site_script
 
 from wlr_gym.cli import main
 from wlr_gym.envs.registry import ENVIRONMENTS
@@ -43,6 +43,15 @@ def test_the_site_has_whole_rows(name):
         inner = [len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines() if line.startswith("|")]
         assert len(set(inner)) <= 1
     assert tables.TABLES[name]()[0] in pages.on_page_markdown(f"<!-- table: {name} -->\n[Table](tables/{name}.md)")
+
+
+def test_the_page_names_what_the_acceptance_test_refuses():
+    page = (ROOT / "docs" / "evaluation.md").read_text(encoding="utf-8").partition("\n## Acceptance")[2].partition("\n## ")[0]
+    refused = [row for row in rows("acceptance") if row[-1].strip() == "no"]
+    assert refused
+    for policy, _, _, floors, *_, bound, _ in refused:
+        assert {policy.strip(), f"`{floors.strip()}`"} <= set(re.findall("`[^`]+`", page)), policy
+        assert bound.strip() in page
 
 
 def test_wlr_effects_prints_the_library(capsys, monkeypatch):
