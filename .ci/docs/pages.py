@@ -64,13 +64,14 @@ INTRODUCTION = (
 FORMULA = re.compile(r"\$\$(?P<display>.+?)\$\$|\$(?P<inline>[^$\s](?:[^$]*[^$\s])?)\$", re.S)
 
 
-#: Where a page has a table that is made.
-TABLE = re.compile(r"<!-- table: (\w+) -->")
+#: Where a page has a table that is made; the link is for readers of the repository.
+TABLE = re.compile(r"<!-- table: (\w+) -->\n\[Table\]\(tables/\1\.md\)")
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put in the tables that are made, and turn LaTeX into MathML."""
-    return mathml(TABLE.sub(lambda found: "\n".join(TABLES[found[1]]()), markdown))
+    """Put in the tables that are made, link the pages of notebooks, and turn LaTeX into MathML."""
+    linked = re.sub(r"\]\((notebooks/\w+)\.ipynb\)", r"](\1.md)", markdown)
+    return mathml(TABLE.sub(lambda found: "\n".join(TABLES[found[1]]()), linked))
 
 
 def mathml(markdown: str) -> str:

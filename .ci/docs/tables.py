@@ -1,6 +1,6 @@
 """Tables of the documentation that are made from code and data; pages say where: ``<!-- table: NAME -->``.
 
-``python .ci/docs/tables.py NAME ...`` prints them.
+``python .ci/docs/tables.py --write`` writes all of them into docs/tables, for readers of the repository; NAME ... prints some.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from wlr_gym.envs.tasks.describe import (
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.task import ObservationColumn, Task
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
+from wlr_gym.learning.evaluation.acceptance import acceptance_rows, read_acceptance
 from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.physics.effects.document import coordinates, parameter_text, places
 from wlr_gym.physics.plants.forces import FEATURES
@@ -44,7 +45,10 @@ from wlr_gym.studies.bench.gap_score_table import markdown
 from wlr_gym.studies.paper.verdicts import verdict_table
 
 ROOT = Path(__file__).resolve().parents[2]
-ANSWERS = ROOT / "docs" / "data" / "gap_answers.json"
+FOLDER = ROOT / "docs" / "tables"
+DATA = ROOT / "docs" / "data"
+ANSWERS = DATA / "gap_answers.json"
+LIMITS = ROOT / "configs" / "hardware" / "nominal.yaml"
 SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
 #: Randomisations that are laid over ``nominal``.
 PRESETS = ("ice", "split", "patches", "slippery", "asymmetric", "slope", "stripes", "ribbed")
@@ -99,19 +103,36 @@ def motion_table() -> list[str]:
     return _table(("motion", "what the robot does", "what it shows"), rows)
 
 
-def blind_test_table() -> list[str]:
-    """Return the score of the stored answers of the blind test; its data are not needed."""
-    answers = read_answers(ANSWERS)
+def limit_table() -> list[str]:
+    """Return the safety limits of the nominal robot; the comments of its file are units and reasons."""
+    section = LIMITS.read_text(encoding="utf-8").partition("\nsafety:\n")[2]
+    rows = [(f"`{name}`", value, why) for name, value, why in re.findall(r"^  (\w+): (\S+) +# (.+)$", section, re.MULTILINE)]
+    return _table(("limit", "nominal", "unit: reason"), rows)
+
+
+def acceptance_table() -> list[str]:
+    """Return the stored acceptance tests of the shipped policies."""
+    header, rows = [], []
+    for stored in map(read_acceptance, sorted((DATA / "acceptance").glob("*.json"))):
+        header, *losses = acceptance_rows(stored)
+        sensors = ", ".join(stored.sensors or ()) or "neither"
+        rows += [(f"`{stored.policy}`", sensors, f"{stored.episodes} x {stored.seeds}", *loss) for loss in losses]
+    return _table(("policy", "robot has", "episodes", *header), rows)
+
+
+def blind_test_table(path: Path = ANSWERS) -> list[str]:
+    """Return the score of stored answers of the blind test; its data are not needed."""
+    answers = read_answers(path)
     first = min(int(name.removeprefix("set_")) for name in answers)
     runs = tuple(range(8)) if first < FIRST_SCORED_SEED else ()  # before, all sets had eight runs
     with tempfile.TemporaryDirectory() as folder:
         plan = Plan(Path(folder), sets=len(answers), first_seed=first, runs=runs)
-        return markdown(run_blind_test(plan, "no_module:nothing_is_analysed", lambda _: None, ANSWERS)).splitlines()
+        return markdown(run_blind_test(plan, "no_module:nothing_is_analysed", lambda _: None, path)).splitlines()
 
 
 def adapt_table() -> list[str]:
     """Return the cases of ``wlr bench adapt`` that were run."""
-    return markdown_of_cases(read_lines(ROOT / "docs" / "data" / "adapt.jsonl")).strip().splitlines()
+    return markdown_of_cases(read_lines(DATA / "adapt.jsonl")).strip().splitlines()
 
 
 def keyword_table() -> list[str]:
@@ -272,9 +293,22 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "adapt": adapt_table,
     "scripts": script_table,
     "blind_test": blind_test_table,
+    "next_blind_test": partial(blind_test_table, DATA / "gap_answers_new.json"),
+    "acceptance": acceptance_table,
+    "limits": limit_table,
 }
 
 
+def table_files() -> dict[str, str]:
+    """Return the text of every file of docs/tables."""
+    note = "*Made by `python .ci/docs/tables.py --write`.*"
+    return {f"{name}.md": "\n".join([note, "", *lines()]) + "\n" for name, lines in TABLES.items()}
+
+
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        print("\n".join(TABLES[name]()), end="\n\n")
+    if sys.argv[1:] == ["--write"]:
+        for file, text in table_files().items():
+            (FOLDER / file).write_text(text, encoding="utf-8")
+    else:
+        for name in sys.argv[1:]:
+            print("\n".join(TABLES[name]()), end="\n\n")

@@ -12,7 +12,7 @@ from wlr_gym.cli import COMMANDS, NESTED, parse
 
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]+)?\)")
 #: Pages that exist on the documentation site only (.ci/docs/pages.py).
-MADE = ("commands.md", "api.md", "notebooks/first_policy.md", "notebooks/hidden_effect.md")
+MADE = ("commands.md", "api.md")
 
 
 def commands(block: Block) -> list[str]:

@@ -26,7 +26,7 @@ def test_the_page_makes_what_it_says(workplace):
     for simulator in ("on_engine", "on_mujoco"):
         hot = _parameters(names[simulator], "servo.stall_torque")
         np.testing.assert_allclose(hot / nominal, [1, 1, 1, 1, 0.6, 0.6, 1, 1])
-    with_xm430 = gym.make("WLR-Velocity-v0", robot="my_robot.yaml", randomization="none")
+    with_xm430 = gym.make("WLR-Velocity-v0", robot="my_servos.yaml", randomization="none")
     np.testing.assert_allclose(_parameters(with_xm430, "servo.stall_torque"), [4.1] * 4 + [1.5] * 4)
     assert names["travelled"] == pytest.approx(1.0 * 3.0 * 0.034, rel=1e-6)
     assert (workplace / "out" / "calm" / "policy").is_dir()
@@ -42,6 +42,6 @@ def test_each_addition_is_one_file():
         "spin.yaml",
         "my_task.py",
         "my_effect.py",
-        "my_robot.yaml",
+        "my_servos.yaml",
         "my_plant.py",
     ]

@@ -1,9 +1,9 @@
-"""The numbers in docs/gap_benchmark.md are those of docs/data/gap_answers.json."""
+"""The answers in docs/data/gap_answers.json are about data that their seeds make; test_docs_tables.py: their score."""
 
 from __future__ import annotations
 
 import pytest
-from blocks import ROOT, site_script
+from blocks import ROOT
 
 from wlr_gym.studies.bench.blind.cases import case
 from wlr_gym.studies.bench.gap import make_data, read_answers
@@ -17,13 +17,6 @@ MADE_AGAIN = 4
 
 def first_seed(answers):
     return min(int(name.removeprefix("set_")) for name in answers)
-
-
-def test_the_page_shows_numbers_of_the_score():
-    page = (ROOT / "docs" / "gap_benchmark.md").read_text(encoding="utf-8").partition("\n## Result")[2]
-    shown = [line for line in page.splitlines() if line.startswith("| ")]
-    assert len(shown) > 10
-    assert set(shown) <= set(site_script("tables").blind_test_table())
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The tables that the site makes (.ci/docs/tables.py): each has its place, and commands print what they say."""
+"""The tables that are made (.ci/docs/tables.py): each has its place and its file, and commands print what they say."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import re
 from collections import Counter
 
 import pytest
-from blocks import PAGES, site_script
+from blocks import PAGES, ROOT, site_script
 
 from wlr_gym.cli import main
 from wlr_gym.envs.registry import ENVIRONMENTS
 
 tables, pages = site_script("tables"), site_script("pages")
-TEXTS = {page.stem: page.read_text(encoding="utf-8") for page in PAGES}
 
 
 def words(text: str) -> str:
@@ -28,8 +27,12 @@ def rows(name: str) -> list[list[str]]:
 
 
 def test_every_table_has_its_place():
-    found = Counter(name for text in TEXTS.values() for name in pages.TABLE.findall(text))
+    found = Counter(name for page in PAGES for name in pages.TABLE.findall(page.read_text(encoding="utf-8")))
     assert found == dict.fromkeys(tables.TABLES, 1)
+
+
+def test_the_files_are_those_that_the_script_writes():
+    assert {path.name: path.read_text(encoding="utf-8") for path in tables.FOLDER.iterdir()} == tables.table_files()
 
 
 @pytest.mark.parametrize("name", tables.TABLES)
@@ -39,7 +42,15 @@ def test_the_site_has_whole_rows(name):
     for block in "\n".join(tables.TABLES[name]()).split("\n\n"):
         inner = [len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines() if line.startswith("|")]
         assert len(set(inner)) <= 1
-    assert tables.TABLES[name]()[0] in pages.on_page_markdown(f"<!-- table: {name} -->")
+    assert tables.TABLES[name]()[0] in pages.on_page_markdown(f"<!-- table: {name} -->\n[Table](tables/{name}.md)")
+
+
+def test_the_page_names_what_the_acceptance_test_refuses():
+    page = (ROOT / "docs" / "evaluation.md").read_text(encoding="utf-8").partition("\n## Acceptance")[2].partition("\n## ")[0]
+    refused = [row for row in rows("acceptance") if row[-1].strip() == "no"]
+    assert refused
+    for policy, _, _, floors, *_, bound, _ in refused:
+        assert all(word in page for word in (policy.strip(), f"`{floors.strip()}`", bound.strip())), policy
 
 
 def test_wlr_effects_prints_the_library(capsys, monkeypatch):
