@@ -64,16 +64,18 @@ def drawn(family, name):
 # ---- what the result states ----
 
 
-def test_effects_and_calibration_are_drawn_within_their_intervals(tmp_path):
+def test_effects_and_calibration_are_drawn_within_their_intervals_and_trained_in_half_of_them(tmp_path):
     found = uncertainty.uncertainty_of(result([delay(0.03, 0.002)]), Patch(), "slippery", ROBOT, tmp_path)
-    late, mu = drawn(found.training, "command.delay[leg_lf]"), drawn(found.training, "ground.mu_x")
-    tolerance = drawn(found.training, "command.delay[leg_rf]")
-    assert (late - tolerance).mean() == pytest.approx(0.03, abs=2e-4)
-    assert (late - tolerance).std() == pytest.approx(0.004 / 3.92, rel=0.1)
-    assert mu.mean() == pytest.approx(0.5, abs=2e-3)
-    assert mu.std() == pytest.approx(0.04 / 3.92, rel=0.1)
+    floors = next(one for one in found.families if one.name == "other floors")
+    for family, share in ((found.training, 0.5), (found.families[0], 1.0), (floors, 1.0)):
+        late, mu = drawn(family, "command.delay[leg_lf]"), drawn(family, "ground.mu_x")
+        tolerance = drawn(family, "command.delay[leg_rf]")
+        assert (late - tolerance).mean() == pytest.approx(0.03, abs=2e-4)
+        assert (late - tolerance).std() == pytest.approx(share * 0.004 / 3.92, rel=0.1)
+        assert mu.mean() == pytest.approx(0.5, abs=2e-3)
+        assert mu.std() == pytest.approx(share * 0.04 / 3.92, rel=0.1)
     kept = load_randomization(str(tmp_path / "randomization.yaml"), ROBOT)
-    assert (kept.parameters(SEEDS, SEEDS).values == drawn_all(found.training)).all()
+    assert (kept.parameters(SEEDS, SEEDS).values == drawn_all(floors)).all()
     assert "patch.mu[patch_1]" in kept.elements  # of the task's own floors
 
 

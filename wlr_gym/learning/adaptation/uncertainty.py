@@ -22,6 +22,8 @@ LEAST_PROBABILITY = 0.05
 OWN_FLOOR = "nominal"
 #: Family in which the adapted policy must be better.
 STATED = "as stated"
+#: Share of the intervals that is trained in: with all of it, policies suit every robot in it and none well. The test covers all.
+TRAINED_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Uncertainty:
 
     Attributes:
         patch: effects that were found, formulas included.
-        training: what is trained with: the result over the task's own randomisation.
+        training: what is trained with: the result, its intervals narrowed, over the task's own randomisation.
         families: what is tested over: ``as stated`` first.
         said: what was taken of the result, and what was not.
     """
@@ -73,17 +75,18 @@ def uncertainty_of(result: Result, found: Patch, base: str | Mapping[str, Any], 
     effects = [dict(one.content()) for one in found.effects if one.name == UNKNOWN_EFFECT]
     maker = _Maker(result, robot, folder)
     base = _named_base(base, folder)
-    training = Family("training", maker.make("training", base, named), effects)
+    training = Family("training", maker.make("training", base, named, TRAINED_SHARE), effects)
     families = [Family(STATED, maker.make(STATED, OWN_FLOOR, named), effects)]
     for end, name in enumerate(("lower ends", "upper ends")):
         if named and any(one.ci95 for entry in named for one in entry.parameters.values()):
             families.append(Family(name, maker.make(name, OWN_FLOOR, [_at_end(one, end) for one in named]), effects))
-    families.append(Family("other floors", maker.make("other floors", base, named), effects))
+    floors = Family("other floors", maker.make("other floors", base, named), effects)
+    families.append(floors)
     for one in _others(result, named):
         title = "nothing missing" if one.name == NOTHING else f"or {plain(one.name)}"
         families.append(Family(title, maker.make(title, OWN_FLOOR, [_entry(effect) for effect in one.effects])))
     save_patch(found, folder / "patch.yaml")
-    write_yaml(folder / "randomization.yaml", dict(training.randomization))
+    write_yaml(folder / "randomization.yaml", dict(floors.randomization))
     return Uncertainty(found, training, tuple(families), _said(result, named, effects))
 
 
@@ -107,13 +110,25 @@ class _Maker:
     def __init__(self, result: Result, robot: Robot, folder: Path) -> None:
         self._content, self._robot, self._folder = result.model_dump(mode="json"), robot, folder
 
-    def make(self, name: str, base: str, entries: Sequence[EffectEntry]) -> dict[str, Any]:
+    def make(self, name: str, base: str, entries: Sequence[EffectEntry], share: float = 1.0) -> dict[str, Any]:
+        """Make one; ``share``: of every interval."""
         effects = [one.model_dump(mode="json") for one in entries]
-        content = {**self._content, "verdict": "effect_found" if effects else "nothing_missing", "effects": effects}
+        for one in effects:
+            one["parameters"] = {key: _narrowed(number, "value", share) for key, number in one["parameters"].items()}
+        calibration = {key: _narrowed(number, "fitted", share) for key, number in self._content["calibration"].items()}
+        verdict = "effect_found" if effects else "nothing_missing"
+        content = {**self._content, "verdict": verdict, "effects": effects, "calibration": calibration}
         path = self._folder / f"{name.replace(' ', '_')}.json"
         write_json(path, content)
         source = {"name": name, "base": base, "result": str(path.resolve())}
         return load_randomization(source, self._robot).config.model_dump(mode="json", exclude_none=True)
+
+
+def _narrowed(number: Mapping[str, Any], key: str, share: float) -> dict[str, Any]:
+    """An estimate, its value under ``key``, with a share of its interval."""
+    interval = number.get("ci95")
+    ends = None if interval is None else [number[key] + share * (end - number[key]) for end in interval]
+    return {**number, "ci95": ends}
 
 
 def _named_base(base: str | Mapping[str, Any], folder: Path) -> str:
