@@ -22,7 +22,7 @@ LEAST_PROBABILITY = 0.05
 OWN_FLOOR = "nominal"
 #: Family in which the adapted policy must be better.
 STATED = "as stated"
-#: Share of the intervals that is trained in: with all of it, policies suit every robot in it and none well. The test covers all.
+#: Share of the intervals that is trained in: over all of it, policies suit every robot and none well. The test covers all.
 TRAINED_SHARE = 0.5
 
 
