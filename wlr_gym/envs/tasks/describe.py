@@ -109,7 +109,8 @@ def limits_text(config: TaskConfig, measure: str) -> str:
     """Return ``rms at most 0.02 m/s`` for a measure that success depends on."""
     bounds = config.success.get(measure)
     limits = {} if bounds is None else limits_within(bounds)
-    return ", ".join(f"{kind} at most {limit:g} {MEASURES[measure].unit}" for kind, limit in limits.items()) or "-"
+    unit = "" if MEASURES[measure].unit == "-" else f" {MEASURES[measure].unit}"
+    return ", ".join(f"{kind} at most {limit:g}{unit}" for kind, limit in limits.items()) or "-"
 
 
 _ACTION = ("joints", "index", "setpoint", "unit", "range", "centre", "scale")
