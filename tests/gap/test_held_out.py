@@ -162,7 +162,7 @@ def test_traces_show_held_out_runs_where_the_gap_is():
         assert np.std(trace.measured - trace.calibrated) > 1.2 * NOISE[c]
 
 
-@pytest.mark.parametrize(("before", "after", "refuted"), [(1.0, 1.1, True), (1.1, 1.0, False)])
+@pytest.mark.parametrize(("before", "after", "refuted"), [(1.0, 1.1, True), (1.0, 1.01, False), (1.1, 1.0, False)])
 def test_effect_with_which_the_held_out_error_grows_must_gain_as_much_as_one_must_to_be_selected(before, after, refuted):
     """Channels that hardly err may gain likelihood while the error of all together grows."""
     problem, rng = Toy({}, []), np.random.default_rng(0)

@@ -27,7 +27,7 @@ from wlr_gym.gap.selection.hypothesis import INSISTENT, Hypothesis
 from wlr_gym.gap.selection.refit import refit
 from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
 from wlr_gym.gap.selection.search import MOST_EFFECTS, PER_NAME, SHORTLIST, remove_redundant, search_effects, shortlist
-from wlr_gym.gap.workflow import analyse_problem, evidence_of
+from wlr_gym.gap.workflow import REFUTED, analyse_problem, evidence_of
 
 RUNS = range(5)
 
@@ -481,18 +481,42 @@ def test_effect_that_the_held_out_runs_refute_is_reported_and_not_selected(every
     assert (analysis.gap.heldout_after == analysis.gap.heldout_calibrated) is not everywhere
 
 
-@pytest.mark.parametrize(("right", "wrong"), [(1.5, 0.6), (0.6, 1.5)])
+@pytest.mark.parametrize(("right", "wrong"), [(1.5, 0.6), (0.6, 1.5), (0.2, 1.5)])
 def test_held_out_runs_refute_one_effect_and_not_the_one_beside_it(right, wrong):
+    """What is left is that of a search without the refuted one: gain, confidence, and what further runs are for."""
     both = [sized("drag", right, "right"), sized("decoy_1", wrong)]
     problem, truth = (Toy({}, effects, rows=400, runs=6) for effects in (both, both[:1]))
     problem._measured[4:] = truth._measured[4:]
     analysis = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
-    assert [effect.name for effect in analysis.effects] == ["drag"]
-    assert analysis.effects[0].parameters["size"].value == pytest.approx(right, rel=0.2)
-    outcomes = {one.name: one.outcome for one in analysis.evidence if one.outcome in ("selected", "fails cross-validation")}
-    assert outcomes == {"drag": "selected", "decoy_1": "fails cross-validation"}
+    refuted = [one for one in analysis.evidence if one.outcome == "fails cross-validation"]
+    assert [(one.name, one.reason) for one in refuted] == [("decoy_1", REFUTED)]
+    if right < 0.5:  # too little on its own
+        assert (analysis.verdict, analysis.effects) == (NOT_EXCITED, ())
+        return
+    (found,) = analysis.effects
+    assert found.name == "drag"
+    assert found.parameters["size"].value == pytest.approx(right, rel=0.3)
+    first = next(one for one in analysis.evidence if one.outcome == "selected")
+    assert first.round == 1  # it wins on its own, with the other in what is left
+    assert found.gain == pytest.approx(first.gain)
     assert analysis.gap is not None
     assert analysis.gap.heldout_after < analysis.gap.heldout_calibrated
+
+
+def test_an_effect_that_is_refuted_after_it_made_an_earlier_one_redundant_leaves_a_verdict_that_says_so(monkeypatch):
+    problem = Toy({}, [sized("decoy_1", 1.5), sized("drag", 0.8, "right")], rows=400, runs=6)
+    problem._measured[4:] = Toy({}, [], rows=400, runs=6)._measured[4:]
+
+    def only_the_last(problem, runs, current, tell):
+        while len(current.model.effects) > 1:
+            current = fit(problem, runs, current.model.without_effect(0), scatter=current.noise.scatter)
+        return current
+
+    monkeypatch.setattr(search, "remove_redundant", only_the_last)
+    analysis = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
+    assert analysis.verdict == NOT_EXCITED
+    assert {one.name for one in analysis.evidence if one.outcome == "fails cross-validation"} <= {"drag", "decoy_1"}
+    assert any(one.reason == REFUTED for one in analysis.evidence)
 
 
 def test_better_model_found_while_converging_is_calibrated_from(monkeypatch):

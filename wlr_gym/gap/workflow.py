@@ -69,6 +69,8 @@ Tell = Callable[[str, float], None]
 STAGES = {"reading": 0.0, "choosing runs": 0.02, "calibrating": 0.1, "naming": 0.35, "proving": 0.85, "drawing": 0.97}
 #: Scatter of the runs, over what their rows predict, that is assumed until a fit has estimated it.
 SCATTER = 5.0
+#: Reason why an effect that was selected is not kept.
+REFUTED = "the held-out runs refute it"
 #: Reason why a candidate is rejected at screening: calibration reproduces its response.
 CONFOUNDED = "confounded with calibrated parameters"
 #: Sums of several threads round otherwise, and a fit may end elsewhere.
@@ -167,10 +169,14 @@ def analyse_problem(
     clock.start("calibrating")
     base = calibrated_fit(problem, fitted, columns, clock.detail)
     clock.start("naming")
-    search = search_effects(problem, fitted, base, clock.detail, columns)
+    start = base
+
+    def find(excluded: Container[str] = ()) -> SearchResult:
+        return search_effects(problem, fitted, start, clock.detail, columns, excluded)
+
+    search = confirmed(problem, fitted, held_out, find(), find)
     base = search.calibrated
     clock.start("proving")
-    search = confirmed(problem, fitted, held_out, search)
     models = (nominal_model(problem), base.model, search.fit.model)
     floor = noise_floor(problem, search.fit.model.setting, held_out)
     gap, run_gaps, channel_gaps = compare_models(problem, fitted, held_out, models, floor)
@@ -204,7 +210,8 @@ def analyse_problem(
         calibration=_calibration(problem, search.fit),
         evidence=tuple(
             entry for number, look in enumerate(search.rounds, 1) for entry in evidence_of(problem, number, look, fitted, kept)
-        ),
+        )
+        + tuple(_fitted_evidence(problem, 1, one, (FAILS_CROSS_VALIDATION, REFUTED), fitted) for one in search.refuted),
         thresholds=tuple(
             Threshold(k, look.threshold, chance(look.by_chance), look.probabilities[1])
             for k, look in enumerate(search.rounds, 1)
@@ -270,7 +277,7 @@ def _verdict(search: SearchResult, effects: Sequence[FoundEffect]) -> str:
     if effects:
         return UNKNOWN if all(effect.name == UNKNOWN for effect in effects) else EFFECT_FOUND
     last = search.rounds[-1]
-    if any(shown_by_some_runs_only(h, last.threshold) for h in last.hypotheses):
+    if search.refuted or any(shown_by_some_runs_only(h, last.threshold) for h in last.hypotheses):
         return NOT_EXCITED
     scores = last.scores
     visible = {score.candidate.name: False for score in scores}
@@ -346,20 +353,8 @@ def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int
     """
     equal, (shares, _) = {h.candidate.label for h in look.equivalents}, look.probabilities
     entries = [
-        Evidence(
-            number,
-            h.candidate.name,
-            h.candidate.where,
-            h.candidate.effect(h.values).parameters,
-            h.gain,
-            h.predicted_gain,
-            *_outcome(h, look, equal, kept),
-            {problem.runs[k]: float(gain) for k, gain in zip(fitted, h.by_run, strict=True)},
-            share,
-            h.candidate.formula,
-            h.candidate.units,
-        )
-        for h, share in zip(look.hypotheses, shares, strict=True)
+        _fitted_evidence(problem, number, one, _outcome(one, look, equal, kept), fitted, share)
+        for one, share in zip(look.hypotheses, shares, strict=True)
     ]
     seen = {entry.name for entry in entries}
     for score in look.scores:
@@ -374,16 +369,36 @@ def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int
     return entries
 
 
+def _fitted_evidence(
+    problem: Problem, number: int, one: Hypothesis, outcome: tuple[str, str], fitted: Sequence[int], probability: float = 0.0
+) -> Evidence:
+    return Evidence(
+        number,
+        one.candidate.name,
+        one.candidate.where,
+        one.candidate.effect(one.values).parameters,
+        one.gain,
+        one.predicted_gain,
+        *outcome,
+        {problem.runs[k]: float(gain) for k, gain in zip(fitted, one.by_run, strict=True)},
+        probability,
+        one.candidate.formula,
+        one.candidate.units,
+    )
+
+
 def _outcome(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Container[str]) -> tuple[str, str]:
     best = look.selected
-    if best is not None and hypothesis.candidate.label == best.candidate.label and hypothesis.cross_validated:
+    if best is not None and hypothesis.candidate.label == best.candidate.label:
+        if not best.cross_validated:
+            return FAILS_CROSS_VALIDATION, REFUTED
         return (
             (SELECTED, "improves the fit most")
             if best.candidate.label in kept
             else (REMOVED, "redundant beside effects selected later")
         )
     if hypothesis.candidate.label in equal and best is not None:
-        return EQUIVALENT, f"improves the fit by {hypothesis.gain / best.gain:.0%} of what the selected effect does"
+        return EQUIVALENT, f"improves the fit by {hypothesis.gain / best.gain:.0%} of what the best does"
     if hypothesis.at_bound:
         return "implausible", "needs a value outside its plausible range"
     if hypothesis.tolerable:
@@ -395,4 +410,4 @@ def _outcome(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Contain
     if best is None:
         least = least_gain(len(hypothesis.values), look.threshold)
         return TOO_LITTLE, f"improves the fit by less than chance and an imperfect simulator can ({least:.0f})"
-    return WORSE_FIT, f"improves the fit by {max(hypothesis.gain, 0.0) / best.gain:.0%} of what the selected effect does"
+    return WORSE_FIT, f"improves the fit by {max(hypothesis.gain, 0.0) / best.gain:.0%} of what the best does"

@@ -7,7 +7,7 @@ its value lies inside its plausible range. Effects that become redundant beside 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -77,13 +77,14 @@ class SearchResult:
     """Outcome: the calibrated model without effects, the final fit, and every round.
 
     ``swaps`` holds, per effect of a model of several, that effect and its rivals with the other effects kept (thorough
-    problems only).
+    problems only); ``refuted``: what an earlier search selected and held-out runs refuted.
     """
 
     calibrated: Fit
     fit: Fit
     rounds: list[Round]
     swaps: dict[str, tuple[Hypothesis, list[Hypothesis]]]
+    refuted: Sequence[Hypothesis] = ()
 
 
 def shortlist(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> list[Score]:
@@ -128,10 +129,16 @@ class Screened:
     products: Products
 
 
-def screened(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = lambda text: None) -> Screened:
-    """Score all candidates beyond a fitted model."""
+def screened(
+    problem: Problem,
+    runs: Sequence[int],
+    current: Fit,
+    tell: Tell = lambda text: None,
+    excluded: Container[str] = (),
+) -> Screened:
+    """Score all candidates beyond a fitted model, but those with ``excluded`` labels."""
     probes, candidates = problem.candidates(current.model.setting, current.residuals, runs)
-    candidates = [candidate for candidate in candidates if not _is_explained(current.model, candidate)]
+    candidates = [one for one in candidates if one.label not in excluded and not _is_explained(current.model, one)]
     tell(f"screening {len(candidates)} candidates")
     found = responses(problem, current, runs, probes)
     products = Products.of(current, found, problem.threads)
@@ -145,6 +152,7 @@ def search_effects(
     start: Fit,
     tell: Tell = lambda text: None,
     given: Sequence[NDArray[np.float32]] | None = None,
+    excluded: Container[str] = (),
 ) -> SearchResult:
     """Search for missing effects.
 
@@ -154,13 +162,14 @@ def search_effects(
         start: the calibrated model.
         tell: called with progress.
         given: columns of ``start`` without its calibration, where they are known: one (numbers, rows x channels) array per run.
+        excluded: labels of candidates that are not tried.
     """
     if given is None and not problem.thorough:
         given = linearise(problem, untouched(problem, start.model), runs)[1]
     current, calibrated, rounds, again = start, start, [], None
     models = [start.model]
     while True:
-        first = screened(problem, runs, current, tell)
+        first = screened(problem, runs, current, tell, excluded)
         scores, alone, found, products = first.scores, first.alone, first.found, first.products
         by_chance = np.zeros(0) if problem.thorough else largest_by_chance(problem, runs, current, found, products, scores)
         threshold = acceptance_threshold(current.cost, by_chance)

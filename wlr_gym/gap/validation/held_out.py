@@ -10,55 +10,81 @@ fitted model itself made, with the same sensors (:func:`noise_floor`).
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
-from wlr_gym.gap.estimation.fit import Fit, widened
 from wlr_gym.gap.estimation.model import FittedModel
 from wlr_gym.gap.estimation.uncertainty import two_sided_95
 from wlr_gym.gap.problem import Problem, Setting
 from wlr_gym.gap.selection.cross_validation import improvement
+from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.screening import LEAST_GAIN
-from wlr_gym.gap.selection.search import Round, SearchResult, without_each
+from wlr_gym.gap.selection.search import SearchResult, without_each
 from wlr_gym.gap.validation.worse import worse_channels
 
 Array = NDArray[np.float64]
 
 #: Held-out runs that an interval of their mean needs.
 LEAST_FOR_INTERVAL = 3
+#: Share by which the error of held-out runs must grow to count against an effect.
+LEAST_GROWTH = 0.02
 #: Distance from the noise floor below which nothing is left to be removed.
 LEAST_ROOM = 1e-9
 
 
-def confirmed(problem: Problem, fitted: Sequence[int], held_out: Sequence[int], search: SearchResult) -> SearchResult:
-    """The search without the effects that runs which no fit has used refute.
+def confirmed(
+    problem: Problem,
+    fitted: Sequence[int],
+    held_out: Sequence[int],
+    search: SearchResult,
+    again: Callable[[Container[str]], SearchResult],
+) -> SearchResult:
+    """The search, none of whose effects runs refute that no fit has used.
 
-    Each is judged beside the others. What is refuted most goes first: a wrong effect may spoil what a right one gains.
+    Each effect is judged beside the others. Where one of several is refuted, ``again`` searches without it: a wrong effect
+    changes what others seem to gain. A single one is left out; to try names until one passes would wear the test out.
+
+    Args:
+        problem, fitted, held_out: the system and its runs.
+        search: what has been found.
+        again: the whole search without effects of these labels.
     """
-    current, refuted = search.fit, set[str]()
-    while current.model.effects:
-        alone = len(current.model.effects) == 1
-        trials = [search.calibrated] if alone else without_each(problem, fitted, current)
-        found = problem.residuals([one.model.setting for one in (*trials, current)], held_out)
-        tau = current.noise.autocorrelation_time
-        beyond = [_beyond_need(problem, [r[[k, -1]] for r in found], tau) for k in range(len(trials))]
-        least = int(np.argmin(beyond))
-        if beyond[least] >= 0.0:
-            break
-        refuted.add(current.model.effects[least][0].label)
-        current = trials[least] if alone else widened(problem, fitted, trials[least])
-    return search if current is search.fit else _withdrawn(search, current, refuted)
+    refuted: list[Hypothesis] = []
+    while (worst := _refuted(problem, fitted, held_out, search)) is not None:
+        label = search.fit.model.effects[worst][0].label
+        number = next(k for k, look in enumerate(search.rounds) if look.selected and look.selected.candidate.label == label)
+        look = search.rounds[number]
+        assert look.selected is not None
+        seen = replace(look.selected, cross_validated=False)
+        if len(search.fit.model.effects) == 1:
+            known = [seen if one is look.selected else one for one in look.hypotheses]
+            rounds = [*search.rounds[:number], replace(look, hypotheses=known, selected=seen)]
+            return SearchResult(search.calibrated, search.calibrated, rounds, {}, refuted)
+        refuted.append(seen)
+        search = again({one.candidate.label for one in refuted})
+    return replace(search, refuted=refuted)
+
+
+def _refuted(problem: Problem, fitted: Sequence[int], held_out: Sequence[int], search: SearchResult) -> int | None:
+    """Which effect the held-out runs refute most; None: none of them."""
+    effects, tau = search.fit.model.effects, search.fit.noise.autocorrelation_time
+    if not effects:
+        return None
+    without = [search.calibrated] if len(effects) == 1 else without_each(problem, fitted, search.fit)
+    found = problem.residuals([one.model.setting for one in (*without, search.fit)], held_out)
+    beyond = [_beyond_need(problem, [r[[k, -1]] for r in found], tau) for k in range(len(without))]
+    return int(np.argmin(beyond)) if min(beyond) < 0.0 else None
 
 
 def _beyond_need(problem: Problem, found: Sequence[Array], autocorrelation_time: Array) -> float:
     """How much more the held-out runs gain by an effect, in minus two log likelihood, than they must.
 
     By chance they may lose, but not as much as an effect must gain to be selected (:data:`LEAST_GAIN`). Where their error
-    grows, they must gain as much.
+    clearly grows, they must gain as much.
 
     Args:
         problem: the system.
@@ -66,21 +92,8 @@ def _beyond_need(problem: Problem, found: Sequence[Array], autocorrelation_time:
         autocorrelation_time: of the model with it.
     """
     before, after = (level(mean_squares([r[k] for r in found], problem.cap)) for k in (0, 1))
-    return improvement(found, autocorrelation_time) - (LEAST_GAIN if after > before else -LEAST_GAIN)
-
-
-def _withdrawn(search: SearchResult, left: Fit, refuted: Container[str]) -> SearchResult:
-    """The search that ends with what is left; what was refuted counts as failing cross-validation."""
-    rounds = [_without_refuted(look, refuted) for look in search.rounds]
-    swaps = {label: rivals for label, rivals in search.swaps.items() if label not in refuted}
-    return SearchResult(search.calibrated, left, rounds if left.model.effects else rounds[:1], swaps)
-
-
-def _without_refuted(look: Round, refuted: Container[str]) -> Round:
-    if look.selected is None or look.selected.candidate.label not in refuted:
-        return look
-    seen = replace(look.selected, cross_validated=False)
-    return replace(look, hypotheses=[seen if one is look.selected else one for one in look.hypotheses], selected=seen)
+    grows = after > (1.0 + LEAST_GROWTH) * before
+    return improvement(found, autocorrelation_time) - (LEAST_GAIN if grows else -LEAST_GAIN)
 
 
 def mean_squares(residuals: Sequence[Array], cap: float) -> Array:
