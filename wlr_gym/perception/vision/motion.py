@@ -47,8 +47,9 @@ _GYRO_WANDER = 1e-5
 #: Squared normalised innovation beyond which an IMU reading counts for less.
 _GATE = 36.0
 _STEP = 1e-5  # of derivatives
-#: s between two frames beyond which the IMU is not used.
-_LONGEST_GAP = 0.5
+#: Where poses follow each other by more than this many frames, the film does not tell how the body moves: it may then gain a
+#: rate (m/s, rad/s) of this size in a second.
+_GAP, _GAINED = 3.0, np.array([1.0, 1.0, 0.05, 1.5, 0.03, 0.03])
 _PITCH_RATE = 1  # place of the gyroscope's y
 #: Deviations from its neighbours (m, rad) from which on a pose can be an outlier.
 _JUMP = (0.01, 0.01, 0.01, 0.03, 0.05, 0.05)
@@ -123,7 +124,7 @@ def smooth_motion(
     kept = np.isfinite(poses[:, 0]) & ~outliers
     inside = np.zeros(0, np.int64)
     if imu is not None:
-        inside = np.flatnonzero(_between_frames(imu.time, time[kept]))
+        inside = np.flatnonzero((imu.time > time[kept][0]) & (imu.time < time[kept][-1]))
     moments = np.concatenate([time[kept], rows, imu.time[inside] if imu is not None else rows[:0]])
     order = np.argsort(moments, kind="stable")
     moments = moments[order]
@@ -146,7 +147,9 @@ def smooth_motion(
     spread = np.zeros(_SIZE)
     for part, std in _PRIOR:
         spread[part] = std**2
-    density = np.array([signal.density for signal in near])
+    density = np.tile([signal.density for signal in near], (len(moments), 1))
+    unseen = _in_gap(moments, time[kept])
+    density[unseen] = np.maximum(density[unseen], 3 * _GAINED**2)
     states, covariance = _smoothed(
         moments, shown, density, wander, slipping_since, last_row, seen.count, seen.design, seen.values, seen.noise, seen.gate,
         at[0], np.diag(spread),
@@ -162,12 +165,11 @@ def smooth_motion(
     )
 
 
-def _between_frames(time: Array, frames: Array) -> NDArray[np.bool_]:
-    """Which times lie between two frames that follow closely: where none does, the motion's density is not known."""
-    after = np.searchsorted(frames, time)
-    inside = (after > 0) & (after < len(frames))
-    inside[inside] = (frames[after[inside]] - frames[after[inside] - 1]) < _LONGEST_GAP
-    return inside
+def _in_gap(time: Array, frames: Array) -> NDArray[np.bool_]:
+    """Which times lie in a gap of the frames with a pose, or end it."""
+    steps = np.diff(frames)
+    before = np.clip(np.searchsorted(frames, time) - 1, 0, len(steps) - 1)
+    return steps[before] > _GAP * np.median(steps)
 
 
 def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> list[Smoothed]:
@@ -305,7 +307,7 @@ def _smoothed(
     x, p, k = start.copy(), spread.copy(), 0
     for i in range(total):
         if i > 0:
-            _transition(time[i] - time[i - 1], density, wander[i], slope[row[i - 1]], matrix, unsteady)
+            _transition(time[i] - time[i - 1], density[i], wander[i], slope[row[i - 1]], matrix, unsteady)
             x = matrix @ x
             p = matrix @ p @ matrix.T + unsteady
         if k < shown.shape[0] and shown[k] == i:
@@ -338,7 +340,7 @@ def _smoothed(
             spreads[k] = p - p @ lent @ p
             k -= 1
         if i > 0:
-            _transition(time[i] - time[i - 1], density, wander[i], slope[row[i - 1]], matrix, unsteady)
+            _transition(time[i] - time[i - 1], density[i], wander[i], slope[row[i - 1]], matrix, unsteady)
             gradient = matrix.T @ gradient
             lent = matrix.T @ lent @ matrix
             lent = 0.5 * (lent + lent.T)

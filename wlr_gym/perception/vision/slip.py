@@ -193,8 +193,8 @@ def _contacts(value: Array, rate: Array, joints: tuple[Array, Array], batch: Par
 
 
 def _encoder_variance(angle: Array, robot: Robot, parameters: Parameters) -> Array:
-    """Variance (K, 4, 2) in m2 of how far a contact has rolled (a wheel's count at its rim, a leg's at hip height), and of how far
-    it is ahead of the hip (a leg's count): in a turn, the wheel moves sideways by that much per radian."""
+    """Variance (K, 4, 2) in m2 of a contact's place: along its heading, by the wheel's count at its rim and the leg's at hip
+    height; and sideways per radian of a turn, by the leg's: the contact is that much further ahead of the hip."""
     radius, reach = parameters["wheel.radius"], parameters["leg.length"] * np.sin(angle[:, LEG_SLICE])
     arms = np.stack([radius**2 + (reach + radius) ** 2, reach**2], axis=2)
     return arms * robot.sensors.encoder.position**2 / 12
