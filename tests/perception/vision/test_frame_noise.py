@@ -55,13 +55,14 @@ def test_jitter_of_the_times_is_told_from_noise_and_widens_along_the_motion(driv
     [
         ([3, 3, 0, 6, 3, 0, 0, 0], [3]),
         ([0.3, 0.3, 0.002, 0.6, 0.3], [3]),  # hardly moving
+        ([3, 3, 0.25, 6, 3], [3]),  # compression changes a picture that it repeats
         ([3, 3, 0, 0, 9, 3, 0, 6, 0, 6], [3, 4, 7, 9]),  # twice in a row, and every other one
         ([3, 0, 0, 0, 0, 3, 3], []),  # standing for a while
         ([0.02, 0.01, -0.001, 0.03, -0.02], []),  # standing, with noise
         ([0.6, 0.3, 0.01, -0.3, -0.6], []),  # turning back
         ([0.3, 0.2, 0.08, 0.2, 0.3], []),  # slower for a moment
     ],
-    ids=["fast", "slow", "in a row", "a while", "standing", "turning back", "slower"],
+    ids=["fast", "slow", "compressed", "in a row", "a while", "standing", "turning back", "slower"],
 )
 def test_a_repeated_picture_has_no_pose_unless_the_robot_stands(steps, repeated, drive):
     places = np.cumsum([0, *steps])

@@ -67,6 +67,8 @@ def test_the_wheels_errors_are_correlated_as_the_covariance_says(turn):
     root = np.linalg.cholesky(draws[0].covariance)
     whitened = np.linalg.solve(root, (errors - errors.mean(axis=0)).T)
     assert 0.5 < np.sqrt(np.mean(whitened**2)) < 1.5
+    whole = np.linalg.solve(root, errors.T)  # with what all draws share: the counts of legs and wheels
+    assert 0.5 < np.sqrt(np.mean(whole**2)) < 1.5
     lateral = draws[0].covariance[1::2, 1::2]
     assert np.all(lateral > 0.8 * lateral[0, 0])  # all wheels are off alike
     with_layout = measure_slip(

@@ -282,14 +282,15 @@ def _least_squares(
             step = np.zeros(6)
             step[k] = 1e-6
             _residuals(measured, roots, places, radii, turned(rotation, step[:3]), position + step[3:], moved)
-            jacobian[:, k] = (moved - residual) / 1e-6
+            for i in range(rows):
+                jacobian[i, k] = (moved[i] - residual[i]) / 1e-6
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
         change, improved = np.zeros(6), False
         for _ in range(8):
             damped = normal.copy()
             for k in range(6):
                 damped[k, k] *= 1.0 + damping
-            change = -np.linalg.solve(damped, gradient)
+            change = -np.linalg.inv(damped) @ gradient  # "solve", and assigning to slices, take seconds to compile
             attempt_rotation, attempt_position = turned(rotation, change[:3]), position + change[3:]
             attempt = _residuals(measured, roots, places, radii, attempt_rotation, attempt_position, moved)
             if attempt <= cost:
@@ -299,14 +300,22 @@ def _least_squares(
         if not improved:
             break
         gain = cost - attempt
-        rotation[:], position[:], cost = attempt_rotation, attempt_position, attempt
-        residual[:] = moved
+        cost = attempt
+        for i in range(3):
+            position[i] = attempt_position[i]
+            for j in range(3):
+                rotation[i, j] = attempt_rotation[i, j]
+        for i in range(rows):
+            residual[i] = moved[i]
         damping = max(1e-9, damping / 10.0)
         if gain < 1e-6 * (1.0 + cost):
             break
     if not (math.isfinite(cost) and position[2] > 0.0):
         return False
-    covariance[:] = np.linalg.inv(normal)
+    inverse = np.linalg.inv(normal)
+    for i in range(6):
+        for j in range(6):
+            covariance[i, j] = inverse[i, j]
     for k in range(squares.shape[0]):
         squares[k] = residual[2 * k] ** 2 + residual[2 * k + 1] ** 2
     return True

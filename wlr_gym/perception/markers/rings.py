@@ -86,17 +86,22 @@ def solve5(normal: Any, right: Any) -> bool:
                 total += inverse[k, i] * inverse[k, j]
             normal[i, j] = total
             answer[i] += total * right[j]
-    right[:] = answer
+    for i in range(size):  # assigning to a slice takes seconds to compile
+        right[i] = answer[i]
     return True
+
+
+@njit(cache=True, nogil=True)
+def _middle(values: Any) -> float:
+    """The median of what is known; NaN where too few rays are."""
+    known = values[~np.isnan(values)]
+    return np.median(known) if known.shape[0] >= _MINIMUM_SHARE * RAYS else math.nan
 
 
 @njit(cache=True, nogil=True)
 def _level(values: Any, contrast: float, fitted: Any) -> float:
     """Fit a + harmonics 1 and 2 over the rays to plateau brightness; far-off rays become NaN. Returns the middle level."""
-    known = values[~np.isnan(values)]
-    if known.shape[0] < _MINIMUM_SHARE * RAYS:
-        return math.nan
-    middle = np.median(known)
+    middle = _middle(values)
     for turn in range(2):
         normal, right = np.zeros((5, 5)), np.zeros(5)
         row = np.ones(5)
@@ -155,7 +160,7 @@ def _edges(image: Any, ellipse: Any, radii: Any, edges: Any, contrasts: Any) -> 
                 total += value
             means[j] = total / count
         sign = -1.0 if k == 1 else 1.0
-        contrast = sign * (np.nanmedian(outside) - np.nanmedian(inside))
+        contrast = sign * (_middle(outside) - _middle(inside))
         if not contrast > _MINIMUM_CONTRAST:
             continue
         if math.isnan(_level(inside, contrast, fitted_in)) or math.isnan(_level(outside, contrast, fitted_out)):
@@ -218,9 +223,8 @@ def _change(ellipse: Any, answer: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _to_directions(camera: Any, ellipse: Any) -> Any:
-    """The ellipse in undistorted coordinates, to first order."""
-    result = np.empty(6)
+def _to_directions(camera: Any, ellipse: Any, result: Any) -> None:
+    """Write the ellipse in undistorted coordinates, to first order."""
     x, y = undistort(camera, ellipse[0], ellipse[1])
     result[0], result[1] = x, y
     rx, ry = undistort(camera, ellipse[0] + 1.0, ellipse[1])
@@ -228,7 +232,6 @@ def _to_directions(camera: Any, ellipse: Any) -> Any:
     a, b, c, d = rx - x, dx - x, ry - y, dy - y
     result[2], result[3] = a * ellipse[2] + b * ellipse[4], a * ellipse[3] + b * ellipse[5]
     result[4], result[5] = c * ellipse[2] + d * ellipse[4], c * ellipse[3] + d * ellipse[5]
-    return result
 
 
 @njit(cache=True, nogil=True)
@@ -278,7 +281,7 @@ def fit_marker(
         if turn == 3 or np.abs(answer).max() * scale < 0.02:
             break  # the edges below belong to this ellipse
         _change(ellipse, answer)
-    shape[:] = _to_directions(camera, ellipse)
+    _to_directions(camera, ellipse, shape)
     return _fit_circles(camera, ellipse, radii, edges, contrasts, centres, covariances, shape, quality)
 
 
@@ -338,7 +341,8 @@ def _fit_circles(
         points += used
         rings += 1
         if k == 0:
-            shape[:] = ring
+            for i in range(6):
+                shape[i] = ring[i]
     if rings < 2:  # one circle alone could be anything
         return False
     quality[0], quality[1] = contrast, math.sqrt(squares / points)

@@ -114,7 +114,7 @@ def _aligned(time: Array, poses: Array, run: Run, robot: Robot, parameters: Para
     grid = around + np.arange(-SEARCH, SEARCH + 1e-9, _GRID)
     useful: list[tuple[str, Array, float, float]] = []
     for pair in pairs:
-        project = _without_slow(time, pair.slowest)
+        project = without_slow(time, pair.slowest)
         curve = np.array([_cost(pair, time + offset, project) for offset in grid])
         if pair.name == "yaw" and _contradicts(project(pair.seen), curve):
             raise InputError(
@@ -141,7 +141,7 @@ def _pace(time: Array, poses: Array, run: Run, robot: Robot, parameters: Paramet
         pair = next((p for p in _pairs(moments, poses[inside], run, robot, parameters, around) if p.name == "yaw"), None)
         if pair is None:
             continue
-        project = _without_slow(moments, pair.slowest)
+        project = without_slow(moments, pair.slowest)
         seen = project(pair.seen)
         curve = np.array([_cost(pair, moments + offset, project) for offset in grid])
         if float(seen @ seen) > _TURN**2 * len(seen) and not _contradicts(seen, curve):
@@ -242,7 +242,7 @@ def _residual(pair: _Pair, at: Array, project: Callable[[Array], Array]) -> Arra
     return error
 
 
-def _without_slow(time: Array, slowest: float) -> Callable[[Array], Array]:
+def without_slow(time: Array, slowest: float) -> Callable[[Array], Array]:
     """Return a function that takes everything with a longer period (s) out of a signal sampled at ``time``."""
     phase = (time - time[0]) / max(time[-1] - time[0], 1e-9)
     count = 1 + int(2 * (time[-1] - time[0]) / slowest)
@@ -280,7 +280,7 @@ def _rolling_pair(
     t = run["t"]
     rolled = accumulate(_rolling_speeds(run, joints, rest, parameters), t).T
     pairs = [_Pair(_DISTANCE, driven, _between(t, way), _SLIP, free_scale=True) for way in rolled]
-    project, shifts = _without_slow(time, _SLIP), np.arange(-SEARCH, SEARCH, 4 * _GRID)
+    project, shifts = without_slow(time, _SLIP), np.arange(-SEARCH, SEARCH, 4 * _GRID)
     return min(pairs, key=lambda pair: min(_cost(pair, time + shift, project) for shift in shifts))
 
 

@@ -26,7 +26,7 @@ from wlr_gym.perception.markers.sheet_fault import sheet_fault
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.alignment import Alignment, align, joint_signals
 from wlr_gym.perception.vision.frame_noise import without_repeats
-from wlr_gym.perception.vision.imu_check import imu_differences, wrong_gravity
+from wlr_gym.perception.vision.imu_check import imu_differences, wrong_axes, wrong_gravity
 from wlr_gym.perception.vision.motion import smoothed_poses
 from wlr_gym.perception.vision.self_calibration import UNSURE, SelfCalibration, calibration_findings, self_calibrated
 from wlr_gym.perception.vision.slip import SlipResult, measure_slip
@@ -312,7 +312,12 @@ def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, 
 def _imu_findings(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> Iterator[str]:
     size = wrong_gravity(run)
     if size is not None:
-        yield f"the accelerometer reads {size:.1f} m/s2 (median), expected 9.8: wrong unit or sensor; the IMU is not used"
+        yield f"the accelerometer reads {size:.1f} m/s2 (median), expected 9.8: wrong unit, sign or sensor; the IMU is not used"
+    for channel, shown, time in wrong_axes(samples, offset, run, robot):
+        yield (
+            f"the film shows {shown} where the log has {channel}, most at {time:.2f} s: axes swapped, or a wrong sign; correct "
+            "the log's columns (x ahead, y to the left, z up: +9.8 at rest); the IMU is not used"
+        )
     for difference in imu_differences(samples, offset, run, robot):
         size, axis = f"{1e3 * difference.size:.0f} mrad", difference.axis
         if difference.level:

@@ -25,8 +25,9 @@ _JITTERS = np.array([0.0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 6, 8, 12]) * 1e-3
 _FACTORS = 0.6 * 1.15 ** np.arange(15)
 #: Twice the gain in log likelihood that an error of the times must bring.
 _WORTH = 12.0
-#: px, and share of the steps before and after, that markers move by at most in a picture shown once more; px, of those steps.
-_SAME, _SAME_SHARE, _MOVING = 0.1, 0.2, 0.1
+#: Share of the steps before and after that markers move by at most in a picture shown once more, which compression may still
+#: change; px, of those steps.
+_SAME_SHARE, _MOVING = 0.2, 0.1
 _MOST_REPEATS = 3  # in a row; then the robot stands
 
 
@@ -78,12 +79,12 @@ def without_repeats(samples: Sequence[Sample]) -> Iterator[Sample]:
 
 def _repeats(steps: Sequence[Array], first: int) -> range:
     """Frames that show the picture before once more, where the markers stay from step ``first`` on."""
-    last = first
-    while last < len(steps) and _length(steps[last]) < _SAME:
+    before, last = steps[first - 1], first
+    while last < len(steps) and _length(steps[last]) < _SAME_SHARE * _length(before):
         last += 1
     if not 0 < last - first <= _MOST_REPEATS or last == len(steps):
         return range(0)
-    before, after = steps[first - 1], steps[last]
+    after = steps[last]
     least = float(np.minimum(_length(before), _length(after)))
     if not least > _MOVING or max(_length(step) for step in steps[first:last]) > _SAME_SHARE * least:
         return range(0)

@@ -2,7 +2,7 @@
 
 Turns are compared as angles. Of each axis the gyroscope's constant, drift and scale (to 10 %) are left open; of pitch and roll
 also how the IMU is turned on the body (which shows along the yaw) and how the floor markers' plane is tilted (along its cosine
-and sine).
+and sine). Of the accelerometer, starts and stops tell which of its axes is which.
 """
 
 from __future__ import annotations
@@ -10,12 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.read import Run
+from wlr_gym.perception.vision.alignment import without_slow
+from wlr_gym.perception.vision.motion import smoothed_poses
 from wlr_gym.perception.vision.tracking import Sample
+from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import Robot
 from wlr_gym.robot.slip import accumulate
 
@@ -31,6 +35,9 @@ _TOGETHER = 5  # frames over which a difference is averaged
 _GRAVITY = 9.80665
 #: By which a gyroscope's scale may be off; m/s2 by which the median size of the specific force may differ from gravity.
 _SCALE_ERROR, _SIZE_ERROR = 0.1, 1.0
+#: s; changes of speed with a longer period are the accelerometer's bias, and legs that shake it. How many times better another
+#: axis must explain those that the film shows.
+_SLOW, _BETTER = 1.0, 2.0
 #: Share of the readings that must be there; those between are interpolated for the comparison.
 _SHARE = 0.9
 
@@ -81,7 +88,8 @@ def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: R
 def imu_agrees(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> bool:
     """Whether film and IMU can be compared and do not differ."""
     comparable = bool(_comparable(samples, offset, run, run["t"])) and wrong_gravity(run) is None
-    return comparable and next(imu_differences(samples, offset, run, robot), None) is None
+    found = chain(imu_differences(samples, offset, run, robot), wrong_axes(samples, offset, run, robot))
+    return comparable and next(found, None) is None
 
 
 def _comparable(samples: Sequence[Sample], offset: float, run: Run, t: Array) -> list[Sample]:
@@ -91,10 +99,35 @@ def _comparable(samples: Sequence[Sample], offset: float, run: Run, t: Array) ->
 
 
 def wrong_gravity(run: Run) -> float | None:
-    """The median size (m/s2) of the specific force, where it cannot be that of a robot on the floor; else None."""
+    """The median size (m/s2; below 0 = downwards) of a specific force that cannot be a robot's on the floor; else None."""
     force = _readings(run, "acc")
-    size = _GRAVITY if force is None else float(np.median(np.linalg.norm(force, axis=1)))
+    if force is None:
+        return None
+    size = math.copysign(float(np.median(np.linalg.norm(force, axis=1))), float(np.median(force[:, 2])))
     return None if abs(size - _GRAVITY) <= _SIZE_ERROR else size
+
+
+def wrong_axes(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> Iterator[tuple[str, str, float]]:
+    """Yield each axis of the accelerometer that another one, or its opposite, would explain the film better.
+
+    That is its channel, what the film shows instead (``-acc_x``), and the time (s, servo clock) where they differ most.
+    """
+    t = run["t"] - 1 / (2 * math.pi * robot.sensors.imu.bandwidth)
+    seen, force = _comparable(samples, offset, run, t), _readings(run, "acc")
+    if not seen or force is None:
+        return
+    time = np.array([sample.time for sample in seen]) + offset
+    inside = (t > time[0]) & (t < time[-1])
+    moved = smoothed_poses(seen, time, t[inside])
+    value, change = (np.stack([getattr(signal, name) for signal in moved], axis=1) for name in ("value", "acceleration"))
+    pushed = np.einsum("kji,kj->ki", rotation(*value[:, 3:].T), change[:, :3] + [0.0, 0.0, _GRAVITY])
+    project = without_slow(t[inside], _SLOW)
+    film, x, y = (project(accumulate(v, t[inside])) for v in (pushed, *force[inside, :2].T))
+    for k, channel in enumerate(("acc_x", "acc_y")):
+        rest = {name: film[:, k] - speed for name, speed in (("acc_x", x), ("-acc_x", -x), ("acc_y", y), ("-acc_y", -y))}
+        best = min(rest, key=lambda name: float(np.linalg.norm(rest[name])))
+        if _BETTER * np.linalg.norm(rest[best]) < np.linalg.norm(rest[channel]):
+            yield channel, best, float(t[inside][np.argmax(np.abs(rest[channel]))])
 
 
 def _readings(run: Run, name: str) -> Array | None:

@@ -13,10 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from wlr_gym.data.read import Run
@@ -47,8 +45,9 @@ _GYRO_WANDER = 1e-5
 #: Squared normalised innovation beyond which an IMU reading counts for less.
 _GATE = 36.0
 _STEP = 1e-5  # of derivatives
-#: s between two frames beyond which the IMU is not used.
-_LONGEST_GAP = 0.5
+#: Where poses follow each other by more than this many frames, the film does not tell how the body moves: it may then gain a
+#: rate (m/s, rad/s) of this size in a second.
+_GAP, _GAINED = 3.0, np.array([1.0, 1.0, 0.05, 1.5, 0.03, 0.03])
 _PITCH_RATE = 1  # place of the gyroscope's y
 #: Deviations from its neighbours (m, rad) from which on a pose can be an outlier.
 _JUMP = (0.01, 0.01, 0.01, 0.03, 0.05, 0.05)
@@ -97,15 +96,15 @@ def imu_readings(run: Run, legs: Array, robot: Robot) -> ImuReadings:
         if name in run:
             values[:, k] = run[name]
     step = float(np.median(np.diff(t)))
-    known = constants(robot, step, camera=True)[0]
+    known = constants(robot, step, camera=True).view(np.recarray)[0]
     changed = np.nan_to_num(np.abs(np.diff(values, axis=0, prepend=values[:1])))
     changed[:-1] = np.maximum(changed[:-1], changed[1:])
-    legs = legs[:, None]
-    gyro = rate_noise(known, changed[:, :3])
-    force = known["accel_noise"] ** 2 + shaking(known, changed[:, 3:], legs**2)
+    legs = legs[:, None]  # the formulas uncompiled: once per run
+    gyro = rate_noise.py_func(known, changed[:, :3])
+    force = known["accel_noise"] ** 2 + shaking.py_func(known, changed[:, 3:], legs**2)
     time, variance = t - known["lag"] * step, _DRIVING**2 * np.concatenate([gyro, force], axis=1)
     values[:, _PITCH_RATE] = np.nan
-    return ImuReadings(time, values, variance, leak_noise(known, legs[:, 0] ** 2), float(known["gravity"]))
+    return ImuReadings(time, values, variance, leak_noise.py_func(known, legs[:, 0] ** 2), float(known["gravity"]))
 
 
 def smooth_motion(
@@ -123,7 +122,7 @@ def smooth_motion(
     kept = np.isfinite(poses[:, 0]) & ~outliers
     inside = np.zeros(0, np.int64)
     if imu is not None:
-        inside = np.flatnonzero(_between_frames(imu.time, time[kept]))
+        inside = np.flatnonzero((imu.time > time[kept][0]) & (imu.time < time[kept][-1]))
     moments = np.concatenate([time[kept], rows, imu.time[inside] if imu is not None else rows[:0]])
     order = np.argsort(moments, kind="stable")
     moments = moments[order]
@@ -140,16 +139,17 @@ def smooth_motion(
         seen.add_imu(read, imu, inside, at[read])
         wander[:, _GYRO_BIAS], wander[:, _LEAK] = _GYRO_WANDER**2, np.interp(moments, imu.time, imu.leak_wander)[:, None]
     slope = _derivatives(lambda x: slipping(x[:, _VALUE], x[:, _RATE]).reshape(-1, 8), at[shown], _MOTION.stop)
-    slope = np.ascontiguousarray(slope[:, :, _MOTION])
+    slope = slope[:, :, _MOTION]
     slipping_since = np.concatenate([np.zeros_like(slope[:1]), slope])  # nothing before the first row
     last_row = np.searchsorted(shown, np.arange(len(moments)), side="right")
     spread = np.zeros(_SIZE)
     for part, std in _PRIOR:
         spread[part] = std**2
-    density = np.array([signal.density for signal in near])
+    density = np.tile([signal.density for signal in near], (len(moments), 1))
+    unseen = _in_gap(moments, time[kept])
+    density[unseen] = np.maximum(density[unseen], 3 * _GAINED**2)
     states, covariance = _smoothed(
-        moments, shown, density, wander, slipping_since, last_row, seen.count, seen.design, seen.values, seen.noise, seen.gate,
-        at[0], np.diag(spread),
+        moments, shown, density, wander, slipping_since, last_row, seen, at[0], np.diag(spread)
     )  # fmt: skip
     return SmoothedMotion(
         value=states[:, _VALUE],
@@ -162,12 +162,11 @@ def smooth_motion(
     )
 
 
-def _between_frames(time: Array, frames: Array) -> NDArray[np.bool_]:
-    """Which times lie between two frames that follow closely: where none does, the motion's density is not known."""
-    after = np.searchsorted(frames, time)
-    inside = (after > 0) & (after < len(frames))
-    inside[inside] = (frames[after[inside]] - frames[after[inside] - 1]) < _LONGEST_GAP
-    return inside
+def _in_gap(time: Array, frames: Array) -> NDArray[np.bool_]:
+    """Which times lie in a gap of the frames with a pose, or end it."""
+    steps = np.diff(frames)
+    before = np.clip(np.searchsorted(frames, time) - 1, 0, len(steps) - 1)
+    return steps[before] > _GAP * np.median(steps)
 
 
 def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> list[Smoothed]:
@@ -263,36 +262,30 @@ def _derivatives(function: Callable[[Array], Array], at: Array, columns: int) ->
     return result
 
 
-@njit(cache=True, nogil=True)
-def _transition(step: float, density: Any, wander: Any, slope: Any, matrix: Any, noise: Any) -> None:
-    """Write the change of the state over a step and its noise; slip goes on with the ``slope`` (8, 12) of its velocity."""
-    matrix[:] = np.eye(_SIZE)
-    noise[:] = np.diag(step * wander)
+def _transition(step: float, density: Array, wander: Array, slope: Array) -> tuple[Array, Array]:
+    """The change of the state over a step and its noise; slip goes on with the ``slope`` (8, 12) of its velocity."""
+    matrix, noise = np.eye(_SIZE), np.diag(step * wander)
     of_value, of_rate = slope[:, :6], slope[:, 6:]
-    matrix[_FIRST_SLIP:, :6] = step * of_value
-    matrix[_FIRST_SLIP:, 6:12] = 0.5 * step**2 * of_value + step * of_rate
-    matrix[_FIRST_SLIP:, 12:18] = step**3 / 6 * of_value + 0.5 * step**2 * of_rate
-    for k in range(6):
-        v, r, a = k, 6 + k, 12 + k
-        matrix[v, r] = matrix[r, a] = step
-        matrix[v, a] = 0.5 * step**2
-        noise[v, v] = density[k] * step**5 / 20
-        noise[v, r] = noise[r, v] = density[k] * step**4 / 8
-        noise[v, a] = noise[a, v] = density[k] * step**3 / 6
-        noise[r, r] = density[k] * step**3 / 3
-        noise[r, a] = noise[a, r] = density[k] * step**2 / 2
-        noise[a, a] = density[k] * step
-        moved, apart = of_rate[:, k], np.array([noise[v, v], noise[v, r], noise[v, a]])
-        noise[_FIRST_SLIP:, _FIRST_SLIP:] += noise[v, v] * np.outer(moved, moved)  # what the body is moved by, it slips by
-        noise[_FIRST_SLIP:, k:18:6] = np.outer(moved, apart)
-        noise[k:18:6, _FIRST_SLIP:] = np.outer(apart, moved)
+    matrix[_VALUE, _RATE] = matrix[_RATE, _ACCELERATION] = step * np.eye(6)
+    matrix[_VALUE, _ACCELERATION] = 0.5 * step**2 * np.eye(6)
+    matrix[_SLIP, _VALUE] = step * of_value
+    matrix[_SLIP, _RATE] = 0.5 * step**2 * of_value + step * of_rate
+    matrix[_SLIP, _ACCELERATION] = step**3 / 6 * of_value + 0.5 * step**2 * of_rate
+    apart = np.array([
+        [step**5 / 20, step**4 / 8, step**3 / 6], [step**4 / 8, step**3 / 3, step**2 / 2], [step**3 / 6, step**2 / 2, step]
+    ])  # fmt: skip
+    moved = of_rate * density  # what the body is moved by, it slips by
+    noise[:18, :18] = (apart[:, None, :, None] * np.diag(density)[:, None, :]).reshape(18, 18)
+    noise[_SLIP, _SLIP] += apart[0, 0] * moved @ of_rate.T
+    noise[_SLIP, :18] = (apart[0][:, None] * moved[:, None, :]).reshape(8, 18)
+    noise[:18, _SLIP] = noise[_SLIP, :18].T
+    return matrix, noise
 
 
-@njit(cache=True, nogil=True)
 def _smoothed(
-    time: Any, shown: Any, density: Any, wander: Any, slope: Any, row: Any, count: Any, design: Any, seen: Any, noise: Any,
-    gate: Any, start: Any, spread: Any,
-) -> Any:  # fmt: skip
+    time: Array, shown: NDArray[np.int64], density: Array, wander: Array, slope: Array, row: NDArray[np.int64],
+    measured: _Measurements, start: Array, spread: Array,
+) -> tuple[Array, Array]:  # fmt: skip
     """States and covariances at the moments ``shown``.
 
     Backwards by Bryson and Frazier's equations: what later measurements say is carried as a gradient and its variance, so no
@@ -301,11 +294,11 @@ def _smoothed(
     total = time.shape[0]
     states, spreads = np.empty((shown.shape[0], _SIZE)), np.empty((shown.shape[0], _SIZE, _SIZE))
     gains, weights, errors = np.zeros((total, _SIZE, 6)), np.zeros((total, 6, 6)), np.zeros((total, 6))
-    matrix, unsteady = np.empty((_SIZE, _SIZE)), np.empty((_SIZE, _SIZE))
+    count, design, seen, noise, gate = measured.count, measured.design, measured.values, measured.noise, measured.gate
     x, p, k = start.copy(), spread.copy(), 0
     for i in range(total):
         if i > 0:
-            _transition(time[i] - time[i - 1], density, wander[i], slope[row[i - 1]], matrix, unsteady)
+            matrix, unsteady = _transition(time[i] - time[i - 1], density[i], wander[i], slope[row[i - 1]])
             x = matrix @ x
             p = matrix @ p @ matrix.T + unsteady
         if k < shown.shape[0] and shown[k] == i:
@@ -328,7 +321,7 @@ def _smoothed(
     for i in range(total - 1, -1, -1):
         m = count[i]
         if m > 0:
-            h, gain, weight = design[i, :m], np.ascontiguousarray(gains[i, :, :m]), np.ascontiguousarray(weights[i, :m, :m])
+            h, gain, weight = design[i, :m], gains[i, :, :m], weights[i, :m, :m]
             gradient = gradient - h.T @ (gain.T @ gradient + weight @ errors[i, :m])
             kept = np.eye(_SIZE) - gain @ h
             lent = kept.T @ lent @ kept + h.T @ weight @ h
@@ -338,7 +331,7 @@ def _smoothed(
             spreads[k] = p - p @ lent @ p
             k -= 1
         if i > 0:
-            _transition(time[i] - time[i - 1], density, wander[i], slope[row[i - 1]], matrix, unsteady)
+            matrix, _ = _transition(time[i] - time[i - 1], density[i], wander[i], slope[row[i - 1]])
             gradient = matrix.T @ gradient
             lent = matrix.T @ lent @ matrix
             lent = 0.5 * (lent + lent.T)

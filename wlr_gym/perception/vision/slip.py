@@ -149,9 +149,11 @@ def measure_slip(
     velocity_std = motion.velocity_variance.reshape(velocity.shape) + late**2
     slip_std = np.diagonal(motion.slip_covariance, axis1=1, axis2=2).reshape(slip.shape) + late_slip**2
     covariance = motion.slip_covariance[-1] + np.outer(late_slip[-1], late_slip[-1])
-    velocity_std[:, :, 0] += _ENCODER_PACE**2 * encoder
-    slip_std[:, :, 0] += encoder + encoder[0]
-    covariance[range(0, 8, 2), range(0, 8, 2)] += encoder[-1] + encoder[0]
+    sideways = _squared_turns(value[:, 3], joints[0][:, LEG_SLICE], robot) * encoder[:, :, 1]
+    counts = np.stack([encoder[:, :, 0] + encoder[0, :, 0], sideways], axis=2)
+    velocity_std += np.stack([_ENCODER_PACE**2 * encoder[:, :, 0], rate[:, [3]] ** 2 * encoder[:, :, 1]], axis=2)
+    slip_std += counts
+    covariance += np.diag(counts[-1].ravel())
     known = robot.tolerances.get("wheel.radius")
     share = 0.0 if known is None else known.share("wheel.radius", robot.wheel.radius)
     side_speed = rate[:, 1] * np.cos(value[:, 3]) - rate[:, 0] * np.sin(value[:, 3])
@@ -191,10 +193,21 @@ def _contacts(value: Array, rate: Array, joints: tuple[Array, Array], batch: Par
 
 
 def _encoder_variance(angle: Array, robot: Robot, parameters: Parameters) -> Array:
-    """Variance (K, 4) in m2 of a contact's place along its heading: a wheel's count at its rim, a leg's at hip height."""
-    radius = parameters["wheel.radius"]
-    height = parameters["leg.length"] * np.sin(angle[:, LEG_SLICE]) + radius
-    return (radius**2 + height**2) * robot.sensors.encoder.position**2 / 12
+    """Variance (K, 4, 2) in m2 of a contact's place: along its heading, by the wheel's count at its rim and the leg's at hip
+    height; and sideways per radian of a turn, by the leg's: the contact is that much further ahead of the hip."""
+    radius, reach = parameters["wheel.radius"], parameters["leg.length"] * np.sin(angle[:, LEG_SLICE])
+    arms = np.stack([radius**2 + (reach + radius) ** 2, reach**2], axis=2)
+    return arms * robot.sensors.encoder.position**2 / 12
+
+
+def _squared_turns(yaw: Array, legs: Array, robot: Robot) -> Array:
+    """Squares (K, 4) of the turns made while a leg showed one count, whose error is one, summed over the counts."""
+    counts = np.rint(legs / robot.sensors.encoder.position) if robot.sensors.encoder.position else legs
+    other = np.diff(counts, axis=0, prepend=math.nan) != 0
+    since = np.maximum.accumulate(np.where(other, np.arange(len(yaw))[:, None], 0), axis=0)
+    before = np.concatenate([since[:1], since[:-1]])
+    finished = np.cumsum(np.where(other, (yaw[:, None] - yaw[before]) ** 2, 0.0), axis=0)
+    return finished + (yaw[:, None] - yaw[since]) ** 2
 
 
 def _apart(rows: Array, frames: Array) -> Array:

@@ -95,13 +95,16 @@ def _smoothed(
 
 @njit(cache=True, nogil=True)
 def _transition(step: float, density: float, matrix: Any, noise: Any) -> None:
-    matrix[:] = np.eye(3)
+    """Write the change over a step and its noise; ``matrix`` is 0 but for what is written."""
+    matrix[0, 0] = matrix[1, 1] = matrix[2, 2] = 1.0
     matrix[0, 1] = matrix[1, 2] = step
     matrix[0, 2] = 0.5 * step * step
-    powers = np.array([step**5 / 20, step**4 / 8, step**3 / 6, step**3 / 3, step**2 / 2, step])
-    noise[0, 0], noise[0, 1], noise[0, 2] = density * powers[0], density * powers[1], density * powers[2]
-    noise[1, 0], noise[1, 1], noise[1, 2] = density * powers[1], density * powers[3], density * powers[4]
-    noise[2, 0], noise[2, 1], noise[2, 2] = density * powers[2], density * powers[4], density * powers[5]
+    noise[0, 0] = density * step**5 / 20
+    noise[0, 1] = noise[1, 0] = density * step**4 / 8
+    noise[0, 2] = noise[2, 0] = density * step**3 / 6
+    noise[1, 1] = density * step**3 / 3
+    noise[1, 2] = noise[2, 1] = density * step**2 / 2
+    noise[2, 2] = density * step
 
 
 @njit(cache=True, nogil=True)
@@ -130,12 +133,18 @@ def _filter(
                 gain = spread[:, 0] / total
                 state = state + gain * error
                 change = np.eye(3)
-                change[:, 0] -= gain
-                spread = change @ spread @ change.T + variances[i] * np.outer(gain, gain)
+                for k in range(3):
+                    change[k, 0] -= gain[k]
+                spread = change @ spread @ change.T
+                for k in range(3):
+                    for j in range(3):
+                        spread[k, j] += variances[i] * gain[k] * gain[j]
                 likelihood -= 0.5 * (error * error / total + math.log(total))
         if states.shape[0] > 0:
-            states[i] = state
-            spreads[i] = spread
+            for k in range(3):
+                states[i, k] = state[k]
+                for j in range(3):
+                    spreads[i, k, j] = spread[k, j]
     return likelihood
 
 
@@ -146,9 +155,12 @@ def _smooth_back(time: Any, density: float, states: Any, spreads: Any) -> None:
         _transition(time[i + 1] - time[i], density, matrix, noise)
         ahead = matrix @ spreads[i] @ matrix.T + noise
         if time[i + 1] == time[i]:
-            states[i] = states[i + 1]
-            spreads[i] = spreads[i + 1]
-            continue
-        gain = np.linalg.solve(ahead, matrix @ spreads[i]).T
-        states[i] = states[i] + gain @ (states[i + 1] - matrix @ states[i])
-        spreads[i] = spreads[i] + gain @ (spreads[i + 1] - ahead) @ gain.T
+            state, spread = states[i + 1], spreads[i + 1]
+        else:
+            gain = (np.linalg.inv(ahead) @ (matrix @ spreads[i])).T  # "solve", and assigning to slices, take seconds to compile
+            state = states[i] + gain @ (states[i + 1] - matrix @ states[i])
+            spread = spreads[i] + gain @ (spreads[i + 1] - ahead) @ gain.T
+        for k in range(3):
+            states[i, k] = state[k]
+            for j in range(3):
+                spreads[i, k, j] = spread[k, j]
