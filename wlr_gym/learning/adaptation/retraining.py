@@ -9,7 +9,7 @@ from typing import Any
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
-from wlr_gym.learning.adaptation.uncertainty import STATED, Family, Uncertainty
+from wlr_gym.learning.adaptation.uncertainty import STATED, TRAINED_SHARE, Family, Uncertainty
 from wlr_gym.learning.evaluation.acceptance import (
     LARGEST_LOSS,
     Acceptance,
@@ -105,7 +105,10 @@ def train_on(progress: Progress, found: Uncertainty) -> AdaptStep:
     config = progress.folder("model") / SETTINGS_FILE
     train_in(progress, folder, config, found.training)
     return AdaptStep(
-        said=(f"{asked.steps:,} environment steps from {asked.policy}, learning rate {asked.learning_rate:g}.",),
+        said=(
+            f"{asked.steps:,} environment steps from {asked.policy}, learning rate {asked.learning_rate:g}, in "
+            f"{TRAINED_SHARE:.0%} of each interval.",
+        ),
         command=f"wlr train {asked.environment} --config {config} --init {asked.policy} --out {folder}",
         numbers={"steps": asked.steps, "learning_rate": asked.learning_rate},
     )
