@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
-from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
+from toy_problem import DECOYS, NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap.analysis import EFFECT_FOUND, NOT_EXCITED
 from wlr_gym.gap.estimation.fit import Fit, fit, linearise
@@ -27,6 +27,7 @@ from wlr_gym.gap.selection.hypothesis import INSISTENT, Hypothesis
 from wlr_gym.gap.selection.refit import refit
 from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
 from wlr_gym.gap.selection.search import MOST_EFFECTS, PER_NAME, SHORTLIST, remove_redundant, search_effects, shortlist
+from wlr_gym.gap.validation.held_out import MOST_SEARCHES
 from wlr_gym.gap.workflow import REFUTED, analyse_problem, evidence_of
 
 RUNS = range(5)
@@ -517,6 +518,16 @@ def test_an_effect_that_is_refuted_after_it_made_an_earlier_one_redundant_leaves
     assert analysis.verdict == NOT_EXCITED
     assert {one.name for one in analysis.evidence if one.outcome == "fails cross-validation"} <= {"drag", "decoy_1"}
     assert any(one.reason == REFUTED for one in analysis.evidence)
+
+
+def test_names_are_not_tried_until_one_passes():
+    problem = Toy({}, [sized(name, 1.5) for name in DECOYS], rows=400, runs=6)
+    problem._measured[4:] = Toy({}, [], rows=400, runs=6)._measured[4:]
+    analysis = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
+    assert (analysis.verdict, analysis.effects) == (NOT_EXCITED, ())
+    assert MOST_SEARCHES == 2
+    assert {one.outcome for one in analysis.evidence}.isdisjoint({"selected", "removed"})
+    assert len([one for one in analysis.evidence if one.reason == REFUTED]) >= 2 + 2
 
 
 def test_better_model_found_while_converging_is_calibrated_from(monkeypatch):

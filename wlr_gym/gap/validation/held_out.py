@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 
 #: Held-out runs that an interval of their mean needs.
 LEAST_FOR_INTERVAL = 3
+#: Searches, at most, after the first.
+MOST_SEARCHES = 2
 #: Share by which the error of held-out runs must grow to count against an effect.
 LEAST_GROWTH = 0.02
 #: Distance from the noise floor below which nothing is left to be removed.
@@ -46,7 +48,8 @@ def confirmed(
     """The search, none of whose effects runs refute that no fit has used.
 
     Each effect is judged beside the others. Where one of several is refuted, ``again`` searches without it: a wrong effect
-    changes what others seem to gain. A single one is left out; to try names until one passes would wear the test out.
+    changes what others seem to gain. A single one, or what :data:`MOST_SEARCHES` more find, is left out: to try names until one
+    passes would wear the test out.
 
     Args:
         problem, fitted, held_out: the system and its runs.
@@ -55,18 +58,33 @@ def confirmed(
     """
     refuted: list[Hypothesis] = []
     while (worst := _refuted(problem, fitted, held_out, search)) is not None:
+        if len(search.fit.model.effects) == 1 or len(refuted) >= MOST_SEARCHES:
+            return _left_out(search, refuted)
         label = search.fit.model.effects[worst][0].label
-        number = next(k for k, look in enumerate(search.rounds) if look.selected and look.selected.candidate.label == label)
-        look = search.rounds[number]
-        assert look.selected is not None
-        seen = replace(look.selected, cross_validated=False)
-        if len(search.fit.model.effects) == 1:
-            known = [seen if one is look.selected else one for one in look.hypotheses]
-            rounds = [*search.rounds[:number], replace(look, hypotheses=known, selected=seen)]
-            return SearchResult(search.calibrated, search.calibrated, rounds, {}, refuted)
-        refuted.append(seen)
+        refuted += [replace(one, cross_validated=False) for one in _selected(search) if one.candidate.label == label]
         search = again({one.candidate.label for one in refuted})
     return replace(search, refuted=refuted)
+
+
+def _selected(search: SearchResult) -> list[Hypothesis]:
+    """Hypotheses of the effects that the model has."""
+    kept = {candidate.label for candidate, _ in search.fit.model.effects}
+    return [look.selected for look in search.rounds if look.selected is not None and look.selected.candidate.label in kept]
+
+
+def _left_out(search: SearchResult, refuted: Sequence[Hypothesis]) -> SearchResult:
+    """The search without its effects, which count as failing cross-validation."""
+    seen = {one: replace(one, cross_validated=False) for one in _selected(search)}
+    rounds = [
+        replace(
+            look,
+            hypotheses=[seen.get(one, one) for one in look.hypotheses],
+            selected=None if look.selected is None else seen.get(look.selected, look.selected),
+        )
+        for look in search.rounds
+    ]
+    last = max(k for k, look in enumerate(search.rounds, 1) if look.selected in seen)
+    return SearchResult(search.calibrated, search.calibrated, rounds[:last], {}, refuted)
 
 
 def _refuted(problem: Problem, fitted: Sequence[int], held_out: Sequence[int], search: SearchResult) -> int | None:
