@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_measure import OFFSET, samples_of
+from test_measure import OFFSET, STD, samples_of
 
 from wlr_gym.perception.vision.frame_noise import frame_noise, widened, without_repeats
 from wlr_gym.perception.vision.imu_check import _angle_rates, imu_differences
@@ -37,6 +37,27 @@ def test_the_frames_noise_is_found_from_one_to_the_next(drive):
     assert frame_noise(honest).jitter == 0.0
     bold = [replace(sample, covariance=sample.covariance / 2.5**2) for sample in honest]
     assert frame_noise(bold).scale == pytest.approx(2.5, rel=0.15)
+
+
+STILL, NOISE = 100, 2.5
+
+
+def standing_first(drive, scatter):
+    """Samples noisier than they state; before, the markers stand, and poses scatter by ``scatter`` sigmas about the first."""
+    rng, samples = np.random.default_rng(8), samples_of(drive)
+    bold = [replace(s, covariance=s.covariance / NOISE**2, centres=np.full((4, 2), 3.0 * k)) for k, s in enumerate(samples)]
+    poses = bold[0].pose + scatter * STD * rng.standard_normal((STILL, 6))
+    return [replace(bold[0], time=bold[0].time - (STILL - k) / 30, pose=pose) for k, pose in enumerate(poses)] + bold
+
+
+@pytest.mark.parametrize(("scatter", "worth"), [(0.1, 1.0), (1.0, STILL)], ids=["copied", "taken anew"])
+def test_pictures_of_standing_markers_that_a_codec_copies_count_as_one(scatter, worth, drive):
+    samples = standing_first(drive, scatter)
+    noise = frame_noise(samples)
+    assert noise.scale == pytest.approx(NOISE, rel=0.15)
+    information = sum(np.linalg.inv(sample.covariance) for sample in widened(samples, noise)[:STILL])
+    assert np.diag(information) * STD**2 == pytest.approx(np.full(6, worth), rel=0.3)
+    assert widened(samples, noise)[-1].covariance == pytest.approx(np.diag(STD**2), rel=0.3)
 
 
 def test_jitter_of_the_times_is_told_from_noise_and_widens_along_the_motion(drive):

@@ -2,6 +2,9 @@
 
 Of five frames, neighbours or every other one, what a cubic in time does not explain is noise; it is held against the sigmas
 that the edges of the markers state. An error of a frame's time moves its pose along the velocity, other noise does not.
+
+A codec copies markers that stand still from picture to picture, with their error: such frames say little about noise, and
+together no more than one of them.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from wlr_gym.perception.vision.tracking import REPEATED, Sample, without_pose
 Array = NDArray[np.float64]
 
 _LEAST_NOISE, _LEAST_FRAMES = 0.7, 30
-_NORMAL = 1.4826  # standard deviation over the median of absolute values
+_ONE_SIGMA = 0.683  # share of normal errors below 1 sigma; compression errs unevenly, which a median does not show
 #: Errors of a frame's time (s, 1 sigma) and factors of the noise that are tried.
 _JITTERS = np.array([0.0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 6, 8, 12]) * 1e-3
 _FACTORS = 0.6 * 1.15 ** np.arange(15)
@@ -29,6 +32,9 @@ _WORTH = 12.0
 #: change; px, of those steps.
 _SAME_SHARE, _MOVING = 0.2, 0.1
 _MOST_REPEATS = 3  # in a row; then the robot stands
+#: Standing frames whose poses scatter by less than this share of the noise are copies of each other.
+_COPIED = 0.5
+_LEAST_STANDING = 3  # frames in a row
 
 
 @dataclass(frozen=True)
@@ -44,24 +50,32 @@ def frame_noise(samples: Sequence[Sample]) -> FrameNoise:
     seen = [sample for sample in samples if math.isfinite(sample.pose[0])]
     if len(seen) < _LEAST_FRAMES:
         return FrameNoise()
+    standing = {k for run in _standing(seen) for k in run}
+    if len(seen) - len(standing) >= _LEAST_FRAMES:
+        seen = [sample for k, sample in enumerate(seen) if k not in standing]
     time, poses, variance, rates = _signals(seen)
     differences = [_fourth_difference(time, poses, variance, rates**2, stride) for stride in (1, 2)]
     jitter = _jitter(*differences[0])
     scales = [
-        float(np.median(_NORMAL * np.median(np.abs(rest) / np.sqrt(edges + jitter**2 * late), axis=0)))
+        float(np.median(np.quantile(np.abs(rest) / np.sqrt(edges + jitter**2 * late), _ONE_SIGMA, axis=0)))
         for rest, edges, late in differences
     ]
     return FrameNoise(max(_LEAST_NOISE, *scales), jitter)
 
 
 def widened(samples: Sequence[Sample], noise: FrameNoise) -> tuple[Sample, ...]:
-    """The samples with that noise in their covariances."""
+    """The samples with that noise in their covariances; of copied pictures, so that together they count as one."""
     seen = [k for k, sample in enumerate(samples) if math.isfinite(sample.pose[0])]
     if len(seen) < 2:  # no rates: :func:`wlr_gym.perception.vision.slip.measure_slip` refuses so few
         return tuple(samples)
-    result = list(samples)
-    for k, rate in zip(seen, _signals([samples[k] for k in seen])[3], strict=True):
-        covariance = noise.scale**2 * samples[k].covariance + noise.jitter**2 * np.outer(rate, rate)
+    result, kept = list(samples), [samples[k] for k in seen]
+    _, poses, _, rates = _signals(kept)
+    copies = np.ones(len(kept))
+    for run in _standing(kept):
+        if _scatter(poses[run], np.stack([kept[k].covariance for k in run])) < _COPIED * noise.scale:
+            copies[run] = len(run)
+    for k, rate, count in zip(seen, rates, copies, strict=True):
+        covariance = count * noise.scale**2 * samples[k].covariance + noise.jitter**2 * np.outer(rate, rate)
         result[k] = replace(samples[k], covariance=covariance)
     return tuple(result)
 
@@ -89,6 +103,19 @@ def _repeats(steps: Sequence[Array], first: int) -> range:
     if not least > _MOVING or max(_length(step) for step in steps[first:last]) > _SAME_SHARE * least:
         return range(0)
     return range(first + 1, last + 1) if float(np.nansum(before * after)) > 0 else range(0)
+
+
+def _standing(seen: Sequence[Sample]) -> list[range]:
+    """Runs of frames in which the markers stay where they are in the picture."""
+    moved = [k for k, (a, b) in enumerate(pairwise(seen), 1) if not _length(b.centres - a.centres) < _MOVING]
+    return [range(first, stop) for first, stop in pairwise([0, *moved, len(seen)]) if stop - first >= _LEAST_STANDING]
+
+
+def _scatter(poses: Array, covariances: Array) -> float:
+    """How far poses (F, 6) lie from one to the next (median), over what their covariances state."""
+    steps = np.diff(poses, axis=0)
+    squares = np.einsum("fi,fij,fj->f", steps, np.linalg.inv(covariances[1:] + covariances[:-1]), steps)
+    return math.sqrt(float(np.median(squares)) / poses.shape[1])
 
 
 def _signals(seen: Sequence[Sample]) -> tuple[Array, Array, Array, Array]:
