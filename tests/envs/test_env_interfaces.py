@@ -105,9 +105,8 @@ def test_options_have_one_list_of_names_and_types():
     assert options == get_type_hints(Settings)
     for name in EnvironmentOptions.__annotations__:
         assert f"\n    {name}: " in str(inspect.getdoc(EnvironmentOptions)), name
-    page = Path(__file__).parents[2].joinpath("docs", "environments.md").read_text(encoding="utf-8")
-    section = page.split("## Keywords")[1].split("`help(")[0]
-    assert sorted(re.findall(r"`(\w+)`", section)) == sorted(EnvironmentOptions.__annotations__)
+    table = Path(__file__).parents[2].joinpath("docs", "tables", "keywords.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^\| `(\w+)`", table, re.MULTILINE)) == sorted(EnvironmentOptions.__annotations__)
 
 
 def test_the_second_word_for_the_backend(fake):

@@ -24,11 +24,12 @@ from wlr_gym.gap.selection.cross_validation import (
 )
 from wlr_gym.gap.selection.equivalence import EQUIVALENT, equivalents
 from wlr_gym.gap.selection.hypothesis import INSISTENT, Hypothesis
+from wlr_gym.gap.selection.outcomes import REFUTED, evidence_of
 from wlr_gym.gap.selection.refit import refit
 from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
 from wlr_gym.gap.selection.search import MOST_EFFECTS, PER_NAME, SHORTLIST, remove_redundant, search_effects, shortlist
 from wlr_gym.gap.validation.held_out import MOST_SEARCHES
-from wlr_gym.gap.workflow import REFUTED, analyse_problem, evidence_of
+from wlr_gym.gap.workflow import analyse_problem
 
 RUNS = range(5)
 

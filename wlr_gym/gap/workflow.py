@@ -17,20 +17,12 @@ from wlr_gym.base.provenance import provenance
 from wlr_gym.gap.analysis import (
     BAD_DATA,
     EFFECT_FOUND,
-    EQUIVALENT,
-    FAILS_CROSS_VALIDATION,
     NOT_EXCITED,
     NOTHING_MISSING,
-    REJECTED,
-    REMOVED,
-    SELECTED,
-    TOO_LITTLE,
     UNKNOWN,
-    WORSE_FIT,
     Analysis,
     Calibrated,
     Equivalent,
-    Evidence,
     FoundEffect,
     IntakeFinding,
     ParameterEstimate,
@@ -48,9 +40,8 @@ from wlr_gym.gap.report.relations import relations
 from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
 from wlr_gym.gap.selection.detectability import detectable
 from wlr_gym.gap.selection.equivalence import equivalents, selection_frequency
-from wlr_gym.gap.selection.hypothesis import Hypothesis
-from wlr_gym.gap.selection.screening import least_gain
-from wlr_gym.gap.selection.search import Round, SearchResult, search_effects
+from wlr_gym.gap.selection.outcomes import evidence_of, refuted_evidence
+from wlr_gym.gap.selection.search import SearchResult, search_effects
 from wlr_gym.gap.selection.threshold import chance
 from wlr_gym.gap.validation.data_split import informative_split, named_split
 from wlr_gym.gap.validation.held_out import compare_models, confirmed, mean_of_runs, mean_squares, noise_floor
@@ -69,10 +60,6 @@ Tell = Callable[[str, float], None]
 STAGES = {"reading": 0.0, "choosing runs": 0.02, "calibrating": 0.1, "naming": 0.35, "proving": 0.85, "drawing": 0.97}
 #: Scatter of the runs, over what their rows predict, that is assumed until a fit has estimated it.
 SCATTER = 5.0
-#: Reason why an effect that was selected is not kept.
-REFUTED = "the held-out runs refute it"
-#: Reason why a candidate is rejected at screening: calibration reproduces its response.
-CONFOUNDED = "confounded with calibrated parameters"
 #: Sums of several threads round otherwise, and a fit may end elsewhere.
 _one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 #: Share of the effects that must be visible within their plausible range for "nothing missing" to mean anything.
@@ -211,7 +198,7 @@ def analyse_problem(
         evidence=tuple(
             entry for number, look in enumerate(search.rounds, 1) for entry in evidence_of(problem, number, look, fitted, kept)
         )
-        + tuple(_fitted_evidence(problem, 1, one, (FAILS_CROSS_VALIDATION, REFUTED), fitted) for one in search.refuted),
+        + tuple(refuted_evidence(problem, one, fitted) for one in search.refuted),
         thresholds=tuple(
             Threshold(k, look.threshold, chance(look.by_chance), look.probabilities[1])
             for k, look in enumerate(search.rounds, 1)
@@ -344,70 +331,3 @@ def _calibration(problem: Problem, found: Fit) -> dict[str, Calibrated]:
         quantity.name: Calibrated(quantity.nominal, float(value), quantity.unit, quantity.sigma, float(half))
         for quantity, value, half in zip(problem.quantities, found.model.quantities, halves, strict=False)
     }
-
-
-def evidence_of(problem: Problem, number: int, look: Round, fitted: Sequence[int], kept: Container[str]) -> list[Evidence]:
-    """Every candidate's outcome in one round: the refitted ones, then the best place of every other name.
-
-    ``kept`` are the labels of what the final model has: what was selected may have been removed again.
-    """
-    equal, (shares, _) = {h.candidate.label for h in look.equivalents}, look.probabilities
-    entries = [
-        _fitted_evidence(problem, number, one, _outcome(one, look, equal, kept), fitted, share)
-        for one, share in zip(look.hypotheses, shares, strict=True)
-    ]
-    seen = {entry.name for entry in entries}
-    for score in look.scores:
-        if score.candidate.name in seen:
-            continue
-        seen.add(score.candidate.name)
-        values = score.candidate.parameters(score.values)
-        reason = CONFOUNDED if score.own < 0.05 else "its predicted improvement is too small"
-        entries.append(
-            Evidence(number, score.candidate.name, score.candidate.where, values, score.gain, score.gain, REJECTED, reason)
-        )
-    return entries
-
-
-def _fitted_evidence(
-    problem: Problem, number: int, one: Hypothesis, outcome: tuple[str, str], fitted: Sequence[int], probability: float = 0.0
-) -> Evidence:
-    return Evidence(
-        number,
-        one.candidate.name,
-        one.candidate.where,
-        one.candidate.effect(one.values).parameters,
-        one.gain,
-        one.predicted_gain,
-        *outcome,
-        {problem.runs[k]: float(gain) for k, gain in zip(fitted, one.by_run, strict=True)},
-        probability,
-        one.candidate.formula,
-        one.candidate.units,
-    )
-
-
-def _outcome(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Container[str]) -> tuple[str, str]:
-    best = look.selected
-    if best is not None and hypothesis.candidate.label == best.candidate.label:
-        if not best.cross_validated:
-            return FAILS_CROSS_VALIDATION, REFUTED
-        return (
-            (SELECTED, "improves the fit most")
-            if best.candidate.label in kept
-            else (REMOVED, "redundant beside effects selected later")
-        )
-    if hypothesis.candidate.label in equal and best is not None:
-        return EQUIVALENT, f"improves the fit by {hypothesis.gain / best.gain:.0%} of what the best does"
-    if hypothesis.at_bound:
-        return "implausible", "needs a value outside its plausible range"
-    if hypothesis.tolerable:
-        return "within tolerance", "the tolerances of calibrated parameters allow as much"
-    if not hypothesis.cross_validated:
-        return FAILS_CROSS_VALIDATION, "left out of the fit, runs are not replayed better with it"
-    if not hypothesis.consistent:
-        return "inconsistent", "helps some runs and harms others"
-    if best is None:
-        least = least_gain(len(hypothesis.values), look.threshold)
-        return TOO_LITTLE, f"improves the fit by less than chance and an imperfect simulator can ({least:.0f})"
-    return WORSE_FIT, f"improves the fit by {max(hypothesis.gain, 0.0) / best.gain:.0%} of what the best does"
