@@ -77,11 +77,8 @@ def test_what_further_runs_cannot_change_is_not_in_play():
 
 
 def test_a_name_that_the_held_out_runs_refute_is_not_in_play_beside_one_that_was_found():
-    refuted, kept = (
-        candidate("coulomb_friction", 1.0, "fails cross-validation"),
-        candidate("viscous_friction", 1.0, "selected", 2),
-    )
-    (only,) = explanations(result("effect_found", (0.0, [refuted]), (0.0, [kept])))
+    refuted, kept = candidate("coulomb_friction", 0.0, "fails cross-validation"), candidate("viscous_friction", 1.0, "selected")
+    (only,) = explanations(result("effect_found", (0.0, [kept, refuted])))
     assert (only.name, [effect.name for effect in only.effects]) == ("viscous_friction", ["viscous_friction"])
 
 

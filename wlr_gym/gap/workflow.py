@@ -154,9 +154,8 @@ def analyse_problem(
     clock.start("choosing runs")
     fitted, held_out, columns = _choose_runs(problem, heldout)
     clock.start("calibrating")
-    base = calibrated_fit(problem, fitted, columns, clock.detail)
+    start = calibrated_fit(problem, fitted, columns, clock.detail)
     clock.start("naming")
-    start = base
 
     def find(excluded: Container[str] = ()) -> SearchResult:
         return search_effects(problem, fitted, start, clock.detail, columns, excluded)
@@ -278,11 +277,10 @@ def _effects(problem: Problem, search: SearchResult, fitted: Sequence[int]) -> t
     found = []
     setting = search.fit.model.setting
     for (candidate, values), own in zip(search.fit.model.effects, intervals, strict=True):
-        look = next(r for r in search.rounds if r.selected is not None and r.selected.candidate.label == candidate.label)
-        assert look.selected is not None
-        frequency = selection_frequency(look.selected, look.hypotheses, look.threshold)
+        look, one = next((look, one) for look, one in search.kept if one.candidate.label == candidate.label)
+        frequency = selection_frequency(one, look.hypotheses, look.threshold)
         tried = problem.reach(candidate.effect(values), setting, fitted) if candidate.formula else {}
-        found.append(replace(found_effect(candidate, own, frequency, look.selected.gain), validity=tried))
+        found.append(replace(found_effect(candidate, own, frequency, one.gain), validity=tried))
     return tuple(sorted(found, key=lambda effect: -effect.gain))
 
 
@@ -313,14 +311,11 @@ def _somewhere(problem: Problem, places: Sequence[Place]) -> tuple[FoundEffect, 
 
 def _equivalent(problem: Problem, search: SearchResult) -> tuple[Equivalent, ...]:
     groups = []
-    kept = {candidate.label for candidate, _ in search.fit.model.effects}
-    for look in search.rounds:
-        if look.selected is None or look.selected.candidate.label not in kept:
-            continue
-        swapped = search.swaps.get(look.selected.candidate.label)
+    for look, one in search.kept:
+        swapped = search.swaps.get(one.candidate.label)
         others = equivalents(*swapped) if swapped else look.equivalents
         if others:
-            names = (look.selected.candidate.name, *(other.candidate.name for other in others))
+            names = (one.candidate.name, *(other.candidate.name for other in others))
             groups.append(Equivalent(names, separating_run(names, problem.motions)))
     return tuple(groups)
 

@@ -40,12 +40,10 @@ def explanations(result: Result) -> tuple[Explanation, ...]:
     """
     added: tuple[PatchEffect, ...] = ()
     found: list[Explanation] = []
-    last = max((one.round for one in result.evidence if one.outcome == SELECTED), default=0)
     for threshold in result.thresholds:
         entries = [one for one in result.evidence if one.round == threshold.round and one.outcome in _OPEN]
         selected = next((one for one in entries if one.outcome == SELECTED), None)
-        withdrawn = selected is None and threshold.round < last
-        if withdrawn or any(one.outcome == REMOVED for one in result.evidence if one.round == threshold.round):
+        if any(one.outcome == REMOVED for one in result.evidence if one.round == threshold.round):
             continue
         if selected is None and added:
             break

@@ -86,6 +86,12 @@ class SearchResult:
     swaps: dict[str, tuple[Hypothesis, list[Hypothesis]]]
     refuted: Sequence[Hypothesis] = ()
 
+    @property
+    def kept(self) -> list[tuple[Round, Hypothesis]]:
+        """Rounds whose selected effect the final model has, and that effect."""
+        labels = {candidate.label for candidate, _ in self.fit.model.effects}
+        return [(look, one) for look in self.rounds if (one := look.selected) is not None and one.candidate.label in labels]
+
 
 def shortlist(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> list[Score]:
     """Return the best scores, at most :data:`PER_NAME` of one effect, and only those above a quarter of the threshold.

@@ -60,21 +60,14 @@ def confirmed(
     while (worst := _refuted(problem, fitted, held_out, search)) is not None:
         if len(search.fit.model.effects) == 1 or len(refuted) >= MOST_SEARCHES:
             return _left_out(search, refuted)
-        label = search.fit.model.effects[worst][0].label
-        refuted += [replace(one, cross_validated=False) for one in _selected(search) if one.candidate.label == label]
+        refuted += [replace(one, cross_validated=False) for _, one in search.kept if one.candidate.label == worst]
         search = again({one.candidate.label for one in refuted})
     return replace(search, refuted=refuted)
 
 
-def _selected(search: SearchResult) -> list[Hypothesis]:
-    """Hypotheses of the effects that the model has."""
-    kept = {candidate.label for candidate, _ in search.fit.model.effects}
-    return [look.selected for look in search.rounds if look.selected is not None and look.selected.candidate.label in kept]
-
-
 def _left_out(search: SearchResult, refuted: Sequence[Hypothesis]) -> SearchResult:
     """The search without its effects, which count as failing cross-validation."""
-    seen = {one: replace(one, cross_validated=False) for one in _selected(search)}
+    seen = {one: replace(one, cross_validated=False) for _, one in search.kept}
     rounds = [
         replace(
             look,
@@ -87,15 +80,15 @@ def _left_out(search: SearchResult, refuted: Sequence[Hypothesis]) -> SearchResu
     return SearchResult(search.calibrated, search.calibrated, rounds[:last], {}, refuted)
 
 
-def _refuted(problem: Problem, fitted: Sequence[int], held_out: Sequence[int], search: SearchResult) -> int | None:
-    """Which effect the held-out runs refute most; None: none of them."""
+def _refuted(problem: Problem, fitted: Sequence[int], held_out: Sequence[int], search: SearchResult) -> str | None:
+    """Label of the effect that the held-out runs refute most; None: none of them."""
     effects, tau = search.fit.model.effects, search.fit.noise.autocorrelation_time
     if not effects:
         return None
     without = [search.calibrated] if len(effects) == 1 else without_each(problem, fitted, search.fit)
     found = problem.residuals([one.model.setting for one in (*without, search.fit)], held_out)
     beyond = [_beyond_need(problem, [r[[k, -1]] for r in found], tau) for k in range(len(without))]
-    return int(np.argmin(beyond)) if min(beyond) < 0.0 else None
+    return effects[int(np.argmin(beyond))][0].label if min(beyond) < 0.0 else None
 
 
 def _beyond_need(problem: Problem, found: Sequence[Array], autocorrelation_time: Array) -> float:

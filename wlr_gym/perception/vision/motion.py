@@ -262,15 +262,21 @@ def _derivatives(function: Callable[[Array], Array], at: Array, columns: int) ->
     return result
 
 
-def _transition(step: float, density: Array, wander: Array, slope: Array) -> tuple[Array, Array]:
-    """The change of the state over a step and its noise; slip goes on with the ``slope`` (8, 12) of its velocity."""
-    matrix, noise = np.eye(_SIZE), np.diag(step * wander)
+def _transition(step: float, slope: Array) -> Array:
+    """The change of the state over a step; slip goes on with the ``slope`` (8, 12) of its velocity."""
+    matrix = np.eye(_SIZE)
     of_value, of_rate = slope[:, :6], slope[:, 6:]
     matrix[_VALUE, _RATE] = matrix[_RATE, _ACCELERATION] = step * np.eye(6)
     matrix[_VALUE, _ACCELERATION] = 0.5 * step**2 * np.eye(6)
     matrix[_SLIP, _VALUE] = step * of_value
     matrix[_SLIP, _RATE] = 0.5 * step**2 * of_value + step * of_rate
     matrix[_SLIP, _ACCELERATION] = step**3 / 6 * of_value + 0.5 * step**2 * of_rate
+    return matrix
+
+
+def _unsteadiness(step: float, density: Array, wander: Array, slope: Array) -> Array:
+    """The noise of that change."""
+    noise, of_rate = np.diag(step * wander), slope[:, 6:]
     apart = np.array([
         [step**5 / 20, step**4 / 8, step**3 / 6], [step**4 / 8, step**3 / 3, step**2 / 2], [step**3 / 6, step**2 / 2, step]
     ])  # fmt: skip
@@ -279,7 +285,7 @@ def _transition(step: float, density: Array, wander: Array, slope: Array) -> tup
     noise[_SLIP, _SLIP] += apart[0, 0] * moved @ of_rate.T
     noise[_SLIP, :18] = (apart[0][:, None] * moved[:, None, :]).reshape(8, 18)
     noise[:18, _SLIP] = noise[_SLIP, :18].T
-    return matrix, noise
+    return noise
 
 
 def _smoothed(
@@ -298,9 +304,10 @@ def _smoothed(
     x, p, k = start.copy(), spread.copy(), 0
     for i in range(total):
         if i > 0:
-            matrix, unsteady = _transition(time[i] - time[i - 1], density[i], wander[i], slope[row[i - 1]])
+            step, own = time[i] - time[i - 1], slope[row[i - 1]]
+            matrix = _transition(step, own)
             x = matrix @ x
-            p = matrix @ p @ matrix.T + unsteady
+            p = matrix @ p @ matrix.T + _unsteadiness(step, density[i], wander[i], own)
         if k < shown.shape[0] and shown[k] == i:
             states[k], spreads[k] = x, p
             k += 1
@@ -331,7 +338,7 @@ def _smoothed(
             spreads[k] = p - p @ lent @ p
             k -= 1
         if i > 0:
-            matrix, _ = _transition(time[i] - time[i - 1], density[i], wander[i], slope[row[i - 1]])
+            matrix = _transition(time[i] - time[i - 1], slope[row[i - 1]])
             gradient = matrix.T @ gradient
             lent = matrix.T @ lent @ matrix
             lent = 0.5 * (lent + lent.T)
