@@ -42,6 +42,17 @@ def test_what_a_folder_keeps_is_the_whole_plan():
     assert whole_settings(again, trial_of({"gamma": 0.9}, 1)) == whole_settings(whole, trial_of({"gamma": 0.9}, 1))
 
 
+def test_variants_are_settings_that_belong_together():
+    variants = {"recipe": {}, "no history": {"gamma": 0.9, "environment.randomization": None}}
+    whole = resolve(plan(variants=variants, space={"epochs": [2, 3]}, seeds=1))
+    again = parse_config(SweepPlan, whole.model_dump(mode="json"), "again")
+    trials = trials_of(known_settings(again) or [], again.seed_list)
+    assert [trial.name for trial in trials][-1] == "epochs=3,variant=no_history,seed=0"
+    first, last = whole_settings(again, trials[0]), whole_settings(again, trials[-1])
+    assert (last["gamma"], last["epochs"], last["environment"]["randomization"]) == (0.9, 3, None)
+    assert first == whole.settings | {"seed": 0, "epochs": 2}
+
+
 def test_random_settings_are_the_same_again_and_within_their_ranges():
     fields = {
         "space": {
@@ -77,6 +88,8 @@ def test_long_names_stay_different():
         ({"space": {"learning_rte": [1e-3]}}, "did you mean 'learning_rate'"),
         ({"space": {"environment.randomisation": ["ice"]}}, "did you mean 'randomization'"),
         ({"space": {"gamma": [0.9, 1.5]}}, "gamma=1.5,seed=0.*gamma"),
+        ({"variants": {"one": {"learning_rte": 1e-3}}}, "variant=one,seed=0.*did you mean 'learning_rate'"),
+        ({"variants": {"one": {}}, "space": {"variant": ["two"]}}, "give 'variants'"),
         ({"space": {"gamma": [0.9, 0.9]}}, "two trials are called 'gamma=0.9,seed=0': the same value is given twice"),
         ({"seeds": [1, 1]}, "two trials are called 'seed=1'"),
         ({"seeds": [1, 1], "space": {"gamma": [0.9]}, "search": {"method": "optuna"}}, "two trials are called 'seed=1'"),

@@ -23,6 +23,8 @@ from wlr_gym.policy.agents import agent_function, apply_changes, load_agent
 
 #: Metric of the held-out episodes -> whether less of it is better.
 METRICS = {"tracking_error": True, "success": False, "excess_slip": True, "reward": False}
+#: Setting of a trial that names one of the plan's ``variants``.
+VARIANT = "variant"
 #: With early stopping: scores per training, where the settings do not say.
 SCORES = 9
 #: Characters of a trial's name before it is cut and a hash of its settings added.
@@ -97,6 +99,8 @@ class SweepPlan(SettingsModel):
         init: trained policy that every trial starts from; None = none.
         settings: changes of the settings, the same in all trials.
         space: dotted name of a setting -> its values, or a :class:`NumberRange` for a search. All combinations make the grid.
+        variants: name -> dotted name of a setting -> its value: settings that belong together, as in an ablation. The names are
+            the values of ``variant`` in the space.
         seeds: how many, from 0 on, or which.
         search: None = every settings of the grid with every seed.
         imports: modules that trials import first: what registers your own task.
@@ -108,9 +112,18 @@ class SweepPlan(SettingsModel):
     init: str | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
     space: dict[str, NumberRange | Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
+    variants: dict[str, dict[str, Any]] = Field(default_factory=dict)
     seeds: Annotated[int, Field(gt=0)] | Annotated[list[Seed], Field(min_length=1)] = 5
     search: SearchPlan | None = None
     imports: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _variants_in_space(self) -> SweepPlan:
+        if self.space.setdefault(VARIANT, list(self.variants)) != list(self.variants):
+            raise InputError(f"space: '{VARIANT}' is none of its settings; give 'variants', and there what each of them sets")
+        if not self.variants:
+            del self.space[VARIANT]
+        return self
 
     @model_validator(mode="after")
     def _complete(self) -> SweepPlan:
@@ -190,7 +203,9 @@ def resolve(plan: SweepPlan) -> SweepPlan:
 def whole_settings(plan: SweepPlan, trial: Trial) -> dict[str, Any]:
     """Return all settings of a trial, as ``wlr train`` takes them."""
     settings = copy.deepcopy(plan.settings)
-    apply_changes(settings, [f"{name}={json.dumps(value)}" for name, value in trial.settings.items()])
+    own = dict(trial.settings)
+    changes = plan.variants.get(own.pop(VARIANT, ""), {}) | own
+    apply_changes(settings, [f"{name}={json.dumps(value)}" for name, value in changes.items()])
     return settings | {"seed": trial.seed}
 
 
