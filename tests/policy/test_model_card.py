@@ -79,11 +79,13 @@ def test_a_card_says_what_the_file_is(policy):
         (["sensors", "computed"], {"camera": False}, "from the slip observer's pose, without a camera"),
         (["sensors", "estimate"], {"camera": True}, "slip observer, with a camera"),
         (["sensors", "estimate"], {"camera": False}, "slip observer, without a camera"),
+        (["sensors", "estimate"], {"camera": True, "present": 0.5}, "slip observer, with or without a camera"),
         (["estimate", "truth"], {}, "for simulators only"),
     ],
 )
 def test_a_card_says_what_the_policy_sees(policy, sources, observer, words):
     content = contract_of(policy)
+    content["environment"]["sensors"] = {"camera": observer.pop("present")} if observer and "present" in observer else None
     content["environment"]["observer"] = observer
     for index, column in enumerate(content["environment"]["observation"]):
         column["source"] = sources[index % len(sources)]

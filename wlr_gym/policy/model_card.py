@@ -49,6 +49,8 @@ def _summary(content: Mapping[str, Any]) -> str:
     environment, training = content["environment"], content.get("training", {})
     sources = {column["source"] for column in environment["observation"]}
     camera = "with" if needs_camera(environment) else "without"
+    if 0.0 < (environment.get("sensors") or {}).get("camera", 0.0) < 1.0:
+        camera = "with or without"
     if "truth" in sources:
         sees = "It sees what no robot can measure, friction for example: an upper bound, for simulators only."
     elif "estimate" in sources:

@@ -77,6 +77,21 @@ def test_policy_is_the_network_that_was_trained(run, core, seen):
     assert np.ptp(saved[f"{net}.0.deviation"]) > 0.01
 
 
+def test_the_finished_policy_adds_a_share_of_what_was_learnt(run, core, seen, tmp_path):
+    """The training is the same bit for bit; the policy's folder and file add less to the controller's action."""
+    pytest.importorskip("onnxruntime")
+    train(tmp_path / "run", residual_share=0.7)
+    assert_same_weights(run / "policy", tmp_path / "run" / "policy")
+    columns = [k for k, column in enumerate(core.task.policy) if column.term == "velocity_controller"][:8]
+    whole, shared = (load_policy(folder, core.contract()).act(seen) for folder in (run, tmp_path / "run"))
+    inside = (np.abs(whole) < 1.0) & (np.abs(shared) < 1.0)
+    added = (whole - seen[:, columns])[inside]
+    assert np.abs(added).max() > 1e-3
+    np.testing.assert_allclose((shared - seen[:, columns])[inside], 0.7 * added, atol=1e-6)
+    export_policy(tmp_path / "run", tmp_path / "policy.onnx", seen)
+    np.testing.assert_allclose(open_policy(tmp_path / "policy.onnx")[0].act(seen), shared, atol=1e-5)
+
+
 def test_file_answers_as_the_network(run, core, seen, tmp_path):
     pytest.importorskip("onnxruntime")
     export_policy(run, tmp_path / "policy.onnx", seen)

@@ -32,11 +32,13 @@ class Layers:
         normalise: observations to mean 0 and standard deviation 1.
         controller: columns of the observation with the controller's action; empty = none.
         residual: what the network adds to it is its output times this.
+        residual_share: of that, how much the finished policy adds.
     """
 
     normalise: bool = False
     controller: tuple[int, ...] = ()
     residual: float = 0.0
+    residual_share: float = 1.0
 
 
 def controller_columns(contract: Mapping[str, Any]) -> tuple[int, ...]:
@@ -92,14 +94,12 @@ class BesideController(nn.Module):
 
 
 class OnTop(nn.Module):
-    """The controller's action plus ``residual`` times what the network adds, which is nothing at the start."""
+    """The controller's action plus ``residual`` times what the network adds."""
 
     def __init__(self, last: nn.Linear, residual: float) -> None:
         super().__init__()
         self.last = last
         self.residual = residual
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the mean actions (N, 8)."""
@@ -114,6 +114,11 @@ class _Layered(ActorCriticPolicy):
         self.layers = layers
         super().__init__(*arguments, **keywords)
 
+    def acting_net(self) -> nn.Module:
+        """Return the last layer of the finished policy; it has the weights of the one that learns."""
+        last: Any = self.action_net
+        return OnTop(last.last, last.residual * self.layers.residual_share) if self.layers.controller else last
+
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
         networks: Any = self.mlp_extractor
@@ -125,6 +130,8 @@ class _Layered(ActorCriticPolicy):
         if layers.controller:
             networks.policy_net = BesideController(networks.policy_net, layers.controller)
             last: Any = self.action_net
+            nn.init.zeros_(last.weight)  # at the start the network adds nothing
+            nn.init.zeros_(last.bias)
             self.action_net: nn.Module = OnTop(last, layers.residual)
         keywords: dict[str, Any] = {"lr": lr_schedule(1), **self.optimizer_kwargs}
         self.optimizer = self.optimizer_class(self.parameters(), **keywords)

@@ -20,7 +20,7 @@ from wlr_gym.policy import contract_of
 
 MODEL_FILE = "model.zip"
 #: Settings that make the network.
-NETWORK = ("hidden_layers", "activation", "normalise", "residual")
+NETWORK = ("hidden_layers", "activation", "normalise", "residual", "residual_share")
 #: Logarithm of the exploration noise of a start from a file without a critic, which does not say that of each joint either.
 #: The mean over joints of what shipped ones had in the end, e**-3.5, costs 5 % of the reward on the legs.
 LOG_STD = -4.6
@@ -146,7 +146,8 @@ def actor(network: Any) -> Any:
     """Return the part of a network that acts, as a torch module: observations (N, D) to actions (N, 8) clipped to [-1, 1]."""
     from torch import nn
 
-    return nn.Sequential(network.mlp_extractor.policy_net, network.action_net, nn.Hardtanh(-1.0, 1.0))
+    last = network.acting_net() if hasattr(network, "acting_net") else network.action_net
+    return nn.Sequential(network.mlp_extractor.policy_net, last, nn.Hardtanh(-1.0, 1.0))
 
 
 def parse_settings(config: Mapping[str, Any]) -> PpoConfig:
@@ -176,7 +177,7 @@ def policy_keywords(config: PpoConfig, contract: Mapping[str, Any]) -> dict[str,
     from wlr_gym.learning.ppo.layers import Layers, controller_columns
 
     columns = () if config.residual is None else controller_columns(contract)
-    return keywords | {"layers": Layers(config.normalise, columns, config.residual or 0.0)}
+    return keywords | {"layers": Layers(config.normalise, columns, config.residual or 0.0, config.residual_share)}
 
 
 def _is_layered(config: PpoConfig) -> bool:
