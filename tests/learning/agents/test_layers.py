@@ -9,6 +9,7 @@ import pytest
 from ppo_runs import ENVIRONMENT, assert_same_weights, weights
 from ppo_runs import train as train_plain
 
+import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.learning.evaluation.rollout import seen_observations
@@ -90,6 +91,21 @@ def test_the_finished_policy_adds_a_share_of_what_was_learnt(run, core, seen, tm
     np.testing.assert_allclose((shared - seen[:, columns])[inside], 0.7 * added, atol=1e-6)
     export_policy(tmp_path / "run", tmp_path / "policy.onnx", seen)
     np.testing.assert_allclose(open_policy(tmp_path / "policy.onnx")[0].act(seen), shared, atol=1e-5)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_a_start_from_a_policy_acts_as_it_does(core, seen, share, tmp_path):
+    """Whatever share of its residual it acts with, and whatever the new one will act with."""
+    train(tmp_path / "run", residual_share=0.7)
+    more = wlr_gym.train(
+        ENVIRONMENT,
+        tmp_path / "more",
+        init=tmp_path / "run",
+        max_seconds=1e-9,
+        settings={"total_steps": 1, "residual_share": share},
+    )
+    before, after = (load_policy(folder, core.contract()).act(seen) for folder in (tmp_path / "run", more))
+    np.testing.assert_allclose(after, before, atol=1e-6)
 
 
 def test_file_answers_as_the_network(run, core, seen, tmp_path):

@@ -11,24 +11,26 @@ from wlr_gym.base.errors import require_package
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.ppo.config import PpoConfig
 from wlr_gym.learning.ppo.export import LEARNER
-from wlr_gym.learning.ppo.policy import ACTOR, actor, contract_to_start_from, load_actor, saved_weights
+from wlr_gym.learning.ppo.layers import scale_residual
+from wlr_gym.learning.ppo.policy import ACTOR, actor, contract_to_start_from, load_actor, parse_settings, saved_weights
 from wlr_gym.learning.ppo.warm_start import fit_critic
 from wlr_gym.policy import check_contract, find_policy, load_policy
 
 
 def start_from(model: PPO, env: Sb3VecEnv, config: PpoConfig, source: str | Path) -> None:
-    """Put a trained policy into ``model``. Where its critic is not known, a critic is fitted; the steps of that count.
+    """Put a trained policy, as it acts, into ``model``. Where its critic is not known, a critic is fitted; its steps count.
 
     Raises:
         InputError: a policy that does not fit the environment, naming the first difference.
     """
-    place = find_policy(source)
-    check_contract(contract_to_start_from(source)["environment"], env.contract(), str(source))
+    place, contract = find_policy(source), contract_to_start_from(source)
+    check_contract(contract["environment"], env.contract(), str(source))
     acting, learner = _file_weights(place) if place.is_file() else (None, saved_weights(place))
     if acting is None:
         load_actor(model.policy, learner)
     else:
         actor(model.policy).load_state_dict(acting)
+    scale_residual(model.policy, parse_settings(contract["config"]).residual_share / config.residual_share)
     own = model.policy.state_dict()
     needed = [name for name in own if not name.startswith(ACTOR)]
     if all(name in learner and learner[name].shape == own[name].shape for name in needed):

@@ -145,6 +145,14 @@ class LayeredAsymmetricPolicy(_Layered, AsymmetricPolicy):
     """For observations {``policy``: (N, D), ``privileged``: (N, P)}."""
 
 
+def scale_residual(network: Any, factor: float) -> None:
+    """Multiply what a network adds to the controller's action; without a controller nothing changes."""
+    if factor != 1.0 and isinstance(network.action_net, OnTop):
+        with torch.no_grad():
+            for weights in network.action_net.last.parameters():
+                weights.mul_(factor)
+
+
 def normalisers(network: nn.Module) -> list[Normaliser]:
     """Return the normalisers of a network."""
     return [part for part in network.modules() if isinstance(part, Normaliser)]

@@ -20,7 +20,7 @@ from wlr_gym.policy import contract_of
 
 MODEL_FILE = "model.zip"
 #: Settings that make the network.
-NETWORK = ("hidden_layers", "activation", "normalise", "residual", "residual_share")
+NETWORK = ("hidden_layers", "activation", "normalise", "residual")
 #: Logarithm of the exploration noise of a start from a file without a critic, which does not say that of each joint either.
 #: The mean over joints of what shipped ones had in the end, e**-3.5, costs 5 % of the reward on the legs.
 LOG_STD = -4.6
@@ -106,7 +106,7 @@ def settings_to_start_from(source: str | Path) -> dict[str, Any]:
     settings = dict(contract["config"])
     settings["learning_rate"] = settings.get("final_learning_rate", PpoConfig.model_fields["final_learning_rate"].default)
     settings["target_kl"] = settings.get("target_kl") or TARGET_KL
-    return settings | {"teacher": None, "initial_log_std": LOG_STD, "schedule_steps": None}
+    return settings | {"teacher": None, "initial_log_std": LOG_STD, "schedule_steps": None, "residual_share": 1.0}
 
 
 def with_network_of(config: PpoConfig, source: str | Path) -> PpoConfig:
