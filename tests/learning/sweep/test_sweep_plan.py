@@ -1,11 +1,15 @@
 """Plans: what they say, what they refuse, before any trial begins."""
 
+import json
+from pathlib import Path
+
 import pytest
 
 import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config
 from wlr_gym.cli import main, sweep
+from wlr_gym.learning.evaluation import make_core
 from wlr_gym.learning.sweep.plan import (
     SweepPlan,
     known_settings,
@@ -18,6 +22,7 @@ from wlr_gym.learning.sweep.plan import (
 )
 
 ENVIRONMENT = "WLR-Velocity-v0"
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def plan(**fields):
@@ -51,6 +56,15 @@ def test_variants_are_settings_that_belong_together():
     first, last = whole_settings(again, trials[0]), whole_settings(again, trials[-1])
     assert (last["gamma"], last["epochs"], last["environment"]["randomization"]) == (0.9, 3, None)
     assert first == whole.settings | {"seed": 0, "epochs": 2}
+
+
+def test_the_ablations_can_begin():
+    """Every setting that they name exists, in the agent and in the task."""
+    whole = resolve(read_plan(ROOT / "examples" / "ablations.yaml"))
+    found = [whole_settings(whole, trial) for trial in trials_of(known_settings(whole) or [], [0])]
+    assert len({json.dumps(settings, sort_keys=True) for settings in found}) == len(found) == len(whole.variants)
+    for settings in found:
+        make_core(ENVIRONMENT, 1, settings["environment"]).close()
 
 
 def test_random_settings_are_the_same_again_and_within_their_ranges():
