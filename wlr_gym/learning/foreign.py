@@ -29,6 +29,8 @@ from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
 from stable_baselines3.sac.policies import SACPolicy  # noqa: E402
 from stable_baselines3.td3.policies import TD3Policy  # noqa: E402
 
+from wlr_gym.learning.ppo.layers import Layered  # noqa: E402
+
 #: The name that the contract gives as agent.
 AGENT = "imported"
 #: Robots that drive, and for how long (s), while file and network are compared.
@@ -204,7 +206,8 @@ class _Sb3Mean(torch.nn.Module):
         if isinstance(policy, TD3Policy):
             return policy.actor(observation)
         features = policy.extract_features(observation, policy.pi_features_extractor)
-        mean = policy.action_net(policy.mlp_extractor.forward_actor(features))
+        last = policy.acting_net() if isinstance(policy, Layered) else policy.action_net
+        mean = last(policy.mlp_extractor.forward_actor(features))
         return torch.tanh(mean) if policy.squash_output else mean
 
 

@@ -1,5 +1,6 @@
 """Plans: what they say, what they refuse, before any trial begins."""
 
+import datetime
 import json
 from pathlib import Path
 
@@ -104,6 +105,11 @@ def test_long_names_stay_different():
         ({"space": {"gamma": [0.9, 1.5]}}, "gamma=1.5,seed=0.*gamma"),
         ({"variants": {"one": {"learning_rte": 1e-3}}}, "variant=one,seed=0.*did you mean 'learning_rate'"),
         ({"variants": {"one": {}}, "space": {"variant": ["two"]}}, "give 'variants'"),
+        ({"variants": {"one": {"gamma": 0.9}}, "space": {"gamma": [0.97]}}, "'one' sets 'gamma', which 'seeds' or 'space'"),
+        ({"variants": {"one": {"seed": 1}}}, "'one' sets 'seed'"),
+        ({"variants": {"one": {"gamma": datetime.date(2026, 1, 1)}}}, "variants: one: gamma: .* is no setting"),
+        ({"variants": {"a b": {}, "a_b": {}}, "search": {"trials": 1}}, "two trials are called 'variant=a_b"),
+        ({"variants": {"one": {}, "two": {"gama": 0.9}}, "search": {"trials": 1}}, "did you mean 'gamma'"),
         ({"space": {"gamma": [0.9, 0.9]}}, "two trials are called 'gamma=0.9,seed=0': the same value is given twice"),
         ({"seeds": [1, 1]}, "two trials are called 'seed=1'"),
         ({"seeds": [1, 1], "space": {"gamma": [0.9]}, "search": {"method": "optuna"}}, "two trials are called 'seed=1'"),

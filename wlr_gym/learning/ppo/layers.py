@@ -107,7 +107,7 @@ class OnTop(nn.Module):
         return x[:, width:] + self.residual * self.last(x[:, :width])
 
 
-class _Layered(ActorCriticPolicy):
+class Layered(ActorCriticPolicy):
     """Stable-Baselines3's policy with :class:`Layers`."""
 
     def __init__(self, *arguments: Any, layers: Layers = Layers(), **keywords: Any) -> None:
@@ -137,11 +137,11 @@ class _Layered(ActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), **keywords)
 
 
-class LayeredPolicy(_Layered):
+class LayeredPolicy(Layered):
     """For plain observations (N, D)."""
 
 
-class LayeredAsymmetricPolicy(_Layered, AsymmetricPolicy):
+class LayeredAsymmetricPolicy(Layered, AsymmetricPolicy):
     """For observations {``policy``: (N, D), ``privileged``: (N, P)}."""
 
 

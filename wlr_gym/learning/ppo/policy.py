@@ -146,7 +146,9 @@ def actor(network: Any) -> Any:
     """Return the part of a network that acts, as a torch module: observations (N, D) to actions (N, 8) clipped to [-1, 1]."""
     from torch import nn
 
-    last = network.acting_net() if hasattr(network, "acting_net") else network.action_net
+    from wlr_gym.learning.ppo.layers import Layered
+
+    last = network.acting_net() if isinstance(network, Layered) else network.action_net
     return nn.Sequential(network.mlp_extractor.policy_net, last, nn.Hardtanh(-1.0, 1.0))
 
 

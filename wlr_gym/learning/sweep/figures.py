@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 #: So many values of a setting have a tick each.
 _FEW = 5
+#: So many letters of words are written level.
+_LEVEL = 40
 _WORDS = {
     "tracking_error": "tracking error (1 = at the task's scales)",
     "success": "success (%)",
@@ -83,7 +85,8 @@ def _aligned(results: Sequence[TrialResult], metric: str) -> tuple[np.ndarray, n
 def effects(results: Sequence[TrialResult], shares: Mapping[str, float], metric: str) -> Figure:
     """Draw the final scores of all trials over each setting, the most important first."""
     names = list(shares)[:4]
-    figure = new_figure(min(10.0, 3.3 * len(names)), 3.2)
+    kinds = max(len({str(one.trial.settings[name]) for one in results}) for name in names)
+    figure = new_figure(min(10.0, max(3.3, 0.4 * kinds) * len(names)), 3.2 if kinds <= _FEW else 4.4)
     for axes, name in zip(figure.subplots(1, len(names), squeeze=False, sharey=True)[0], names, strict=True):
         _draw_effect(axes, [one for one in results if metric in one.final], name, metric)
         axes.set_title(f"{name}: {100 * shares[name]:.0f} %", fontsize=9)
@@ -103,9 +106,11 @@ def _draw_effect(axes: Axes, results: Sequence[TrialResult], name: str, metric: 
             axes.set_xticks(np.unique(x), [f"{value:g}" for value in np.unique(x)])
             axes.minorticks_off()
     else:
-        words = sorted({str(value) for value in values})
+        words = list(dict.fromkeys(str(value) for value in values))
         x = np.array([words.index(str(value)) for value in values], dtype=float)
         axes.set_xticks(range(len(words)), words)
+        if sum(map(len, words)) > _LEVEL:
+            axes.set_xticks(range(len(words)), words, rotation=40, ha="right", rotation_mode="anchor")
     axes.plot(x, scores, "o", color=COLOURS[0], markersize=4, alpha=0.5, markeredgewidth=0)
     axes.margins(x=0.15)
     axes.tick_params(labelsize=8)

@@ -123,6 +123,21 @@ class SweepPlan(SettingsModel):
             raise InputError(f"space: '{VARIANT}' is none of its settings; give 'variants', and there what each of them sets")
         if not self.variants:
             del self.space[VARIANT]
+        for name, changes in self.variants.items():
+            for key in changes:
+                if key == "seed" or key in self.space:
+                    raise InputError(f"variants: '{name}' sets '{key}', which 'seeds' or 'space' sets too")
+        return self
+
+    @model_validator(mode="after")
+    def _values_are_json(self) -> SweepPlan:
+        lists = {name: values for name, values in self.space.items() if isinstance(values, list)}
+        for where, values in [("space", lists), *((f"variants: {name}", changes) for name, changes in self.variants.items())]:
+            for key, value in values.items():
+                try:
+                    json.dumps(value)
+                except TypeError as error:
+                    raise InputError(f"{where}: {key}: {value!r} is no setting: {error}; put words into quotes") from None
         return self
 
     @model_validator(mode="after")
@@ -275,7 +290,11 @@ def _check(plan: SweepPlan) -> None:
     """Refuse what no trial could do, before any begins."""
     known = known_settings(plan)
     trials_of([{}] if known is None else known, plan.seed_list)  # no name twice
-    for settings in [draw(plan, np.random.default_rng(0))] if known is None else known:
+    if plan.search is not None:  # which leaves some out, so far
+        drawn = draw(plan, np.random.default_rng(0))
+        known = [*(known or [drawn]), *(drawn | {VARIANT: name} for name in plan.variants)]
+        trials_of([{VARIANT: name} for name in plan.variants], [0])
+    for settings in known or []:
         trial = trial_of(settings, plan.seed_list[0])
         whole = whole_settings(plan, trial)
         _check_environment(whole.get("environment") or {}, trial.name)
@@ -311,5 +330,5 @@ def _check_early_stopping(plan: SweepPlan) -> None:
             f"early_stopping: settings 'evaluate_every' = {every} and 'total_steps' = {total}: expected scores at least every "
             "ninth of the steps; set evaluate_every"
         )
-    if "total_steps" in plan.space:
+    if "total_steps" in plan.space or any("total_steps" in changes for changes in plan.variants.values()):
         raise InputError("early_stopping: trials must be comparable at equal steps: 'total_steps' cannot be searched")

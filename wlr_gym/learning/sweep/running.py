@@ -76,6 +76,7 @@ def sweep(
     agent: str = "ppo",
     settings: Mapping[str, Any] | None = None,
     space: Mapping[str, Any] | None = None,
+    variants: Mapping[str, Mapping[str, Any]] | None = None,
     seeds: int | Sequence[int] = 5,
     search: Mapping[str, Any] | None = None,
     init: str | Path | None = None,
@@ -91,6 +92,7 @@ def sweep(
         settings: changes of the settings that all trials share.
         space: dotted name of a setting -> list of values, or, for a search, ``{"low": 1e-4, "high": 1e-2, "log": True}``.
             All combinations of lists make the grid.
+        variants: name -> dotted name of a setting -> value: settings that belong together, one more dimension of the grid.
         seeds: how many, from 0 on, or which.
         search: fields of :class:`wlr_gym.learning.sweep.plan.SearchPlan`, such as
             ``{"method": "optuna", "trials": 20, "early_stopping": True}``; None = every settings with every seed.
@@ -114,6 +116,7 @@ def sweep(
         "init": None if init is None else str(init),
         "settings": dict(settings or {}),
         "space": {name: dict(given) if isinstance(given, Mapping) else given for name, given in (space or {}).items()},
+        "variants": {name: dict(given) for name, given in (variants or {}).items()},
         "seeds": seeds if isinstance(seeds, int) else list(seeds),
         "search": None if search is None else dict(search),
     }
