@@ -29,8 +29,8 @@ class PpoConfig(SettingsModel):
         hidden_layers, activation: of the networks of policy and value, which share nothing.
         normalise: bring the observations to mean 0 and deviation 1, as the untrained policy meets them, inside the network.
         residual: the network's output times this is added to the action of the task's ``controller``; None = no controller.
-        residual_share: how much of the residual the finished policy adds; all of it in training. Less than 1 takes more from
-            what differs from seed to seed than from what all of them learn.
+        residual_share: how much of the residual the finished policy adds; all of it in training. Less than 1 shrinks what is
+            one seed's own more than what all seeds learn.
         mirror: learn from the left-right mirror image of every other sample.
         initial_log_std: logarithm of the exploration noise at the start, in actions: of all joints, or of (legs, wheels).
         teacher: agent whose actions the actor learns before PPO starts (``warm_start.py``); None = from nothing.

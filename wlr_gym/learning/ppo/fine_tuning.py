@@ -18,7 +18,9 @@ from wlr_gym.policy import check_contract, find_policy, load_policy
 
 
 def start_from(model: PPO, env: Sb3VecEnv, config: PpoConfig, source: str | Path) -> None:
-    """Put a trained policy, as it acts, into ``model``. Where its critic is not known, a critic is fitted; its steps count.
+    """Put a trained policy into ``model``, so that the finished one would act as it does.
+
+    Where its critic is not known, a critic is fitted; the steps of that count.
 
     Raises:
         InputError: a policy that does not fit the environment, naming the first difference.
