@@ -34,17 +34,18 @@ def hide(seed: int) -> dict[str, Any]:
     return _HIDDEN[int(draw.integers(len(_HIDDEN)))](draw)
 
 
-def _friction(draw: Draw) -> dict[str, Any]:
-    leg = LEGS[int(draw.integers(len(LEGS)))]
-    return {"name": "coulomb_friction", "where": [leg], "parameters": {"torque": round(float(draw.uniform(0.3, 0.45)), 3)}}
+def _gyro(draw: Draw) -> dict[str, Any]:
+    """A gyroscope that reads a turn where there is none: the robot turns when it is to go straight ahead."""
+    bias = round(float(draw.uniform(0.04, 0.06) * draw.choice((-1.0, 1.0))), 4)
+    return {"name": "gyro_bias", "where": ["sensor"], "parameters": {"z": bias}}
 
 
 def _delay(draw: Draw) -> dict[str, Any]:
-    delay = round(float(draw.uniform(0.03, 0.05)), 3)
+    delay = round(float(draw.uniform(0.05, 0.07)), 3)
     return {"name": "command_delay", "where": list(JOINTS), "parameters": {"delay": delay}}
 
 
-_HIDDEN: tuple[Callable[[Draw], dict[str, Any]], ...] = (_friction, _delay)
+_HIDDEN: tuple[Callable[[Draw], dict[str, Any]], ...] = (_gyro, _delay)
 
 
 def drive(demo: Demo, tell: Tell) -> Section:
