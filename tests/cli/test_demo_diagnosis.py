@@ -31,6 +31,14 @@ def test_a_right_answer():
     assert answer.sentence == "The name and the place were right, the size off by 5 %."
 
 
+def test_only_what_was_hidden_has_a_size():
+    """A gyroscope's bias about z says nothing of x and y, which are 0."""
+    bias = load_patch([{"name": "gyro_bias", "where": ["sensor"], "parameters": {"z": 0.05}}]).effects[0]
+    answer = judge(bias, [found("gyro_bias", ["sensor"], x=0.001, y=-0.001, z=0.049)])
+    assert list(answer.sizes) == ["z"]
+    assert answer.sentence == "The name and the place were right, the size off by 2 %."
+
+
 def test_wrong_answers_are_said_to_be_wrong():
     elsewhere = judge(HIDDEN, [found("coulomb_friction", ["leg_rf"], torque=0.4)])
     assert (elsewhere.named, elsewhere.placed, elsewhere.right) == (True, False, False)
