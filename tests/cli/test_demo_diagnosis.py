@@ -34,7 +34,7 @@ def test_a_right_answer():
 def test_only_what_was_hidden_has_a_size():
     """A gyroscope's bias about z says nothing of x and y, which are 0."""
     bias = load_patch([{"name": "gyro_bias", "where": ["sensor"], "parameters": {"z": 0.05}}]).effects[0]
-    answer = judge(bias, [found("gyro_bias", ["sensor"], x=0.001, y=-0.001, z=0.049)])
+    answer = judge(bias, [found("gyro_bias", ["sensor"], x=0.001, y=0.001, z=0.049)])
     assert list(answer.sizes) == ["z"]
     assert answer.sentence == "The name and the place were right, the size off by 2 %."
 

@@ -242,7 +242,7 @@ def _revealed(hidden: PatchEffect, found: Sequence[EffectEntry], answer: Diagnos
                 parameter,
                 f"{number(truth)}{unit}",
                 f"{number(value)}{unit}{interval}",
-                f"{100.0 * (value / truth - 1.0):+.0f} %; {inside}",
+                f"{round(100.0 * (value / truth - 1.0)):+d} %; {inside}",
             )
         )
     extra = (
