@@ -85,9 +85,8 @@ def _aligned(results: Sequence[TrialResult], metric: str) -> tuple[np.ndarray, n
 def effects(results: Sequence[TrialResult], shares: Mapping[str, float], metric: str) -> Figure:
     """Draw the final scores of all trials over each setting, the most important first."""
     names = list(shares)[:4]
-    words = max(
-        len({one.trial.settings[name] for one in results if isinstance(one.trial.settings[name], str)}) for name in names
-    )
+    values = [[one.trial.settings[name] for one in results] for name in names]
+    words = max(len({value for value in column if isinstance(value, str)}) for column in values)
     figure = new_figure(min(10.0, max(3.3, 0.4 * words) * len(names)), 3.2 if words <= _FEW else 4.4)
     for axes, name in zip(figure.subplots(1, len(names), squeeze=False, sharey=True)[0], names, strict=True):
         _draw_effect(axes, [one for one in results if metric in one.final], name, metric)
