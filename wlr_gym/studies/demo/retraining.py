@@ -91,7 +91,8 @@ def outcome(numbers: dict[str, Any]) -> tuple[str, str]:
         change, interval = f"{-better:.0f} % higher", f"95 % interval {-high:.0f} to {-low:.0f} %"
         tail = " Training on made it worse."
     else:
-        change, tail = f"{better:+.0f} % better", " No difference beyond the interval."
+        change, interval = f"{-better:+.0f} %", f"95 % interval {-high:+.0f} to {-low:+.0f} %"
+        tail = " No difference beyond the interval."
     text = f"Tracking error on the robot with the fault {before} before and {after} after training on: {change}"
     return f"{text} ({interval}, {len(numbers['old'])} pairs of episodes).{tail}", verdict
 
