@@ -15,7 +15,7 @@ from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.envs.core import Core
 from wlr_gym.envs.registry import task_source_of
 from wlr_gym.learning.evaluation.rollout import seen_observations
-from wlr_gym.learning.ppo.policy import ModulePolicy
+from wlr_gym.learning.ppo.policy import ModulePolicy, acting_net
 from wlr_gym.policy.export import Parity, write_policy_file
 from wlr_gym.policy.file import policy_content
 
@@ -28,8 +28,6 @@ from stable_baselines3.common.save_util import load_from_zip_file  # noqa: E402
 from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
 from stable_baselines3.sac.policies import SACPolicy  # noqa: E402
 from stable_baselines3.td3.policies import TD3Policy  # noqa: E402
-
-from wlr_gym.learning.ppo.layers import Layered  # noqa: E402
 
 #: The name that the contract gives as agent.
 AGENT = "imported"
@@ -206,8 +204,7 @@ class _Sb3Mean(torch.nn.Module):
         if isinstance(policy, TD3Policy):
             return policy.actor(observation)
         features = policy.extract_features(observation, policy.pi_features_extractor)
-        last = policy.acting_net() if isinstance(policy, Layered) else policy.action_net
-        mean = last(policy.mlp_extractor.forward_actor(features))
+        mean = acting_net(policy)(policy.mlp_extractor.forward_actor(features))
         return torch.tanh(mean) if policy.squash_output else mean
 
 

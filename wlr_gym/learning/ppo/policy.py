@@ -146,10 +146,14 @@ def actor(network: Any) -> Any:
     """Return the part of a network that acts, as a torch module: observations (N, D) to actions (N, 8) clipped to [-1, 1]."""
     from torch import nn
 
+    return nn.Sequential(network.mlp_extractor.policy_net, acting_net(network), nn.Hardtanh(-1.0, 1.0))
+
+
+def acting_net(network: Any) -> Any:
+    """Return the last layer of a network as the finished policy has it."""
     from wlr_gym.learning.ppo.layers import Layered
 
-    last = network.acting_net() if isinstance(network, Layered) else network.action_net
-    return nn.Sequential(network.mlp_extractor.policy_net, last, nn.Hardtanh(-1.0, 1.0))
+    return network.acting_net() if isinstance(network, Layered) else network.action_net
 
 
 def parse_settings(config: Mapping[str, Any]) -> PpoConfig:

@@ -109,9 +109,8 @@ def _draw_effect(axes: Axes, results: Sequence[TrialResult], name: str, metric: 
     else:
         words = list(dict.fromkeys(str(value) for value in values))
         x = np.array([words.index(str(value)) for value in values], dtype=float)
-        axes.set_xticks(range(len(words)), words)
-        if sum(map(len, words)) > _LEVEL:
-            axes.set_xticks(range(len(words)), words, rotation=40, ha="right", rotation_mode="anchor")
+        level = sum(map(len, words)) <= _LEVEL
+        axes.set_xticks(range(len(words)), words, rotation=0 if level else 40, ha="center" if level else "right")
     axes.plot(x, scores, "o", color=COLOURS[0], markersize=4, alpha=0.5, markeredgewidth=0)
     axes.margins(x=0.15)
     axes.tick_params(labelsize=8)

@@ -290,11 +290,10 @@ def _check(plan: SweepPlan) -> None:
     """Refuse what no trial could do, before any begins."""
     known = known_settings(plan)
     trials_of([{}] if known is None else known, plan.seed_list)  # no name twice
-    if plan.search is not None:  # which leaves some out, so far
-        drawn = draw(plan, np.random.default_rng(0))
-        known = [*(known or [drawn]), *(drawn | {VARIANT: name} for name in plan.variants)]
-        trials_of([{VARIANT: name} for name in plan.variants], [0])
-    for settings in known or []:
+    drawn = draw(plan, np.random.default_rng(0))
+    variants = [drawn | {VARIANT: name} for name in plan.variants] if plan.search else []  # a search may begin with few of them
+    trials_of(variants, plan.seed_list)
+    for settings in [*(known or [drawn]), *variants]:
         trial = trial_of(settings, plan.seed_list[0])
         whole = whole_settings(plan, trial)
         _check_environment(whole.get("environment") or {}, trial.name)
