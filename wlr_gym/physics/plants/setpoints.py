@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from wlr_gym.base.snapshot import RowStore
@@ -34,6 +35,17 @@ class Setpoints(Protocol):
     def stores(self) -> dict[str, RowStore]: ...
 
 
+@njit(cache=True, nogil=True)
+def _read(ring: Any, head: int, ticks: Any, newer: Any, older: Any) -> None:
+    """Read the setpoints written so many ``ticks`` (N, 8) ago, and those of a tick before, from a ring (depth, N, 8)."""
+    depth, count, width = ring.shape
+    for i in range(count):
+        for j in range(width):
+            place = head - ticks[i, j]
+            newer[i, j] = ring[place % depth, i, j]
+            older[i, j] = ring[(place - 1) % depth, i, j]
+
+
 class SetpointHistory:
     """Ring of the last setpoints, from which each joint reads at its own ``command.delay``.
 
@@ -46,7 +58,6 @@ class SetpointHistory:
         self._period = control_period
         depth = int(np.ceil(SPECS["command.delay"].high / control_period)) + 2
         self._ring = np.zeros((depth, count, 8))
-        self._columns = np.arange(count * 8).reshape(count, 8)
         self._head = 0
         self._ticks = np.zeros((count, 8), np.intp)
         self._switch_time = np.zeros((count, 8))
@@ -75,15 +86,13 @@ class SetpointHistory:
         self._ring[self._head] = setpoints
         if not self._delayed:
             return setpoints, setpoints, self._switch_time
-        return self._at(self._ticks), self._at(self._ticks + 1), self._switch_time
+        newer, older = np.empty((2, *setpoints.shape))
+        _read(self._ring, self._head, self._ticks, newer, older)
+        return newer, older, self._switch_time
 
     def stores(self) -> dict[str, RowStore]:
         """Return the setpoints that were written, newest first (delays are parameters)."""
         return {"setpoints": _NewestFirst(self)}
-
-    def _at(self, ticks: NDArray[np.intp]) -> Array:
-        places = (self._head - ticks) % len(self._ring)
-        return self._ring.take(places * self._columns.size + self._columns)
 
 
 class _NewestFirst:
