@@ -135,9 +135,6 @@ def test_training_goes_on_with_the_policy_s_recipe_on_the_stated_robots(tmp_path
     assert environment["randomization"] == found.training.randomization
     assert environment["task"]["sensors"] == {"camera": 0.0, "flow": 0.0}
     assert environment["task"]["controller"]  # what the policy acts on
-    rewards = environment["task"]["rewards"]
-    assert rewards["stuck_wheels"]["weight"] < 0.0  # what the supervision would stop
-    assert rewards["squared_velocity_error"]  # beside the recipe's own
     assert (settings["total_steps"], settings["seed"], settings["learning_rate"]) == (10**6, 3, 5e-4)
 
 

@@ -29,8 +29,6 @@ FALLS_TO = 0.2
 #: Logarithm of the exploration noise of legs and wheels at the start, where the policy's file has none of its own: that at
 #: which trainings of the recipe end.
 LOG_STD = (-4.2, -2.1)
-#: Reward term of every training on: supervision stops robots whose wheels stick, and the simulation has none.
-STUCK_WHEELS = {"stuck_wheels": {"weight": -6.0}}
 #: Environment steps between scores on held-out episodes, and between checkpoints, as shares of the training.
 _SCORES = 4
 #: Name of the settings of the training.
@@ -55,11 +53,11 @@ def training_settings(policy: str, family: Family, *, steps: int, rate: float, s
     """
     settings = dict(agent_function("ppo", "settings_to_start_from")(policy))
     environment = dict(settings.get("environment") or {})
-    task = environment.get("task") or {}
-    if isinstance(task, Mapping):  # not a task file
-        present = having(sensors)["task"] if task.get("sensors") else {}
-        environment["task"] = {**task, **present, "rewards": {**(task.get("rewards") or {}), **STUCK_WHEELS}}
-    environment["randomization"] = dict(family.randomization)
+    task = environment.get("task")
+    task = dict(task) if isinstance(task, Mapping) else {}
+    if task.get("sensors"):
+        task |= having(sensors)["task"]
+    environment |= {"randomization": dict(family.randomization)} | ({"task": task} if task else {})
     if family.effects:
         environment["effects"] = [dict(one) for one in family.effects]
     else:
