@@ -362,8 +362,8 @@ def value_of(name, parameters=None, **truth):
     matrices["truth"][:, TRUTH_LAYOUT.slices["quaternion"]] = [1.0, 0.0, 0.0, 0.0]
     matrices["truth"][:, TRUTH_LAYOUT.slices["body_clearance"]] = 0.1
     for channel, value in truth.items():
-        source = "command" if channel == "command" else "truth"
-        where = slice(None) if source == "command" else TRUTH_LAYOUT.slices[channel]
+        source = channel if channel in ("command", "action") else "truth"
+        where = TRUTH_LAYOUT.slices[channel] if source == "truth" else slice(None)
         matrices[source][:, where] = value
     return float(np.squeeze(expressions(task, reader(task, matrices))[f"term.{name}"]))
 
@@ -379,6 +379,10 @@ def test_reward_terms_by_hand():
     assert value_of("energy", electrical_energy=-0.2) == 0.0
     torque = [0.9 * 7.3, 0, 0, 0, 1.5, 0, 0, 0]
     assert value_of("torque_saturation", motor_torque=torque) == pytest.approx((0.5 + 1.0) / 8)
+    speeds = [0.0] * 4 + [0.2, -0.1, 0.3, 0.0]  # rad/s; 6 rad/s are an action of 1, legs do not count
+    action = [1.0] * 4 + [0.1, 0.0, 0.5, -0.05]
+    assert value_of("stuck_wheels", action=action, joint_velocity=speeds) == pytest.approx((0.6 + 0.0 + 0.3) / 4)
+    assert value_of("stuck_wheels", {"scale": 0.5}, action=action, joint_velocity=[5.0] * 8) == 0.0
     assert value_of("leg_posture", joint_position=[np.pi / 2 + 0.5] * 4 + [0] * 4) == pytest.approx(1.0)
     tipped = [np.cos(0.6), np.sin(0.6), 0, 0]
     assert value_of("alive", quaternion=tipped) == 0.0

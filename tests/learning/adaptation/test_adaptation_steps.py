@@ -22,6 +22,7 @@ from wlr_gym.gap.report.entries import Result
 from wlr_gym.learning.adaptation import driving, identification, retraining, uncertainty
 from wlr_gym.learning.adaptation.plan import STEPS, AdaptStep, Asked, Progress, open_folder
 from wlr_gym.learning.adaptation.robots import EmulatedRobot
+from wlr_gym.learning.adaptation.supervised import more_often, stopped_episodes
 from wlr_gym.learning.evaluation.acceptance import Acceptance, Loss
 from wlr_gym.physics.effects import Patch, load_patch
 from wlr_gym.robot import load_robot
@@ -139,9 +140,17 @@ def test_training_goes_on_with_the_policy_s_recipe_on_the_stated_robots(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("stated", "elsewhere", "kept"), [(-3.0, 2.0, "new"), (1.0, 2.0, "velocity_slip_aware"), (-3.0, 6.0, "velocity_slip_aware")]
+    ("stated", "elsewhere", "stops", "kept"),
+    [
+        (-3.0, 2.0, 6, "new"),
+        (1.0, 2.0, 6, "velocity_slip_aware"),
+        (-3.0, 6.0, 6, "velocity_slip_aware"),
+        (-3.0, 2.0, 30, "velocity_slip_aware"),
+    ],
 )
-def test_the_new_policy_is_kept_where_it_is_better_and_nowhere_worse(tmp_path, monkeypatch, stated, elsewhere, kept):
+def test_the_new_policy_is_kept_where_it_is_better_and_nowhere_worse_or_stopped(
+    tmp_path, monkeypatch, stated, elsewhere, stops, kept
+):
     bounds = {"as stated": stated, "other floors": elsewhere}
     played = []
 
@@ -153,11 +162,55 @@ def test_the_new_policy_is_kept_where_it_is_better_and_nowhere_worse(tmp_path, m
     monkeypatch.setattr(retraining, "compare_on", compare)
     monkeypatch.setattr(retraining, "trained_policy", lambda progress: "new")
     monkeypatch.setattr(retraining, "export_trained", lambda progress: "new")
+    monkeypatch.setattr(retraining, "watched", lambda progress, found, own, policy: episodes(stops if policy == "new" else 5))
     families = [uncertainty.Family(name, {}) for name in bounds]
     found = uncertainty.Uncertainty(Patch(), families[0], tuple(families), ())
     for _ in range(2):  # the second time its files answer
         assert retraining.accept_policy(Progress(tmp_path, asked()), found, ROBOT).numbers["policy"] == kept
     assert played == list(bounds)
+
+
+def episodes(stopped):
+    """In which of 128 episodes a robot is stopped."""
+    return np.arange(128) < stopped
+
+
+@pytest.mark.parametrize(("stops", "trainings"), [(6, ["training"]), (30, ["training", "training_again"])])
+def test_a_policy_that_the_supervision_stops_more_often_is_trained_again(tmp_path, monkeypatch, stops, trainings):
+    done = {}
+
+    def train(progress, folder, config, family, rewards=None):
+        (folder / "policy").mkdir(parents=True)
+        done[folder.name] = rewards
+
+    def watched(progress, found, own, policy):
+        return episodes(stops if policy.endswith("training/policy") else 5)
+
+    monkeypatch.setattr(retraining, "train_in", train)
+    monkeypatch.setattr(retraining, "watched", watched)
+    progress = Progress(tmp_path, asked())
+    found = uncertainty.Uncertainty(Patch(), uncertainty.Family("training", {}), (uncertainty.Family("as stated", {}),), ())
+    record = retraining.train_supervised(progress, found, ROBOT)
+    assert list(done) == trainings
+    assert done["training"] is None
+    assert retraining.trained_policy(progress) == str(tmp_path / trainings[-1] / "policy")
+    if len(trainings) == 2:
+        assert done["training_again"] == retraining.STUCK_WHEELS
+        assert "would stop it in 23% of episodes, and the old policy in 4%" in record.said[-1]
+
+
+def test_the_supervision_stops_a_robot_whose_wheel_sticks_and_no_healthy_one():
+    found = {torque: stopped_episodes("pid", "WLR-Velocity-v0", having_friction(torque), 8, 100_000) for torque in (0.0, 1.2)}
+    assert not found[0.0].any()
+    assert found[1.2].all()
+    assert not more_often(found[0.0], found[0.0])
+    assert more_often(found[1.2], found[0.0])
+    assert not more_often(found[0.0], found[1.2])
+
+
+def having_friction(torque):
+    effects = [{"name": "coulomb_friction", "where": ["wheel_lf"], "parameters": {"torque": torque}}] if torque else None
+    return {"randomization": "nominal", "effects": effects, "episode_length": 8.0}
 
 
 # ---- the robot ----
@@ -216,7 +269,7 @@ def test_it_resumes_at_every_step_and_repeats_none(tmp_path, monkeypatch, interr
     monkeypatch.setattr(steps, "find_gap", step("gap"))
     monkeypatch.setattr(steps, "_decided", lambda progress: decided)
     monkeypatch.setattr(steps, "state_uncertainty", step("model", lambda record: (record, "found")))
-    monkeypatch.setattr(steps, "train_on", step("training"))
+    monkeypatch.setattr(steps, "train_supervised", step("training"))
     monkeypatch.setattr(
         steps, "accept_policy", step("acceptance", lambda record: record.model_copy(update={"numbers": {"policy": "new"}}))
     )

@@ -17,7 +17,7 @@ from wlr_gym.learning.adaptation.driving import drive_after, drive_before, recor
 from wlr_gym.learning.adaptation.identification import find_gap, state_uncertainty
 from wlr_gym.learning.adaptation.page import write_page
 from wlr_gym.learning.adaptation.plan import EXCITATIONS, AdaptStep, Asked, Progress, Tell, open_folder
-from wlr_gym.learning.adaptation.retraining import accept_policy, train_on
+from wlr_gym.learning.adaptation.retraining import accept_policy, train_supervised
 from wlr_gym.learning.adaptation.robots import AdaptedRobot, EmulatedRobot, RealRobot
 from wlr_gym.learning.adaptation.uncertainty import Uncertainty
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
@@ -171,7 +171,7 @@ def run_steps(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> Ada
         for name in ("training", "acceptance"):
             _step(progress, name, lambda: AdaptStep(outcome="left out", said=("There is nothing to train on.",)))
     else:
-        _step(progress, "training", lambda: train_on(progress, found))
+        _step(progress, "training", lambda: train_supervised(progress, found, own))
         _step(progress, "acceptance", lambda: accept_policy(progress, found, own))
         kept = str(progress.steps["acceptance"].numbers["policy"])
     _step(progress, "after", lambda: drive_after(progress, robot, kept))

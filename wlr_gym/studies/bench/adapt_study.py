@@ -33,7 +33,7 @@ from wlr_gym.learning.adaptation.adapt import find_uncertainty
 from wlr_gym.learning.adaptation.driving import episodes_of, errors_of
 from wlr_gym.learning.adaptation.identification import task_randomization
 from wlr_gym.learning.adaptation.plan import Asked, Progress, open_folder
-from wlr_gym.learning.adaptation.retraining import accept_policy, train_in, train_on
+from wlr_gym.learning.adaptation.retraining import accept_policy, train_in, train_supervised
 from wlr_gym.learning.adaptation.robots import EmulatedRobot
 from wlr_gym.learning.adaptation.uncertainty import Family, Uncertainty, uncertainty_of
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
@@ -288,8 +288,7 @@ def _calibrated(progress: Progress, robot: EmulatedRobot, own: Robot) -> tuple[s
 def _trained(progress: Progress, found: Uncertainty | None, own: Robot) -> tuple[str, dict[str, Any]]:
     if found is None:
         return POLICY, {"kept": "old"}
-    if not (progress.out / "training" / "policy").is_dir():
-        train_on(progress, found)
+    train_supervised(progress, found, own)
     numbers = accept_policy(progress, found, own).numbers
     return numbers["policy"], {"kept": numbers["kept"], "losses": numbers["losses"]}
 

@@ -12,7 +12,7 @@ from wlr_gym.envs.tasks.terms import references
 from wlr_gym.envs.tasks.terms.geometry import true_pose
 from wlr_gym.envs.tasks.terms.scalar import POSITIVE, ScalarTerm, registered
 from wlr_gym.physics.codegen import ops
-from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, LEGS, WHEELS
+from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS
 
 REWARDS: dict[str, ScalarTerm] = {}
 
@@ -169,6 +169,18 @@ def torque_saturation(signals: Signals, *, threshold: Value = 0.8) -> Value:
     stall = [signals.robot("servo.leg.stall_torque")] * len(LEGS) + [signals.robot("servo.wheel.stall_torque")] * len(WHEELS)
     used = [ops.absolute(torque) / limit for torque, limit in zip(signals.truth("motor_torque"), stall, strict=True)]
     return mean([ops.maximum(share - threshold, 0.0) for share in used]) / (1.0 - threshold)
+
+
+@registered(REWARDS, still=POSITIVE, scale=POSITIVE)
+def stuck_wheels(signals: Signals, *, still: Value = 0.25, scale: Value = 1.0) -> Value:
+    """Mean over wheels of |setpoint| over ``scale`` (rad/s), of those that turn slower than ``still`` (rad/s).
+
+    A wheel that stands against its setpoint looks blocked, or its encoder frozen: where that lasts, supervision stops a robot.
+    """
+    setpoints = [signals.task("action.wheel_scale") * action for action in signals.action[WHEEL_SLICE]]
+    speeds = signals.truth("joint_velocity")[WHEEL_SLICE]
+    pairs = zip(setpoints, speeds, strict=True)
+    return mean([ops.where_positive(still - ops.absolute(v), ops.absolute(u), 0.0) for u, v in pairs]) / scale
 
 
 @registered(REWARDS)
