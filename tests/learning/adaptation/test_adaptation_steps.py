@@ -166,7 +166,9 @@ def test_the_new_policy_is_kept_where_it_is_better_and_nowhere_worse_or_stopped(
     families = [uncertainty.Family(name, {}) for name in bounds]
     found = uncertainty.Uncertainty(Patch(), families[0], tuple(families), ())
     for _ in range(2):  # the second time its files answer
-        assert retraining.accept_policy(Progress(tmp_path, asked()), found, ROBOT).numbers["policy"] == kept
+        record = retraining.accept_policy(Progress(tmp_path, asked()), found, ROBOT)
+        assert record.numbers["policy"] == kept
+        assert (stops == 30) == ("would stop the new one more often (in 23% of episodes, not 4%)" in record.said[0])
     assert played == list(bounds)
 
 
@@ -180,7 +182,7 @@ def test_a_policy_that_the_supervision_stops_more_often_is_trained_again(tmp_pat
     done = {}
 
     def train(progress, folder, config, family, rewards=None):
-        (folder / "policy").mkdir(parents=True)
+        (folder / "policy").mkdir(parents=True, exist_ok=True)
         done[folder.name] = rewards
 
     def watched(progress, found, own, policy):
@@ -197,6 +199,17 @@ def test_a_policy_that_the_supervision_stops_more_often_is_trained_again(tmp_pat
     if len(trainings) == 2:
         assert done["training_again"] == retraining.STUCK_WHEELS
         assert "would stop it in 23% of episodes, and the old policy in 4%" in record.said[-1]
+        assert record.command.endswith(str(tmp_path / "training_again"))
+        monkeypatch.setattr(retraining, "_takes_rewards", lambda policy: False)
+        assert "nothing was changed" in retraining.train_supervised(progress, found, ROBOT).said[-1]
+
+
+def test_rewards_come_beside_those_of_the_recipe():
+    sizes = {"steps": 10**6, "rate": 5e-4, "seed": 3, "rewards": retraining.STUCK_WHEELS}
+    settings = retraining.training_settings("velocity_slip_aware", uncertainty.Family("training", {}), **sizes)
+    rewards = settings["environment"]["task"]["rewards"]
+    assert rewards["stuck_wheels"] == {"weight": -6.0}
+    assert rewards["squared_velocity_error"]
 
 
 def test_the_supervision_stops_a_robot_whose_wheel_sticks_and_no_healthy_one():

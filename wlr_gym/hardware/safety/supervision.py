@@ -89,7 +89,7 @@ def remember(
 
     Args:
         limits, ratings: the robot's.
-        status: what was last seen.
+        status: what was last seen; arrays of joints may be those of several robots, (N, 8).
         memory: of the step before.
         previous: (8,) setpoints sent in the step before.
         torque_on: (8,) motors that were on.
@@ -166,6 +166,21 @@ def error_time(limits: SafetyLimits, ratings: Ratings) -> Array:
 # ---- verdicts ----
 
 
+def frozen_limit(limits: SafetyLimits) -> Array:
+    """Return by how many rad (8,) a joint should have turned, when it has not moved, at most."""
+    return np.where(_IS_LEG, limits.frozen_leg, limits.frozen_wheel)
+
+
+def is_frozen(limits: SafetyLimits, memory: JointMemory) -> Mask:
+    """Return which joints (..., 8) repeat their reading while they should turn."""
+    return np.abs(memory.unmoved) > frozen_limit(limits)
+
+
+def is_lost(limits: SafetyLimits, ratings: Ratings, memory: JointMemory) -> Mask:
+    """Return which joints (..., 8) have stayed away from their setpoints for too long."""
+    return memory.away > error_time(limits, ratings)
+
+
 def judge(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: JointMemory, on: Mask) -> Iterator[Verdict]:
     """Yield what is wrong with joints and IMU.
 
@@ -174,8 +189,8 @@ def judge(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: J
     yield from _judge_registers(ratings, status, on)
     for k in np.flatnonzero(status.jump):
         yield Verdict(Level.OFF, "jump", _jump_text(limits, ratings, status, int(k)))
-    frozen = np.where(_IS_LEG, limits.frozen_leg, limits.frozen_wheel)
-    for k in np.flatnonzero(np.abs(memory.unmoved) > frozen):
+    frozen = frozen_limit(limits)
+    for k in np.flatnonzero(is_frozen(limits, memory)):
         yield Verdict(
             Level.OFF,
             "frozen",
@@ -183,7 +198,7 @@ def judge(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: J
             f"{abs(memory.unmoved[k]):.2f} rad (limit {frozen[k]:g} rad): is it blocked? If not, its encoder has failed: "
             f"exchange the servo",
         )
-    for k in np.flatnonzero(memory.away > error_time(limits, ratings)):
+    for k in np.flatnonzero(is_lost(limits, ratings, memory)):
         yield Verdict(Level.OFF, "tracking", _tracking_text(limits, ratings, status, memory, int(k)))
     if memory.imu_same > limits.imu_frozen:
         text = f"imu repeats the same six values for {memory.imu_same:.2f} s (limit {limits.imu_frozen:g} s): "

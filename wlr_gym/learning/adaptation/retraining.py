@@ -38,7 +38,7 @@ LOG_STD = (-4.2, -2.1)
 #: it makes policies for weak motors 36 % worse.
 STUCK_WHEELS = {"stuck_wheels": {"weight": -6.0}}
 #: Simulated episodes that the supervision watches, and their length, s.
-WATCHED, WATCHED_SECONDS = 128, 10.0
+WATCHED, WATCHED_SECONDS = 512, 10.0
 #: Environment steps between scores on held-out episodes, and between checkpoints, as shares of the training.
 _SCORES = 4
 #: Name of the settings of the training.
@@ -130,7 +130,7 @@ def train_on(progress: Progress, found: Uncertainty) -> AdaptStep:
             f"{asked.steps:,} environment steps from {asked.policy}, learning rate {asked.learning_rate:g}, in "
             f"{TRAINED_SHARE:.0%} of each interval.",
         ),
-        command=f"wlr train {asked.environment} --config {config} --init {asked.policy} --out {folder}",
+        command=_command(progress, config, folder),
         numbers={"steps": asked.steps, "learning_rate": asked.learning_rate},
     )
 
@@ -143,13 +143,25 @@ def train_supervised(progress: Progress, found: Uncertainty, own: Robot) -> Adap
     )
     if not more_often(new, old):
         return record
+    shares = f"{new.mean():.0%} of episodes, and the old policy in {old.mean():.0%}"
+    if not _takes_rewards(progress.asked.policy):
+        said = f"The supervision would stop it in {shares}; its task is a file of its own, so nothing was changed."
+        return record.model_copy(update={"said": (*record.said, said)})
     config = progress.folder("model") / f"{AGAIN}.yaml"
     train_in(progress, progress.out / AGAIN, config, found.training, STUCK_WHEELS)
-    said = (
-        f"The supervision would stop it in {new.mean():.0%} of episodes, and the old policy in {old.mean():.0%}: trained once "
-        "more, wheels that stick being a cost."
-    )
-    return record.model_copy(update={"said": (*record.said, said)})
+    said = f"The supervision would stop it in {shares}: trained once more, wheels that stick being a cost."
+    command = _command(progress, config, progress.out / AGAIN)
+    return record.model_copy(update={"said": (*record.said, said), "command": command})
+
+
+def _takes_rewards(policy: str) -> bool:
+    """Whether reward terms can be laid over the task of a policy's recipe: it is not a file."""
+    environment = agent_function("ppo", "settings_to_start_from")(policy).get("environment") or {}
+    return isinstance(environment.get("task") or {}, Mapping)
+
+
+def _command(progress: Progress, config: Path, folder: Path) -> str:
+    return f"wlr train {progress.asked.environment} --config {config} --init {progress.asked.policy} --out {folder}"
 
 
 def watched(progress: Progress, found: Uncertainty, own: Robot, policy: str) -> NDArray[np.bool_]:
@@ -158,7 +170,7 @@ def watched(progress: Progress, found: Uncertainty, own: Robot, policy: str) -> 
     keywords = {"randomization": dict(family.randomization), "effects": list(family.effects) or None, "robot": own}
     keywords |= {"precision": "float32", "episode_length": WATCHED_SECONDS, **having(asked.sensors)}
     progress.tell("supervision on simulated episodes", 0.0)
-    return stopped_episodes(policy, asked.environment, keywords, min(WATCHED, asked.episodes), FIRST_SEED)
+    return stopped_episodes(policy, asked.environment, keywords, WATCHED, FIRST_SEED)
 
 
 def trained_policy(progress: Progress) -> str:
@@ -203,10 +215,8 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> AdaptSt
     elif worse:
         verdict = f"The old policy is kept: the new one may be worse in '{worse[0].floors}' (by up to {worse[0].bound:.1f} %)."
     elif stops_more:
-        verdict = (
-            "The old policy is kept: the supervision would stop the new one more often (in {:.0%} of episodes, not {:.0%})."
-        )
-        verdict = verdict.format(stopped[1].mean(), stopped[0].mean())
+        shares = f"{stopped.mean():.0%} of episodes, not {stopped_before.mean():.0%}"
+        verdict = f"The old policy is kept: the supervision would stop the new one more often (in {shares})."
     else:
         verdict = "The old policy is kept: the new one is not better beyond the interval."
     numbers = {

@@ -12,14 +12,11 @@ from wlr_gym.envs.core import Core
 from wlr_gym.hardware.config import load_hardware
 from wlr_gym.hardware.safety.rules import ratings_of
 from wlr_gym.hardware.safety.state import RobotStatus
-from wlr_gym.hardware.safety.supervision import JointMemory, judge, remember
+from wlr_gym.hardware.safety.supervision import JointMemory, is_frozen, is_lost, remember
 from wlr_gym.hardware.servos import UNREAD
 from wlr_gym.learning.evaluation.rollout import roll_out
 from wlr_gym.learning.evaluation.subjects import make_player
 from wlr_gym.robot import JOINTS
-
-#: Rules that look at what joints do; the others look at registers, sensors and bus, which no simulator has.
-RULES = ("frozen", "tracking")
 
 
 def stopped_episodes(policy: str, environment: str, keywords: Mapping[str, Any], episodes: int, seed: int) -> NDArray[np.bool_]:
@@ -39,46 +36,46 @@ def stopped_episodes(policy: str, environment: str, keywords: Mapping[str, Any],
 
 
 def more_often(new: NDArray[np.bool_], old: NDArray[np.bool_]) -> bool:
-    """Whether the first is stopped in more of the same episodes (N,) than the second, beyond the 95 % interval."""
-    more = new.astype(float) - old
-    return bool(more.mean() > 1.96 * more.std() / np.sqrt(len(more)))
+    """Whether the first is stopped in more of the same episodes (N,) than the second (McNemar's exact test, 2.5 %)."""
+    from scipy.stats import binomtest
+
+    worse, differ = int((new & ~old).sum()), int((new ^ old).sum())
+    return differ > 0 and bool(binomtest(worse, differ, alternative="greater").pvalue < 0.025)
 
 
 class _Watched:
-    """The supervision of all robots of a batch."""
+    """The supervision's rules on what joints do, on all robots of a batch; it has others for registers, sensors and bus."""
 
     def __init__(self, core: Core) -> None:
-        self._core, self._on = core, np.ones(len(JOINTS), bool)
+        self._core, self._on = core, np.ones((core.count, len(JOINTS)), bool)
         self._limits = load_hardware("nominal").safety
         self._ratings = ratings_of(core.task.robot, core.task.config.control_period)
-        self._memories = [JointMemory() for _ in range(core.count)]
+        self._memory = JointMemory()
         self.stopped: NDArray[np.bool_] = np.zeros(core.count, bool)
 
     def look(self) -> None:
-        """Judge the robots whose episodes go on and that were not stopped."""
+        """Judge the robots whose episodes go on."""
         core, limits, ratings = self._core, self._limits, self._ratings
-        for row in np.flatnonzero(~(self.stopped | core.terminated | core.truncated)).tolist():
-            status, memory = self._status(row), self._memories[row]
-            memory = remember(limits, ratings, status, memory, core.actions.setpoints[row], self._on)
-            self._memories[row] = memory
-            self.stopped[row] = any(one.rule in RULES for one in judge(limits, ratings, status, memory, self._on))
+        self._memory = remember(limits, ratings, self._status(), self._memory, core.actions.setpoints.copy(), self._on)
+        bad = is_frozen(limits, self._memory) | is_lost(limits, ratings, self._memory)
+        self.stopped |= bad.any(axis=1) & ~(core.terminated | core.truncated)
 
-    def _status(self, row: int) -> RobotStatus:
-        """What a robot's servos say; a leg's effort tells nothing without the voltage on its motor, so it is not believed."""
-        sensors, none = self._core.sensors, np.zeros(len(JOINTS))  # copied: they are read anew in place
+    def _status(self) -> RobotStatus:
+        """What the servos say, copied, since sensors are read in place; that legs' motors draw current is not looked at."""
+        sensors, none, unknown = self._core.sensors, np.zeros(self._on.shape), np.full(3, np.nan)
         return RobotStatus(
             time=0.0,
-            position=sensors.joint_position[row].copy(),
-            velocity=sensors.joint_velocity[row].copy(),
+            position=sensors.joint_position.copy(),
+            velocity=sensors.joint_velocity.copy(),
             effort=none,
             silence=none,
             alert=none > 0,
             restarted=none > 0,
             voltage=none + self._ratings.supply,
             temperature=none,
-            gyro=sensors.gyro[row].copy(),
-            accelerometer=sensors.accelerometer[row].copy(),
+            gyro=unknown,
+            accelerometer=unknown,
             imu_silence=0.0,
-            up=np.array([0.0, 0.0, 1.0]),
-            registers=UNREAD._replace(torque=np.ones(len(JOINTS))),
+            up=unknown,
+            registers=UNREAD._replace(torque=np.ones(self._on.shape)),
         )
