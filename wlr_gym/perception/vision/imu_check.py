@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from wlr_gym.data.read import Run
 from wlr_gym.perception.vision.alignment import without_slow
 from wlr_gym.perception.vision.motion import smoothed_poses
+from wlr_gym.perception.vision.self_calibration import UNSURE
 from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import Robot
@@ -85,11 +85,39 @@ def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: R
         yield from _level(time, film, std, force, t, gyro)
 
 
-def imu_agrees(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> bool:
-    """Whether film and IMU can be compared and do not differ."""
-    comparable = bool(_comparable(samples, offset, run, run["t"])) and wrong_gravity(run) is None
-    found = chain(imu_differences(samples, offset, run, robot), wrong_axes(samples, offset, run, robot))
-    return comparable and next(found, None) is None
+def imu_compared(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> tuple[bool, list[str]]:
+    """Whether film and IMU can be compared and do not differ; and how they differ, in words."""
+    differences = list(imu_findings(samples, offset, run, robot))
+    return bool(_comparable(samples, offset, run, run["t"])) and not differences, differences
+
+
+def imu_findings(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> Iterator[str]:
+    """What of a film the IMU contradicts, in words."""
+    size = wrong_gravity(run)
+    if size is not None:
+        yield f"the accelerometer reads {size:.1f} m/s2 (median), expected 9.8: wrong unit, sign or sensor; the IMU is not used"
+    for channel, shown, time in wrong_axes(samples, offset, run, robot):
+        yield (
+            f"the film shows {shown} where the log has {channel}, most at {time:.2f} s: axes swapped, or a wrong sign; correct "
+            "the log's columns (x ahead, y to the left, z up: +9.8 at rest); the IMU is not used"
+        )
+    for difference in imu_differences(samples, offset, run, robot):
+        size, axis = f"{1e3 * difference.size:.0f} mrad", difference.axis
+        if difference.level:
+            yield (
+                f"at rest the {axis} differs from the accelerometer's by {size}: floor markers not level, a plate or an IMU "
+                "that is tilted, or a wrong calibration"
+            )
+        elif axis == "yaw":
+            yield (
+                f"camera and gyroscope see turns that differ by {size}, most at {difference.time:.2f} s: frame times that jump "
+                f"(frames dropped without a trace?), or a wrong run; {UNSURE}"
+            )
+        else:
+            yield (
+                f"the {axis} differs from the gyroscope's by {size}, most at {difference.time:.2f} s: a marker that gives way, "
+                f"a wrong readout or frame times that jump; {UNSURE}"
+            )
 
 
 def _comparable(samples: Sequence[Sample], offset: float, run: Run, t: Array) -> list[Sample]:
