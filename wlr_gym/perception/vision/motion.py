@@ -1,11 +1,12 @@
 """One smoother of the body's motion over camera, IMU and legs: a Kalman filter forwards, what comes later added backwards.
 
 Each of x, y, z, yaw, pitch and roll moves with white jerk, as much as smoothing it alone finds (:mod:`.smoothing`). A frame
-measures all six, with its covariance; the legs measure height, pitch and roll (:mod:`.stance`). Gyroscope and accelerometer
-measure turn rates and the force on the body, with the noise that the slip observer gives them: more where a reading changes and
-where legs move. Left open are bias, scale and mounting of the IMU and the slope of the floor. The gyroscope's pitch rate is not
-used: legs and drives pitch the body in step with the log, whose samples then add up to milliradians of no motion. Wheels
-measure nothing: their slip is what is wanted. It is part of the state, so its covariance comes with it.
+measures all six, with its covariance; the legs measure changes of height, pitch and roll (:mod:`.stance`). Gyroscope and
+accelerometer measure turn rates and the force on the body, with the noise that the slip observer gives them: more where a
+reading changes and where legs move. Left open are bias, scale and mounting of the IMU and the slope of the floor. The
+gyroscope's pitch rate is not used: legs and drives pitch the body in step with the log, whose samples then add up to
+milliradians of no motion. Wheels measure nothing: their slip is what is wanted. It is part of the state, so its covariance
+comes with it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from wlr_gym.data.read import Run
 from wlr_gym.perception.observer.prediction import leak_noise, rate_noise, shaking
 from wlr_gym.perception.observer.state import constants
 from wlr_gym.perception.vision.smoothing import Smoothed, smooth
-from wlr_gym.perception.vision.stance import OPEN, STANDING, Stance
+from wlr_gym.perception.vision.stance import OPEN, STANDING, UNDER_WHEELS, Stance
 from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import Robot
@@ -32,7 +33,8 @@ Array = NDArray[np.float64]
 _VALUE, _RATE, _ACCELERATION = slice(0, 6), slice(6, 12), slice(12, 18)
 _GYRO_BIAS, _GYRO_SCALE, _MOUNT, _LEAK, _SLOPE = slice(18, 21), slice(21, 24), slice(24, 27), slice(27, 30), slice(30, 32)
 _OPEN = slice(32, 32 + OPEN)
-_FIRST_SLIP, _SIZE = 41, 49
+_FIRST_SLIP = 32 + OPEN
+_SIZE = _FIRST_SLIP + 8
 _SLIP = slice(_FIRST_SLIP, _SIZE)
 _ANGLES, _MOTION = slice(3, 6), slice(0, 12)
 #: 1 sigma before anything is seen, about what the single smoothers found (m, rad), and of the IMU.
@@ -151,7 +153,7 @@ def smooth_motion(
     if legs is not None:
         seen.add_stance(shown, legs, at[shown])
         nearest = np.clip(last_row - 1, 0, len(rows) - 1)
-        wander[:, _OPEN.start : _OPEN.start + 3], spread[_OPEN] = legs.wander[nearest], legs.prior**2
+        wander[:, _OPEN][:, UNDER_WHEELS], spread[_OPEN] = legs.wander[nearest], legs.prior**2
     slope = _derivatives(lambda x: slipping(x[:, _VALUE], x[:, _RATE]).reshape(-1, 8), at[shown], _MOTION.stop)
     slope = slope[:, :, _MOTION]
     slipping_since = np.concatenate([np.zeros_like(slope[:1]), slope])  # nothing before the first row
@@ -170,6 +172,12 @@ def smooth_motion(
         slip_covariance=covariance[:, _SLIP, _SLIP].copy(),  # the rest is 25 times as large
         outliers=outliers,
     )
+
+
+def without_outliers(samples: Sequence[Sample], time: Array) -> tuple[Sequence[Sample], Array]:
+    """The samples that do not contradict their neighbours, and their times."""
+    kept = ~_outliers(_unwrapped(samples), _std(samples), time)
+    return [sample for sample, fine in zip(samples, kept, strict=True) if fine], time[kept]
 
 
 def _in_gap(time: Array, frames: Array) -> NDArray[np.bool_]:
@@ -244,9 +252,9 @@ class _Measurements:
 
     def add_stance(self, at: NDArray[np.int64], legs: Stance, states: Array) -> None:
         self.count[at] = 3
-        self.values[at, :3], self.noise[at, :3, :3] = legs.values, np.diag(legs.variance)
+        self.values[at, :3], self.noise[at, :3, :3] = legs.values, legs.noise
         self.design[at[:, None], range(3), STANDING] = 1.0
-        self.design[at, :3, _OPEN] = -legs.design(np.arange(len(at)), states)
+        self.design[at, :3, _OPEN] = -legs.design(states)
 
 
 def body_rates(pitch: Array, roll: Array, rates: Array) -> Array:

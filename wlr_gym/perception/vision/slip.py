@@ -24,8 +24,8 @@ from wlr_gym.data.body_pose import quaternion
 from wlr_gym.data.read import Run
 from wlr_gym.perception.vision.alignment import joint_signals, repeated
 from wlr_gym.perception.vision.imu_check import imu_compared
-from wlr_gym.perception.vision.motion import body_rates, imu_readings, smooth_motion
-from wlr_gym.perception.vision.stance import Stance, floor_slope, levelled, stance
+from wlr_gym.perception.vision.motion import body_rates, imu_readings, smooth_motion, without_outliers
+from wlr_gym.perception.vision.stance import stance, stance_findings
 from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
@@ -48,7 +48,7 @@ class SlipResult:
 
     Attributes:
         time: (K,) s, servo clock.
-        pose, pose_std: (K, 6) x, y, z, yaw, pitch, roll of the body on the floor, smoothed, 1 sigma. rate: (K, 6).
+        pose, pose_std: (K, 6) x, y, z, yaw, pitch, roll of the body in the floor frame, smoothed, 1 sigma. rate: (K, 6).
         slip_velocity: (K, 4, 2) m/s of each wheel's contact along its heading and to its left; slip_velocity_std: 1 sigma.
         slip: (K, 4, 2) m, slip velocity accumulated from the first row. slip_std: 1 sigma, random errors.
         slip_radius_std: (K, 4) m, 1 sigma of the longitudinal slip from the wheel radius.
@@ -140,10 +140,10 @@ def measure_slip(
     batch = repeated(parameters, len(rows))
     agrees, contradictions = imu_compared(samples, offset, run, robot)
     imu = imu_readings(run, _leg_pace(run, robot), robot) if agrees else None
-    legs: Stance | None = stance(rows, joints, robot, parameters)
-    tilt, other = floor_slope(samples, offset, legs)
-    samples, legs = (samples, None) if other else (levelled(samples, tilt), legs)
-    motion = smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu, legs)
+    legs = stance(rows, joints, robot, parameters)
+    other = list(stance_findings(*without_outliers(samples, time), legs))
+    sure = None if other else legs
+    motion = smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu, sure)
     value, rate = motion.value, motion.rate
     velocity, rolling, no_slip_speed = _contacts(value, rate, joints, batch)
     travel = velocity[:, :, 0] + rolling
