@@ -69,7 +69,8 @@ def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: R
         return
     time = np.array([sample.time for sample in seen]) + offset
     film = np.unwrap(np.stack([sample.pose[3:] for sample in seen]), axis=0)
-    std = np.sqrt(np.median([np.diag(sample.covariance)[3:] for sample in seen], axis=0))
+    own = np.sqrt([np.diag(sample.covariance)[3:] for sample in seen])
+    std = np.median(own, axis=0)
     gyro = _readings(run, "gyro")
     assert gyro is not None
     pitch, roll = (np.interp(t, time, film[:, k]) for k in (1, 2))
@@ -78,7 +79,7 @@ def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: R
     around = [turned[:, 0], np.cos(yaw), np.sin(yaw)]
     for k, axis in enumerate(("yaw", "pitch", "roll")):
         known = np.column_stack([np.ones(len(time)), time, *(around if k else [])])
-        limit = max(TILT_ERROR if k else TURN_ERROR, SIGMAS * float(std[k]))
+        limit = np.maximum(TILT_ERROR if k else TURN_ERROR, SIGMAS * np.maximum(own[:, k], std[k]))
         yield from _largest(axis, time, _without_turn(film[:, k], turned[:, k], known), limit)
     force = _readings(run, "acc")
     if force is not None:
@@ -187,10 +188,10 @@ def _rest(values: Array, known: Array) -> Array:
     return values - known @ (np.linalg.lstsq(known / size, values, rcond=1e-6)[0] / size)
 
 
-def _largest(axis: str, time: Array, rest: Array, limit: float) -> Iterator[TurnDifference]:
-    mean = np.convolve(rest, np.full(_TOGETHER, 1 / _TOGETHER), mode="valid")
-    worst = int(np.argmax(np.abs(mean)))
-    if abs(mean[worst]) > limit:
+def _largest(axis: str, time: Array, rest: Array, limit: Array) -> Iterator[TurnDifference]:
+    mean, limit = (np.convolve(a, np.full(_TOGETHER, 1 / _TOGETHER), mode="valid") for a in (rest, limit))
+    worst = int(np.argmax(np.abs(mean) / limit))
+    if abs(mean[worst]) > limit[worst]:
         yield TurnDifference(axis, float(time[worst + _TOGETHER // 2]), float(abs(mean[worst])))
 
 

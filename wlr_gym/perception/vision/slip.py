@@ -138,10 +138,11 @@ def measure_slip(
     joints = joint_signals(run, rows, robot)
     joints[0][:, LEG_SLICE] -= parameters["joint.zero_offset"]
     batch = repeated(parameters, len(rows))
-    agrees, contradictions = imu_compared(samples, offset, run, robot)
+    fine, fine_time = without_outliers(samples, time)
+    agrees, contradictions = imu_compared(fine, offset, run, robot)
     imu = imu_readings(run, _leg_pace(run, robot), robot) if agrees else None
     legs = stance(rows, joints, robot, parameters)
-    other = list(stance_findings(*without_outliers(samples, time), legs))
+    other = list(stance_findings(fine, fine_time, legs))
     sure = None if other else legs
     motion = smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu, sure)
     value, rate = motion.value, motion.rate

@@ -32,7 +32,7 @@ _ZERO = 0.01
 _OPEN, _SLOPE = 0.02, 0.01
 #: Sigmas by which a change may differ between film and legs; frames that are averaged; s over which changes are compared: those
 #: of a step, and of a lift.
-SIGMAS, _TOGETHER, _LAGS = 6.0, 5, (0.3, 1.0, 4.0)
+SIGMAS, _TOGETHER, _LAGS = 4.0, 5, (0.3, 1.0, 4.0)
 #: Height, pitch and roll of a pose; how many numbers are left open: constants, floor under each wheel, slopes (x, y), zeros.
 STANDING, _OPENS = [2, 4, 5], (3, 4, 2, 4)
 OPEN, UNDER_WHEELS = sum(_OPENS), slice(3, 7)
