@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from test_measure import OFFSET, samples_of
 
 from wlr_gym.data import Run
+from wlr_gym.perception.vision import slip
 from wlr_gym.perception.vision.imu_check import imu_findings, wrong_axes
 from wlr_gym.perception.vision.motion import ImuReadings, smooth_motion
 from wlr_gym.perception.vision.slip import measure_slip
@@ -128,10 +129,13 @@ def measured(drive, samples=None, **columns):
     return measure_slip(samples or samples_of(drive), OFFSET, run, drive.robot, Parameters.nominal(drive.robot))
 
 
-def test_slip_to_the_side_is_sharper_with_the_imu(drive):
+@pytest.mark.parametrize(("legs", "share"), [(True, 0.9), (False, 0.8)])
+def test_slip_to_the_side_is_sharper_with_the_imu(drive, monkeypatch, legs, share):
+    if not legs:
+        monkeypatch.setattr(slip, "stance_findings", lambda *_: ["not used"])
     alone, both = measured(drive, **NONE), measured(drive)
     true = true_slip(drive, both.time)
-    assert np.median(both.slip_std[:, :, 1]) < 0.9 * np.median(alone.slip_std[:, :, 1])
+    assert np.median(both.slip_std[:, :, 1]) < share * np.median(alone.slip_std[:, :, 1])
     assert np.median(both.slip_velocity_std[:, :, 1]) < 0.95 * np.median(alone.slip_velocity_std[:, :, 1])
     for found in (alone, both):
         assert np.abs(found.slip - true).max() < 1e-3
