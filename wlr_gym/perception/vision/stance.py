@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,8 +64,8 @@ class Stance:
 
     def at(self, time: Array) -> Stance:
         """What they say at other times, between the rows."""
-        rows = (self.values, self.by_wheel, self.by_zero, self.noise, self.wander)
-        return Stance(time, *(_between(time, self.time, row) for row in rows), self.prior)
+        names = ("values", "by_wheel", "by_zero", "noise", "wander")
+        return replace(self, time=time, **{name: _between(time, self.time, getattr(self, name)) for name in names})
 
 
 def stance(time: Array, joints: tuple[Array, Array], robot: Robot, parameters: Parameters) -> Stance:
@@ -95,11 +95,12 @@ def stance_findings(samples: Sequence[Sample], time: Array, legs: Stance) -> Ite
     Args:
         samples: of the film, without outliers. time: (F,) s of them, servo clock; those outside the legs' are not compared.
     """
-    seen = np.array([math.isfinite(sample.pose[0]) for sample in samples]) & (time >= legs.time[0]) & (time <= legs.time[-1])
-    if seen.sum() <= _TOGETHER:
+    within = (time >= legs.time[0]) & (time <= legs.time[-1])
+    seen = [(t, s) for t, s, fine in zip(time.tolist(), samples, within, strict=True) if fine and math.isfinite(s.pose[0])]
+    if len(seen) <= _TOGETHER:
         return
-    poses, variance = (np.stack([get(samples[k]) for k in np.flatnonzero(seen)]) for get in (_pose, _variance))
-    time = time[seen]
+    time, poses = np.array([t for t, _ in seen]), np.stack([sample.pose for _, sample in seen])
+    variance = np.stack([np.diag(sample.covariance)[STANDING] for _, sample in seen])
     legs = legs.at(time)
     wandered = np.cumsum(np.diff(time, prepend=time[0])[:, None] * legs.wander, axis=0)
     variance = variance + np.diagonal(legs.noise, axis1=1, axis2=2) / _TOGETHER
@@ -126,14 +127,6 @@ def _changes(
     size = np.abs(rest[step:] - rest[:-step])
     sigmas, middle = size / np.sqrt(allowed), 0.5 * (time[step:] + time[:-step])
     return [(float(sigmas[i, k]), float(size[i, k]), float(middle[i])) for k, i in enumerate(np.argmax(sigmas, axis=0))]
-
-
-def _pose(sample: Sample) -> Array:
-    return sample.pose
-
-
-def _variance(sample: Sample) -> Array:
-    return np.diag(sample.covariance)[STANDING]
 
 
 def _mean(values: Array) -> Array:
