@@ -106,7 +106,7 @@ def test_a_short_straight_drive_is_no_worse_with_the_legs(drive, alone):
 def standing(robot, front, rear, period=0.02):
     """What legs say that rest at these angles."""
     angles = np.tile([front, front, rear, rear, 0.0, 0.0, 0.0, 0.0], (20, 1))
-    return stance(period * np.arange(20), (angles, 0 * angles), robot, Parameters.nominal(robot))
+    return stance(np.linspace(0.0, 19 * period, 20), (angles, 0 * angles), robot, Parameters.nominal(robot))
 
 
 def test_a_short_wheelbase_tells_the_pitch_worse(drive):
@@ -115,7 +115,7 @@ def test_a_short_wheelbase_tells_the_pitch_worse(drive):
         standing(drive.robot, math.radians(150), math.radians(30)),
     )
     parameters = Parameters.nominal(drive.robot)
-    hip, reach = parameters["hip.position"][0, 0], parameters["leg.length"][0, 0] * math.cos(math.radians(30))
+    hip, reach = float(parameters["hip.position"][0, 0]), float(parameters["leg.length"][0, 0]) * math.cos(math.radians(30))
     assert short.noise[0, 1, 1] / long.noise[0, 1, 1] == pytest.approx(((hip + reach) / (hip - reach)) ** 2, rel=0.02)
     assert short.noise[0, 0, 0] == pytest.approx(long.noise[0, 0, 0], rel=0.02)
 
