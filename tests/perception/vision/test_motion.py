@@ -132,7 +132,7 @@ def measured(drive, samples=None, **columns):
 @pytest.mark.parametrize(("legs", "share"), [(True, 0.9), (False, 0.8)])
 def test_slip_to_the_side_is_sharper_with_the_imu(drive, monkeypatch, legs, share):
     if not legs:
-        monkeypatch.setattr(slip, "stance_findings", lambda *_: ["not used"])
+        monkeypatch.setattr(slip, "leg_findings", lambda *_: ["not used"])
     alone, both = measured(drive, **NONE), measured(drive)
     true = true_slip(drive, both.time)
     assert np.median(both.slip_std[:, :, 1]) < share * np.median(alone.slip_std[:, :, 1])

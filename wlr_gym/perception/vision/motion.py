@@ -1,7 +1,7 @@
 """One smoother of the body's motion over camera, IMU and legs: a Kalman filter forwards, what comes later added backwards.
 
 Each of x, y, z, yaw, pitch and roll moves with white jerk, as much as smoothing it alone finds (:mod:`.smoothing`). A frame
-measures all six, with its covariance; the legs measure changes of height, pitch and roll (:mod:`.stance`). Gyroscope and
+measures all six, with its covariance; the legs measure changes of height, pitch and roll (:mod:`.legs`). Gyroscope and
 accelerometer measure turn rates and the force on the body, with the noise that the slip observer gives them: more where a
 reading changes and where legs move. Left open are bias, scale and mounting of the IMU and the slope of the floor. The
 gyroscope's pitch rate is not used: legs and drives pitch the body in step with the log, whose samples then add up to
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from wlr_gym.data.read import Run
 from wlr_gym.perception.observer.prediction import leak_noise, rate_noise, shaking
 from wlr_gym.perception.observer.state import constants
+from wlr_gym.perception.vision.legs import OPEN, STANDING, UNDER_WHEELS, LegReadings
 from wlr_gym.perception.vision.smoothing import Smoothed, smooth
-from wlr_gym.perception.vision.stance import OPEN, STANDING, UNDER_WHEELS, Stance
 from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import Robot
@@ -117,7 +117,7 @@ def smooth_motion(
     rows: Array,
     slipping: Callable[[Array, Array], Array],
     imu: ImuReadings | None,
-    legs: Stance | None = None,
+    legs: LegReadings | None = None,
 ) -> SmoothedMotion:
     """Smooth a body's motion.
 
@@ -151,7 +151,7 @@ def smooth_motion(
         seen.add_imu(read, imu, inside, at[read])
         wander[:, _GYRO_BIAS], wander[:, _LEAK] = _GYRO_WANDER**2, np.interp(moments, imu.time, imu.leak_wander)[:, None]
     if legs is not None:
-        seen.add_stance(shown, legs, at[shown])
+        seen.add_legs(shown, legs, at[shown])
         nearest = np.clip(last_row - 1, 0, len(rows) - 1)
         wander[:, _OPEN][:, UNDER_WHEELS], spread[_OPEN] = legs.wander[nearest], legs.prior**2
     slope = _derivatives(lambda x: slipping(x[:, _VALUE], x[:, _RATE]).reshape(-1, 8), at[shown], _MOTION.stop)
@@ -250,7 +250,7 @@ class _Measurements:
             self.design[k, :m], self.values[k, :m] = design[i, fine], values[i, fine]
             self.noise[k, range(m), range(m)] = imu.variance[rows[i], fine]
 
-    def add_stance(self, at: NDArray[np.int64], legs: Stance, states: Array) -> None:
+    def add_legs(self, at: NDArray[np.int64], legs: LegReadings, states: Array) -> None:
         self.count[at] = 3
         self.values[at, :3], self.noise[at, :3, :3] = legs.values, legs.noise
         self.design[at[:, None], range(3), STANDING] = 1.0

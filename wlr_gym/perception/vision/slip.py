@@ -24,8 +24,8 @@ from wlr_gym.data.body_pose import quaternion
 from wlr_gym.data.read import Run
 from wlr_gym.perception.vision.alignment import joint_signals, repeated
 from wlr_gym.perception.vision.imu_check import imu_compared
+from wlr_gym.perception.vision.legs import leg_findings, leg_readings
 from wlr_gym.perception.vision.motion import body_rates, imu_readings, smooth_motion, without_outliers
-from wlr_gym.perception.vision.stance import stance, stance_findings
 from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
@@ -141,8 +141,8 @@ def measure_slip(
     fine, fine_time = without_outliers(samples, time)
     agrees, contradictions = imu_compared(fine, offset, run, robot)
     imu = imu_readings(run, _leg_pace(run, robot), robot) if agrees else None
-    legs = stance(rows, joints, robot, parameters)
-    other = list(stance_findings(fine, fine_time, legs))
+    legs = leg_readings(rows, joints, robot, parameters)
+    other = list(leg_findings(fine, fine_time, legs))
     sure = None if other else legs
     motion = smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu, sure)
     value, rate = motion.value, motion.rate

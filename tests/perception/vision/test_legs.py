@@ -10,8 +10,8 @@ from test_measure import OFFSET, samples_of
 
 from wlr_gym.data import Run
 from wlr_gym.perception.vision import slip
+from wlr_gym.perception.vision.legs import STANDING, leg_readings
 from wlr_gym.perception.vision.slip import measure_slip
-from wlr_gym.perception.vision.stance import STANDING, stance
 from wlr_gym.perception.vision.tracking import angles
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
@@ -70,7 +70,7 @@ def alone(monkeypatch):
 
     def without(drive, samples, run=None):
         with monkeypatch.context() as patch:
-            patch.setattr(slip, "stance_findings", lambda *_: ["not used"])
+            patch.setattr(slip, "leg_findings", lambda *_: ["not used"])
             return measured(drive, samples, run)
 
     return without
@@ -106,7 +106,7 @@ def test_a_short_straight_drive_is_no_worse_with_the_legs(drive, alone):
 def standing(robot, front, rear, period=0.02):
     """What legs say that rest at these angles."""
     angles = np.tile([front, front, rear, rear, 0.0, 0.0, 0.0, 0.0], (20, 1))
-    return stance(np.linspace(0.0, 19 * period, 20), (angles, 0 * angles), robot, Parameters.nominal(robot))
+    return leg_readings(np.linspace(0.0, 19 * period, 20), (angles, 0 * angles), robot, Parameters.nominal(robot))
 
 
 def test_a_short_wheelbase_tells_the_pitch_worse(drive):

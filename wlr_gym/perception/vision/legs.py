@@ -39,7 +39,7 @@ OPEN, UNDER_WHEELS = sum(_OPENS), slice(3, 7)
 
 
 @dataclass(frozen=True, eq=False)
-class Stance:
+class LegReadings:
     """What the legs say.
 
     Attributes:
@@ -62,13 +62,13 @@ class Stance:
         slopes = np.stack([x, y, -c, -s, -s, c], axis=1).reshape(-1, 3, 2)
         return np.concatenate([np.tile(np.eye(3), (len(x), 1, 1)), self.by_wheel, slopes, self.by_zero], axis=2)
 
-    def at(self, time: Array) -> Stance:
+    def at(self, time: Array) -> LegReadings:
         """What they say at other times, between the rows."""
         names = ("values", "by_wheel", "by_zero", "noise", "wander")
         return replace(self, time=time, **{name: _between(time, self.time, getattr(self, name)) for name in names})
 
 
-def stance(time: Array, joints: tuple[Array, Array], robot: Robot, parameters: Parameters) -> Stance:
+def leg_readings(time: Array, joints: tuple[Array, Array], robot: Robot, parameters: Parameters) -> LegReadings:
     """What legs say by angles and rates (K, 8) of the joints, nominal zeros taken off."""
     legs, rate = joints[0][:, LEG_SLICE], joints[1]
     values = rest_pose(repeated(parameters, len(time)), legs)
@@ -86,10 +86,10 @@ def stance(time: Array, joints: tuple[Array, Array], robot: Robot, parameters: P
     way = np.abs(rate[:, WHEEL_SLICE] * parameters["wheel.radius"]) + np.abs(rate[:, LEG_SLICE] * parameters["leg.length"])
     known = robot.tolerances.get("joint_zero")
     prior = np.repeat([_OPEN, UNEVEN, _SLOPE, _ZERO if known is None else known.legs], _OPENS)
-    return Stance(time, values, by_wheel, by_zero, noise, way * UNEVEN**2 / length, prior)
+    return LegReadings(time, values, by_wheel, by_zero, noise, way * UNEVEN**2 / length, prior)
 
 
-def stance_findings(samples: Sequence[Sample], time: Array, legs: Stance) -> Iterator[str]:
+def leg_findings(samples: Sequence[Sample], time: Array, legs: LegReadings) -> Iterator[str]:
     """How a film contradicts the legs, in words: by changes of height, pitch or roll that the model does not allow.
 
     Args:
