@@ -38,9 +38,9 @@ def logged(drive, kept):
 
 
 def drifting(samples, pitch, roll):
-    """With tilts that drift to and fro, as compression lets them, and sigmas of that size."""
+    """With tilts that drift to and fro, as compression lets them, and sigmas by which a second of frames errs that much."""
     size = np.array([0, 0, 0, 0, pitch, roll])
-    wide = np.diag(size**2)
+    wide = 30 * np.diag(size**2)
     return [replace(s, pose=s.pose + size * math.cos(0.7 * s.time), covariance=s.covariance + wide) for s in samples]
 
 
@@ -76,12 +76,12 @@ def alone(monkeypatch):
     return without
 
 
-def test_tilts_that_frames_tell_badly_come_from_the_legs(drive, alone):
-    samples = drifting(samples_of(drive), 0.008, 0.008)
-    found, film = measured(drive, samples), alone(drive, samples)
-    error, before = (one.slip - true_slip(drive, one.time) for one in (found, film))
+def test_tilts_that_frames_tell_badly_come_from_the_legs(paper, alone):
+    samples = shaken(samples_of(paper), 0.008)
+    found, film = measured(paper, samples), alone(paper, samples)
+    error, before = (one.slip - true_slip(paper, one.time) for one in (found, film))
     assert np.abs(error).max() < 0.6 * np.abs(before).max()
-    assert np.median(found.slip_std) < 0.8 * np.median(film.slip_std)
+    assert np.median(found.slip_std) < 0.9 * np.median(film.slip_std)
     assert not found.contradictions
 
 
@@ -140,10 +140,12 @@ def test_a_wheel_on_a_step_is_said_and_the_legs_are_not_used(drive, alone):
     assert np.array_equal(found.pose, alone(drive, stepped).pose)
 
 
-def test_front_wheels_on_a_kerb_of_3_mm_are_said(drive):
+@pytest.mark.parametrize("tilt", [0.0, 0.003, 0.008])
+def test_front_wheels_on_a_kerb_of_3_mm_are_said(paper, tilt):
+    """Also where each frame shows no more than its own noise."""
     change = np.array([0, 0, 0.0015, 0, -0.0086, 0])
-    stepped = [replace(s, pose=s.pose + change * (3.0 < s.time < 5.0)) for s in samples_of(drive)]
-    assert any("differs from what the legs say" in text for text in measured(drive, stepped).contradictions)
+    stepped = [replace(s, pose=s.pose + change * np.interp(s.time, [3, 3.2, 4.8, 5], [0, 1, 1, 0])) for s in samples_of(paper)]
+    assert any("pitch differs from what the legs say" in text for text in measured(paper, shaken(stepped, tilt)).contradictions)
 
 
 def test_a_robot_that_is_lifted_is_said(drive):

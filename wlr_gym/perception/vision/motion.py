@@ -46,7 +46,7 @@ _PRIOR = (
 _DRIVING = 2.0
 #: rad/s per root second: walk of the gyroscope's bias.
 _GYRO_WANDER = 1e-5
-#: Squared normalised innovation beyond which an IMU reading counts for less.
+#: Squared normalised innovation beyond which what IMU or legs say counts for less.
 _GATE = 36.0
 _STEP = 1e-5  # of derivatives
 #: Where poses follow each other by more than this many frames, the film does not tell how the body moves: it may then gain a
@@ -174,10 +174,10 @@ def smooth_motion(
     )
 
 
-def without_outliers(samples: Sequence[Sample], time: Array) -> tuple[Sequence[Sample], Array]:
-    """The samples that do not contradict their neighbours, and their times."""
+def without_outliers(samples: Sequence[Sample], time: Array) -> list[Sample]:
+    """The samples that do not contradict their neighbours."""
     kept = ~_outliers(_unwrapped(samples), _std(samples), time)
-    return [sample for sample, fine in zip(samples, kept, strict=True) if fine], time[kept]
+    return [sample for sample, fine in zip(samples, kept, strict=True) if fine]
 
 
 def _in_gap(time: Array, frames: Array) -> NDArray[np.bool_]:

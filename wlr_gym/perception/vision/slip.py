@@ -138,13 +138,15 @@ def measure_slip(
     joints = joint_signals(run, rows, robot)
     joints[0][:, LEG_SLICE] -= parameters["joint.zero_offset"]
     batch = repeated(parameters, len(rows))
-    fine, fine_time = without_outliers(samples, time)
+    fine = without_outliers(samples, time)
     agrees, contradictions = imu_compared(fine, offset, run, robot)
     imu = imu_readings(run, _leg_pace(run, robot), robot) if agrees else None
-    legs = leg_readings(rows, joints, robot, parameters)
-    other = list(leg_findings(fine, fine_time, legs))
-    sure = None if other else legs
-    motion = smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu, sure)
+    film, joined = (
+        smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu, legs)
+        for legs in (None, leg_readings(rows, joints, robot, parameters))
+    )
+    other = list(leg_findings(rows, (film.value, film.value_std), (joined.value, joined.value_std), fine))
+    motion = film if other else joined
     value, rate = motion.value, motion.rate
     velocity, rolling, no_slip_speed = _contacts(value, rate, joints, batch)
     travel = velocity[:, :, 0] + rolling
