@@ -148,8 +148,9 @@ def test_front_wheels_on_a_kerb_of_3_mm_are_said(paper, tilt):
     assert any("pitch differs from what the legs say" in text for text in measured(paper, shaken(stepped, tilt)).contradictions)
 
 
-def test_a_robot_that_is_lifted_is_said(drive):
-    found = measured(drive, raised(samples_of(drive), 0.01, 3.5, 5.5))
+@pytest.mark.parametrize("height", [0.01, 0.1, 0.3])
+def test_a_robot_that_is_lifted_is_said(drive, height):
+    found = measured(drive, raised(samples_of(drive), height, 3.5, 5.5))
     assert any("height differs from what the legs say" in text for text in found.contradictions)
 
 

@@ -113,8 +113,8 @@ def leg_findings(
         sigmas = np.abs(change) / np.sqrt(np.maximum(before - after, _LEAST * before))
         worst = int(np.argmax(sigmas))
         if sigmas[worst] > SIGMAS:
+            size = f"{1e3 * abs(change[worst]):.1f} {unit} ({sigmas[worst]:.0f} sigmas)"
             yield (
-                f"the {name} differs from what the legs say, which would change it by {1e3 * abs(change[worst]):.1f} {unit}, "
-                f"most at {when[worst]:.2f} s: a wheel off the floor, a floor that is not flat, or a marker that gives way; "
-                "legs are not used"
+                f"the {name} differs from what the legs say, which would change it by {size}, most at {when[worst]:.2f} s: a "
+                "wheel off the floor, a floor that is not flat, or a marker that gives way; legs are not used"
             )

@@ -46,7 +46,7 @@ _PRIOR = (
 _DRIVING = 2.0
 #: rad/s per root second: walk of the gyroscope's bias.
 _GYRO_WANDER = 1e-5
-#: Squared normalised innovation beyond which what IMU or legs say counts for less.
+#: Squared normalised innovation beyond which an IMU reading counts for less.
 _GATE = 36.0
 _STEP = 1e-5  # of derivatives
 #: Where poses follow each other by more than this many frames, the film does not tell how the body moves: it may then gain a
@@ -251,7 +251,7 @@ class _Measurements:
             self.noise[k, range(m), range(m)] = imu.variance[rows[i], fine]
 
     def add_legs(self, at: NDArray[np.int64], legs: LegReadings, states: Array) -> None:
-        self.count[at] = 3
+        self.count[at], self.gate[at] = 3, math.inf  # legs that contradict the film are to show: see leg_findings
         self.values[at, :3], self.noise[at, :3, :3] = legs.values, legs.noise
         self.design[at[:, None], range(3), STANDING] = 1.0
         self.design[at, :3, _OPEN] = -legs.design(states)
