@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from test_measure import OFFSET, samples_of
 
 from wlr_gym.data import Run
-from wlr_gym.perception.vision.analysis import _imu_findings
-from wlr_gym.perception.vision.imu_check import wrong_axes
+from wlr_gym.perception.vision import slip
+from wlr_gym.perception.vision.imu_check import imu_findings, wrong_axes
 from wlr_gym.perception.vision.motion import ImuReadings, smooth_motion
 from wlr_gym.perception.vision.slip import measure_slip
 from wlr_gym.perception.vision.tracking import OK, Sample, angles
@@ -129,10 +129,13 @@ def measured(drive, samples=None, **columns):
     return measure_slip(samples or samples_of(drive), OFFSET, run, drive.robot, Parameters.nominal(drive.robot))
 
 
-def test_slip_to_the_side_is_sharper_with_the_imu(drive):
+@pytest.mark.parametrize(("legs", "share"), [(True, 0.9), (False, 0.8)])
+def test_slip_to_the_side_is_sharper_with_the_imu(drive, monkeypatch, legs, share):
+    if not legs:
+        monkeypatch.setattr(slip, "leg_findings", lambda *_: ["not used"])
     alone, both = measured(drive, **NONE), measured(drive)
     true = true_slip(drive, both.time)
-    assert np.median(both.slip_std[:, :, 1]) < 0.8 * np.median(alone.slip_std[:, :, 1])
+    assert np.median(both.slip_std[:, :, 1]) < share * np.median(alone.slip_std[:, :, 1])
     assert np.median(both.slip_velocity_std[:, :, 1]) < 0.95 * np.median(alone.slip_velocity_std[:, :, 1])
     for found in (alone, both):
         assert np.abs(found.slip - true).max() < 1e-3
@@ -165,7 +168,7 @@ def test_a_wrong_imu_changes_nothing_and_is_a_finding(drive, wrong):
     columns = WRONG[wrong](drive.run)
     run = Run(drive.run.table.assign(**columns), drive.run.meta, drive.run.path)
     assert np.array_equal(measured(drive, **columns).pose, measured(drive, **NONE).pose)
-    assert list(_imu_findings(samples_of(drive), OFFSET, run, drive.robot))
+    assert list(imu_findings(samples_of(drive), OFFSET, run, drive.robot))
 
 
 def test_an_axis_of_the_accelerometer_that_is_wrong_is_named(drive):

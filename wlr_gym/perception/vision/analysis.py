@@ -26,9 +26,8 @@ from wlr_gym.perception.markers.sheet_fault import sheet_fault
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.alignment import Alignment, align, joint_signals
 from wlr_gym.perception.vision.frame_noise import without_repeats
-from wlr_gym.perception.vision.imu_check import imu_differences, wrong_axes, wrong_gravity
 from wlr_gym.perception.vision.motion import smoothed_poses
-from wlr_gym.perception.vision.self_calibration import UNSURE, SelfCalibration, calibration_findings, self_calibrated
+from wlr_gym.perception.vision.self_calibration import SelfCalibration, calibration_findings, self_calibrated
 from wlr_gym.perception.vision.slip import SlipResult, measure_slip
 from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, REPEATED, Sample, VideoFrame, track
 from wlr_gym.perception.vision.video import Frames
@@ -164,10 +163,7 @@ def analyse(
     legs = joint_signals(run, slip.time, found)[0][:, LEG_SLICE] - parameters["joint.zero_offset"]
     height_error = float(np.median(slip.pose[:, 2] - rest_pose(parameters, legs)[:, 0]))
     missing = frames.missing if isinstance(frames, Frames) else 0
-    findings = (
-        *_findings(samples, slip, height_error, missing), *calibration_findings(calibration),
-        *_imu_findings(samples, offset, run, found),
-    )  # fmt: skip
+    findings = *_findings(samples, slip, height_error, missing), *calibration_findings(calibration), *slip.contradictions
     return VideoAnalysis(
         measured, samples, alignment, offset, slip, found, origin, height_error, missing, findings, calibration
     )
@@ -307,34 +303,6 @@ def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, 
     dropped = int(np.sum(np.round(steps / np.median(steps)) - 1)) if len(steps) else 0
     if dropped > 0:
         yield f"about {dropped} frames were dropped by the camera"
-
-
-def _imu_findings(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> Iterator[str]:
-    size = wrong_gravity(run)
-    if size is not None:
-        yield f"the accelerometer reads {size:.1f} m/s2 (median), expected 9.8: wrong unit, sign or sensor; the IMU is not used"
-    for channel, shown, time in wrong_axes(samples, offset, run, robot):
-        yield (
-            f"the film shows {shown} where the log has {channel}, most at {time:.2f} s: axes swapped, or a wrong sign; correct "
-            "the log's columns (x ahead, y to the left, z up: +9.8 at rest); the IMU is not used"
-        )
-    for difference in imu_differences(samples, offset, run, robot):
-        size, axis = f"{1e3 * difference.size:.0f} mrad", difference.axis
-        if difference.level:
-            yield (
-                f"at rest the {axis} differs from the accelerometer's by {size}: floor markers not level, a plate or an IMU "
-                "that is tilted, or a wrong calibration"
-            )
-        elif axis == "yaw":
-            yield (
-                f"camera and gyroscope see turns that differ by {size}, most at {difference.time:.2f} s: frame times that jump "
-                f"(frames dropped without a trace?), or a wrong run; {UNSURE}"
-            )
-        else:
-            yield (
-                f"the {axis} differs from the gyroscope's by {size}, most at {difference.time:.2f} s: a marker that gives way, "
-                f"a wrong readout or frame times that jump; {UNSURE}"
-            )
 
 
 # --- plots ------------------------------------------------------------------------------------------------------------

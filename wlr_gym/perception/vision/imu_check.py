@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from wlr_gym.data.read import Run
 from wlr_gym.perception.vision.alignment import without_slow
 from wlr_gym.perception.vision.motion import smoothed_poses
+from wlr_gym.perception.vision.self_calibration import UNSURE
 from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import Robot
@@ -69,7 +69,8 @@ def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: R
         return
     time = np.array([sample.time for sample in seen]) + offset
     film = np.unwrap(np.stack([sample.pose[3:] for sample in seen]), axis=0)
-    std = np.sqrt(np.median([np.diag(sample.covariance)[3:] for sample in seen], axis=0))
+    own = np.sqrt([np.diag(sample.covariance)[3:] for sample in seen])
+    std = np.median(own, axis=0)
     gyro = _readings(run, "gyro")
     assert gyro is not None
     pitch, roll = (np.interp(t, time, film[:, k]) for k in (1, 2))
@@ -78,18 +79,46 @@ def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: R
     around = [turned[:, 0], np.cos(yaw), np.sin(yaw)]
     for k, axis in enumerate(("yaw", "pitch", "roll")):
         known = np.column_stack([np.ones(len(time)), time, *(around if k else [])])
-        limit = max(TILT_ERROR if k else TURN_ERROR, SIGMAS * float(std[k]))
+        limit = np.maximum(TILT_ERROR if k else TURN_ERROR, SIGMAS * np.maximum(own[:, k], std[k]))
         yield from _largest(axis, time, _without_turn(film[:, k], turned[:, k], known), limit)
     force = _readings(run, "acc")
     if force is not None:
         yield from _level(time, film, std, force, t, gyro)
 
 
-def imu_agrees(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> bool:
-    """Whether film and IMU can be compared and do not differ."""
-    comparable = bool(_comparable(samples, offset, run, run["t"])) and wrong_gravity(run) is None
-    found = chain(imu_differences(samples, offset, run, robot), wrong_axes(samples, offset, run, robot))
-    return comparable and next(found, None) is None
+def imu_compared(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> tuple[bool, list[str]]:
+    """Whether film and IMU can be compared and do not differ; and how they differ, in words."""
+    differences = list(imu_findings(samples, offset, run, robot))
+    return bool(_comparable(samples, offset, run, run["t"])) and not differences, differences
+
+
+def imu_findings(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> Iterator[str]:
+    """What of a film the IMU contradicts, in words."""
+    size = wrong_gravity(run)
+    if size is not None:
+        yield f"the accelerometer reads {size:.1f} m/s2 (median), expected 9.8: wrong unit, sign or sensor; the IMU is not used"
+    for channel, shown, time in wrong_axes(samples, offset, run, robot):
+        yield (
+            f"the film shows {shown} where the log has {channel}, most at {time:.2f} s: axes swapped, or a wrong sign; correct "
+            "the log's columns (x ahead, y to the left, z up: +9.8 at rest); the IMU is not used"
+        )
+    for difference in imu_differences(samples, offset, run, robot):
+        size, axis = f"{1e3 * difference.size:.0f} mrad", difference.axis
+        if difference.level:
+            yield (
+                f"at rest the {axis} differs from the accelerometer's by {size}: floor markers not level, a plate or an IMU "
+                "that is tilted, or a wrong calibration"
+            )
+        elif axis == "yaw":
+            yield (
+                f"camera and gyroscope see turns that differ by {size}, most at {difference.time:.2f} s: frame times that jump "
+                f"(frames dropped without a trace?), or a wrong run; {UNSURE}"
+            )
+        else:
+            yield (
+                f"the {axis} differs from the gyroscope's by {size}, most at {difference.time:.2f} s: a marker that gives way, "
+                f"a wrong readout or frame times that jump; {UNSURE}"
+            )
 
 
 def _comparable(samples: Sequence[Sample], offset: float, run: Run, t: Array) -> list[Sample]:
@@ -159,10 +188,10 @@ def _rest(values: Array, known: Array) -> Array:
     return values - known @ (np.linalg.lstsq(known / size, values, rcond=1e-6)[0] / size)
 
 
-def _largest(axis: str, time: Array, rest: Array, limit: float) -> Iterator[TurnDifference]:
-    mean = np.convolve(rest, np.full(_TOGETHER, 1 / _TOGETHER), mode="valid")
-    worst = int(np.argmax(np.abs(mean)))
-    if abs(mean[worst]) > limit:
+def _largest(axis: str, time: Array, rest: Array, limit: Array) -> Iterator[TurnDifference]:
+    mean, limit = (np.convolve(a, np.full(_TOGETHER, 1 / _TOGETHER), mode="valid") for a in (rest, limit))
+    worst = int(np.argmax(np.abs(mean) / limit))
+    if abs(mean[worst]) > limit[worst]:
         yield TurnDifference(axis, float(time[worst + _TOGETHER // 2]), float(abs(mean[worst])))
 
 

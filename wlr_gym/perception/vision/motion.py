@@ -1,11 +1,12 @@
-"""One smoother of the body's motion over camera and IMU: a Kalman filter forwards, what comes later added backwards.
+"""One smoother of the body's motion over camera, IMU and legs: a Kalman filter forwards, what comes later added backwards.
 
 Each of x, y, z, yaw, pitch and roll moves with white jerk, as much as smoothing it alone finds (:mod:`.smoothing`). A frame
-measures all six, with its covariance. Gyroscope and accelerometer measure turn rates and the force on the body, with the noise
-that the slip observer gives them: more where a reading changes and where legs move. Left open are bias, scale and mounting of
-the IMU and the slope of the floor. The gyroscope's pitch rate is not used: legs and drives pitch the body in step with the
-log, whose samples then add up to milliradians of no motion. Wheels measure nothing: their slip is what is wanted. It is part of
-the state, so its covariance comes with it.
+measures all six, with its covariance; the legs measure changes of height, pitch and roll (:mod:`.legs`). Gyroscope and
+accelerometer measure turn rates and the force on the body, with the noise that the slip observer gives them: more where a
+reading changes and where legs move. Left open are bias, scale and mounting of the IMU and the slope of the floor. The
+gyroscope's pitch rate is not used: legs and drives pitch the body in step with the log, whose samples then add up to
+milliradians of no motion. Wheels measure nothing: their slip is what is wanted. It is part of the state, so its covariance
+comes with it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from wlr_gym.data.read import Run
 from wlr_gym.perception.observer.prediction import leak_noise, rate_noise, shaking
 from wlr_gym.perception.observer.state import constants
+from wlr_gym.perception.vision.legs import OPEN, STANDING, UNDER_WHEELS, LegReadings
 from wlr_gym.perception.vision.smoothing import Smoothed, smooth
 from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.physics.plants.sensors import rotation
@@ -30,7 +32,9 @@ Array = NDArray[np.float64]
 # Where the state's elements stand; those of the IMU per axis, the slope along x and y of the floor.
 _VALUE, _RATE, _ACCELERATION = slice(0, 6), slice(6, 12), slice(12, 18)
 _GYRO_BIAS, _GYRO_SCALE, _MOUNT, _LEAK, _SLOPE = slice(18, 21), slice(21, 24), slice(24, 27), slice(27, 30), slice(30, 32)
-_FIRST_SLIP, _SIZE = 32, 40
+_OPEN = slice(32, 32 + OPEN)
+_FIRST_SLIP = 32 + OPEN
+_SIZE = _FIRST_SLIP + 8
 _SLIP = slice(_FIRST_SLIP, _SIZE)
 _ANGLES, _MOTION = slice(3, 6), slice(0, 12)
 #: 1 sigma before anything is seen, about what the single smoothers found (m, rad), and of the IMU.
@@ -108,14 +112,19 @@ def imu_readings(run: Run, legs: Array, robot: Robot) -> ImuReadings:
 
 
 def smooth_motion(
-    samples: Sequence[Sample], time: Array, rows: Array, slipping: Callable[[Array, Array], Array], imu: ImuReadings | None
+    samples: Sequence[Sample],
+    time: Array,
+    rows: Array,
+    slipping: Callable[[Array, Array], Array],
+    imu: ImuReadings | None,
+    legs: LegReadings | None = None,
 ) -> SmoothedMotion:
     """Smooth a body's motion.
 
     Args:
         samples: of the film. time: (F,) s of them, servo clock. rows: (K,) s, where the motion is wanted.
         slipping: slip velocities (K, 4, 2) for values and rates (K, 6) at the rows.
-        imu: None = the camera alone.
+        imu: None = the camera alone. legs: what they say at the rows; None = nothing.
     """
     poses, std = _unwrapped(samples), _std(samples)
     outliers = _outliers(poses, std, time)
@@ -134,17 +143,20 @@ def smooth_motion(
 
     seen = _Measurements.none(len(moments))
     seen.add_frames(frames, poses[kept], np.stack([sample.covariance for sample in samples])[kept])
-    wander = np.zeros((len(moments), _SIZE))
+    last_row = np.searchsorted(shown, np.arange(len(moments)), side="right")
+    wander, spread = np.zeros((len(moments), _SIZE)), np.zeros(_SIZE)
+    for part, std in _PRIOR:
+        spread[part] = std**2
     if imu is not None:
         seen.add_imu(read, imu, inside, at[read])
         wander[:, _GYRO_BIAS], wander[:, _LEAK] = _GYRO_WANDER**2, np.interp(moments, imu.time, imu.leak_wander)[:, None]
+    if legs is not None:
+        seen.add_legs(shown, legs, at[shown])
+        nearest = np.clip(last_row - 1, 0, len(rows) - 1)
+        wander[:, _OPEN][:, UNDER_WHEELS], spread[_OPEN] = legs.wander[nearest], legs.prior**2
     slope = _derivatives(lambda x: slipping(x[:, _VALUE], x[:, _RATE]).reshape(-1, 8), at[shown], _MOTION.stop)
     slope = slope[:, :, _MOTION]
     slipping_since = np.concatenate([np.zeros_like(slope[:1]), slope])  # nothing before the first row
-    last_row = np.searchsorted(shown, np.arange(len(moments)), side="right")
-    spread = np.zeros(_SIZE)
-    for part, std in _PRIOR:
-        spread[part] = std**2
     density = np.tile([signal.density for signal in near], (len(moments), 1))
     unseen = _in_gap(moments, time[kept])
     density[unseen] = np.maximum(density[unseen], 3 * _GAINED**2)
@@ -160,6 +172,12 @@ def smooth_motion(
         slip_covariance=covariance[:, _SLIP, _SLIP].copy(),  # the rest is 25 times as large
         outliers=outliers,
     )
+
+
+def without_outliers(samples: Sequence[Sample], time: Array) -> list[Sample]:
+    """The samples that do not contradict their neighbours."""
+    kept = ~_outliers(_unwrapped(samples), _std(samples), time)
+    return [sample for sample, fine in zip(samples, kept, strict=True) if fine]
 
 
 def _in_gap(time: Array, frames: Array) -> NDArray[np.bool_]:
@@ -231,6 +249,12 @@ class _Measurements:
             self.count[k] = m = len(fine)
             self.design[k, :m], self.values[k, :m] = design[i, fine], values[i, fine]
             self.noise[k, range(m), range(m)] = imu.variance[rows[i], fine]
+
+    def add_legs(self, at: NDArray[np.int64], legs: LegReadings, states: Array) -> None:
+        self.count[at], self.gate[at] = 3, math.inf  # legs that contradict the film are to show: see leg_findings
+        self.values[at, :3], self.noise[at, :3, :3] = legs.values, legs.noise
+        self.design[at[:, None], range(3), STANDING] = 1.0
+        self.design[at, :3, _OPEN] = -legs.design(states)
 
 
 def body_rates(pitch: Array, roll: Array, rates: Array) -> Array:

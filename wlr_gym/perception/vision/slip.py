@@ -1,12 +1,12 @@
 """Slip of every wheel and of the body from the camera's poses and the encoders, with uncertainty.
 
-Poses (with the IMU, :mod:`wlr_gym.perception.vision.motion`) and joint angles are smoothed onto the run's rows; their rates
-give each wheel's slip velocity by :mod:`wlr_gym.robot.slip`.
+Poses (with IMU and legs, :mod:`wlr_gym.perception.vision.motion`) and joint angles are smoothed onto the run's rows; their
+rates give each wheel's slip velocity by :mod:`wlr_gym.robot.slip`.
 
-Three kinds of error are kept apart. Random ones: of frames and IMU, of which the smoother knows the joint covariance of all
-slips, and of the offset of the clocks; so heading errors that turn the way driven sideways, and tilts that move the contacts,
-are in it. That of the wheels' radius (``tolerances`` of the robot file), and that of the layout of the markers on the body (its
-scale and heading): both grow with the distance driven and dominate long drives.
+Three kinds of error are kept apart. Random ones: of frames, IMU and legs, of which the smoother knows the joint covariance of
+all slips, and of the offset of the clocks; so heading errors that turn the way driven sideways, and tilts that move the
+contacts, are in it. That of the wheels' radius (``tolerances`` of the robot file), and that of the layout of the markers on the
+body (its scale and heading): both grow with the distance driven and dominate long drives.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data.body_pose import quaternion
 from wlr_gym.data.read import Run
 from wlr_gym.perception.vision.alignment import joint_signals, repeated
-from wlr_gym.perception.vision.imu_check import imu_agrees
-from wlr_gym.perception.vision.motion import ImuReadings, body_rates, imu_readings, smooth_motion
+from wlr_gym.perception.vision.imu_check import imu_compared
+from wlr_gym.perception.vision.legs import leg_findings, leg_readings
+from wlr_gym.perception.vision.motion import body_rates, imu_readings, smooth_motion, without_outliers
 from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
@@ -56,7 +57,7 @@ class SlipResult:
         ratio, angle: (K, 4) slip ratio and angle (rad).
         no_slip_error: share of the predicted path that ignoring slip gets wrong (the paper's measure).
         covered: (K,) False where no frame with a pose is near.
-        outliers: (F,) samples left out.
+        outliers: (F,) samples left out. contradictions: between film, IMU and legs, in words.
     """
 
     time: Array
@@ -75,6 +76,7 @@ class SlipResult:
     no_slip_error: float
     covered: NDArray[np.bool_]
     outliers: NDArray[np.bool_]
+    contradictions: tuple[str, ...]
 
     @property
     def body_slip(self) -> Array:
@@ -136,8 +138,15 @@ def measure_slip(
     joints = joint_signals(run, rows, robot)
     joints[0][:, LEG_SLICE] -= parameters["joint.zero_offset"]
     batch = repeated(parameters, len(rows))
-    imu = _usable_imu(samples, offset, run, robot)
-    motion = smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu)
+    fine = without_outliers(samples, time)
+    agrees, contradictions = imu_compared(fine, offset, run, robot)
+    imu = imu_readings(run, _leg_pace(run, robot), robot) if agrees else None
+    film, joined = (
+        smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu, legs)
+        for legs in (None, leg_readings(rows, joints, robot, parameters))
+    )
+    other = list(leg_findings(rows, (film.value, film.value_std), (joined.value, joined.value_std), fine))
+    motion = film if other else joined
     value, rate = motion.value, motion.rate
     velocity, rolling, no_slip_speed = _contacts(value, rate, joints, batch)
     travel = velocity[:, :, 0] + rolling
@@ -178,6 +187,7 @@ def measure_slip(
         no_slip_error=float(no_slip_error(accumulate(heading_speed, rows)[-1], accumulate(no_slip_speed, rows)[-1])),
         covered=_apart(rows, time[seen]) < LONGEST_GAP,
         outliers=motion.outliers,
+        contradictions=(*contradictions, *other),
     )
 
 
@@ -216,9 +226,6 @@ def _apart(rows: Array, frames: Array) -> Array:
     return np.minimum(np.abs(rows - frames[after - 1]), np.abs(frames[after] - rows))
 
 
-def _usable_imu(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> ImuReadings | None:
-    """What the IMU read; None where film and IMU differ: then the film alone counts."""
-    if not imu_agrees(samples, offset, run, robot):
-        return None
-    legs = joint_signals(run, run["t"], robot)[1][:, LEG_SLICE]
-    return imu_readings(run, np.sqrt(np.mean(legs**2, axis=1)), robot)
+def _leg_pace(run: Run, robot: Robot) -> Array:
+    """Rates of the legs (T,), rms, rad/s."""
+    return np.sqrt(np.mean(joint_signals(run, run["t"], robot)[1][:, LEG_SLICE] ** 2, axis=1))
