@@ -86,7 +86,7 @@ class SetpointHistory:
         self._ring[self._head] = setpoints
         if not self._delayed:
             return setpoints, setpoints, self._switch_time
-        newer, older = np.empty((2, *setpoints.shape))
+        newer, older = np.empty_like(setpoints), np.empty_like(setpoints)
         _read(self._ring, self._head, self._ticks, newer, older)
         return newer, older, self._switch_time
 
