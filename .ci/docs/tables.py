@@ -15,6 +15,7 @@ from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
+import ablations
 import performance
 
 from wlr_gym.data.excitations import EXCITATIONS
@@ -128,6 +129,11 @@ def blind_test_table(path: Path = ANSWERS) -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         plan = Plan(Path(folder), sets=len(answers), first_seed=first, runs=runs)
         return markdown(run_blind_test(plan, "no_module:nothing_is_analysed", lambda _: None, path)).splitlines()
+
+
+def ablation_table() -> list[str]:
+    """Return what each part of Velocity's recipe is worth."""
+    return _table(ablations.HEADER, ablations.rows())
 
 
 def adapt_table() -> list[str]:
@@ -291,6 +297,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     **{name: partial(lambda name: performance.made()[name], name) for name in ("speed", "batch", "machines", "engine")},
     "equations": verdict_table,
     "adapt": adapt_table,
+    "ablations": ablation_table,
     "scripts": script_table,
     "blind_test": blind_test_table,
     "next_blind_test": partial(blind_test_table, DATA / "gap_answers_new.json"),
