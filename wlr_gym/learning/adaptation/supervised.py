@@ -47,7 +47,8 @@ class _Watched:
     """The supervision's rules on what joints do, on all robots of a batch; it has others for registers, sensors and bus."""
 
     def __init__(self, core: Core) -> None:
-        self._core, self._on = core, np.ones((core.count, len(JOINTS)), bool)
+        free = core.actions.torque_on  # of tasks whose wheels have no torque
+        self._core, self._on = core, np.ones((core.count, len(JOINTS)), bool) if free is None else free
         self._limits = load_hardware("nominal").safety
         self._ratings = ratings_of(core.task.robot, core.task.config.control_period)
         self._memory = JointMemory()
