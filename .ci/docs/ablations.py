@@ -12,11 +12,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from learning import interval, percent
+
 from wlr_gym.base.files import write_json
 from wlr_gym.base.plots import BLUE, GREEN, ORANGE, WINE, legend_below, new_figure, save, tidy
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.learning.evaluation.scoring import evaluate
+from wlr_gym.learning.evaluation.training_seeds import expand
 
 ROOT = Path(__file__).resolve().parents[2]
 SWEEP = ROOT / "examples" / "ablations.yaml"
@@ -40,7 +43,7 @@ def score(sweep: str, blind: str) -> None:
     found = {name: f"{sweep}/trials/variant={name.replace(' ', '_')},seed=*" for name in read_yaml(SWEEP)["variants"]}
     found |= {BLIND[weight]: f"{blind}/trials/*slip.weight=-{weight:g},seed=*" for weight in BLIND}
     data = read_data() or {"commit": git_commit(), "episodes": EPISODES, "settings": {}, "controllers": {}}
-    for name in [one for one in found if runs(found[one]) and one not in data["settings"]]:
+    for name in [one for one in found if expand(found[one]) and one not in data["settings"]]:
         data["settings"][name] = {floors: _numbers(data, found[name], found[RECIPE], floors) for floors in FLOORS}
         write_json(DATA, data)
         print(name, data["settings"][name], flush=True)
@@ -48,9 +51,9 @@ def score(sweep: str, blind: str) -> None:
 
 def _numbers(data: dict[str, Any], ours: str, recipe: str, floors: str) -> dict[str, Any]:
     """Return the numbers of a setting on floors, without camera and flow; with the recipe those of the controllers."""
-    others = {"recipe": runs(recipe)} if ours != recipe else {one: one for one in CONTROLLERS}
+    others = {"recipe": expand(recipe)} if ours != recipe else {one: one for one in CONTROLLERS}
     card = evaluate(
-        runs(ours),
+        expand(ours),
         "WLR-Velocity-v0",
         baselines=list(others.values()),
         episodes=EPISODES,
@@ -61,17 +64,10 @@ def _numbers(data: dict[str, Any], ours: str, recipe: str, floors: str) -> dict[
     scores = dict(zip(("ours", *others), (card.scores["main"][name] for name in card.names), strict=True))
     if ours == recipe:
         data["controllers"][floors] = {one: {key: scores[one][key].mean for key in _KEYS} for one in others}
-    numbers: dict[str, Any] = {key: [(one := scores["ours"][key]).mean, one.low, one.high] for key in _KEYS}
+    numbers = {key: interval(scores["ours"][key]) for key in _KEYS}
     if ours != recipe:
-        better = card.comparison["main"][card.names[1]]["tracking_error"]
-        numbers["better"] = [better.mean, better.low, better.high]
+        numbers["better"] = interval(card.comparison["main"][card.names[1]]["tracking_error"])
     return numbers
-
-
-def runs(pattern: str) -> list[str]:
-    """Return the run folders that a pattern of trials names."""
-    path = Path(pattern)
-    return [str(one) for one in sorted(path.parent.glob(path.name))]
 
 
 def read_data() -> dict[str, Any]:
@@ -89,9 +85,8 @@ def rows() -> list[list[str]]:
 
 def _cells(numbers: dict[str, Any]) -> list[str]:
     error, low, high = numbers["tracking_error"]
-    better = "{:.0f} [{:.0f}, {:.0f}]".format(*numbers["better"]) if "better" in numbers else "-"
-    slip = f"{1e3 * numbers['slip_speed'][0]:.1f}"
-    return [f"{error:.3f} [{low:.3f}, {high:.3f}]", better.replace("-", "\N{MINUS SIGN}"), slip]
+    better = percent(numbers["better"]) if "better" in numbers else ""
+    return [f"{error:.3f} [{low:.3f}, {high:.3f}]", better, f"{1e3 * numbers['slip_speed'][0]:.1f}"]
 
 
 def draw(path: Path) -> None:

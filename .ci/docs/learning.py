@@ -89,22 +89,23 @@ def row_of(card: Card, sensors: str, floors: str) -> dict[str, Any]:
     """Return the numbers of a row."""
     scores, better, seeds = card.scores["main"], card.comparison["main"], card.seed_scores
     row: dict[str, Any] = {"sensors": sensors, "floors": floors}
-    row |= {key: _numbers(scores[OURS][key]) for key in ("tracking_error", "success", "slip_speed")}
+    row |= {key: interval(scores[OURS][key]) for key in ("tracking_error", "success", "slip_speed")}
     if OURS in seeds:
         row |= {"median": seeds[OURS].median("tracking_error"), "spread": seeds[OURS].spread("tracking_error")}
     row["others"] = {
         name: {
             "tracking_error": scores[name]["tracking_error"].mean,
             "slip_speed": scores[name]["slip_speed"].mean,
-            "better": _numbers(better[name]["tracking_error"]),
-            "slips_less": _numbers(better[name]["slip_speed"]),
+            "better": interval(better[name]["tracking_error"]),
+            "slips_less": interval(better[name]["slip_speed"]),
         }
         for name in (BLIND, *CONTROLLERS)
     }
     return row
 
 
-def _numbers(estimate: Estimate) -> list[float]:
+def interval(estimate: Estimate) -> list[float]:
+    """Return mean, low and high."""
     return [estimate.mean, estimate.low, estimate.high]
 
 
@@ -125,11 +126,12 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     found = ["neither" if row["sensors"] == "none" else row["sensors"], row["floors"]]
     found += [f"**{error:.3f} [{low:.3f}, {high:.3f}]**", spread]
     found += [f"{row['success'][0]:.0f}", f"{1000 * row['slip_speed'][0]:.1f}"]
-    found += [f"{others[name]['tracking_error']:.3f}, {_percent(others[name]['better'])}" for name in (BLIND, *CONTROLLERS)]
-    return found + [_percent(others[name]["slips_less"]) for name in (BLIND, "pid")]
+    found += [f"{others[name]['tracking_error']:.3f}, {percent(others[name]['better'])}" for name in (BLIND, *CONTROLLERS)]
+    return found + [percent(others[name]["slips_less"]) for name in (BLIND, "pid")]
 
 
-def _percent(numbers: list[float]) -> str:
+def percent(numbers: list[float]) -> str:
+    """Return mean, low and high as text."""
     mean, low, high = (f"{value:.0f}".replace("-", "\N{MINUS SIGN}") for value in numbers)
     return f"{mean} [{low}, {high}]"
 

@@ -221,6 +221,17 @@ def test_the_supervision_stops_a_robot_whose_wheel_sticks_and_no_healthy_one():
     assert not more_often(found[0.0], found[1.2])
 
 
+def test_what_the_supervision_would_stop_is_asked_once(tmp_path, monkeypatch):
+    played = []
+    monkeypatch.setattr(retraining, "stopped_episodes", lambda policy, *_: played.append(policy) or episodes(7))
+    family = uncertainty.Family("as stated", {})
+    progress, found = Progress(tmp_path, asked()), uncertainty.Uncertainty(Patch(), family, (family,), ())
+    policies = ["velocity_slip_aware", str(tmp_path / "training" / "policy"), str(tmp_path / "training_again" / "policy")]
+    for policy in policies * 2:
+        assert np.array_equal(retraining.watched(progress, found, ROBOT, policy), episodes(7))
+    assert played == policies
+
+
 def having_friction(torque):
     effects = [{"name": "coulomb_friction", "where": ["wheel_lf"], "parameters": {"torque": torque}}] if torque else None
     return {"randomization": "nominal", "effects": effects, "episode_length": 8.0}

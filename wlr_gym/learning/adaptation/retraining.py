@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
@@ -165,12 +167,16 @@ def _command(progress: Progress, config: Path, folder: Path) -> str:
 
 
 def watched(progress: Progress, found: Uncertainty, own: Robot, policy: str) -> NDArray[np.bool_]:
-    """Return in which simulated episodes (N,) the supervision would stop a robot as the result states it."""
+    """Return in which simulated episodes (N,) the supervision would stop a robot as the result states it; kept in a file."""
     asked, family = progress.asked, found.families[0]
-    keywords = {"randomization": dict(family.randomization), "effects": list(family.effects) or None, "robot": own}
-    keywords |= {"precision": "float32", "episode_length": WATCHED_SECONDS, **having(asked.sensors)}
-    progress.tell("supervision on simulated episodes", 0.0)
-    return stopped_episodes(policy, asked.environment, keywords, WATCHED, FIRST_SEED)
+    name = "old" if policy == asked.policy else Path(policy).parent.name
+    path = progress.folder("acceptance") / f"stopped_{name}.json"
+    if not path.is_file():
+        keywords = {"randomization": dict(family.randomization), "effects": list(family.effects) or None, "robot": own}
+        keywords |= {"precision": "float32", "episode_length": WATCHED_SECONDS, **having(asked.sensors)}
+        progress.tell("supervision on simulated episodes", 0.0)
+        write_json(path, stopped_episodes(policy, asked.environment, keywords, WATCHED, FIRST_SEED).tolist())
+    return np.array(json.loads(path.read_text(encoding="utf-8")), bool)
 
 
 def trained_policy(progress: Progress) -> str:
