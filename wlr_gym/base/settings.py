@@ -105,19 +105,28 @@ def parse_yaml(text: str) -> Any:
     return yaml.load(text, Loader=_Loader)
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
     """SafeLoader that reads 1e-3 and 2.5e-4 as numbers (YAML 1.1 takes the former for text) and refuses a key given twice."""
 
-    def compose_mapping_node(self, anchor: Any) -> Any:
-        """Read a mapping as it is written; merging by ``<<`` comes later."""
-        node = super().compose_mapping_node(anchor)
-        lines: dict[str, int] = {}
-        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+    def construct_document(self, node: yaml.Node) -> Any:
+        """Return what a document says; its mappings are looked at as they are written, before merging by ``<<``."""
+        _refuse_doubled_keys(node, set())
+        return super().construct_document(node)
+
+
+def _refuse_doubled_keys(node: yaml.Node, seen: set[int]) -> None:
+    if id(node) in seen or isinstance(node, yaml.ScalarNode):
+        return
+    seen.add(id(node))
+    lines: dict[str, int] = {}
+    for child in node.value:
+        key, value = child if isinstance(node, yaml.MappingNode) else (None, child)
+        if isinstance(key, yaml.ScalarNode):
             if key.value in lines:
                 problem = f"key '{key.value}' occurs twice, first in line {lines[key.value]}"
                 raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
             lines[key.value] = key.start_mark.line + 1
-        return node
+        _refuse_doubled_keys(value, seen)
 
 
 _Loader.add_implicit_resolver(
