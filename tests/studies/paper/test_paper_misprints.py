@@ -13,7 +13,7 @@ sp = pytest.importorskip("sympy")
 from paper_symbols import constants, same, state  # noqa: E402
 
 from wlr_gym.studies.paper import printed, repaired  # noqa: E402
-from wlr_gym.studies.paper.quantities import WHEELS, PaperConstants, State, ahead, to_the_right  # noqa: E402
+from wlr_gym.studies.paper.quantities import WHEELS, PaperConstants, State, ahead, to_the_right, wheelbase  # noqa: E402
 
 C, S = constants(), state()
 T = sp.Symbol("t")
@@ -151,7 +151,7 @@ def test_27_has_one_wrong_sign_and_28_a_wrong_denominator():
     as_printed, right = (equation(C, s) for equation in FORCES["rr"])
     assert same(as_printed - right, C.m_l * C.l_y * S.yaw_dd)
     as_printed, right = (equation(C, s) for equation in FORCES["lr"])
-    base, misprinted = printed._base(C, s), printed._misprinted_base(C, s)
+    base, misprinted = wheelbase(C, s), printed._misprinted_base(C, s)
     assert same(as_printed - right, C.mu_dx * printed.rear_moment(C, s) * (1 / misprinted - 1 / base))
 
 
@@ -159,10 +159,10 @@ def test_the_misprinted_denominator_adds_metres_to_a_number_and_even_passes_zero
     """Audit: 1.333 for 0.584 at alpha 30, beta 150 degrees. In the first test it changes sign on the way."""
     c = PaperConstants()
     far = State(alpha=math.radians(30), beta=math.radians(150))
-    assert printed._base(c, far) == pytest.approx(0.584, abs=1e-3)
+    assert wheelbase(c, far) == pytest.approx(0.584, abs=1e-3)
     assert printed._misprinted_base(c, far) == pytest.approx(1.333, abs=1e-3)
     near = State(alpha=math.radians(30), beta=math.radians(30))
-    assert printed._misprinted_base(c, near) < 0.0 < printed._base(c, near)
+    assert printed._misprinted_base(c, near) < 0.0 < wheelbase(c, near)
     assert printed.eq28_force_on_the_left_rear_wheel(c, near) < 0.0 < printed.eq27_force_on_the_right_rear_wheel(c, near)
 
 

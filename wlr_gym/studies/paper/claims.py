@@ -16,7 +16,7 @@ import numpy as np
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.paper import printed, reduced
-from wlr_gym.studies.paper.evidence import DRAG, VARIANTS, PaperEvidence
+from wlr_gym.studies.paper.evidence import DRAG, PaperEvidence, variant_row
 from wlr_gym.studies.paper.experiments import (
     LEG_SPEED,
     TESTS,
@@ -101,7 +101,7 @@ def _wording(e: PaperEvidence) -> tuple[str, str]:
 
 def _lateral(e: PaperEvidence) -> tuple[str, str]:
     own = [1000 * abs(float(e.plant[test].end[0, 1])) for test in TESTS]
-    k = list(VARIANTS).index("more drag left")
+    k = variant_row("more drag left")
     uneven = [100 * float(e.variants[test].end[k, 1]) for test in TESTS]
     return (
         f"{own[0]:.3f} and {own[1]:.3f} mm on a symmetric robot; {uneven[0]:.1f} and {uneven[1]:.1f} cm with unequal rear drag",
@@ -118,7 +118,7 @@ def _half_way(record: Record, robot: int) -> float:
 
 def _early_drift(e: PaperEvidence) -> tuple[str, str]:
     record = e.variants["test_1"]
-    share = _half_way(record, list(VARIANTS).index("more drag left"))
+    share = _half_way(record, variant_row("more drag left"))
     load = float(e.plant["test_1"].force[_after(e.plant["test_1"], 0.0), 0, :2, 2].sum())
     portion = load / (e.robot.total_mass * e.robot.gravity)
     return (
@@ -130,7 +130,7 @@ def _early_drift(e: PaperEvidence) -> tuple[str, str]:
 
 def _late_drift(e: PaperEvidence) -> tuple[str, str]:
     record = e.variants["test_2"]
-    share = _half_way(record, list(VARIANTS).index("left front wheel 2 % small"))
+    share = _half_way(record, variant_row("left front wheel 2 % small"))
     base = float(e.ideal["test_2"].posture.wheelbase[-1])
     return (
         f"with unequal front wheels half of it comes after {100 * share:.0f} % of the path; wheelbase {base:.3f} m at the end",
@@ -256,7 +256,7 @@ def _pitch(e: PaperEvidence) -> tuple[str, str]:
 
 def _roll(e: PaperEvidence) -> tuple[str, str]:
     own = max(math.degrees(float(np.abs(e.plant[test].attitude[:, 0, 2]).max())) for test in TESTS)
-    k = list(VARIANTS).index("more drag left")
+    k = variant_row("more drag left")
     uneven = max(math.degrees(float(np.abs(e.variants[test].attitude[:, k, 2]).max())) for test in TESTS)
     force = max(float(np.abs(np.diff(e.variants[test].force[:, k, :, 2])[:, [0, 2]]).max()) for test in TESTS)
     return (

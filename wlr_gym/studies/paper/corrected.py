@@ -6,6 +6,8 @@ Legs pairwise equal, no roll, four wheels on a level floor. (7) to (11) are the 
 
 from __future__ import annotations
 
+from functools import partial
+
 from wlr_gym.studies.paper import printed
 from wlr_gym.studies.paper.quantities import (
     WHEELS,
@@ -36,29 +38,18 @@ def eq2_velocity_of_the_body(velocity_in_floor: Vector, yaw: Value) -> Vector:
 
 
 def _contact_slip(c: PaperConstants, s: State, wheel: str) -> Vector:
-    """Velocity of the wheel's contact point over the floor: wheel centre minus rolling, with the ABSOLUTE spin rate."""
+    """(3)-(6): velocity of the wheel's contact point over the floor: wheel centre minus rolling, with the ABSOLUTE spin rate.
+
+    That is (x_s', y_s', z_s' = 0 on the floor): what the printed left side leaves open.
+    """
     v = printed.eq1_velocity_of_a_wheel_centre((s.x_d, s.y_d, s.z_d), s.yaw_d, *printed.wheel_vector(c, s, wheel))
     return v[0] - c.a * (s.theta_d[wheel] + s.absolute_leg(wheel)[1]), v[1], v[2]
 
 
-def eq3_slip_of_the_right_front_wheel(c: PaperConstants, s: State) -> Vector:
-    """(3): slip velocity (x_s', y_s', z_s' = 0 on the floor) of the contact point: what the printed left side leaves open."""
-    return _contact_slip(c, s, "rf")
-
-
-def eq4_slip_of_the_left_front_wheel(c: PaperConstants, s: State) -> Vector:
-    """(4): as (3)."""
-    return _contact_slip(c, s, "lf")
-
-
-def eq5_slip_of_the_right_rear_wheel(c: PaperConstants, s: State) -> Vector:
-    """(5): as (3)."""
-    return _contact_slip(c, s, "rr")
-
-
-def eq6_slip_of_the_left_rear_wheel(c: PaperConstants, s: State) -> Vector:
-    """(6): as (3)."""
-    return _contact_slip(c, s, "lr")
+eq3_slip_of_the_right_front_wheel = partial(_contact_slip, wheel="rf")
+eq4_slip_of_the_left_front_wheel = partial(_contact_slip, wheel="lf")
+eq5_slip_of_the_right_rear_wheel = partial(_contact_slip, wheel="rr")
+eq6_slip_of_the_left_rear_wheel = partial(_contact_slip, wheel="lr")
 
 
 # ---- Gibbs function --------------------------------------------------------------------------------------------------
@@ -198,7 +189,10 @@ def _k2(c: PaperConstants) -> Value:
 
 
 def _leg_torque(c: PaperConstants, s: State, f: Forces, right: str, left: str) -> Value:
-    """Row of a pair of legs: inertia, gravity, normal forces and traction; the sum of both motors."""
+    """(19), (20): sum of both hip motors of an axle, N m: inertia, gravity, normal forces and traction.
+
+    At rest, in front: 2 l cos(alpha + psi) (N_f - lam m_l g - m_w g).
+    """
     phi, _, _ = s.absolute_leg(right)
     angle, _, leg_dd = s.leg(right)
     k1, k2, sigma = _k1(c), _k2(c), ahead(right)
@@ -219,14 +213,8 @@ def _leg_torque(c: PaperConstants, s: State, f: Forces, right: str, left: str) -
     return inertia + turning - 2 * k1 * c.g * cos(phi) + loads
 
 
-def eq19_torque_of_the_front_legs(c: PaperConstants, s: State, f: Forces) -> Value:
-    """(19): sum of both front hip motors, N m. At rest 2 l cos(alpha + psi) (N_f - lam m_l g - m_w g)."""
-    return _leg_torque(c, s, f, "rf", "lf")
-
-
-def eq20_torque_of_the_rear_legs(c: PaperConstants, s: State, f: Forces) -> Value:
-    """(20): sum of both rear hip motors, N m."""
-    return _leg_torque(c, s, f, "rr", "lr")
+eq19_torque_of_the_front_legs = partial(_leg_torque, right="rf", left="lf")
+eq20_torque_of_the_rear_legs = partial(_leg_torque, right="rr", left="lr")
 
 
 def spin_inertia_torque(c: PaperConstants, s: State, wheel: str) -> Value:
@@ -235,52 +223,28 @@ def spin_inertia_torque(c: PaperConstants, s: State, wheel: str) -> Value:
 
 
 def _wheel_torque(c: PaperConstants, s: State, f: Forces, wheel: str) -> Value:
+    """(21)-(24): I_o (theta'' + leg'' + psi'') + J_w theta'' + a F_x, N m; of a free wheel it is minus its gear's drag."""
     return spin_inertia_torque(c, s, wheel) + c.a * f.x[wheel]
 
 
-def eq21_torque_of_the_right_front_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
-    """(21): I_o (theta'' + alpha'' + psi'') + J_w theta'' + a F_x, N m."""
-    return _wheel_torque(c, s, f, "rf")
-
-
-def eq22_torque_of_the_left_front_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
-    """(22): as (21)."""
-    return _wheel_torque(c, s, f, "lf")
-
-
-def eq23_torque_of_the_right_rear_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
-    """(23): as (21) with beta; of a free wheel it is minus its gear's drag."""
-    return _wheel_torque(c, s, f, "rr")
-
-
-def eq24_torque_of_the_left_rear_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
-    """(24): as (23)."""
-    return _wheel_torque(c, s, f, "lr")
+eq21_torque_of_the_right_front_wheel = partial(_wheel_torque, wheel="rf")
+eq22_torque_of_the_left_front_wheel = partial(_wheel_torque, wheel="lf")
+eq23_torque_of_the_right_rear_wheel = partial(_wheel_torque, wheel="rr")
+eq24_torque_of_the_left_rear_wheel = partial(_wheel_torque, wheel="lr")
 
 
 def _longitudinal_force(c: PaperConstants, s: State, f: Forces, wheel: str) -> Value:
-    """The same row read the other way: what the floor does to a wheel whose motor torque is known, sticking or not."""
+    """(25)-(28): (tau - I_o (theta'' + leg'' + psi'') - J_w theta'')/a, N: (21)-(24) for a motor torque that is known.
+
+    Of a wheel that sticks or not: within mu F_n, and equal to it against the slip.
+    """
     return (f.tau_theta[wheel] - spin_inertia_torque(c, s, wheel)) / c.a
 
 
-def eq25_force_on_the_right_front_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
-    """(25): (tau - I_o (theta'' + alpha'' + psi'') - J_w theta'')/a, N; within mu F_n, and equal to it against the slip."""
-    return _longitudinal_force(c, s, f, "rf")
-
-
-def eq26_force_on_the_left_front_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
-    """(26): as (25)."""
-    return _longitudinal_force(c, s, f, "lf")
-
-
-def eq27_force_on_the_right_rear_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
-    """(27): as (25) with beta."""
-    return _longitudinal_force(c, s, f, "rr")
-
-
-def eq28_force_on_the_left_rear_wheel(c: PaperConstants, s: State, f: Forces) -> Value:
-    """(28): as (27)."""
-    return _longitudinal_force(c, s, f, "lr")
+eq25_force_on_the_right_front_wheel = partial(_longitudinal_force, wheel="rf")
+eq26_force_on_the_left_front_wheel = partial(_longitudinal_force, wheel="lf")
+eq27_force_on_the_right_rear_wheel = partial(_longitudinal_force, wheel="rr")
+eq28_force_on_the_left_rear_wheel = partial(_longitudinal_force, wheel="lr")
 
 
 def lateral_balance(c: PaperConstants, s: State) -> tuple[Value, Value]:

@@ -50,6 +50,11 @@ VARIANTS: Mapping[str, Patch] = {
 }
 
 
+def variant_row(label: str) -> int:
+    """Return which robot of a record of the variants has this label."""
+    return list(VARIANTS).index(label)
+
+
 @dataclass(frozen=True, eq=False)
 class PaperEvidence:
     """What claims are checked with.
@@ -69,7 +74,7 @@ class PaperEvidence:
 
     def variant_error(self, test: str, label: str) -> float:
         """Error of ignoring slip of one of the variants."""
-        return float(error_of_ignoring_slip(self.robot, self.variants[test])[list(VARIANTS).index(label)])
+        return float(error_of_ignoring_slip(self.robot, self.variants[test])[variant_row(label)])
 
 
 def gather(robot: Robot, plant: Mapping[str, Record], threads: int = 1) -> PaperEvidence:

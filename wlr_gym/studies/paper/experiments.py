@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,14 +18,13 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.data.body_pose import euler_angles
 from wlr_gym.data.excitations import Motion
-from wlr_gym.data.format import Profile, RunMeta
+from wlr_gym.data.format import Profile
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.run_states import standing_at
 from wlr_gym.hardware.dynamixel.tables import load_table
-from wlr_gym.physics.plants import REAL, SIMULATORS, check_backend, make_plant
+from wlr_gym.physics.plants import REAL, SIMULATORS, make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, Sensors
 from wlr_gym.physics.plants.forces import Force
-from wlr_gym.physics.plants.robot_options import RobotOptions
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -183,9 +183,9 @@ def no_slip_travel(robot: Robot, record: Record, encoder_on_leg: bool) -> Array:
     return c.a * (turned - turned[start]) - (reach - reach[start])
 
 
-def error_of_ignoring_slip(robot: Robot, record: Record, encoder_on_leg: bool = True) -> Array:
+def error_of_ignoring_slip(robot: Robot, record: Record) -> Array:
     """Return the paper's measure (N,): 1 - travel/no-slip travel at the end; positive = falls short."""
-    return no_slip_error(record.end[:, 0], no_slip_travel(robot, record, encoder_on_leg)[-1])
+    return no_slip_error(record.end[:, 0], no_slip_travel(robot, record, True)[-1])
 
 
 # ---- driving ---------------------------------------------------------------------------------------------------------
@@ -201,51 +201,31 @@ def drive(
     every: int = 1,
     threads: int = 1,
     precision: str = "float64",
-    hardware: RobotOptions | None = None,
 ) -> Record:
     """Drive one test, N robots at once.
 
     Args:
-        model: of :data:`MODELS`.
+        model: the reduced one, or a simulator.
         test: of :data:`TESTS`. robot: the robot.
         parameters: (N); None = one nominal robot. The test's servo profile is written into them.
         forces: formula forces (simulators).
         physics_step: s; None = 1 ms, for the reduced model 2 ms.
         every: record every so many control ticks.
         threads, precision: of a simulator.
-        hardware: which robot, and how it is connected.
 
     Raises:
-        InputError: unknown model, formula forces for the reduced model, a robot that cannot be reached.
-        StoppedError: a robot had to stop, or its torque is not confirmed off (wlr_gym.hardware.loop).
+        InputError: unknown model, formula forces for the reduced model.
     """
-    if model in REAL:
-        return _drive_robot(test, robot, hardware, every)
     parameters = profile_parameters(Parameters.nominal(robot) if parameters is None else parameters, PROFILE)
     if model == REDUCED:
         if forces:
             raise InputError("the reduced model takes no formula forces; expected a simulator")
         return _drive_reduced([test], robot, parameters, physics_step or 0.002, every)[0]
-    check_backend(model)
+    if model not in SIMULATORS:
+        raise unknown_name("backend", model, (REDUCED, *SIMULATORS))
     options = PlantOptions(PERIOD, physics_step or 0.001, precision, threads, sensor_noise=False)
-    plant = make_plant(model, robot, len(parameters), options, forces)
-    try:
+    with closing(make_plant(model, robot, len(parameters), options, forces)) as plant:
         return drive_plant(plant, test, parameters, every)
-    finally:
-        plant.close()
-
-
-def _drive_robot(test: PaperTest, robot: Robot, hardware: RobotOptions | None, every: int) -> Record:
-    from wlr_gym.hardware.plant import RobotPlant
-
-    meta = RunMeta(robot=robot.name, profile=PROFILE, notes=f"paper, {test.title}")
-    plant = RobotPlant(robot, 1, PlantOptions(PERIOD), hardware, meta=meta)
-    try:
-        record = drive_plant(plant, test, Parameters.nominal(robot), every)
-        plant.loop.finish("the test is over")
-        return record
-    finally:
-        plant.close()
 
 
 def drive_plant(plant: Plant, test: PaperTest, parameters: Parameters, every: int = 1) -> Record:
@@ -364,22 +344,12 @@ def _look_at_reduced(model: reduced.ReducedModel, state: reduced.ReducedState, s
     }
 
 
-def drive_both(
-    model: str,
-    robot: Robot,
-    parameters: Parameters | None = None,
-    every: int = 1,
-    threads: int = 1,
-    hardware: RobotOptions | None = None,
-) -> dict[str, Record]:
+def drive_both(model: str, robot: Robot, parameters: Parameters | None = None) -> dict[str, Record]:
     """Drive both tests on one model; see :func:`drive`."""
     if model == REDUCED:
         nominal = profile_parameters(Parameters.nominal(robot) if parameters is None else parameters, PROFILE)
-        return dict(zip(TESTS, _drive_reduced(list(TESTS.values()), robot, nominal, 0.002, every), strict=True))
-    return {
-        name: drive(model, test, robot, parameters, every=every, threads=threads, hardware=hardware)
-        for name, test in TESTS.items()
-    }
+        return dict(zip(TESTS, _drive_reduced(list(TESTS.values()), robot, nominal, 0.002, 1), strict=True))
+    return {name: drive(model, test, robot, parameters) for name, test in TESTS.items()}
 
 
 def select(record: Record, robots: NDArray[np.intp]) -> Record:

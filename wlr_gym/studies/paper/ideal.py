@@ -57,32 +57,19 @@ class IdealMotion:
 
     def state(self) -> State:
         """Return the motion in the paper's symbols: its slip is 0."""
-        u, u_dot = self.u, self.u_dot
-        order = {"rf": 8, "lf": 7, "rr": 10, "lr": 9}
-        return State(
-            alpha=self.front, beta=self.rear, psi=self.posture.pitch,
-            alpha_d=u[:, 5], beta_d=u[:, 6], psi_d=u[:, 4], alpha_dd=u_dot[:, 5], beta_dd=u_dot[:, 6], psi_dd=u_dot[:, 4],
-            x_d=u[:, 0], y_d=u[:, 1], z_d=u[:, 3], yaw_d=u[:, 2], x_dd=u_dot[:, 0], y_dd=u_dot[:, 1], z_dd=u_dot[:, 3],
-            yaw_dd=u_dot[:, 2],
-            theta_d={wheel: u[:, k] for wheel, k in order.items()},
-            theta_dd={wheel: u_dot[:, k] for wheel, k in order.items()},
-        )  # fmt: skip
+        return reduced.state_of(self.front, self.rear, self.posture.pitch, self.u, self.u_dot)
 
     def as_printed(self) -> dict[str, Any]:
         """Return (19)-(28) as printed, evaluated on this motion."""
         return printed.forces_as_used(self.constants, self.state())
 
 
-def ideal_motion(test: PaperTest, constants: PaperConstants | None = None, leg_ramp: float = LEG_RAMP) -> IdealMotion:
-    """Return one test without slip.
-
-    Args:
-        test: which. constants: of the robot; None = the paper's. leg_ramp: s.
-    """
+def ideal_motion(test: PaperTest, constants: PaperConstants | None = None) -> IdealMotion:
+    """Return one test without slip, of a robot with these constants; None = the paper's."""
     c = constants or PaperConstants()
     time = np.arange(-0.2, duration() + 0.5, _TICK)
-    front, front_rate = _leg(time, test.start[0], test.end[0], leg_ramp)
-    rear, rear_rate = _leg(time, test.start[1], test.end[1], leg_ramp)
+    front, front_rate = _leg(time, test.start[0], test.end[0])
+    rear, rear_rate = _leg(time, test.start[1], test.end[1])
     turned, spin = _front_wheels(time)
     p = reduced.posture(c, front, rear)
     u9 = np.zeros((len(time), 9))
@@ -99,15 +86,15 @@ def ideal_motion(test: PaperTest, constants: PaperConstants | None = None, leg_r
     return IdealMotion(test, c, time, front, rear, wheels - wheels[start], p, x - x[start], u, u_dot)
 
 
-def _leg(time: Array, start: float, end: float, ramp: float) -> tuple[Array, Array]:
+def _leg(time: Array, start: float, end: float) -> tuple[Array, Array]:
     """Angle and rate of a leg: constant speed between two ramps, as long as a rectangular profile plus one ramp."""
     if start == end:
         return np.full_like(time, start), np.zeros_like(time)
     length = abs(end - start) / LEG_SPEED
-    acceleration = LEG_SPEED / ramp
-    up = np.clip(time, 0.0, ramp)
-    down = np.clip(time - length, 0.0, ramp)
-    steady = np.clip(time - ramp, 0.0, length - ramp)
+    acceleration = LEG_SPEED / LEG_RAMP
+    up = np.clip(time, 0.0, LEG_RAMP)
+    down = np.clip(time - length, 0.0, LEG_RAMP)
+    steady = np.clip(time - LEG_RAMP, 0.0, length - LEG_RAMP)
     angle = acceleration * up**2 / 2 + LEG_SPEED * steady + LEG_SPEED * down - acceleration * down**2 / 2
     rate = acceleration * (up - down)
     way = np.sign(end - start)

@@ -15,14 +15,11 @@ from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.paper import printed, reduced
 from wlr_gym.studies.paper.experiments import Record
-from wlr_gym.studies.paper.quantities import State
 
 Array = NDArray[np.float64]
 
 #: Ticks to each side that rates are averaged over before they are differentiated: +-60 ms.
 _SMOOTH = 3
-#: The paper's wheels in the order lf, rf, lr, rr.
-_ORDER = {"lf": 0, "rf": 1, "lr": 2, "rr": 3}
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,44 +36,35 @@ class FromMeasurement:
     wheel_torque_printed: Array
 
 
-def inverse_from_record(robot: Robot, record: Record, index: int = 0, rear_drag: float | None = None) -> FromMeasurement:
-    """Return what the measured motion of one robot says about its torques.
+def inverse_from_record(robot: Robot, record: Record, rear_drag: float | None = None) -> FromMeasurement:
+    """Return what the measured motion of a record's first robot says about its torques.
 
     Args:
         robot: whose masses and lengths.
         record: with pose, velocity and slip (a simulator's, or of vision).
-        index: which robot of the record.
         rear_drag: N m, dry friction in the gear of a rear wheel; None = the robot's nominal one.
     """
     drag = robot.servo.wheel.coulomb_friction if rear_drag is None else rear_drag
     c = reduced.constants_of(Parameters.nominal(robot))
-    joints, rates = record.joint_position[:, index], record.joint_velocity[:, index]
-    pitch = record.attitude[:, index, 1]
-    v = record.velocity[:, index]
+    joints, rates = record.joint_position[:, 0], record.joint_velocity[:, 0]
+    pitch = record.attitude[:, 0, 1]
+    v = record.velocity[:, 0]
     period = float(record.time[1] - record.time[0])
-    u = np.column_stack([v[:, 0], v[:, 1], record.yaw_rate[:, index], v[:, 2], np.gradient(pitch, period),
+    u = np.column_stack([v[:, 0], v[:, 1], record.yaw_rate[:, 0], v[:, 2], np.gradient(pitch, period),
                          rates[:, :2].mean(axis=1), rates[:, 2:4].mean(axis=1), rates[:, 4:]])  # fmt: skip
     u = _smoothed(u)
     u_dot = np.gradient(u, period, axis=0)
-    slip_dot = np.gradient(_smoothed(record.slip[:, index].reshape(-1, 8)), period, axis=0).reshape(-1, 4, 2)
+    slip_dot = np.gradient(_smoothed(record.slip[:, 0].reshape(-1, 8)), period, axis=0).reshape(-1, 4, 2)
     front, rear = joints[:, :2].mean(axis=1), joints[:, 2:4].mean(axis=1)
     right = reduced.inverse_dynamics(c, front, rear, pitch, u, u_dot, -drag * np.tanh(u[:, 9:] / 0.01))
-    s = State(
-        alpha=front, beta=rear, psi=pitch, alpha_d=u[:, 5], beta_d=u[:, 6], psi_d=u[:, 4],
-        alpha_dd=u_dot[:, 5], beta_dd=u_dot[:, 6], psi_dd=u_dot[:, 4],
-        x_d=u[:, 0], y_d=u[:, 1], z_d=u[:, 3], yaw_d=u[:, 2],
-        x_dd=u_dot[:, 0], y_dd=u_dot[:, 1], z_dd=u_dot[:, 3], yaw_dd=u_dot[:, 2],
-        theta_d={wheel: u[:, 7 + k] for wheel, k in _ORDER.items()},
-        theta_dd={wheel: u_dot[:, 7 + k] for wheel, k in _ORDER.items()},
-        x_s_d={wheel: record.slip[:, index, k, 0] for wheel, k in _ORDER.items()},
-        x_s_dd={wheel: slip_dot[:, k, 0] for wheel, k in _ORDER.items()},
-    )  # fmt: skip
-    found = printed.forces_as_used(c, s)
+    x_s_d = {wheel: record.slip[:, 0, k, 0] for wheel, k in reduced.ORDER.items()}
+    x_s_dd = {wheel: slip_dot[:, k, 0] for wheel, k in reduced.ORDER.items()}
+    found = printed.forces_as_used(c, reduced.state_of(front, rear, pitch, u, u_dot, x_s_d=x_s_d, x_s_dd=x_s_dd))
     wheels = found["tau_theta"]
     return FromMeasurement(
         right,
         np.column_stack([found["tau_alpha"], found["tau_beta"]]),
-        np.column_stack([wheels[wheel] for wheel in _ORDER]),
+        np.column_stack([wheels[wheel] for wheel in reduced.ORDER]),
     )
 
 

@@ -6,6 +6,7 @@ z-parts of (19) and (20) count z downwards (wheels above the hips if z were up);
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from wlr_gym.studies.paper.quantities import (
@@ -21,6 +22,7 @@ from wlr_gym.studies.paper.quantities import (
     sign,
     sin,
     to_the_right,
+    wheelbase,
 )
 
 
@@ -45,28 +47,15 @@ def wheel_vector(c: PaperConstants, s: State, wheel: str) -> tuple[Vector, Vecto
 
 
 def _wheel_velocity(c: PaperConstants, s: State, wheel: str) -> Vector:
+    """(3)-(6): (x' - x_s' - a theta') i + (y' - y_s') j + (z' - z_s') k + theta' k x r + r'."""
     v = (s.x_d - s.x_s_d[wheel] - c.a * s.theta_d[wheel], s.y_d - s.y_s_d[wheel], s.z_d - s.z_s_d[wheel])
     return eq1_velocity_of_a_wheel_centre(v, s.yaw_d, *wheel_vector(c, s, wheel))
 
 
-def eq3_velocity_of_the_right_front_wheel(c: PaperConstants, s: State) -> Vector:
-    """(3): (x' - x_s' - a theta') i + (y' - y_s') j + (z' - z_s') k + theta' k x r + r'."""
-    return _wheel_velocity(c, s, "rf")
-
-
-def eq4_velocity_of_the_left_front_wheel(c: PaperConstants, s: State) -> Vector:
-    """(4): as (3)."""
-    return _wheel_velocity(c, s, "lf")
-
-
-def eq5_velocity_of_the_right_rear_wheel(c: PaperConstants, s: State) -> Vector:
-    """(5): as (3)."""
-    return _wheel_velocity(c, s, "rr")
-
-
-def eq6_velocity_of_the_left_rear_wheel(c: PaperConstants, s: State) -> Vector:
-    """(6): as (3)."""
-    return _wheel_velocity(c, s, "lr")
+eq3_velocity_of_the_right_front_wheel = partial(_wheel_velocity, wheel="rf")
+eq4_velocity_of_the_left_front_wheel = partial(_wheel_velocity, wheel="lf")
+eq5_velocity_of_the_right_rear_wheel = partial(_wheel_velocity, wheel="rr")
+eq6_velocity_of_the_left_rear_wheel = partial(_wheel_velocity, wheel="lr")
 
 
 def eq7_gibbs_function_of_the_wheels(c: PaperConstants, s: State) -> Value:
@@ -166,10 +155,6 @@ def rear_moment(c: PaperConstants, s: State) -> Value:
     return c.M_G * c.g / 2 * (hips / 2 + front) + c.m_l * c.g * (hips + 3 * front / 2 - rear / 2)
 
 
-def _base(c: PaperConstants, s: State) -> Value:
-    return c.l_x * cos(s.psi) + c.l * (cos(s.alpha + s.psi) - cos(s.beta + s.psi))
-
-
 def _misprinted_base(c: PaperConstants, s: State) -> Value:
     """The denominator of (28)-(30), where "l(" is lost."""
     return c.l_x * cos(s.psi) + c.l * cos(s.alpha + s.psi) - cos(s.beta + s.psi)
@@ -177,12 +162,12 @@ def _misprinted_base(c: PaperConstants, s: State) -> Value:
 
 def eq16_normal_force_in_front(c: PaperConstants, s: State) -> Value:
     """(16): on one front wheel, N."""
-    return front_moment(c, s) / _base(c, s)
+    return front_moment(c, s) / wheelbase(c, s)
 
 
 def eq17_normal_force_behind(c: PaperConstants, s: State) -> Value:
     """(17): on one rear wheel, N."""
-    return rear_moment(c, s) / _base(c, s)
+    return rear_moment(c, s) / wheelbase(c, s)
 
 
 def eq18_generalised_force(ds: Value, dd: Value, dv: Value) -> Value:
@@ -191,7 +176,10 @@ def eq18_generalised_force(ds: Value, dd: Value, dv: Value) -> Value:
 
 
 def _leg_torque(c: PaperConstants, s: State, right: str, left: str) -> Value:
-    """(19) and (20): one bracket for each wheel of the axle, all inside 1/2 m_l(...), the z-part with 1/2 over all of it."""
+    """(19), (20): sum of both hip motors of an axle, N m.
+
+    One bracket for each wheel of the axle, all inside 1/2 m_l(...), the z-part with 1/2 over all of it.
+    """
     phi, phi_d, phi_dd = s.absolute_leg(right)
     sigma, leg_dd = ahead(right) * c.l_x, s.leg(right)[2]
     pitch_x = -sigma * s.psi_dd * sin(s.psi) - sigma * s.psi_d**2 * cos(s.psi)
@@ -207,38 +195,19 @@ def _leg_torque(c: PaperConstants, s: State, right: str, left: str) -> Value:
     return 2 * c.I_ly * leg_dd + c.m_l * total / 2
 
 
-def eq19_torque_of_the_front_legs(c: PaperConstants, s: State) -> Value:
-    """(19): sum of both front hip motors, N m."""
-    return _leg_torque(c, s, "rf", "lf")
-
-
-def eq20_torque_of_the_rear_legs(c: PaperConstants, s: State) -> Value:
-    """(20): sum of both rear hip motors, N m."""
-    return _leg_torque(c, s, "rr", "lr")
+eq19_torque_of_the_front_legs = partial(_leg_torque, right="rf", left="lf")
+eq20_torque_of_the_rear_legs = partial(_leg_torque, right="rr", left="lr")
 
 
 def _wheel_torque(c: PaperConstants, s: State, wheel: str) -> Value:
+    """(21)-(24), their last bracket closed at the end: I_o theta'' - m_l a (x'' - ...), N m."""
     return c.I_o * s.theta_dd[wheel] - c.m_l * c.a * leg_acceleration(c, s, wheel)[0]
 
 
-def eq21_torque_of_the_right_front_wheel(c: PaperConstants, s: State) -> Value:
-    """(21), its last bracket closed at the end: I_o theta'' - m_l a (x'' - ...), N m."""
-    return _wheel_torque(c, s, "rf")
-
-
-def eq22_torque_of_the_left_front_wheel(c: PaperConstants, s: State) -> Value:
-    """(22): as (21)."""
-    return _wheel_torque(c, s, "lf")
-
-
-def eq23_torque_of_the_right_rear_wheel(c: PaperConstants, s: State) -> Value:
-    """(23): as (21)."""
-    return _wheel_torque(c, s, "rr")
-
-
-def eq24_torque_of_the_left_rear_wheel(c: PaperConstants, s: State) -> Value:
-    """(24): as (21)."""
-    return _wheel_torque(c, s, "lr")
+eq21_torque_of_the_right_front_wheel = partial(_wheel_torque, wheel="rf")
+eq22_torque_of_the_left_front_wheel = partial(_wheel_torque, wheel="lf")
+eq23_torque_of_the_right_rear_wheel = partial(_wheel_torque, wheel="rr")
+eq24_torque_of_the_left_rear_wheel = partial(_wheel_torque, wheel="lr")
 
 
 def _longitudinal_force(c: PaperConstants, s: State, wheel: str, yaw_sign: int, friction: Value) -> Value:
@@ -285,10 +254,6 @@ def eq30_lateral_force_behind(c: PaperConstants, s: State) -> Value:
 
 def forces_as_used(c: PaperConstants, s: State) -> dict[str, Any]:
     """Return (19)-(28) at one state, as the paper uses them: driven by measured motion and slip."""
-    wheel_torques = (
-        eq21_torque_of_the_right_front_wheel, eq22_torque_of_the_left_front_wheel,
-        eq23_torque_of_the_right_rear_wheel, eq24_torque_of_the_left_rear_wheel,
-    )  # fmt: skip
     forces = (
         eq25_force_on_the_right_front_wheel, eq26_force_on_the_left_front_wheel,
         eq27_force_on_the_right_rear_wheel, eq28_force_on_the_left_rear_wheel,
@@ -296,6 +261,6 @@ def forces_as_used(c: PaperConstants, s: State) -> dict[str, Any]:
     return {
         "tau_alpha": eq19_torque_of_the_front_legs(c, s),
         "tau_beta": eq20_torque_of_the_rear_legs(c, s),
-        "tau_theta": {wheel: equation(c, s) for wheel, equation in zip(WHEELS, wheel_torques, strict=True)},
+        "tau_theta": {wheel: _wheel_torque(c, s, wheel) for wheel in WHEELS},
         "x": {wheel: equation(c, s) for wheel, equation in zip(WHEELS, forces, strict=True)},
     }

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from wlr_gym.physics import servo
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
-from wlr_gym.studies.paper.quantities import PaperConstants
+from wlr_gym.studies.paper.quantities import PaperConstants, State
 from wlr_gym.studies.paper.rubbing import rub
 
 Array = NDArray[np.float64]
@@ -35,6 +35,8 @@ _WHEELS = slice(7, 11)
 _KEPT = [VX, VY, YAW, FRONT, REAR, 7, 8, 9, 10]
 _LEGS9 = slice(3, 5)
 _WHEELS9 = slice(5, 9)
+#: The paper's wheels in the order lf, rf, lr, rr.
+ORDER = {"lf": 0, "rf": 1, "lr": 2, "rr": 3}
 #: Of the corners lf, rf, lr, rr: ahead, to the left, and which leg.
 _AHEAD = np.array([1.0, 1.0, -1.0, -1.0])
 _LEFT = np.array([1.0, -1.0, 1.0, -1.0])
@@ -55,6 +57,25 @@ def constants_of(parameters: Parameters) -> PaperConstants:
     )  # fmt: skip
 
 
+def state_of(front: Array, rear: Array, pitch: Array, u: Array, u_dot: Array, **slip: dict[str, Array]) -> State:
+    """Return a motion in the paper's symbols.
+
+    Args:
+        front, rear, pitch: (T,) leg angles relative to the body, body pitch; rad.
+        u, u_dot: (T, 11) and its time derivative.
+        slip: fields of the state; none = 0.
+    """
+    return State(
+        alpha=front, beta=rear, psi=pitch, alpha_d=u[:, FRONT], beta_d=u[:, REAR], psi_d=u[:, PITCH],
+        alpha_dd=u_dot[:, FRONT], beta_dd=u_dot[:, REAR], psi_dd=u_dot[:, PITCH],
+        x_d=u[:, VX], y_d=u[:, VY], z_d=u[:, VZ], yaw_d=u[:, YAW],
+        x_dd=u_dot[:, VX], y_dd=u_dot[:, VY], z_dd=u_dot[:, VZ], yaw_dd=u_dot[:, YAW],
+        theta_d={wheel: u[:, _WHEELS][:, k] for wheel, k in ORDER.items()},
+        theta_dd={wheel: u_dot[:, _WHEELS][:, k] for wheel, k in ORDER.items()},
+        **slip,
+    )  # fmt: skip
+
+
 # ---- equations in u11 ------------------------------------------------------------------------------------------------
 
 
@@ -72,6 +93,11 @@ class Posture:
 def posture(c: PaperConstants, front: Array, rear: Array) -> Posture:
     """Return the posture with all wheels on a level floor, for leg angles (N,) relative to the body."""
     pitch = np.arctan2(c.l * (np.sin(rear) - np.sin(front)), c.l_x + c.l * (np.cos(front) - np.cos(rear)))
+    return pitched(c, front, rear, pitch)
+
+
+def pitched(c: PaperConstants, front: Array, rear: Array, pitch: Array) -> Posture:
+    """Return the posture at a body pitch (N,) that was measured."""
     f, r = front + pitch, rear + pitch
     base = c.l_x * np.cos(pitch) + c.l * (np.cos(f) - np.cos(r))
     return Posture(pitch, f, r, base, c.a + c.l / 2 * (np.sin(f) + np.sin(r)))
@@ -221,7 +247,7 @@ def inverse_dynamics(
         c: constants. front, rear, pitch: (N,) rad. u, u_dot: (N, 11) and its time derivative.
         rear_wheel_torque: (N, 2) torque on the rear wheels lr, rr, N m: minus the drag of their gears.
     """
-    p = Posture(pitch, front + pitch, rear + pitch, *_base_and_height(c, front, rear, pitch))
+    p = pitched(c, front, rear, pitch)
     mass, bias = mass_matrix_and_bias(c, front, rear, pitch, u)
     needed = np.einsum("nij,nj->ni", mass, u_dot) + bias
     radius = np.broadcast_to(np.asarray(c.a)[..., None] if np.ndim(c.a) else c.a, (len(u), 4))
@@ -238,11 +264,6 @@ def inverse_dynamics(
     normal = normal_forces(rest, j_n)
     rest -= np.einsum("nwk,nw->nk", j_n, normal)
     return InverseDynamics(rest[:, [FRONT, REAR]], rest[:, _WHEELS], along, lateral, normal)
-
-
-def _base_and_height(c: PaperConstants, front: Array, rear: Array, pitch: Array) -> tuple[Array, Array]:
-    f, r = front + pitch, rear + pitch
-    return c.l_x * np.cos(pitch) + c.l * (np.cos(f) - np.cos(r)), c.a + c.l / 2 * (np.sin(f) + np.sin(r))
 
 
 # ---- forward dynamics ------------------------------------------------------------------------------------------------

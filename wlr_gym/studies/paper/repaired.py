@@ -6,14 +6,15 @@ that the paper's S, V and D leave out is in :mod:`wlr_gym.studies.paper.correcte
 
 from __future__ import annotations
 
+from functools import partial
+
 from wlr_gym.studies.paper import printed
-from wlr_gym.studies.paper.printed import eq11_acceleration_of_the_body, eq16_normal_force_in_front, eq17_normal_force_behind
 from wlr_gym.studies.paper.quantities import PaperConstants, State, Value, cos, is_front, sign, sin
 
 
 def eq9_gibbs_function_of_the_body(c: PaperConstants, s: State) -> Value:
     """(9) with Psi''^2, as in (10)."""
-    squared = sum(component**2 for component in eq11_acceleration_of_the_body(s))
+    squared = sum(component**2 for component in printed.eq11_acceleration_of_the_body(s))
     return (c.I_Gz * s.yaw_dd**2 + c.I_Gy * s.psi_dd**2 + c.M_G * squared) / 2
 
 
@@ -30,6 +31,7 @@ def eq15_dissipation(c: PaperConstants, s: State, f_nf: Value, f_nr: Value) -> V
 
 
 def _leg_torque(c: PaperConstants, s: State, right: str, left: str) -> Value:
+    """(19), (20): 2 I_ly leg'' + m_l l sum(-A_x sin + A_z cos): the factor 2 of the z-part back, the leg out of its 1/2."""
     phi, leg_dd = s.absolute_leg(right)[0], s.leg(right)[2]
     total = 0
     for wheel in (right, left):
@@ -38,46 +40,27 @@ def _leg_torque(c: PaperConstants, s: State, right: str, left: str) -> Value:
     return 2 * c.I_ly * leg_dd + c.m_l * c.l * total
 
 
-def eq19_torque_of_the_front_legs(c: PaperConstants, s: State) -> Value:
-    """(19): 2 I_ly alpha'' + m_l l sum(-A_x sin + A_z cos): the factor 2 of the z-part back, the leg out of its 1/2."""
-    return _leg_torque(c, s, "rf", "lf")
+eq19_torque_of_the_front_legs = partial(_leg_torque, right="rf", left="lf")
+eq20_torque_of_the_rear_legs = partial(_leg_torque, right="rr", left="lr")
 
 
-def eq20_torque_of_the_rear_legs(c: PaperConstants, s: State) -> Value:
-    """(20): likewise."""
-    return _leg_torque(c, s, "rr", "lr")
-
-
-def _longitudinal(c: PaperConstants, s: State, wheel: str) -> Value:
-    normal = eq16_normal_force_in_front(c, s) if is_front(wheel) else eq17_normal_force_behind(c, s)
+def _longitudinal_force(c: PaperConstants, s: State, wheel: str) -> Value:
+    """(25)-(28): -m_l A_x + mu F_n sgn(x_s'): the sgn back, -theta'' l_y in (27), the denominator of (28) the wheelbase."""
+    normal = printed.eq16_normal_force_in_front(c, s) if is_front(wheel) else printed.eq17_normal_force_behind(c, s)
     return -c.m_l * printed.leg_acceleration(c, s, wheel)[0] + c.mu_dx * normal * sign(s.x_s_d[wheel])
 
 
-def eq25_force_on_the_right_front_wheel(c: PaperConstants, s: State) -> Value:
-    """(25): -m_l A_x + mu F_n sgn(x_s'): the sgn back."""
-    return _longitudinal(c, s, "rf")
-
-
-def eq26_force_on_the_left_front_wheel(c: PaperConstants, s: State) -> Value:
-    """(26): likewise."""
-    return _longitudinal(c, s, "lf")
-
-
-def eq27_force_on_the_right_rear_wheel(c: PaperConstants, s: State) -> Value:
-    """(27): likewise, with -theta'' l_y."""
-    return _longitudinal(c, s, "rr")
-
-
-def eq28_force_on_the_left_rear_wheel(c: PaperConstants, s: State) -> Value:
-    """(28): likewise, over l_x cos psi + l (cos - cos)."""
-    return _longitudinal(c, s, "lr")
+eq25_force_on_the_right_front_wheel = partial(_longitudinal_force, wheel="rf")
+eq26_force_on_the_left_front_wheel = partial(_longitudinal_force, wheel="lf")
+eq27_force_on_the_right_rear_wheel = partial(_longitudinal_force, wheel="rr")
+eq28_force_on_the_left_rear_wheel = partial(_longitudinal_force, wheel="lr")
 
 
 def eq29_lateral_force_in_front(c: PaperConstants, s: State) -> Value:
     """(29): 2 mu_dy F_nf sgn(y_f'), over the right denominator."""
-    return 2 * c.mu_dy * eq16_normal_force_in_front(c, s) * sign(s.y_f_d)
+    return 2 * c.mu_dy * printed.eq16_normal_force_in_front(c, s) * sign(s.y_f_d)
 
 
 def eq30_lateral_force_behind(c: PaperConstants, s: State) -> Value:
     """(30): 2 mu_dy F_nr sgn(y_r'), over the right denominator."""
-    return 2 * c.mu_dy * eq17_normal_force_behind(c, s) * sign(s.y_r_d)
+    return 2 * c.mu_dy * printed.eq17_normal_force_behind(c, s) * sign(s.y_r_d)

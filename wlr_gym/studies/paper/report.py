@@ -16,7 +16,7 @@ from wlr_gym.physics.plants import SIMULATORS
 from wlr_gym.robot import Robot
 from wlr_gym.studies.paper import slip_search
 from wlr_gym.studies.paper.claims import CheckedClaim, claims_table
-from wlr_gym.studies.paper.evidence import VARIANTS, PaperEvidence
+from wlr_gym.studies.paper.evidence import PaperEvidence, variant_row
 from wlr_gym.studies.paper.experiments import REDUCED, TESTS, Record, error_of_ignoring_slip
 from wlr_gym.studies.paper.measured import inverse_from_record
 from wlr_gym.studies.paper.slip_candidates import READINGS, PaperReading
@@ -92,8 +92,7 @@ def write_figures(folder: Path, records: Records, evidence: PaperEvidence, findi
         measured = inverse_from_record(evidence.robot, source[name])
         variants = evidence.variants[name]
         paths = {
-            label: variants.position[:, list(VARIANTS).index(label), :2]
-            for label in ("more drag left", "left front wheel 2 % small")
+            label: variants.position[:, variant_row(label), :2] for label in ("more drag left", "left front wheel 2 % small")
         }
         own = [record[name] for record in records.values()]
         for file, figure in figures.figures_of_test(own, evidence.ideal[name], measured, paths).items():

@@ -131,19 +131,16 @@ def _rows() -> list[tuple[int, str, str, tuple[str, ...], str, str]]:
     ]  # fmt: skip
 
 
-def _function(module: Any, number: int, own: bool = False) -> Callable[..., Any] | None:
-    """The function of an equation in a module; ``own``: not one it has from elsewhere."""
-    found = [value for name, value in vars(module).items() if name.startswith(f"eq{number}_")]
-    found = [value for value in found if not own or value.__module__ == module.__name__]
-    return found[0] if found else None
+def _function(module: Any, number: int) -> Callable[..., Any] | None:
+    """The function of an equation in a module; None = there is none."""
+    return next((value for name, value in vars(module).items() if name.startswith(f"eq{number}_")), None)
 
 
 def _equation(number: int, title: str, section: str, verdicts: tuple[str, ...], remark: str, correction: str) -> Equation:
     as_printed, right = (_function(module, number) for module in (printed, corrected))
     assert as_printed is not None
     assert right is not None
-    misprint_undone = _function(repaired, number, own=True)
-    return Equation(number, title, section, verdicts, remark, correction, as_printed, right, misprint_undone)
+    return Equation(number, title, section, verdicts, remark, correction, as_printed, right, _function(repaired, number))
 
 
 #: Every equation by its number.
