@@ -33,9 +33,9 @@ def helps(case: Mapping[str, Line]) -> bool | None:
     return float(_errors(case["truth"]).mean()) <= (1.0 - HELPS) * float(_errors(case["none"]).mean())
 
 
-def regained(case: Mapping[str, Line], contender: str = "ours") -> Estimate:
-    """Return (old - contender) / (old - truth), %, paired over the episodes."""
-    pairs = [_pairs(case[name]) for name in (contender, "truth", "none", "none")]
+def regained(case: Mapping[str, Line]) -> Estimate:
+    """Return (old - ours) / (old - truth), %, paired over the episodes."""
+    pairs = [_pairs(case[name]) for name in ("ours", "truth", "none", "none")]
     return Bootstrap(1, len(_errors(case["none"]))).share(*pairs, subjects=(0, 1, 2, 2))
 
 

@@ -74,7 +74,7 @@ def _measure_cycle(size: Size) -> list[Measurement]:
             name: interleave({"ours": _rate(ours, cycles, clock), "peer": _rate(peer, cycles, clock)}, size.rounds)
             for name, clock in clocks.items()
         }
-        latency = [_latency(delay, cycles) for _ in range(size.rounds)]
+        latency = [[1e6 * delay() for _ in range(cycles)] for _ in range(size.rounds)]
     what = "bus cycle, 8 servos, 2 buses, SI values"
     per_cycle = tuple(1e6 / rate for rate in rates["wall"]["ours"])
     return [
@@ -134,10 +134,6 @@ def _rate(cycle: Cycle, count: int, clock: Callable[[], float]) -> Callable[[], 
         return count / max(clock() - start, 1e-9)
 
     return run
-
-
-def _latency(delay: Callable[[], float], count: int) -> list[float]:
-    return [1e6 * delay() for _ in range(count)]
 
 
 # ---- the contenders --------------------------------------------------------------------------------------------------

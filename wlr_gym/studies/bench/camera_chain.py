@@ -7,8 +7,8 @@ emulated robot starts at rest, the simulated one is put down with some speed: th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ Array = NDArray[np.float64]
 ENVIRONMENT = "WLR-Velocity-v0"
 #: s of emulated time per tick.
 _TICK = 0.002
+#: s at the beginning of an episode that do not count.
+_SKIPPED = 1.0
 #: Seed of the first episode.
 _FIRST_SEED = 9000
 
@@ -73,9 +75,9 @@ class ChainDrive:
         yaw = np.unwrap(np.concatenate([self.start[2:], yaw_of(*quaternion.T)]))[1:] - self.start[2]
         return np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx, yaw], axis=1)
 
-    def errors(self, skip: float = 0.0) -> dict[str, float]:
-        """Return measure -> rms of the task Velocity without the first ``skip`` s, SI units."""
-        late = self.time > skip
+    def errors(self) -> dict[str, float]:
+        """Return measure -> rms of the task Velocity without the first second, SI units."""
+        late = self.time > _SKIPPED
         speed = self.true("linear_velocity_in_body")[late, 0] - self.command[late, 0]
         turn = self.true("angular_velocity_in_body")[late, 2] - self.command[late, 1]
         return {"velocity_error": float(np.sqrt(np.mean(speed**2))), "yaw_rate_error": float(np.sqrt(np.mean(turn**2)))}
@@ -138,40 +140,36 @@ def _quick(file: CameraFile) -> CameraFile:
     return file.model_copy(update={"calibration": file.calibration.model_copy(update=lens), "emulated": scene})
 
 
-def chain_camera(latency: float = 0.04, dropout: float = 0.1, **scene: Any) -> CameraFile:
-    """Return the emulated camera with a latency (s) and a share of lost frames."""
+def chain_camera() -> CameraFile:
+    """Return the emulated camera with a latency of 40 ms and a tenth of the frames lost."""
     file = load_camera_file("emulated")
-    changes = {"latency": latency, "dropout": dropout} | scene
-    return file.model_copy(update={"emulated": file.emulated.model_copy(update=changes)})
+    return file.model_copy(update={"emulated": file.emulated.model_copy(update={"latency": 0.04, "dropout": 0.1})})
 
 
-def simulated_core(setting: ChainSetting, episodes: int) -> Core:
-    """Return the simulated robots of a setting."""
+def simulated_core(setting: ChainSetting) -> Core:
+    """Return the simulated robot of a setting."""
     keywords = {"randomization": setting.floor, "episode_length": setting.seconds, **setting.extra}
-    return make_core(ENVIRONMENT, episodes, environment_for(setting.policy, keywords))
+    return make_core(ENVIRONMENT, 1, environment_for(setting.policy, keywords))
 
 
-def simulated_errors(setting: ChainSetting, seeds: Sequence[int], skip: float = 1.0) -> Array:
-    """Return the tracking errors (episodes,) in the simulator, with its own camera, without the first ``skip`` s."""
-    core = simulated_core(setting, 1)
-    try:
-        policy, first = make_policy(setting.policy, core.contract()), round(skip / core.task.config.control_period)
+def simulated_errors(setting: ChainSetting, seeds: Sequence[int]) -> Array:
+    """Return the tracking errors (episodes,) in the simulator, with its own camera, without the first second."""
+    with closing(simulated_core(setting)) as core:
+        policy, first = make_policy(setting.policy, core.contract()), round(_SKIPPED / core.task.config.control_period)
         found = []
         for seed in seeds:
             rollout = roll_out(core, policy, seed)
             rms = np.sqrt((rollout.measured[first:, 0] ** 2).mean(axis=0))
             found.append(_tracking(core, dict(zip(core.task.measures, rms, strict=True)), bool(rollout.fell[0])))
         return np.array(found)
-    finally:
-        core.close()
 
 
-def chain_errors(setting: ChainSetting, seeds: Sequence[int], skip: float = 1.0) -> Array:
-    """Return the tracking errors (episodes,) of the whole chain, without the first ``skip`` s; a run that was stopped fell."""
-    core = simulated_core(setting, 1)
+def chain_errors(setting: ChainSetting, seeds: Sequence[int]) -> Array:
+    """Return the tracking errors (episodes,) of the whole chain, without the first second; a run that was stopped fell."""
+    core = simulated_core(setting)
     core.close()
     drives = (drive_chain(setting, seed) for seed in seeds)
-    return np.array([_tracking(core, drive.errors(skip), drive.reason != "time is over") for drive in drives])
+    return np.array([_tracking(core, drive.errors(), drive.reason != "time is over") for drive in drives])
 
 
 def _tracking(core: Core, rms: Mapping[str, float], fell: bool) -> float:
@@ -179,12 +177,12 @@ def _tracking(core: Core, rms: Mapping[str, float], fell: bool) -> float:
     return float(tracking_error(scales, {which: np.array([rms[which[0]]]) for which in scales}, np.array([fell]))[0])
 
 
-def drive_chain(setting: ChainSetting, seed: int, log: Path | None = None) -> ChainDrive:
+def drive_chain(setting: ChainSetting, seed: int) -> ChainDrive:
     """Drive one episode on an emulated robot that is as the simulated one of this seed is drawn.
 
     Floors that change with time are those of the start.
     """
-    drawn = simulated_core(setting, 1)
+    drawn = simulated_core(setting)
     drawn.seed(0, seed)
     drawn.begin_episodes(drawn.everyone)
     parameters = Parameters(drawn.parameters.values.copy())
@@ -202,11 +200,9 @@ def drive_chain(setting: ChainSetting, seed: int, log: Path | None = None) -> Ch
     if setting.camera is not None:
         scene = setting.camera.emulated.model_copy(update={"seed": seed})
         camera = setting.camera.model_copy(update={"emulated": scene})
-    core.plant = RobotPlant(core.task.robot, 1, plant.options, RobotOptions(log=log), emulated_link(machine, camera))
-    try:
+    core.plant = RobotPlant(core.task.robot, 1, plant.options, RobotOptions(), emulated_link(machine, camera))
+    with closing(core):
         return _watched(core, machine, setting, seed)
-    finally:
-        core.close()
 
 
 def _standing(core: Core, parameters: Parameters) -> PlantState:

@@ -236,8 +236,16 @@ def _drive(plant: Plant, chosen: list[BenchMotion]) -> Array:
     """Return the poses (N, 7) at the end of the motions."""
     parameters, state = start(load_robot(), chosen)
     plant.reset(parameters=parameters, state=state)
-    for row in np.stack([motion.setpoints for motion in chosen], axis=1):
+    for row in _setpoints(chosen):
         plant.step(row)
+    return _pose(plant)
+
+
+def _setpoints(chosen: list[BenchMotion]) -> Array:
+    return np.stack([motion.setpoints for motion in chosen], axis=1)
+
+
+def _pose(plant: Plant) -> Array:
     return np.hstack([plant.truth().position, plant.truth().quaternion])
 
 
@@ -261,10 +269,6 @@ def _timed(work: Callable[[], object], simulated: float, threads: int) -> float:
     return simulated / (clock() - begin)
 
 
-def _setpoints(chosen: list[BenchMotion]) -> Array:
-    return np.stack([motion.setpoints for motion in chosen], axis=1)
-
-
 def _engine_run(setting: EngineSetting, chosen: list[BenchMotion], copies: int) -> Run:
     many, robot = chosen * copies, load_robot()
     options = PlantOptions(physics_step=setting.step, precision=setting.precision, threads=setting.threads, sensor_noise=False)
@@ -279,8 +283,7 @@ def _engine_run(setting: EngineSetting, chosen: list[BenchMotion], copies: int) 
     def run() -> tuple[Array, float]:
         plant.reset(parameters=parameters, state=state)
         speed = _timed(drive, len(many) * len(setpoints) * PERIOD, setting.threads)
-        pose = np.hstack([plant.truth().position, plant.truth().quaternion])
-        return pose[: len(chosen)], speed
+        return _pose(plant)[: len(chosen)], speed
 
     return run
 

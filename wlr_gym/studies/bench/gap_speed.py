@@ -41,16 +41,13 @@ class AnalysisTime:
         return sum(step.processor for step in self.steps)
 
 
-def time_analyses(
-    folders: Sequence[Path], threads: int = 2, say: Callable[[str], None] = print, repeats: int = 1
-) -> list[AnalysisTime]:
+def time_analyses(folders: Sequence[Path], threads: int = 2, say: Callable[[str], None] = print) -> list[AnalysisTime]:
     """Analyse folders of runs, one after the other, without writing anything.
 
     Args:
         folders: of runs in the measured-run format.
         threads: as of ``wlr gap --threads``.
         say: shown a line per step that takes long, and one per folder.
-        repeats: how often each is analysed; the fastest counts.
 
     Raises:
         InputError: no folders, or fewer than one thread.
@@ -61,10 +58,9 @@ def time_analyses(
         raise InputError(f"--threads {threads}: expected 1 or more")
     found = []
     for folder in folders:
-        best = min((_timed(folder, threads) for _ in range(repeats)), key=lambda one: one.wall)
-        for line in lines(best):
+        found.append(_timed(folder, threads))
+        for line in lines(found[-1]):
             say(line)
-        found.append(best)
     return found
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +14,7 @@ from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.studies.bench.measure import Contender, Measurement, Size, interleave, rate
 from wlr_gym.studies.bench.mujoco_loop import ServoBatch, build_servo_model
-from wlr_gym.studies.bench.speed import SUBSTEPS, random_setpoints
+from wlr_gym.studies.bench.speed import SUBSTEPS, random_setpoints, substeps
 
 Array = NDArray[np.float64]
 
@@ -46,36 +48,16 @@ def measure_mujoco(size: Size) -> list[Measurement]:
 
 
 def _plant(backend: str, count: int, ticks: int) -> Contender:
-    plant, setpoints = make_plant(backend, load_robot(), count), random_setpoints(ticks, count)
-
-    def drive() -> None:
-        for row in setpoints:
-            plant.step(row)
-
-    def run() -> float:
-        plant.reset()
-        return rate(drive, count * ticks * SUBSTEPS)
-
-    return run
+    plant = make_plant(backend, load_robot(), count)
+    return substeps(plant.step, plant.reset, count, ticks)
 
 
 def _servos(count: int, ticks: int) -> Contender:
-    robot, setpoints = load_robot(), random_setpoints(ticks, count)
+    robot = load_robot()
     parameters = Parameters.nominal(robot, count)
-    batch, state = (
-        ServoBatch(build_servo_model(robot, parameters, contact="matched"), parameters),
-        standing_state(robot, parameters),
-    )
-
-    def drive() -> None:
-        for row in setpoints:
-            batch.step(row, SUBSTEPS)
-
-    def run() -> float:
-        batch.reset(state)
-        return rate(drive, count * ticks * SUBSTEPS)
-
-    return run
+    batch = ServoBatch(build_servo_model(robot, parameters, contact="matched"), parameters)
+    state = standing_state(robot, parameters)
+    return substeps(partial(batch.step, substeps=SUBSTEPS), partial(batch.reset, state), count, ticks)
 
 
 def _steps_alone(count: int, ticks: int) -> Contender:

@@ -37,19 +37,24 @@ def random_setpoints(ticks: int, count: int) -> Array:
     return np.repeat(np.concatenate([legs, wheels], axis=2), 10, axis=0)[:ticks]
 
 
-def _engine(count: int, ticks: int, precision: str, threads: int) -> Contender:
-    plant = GibbsAppellPlant(load_robot(), count, PlantOptions(precision=precision, threads=threads))
+def substeps(step: Callable[[Array], object], reset: Callable[[], object], count: int, ticks: int) -> Contender:
+    """Return what measures the substeps per second of robots: a reset, then so many control ticks of random setpoints."""
     setpoints = random_setpoints(ticks, count)
 
     def drive() -> None:
         for row in setpoints:
-            plant.step(row)
+            step(row)
 
     def run() -> float:
-        plant.reset()
+        reset()
         return rate(drive, count * ticks * SUBSTEPS)
 
     return run
+
+
+def _engine(count: int, ticks: int, precision: str, threads: int) -> Contender:
+    plant = GibbsAppellPlant(load_robot(), count, PlantOptions(precision=precision, threads=threads))
+    return substeps(plant.step, plant.reset, count, ticks)
 
 
 def measure_env_step(size: Size) -> list[Measurement]:

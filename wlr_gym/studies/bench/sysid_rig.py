@@ -72,15 +72,15 @@ def true_numbers(rng: np.random.Generator) -> Array:
     return np.array([q.nominal + 0.6 * q.sigma * rng.uniform(-1.0, 1.0) for q in free])
 
 
-def rig_contest(seconds: float, seed: int = 0) -> Contest:
+def rig_contest(seconds: float) -> Contest:
     """Return the contest over recordings of this length (s)."""
-    problem, truth = make_rig(seconds, seed)
+    problem, truth = make_rig(seconds)
     return contest_between(f"pendulum, {len(RUNS)} runs of {seconds:g} s", problem, truth, peer_of(problem))
 
 
-def make_rig(seconds: float, seed: int = 0) -> tuple[WholeRuns, Array]:
+def make_rig(seconds: float) -> tuple[WholeRuns, Array]:
     """Return the problem of recordings of this length (s), and the numbers (7,) behind them."""
-    rng = generator(seed, "bench", "sysid")
+    rng = generator(0, "bench", "sysid")
     truth = true_numbers(rng)
     return WholeRuns([_recorded(k, seconds, truth, rng) for k in range(len(RUNS))]), truth
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
 
@@ -70,15 +71,15 @@ class FewNumbers(RobotProblem):
         return self.parameters([Setting(values)])
 
 
-def robot_contest(seconds: float, seed: int = 0) -> Contest:
+def robot_contest(seconds: float) -> Contest:
     """Return the contest over runs of this length (s)."""
-    problem, truth = make_robot(seconds, seed)
+    problem, truth = make_robot(seconds)
     return contest_between(f"robot, {RUNS} runs of {seconds:g} s", problem, truth, peer_of(problem))
 
 
-def make_robot(seconds: float, seed: int = 0) -> tuple[FewNumbers, Array]:
+def make_robot(seconds: float) -> tuple[FewNumbers, Array]:
     """Return the problem of runs of this length (s), and the numbers behind them."""
-    rng = generator(seed, "bench", "sysid robot")
+    rng = generator(0, "bench", "sysid robot")
     still = FewNumbers([_recorded(Parameters.nominal(load_robot()), 1.0, 0, rng)])
     truth = np.array([q.nominal + q.sigma * rng.uniform(-1.0, 1.0) for q in still.quantities])
     return FewNumbers([_recorded(still.table(truth), seconds, k, rng) for k in range(RUNS)]), truth
@@ -87,8 +88,7 @@ def make_robot(seconds: float, seed: int = 0) -> tuple[FewNumbers, Array]:
 def _recorded(parameters: Parameters, seconds: float, run: int, rng: np.random.Generator) -> Run:
     robot, rows = load_robot(), round(seconds / PERIOD) + 1
     setpoints = _goals(PERIOD * np.arange(rows, dtype=np.float64), robot.home.leg_angle, rng)
-    plant = make_plant("mujoco", robot, 1, PlantOptions(PERIOD, 0.5 * STEP))
-    try:
+    with closing(make_plant("mujoco", robot, 1, PlantOptions(PERIOD, 0.5 * STEP))) as plant:
         readings = plant.reset(np.array([run], np.uint64), parameters, state=standing_state(robot, parameters))
         for _ in range(round(REST / PERIOD)):
             readings = plant.step(setpoints[:1])
@@ -96,8 +96,6 @@ def _recorded(parameters: Parameters, seconds: float, run: int, rng: np.random.G
         for row, goal in enumerate(setpoints):
             table[row] = channels(readings, 0)
             readings = plant.step(goal[None])
-    finally:
-        plant.close()
     table[:, WHEEL_SLICE] -= table[0, WHEEL_SLICE]
     frame = pandas.DataFrame(np.hstack([setpoints, table]), columns=[*COMMANDS, *SENSED])
     frame.insert(0, "t", PERIOD * np.arange(rows))

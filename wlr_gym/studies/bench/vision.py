@@ -140,8 +140,9 @@ def _centre_error(camera: Camera, look: Look, seed: int) -> float:
     return float(np.hypot(*error) * camera.focal[0])
 
 
-def _crop(camera: Camera, middle: Array, half: int = 60) -> tuple[Camera, Array]:
+def _crop(camera: Camera, middle: Array) -> tuple[Camera, Array]:
     """A camera that sees only the pixels around ``middle``, and its upper left corner."""
+    half = 60
     corner = np.round(middle) - half
     centre = (camera.centre[0] - corner[0], camera.centre[1] - corner[1])
     return camera.model_copy(update={"width": 2 * half, "height": 2 * half, "centre": centre}), corner
@@ -281,12 +282,12 @@ def measure_drives(size: Size) -> list[VisionResult]:
     return [line for make in makers[size(0, 2) :] for line in measure_drive(make())]
 
 
-def measure_drive(drive: FilmedDrive, tilt: float = 0.0, look: Look | None = None) -> list[VisionResult]:
+def measure_drive(drive: FilmedDrive) -> list[VisionResult]:
     """Lines for one filmed drive: worst error of the accumulated slip of any wheel at any time, and the clocks' offset."""
     body, floor = load_target("body"), load_target("floor")
     camera = CAMERA.model_copy(update={"distortion": LENS})
-    renderer = Renderer(camera, view(tilt, 2.0), floor_facets(floor))
-    shots = film(drive, renderer, body, look or Look(), TRUE_OFFSET)
+    renderer = Renderer(camera, view(0.0, 2.0), floor_facets(floor))
+    shots = film(drive, renderer, body, Look(), TRUE_OFFSET)
     analysis = analyse(shots, drive.run, camera, body, floor, drive.robot)
     samples, slip, found = analysis.samples, analysis.slip, analysis.alignment
     assert found is not None  # no offset was given

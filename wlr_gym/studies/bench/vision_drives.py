@@ -127,6 +127,7 @@ def _drive(
     x: float,
 ) -> FilmedDrive:
     import pandas
+    from scipy.spatial.transform import Rotation
 
     plant = make_plant("gibbs_appell", robot, 1, PlantOptions(control_period=TICK, physics_step=0.001))
     sensors = plant.reset(np.array([7], np.uint64), parameters, state=_start(robot, parameters, legs, x))
@@ -151,7 +152,8 @@ def _drive(
     found = np.array(truths)
     run = Run(pandas.DataFrame(rows), RunMeta(robot=robot.name), Path(f"{name.replace(' ', '_')}.parquet"))
     time = np.asarray(TICK * np.arange(count + 1), np.float64)
-    return FilmedDrive(name, run, robot, parameters, time, found[:, :3], _matrices(found[:, 3:7]), found[:, 7:], slips)
+    turns = Rotation.from_quat(found[:, 3:7], scalar_first=True).as_matrix()
+    return FilmedDrive(name, run, robot, parameters, time, found[:, :3], turns, found[:, 7:], slips)
 
 
 def _start(robot: Robot, parameters: Parameters, legs: list[float], x: float) -> PlantState:
@@ -172,12 +174,6 @@ def _row(time: float, goal: Array, sensors: Array, slices: dict[str, slice]) -> 
 
 
 _KINDS = (("pos", "position"), ("vel", "velocity"), ("eff", "effort"))
-
-
-def _matrices(quaternion: Array) -> Array:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix()
 
 
 def film(

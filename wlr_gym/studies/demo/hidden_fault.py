@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.plots import COLOURS, new_figure, tidy
+from wlr_gym.base.text import counted
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
 from wlr_gym.studies.demo.stage import Section, Tell, drawn, paragraph
@@ -83,8 +85,7 @@ def _told(drivers: tuple[str, ...]) -> str:
     from wlr_gym.data.excitations import EXCITATIONS
 
     motions = [f"'{name}' ({EXCITATIONS[name].doc})" for name in drivers if name in EXCITATIONS]
-    count = drivers.count(POLICY)
-    runs = f"{count} run{'s' if count > 1 else ''}"
+    runs = counted(drivers.count(POLICY), "run")
     return f"{runs} by the shipped policy {POLICY}, and {len(motions)} by motions: {', '.join(motions)}."
 
 
@@ -95,11 +96,8 @@ def _deploy(demo: Demo, patch: Any, seed: int) -> None:
 
     hardware = {"emulated": True, "log": demo.measured, "effects": patch}
     keywords = {"backend": "dynamixel", "robot": "nominal", "hardware": hardware, "episode_length": demo.run_seconds}
-    core = make_core(ENVIRONMENT, 1, environment_for(POLICY, keywords))
-    try:
+    with closing(make_core(ENVIRONMENT, 1, environment_for(POLICY, keywords))) as core:
         ended = deploy(core, make_policy(POLICY, core.contract()), seed)
-    finally:
-        core.close()
     if not ended.well:
         raise InputError(f"the robot was stopped: {ended.reason}")
 
@@ -117,11 +115,8 @@ def _excite(demo: Demo, patch: Any, name: str) -> None:
 
     robot = load_robot()
     motion = replace(excite(name, demo.seed, robot, seconds=demo.run_seconds), profile=Profile())
-    plant = RobotPlant(robot, 1, hardware=RobotOptions(emulated=True, log=demo.measured, effects=patch))
-    try:
+    with closing(RobotPlant(robot, 1, hardware=RobotOptions(emulated=True, log=demo.measured, effects=patch))) as plant:
         ended = drive_robot(plant, motion)
-    finally:
-        plant.close()
     if not ended.well:
         raise InputError(f"the robot was stopped: {ended.reason}")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -100,10 +100,8 @@ def _play(source: str | Path, demo: Demo) -> Rollout:
     from wlr_gym.learning.evaluation import FIRST_SEED, make_player, roll_out
 
     core, policy = make_player(ENVIRONMENT, source, demo.episodes, {"precision": "float32"})
-    try:
+    with closing(core):
         return roll_out(core, policy, FIRST_SEED + demo.seed)
-    finally:
-        core.close()
 
 
 def _reward_per_second(rollout: Rollout) -> float:

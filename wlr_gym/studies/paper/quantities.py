@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,24 +34,7 @@ def _apply(function: str, x: Value) -> Value:
     return getattr(sympy, function)(x)
 
 
-def sin(x: Value) -> Value:
-    """Sine."""
-    return _apply("sin", x)
-
-
-def cos(x: Value) -> Value:
-    """Cosine."""
-    return _apply("cos", x)
-
-
-def sign(x: Value) -> Value:
-    """Sign; 0 at 0."""
-    return _apply("sign", x)
-
-
-def root(x: Value) -> Value:
-    """Square root."""
-    return _apply("sqrt", x)
+sin, cos, sign, root = (partial(_apply, function) for function in ("sin", "cos", "sign", "sqrt"))
 
 
 def is_front(wheel: str) -> bool:

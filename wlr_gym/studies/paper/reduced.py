@@ -6,8 +6,7 @@ their leg. Height and pitch follow from the legs. The equations are written in u
     M u11' + h = E tau + sum_i (J_x,i F_x,i + J_y,i F_y,i + J_n,i N_i),      u11 = B u9,
 
 in closed form (source: audit of the paper, section 4a; tests prove it to be the projection of :mod:`wlr_gym.physics.model`).
-The two
-rows that B leaves over give the normal forces, equal left and right: four loads on three equations of a rigid body.
+The two rows that B leaves over give the normal forces, equal left and right: four loads on three equations of a rigid body.
 
 Everything is batched over N robots. Of asymmetries, the model knows friction, gear drag and radius of single wheels (the last
 in rolling only); masses and loads are those of the left side.
@@ -301,11 +300,10 @@ class ReducedModel:
         self.parameters = parameters
         nominal = robot.servo.supply_voltage
         pair = [0, 2, 4, 5, 6, 7]  # one leg of each axle, all wheels
-        many = np.array([2.0, 2.0, 1.0, 1.0, 1.0, 1.0])
-        constant, resistance = servo.motor_constants(
+        self._many = many = np.array([2.0, 2.0, 1.0, 1.0, 1.0, 1.0])
+        self._constant, self._resistance = servo.motor_constants(
             parameters["servo.stall_torque"][:, pair], parameters["servo.no_load_speed"][:, pair], nominal
         )
-        self._constant, self._resistance, self._many = constant, resistance, many
         self._kp, self._kd = servo.position_gains(parameters)[:, pair], parameters["servo.kd"][:, pair]
         self._supply = parameters["servo.supply_voltage"][:, None]
         self._viscous = many * parameters["servo.viscous_friction"][:, pair]
@@ -347,8 +345,9 @@ class ReducedModel:
         pull = np.einsum("nij,nj->ni", small, state.u) - h * free
         pull[:, 3:] += h * drive
         j_x, j_y, j_n = contact_rows(c, p, self._radius)
-        rows = np.stack([j_x @ b, j_y @ b], axis=2)
-        new, force = self._rub(state, small_damped, pull, rows)
+        rows = np.ascontiguousarray(np.stack([j_x @ b, j_y @ b], axis=2))
+        new, impulse = rub(small_damped, pull, rows, h * state.normal, self._mu, h * self._dry, state.u)
+        force = impulse / h
         state.motor = drive - (damping - self._viscous) * new[:, 3:]
         acceleration = np.einsum("nij,nj->ni", b, (new - state.u) / h) + lag
         rest = np.einsum("nij,nj->ni", mass, acceleration) + bias - np.einsum("nwk,nw->nk", j_x, force[:, :, 0])
@@ -388,12 +387,6 @@ class ReducedModel:
         return on * servo.motor_torque(self._constant, self._resistance, voltage, 0.0), (
             self._viscous + on * self._constant**2 / self._resistance
         )
-
-    def _rub(self, state: ReducedState, a: Array, pull: Array, rows: Array) -> tuple[Array, Array]:
-        """Return the velocities (N, 9) after dry friction, and the floor's forces (N, 4, 2)."""
-        h = self.step
-        new, impulse = rub(a, pull, np.ascontiguousarray(rows), h * state.normal, self._mu, h * self._dry, state.u)
-        return new, impulse / h
 
 
 def run(
