@@ -100,14 +100,17 @@ def run(options: BenchOptions) -> int:
             raise unknown_name("measurement", name, (*MEASUREMENTS, BLIND_TEST, ADAPT_STUDY))
     if options.rounds < 1:
         raise InputError(f"--rounds {options.rounds}: expected 1 or more")
-    if options.save is not None and not options.save.parent.is_dir():
-        raise InputError(f"--save {options.save}: folder {options.save.parent} does not exist")
     if options.save is not None:
+        if not options.save.parent.is_dir():
+            raise InputError(f"--save {options.save}: folder {options.save.parent} does not exist")
         refuse_existing(options.save, options.force, "--save")
+    for name in (ADAPT_STUDY, BLIND_TEST):
+        if name in asked and len(asked) > 1:
+            raise InputError(f"{name} takes hours and is run alone, not with {', '.join(set(asked) - {name})}")
     if ADAPT_STUDY in asked:
-        return _adapt_study(options, asked)
+        return _adapt_study(options)
     if BLIND_TEST in asked:
-        return _blind_test(options, asked)
+        return _gap_speed(options) if options.speed else _blind_test(options)
     if options.out is not None:
         return _lab_films(options, asked)
     console, size = Console(), Size(options.rounds, options.quick)
@@ -150,32 +153,26 @@ def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console,
     return engine_report.pairs(found.results)
 
 
-def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
+def _write(path: Path, text: str, console: Console) -> None:
+    """Write a report, and show it."""
+    path.write_text(text, encoding="utf-8")
+    console.print(text, markup=False, highlight=False)
+
+
+def _blind_test(options: BenchOptions) -> int:
     """Test the gap workflow on data sets with hidden truths; print and write its score."""
     from wlr_gym.studies.bench import gap
     from wlr_gym.studies.bench.gap_score_table import markdown
 
-    if len(asked) > 1:
-        raise InputError(f"{BLIND_TEST} takes hours and is run alone, not with {', '.join(set(asked) - {BLIND_TEST})}")
-    if options.speed:
-        return _gap_speed(options)
     if options.out is None:
         raise InputError(f"{BLIND_TEST} needs --out DIR: finished data sets are kept there, so that it can be interrupted")
     console = Console(soft_wrap=True)
     plan = gap.Plan(options.out, gap.ALL_SETS if options.sets is None else options.sets, options.processes)
-    report = gap.run_blind_test(
-        plan,
-        say=console.print,
-        answers=options.answers,
-        ray=ray_address(options.ray),
-    )
-    text = markdown(report)
-    (options.out / "score.md").write_text(text, encoding="utf-8")
-    console.print(text, markup=False, highlight=False)
+    report = gap.run_blind_test(plan, say=console.print, answers=options.answers, ray=ray_address(options.ray))
+    _write(options.out / "score.md", markdown(report), console)
     if options.classifier:
-        baseline = markdown(gap.score_classifier(plan, options.classifier, console.print))
-        (options.out / "score_classifier.md").write_text(baseline, encoding="utf-8")
-        console.print(baseline, markup=False, highlight=False)
+        found = gap.score_classifier(plan, options.classifier, console.print)
+        _write(options.out / "score_classifier.md", markdown(found), console)
     if options.save is not None:
         write_json(options.save, report)
     if options.json:
@@ -184,14 +181,12 @@ def _blind_test(options: BenchOptions, asked: tuple[str, ...]) -> int:
     return OK
 
 
-def _adapt_study(options: BenchOptions, asked: tuple[str, ...]) -> int:
+def _adapt_study(options: BenchOptions) -> int:
     """Adapt a policy to robots with hidden faults, and others beside it; print and write the table."""
     from wlr_gym.studies.bench import adapt_study
     from wlr_gym.studies.bench.adapt_cases import chosen_cases
     from wlr_gym.studies.bench.adapt_table import markdown
 
-    if len(asked) > 1:
-        raise InputError(f"{ADAPT_STUDY} takes hours and is run alone, not with {', '.join(set(asked) - {ADAPT_STUDY})}")
     if options.out is None:
         raise InputError(f"{ADAPT_STUDY} needs --out DIR: finished cases are kept there, so that it can be interrupted")
     for name in options.contenders:
@@ -201,9 +196,7 @@ def _adapt_study(options: BenchOptions, asked: tuple[str, ...]) -> int:
     contenders = options.contenders or tuple(adapt_study.CONTENDERS)
     study = adapt_study.AdaptStudy(options.out, chosen_cases(options.cases), contenders=contenders)
     lines = adapt_study.run_adapt_study(study.quick() if options.quick else study, console.print)
-    text = markdown(lines)
-    (options.out / "adapt.md").write_text(text, encoding="utf-8")
-    console.print(text, markup=False)
+    _write(options.out / "adapt.md", markdown(lines), console)
     if options.json:
         print_json(lines)
     console.print(f"written: {options.out / adapt_study.LINES_FILE}, {options.out / 'adapt.md'}")

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, settings_of
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
@@ -106,8 +106,8 @@ def run(options: CompareOptions) -> int:
 
 
 def _motions(options: CompareOptions) -> tuple[list[Motion], Robot]:
-    from wlr_gym.data import read_dataset, read_run
     from wlr_gym.data.excitations import EXCITATIONS, excite
+    from wlr_gym.data.read import read_runs
     from wlr_gym.data.record import motion_of
     from wlr_gym.data.replay import robot_of
     from wlr_gym.robot import load_robot
@@ -120,9 +120,7 @@ def _motions(options: CompareOptions) -> tuple[list[Motion], Robot]:
         return [excite(name, options.seed, robot, seconds=options.seconds) for name in names], robot
     if options.excitation:
         raise InputError("--runs and --excitation: expected one of them")
-    if not options.runs.exists():
-        raise InputError(f"{options.runs}: no such file or folder; expected a run (CSV or Parquet) or a folder of runs")
-    runs = read_dataset(options.runs).runs if options.runs.is_dir() else [read_run(options.runs)]
+    runs = read_runs(options.runs)
     return [motion_of(measured).cut(options.seconds) for measured in runs], robot_of(runs[0], options.robot)
 
 
@@ -180,11 +178,8 @@ def _draw(found: Comparison, out: Path, tell: Callable[[str, float], None]) -> N
 
 
 def _resolved(options: CompareOptions, motions: Sequence[Motion], robot: Robot, patch: Patch) -> dict[str, object]:
-    given = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
     return {
-        **given,
-        "plants": list(options.plants),
-        "excitation": list(options.excitation),
+        **settings_of(options),
         "robot": robot.name,
         "motions": [motion.name for motion in motions],
         "effects": patch.content()["effects"],

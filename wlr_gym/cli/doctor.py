@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.text import counted
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import JsonOption
 from wlr_gym.cli.results import print_json
@@ -63,11 +65,8 @@ def run(options: DoctorOptions) -> int:
         raise InputError("--scan: the emulated robot of this process has no ports; name those of wlr emulate")
     console = Console(soft_wrap=True, highlight=False)
     robot, hardware = options.load()
-    link = options.link()
-    try:
+    with closing(options.link()) as link:
         checks = examine(link, robot, hardware, options, console)
-    finally:
-        link.close()
     if options.policy is not None:
         checks += check_policy(options.policy, options.robot_name(options.robot), options.camera is not None)
     if options.json:
@@ -141,11 +140,8 @@ def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Chec
     try:
         policy = contract_of(source)
         environment = policy.get("training", {}).get("environment", "WLR-Velocity-v0")
-        core = make_core(environment, 1, environment_for(source, {"robot": robot}))
-        try:
+        with closing(make_core(environment, 1, environment_for(source, {"robot": robot}))) as core:
             check_contract(policy["environment"], core.contract(), source)
-        finally:
-            core.close()
     except InputError as error:
         return [Check("policy", "contract", False, str(error), "one that fits", remedy)]
     checks = [Check("policy", "contract", True, f"{policy['agent']}, {policy['environment']['task']}", "", "")]
@@ -189,13 +185,13 @@ def _print(checks: Sequence[Check], console: Console, options: DoctorOptions) ->
         console.print(Text(f"All {len(checks)} checks passed.", "bold green"))
         return
     faults = sum(check.is_fatal for check in wrong)
-    counts = f"{_plural(faults, 'fault')}, {_plural(len(wrong) - faults, 'warning')} in {len(checks)} checks."
+    counts = f"{counted(faults, 'fault')}, {counted(len(wrong) - faults, 'warning')} in {len(checks)} checks."
     console.print(Text(counts, "bold red" if faults else "bold yellow"))
     first = wrong[0]
     summary = f"First: {first.where}, {first.what}: {first.found}, expected {first.expected}."
     console.print(Text(f"{summary}\n{first.remedy}", "bold"))
     if registers := mendable(checks):
-        repair = f"{_plural(len(registers), 'register')} can be written, after a question: {_mend_command(options)}"
+        repair = f"{counted(len(registers), 'register')} can be written, after a question: {_mend_command(options)}"
         console.print(Text(repair, "bold"))
 
 
@@ -208,10 +204,6 @@ def _mend_command(options: DoctorOptions) -> str:
     words += ["--emulated"] if options.emulated else []
     words += ["--camera", options.camera] if options.camera else []
     return shlex.join([*words, "--mend"])
-
-
-def _plural(count: int, word: str) -> str:
-    return f"{count} {word}{'' if count == 1 else 's'}"
 
 
 def _lines(checks: Sequence[Check], verbose: bool) -> list[tuple[str, str]]:

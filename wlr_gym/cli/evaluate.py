@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import make_output_folder, refuse_existing
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of, settings_of
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.tables import print_table
 from wlr_gym.envs.registry import task_name_of
@@ -140,9 +140,8 @@ def run(options: EvaluateOptions) -> int:
         "backend": BACKENDS[0] if options.backend == "both" else options.backend, **having(options.present()),
     }  # fmt: skip
     if options.out is not None:
-        settings = {key: _plain(value) for key, value in asdict(options).items()}
         driven = {} if robot is None else {"robot": robot_content(robot)}
-        record_provenance(options.out, settings | driven | {"effects": patch.content()["effects"]}, options.seed)
+        record_provenance(options.out, settings_of(options) | driven | {"effects": patch.content()["effects"]}, options.seed)
         _write(options.out, card, samples, options.seed)
         if options.record:
             _record(options, _shown(card, read_subjects([options.policy])[0]), options.out / "runs", keywords)
@@ -238,10 +237,6 @@ def _check(options: EvaluateOptions) -> None:
             raise InputError(f"--video-seconds {options.video_seconds:g}: expected more than 0")
 
 
-def _plain(value: Any) -> Any:
-    return str(value) if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
-
-
 def _play(options: EvaluateOptions, patch: Patch) -> tuple[Card, Rollout]:
     """Play everything; returns the card, and the first block of the first subject."""
     first: list[Rollout] = []
@@ -296,10 +291,8 @@ def _write(folder: Path, card: Card, samples: Rollout, seed: int) -> None:
 def _record(options: EvaluateOptions, subject: Subject, folder: Path, keywords: Mapping[str, Any]) -> None:
     """Write the first episodes of the policy as runs."""
     core, policy = make_player(str(options.env), subject.sources[0], options.record, keywords)
-    try:
+    with closing(core):
         written = record_episodes(core, policy, folder, options.seed)
-    finally:
-        core.close()
     print(f"written: {len(written)} runs in {folder}")
 
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
@@ -22,6 +23,9 @@ from wlr_gym.base.files import make_output_folder, refuse_existing
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption, environment_of
 from wlr_gym.cli.results import print_json
+
+if TYPE_CHECKING:
+    from wlr_gym.policy import Parity
 
 #: Episodes whose observations are compared, and their length, s.
 ROBOTS = 16
@@ -149,10 +153,15 @@ def _export(source: str, out: Path) -> dict[str, Any]:
     folder = find_policy(source)
     print(f"exporting {source}, then comparing: some seconds", flush=True)
     parity = export_policy(folder, out, real_observations(folder), training_facts(folder))
+    return _written(out, parity, "policy", f"{ROBOTS} episodes")
+
+
+def _written(out: Path, parity: Parity, original: str, real: str) -> dict[str, Any]:
+    """Say that a policy file is written, and how exactly it answers as what it was made of; return both."""
     print(
         f"written: {out} ({out.stat().st_size / 1000:.0f} kB)\n"
-        f"answers as the policy does: actions differ by at most {parity.random:.1e} on random observations, "
-        f"{parity.real:.1e} on those of {ROBOTS} episodes"
+        f"answers as the {original} does: actions differ by at most {parity.random:.1e} on random observations, "
+        f"{parity.real:.1e} on those of {real}"
     )
     return {"policy": out, "parity": parity}
 
@@ -170,12 +179,7 @@ def _import(options: ExportOptions) -> dict[str, Any]:
     out = _target(options)
     env = gymnasium.make(options.env, robot=options.robot, **fed_environment(settings.get("environment") or {}))
     parity = import_policy(options.policy[0], env, out, normalizer=options.normalizer)
-    print(
-        f"written: {out} ({out.stat().st_size / 1000:.0f} kB)\n"
-        f"answers as the archive does: actions differ by at most {parity.random:.1e} on random observations, "
-        f"{parity.real:.1e} on those of robots that it drives"
-    )
-    return {"policy": out, "parity": parity}
+    return _written(out, parity, "archive", "robots that it drives")
 
 
 def _write_card(source: str, evaluation: Path, force: bool) -> dict[str, Any]:
@@ -197,11 +201,8 @@ def real_observations(source: Path) -> NDArray[np.float32]:
     from wlr_gym.learning.evaluation.rollout import make_core, seen_observations
     from wlr_gym.policy import make_policy, policy_environment
 
-    core = make_core(environment_of(None, source), ROBOTS, policy_environment(source))
-    try:
+    with closing(make_core(environment_of(None, source), ROBOTS, policy_environment(source))) as core:
         return seen_observations(core, make_policy(source, core.contract()), SECONDS)
-    finally:
-        core.close()
 
 
 def training_facts(folder: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import json
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +21,7 @@ import tyro
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.gap_decide import DecideOptions, print_rounds, recorder_of
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, settings_of
 from wlr_gym.cli.progress import progress
 from wlr_gym.cli.results import print_json
 
@@ -85,9 +85,7 @@ def run(options: GapOptions) -> int:
             threads=options.threads or os.cpu_count() or 1,
             tell=partial(tell, ""),
         )
-    settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
-    settings |= {"heldout": list(options.heldout), "hidden": list(options.hidden)}
-    record_provenance(options.out, settings | {"effects": known.content()["effects"]})
+    record_provenance(options.out, settings_of(options) | {"effects": known.content()["effects"]})
     if options.json:
         print_json(json.loads((options.out / RESULT_FILE).read_text(encoding="utf-8")))
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -103,11 +104,8 @@ def _emulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backen
 
     del backend  # it has a simulator of its own
     meta = read_meta(data).model_copy(update={"profile": motion.profile})
-    plant = RobotOption(emulated=True).plant_of(robot, data, meta, hidden)
-    try:
+    with closing(RobotOption(emulated=True).plant_of(robot, data, meta, hidden)) as plant:
         drive = drive_robot(plant, motion)
-    finally:
-        plant.close()
     return Recorded(drive.run, drive.reason)
 
 

@@ -6,7 +6,8 @@ how sure it is, and writes it; with --out it is used at once. What wlr export --
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -69,7 +70,9 @@ def run(options: ImportOptions) -> int:
         given = found
     assert options.out is not None
     if given is None and not (options.out / MAP_FILE).is_file():
-        _check_own([log for log in options.log if not is_own(log)])
+        for log in options.log:
+            if not is_own(log):
+                raise InputError(f"{log}: another program's log: give --map, or --suggest to have one proposed")
     runs: list[ImportedRun] = []
     for log in options.log:
         with _reading(console, log) as tell:
@@ -91,29 +94,13 @@ def _check(options: ImportOptions) -> None:
         raise InputError("--out: expected a folder for the runs")
 
 
-def _check_own(others: Sequence[Path]) -> None:
-    if others:
-        raise InputError(f"{others[0]}: another program's log: give --map, or --suggest to have one proposed")
+@contextmanager
+def _reading(console: Console, log: Path) -> Iterator[Callable[[float], None]]:
+    """Show a bar of how much of a log has been read; yields a function that is told the share."""
+    from wlr_gym.cli.progress import progress
 
-
-class _Reading:
-    """A bar that shows how much of a log has been read."""
-
-    def __init__(self, console: Console, log: Path) -> None:
-        from wlr_gym.cli.progress import progress
-
-        self._bar = progress(console)
-        self._log = log
-
-    def __enter__(self) -> Callable[[float], None]:
-        return partial(self._bar.__enter__(), "", f"reading {self._log.name}")
-
-    def __exit__(self, *error: Any) -> None:
-        self._bar.__exit__(*error)
-
-
-def _reading(console: Console, log: Path) -> _Reading:
-    return _Reading(console, log)
+    with progress(console) as tell:
+        yield partial(tell, "", f"reading {log.name}")
 
 
 # ---- the proposed map ------------------------------------------------------------------------------------------------

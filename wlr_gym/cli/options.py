@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from wlr_gym.base.errors import InputError
 
@@ -73,6 +73,11 @@ def pairs(option: str, words: Sequence[str], example: str) -> dict[str, str]:
             raise InputError(f"{option} {word}: expected name=value, such as {example}")
         found[name] = value
     return found
+
+
+def settings_of(options: Any) -> dict[str, Any]:
+    """Return the options of a command as ``config.yaml`` has them."""
+    return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
 
 
 def environment_of(env: str | None, policy: str | Path) -> str:

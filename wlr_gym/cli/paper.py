@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.options import ForceOption, JsonOption, settings_of
 from wlr_gym.cli.progress import Tell, progress
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import HardwareOption, confirm
@@ -75,7 +75,7 @@ def run(options: PaperOptions) -> int:
     from wlr_gym.studies.paper.experiments import write_tests
 
     _check(options)
-    robot = load_robot(options.robot) if options.robot else load_robot()
+    robot = load_robot(options.robot or "nominal")
     refuse_existing(options.out / "report.md", options.force)
     make_output_folder(options.out)
     write_tests(options.out / "commands")
@@ -99,8 +99,7 @@ def run(options: PaperOptions) -> int:
             tell("", "figures", _SHARES["decided"])
             report.write_figures(options.out, records, evidence, findings)
     report.write_report(options.out, robot, records, claims, findings, decisive)
-    given = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
-    record_provenance(options.out, given | {"plant": list(options.plant), "robot": robot.name}, options.seed)
+    record_provenance(options.out, settings_of(options) | {"robot": robot.name}, options.seed)
     if options.json:
         print_json(claims)
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,8 +89,7 @@ def run(options: PlayOptions) -> int:
     keywords |= {"effects": options.patch(), **having(options.present())}
     own = environment_for(options.agent, keywords)
     keywords["robot"] = own["robot"]  # a second one drives the same robot
-    core = make_core(environment_of(options.env, options.agent), 1, own)
-    try:
+    with closing(make_core(environment_of(options.env, options.agent), 1, own)) as core:
         policy = make_policy(options.agent, core.contract())
         driver = _driver(options, core)
         if options.video is None and not options.web:
@@ -100,8 +100,6 @@ def run(options: PlayOptions) -> int:
             _film(options, core, policy, driver)
         else:
             show(options, core, policy, driver, _web_viewer if options.web else _window_viewer)
-    finally:
-        core.close()
     return OK
 
 
@@ -229,13 +227,10 @@ def show(
     from wlr_gym.render.teleop import Keyboard
 
     period = core.task.config.control_period
-    viewer = new_viewer(options, core.task.robot, driver.press if isinstance(driver, Keyboard) else None)
-    try:
+    with closing(new_viewer(options, core.task.robot, driver.press if isinstance(driver, Keyboard) else None)) as viewer:
         for tick, _ in enumerate(drive(core, policy, options.seed, driver)):
             if options.seconds is not None and tick * period > options.seconds:
                 break
             texts = {"time": present_time(core), "command": commands(core), "title": options.agent}
             if not viewer.show(core.plant.truth(), core.parameters, period=period, **texts):
                 break
-    finally:
-        viewer.close()

@@ -8,6 +8,7 @@ stops it in good order.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -129,11 +130,8 @@ def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robo
     for motion in motions:
         if not (options.emulated or options.yes):
             confirm(motion, robot, console)
-        plant = options.plant(options.out, meta, options.patch())
-        try:
+        with closing(options.plant(options.out, meta, options.patch())) as plant:
             drive = drive_robot(plant, motion)
-        finally:
-            plant.close()
         _report(motion, drive, console)
         found.append(
             {"motion": motion.name, "run": drive.run, "reason": drive.reason, "well": drive.well, "ticks": drive.ticks}

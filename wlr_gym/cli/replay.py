@@ -9,15 +9,17 @@ Writes errors.json (run, channel: errors in units and in sensor noise), overlay 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.text import counted
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, settings_of
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import HardwareOption, confirm
 
@@ -68,6 +70,7 @@ def run(options: ReplayOptions) -> int:
 
     from wlr_gym.base.files import make_output_folder, refuse_existing, write_json
     from wlr_gym.base.provenance import record_provenance
+    from wlr_gym.data.read import read_runs
     from wlr_gym.data.replay import prepare
     from wlr_gym.data.replay_plots import save_plots
     from wlr_gym.physics.plants import REAL, check_backend
@@ -82,7 +85,7 @@ def run(options: ReplayOptions) -> int:
         raise InputError("--video: a film needs a simulator; --backend dynamixel has none")
     if options.video is not None:
         check_video(options.video)
-    runs = _read(options.runs)
+    runs = read_runs(options.runs)
     patch = options.patch()
     refuse_existing(options.out / ERRORS_FILE, options.force)
     for film in _films(options, [one.name for one in runs]):
@@ -133,14 +136,6 @@ def _film(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch,
         console.print(f"video: {target}")
 
 
-def _read(path: Path) -> Sequence[Run]:
-    from wlr_gym.data import read_dataset, read_run
-
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder; expected a run (CSV or Parquet) or a folder of runs")
-    return read_dataset(path).runs if path.is_dir() else [read_run(path)]
-
-
 def _replay_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
     from rich.progress import track
 
@@ -166,11 +161,8 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
         if not (options.emulated or options.yes):
             confirm(motion, robot, console)
         folder = options.out / "robot" / measured.name
-        plant = options.plant_of(robot, folder, meta_of(motion, robot, RunMeta()), patch)
-        try:
+        with closing(options.plant_of(robot, folder, meta_of(motion, robot, RunMeta()), patch)) as plant:
             drive = drive_robot(plant, motion)
-        finally:
-            plant.close()
         interventions = drive.statistics["interventions"]
         changed = ", ".join(f"{rule} in {count} steps" for rule, count in interventions.items()) or "nothing changed"
         console.print(f"{measured.name}: {drive.ticks} of {len(motion.setpoints)} steps driven; command limiter: {changed}")
@@ -182,7 +174,7 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
 
 def _resolved(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch) -> dict[str, object]:
     return {
-        **{name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()},
+        **settings_of(options),
         "robot": results[0].robot.name,
         "clock": results[0].clock,
         "physics_step": results[0].physics_step,
@@ -200,7 +192,7 @@ def _print(results: Sequence[ReplayResult], patch: Patch, console: Console, othe
             line = f"{result.run.name}: {finding.kind} in '{finding.column}': {finding.message}"
             console.print(line, style="yellow", highlight=False, soft_wrap=True)
     errors = [pair for result in results for pair in result.errors.items()]
-    runs = f"{len(results)} run{'s' if len(results) > 1 else ''}"
+    runs = counted(len(results), "run")
     _print_errors(errors, f"Measured minus {other}, rms ({runs}, effects added: {patch.summary()})", console)
     _print_joints(errors, console)
     if len(results) > 1:

@@ -78,11 +78,11 @@ def run(options: ViewOptions) -> int:
 
 
 def _read(paths: Sequence[Path]) -> list[Run]:
-    from wlr_gym.data import read_dataset, read_run
+    from wlr_gym.data.read import read_runs
 
     if not paths:
         raise InputError("expected runs (CSV or Parquet), or folders of runs; wlr import makes runs of other programs' logs")
-    return [run for path in paths for run in (read_dataset(path).runs if path.is_dir() else [read_run(path)])]
+    return [run for path in paths for run in read_runs(path)]
 
 
 def _names(runs: Sequence[Run]) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,7 +17,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.options import ForceOption, JsonOption, settings_of
 from wlr_gym.cli.progress import progress
 from wlr_gym.cli.results import print_json
 
@@ -103,8 +103,7 @@ def run(options: VisionOptions) -> int:
             shutil.rmtree(options.out, ignore_errors=True)
         raise
     paths = save_video_analysis(analysis, options.out)
-    settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
-    record_provenance(options.out, settings | {"robot": analysis.robot.name})
+    record_provenance(options.out, settings_of(options) | {"robot": analysis.robot.name})
     if options.json:
         print_json(analysis.summary())
     else:

@@ -106,6 +106,18 @@ def read_dataset(folder: str | Path) -> DataSet:
     return DataSet(tuple(read_run(path) for path in paths), read_meta(folder), folder)
 
 
+def read_runs(path: str | Path) -> tuple[Run, ...]:
+    """Read a run, or every run of a folder.
+
+    Raises:
+        InputError: no such file or folder; see :func:`read_run` and :func:`read_dataset`.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; expected a run (CSV or Parquet) or a folder of runs")
+    return read_dataset(path).runs if path.is_dir() else (read_run(path),)
+
+
 def run_files(folder: Path) -> list[Path]:
     """Return the runs of a folder, ``run_2`` before ``run_10``; what else is known of a run lies beside it (:data:`BESIDE`)."""
     files = [path for path in folder.glob("run_*") if path.suffix.lower() in SUFFIXES and not path.stem.endswith(BESIDE)]
