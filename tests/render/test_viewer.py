@@ -14,7 +14,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.render import viewer as viewer_module
 from wlr_gym.render.teleop import DOWN, LEFT, RESET, RIGHT, SPACE, UP, Gamepad, Keyboard, Script
 from wlr_gym.render.view import View
-from wlr_gym.render.viewer import Viewer, open_window
+from wlr_gym.render.viewer import Pace, Viewer, open_window
 
 RANGES = {"linear_velocity_x": (-0.1, 0.2), "yaw_rate": (-0.5, 0.5)}
 
@@ -60,7 +60,7 @@ def opened(robot):
     def sleep(seconds):
         now[0] += seconds
 
-    return Viewer(robot, View(), open=open_fake, clock=lambda: now[0], sleep=sleep), windows, now
+    return Viewer(robot, View(), open=open_fake, pace=Pace(lambda: now[0], sleep)), windows, now
 
 
 def test_pose_text_and_marks_go_into_the_window(opened, parameters):

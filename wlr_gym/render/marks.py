@@ -56,8 +56,9 @@ class Area:
     mu: float
     height: float
 
-    def points(self, near: Array, reach: float = 0.9, count: int = 7) -> Array:
-        """Return a grid of points (count * count, 3) on what of it is near a place (x, y), the innermost first."""
+    def points(self, near: Array) -> Array:
+        """Return a grid of points (49, 3) on what of it is within 0.9 m of a place (x, y), the innermost first."""
+        reach, count = 0.9, 7
         low = np.maximum(np.minimum(near[:2] - reach, self.high), self.low)
         high = np.minimum(np.maximum(near[:2] + reach, self.low), self.high)
         share = (np.arange(count) + 0.5) / count

@@ -94,7 +94,7 @@ class Viewer:
         view: what to show; the size is the window's own affair.
         on_key: called with GLFW's key code, from the window's thread.
         open: how the window is opened (tests).
-        clock, sleep: what time it is, and how to wait (tests).
+        pace: waits for the next tick (tests).
     """
 
     def __init__(
@@ -103,12 +103,11 @@ class Viewer:
         view: View | None = None,
         on_key: KeyCallback | None = None,
         open: OpenWindow = open_window,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        pace: Pace | None = None,
     ) -> None:
         self.robot = robot
         self.view: View = view or View()
-        self._on_key, self._open, self._pace = on_key, open, Pace(clock, sleep)
+        self._on_key, self._open, self._pace = on_key, open, pace or Pace()
         self._stage: Stage | None = None
         self._window: Window | None = None
 

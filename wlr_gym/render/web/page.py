@@ -161,24 +161,12 @@ def floor_pose(place: Array, yaw: float, up: Array, camera: FollowCamera) -> tup
         up: (3,) against gravity in the floor frame: it becomes the eye's z, so that a slope is seen as a slope.
         camera: turns with the robot, or keeps its direction.
     """
-    half = 0.5 * yaw if camera.turns else 0.0
-    turn = np.array([np.cos(half), 0.0, 0.0, -np.sin(half)])
-    cross = np.array([up[1], -up[0], 0.0])  # up x z
-    tilt = np.array([1.0 + up[2], *cross])
-    tilt /= np.linalg.norm(tilt)
-    whole = _product(turn, tilt)
-    moved = np.array([place[0], place[1], 0.0])
-    return whole, -_rotated(whole, moved)
+    from scipy.spatial.transform import Rotation
 
-
-def _product(a: Array, b: Array) -> Array:
-    w = a[0] * b[0] - a[1:] @ b[1:]
-    return np.array([w, *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))])
-
-
-def _rotated(turn: Array, vector: Array) -> Array:
-    axis = turn[1:]
-    return np.asarray(vector + 2.0 * np.cross(axis, np.cross(axis, vector) + turn[0] * vector), np.float64)
+    turn = Rotation.from_rotvec([0.0, 0.0, -yaw if camera.turns else 0.0])
+    tilt = Rotation.from_quat([1.0 + up[2], up[1], -up[0], 0.0], scalar_first=True)  # about up x z
+    whole = turn * tilt
+    return whole.as_quat(scalar_first=True), -whole.apply([place[0], place[1], 0.0])
 
 
 def html_lines(lines: list[str]) -> str:

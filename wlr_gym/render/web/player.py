@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,6 +26,8 @@ SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10")
 #: s that plots show around the present; the whole recording is drawn less often, for it is more to send.
 WINDOWS = {"4 s": 4.0, "20 s": 20.0, "all": np.inf}
 _ALL_PER_SECOND = 2.0
+#: What is shown until something else is chosen.
+_VIEW = View(forces=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +97,6 @@ class Player:
         names: of the recordings.
         open: return a recording by its place in ``names``; called when it is chosen.
         first: titles that are plotted at the beginning.
-        view: what to show.
         host, port: where the page is served.
 
     Raises:
@@ -108,14 +109,13 @@ class Player:
         names: Sequence[str],
         open: Callable[[int], Playable],
         first: Sequence[str],
-        view: View | None = None,
         host: str = HOST,
         port: int = PORT,
     ) -> None:
-        self._view, self._open, self._names = view or View(forces=True), open, list(names)
+        self._open, self._names = open, list(names)
         self.recording: Playable = open(0)
         self.server, self.address = open_server(host, port, "wlr view")
-        aim(self.server, self._view.camera)
+        aim(self.server, _VIEW.camera)
         self._ground = PageFloor(self.server)
         self._figures: dict[str, Figure] = {}
         self._lock = threading.Lock()
@@ -183,27 +183,25 @@ class Player:
     def _draw(self, time: float, texts: bool) -> None:
         recording, view = self.recording, self._look.view
         moment, ghost = recording.at(time), recording.ghost_at(time) if self._show_ghost.value else None
-        seen = View(view.size, view.camera, view.friction, view.slip and moment.slip, view.forces and moment.forces)
+        seen = replace(view, slip=view.slip and moment.slip, forces=view.forces and moment.forces)
         with self.server.atomic():
             stage = self._figures["robot"].pose(moment.truth, moment.parameters)
             self._figures["robot"].point(arrows_of(stage, moment.truth, moment.parameters, 0, seen))
             self._ground.show(stage, moment.truth, moment.parameters, 0, view)
             self._ground.look(stage, moment.truth, moment.parameters, 0, view.camera)
-            self._draw_ghost(ghost, View(view.size, view.camera, view.friction, view.slip, view.forces), not moment.forces)
+            self._draw_ghost(ghost, replace(view, slip=False, forces=view.forces and not moment.forces))
         if texts:
             lines = [*describe(moment.truth, moment.parameters, 0, time, None, recording.name, slip=moment.slip)]
-            shown = View(view.size, view.camera, view.friction, view.slip, view.forces)
-            self._text.content = html_lines([*lines, *recording.lines(time), *legend(moment.parameters, 0, shown)])
+            self._text.content = html_lines([*lines, *recording.lines(time), *legend(moment.parameters, 0, view)])
 
-    def _draw_ghost(self, ghost: Moment | None, view: View, arrows: bool) -> None:
-        """Draw the ghost; its arrows only where the robot has none of its own."""
+    def _draw_ghost(self, ghost: Moment | None, view: View) -> None:
+        """Draw the ghost; the view has its arrows only where the robot has none of its own."""
         figure = self._figures["ghost"]
         if ghost is None:
             figure.hide()
             return
         stage = figure.pose(ghost.truth, ghost.parameters)
-        forces = View(view.size, view.camera, view.friction, False, view.forces and arrows)
-        figure.point(arrows_of(stage, ghost.truth, ghost.parameters, 0, forces))
+        figure.point(arrows_of(stage, ghost.truth, ghost.parameters, 0, view))
 
     def _plot(self, now: float, time: float) -> None:
         width = WINDOWS[str(self._window.value)]
@@ -227,7 +225,7 @@ class Player:
         self._slider: Any = gui.add_slider("time (s)", 0.0, max(round(self.recording.length, 2), 0.01), 0.01, 0.0)
         self._speed: Any = gui.add_dropdown("speed", SPEEDS, initial_value="1")
         self._show_ghost: Any = gui.add_checkbox("ghost: replayed", True)
-        self._look = ViewControls(self.server, self._view)
+        self._look = ViewControls(self.server, _VIEW)
         place = plot_panel(self.server)
         with place:
             self._window: Any = gui.add_dropdown("shown", tuple(WINDOWS), initial_value="20 s")

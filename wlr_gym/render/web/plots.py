@@ -45,7 +45,7 @@ class Curve:
     colour: int = 0
 
 
-def thinned(curve: Curve, begin: float, end: float, columns: int = COLUMNS) -> tuple[Array, Array]:
+def thinned(curve: Curve, begin: float, end: float) -> tuple[Array, Array]:
     """Return a curve between two times with at most about two points per column: the least and the greatest in it.
 
     Values that are NaN are left out: a line goes to the next one.
@@ -55,9 +55,9 @@ def thinned(curve: Curve, begin: float, end: float, columns: int = COLUMNS) -> t
     t, values = curve.t[first:last], curve.values[first:last]
     known = np.isfinite(values)
     t, values = t[known], values[known]
-    if len(t) <= 2 * columns:
+    if len(t) <= 2 * COLUMNS:
         return t, values
-    width = -(-len(t) // columns)
+    width = -(-len(t) // COLUMNS)
     padded = np.pad(values, (0, -len(values) % width), mode="edge").reshape(-1, width)
     starts = width * np.arange(len(padded))
     kept = np.unique(np.concatenate([starts + padded.argmin(axis=1), starts + padded.argmax(axis=1)]))
