@@ -187,10 +187,10 @@ def test_an_imu_that_is_mounted_otherwise_is_found(tmp_path):
     turned = NOMINAL.imu.model_copy(
         update={"calibration": NOMINAL.imu.calibration.model_copy(update={"mounting": (0, 0, 1.57)})}
     )
-    from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu
+    from wlr_gym.hardware.emulator.memory import EmulatedWorld, memory_imu
 
     assert isinstance(link.clock, EmulatedWorld)
-    link.imu = MemoryImu(link.clock, turned)
+    link.imu = memory_imu(link.clock, turned)
     with Commissioning(ROBOT, NOMINAL, link, EmulatedPerson(emulated), tmp_path, RunMeta()) as commissioning:
         (result,) = commissioning.make(choose(["imu"]))
     wrong = {finding.quantity.name for finding in result.findings if not finding.is_expected}

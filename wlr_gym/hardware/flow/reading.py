@@ -23,10 +23,6 @@ SILENCE = 0.1
 FROZEN = 40
 
 
-class FlowGoneError(ConnectionError):
-    """The flow sensor's port does not work any more: unplugged, dead driver."""
-
-
 @dataclass(frozen=True)
 class CountedMotion:
     """What the chip counted from one of its frames to a later one.
