@@ -77,6 +77,11 @@ class FlowStatistics:
     errors: int = 0
     refused: dict[str, int] = field(default_factory=dict)
 
+    def refuse(self, trouble: str) -> None:
+        """Count a reading that is not valid."""
+        kind = trouble.partition(":")[0]
+        self.refused[kind] = self.refused.get(kind, 0) + 1
+
 
 class FlowConversion:
     """Counts to calibrated flow along the body's axes, and back.
@@ -146,8 +151,7 @@ class FlowReader:
             return FlowReading(self._flow, quality, max(0.0, now - self._end), is_new=True)
         trouble = gone or next((fault for _, fault in reversed(faults) if fault), "") or self._silence(now)
         if trouble:
-            kind = trouble.partition(":")[0]
-            self.statistics.refused[kind] = self.statistics.refused.get(kind, 0) + 1
+            self.statistics.refuse(trouble)
         return FlowReading(self._flow, 0.0, max(0.0, now - self._end), is_new=False, trouble=trouble)
 
     def _silence(self, now: float) -> str:
