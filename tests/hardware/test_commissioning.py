@@ -308,9 +308,12 @@ def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp
     guards = []
 
     class Guard:
-        def __init__(self, *_):
-            self.is_released = False
+        def __init__(self, *_, is_wanted):
+            self.is_released = not is_wanted
             guards.append(self)
+
+        def start(self, log):
+            pass
 
         def release(self):
             self.is_released = True
@@ -318,7 +321,7 @@ def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp
         def expect(self, seconds):
             pass
 
-    monkeypatch.setattr(runner, "WatchdogProcess", Guard)
+    monkeypatch.setattr(runner, "Guard", Guard)
     emulated = EmulatedStand(ROBOT, NOMINAL)
     link = emulated_link(emulated.machine)
     link.is_serial = True
