@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, write_text
+from wlr_gym.base.files import make_output_folder, replace_file
 from wlr_gym.data.compared_plants import SETTLE
 from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
@@ -20,7 +20,7 @@ from wlr_gym.data.replay import held_setpoints, profile_parameters
 from wlr_gym.data.run_states import standing_at
 from wlr_gym.data.sensor_columns import channels, sensed_columns
 from wlr_gym.data.simulation_record import Simulation, departures, start_of
-from wlr_gym.data.write import write_meta, write_run
+from wlr_gym.data.write import write_csv, write_meta, write_run
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
 from wlr_gym.physics.plants import SIMULATORS, make_plant
 from wlr_gym.physics.plants.base import PlantOptions
@@ -44,13 +44,10 @@ def write_commands(folder: Path, motion: Motion) -> Path:
     """
     make_output_folder(folder)
     write_meta(folder, RunMeta(profile=motion.profile))
-    lines = [",".join(["t", *COMMANDS])]
-    for tick, setpoints in enumerate(motion.setpoints.tolist()):
-        lines.append(
-            ",".join([repr(round(tick * motion.period, 9)), *("" if value != value else repr(value) for value in setpoints)])
-        )
+    t = np.array([round(tick * motion.period, 9) for tick in range(len(motion.setpoints))])
+    columns = {"t": t, **dict(zip(COMMANDS, motion.setpoints.T, strict=True))}
     path = folder / f"{motion.name}.csv"
-    write_text(path, "\n".join(lines) + "\n")
+    replace_file(path, lambda temporary: write_csv(temporary, columns))
     return path
 
 

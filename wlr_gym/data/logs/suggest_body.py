@@ -197,7 +197,7 @@ def find_imu(look: LogSignals, body: BodyMotion | None, wheels: BodyMotion | Non
     Axes and, roughly, the clock go into ``look``.
     """
     units: dict[str, str] = {}
-    up = _gravity(look, units)
+    up = _upward(look, units)
     yaw = _yaw_axis(look, body, wheels, units)
     if "imu" in look.given.frames:
         look.frames["imu"] = look.given.frames["imu"]
@@ -223,7 +223,7 @@ def gravity(look: LogSignals) -> tuple[Array, str] | None:
     return mean, f"{'-' if mean[axis] < 0 else ''}{XYZ[axis]}"
 
 
-def _gravity(look: LogSignals, units: dict[str, str]) -> str | None:
+def _upward(look: LogSignals, units: dict[str, str]) -> str | None:
     """Return the accelerometer's axis that reads +g at rest; its unit by g."""
     if (found := gravity(look)) is None:
         return None
