@@ -366,7 +366,7 @@ def test_writing_does_not_overwrite_other_meta_data(tmp_path, table):
 def test_a_broken_write_leaves_the_old_file(tmp_path, table, monkeypatch):
     path = write_run(tmp_path / "run_01.csv", table)
     before = path.read_bytes()
-    monkeypatch.setattr("wlr_gym.data.write._write_csv", lambda path, columns: 1 / 0)
+    monkeypatch.setattr("wlr_gym.data.write.write_csv", lambda path, columns: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         write_run(path, table)
     assert path.read_bytes() == before

@@ -21,7 +21,7 @@ pytest.importorskip("termios")
 
 from robot_rig import jabbering_port  # noqa: E402
 
-from wlr_gym.hardware.dynamixel.bus import Block, BusGroup, open_all  # noqa: E402
+from wlr_gym.hardware.dynamixel.bus import Block, BusGroup  # noqa: E402
 from wlr_gym.hardware.dynamixel.errors import BusGoneError, NoAnswerError, RefusedError, RestlessLineError  # noqa: E402
 from wlr_gym.hardware.dynamixel.port import DynamixelPort  # noqa: E402
 from wlr_gym.hardware.dynamixel.tick_clock import TickClock  # noqa: E402
@@ -295,13 +295,6 @@ def test_defect_5_missing_port_is_named(tmp_path):
     group.close()
     with pytest.raises(InputError, match="baud rate 4500000"):
         BusGroup("legs", path, 4_500_000, LEGS).open()
-
-
-def test_all_groups_open_or_none(server, tmp_path):
-    good = connect(server)
-    with pytest.raises(InputError):
-        open_all([good, BusGroup("wheels", str(tmp_path / "none"), 1_000_000, LEGS)])
-    assert not good._port.is_open
 
 
 # --- faults on the line

@@ -246,11 +246,11 @@ def sensor(monkeypatch):
 
     def link(self, changed=None):
         made = emulated_link(machine)
-        from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu
+        from wlr_gym.hardware.emulator.memory import EmulatedWorld, memory_imu
 
         assert isinstance(made.clock, EmulatedWorld)
         assert changed is not None
-        made.imu = MemoryImu(made.clock, changed.imu)
+        made.imu = memory_imu(made.clock, changed.imu)
         return made
 
     monkeypatch.setattr(RobotOption, "link", link)

@@ -187,10 +187,10 @@ def test_an_imu_that_is_mounted_otherwise_is_found(tmp_path):
     turned = NOMINAL.imu.model_copy(
         update={"calibration": NOMINAL.imu.calibration.model_copy(update={"mounting": (0, 0, 1.57)})}
     )
-    from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu
+    from wlr_gym.hardware.emulator.memory import EmulatedWorld, memory_imu
 
     assert isinstance(link.clock, EmulatedWorld)
-    link.imu = MemoryImu(link.clock, turned)
+    link.imu = memory_imu(link.clock, turned)
     with Commissioning(ROBOT, NOMINAL, link, EmulatedPerson(emulated), tmp_path, RunMeta()) as commissioning:
         (result,) = commissioning.make(choose(["imu"]))
     wrong = {finding.quantity.name for finding in result.findings if not finding.is_expected}
@@ -308,9 +308,12 @@ def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp
     guards = []
 
     class Guard:
-        def __init__(self, *_):
-            self.is_released = False
+        def __init__(self, *_, is_wanted):
+            self.is_released = not is_wanted
             guards.append(self)
+
+        def start(self, log):
+            pass
 
         def release(self):
             self.is_released = True
@@ -318,7 +321,7 @@ def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp
         def expect(self, seconds):
             pass
 
-    monkeypatch.setattr(runner, "WatchdogProcess", Guard)
+    monkeypatch.setattr(runner, "Guard", Guard)
     emulated = EmulatedStand(ROBOT, NOMINAL)
     link = emulated_link(emulated.machine)
     link.is_serial = True

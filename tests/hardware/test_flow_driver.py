@@ -276,7 +276,7 @@ class Pipe:
 
 def stream_and_pipe():
     clock, pipe = Clock(), Pipe()
-    stream = FlowStream(STREAM, SENSOR, clock, lambda port: pipe)
+    stream = FlowStream(STREAM, SENSOR, clock, lambda *port: pipe)
     stream.open()
     return clock, pipe, stream
 

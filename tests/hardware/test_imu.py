@@ -59,7 +59,7 @@ def test_endless_noise_does_not_pile_up():
     parser = FrameParser()
     for _ in range(50):
         assert parser.feed(b"\x11" * 1000) == []
-    assert len(parser._finder._buffer) <= 2 * SIZE
+    assert len(parser._buffer) <= 2 * SIZE
 
 
 def test_units_of_the_data_sheet():

@@ -258,8 +258,9 @@ def memory():
 
 @pytest.fixture
 def stream(clock, memory):
-    with ImuStream(ImuPort(port="x", rate=200.0), clock, lambda port: memory) as stream:
-        yield stream
+    stream = ImuStream(ImuPort(port="x", rate=200.0), clock, lambda *port: memory)
+    stream.open()
+    return stream
 
 
 def test_newest_frame_wins_and_losses_are_counted(clock, memory, stream):
@@ -273,10 +274,10 @@ def test_newest_frame_wins_and_losses_are_counted(clock, memory, stream):
     assert stream.read().age == pytest.approx(0.5)
 
 
-def test_what_piled_up_before_is_thrown_away(clock, memory):
+def test_what_piled_up_before_is_thrown_away(memory, stream):
     memory.data = frame(1.0)
-    with ImuStream(ImuPort(port="x", rate=200.0), clock, lambda port: memory) as stream:
-        assert stream.read() is None
+    stream.open()
+    assert stream.read() is None
 
 
 def test_age_is_told_from_the_microcontrollers_clock_over_its_turn(clock, memory, stream):
@@ -413,17 +414,18 @@ def test_a_stream_in_use_is_refused_and_the_doctor_says_what_to_do(tmp_path):
     ours, theirs = os.openpty()
     hardware = with_ports(load_hardware(), {name: os.ttyname(theirs) for name in ("legs", "imu")})
     try:
-        with ImuStream(hardware.imu):
-            other = ImuStream(hardware.imu)
-            with pytest.raises(PortInUseError, match=r"IMU port .* is in use by another program"):
-                other.open()
-            servos = Servos(load_robot("emanual"), with_ports(hardware, {"wheels": str(tmp_path / "none")}))
-            found = {check.where: check for check in open_ports(servos, other, hardware)}
+        first, other = ImuStream(hardware.imu), ImuStream(hardware.imu)
+        first.open()
+        with pytest.raises(PortInUseError, match=r"IMU port .* is in use by another program"):
+            other.open()
+        servos = Servos(load_robot("emanual"), with_ports(hardware, {"wheels": str(tmp_path / "none")}))
+        found = {check.where: check for check in open_ports(servos, other, hardware)}
+        first.close()
         assert {where: "End that program first" in check.remedy for where, check in found.items()} == {
             "legs": True, "wheels": False, "imu": True,
         }  # fmt: skip
-        with other:
-            pass
+        other.open()
+        other.close()
     finally:
         os.close(ours)
         os.close(theirs)
@@ -458,23 +460,25 @@ def test_on_the_emulated_robots_port():
     machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions(timing=NO_TIME, sensor_noise=False))
     with Server(machine, real_time=False) as server:
         port = with_ports(machine.hardware, server.ports).imu
-        with make_imu(port, lambda: machine.time) as imu:
-            server.advance(0.5)
-            end = time.monotonic() + 5.0
-            while imu.statistics.readings < 100 and time.monotonic() < end:  # the system passes bytes on when it likes
-                imu.read()
-            server.advance(0.02)
-            while (reading := imu.read()) is None and time.monotonic() < end:
-                pass
-            assert reading is not None
-            assert reading.age < 0.025
-            np.testing.assert_allclose(reading.accelerometer, [0.0, 0.0, 9.81], atol=0.02)
-            np.testing.assert_allclose(reading.gyro, 0.0, atol=0.01)
-            assert imu.statistics.readings >= 100
-            server.command("unplug imu")
-            server.advance(0.01)
-            with pytest.raises(ImuGoneError):
-                imu.read()
+        imu = make_imu(port, lambda: machine.time)
+        imu.open()
+        server.advance(0.5)
+        end = time.monotonic() + 5.0
+        while imu.statistics.readings < 100 and time.monotonic() < end:  # the system passes bytes on when it likes
+            imu.read()
+        server.advance(0.02)
+        while (reading := imu.read()) is None and time.monotonic() < end:
+            pass
+        assert reading is not None
+        assert reading.age < 0.025
+        np.testing.assert_allclose(reading.accelerometer, [0.0, 0.0, 9.81], atol=0.02)
+        np.testing.assert_allclose(reading.gyro, 0.0, atol=0.01)
+        assert imu.statistics.readings >= 100
+        server.command("unplug imu")
+        server.advance(0.01)
+        with pytest.raises(ImuGoneError):
+            imu.read()
+        imu.close()
 
 
 # ---- calibration ----

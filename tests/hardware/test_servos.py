@@ -5,6 +5,7 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import load_hardware, with_ports
+from wlr_gym.hardware.dynamixel.tables import error_names
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.physics.servo import effort_counts
@@ -36,6 +37,13 @@ def connect(server, patience=0.15):
 def servos(server):
     with connect(server) as servos:
         yield servos
+
+
+def test_all_ports_open_or_none(server, tmp_path):
+    servos = Servos(ROBOT, with_ports(HARDWARE, {**server.ports, "wheels": str(tmp_path / "none")}))
+    with pytest.raises(InputError, match="none: cannot be opened"):
+        servos.open()
+    assert not servos.groups["legs"]._port.is_open
 
 
 def drive(servos):
@@ -107,8 +115,8 @@ def test_health_and_errors(server, servos):
     np.testing.assert_allclose(voltage, 12.0, atol=0.2)
     assert temperature[2] > 40 > temperature[0]
     assert servos.read().alert.tolist() == [joint == "wheel_rf" for joint in JOINTS]
-    assert servos.hardware_errors("wheel_rf") == ["overload"]
-    assert servos.hardware_errors("leg_lf") == []
+    assert error_names(servos.get("wheel_rf", "hardware_error_status")) == ["overload"]
+    assert error_names(servos.get("leg_lf", "hardware_error_status")) == []
 
 
 def test_a_missing_answer_is_nan_and_flagged(server):

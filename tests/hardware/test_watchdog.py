@@ -19,7 +19,7 @@ from wlr_gym.hardware.dynamixel.bus import BusGroup
 from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.safety.watchdog import WatchdogProcess, switch_off
+from wlr_gym.hardware.safety.watchdog import Guard, switch_off
 
 DRIVER = """
 import sys, numpy as np
@@ -40,7 +40,7 @@ try:
         for tick in range(100000):
             plant.step(setpoints)
             if tick == 10:
-                print("driving", plant.loop._guard.process.process.pid, flush=True)
+                print("driving", plant.loop._guard.process.pid, flush=True)
 except StoppedError as stop:
     print("stopped:", stop)
 finally:
@@ -120,12 +120,15 @@ def test_signals_end_a_driving_process_in_good_order(tmp_path, server, name):
 
 
 def test_the_watchdog_process_ends_when_it_is_told(server):
-    watchdog = WatchdogProcess(ROBOT, HARDWARE)
-    watchdog.process.send_signal(signal.SIGINT)  # the terminal's Ctrl-C is not for it
-    watchdog.process.send_signal(signal.SIGTERM)
-    assert watchdog.process.poll() is None
-    watchdog.release()
-    assert watchdog.process.wait(PATIENCE) == 0
+    guard = Guard(ROBOT, HARDWARE)
+    guard.start()
+    process = guard.process
+    assert process is not None
+    process.send_signal(signal.SIGINT)  # the terminal's Ctrl-C is not for it
+    process.send_signal(signal.SIGTERM)
+    assert process.poll() is None
+    guard.release()
+    assert process.wait(PATIENCE) == 0
 
 
 def test_the_watchdog_process_waits_for_an_adapter_that_is_gone(server):

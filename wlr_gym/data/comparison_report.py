@@ -14,7 +14,6 @@ from wlr_gym.data.comparison import BOUNDS, HORIZON, Agreement, Comparison, Moti
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 #: Panels of a motion's figure: signals drawn together.
 _PANELS = (
@@ -143,17 +142,6 @@ def markdown(comparisons: Sequence[Comparison], heading: str) -> str:
 
 def save_motion_plot(comparison: Comparison, index: int, path: Path) -> Path:
     """Write one motion's figure: both plants over each other, and below each panel their difference in noise units."""
-    motion = comparison.motions[index]
-    title = f"{motion.name}, effects: {comparison.effects}"
-    return save(_motion_figure(comparison, index, title), path)
-
-
-def save_map(comparison: Comparison, path: Path) -> Path:
-    """Write the map of all differences: signals by motions, rms in noise units."""
-    return save(_map_figure(comparison), path)
-
-
-def _motion_figure(comparison: Comparison, index: int, title: str) -> Figure:
     columns = 3
     figure = new_figure(6.0 * columns, 3.3 * -(-len(_PANELS) // columns))
     outer = figure.add_gridspec(-(-len(_PANELS) // columns), columns)
@@ -167,8 +155,8 @@ def _motion_figure(comparison: Comparison, index: int, title: str) -> Figure:
     labels = [traces.plant.label for traces in (comparison.first, comparison.second)]
     handles = [figure.axes[0].plot([], [], color=colour)[0] for colour in (_FIRST, _SECOND)]
     figure.legend(handles, labels, loc="outside upper right", ncols=2, frameon=False)
-    figure.suptitle(title, fontsize=13)
-    return figure
+    figure.suptitle(f"{comparison.motions[index].name}, effects: {comparison.effects}", fontsize=13)
+    return save(figure, path)
 
 
 def _draw_panel(comparison: Comparison, index: int, names: Sequence[str], above: Axes, below: Axes) -> None:
@@ -194,7 +182,8 @@ def _draw_panel(comparison: Comparison, index: int, names: Sequence[str], above:
         axes.margins(x=0.01)
 
 
-def _map_figure(comparison: Comparison) -> Figure:
+def save_map(comparison: Comparison, path: Path) -> Path:
+    """Write the map of all differences: signals by motions, rms in noise units."""
     from matplotlib.colors import LogNorm
 
     names = list(comparison.signals)
@@ -218,4 +207,4 @@ def _map_figure(comparison: Comparison) -> Figure:
     axes.set_xlabel("motion", fontsize=9)
     axes.set_ylabel("signal", fontsize=9)
     figure.colorbar(image, ax=axes, shrink=0.8, format="%g", label="rms difference (1 = sensor noise)")
-    return figure
+    return save(figure, path)

@@ -19,10 +19,11 @@ def rolled_poses(run: Run, robot: Robot) -> Array:
     the wheels of both sides turn to, as if they did not skid.
     """
     t = run["t"]
-    steps, turns = _steps(run, robot), _turns(run, robot)
+    steps, turns = _rolled(run, robot).mean(axis=1), _turns(run, robot)
     poses = np.zeros((len(t), 3))
     poses[:, 2] = np.cumsum(turns)
-    poses[:, :2] = np.cumsum(steps[:, None] * _ahead(poses[:, 2] - 0.5 * turns), axis=0)
+    heading = poses[:, 2] - 0.5 * turns
+    poses[:, :2] = np.cumsum(steps[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
     if not has_camera(run):
         return poses
     frames = np.flatnonzero(np.isfinite(run["cam_x"] + run["cam_y"] + run["cam_yaw"]))
@@ -42,10 +43,6 @@ def _rolled(run: Run, robot: Robot) -> Array:
     return robot.wheel.radius * np.diff(angles, axis=0, prepend=angles[:1])
 
 
-def _steps(run: Run, robot: Robot) -> Array:
-    return _rolled(run, robot).mean(axis=1)
-
-
 def _turns(run: Run, robot: Robot) -> Array:
     if "gyro_z" in run and np.isfinite(run["gyro_z"]).any():
         known = np.isfinite(run["gyro_z"])
@@ -53,7 +50,3 @@ def _turns(run: Run, robot: Robot) -> Array:
         return rate * np.diff(run["t"], prepend=run["t"][0])
     sides = np.array([sign for _, sign in CORNER_SIGNS])
     return -(sides * _rolled(run, robot)).mean(axis=1) / robot.hip_position.y
-
-
-def _ahead(yaw: Array) -> Array:
-    return np.stack([np.cos(yaw), np.sin(yaw)], axis=1)

@@ -157,19 +157,13 @@ def _read_csv(path: Path) -> dict[str, Array]:
 
 
 def _numbers(cells: tuple[str, ...] | list[str], name: str, path: Path) -> Array:
-    try:
-        return np.array([float(cell) if cell.strip() else np.nan for cell in cells], dtype=np.float64)
-    except ValueError:
-        row, cell = next((row, cell) for row, cell in enumerate(cells) if not _is_number(cell))
-        raise InputError(f"{path}: row {row}, column '{name}': '{cell}' is not a number") from None
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell or "nan")
-    except ValueError:
-        return not cell.strip()
-    return True
+    numbers = []
+    for row, cell in enumerate(cells):
+        try:
+            numbers.append(float(cell) if cell.strip() else np.nan)
+        except ValueError:
+            raise InputError(f"{path}: row {row}, column '{name}': '{cell}' is not a number") from None
+    return np.array(numbers, np.float64)
 
 
 def _read_parquet(path: Path) -> dict[str, Array]:

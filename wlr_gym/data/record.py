@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, write_text
+from wlr_gym.base.files import make_output_folder, replace_file
 from wlr_gym.data.compared_plants import SETTLE
 from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
@@ -20,7 +20,7 @@ from wlr_gym.data.replay import held_setpoints, profile_parameters
 from wlr_gym.data.run_states import standing_at
 from wlr_gym.data.sensor_columns import channels, sensed_columns
 from wlr_gym.data.simulation_record import Simulation, departures, start_of
-from wlr_gym.data.write import write_meta, write_run
+from wlr_gym.data.write import write_csv, write_meta, write_run
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
 from wlr_gym.physics.plants import SIMULATORS, make_plant
 from wlr_gym.physics.plants.base import PlantOptions
@@ -44,22 +44,18 @@ def write_commands(folder: Path, motion: Motion) -> Path:
     """
     make_output_folder(folder)
     write_meta(folder, RunMeta(profile=motion.profile))
-    lines = [",".join(["t", *COMMANDS])]
-    for tick, setpoints in enumerate(motion.setpoints.tolist()):
-        lines.append(
-            ",".join([repr(round(tick * motion.period, 9)), *("" if value != value else repr(value) for value in setpoints)])
-        )
+    t = np.array([round(tick * motion.period, 9) for tick in range(len(motion.setpoints))])
+    columns = {"t": t, **dict(zip(COMMANDS, motion.setpoints.T, strict=True))}
     path = folder / f"{motion.name}.csv"
-    write_text(path, "\n".join(lines) + "\n")
+    replace_file(path, lambda temporary: write_csv(temporary, columns))
     return path
 
 
-def read_commands(path: Path, period: float = CONTROL_PERIOD) -> Motion:
-    """Read a motion from the setpoints in a command file or a whole run; its profile from the ``meta.yaml`` beside it.
+def read_commands(path: Path) -> Motion:
+    """Read a motion at the control rate from a command file or a whole run; its profile from the ``meta.yaml`` beside it.
 
     Args:
         path: file with the columns ``t`` and ``cmd_*``; others are not looked at. Each row's setpoints hold until the next row.
-        period: s per control step.
 
     Raises:
         InputError: no such file, a column that is missing, times that do not increase, setpoints that are not rad and rad/s.
@@ -85,18 +81,19 @@ def read_commands(path: Path, period: float = CONTROL_PERIOD) -> Motion:
     if (beyond := np.abs(np.nan_to_num(setpoints)) > _LARGEST).any() or np.isinf(setpoints).any():
         row, joint = np.argwhere(beyond | np.isinf(setpoints))[0]
         raise InputError(f"{path}: row {row}, column 'cmd_{JOINTS[joint]}': {setpoints[row, joint]:g}: expected rad and rad/s")
-    ticks = round((t[-1] - t[0]) / period) + 1
-    rows = np.searchsorted(t - t[0], period * (np.arange(ticks) + 0.5), side="right") - 1
-    return Motion(path.stem, setpoints[rows], period, read_meta(path.parent).profile)
+    return Motion(path.stem, setpoints[_held_rows(t - t[0])], CONTROL_PERIOD, read_meta(path.parent).profile)
+
+
+def _held_rows(t: Array) -> NDArray[np.intp]:
+    """Return the row that holds in the middle of each control step; rows (R,) are at ``t``, from 0 on, s."""
+    ticks = round(t[-1] / CONTROL_PERIOD) + 1
+    return np.searchsorted(t, CONTROL_PERIOD * (np.arange(ticks) + 0.5), side="right") - 1
 
 
 def motion_of(run: Run) -> Motion:
     """Return the commands of a measured run at the control rate, each row's from its time on; NaN = torque off."""
-    t = run["t"] - run["t"][0]
-    ticks = round(t[-1] / CONTROL_PERIOD) + 1
-    rows = np.searchsorted(t, CONTROL_PERIOD * (np.arange(ticks) + 0.5), side="right") - 1
     commanded = np.stack([np.isfinite(run[f"cmd_{joint}"]) for joint in JOINTS], axis=1)
-    setpoints = np.where(commanded, held_setpoints(run), np.nan)[rows]
+    setpoints = np.where(commanded, held_setpoints(run), np.nan)[_held_rows(run["t"] - run["t"][0])]
     return Motion(run.name, setpoints, CONTROL_PERIOD, run.meta.profile)
 
 

@@ -33,13 +33,12 @@ def simulated_parameters(run: Run, robot: Robot) -> Parameters:
     return parameters
 
 
-def simulate_again(run: Run, robot: Robot, backend: str | None = None) -> dict[str, Array]:
+def simulate_again(run: Run, robot: Robot) -> dict[str, Array]:
     """Simulate a run as it was: same plant, start, noise, parameters and setpoints; same bits on the same kind of machine.
 
     Args:
         run: a run with its record.
         robot: the robot it is of.
-        backend: another plant than the record's.
 
     Returns:
         The channels of the robot's sensors, each (rows,).
@@ -47,11 +46,11 @@ def simulate_again(run: Run, robot: Robot, backend: str | None = None) -> dict[s
     Raises:
         InputError: no record beside the run, or one that does not fit the table or the plant.
     """
-    rows = [values for _, _, values in simulated_rows(run, robot, backend)]
+    rows = [values for _, _, values in simulated_rows(run, robot)]
     return dict(zip(sensed_columns(robot), np.array(rows).T, strict=True))
 
 
-def simulated_rows(run: Run, robot: Robot, backend: str | None = None) -> Iterator[tuple[Parameters, Truth, Array]]:
+def simulated_rows(run: Run, robot: Robot) -> Iterator[tuple[Parameters, Truth, Array]]:
     """Yield what :func:`simulate_again` knows at each row of a run: parameters (1), truth (1), readings."""
     record = _record_of(run)
     names = ("control_period", "physics_step", "precision", "sensor_noise")
@@ -60,7 +59,7 @@ def simulated_rows(run: Run, robot: Robot, backend: str | None = None) -> Iterat
     parameters, columns = simulated_parameters(run, robot), sensed_columns(robot)
     changes = {change.row: change.parameters for change in record.changes}
     forces = load_patch(record.formulas).forces
-    plant = make_plant(record.backend if backend is None else backend, robot, 1, options, forces)
+    plant = make_plant(record.backend, robot, 1, options, forces)
     try:
         sensors = plant.reset(np.array([record.seed], np.uint64), parameters, state=_state(record, run))
         for row, wanted in enumerate(setpoints):

@@ -52,7 +52,7 @@ def write_run(
     path.parent.mkdir(parents=True, exist_ok=True)
     if meta is not None:
         write_meta(path.parent, meta if robot is None else note_robot(path.parent, robot, meta))
-    write = _write_csv if path.suffix.lower() == ".csv" else _write_parquet
+    write = write_csv if path.suffix.lower() == ".csv" else _write_parquet
     replace_file(path, lambda temporary: write(temporary, columns))
     write_simulation(path, simulation)
     return path
@@ -84,7 +84,8 @@ def check_meta(folder: str | Path, meta: RunMeta) -> None:
         raise InputError(f"{path}: says something else than the meta data of the new run; write it to another folder")
 
 
-def _write_csv(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
+def write_csv(path: Path, columns: Mapping[str, NDArray[np.float64]]) -> None:
+    """Write columns as CSV; NaN is an empty cell, and numbers read back as the same float64."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)

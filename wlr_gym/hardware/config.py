@@ -10,15 +10,11 @@ from pydantic import Field, model_validator
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.paths import named_in
 from wlr_gym.base.settings import SettingsModel, parse_config, read_config
-from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, load_table
+from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, POSITION_MODE, VELOCITY_MODE, load_table
 from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.measured import Measured
 from wlr_gym.robot import JOINTS, LEGS, Vector3
 
-#: Operating mode of the legs. Setpoints are written for these modes; in another one they would be another quantity.
-POSITION_MODE = 3
-#: Operating mode of the wheels.
-VELOCITY_MODE = 1
 #: What the EEPROM of all servos must hold: directions and zeros stand in the hardware file, torque comes on when asked for.
 FIXED_REGISTERS = {"drive_mode": 0, "homing_offset": 0, "startup_configuration": 0}
 
@@ -207,7 +203,7 @@ class Hardware(SettingsModel):
 
 def _require_registers(name: str, bus: Bus, joint: str) -> None:
     """Raise :class:`ValueError` where a bus's EEPROM is not what a joint is driven with."""
-    mode = POSITION_MODE if joint in LEGS else VELOCITY_MODE
+    mode = POSITION_MODE if joint in LEGS else VELOCITY_MODE  # in another one, setpoints would be another quantity
     for item, expected in {"operating_mode": mode, **FIXED_REGISTERS}.items():
         found = bus.eeprom.get(item, load_table(bus.model)[item].default)
         if found != expected:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import gc
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,7 +108,8 @@ def deploy(
                 start = time.perf_counter()
                 action = policy.act(core.observation)
                 inference.append(time.perf_counter() - start)
-                _log(core, loop, action)
+                row = np.concatenate([core.command[0], np.asarray(action, np.float64)[0]])
+                loop.recorder.policy(policy_columns(core), row)
                 if steer is not None:
                     core.set_command(steer())
                 followed = core.command.copy()
@@ -122,10 +123,6 @@ def deploy(
         finally:
             loop.stop("exception")
     return Deployment(loop.reason, loop.ended_well, len(inference), loop.recorder.run, loop.statistics(), np.array(inference))
-
-
-def _log(core: Core, loop: ControlLoop, action: NDArray[np.float32]) -> None:
-    loop.recorder.policy(policy_columns(core), np.concatenate([core.command[0], np.asarray(action, np.float64)[0]]))
 
 
 def policy_columns(core: Core) -> list[str]:
@@ -179,31 +176,23 @@ def _sensor_rows(run: Run) -> list[Sensors]:
         values[:, SENSOR_LAYOUT.slices[channel]] = np.stack([run[name] for name in names], axis=1)
     values[:, SENSOR_LAYOUT.slices["supply_voltage"]] = run["volt"][:, None]
     if "flow_age" in run:
-        _fill_flow(values, run)
+        _fill_held(values, run, ("flow_x", "flow_y", "flow_age"), ("flow", "flow_age", "flow_is_new"))
+        values[:, SENSOR_LAYOUT.slices["flow_quality"]] = np.nan_to_num(run["flow_quality"])[:, None]  # not held
     if "cam_age" in run:
-        _fill_camera(values, run)
+        of_camera = ("camera_pose", "camera_age", "camera_is_new")
+        _fill_held(values, run, ("cam_x", "cam_y", "cam_yaw", "cam_age"), of_camera)
     return [Sensors(row[None]) for row in values]
 
 
-def _fill_flow(values: NDArray[np.float64], run: Run) -> None:
-    """Write what a run says of optical flow into its sensors; a reading is held until the next, its quality is not."""
-    seen = np.stack([run["flow_x"], run["flow_y"], run["flow_quality"]], axis=1)
+def _fill_held(values: NDArray[np.float64], run: Run, columns: Sequence[str], channels: Sequence[str]) -> None:
+    """Write a sensor that does not read in every row: its reading, held until the next; its age; whether it is new."""
+    *reading, age = (run[name] for name in columns)
+    seen = np.stack(reading, axis=1)
     is_new = np.isfinite(seen[:, 0])
     last = np.maximum.accumulate(np.where(is_new, np.arange(len(seen)), -1))
-    values[:, SENSOR_LAYOUT.slices["flow"]] = np.where(last[:, None] >= 0, seen[last, :2], 0.0)
-    values[:, SENSOR_LAYOUT.slices["flow_quality"]] = np.where(is_new, seen[:, 2], 0.0)[:, None]
-    values[:, SENSOR_LAYOUT.slices["flow_age"]] = run["flow_age"][:, None]
-    values[:, SENSOR_LAYOUT.slices["flow_is_new"]] = is_new[:, None]
-
-
-def _fill_camera(values: NDArray[np.float64], run: Run) -> None:
-    """Write what a run says of its camera into its sensors; a pose is held until the next."""
-    seen = np.stack([run["cam_x"], run["cam_y"], run["cam_yaw"]], axis=1)
-    is_new = np.isfinite(seen[:, 0])
-    last = np.maximum.accumulate(np.where(is_new, np.arange(len(seen)), -1))
-    values[:, SENSOR_LAYOUT.slices["camera_pose"]] = np.where(last[:, None] >= 0, seen[last], 0.0)
-    values[:, SENSOR_LAYOUT.slices["camera_age"]] = run["cam_age"][:, None]
-    values[:, SENSOR_LAYOUT.slices["camera_is_new"]] = is_new[:, None]
+    held = np.where(last[:, None] >= 0, seen[last], 0.0)
+    for channel, found in zip(channels, (held, age[:, None], is_new[:, None]), strict=True):
+        values[:, SENSOR_LAYOUT.slices[channel]] = found
 
 
 def read_policy_log(run: Path) -> dict[str, NDArray[np.float64]]:

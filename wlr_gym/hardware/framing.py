@@ -14,6 +14,8 @@ CRC_SIZE = 2
 _CHUNK = 65536
 #: Reads until the port must be empty: 256 kB.
 _LARGEST_BACKLOG = 64
+#: s since the port was last empty, up to which frames are hardly older than that: they relate the clocks.
+RECENT = 0.1
 
 
 class Device(Protocol):
@@ -40,23 +42,31 @@ def sealed(body: bytes) -> bytes:
     return body + crc16(body).to_bytes(CRC_SIZE, "little")
 
 
-class FrameFinder:
-    """Finds whole frames in a stream; noise costs no more than the frames it hits.
+class NumberedFrames:
+    """Finds whole frames in a stream, and counts by their sequence numbers (modulo 65536) what is missing.
+
+    Noise costs no more than the frames it hits.
 
     Args:
+        layout: of a frame without its CRC: sync, sequence number, and what else is in it.
         sync: how a frame begins.
-        size: bytes of a frame, CRC included.
 
     Attributes:
+        lost: frames missing between the received ones.
         crc_errors: frames dropped because their CRC was wrong.
     """
 
-    def __init__(self, sync: bytes, size: int) -> None:
-        self._sync, self._size = sync, size
+    def __init__(self, layout: struct.Struct, sync: bytes) -> None:
+        self._layout, self._sync, self._size = layout, sync, layout.size + CRC_SIZE
         self._buffer = bytearray()
-        self.crc_errors = 0
+        self._last: int | None = None
+        self.lost = self.crc_errors = 0
 
-    def feed(self, data: bytes) -> list[bytes]:
+    def take(self, data: bytes) -> list[tuple[tuple[Any, ...], bool]]:
+        """Take bytes; return the content of the frames they complete, after the sync, and whether it is the last one again."""
+        return [self._count(self._layout.unpack(raw)[1:]) for raw in self._completed(data)]
+
+    def _completed(self, data: bytes) -> list[bytes]:
         """Take bytes; return the frames they complete, without their CRC."""
         self._buffer += data
         frames = []
@@ -70,33 +80,6 @@ class FrameFinder:
                 del self._buffer[: place + 1]
         del self._buffer[: max(0, len(self._buffer) - 2 * self._size)]  # noise without a start never piles up
         return frames
-
-
-class NumberedFrames:
-    """Finds whole frames in a stream, and counts by their sequence numbers (modulo 65536) what is missing.
-
-    Args:
-        layout: of a frame without its CRC: sync, sequence number, and what else is in it.
-        sync: how a frame begins.
-
-    Attributes:
-        lost: frames missing between the received ones.
-    """
-
-    def __init__(self, layout: struct.Struct, sync: bytes) -> None:
-        self._layout = layout
-        self._finder = FrameFinder(sync, layout.size + CRC_SIZE)
-        self._last: int | None = None
-        self.lost = 0
-
-    @property
-    def crc_errors(self) -> int:
-        """Frames dropped because their CRC was wrong."""
-        return self._finder.crc_errors
-
-    def take(self, data: bytes) -> list[tuple[tuple[Any, ...], bool]]:
-        """Take bytes; return the content of the frames they complete, after the sync, and whether it is the last one again."""
-        return [self._count(self._layout.unpack(raw)[1:]) for raw in self._finder.feed(data)]
 
     def _count(self, content: tuple[Any, ...]) -> tuple[tuple[Any, ...], bool]:
         sequence, last, self._last = content[0], self._last, content[0]

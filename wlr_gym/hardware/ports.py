@@ -6,7 +6,7 @@ import errno
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, require_package
 
 if TYPE_CHECKING:
     import serial
@@ -40,7 +40,9 @@ def open_serial(path: str, baud_rate: int, name: str = "port") -> serial.Serial:
     Raises:
         PortInUseError: another program has it.
         InputError: it is not there, or cannot be opened.
+        MissingPackageError: pyserial is not installed.
     """
+    require_package("serial", "robot")
     import serial
 
     try:

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.blocks import Block, BlockReading, IndirectBlock
-from wlr_gym.hardware.dynamixel.bus import PATIENCE, BusGroup, open_all
+from wlr_gym.hardware.dynamixel.bus import PATIENCE, BusGroup
 from wlr_gym.hardware.dynamixel.errors import BusGoneError, NoAnswerError
-from wlr_gym.hardware.dynamixel.tables import ControlTable, error_names, load_table
+from wlr_gym.hardware.dynamixel.tables import ControlTable, load_table
 from wlr_gym.hardware.fit import check_fit
 from wlr_gym.physics.servo import effort_counts, idle_effort
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
@@ -35,6 +35,11 @@ _STATE = ("present_position", "present_velocity")
 _REGISTERS = ("torque_enable", "hardware_error_status", "bus_watchdog", "goal_pwm", "present_pwm")
 #: ... and now and then.
 _HEALTH = ("present_input_voltage", "present_temperature")
+#: Items in RAM that set how a motor moves: profiles, of which the default is none, and gains.
+_TUNING = (
+    *("profile_velocity", "profile_acceleration", "velocity_p_gain", "velocity_i_gain", "position_p_gain"),
+    *("position_i_gain", "position_d_gain", "feedforward_1st_gain", "feedforward_2nd_gain"),
+)
 #: Times that a single item is asked for again.
 RETRIES = 2
 
@@ -188,7 +193,11 @@ class Servos:
         Raises:
             InputError: a port is not there, or cannot be opened.
         """
-        open_all(self.groups.values())
+        with contextlib.ExitStack() as stack:
+            for group in self.groups.values():
+                group.open()
+                stack.callback(group.close)
+            stack.pop_all()
 
     def set_patience(self, seconds: float) -> None:
         """Set how long (s) an answer may take beyond its bytes' time on the wire, on all buses."""
@@ -269,14 +278,6 @@ class Servos:
             found |= group.answers()
         return found
 
-    def hardware_errors(self, joint: str) -> list[str]:
-        """Return the names of a joint's hardware errors.
-
-        Raises:
-            NoAnswerError, RefusedError: see :class:`wlr_gym.hardware.dynamixel.bus.BusGroup`.
-        """
-        return error_names(self.get(joint, "hardware_error_status"))
-
     # ---- single items, by joint ----
 
     def ping(self, joint: str) -> tuple[int, int]:
@@ -290,6 +291,13 @@ class Servos:
     def set(self, joint: str, item: str, count: int) -> None:
         """Write a count into a joint's control table item; see :meth:`BusGroup.write`. A lost answer is asked for again."""
         _persist(self._group(joint).write, self._id(joint), item, count)
+
+    def reset_tuning(self, joint: str) -> None:
+        """Set a joint's gains and profiles to their defaults, as after a reboot: no profile."""
+        for item in _TUNING:
+            default = self.table(joint)[item].default
+            assert isinstance(default, int)
+            self.set(joint, item, default)
 
     def get_all(self, item: str) -> dict[str, int]:
         """Return joint -> count of an item, of the joints that answered; the buses work at the same time.

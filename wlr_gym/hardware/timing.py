@@ -14,6 +14,8 @@ import numpy as np
 #: Parts of a control step that are timed; latency is from the readings to the setpoints that answer them.
 PARTS = ("read", "think", "write", "slack", "latency")
 _PERCENTILES = (50, 95, 99, 100)
+#: s for which a program works without a pause to learn its share of the processor.
+_SHARE_TIME = 0.2
 
 
 class Clock(Protocol):
@@ -41,19 +43,18 @@ class MonotonicClock:
             time.sleep(left)
 
 
-def processor_share(clock: Callable[[], float], seconds: float = 0.2) -> float:
+def processor_share(clock: Callable[[], float]) -> float:
     """Return the share of one processor that this program gets while it works without a pause; 1 = no other one wants it.
 
     Args:
         clock: s, of whoever is slow. Where it does not pass by itself (emulated time) no computer is too slow: 1.
-        seconds: to work for.
     """
     before = clock()
     time.sleep(1e-3)
     if clock() == before:
         return 1.0
     start, used = time.perf_counter(), time.thread_time()
-    while (passed := time.perf_counter() - start) < seconds:
+    while (passed := time.perf_counter() - start) < _SHARE_TIME:
         pass
     return min(1.0, (time.thread_time() - used) / passed)
 

@@ -39,9 +39,7 @@ class Lag:
         return abs(self.correlation) >= _LEAST and self.sigma < 0.02
 
 
-def find_lag(
-    t: Array, values: Array, reference_t: Array, reference: Array, counts: Array | None = None, reach: float = _REACH
-) -> Lag | None:
+def find_lag(t: Array, values: Array, reference_t: Array, reference: Array, counts: Array | None = None) -> Lag | None:
     """Return what to add to ``t`` so that ``values`` move as ``reference`` does, up to sign and size; None = nothing moves.
 
     Both are freed of noise and drift alike and brought to one grid; the lag is where the magnitude of their correlation is
@@ -51,7 +49,6 @@ def find_lag(
         t, values: (N,) s, signal of the topic whose clock is off.
         reference_t, reference: (M,) s, signal of the topic whose clock counts.
         counts: (M,) 0 or 1: when the two should move alike; None = always.
-        reach: s; largest lag that is looked for.
     """
     begin, end = max(t[0], reference_t[0]), min(t[-1], reference_t[-1])
     if end - begin < _LEAST_SECONDS:
@@ -61,11 +58,12 @@ def find_lag(
     weight = np.ones(len(grid)) if counts is None else np.round(np.interp(grid, reference_t, counts))
     if weight.mean() * (end - begin) < _LEAST_SECONDS:
         return None
-    whole = _best(moved, fixed, weight, round(reach / _STEP))
+    reach = round(_REACH / _STEP)
+    whole = _best(moved, fixed, weight, reach)
     if whole is None:
         return None
     lag, correlation = whole
-    sigma = _jackknife(moved, fixed, weight, round(reach / _STEP))
+    sigma = _jackknife(moved, fixed, weight, reach)
     return Lag(lag, max(sigma, 0.1 * _STEP), correlation)
 
 

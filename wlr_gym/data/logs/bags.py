@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -59,17 +60,17 @@ def _by_rosbags(path: Path, wants: Callable[[str], bool], notes: list[str], tell
     definitions, ros2 = Definitions(), what == "rosbag2"
     decodable = _decodable(reader, definitions, wants, notes, ros2)
     chosen = [connection for connection in reader.connections if connection.topic in decodable]
-    decode = definitions.cdr if ros2 else definitions.ros1
-    total, count, broken = max(sum(one.msgcount for one in chosen), 1), 0, dict[str, int]()
+    total, count, broken = max(sum(one.msgcount for one in chosen), 1), 0, Counter[str]()
     try:
         for connection, time, data in reader.messages(connections=chosen) if chosen else ():
             count += 1
             if count % _STRIDE == 0:
                 tell(min(count / total, 1.0))
+            kind = connection.msgtype
             try:
-                yield Message(connection.topic, full_name(connection.msgtype), time, decode(bytes(data), connection.msgtype))
+                yield Message(connection.topic, full_name(kind), time, definitions.decode(bytes(data), kind, ros2))
             except ValueError:
-                broken[connection.topic] = broken.get(connection.topic, 0) + 1
+                broken[connection.topic] += 1
     except GeneratorExit:
         raise
     except Exception as error:  # as above
@@ -110,9 +111,8 @@ def _decodable(reader: Any, definitions: Definitions, wants: Callable[[str], boo
     """Return the topics that are wanted and whose messages can be decoded; note the others."""
     from rosbags.interfaces import MessageDefinitionFormat
 
-    found, writers = set(), dict[str, int]()
+    found = set()
     for connection in reader.connections:
-        writers[connection.topic] = writers.get(connection.topic, 0) + 1
         if not wants(connection.topic):
             continue
         text, language = connection.msgdef.data, connection.msgdef.format
@@ -128,5 +128,6 @@ def _decodable(reader: Any, definitions: Definitions, wants: Callable[[str], boo
             found.add(connection.topic)
         except UnknownTypeError as error:
             notes.append(f"topic '{connection.topic}': {error}; left out")
+    writers = Counter(connection.topic for connection in reader.connections)
     notes += [f"topic '{topic}' has {count} writers: their messages are mixed" for topic, count in writers.items() if count > 1]
     return found

@@ -143,7 +143,7 @@ def _vectors(topic: Topic) -> Iterator[FieldCandidate]:
             continue  # computed, not measured
         stem, axis = _axis_of(field)
         kind = next((kind for kind, known in _VECTORS.items() if _says(stem, known)), None) or _SHORT.get(stem)
-        if kind is not None and axis is not None and _has(topic, field, axis, "xyz"):
+        if kind is not None and axis is not None and _has(topic, field, "xyz"):
             yield FieldCandidate(f"{kind}_{axis}", topic.name, field, unit=read_name(field.replace("rad", "")).unit)
 
 
@@ -157,14 +157,14 @@ def _pose(topic: Topic) -> Iterator[FieldCandidate]:
                 yield FieldCandidate("cam_yaw", topic.name, f"{turn}.yaw")
                 return
     headings = [field for field in topic.fields if (_says(field, _HEADING) or field == "theta") and "rate" not in field]
-    turns = [field[:-1] for field in topic.fields if field.endswith("w") and _has(topic, f"{field[:-1]}x", "x", "xyz")]
+    turns = [field[:-1] for field in topic.fields if field.endswith("w") and _has(topic, f"{field[:-1]}x", "xyz")]
     headings = headings or [f"{turn.rstrip('._')}.yaw" for turn in turns]
-    places = [field for field in topic.fields if _axis_of(field)[1] == "x" and _has(topic, field, "x", "xy")]
+    places = [field for field in topic.fields if _axis_of(field)[1] == "x" and _has(topic, field, "xy")]
     places = [field for field in places if not _vector_word(field) and field[:-1] not in turns]
     if headings and places:
         x = places[0]
         yield FieldCandidate("cam_x", topic.name, x, unit=read_name(x).unit)
-        yield FieldCandidate("cam_y", topic.name, _other(x, "x", "y"), unit=read_name(x).unit)
+        yield FieldCandidate("cam_y", topic.name, _other(x, "y"), unit=read_name(x).unit)
         yield FieldCandidate("cam_yaw", topic.name, headings[0], unit=read_name(headings[0]).unit)
 
 
@@ -181,17 +181,17 @@ def _axis_of(field: str) -> tuple[str, str | None]:
     return (found.group(1).rstrip("._[ ").lower(), found.group(2).lower()) if found else (field.lower(), None)
 
 
-def _other(field: str, axis: str, other: str) -> str:
+def _other(field: str, axis: str) -> str:
     """Return a field's name with another axis."""
     found = re.fullmatch(r"(.*?[._\[ ]?)([xyzXYZ])((?:\]|[_ \[(].*)?)", field)
     if not found:
         return field
-    letter = other.upper() if found.group(2).isupper() else other
+    letter = axis.upper() if found.group(2).isupper() else axis
     return f"{found.group(1)}{letter}{found.group(3)}"
 
 
-def _has(topic: Topic, field: str, axis: str, axes: Iterable[str]) -> bool:
-    return all(_other(field, axis, other) in topic.fields for other in axes)
+def _has(topic: Topic, field: str, axes: Iterable[str]) -> bool:
+    return all(_other(field, axis) in topic.fields for axis in axes)
 
 
 def _says(name: str, known: set[str]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 from wlr_gym.base.errors import InputError
@@ -23,12 +24,7 @@ class Definitions:
     """Decodes messages of ROS 1 and 2."""
 
     def __init__(self) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
         self._stores: dict[str, Any] = {}  # by type: two files may define one differently
-        self._empty = lambda: get_typestore(Stores.EMPTY)
-        self._common = {True: Stores.ROS2_HUMBLE, False: Stores.ROS1_NOETIC}
-        self._get = get_typestore
 
     def define(self, kind: str, text: str, language: str = "ros2msg") -> None:
         """Take the definition of a type, with those of the types in it, as a file holds it.
@@ -36,9 +32,9 @@ class Definitions:
         Raises:
             UnknownTypeError: it cannot be understood.
         """
-        from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+        from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
-        store = self._empty()
+        store = get_typestore(Stores.EMPTY)
         try:
             found = _idl(text, get_types_from_idl) if language == "ros2idl" else get_types_from_msg(text, full_name(kind))
             store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
@@ -50,16 +46,16 @@ class Definitions:
         """Whether a type is defined."""
         return full_name(kind) in self._stores
 
-    def use_common(self, kind: str, ros2: bool = True) -> None:
-        """Take the definition of a type that the file does not define from what is generally known.
+    def use_common(self, kind: str, ros2: bool) -> None:
+        """Take the definition of a type that the file does not define from what is generally known of ROS 2, else 1.
 
         Raises:
             UnknownTypeError: it is not.
         """
-        from rosbags.typesys import get_types_from_msg
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         name = full_name(kind)
-        store = self._get(self._common[ros2])
+        store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
         if name not in store.fielddefs and name in KNOWN:
             for known, text in KNOWN.items():
                 store.register(get_types_from_msg(text, known))
@@ -67,30 +63,18 @@ class Definitions:
             raise UnknownTypeError(f"type '{kind}': the file does not define it, and it is none that ROS comes with")
         self._stores[name] = store
 
-    def cdr(self, data: bytes, kind: str) -> Any:
-        """Return a message of ROS 2.
+    def decode(self, data: bytes, kind: str, ros2: bool) -> Any:
+        """Return a message of ROS 2, else 1.
 
         Raises:
             ValueError: its bytes do not fit its definition.
         """
-        return self._decode("deserialize_cdr", data, kind)
-
-    def ros1(self, data: bytes, kind: str) -> Any:
-        """Return a message of ROS 1.
-
-        Raises:
-            ValueError: its bytes do not fit its definition.
-        """
-        return self._decode("deserialize_ros1", data, kind)
-
-    def _decode(self, method: str, data: bytes, kind: str) -> Any:
-        import struct
-
         from rosbags.serde import SerdeError
 
         name = full_name(kind)
         try:
-            return getattr(self._stores[name], method)(data, name)
+            store = self._stores[name]
+            return store.deserialize_cdr(data, name) if ros2 else store.deserialize_ros1(data, name)
         except (SerdeError, struct.error, IndexError, AssertionError, UnicodeDecodeError, MemoryError, KeyError) as error:
             raise ValueError(f"{type(error).__name__}: {error}") from None
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.body_pose import quaternion
+from wlr_gym.data.body_pose import euler_angles, quaternion
 from wlr_gym.data.logs.messages import BODY, FLOOR, STRING, Sent, header, make, sent
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import robot_of
@@ -104,8 +104,7 @@ def _motion(run: Run, robot: Robot, rows: NDArray[np.intp], times: list[int]) ->
 
 def _feet(parameters: Parameters, position: Array, turn: Array, legs: Array) -> tuple[Array, Array]:
     """Return where the wheels touch the floor (N, 4, 2), m, and the heading (N,), rad."""
-    w, x, y, z = turn.T
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    yaw, _, _ = euler_angles(turn)
     along = np.stack([np.cos(legs), np.zeros_like(legs), -np.sin(legs)], axis=-1) * parameters["leg.length"][:, :, None]
     hips = parameters["hip.position"][:, None, :] * np.array([(*sign, 1.0) for sign in CORNER_SIGNS])
     level = rotation(yaw, np.zeros_like(yaw), np.zeros_like(yaw))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -37,7 +38,7 @@ def messages(path: Path, wants: Callable[[str], bool], notes: list[str], tell: S
     channels: dict[int, Channel] = {}
     decoders: dict[int, Callable[[bytes], Any] | None] = {}
     definitions = Definitions()
-    broken: dict[str, int] = {}
+    broken = Counter[str]()
     with path.open("rb") as file:
         for record in _records(file, path, notes, tell):
             if isinstance(record, Schema):
@@ -53,12 +54,13 @@ def messages(path: Path, wants: Callable[[str], bool], notes: list[str], tell: S
                 try:
                     content = decode(record.data)
                 except ValueError:
-                    broken[channel.topic] = broken.get(channel.topic, 0) + 1
+                    broken[channel.topic] += 1
                     continue
                 schema = schemas.get(channel.schema_id)
                 yield Message(channel.topic, full_name(schema.name) if schema else "json", record.log_time, content)
     notes += [f"topic '{topic}': {count} messages do not fit their definition; left out" for topic, count in broken.items()]
-    _note_writers(channels.values(), notes)
+    writers = Counter(channel.topic for channel in channels.values())
+    notes += [f"topic '{topic}' has {count} writers: their messages are mixed" for topic, count in writers.items() if count > 1]
 
 
 def _records(file: IO[bytes], path: Path, notes: list[str], tell: Share) -> Iterator[Any]:
@@ -122,17 +124,9 @@ def _decoder(channel: Any, schema: Any, definitions: Definitions, notes: list[st
     except (UnknownTypeError, UnicodeDecodeError) as error:
         notes.append(f"topic '{channel.topic}': {error}; left out")
         return None
-    decode = definitions.cdr if encoding == "cdr" else definitions.ros1
-    return lambda data: decode(data, kind)
+    return lambda data: definitions.decode(data, kind, encoding == "cdr")
 
 
 def _json(data: bytes) -> Any:
     content = json.loads(data)
     return content if isinstance(content, dict) else {"data": content}
-
-
-def _note_writers(channels: Any, notes: list[str]) -> None:
-    topics: dict[str, int] = {}
-    for channel in channels:
-        topics[channel.topic] = topics.get(channel.topic, 0) + 1
-    notes += [f"topic '{topic}' has {count} writers: their messages are mixed" for topic, count in topics.items() if count > 1]

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.data.body_pose import euler_angles
 from wlr_gym.data.logs.topics import Topic
 from wlr_gym.robot.parameter_table import XYZ
 
@@ -39,13 +40,9 @@ def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, w
     w, *vector = (quaternion / np.linalg.norm(quaternion, axis=1)[:, None]).T
     if axes is not None:  # a proper turn of both frames: the quaternion's vector turns with them
         vector = [vector[XYZ.index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0) for axis in axes]
-    x, y, z = vector
-    angles = {
-        "yaw": np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-        "pitch": np.arcsin(np.clip(2 * (w * y - x * z), -1, 1)),
-        "roll": np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        "tilt": np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)),
-    }
+    yaw, pitch, roll = euler_angles(np.stack([w, *vector], axis=1))
+    x, y, _ = vector
+    angles = {"yaw": yaw, "pitch": pitch, "roll": roll, "tilt": np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))}
     values = angles[angle]
     return at, np.unwrap(values) if angle == "yaw" else values
 

@@ -64,7 +64,7 @@ def propose(log: Log, robot: Robot, given: Mapping[str, Any] | None = None) -> P
     set_clocks(look, body, wheels, imu.heading, imu.pushed)
     units = dict(imu.units)
     _voltage(look, units)
-    proposed = LogMap.model_validate(_content(look, joints, units, known))
+    proposed = LogMap.model_validate(_content(look, joints, units))
     used = {one.topic for one in look.chosen.values()}
     unused = tuple(name for name in log.topics if name not in used)
     return Proposal(combine(proposed, given, "map"), tuple(look.reasons), unused)
@@ -77,9 +77,9 @@ def _look(log: Log, robot: Robot, known: LogMap) -> LogSignals:
     if not chosen:
         topics = ", ".join(f"'{name}' ({topic.kind})" for name, topic in list(log.topics.items())[:12])
         raise InputError(f"{log.name}: nothing in it is known for a channel; topics: {topics}")
-    for column in [name for name in chosen if name.startswith("cam_") and name in ("cam_z", "cam_pitch")]:
-        if "cam_x" not in chosen:
-            del chosen[column]
+    if "cam_x" not in chosen:
+        for column in ("cam_z", "cam_pitch"):
+            chosen.pop(column, None)
     topics = sorted({one.topic for one in chosen.values()})
     _leave_out_short(log, chosen)
     rows = known.rows or (chosen["pos_leg_lf"].topic if "pos_leg_lf" in chosen else topics[0])
@@ -126,7 +126,7 @@ def _voltage(look: LogSignals, units: dict[str, str]) -> None:
 # ---- the map ---------------------------------------------------------------------------------------------------------
 
 
-def _content(look: LogSignals, found: JointFindings, units: Mapping[str, str], known: LogMap) -> dict[str, Any]:
+def _content(look: LogSignals, found: JointFindings, units: Mapping[str, str]) -> dict[str, Any]:
     names = _joint_names(look)
     channels = dict(_channels(look, found, units, names))
     joints = {
@@ -194,7 +194,7 @@ def _channels(
         elif column == "volt":
             unit = units.get("volt")
         elif column in CAMERA and column != "cam_yaw":
-            field = _pose_field(look, one)
+            field = _pose_field(field)
         si = COLUMNS[column].unit
         yield column, ChannelSource(topic=one.topic, field=field, unit=None if unit == si else unit, sign=_sign(sign))
 
@@ -209,9 +209,10 @@ def _axis_field(look: LogSignals, kind: str) -> str:
     return fields[0]
 
 
-def _pose_field(look: LogSignals, one: FieldCandidate) -> str:
-    ends = ("position.x", "position.y", "position.z", "translation.x", "translation.y", "translation.z")
-    return f"{one.field[:-1]}{{axis}}" if one.field.endswith(ends) else one.field
+def _pose_field(field: str) -> str:
+    """Return a field of a pose with its axis as ``{axis}``, where it is one of a vector."""
+    ends = tuple(f"{vector}.{axis}" for vector in ("position", "translation") for axis in XYZ)
+    return f"{field[:-1]}{{axis}}" if field.endswith(ends) else field
 
 
 def _grouped(channels: Mapping[str, ChannelSource]) -> dict[str, ChannelSource]:

@@ -53,13 +53,13 @@ class ImuFindings:
     pushed: Array | None
 
 
-def smoothed(t: Array, values: Array, width: float = _SMOOTH) -> tuple[Array, Array, Array]:
-    """Return a grid, and value and rate of a signal on it, averaged over ``width`` seconds."""
-    grid = np.arange(t[0] + width, t[-1] - width, 0.02)
+def smoothed(t: Array, values: Array) -> tuple[Array, Array, Array]:
+    """Return a grid, and value and rate of a signal on it, averaged over :data:`_SMOOTH` seconds."""
+    grid = np.arange(t[0] + _SMOOTH, t[-1] - _SMOOTH, 0.02)
     total = integral(t, values)
-    half = 0.5 * width
-    value = (np.interp(grid + half, t, total) - np.interp(grid - half, t, total)) / width
-    rate = (np.interp(grid + half, t, values) - np.interp(grid - half, t, values)) / width
+    half = 0.5 * _SMOOTH
+    value = (np.interp(grid + half, t, total) - np.interp(grid - half, t, total)) / _SMOOTH
+    rate = (np.interp(grid + half, t, values) - np.interp(grid - half, t, values)) / _SMOOTH
     return grid, value, rate
 
 
@@ -197,7 +197,7 @@ def find_imu(look: LogSignals, body: BodyMotion | None, wheels: BodyMotion | Non
     Axes and, roughly, the clock go into ``look``.
     """
     units: dict[str, str] = {}
-    up = _gravity(look, units)
+    up = _upward(look, units)
     yaw = _yaw_axis(look, body, wheels, units)
     if "imu" in look.given.frames:
         look.frames["imu"] = look.given.frames["imu"]
@@ -214,15 +214,22 @@ def _along(look: LogSignals, kind: str, axis: str) -> Array:
     return -values if axis.startswith("-") else values
 
 
-def _gravity(look: LogSignals, units: dict[str, str]) -> str | None:
-    """Return the accelerometer's axis that reads +g at rest; its unit by g."""
+def gravity(look: LogSignals) -> tuple[Array, str] | None:
+    """Return what the accelerometer reads in the median (3,), raw, and the axis that reads +g, such as ``-z``."""
     if not look.has("acc_x", "acc_y", "acc_z"):
         return None
     mean = np.array([float(np.median(look.raw(f"acc_{axis}")[1])) for axis in XYZ])
+    axis = int(np.argmax(np.abs(mean)))
+    return mean, f"{'-' if mean[axis] < 0 else ''}{XYZ[axis]}"
+
+
+def _upward(look: LogSignals, units: dict[str, str]) -> str | None:
+    """Return the accelerometer's axis that reads +g at rest; its unit by g."""
+    if (found := gravity(look)) is None:
+        return None
+    mean, name = found
     unit, off = unit_of(float(np.linalg.norm(mean)) / 9.81, FACTORS["m/s2"])
     units["acc"] = look.chosen["acc_x"].unit if look.chosen["acc_x"].unit in FACTORS["m/s2"] else unit
-    axis = int(np.argmax(np.abs(mean)))
-    name = f"{'-' if mean[axis] < 0 else ''}{XYZ[axis]}"
     sure = SURE if abs(off - 1.0) < _GRAVITY_SHARE else GUESS
     text = f"topic '{look.chosen['acc_x'].topic}', in {units['acc']}: reads {off:.3f} g in the median, along its {name}"
     look.note("acc", sure, text)

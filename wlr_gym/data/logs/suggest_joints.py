@@ -202,12 +202,12 @@ def _rate(look: LogSignals, found: JointFindings, joint: str) -> None:
     elif same is not None and abs(same.correlation) > _CLEAR:
         found.unit[column], _ = unit_of(same.ratio, {unit: _RATES[unit] for unit in ("rad/s", "deg/s", "rpm", "count")})
     else:
-        found.unit[column] = _same_kind(look, found, joint)
+        found.unit[column] = _same_kind(found, joint)
     if same is not None and same.correlation < -_CLEAR:
         found.sign[column] = -1
 
 
-def _same_kind(look: LogSignals, found: JointFindings, joint: str) -> str:
+def _same_kind(found: JointFindings, joint: str) -> str:
     angle_unit = found.unit.get(f"pos_{joint}", "rad")
     return {"deg": "deg/s", "count": "count"}.get(angle_unit, "rad/s")
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import product
 
-import numpy as np
-
 from wlr_gym.data.logs.signals import GUESS, LIKELY, LogSignals
-from wlr_gym.data.logs.suggest_body import lag_of_gyro, wheel_motion
+from wlr_gym.data.logs.suggest_body import gravity, lag_of_gyro, wheel_motion
 from wlr_gym.data.logs.suggest_joints import JointFindings, is_given
 from wlr_gym.robot import WHEELS
 from wlr_gym.robot.parameter_table import XYZ
@@ -47,7 +45,7 @@ def find_sides(look: LogSignals, found: JointFindings) -> None:
         look.note("joints.wheel_*.sign", GUESS, f"left as in the log: {shown}; check that forward counts up on both sides")
         return
     fitting = [one for one in readings if one.left * one.right == (1 if alike > opposed else -1)]
-    upward = _upward(look)
+    _, upward = gravity(look) or (None, None)
     best = next((one for one in fitting if upward is not None and _turns_up(one, upward)), fitting[0])
     for side, sign in (("left", best.left), ("right", best.right)):
         for wheel in _SIDES[side]:
@@ -75,15 +73,6 @@ def _readings(look: LogSignals, found: JointFindings) -> list[_Reading]:
             if lag is not None:
                 readings.append(_Reading(left, right, lag.correlation, axis))
     return sorted(readings, key=lambda one: -abs(one.correlation))
-
-
-def _upward(look: LogSignals) -> str | None:
-    """Return the accelerometer's axis that points up, such as ``-z``."""
-    if not look.has("acc_x", "acc_y", "acc_z"):
-        return None
-    mean = [float(np.median(look.raw(f"acc_{axis}")[1])) for axis in XYZ]
-    axis = int(np.argmax(np.abs(mean)))
-    return f"{'-' if mean[axis] < 0 else ''}{XYZ[axis]}"
 
 
 def _turns_up(reading: _Reading, upward: str) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,7 +92,7 @@ class _Reading:
     last: int | None = None
     timeless: int = 0
     first_timeless: str = ""
-    texts: dict[str, int] | None = None
+    texts: dict[str, int] = field(default_factory=dict)
 
     def topic(self, frame: pandas.DataFrame, decimal: str, wanted: Collection[str] | None) -> Topic:
         """Return some rows as messages.
@@ -114,8 +114,8 @@ class _Reading:
 
     def notes(self) -> list[str]:
         """Return what was left out."""
-        texts = [name for name, numbers in (self.texts or {}).items() if not numbers and name.lower() not in TIME_NAMES]
-        mixed = [name for name, numbers in (self.texts or {}).items() if numbers]
+        texts = [name for name, numbers in self.texts.items() if not numbers and name.lower() not in TIME_NAMES]
+        mixed = [name for name, numbers in self.texts.items() if numbers]
         return [
             *([f"{self.timeless} rows without a time are left out ({self.first_timeless})"] if self.timeless else []),
             *([f"columns that hold no numbers: {', '.join(texts)}; left out"] if texts else []),
@@ -151,7 +151,6 @@ class _Reading:
         """Return the columns with their texts as numbers, where they are."""
         import pandas
 
-        self.texts = self.texts or {}
         changed: dict[str, Any] = {}
         for name in frame.columns:
             if pandas.api.types.is_numeric_dtype(frame[name]) or pandas.api.types.is_datetime64_any_dtype(frame[name]):

@@ -28,7 +28,7 @@ from wlr_gym.hardware.emulator.stand import EmulatedStand
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.operator import stop_on_signals
 from wlr_gym.hardware.safety.preflight import check_servos
-from wlr_gym.hardware.safety.watchdog import WatchdogProcess
+from wlr_gym.hardware.safety.watchdog import Guard
 from wlr_gym.robot import Robot
 
 #: How a test can end.
@@ -119,14 +119,14 @@ class Commissioning:
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
         """Have a process beside this one that switches the motors of a real robot off when this one is killed or hangs."""
-        watchdog = WatchdogProcess(self._robot, self._hardware, self._folder) if self._link.is_serial else None
-        if watchdog is not None:
-            self._stand.sign_of_life = watchdog.expect
+        guard = Guard(self._robot, self._hardware, is_wanted=self._link.is_serial)
+        guard.start(self._folder)
+        self._stand.sign_of_life = guard.expect
         try:
             yield
         finally:
-            if watchdog is not None and self._is_off:  # else it goes on trying when this process is gone
-                watchdog.release()
+            if self._is_off:  # else it goes on trying when this process is gone
+                guard.release()
 
     def _make(self, test: StandTest) -> StandResult:
         """Make a test; once more where the Bus Watchdog stopped its motors, for that is no fault of theirs."""

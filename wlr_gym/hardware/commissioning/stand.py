@@ -23,7 +23,7 @@ from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 from wlr_gym.hardware.imu.reading import ImuGoneError
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.operator import Operator
-from wlr_gym.hardware.safety.limiter import CALM_PATIENCE, WATCHDOG_UNIT
+from wlr_gym.hardware.safety.limiter import CALM_PATIENCE, WATCHDOG_UNIT, watchdog_count
 from wlr_gym.hardware.servos import JointReadings
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 
@@ -43,11 +43,6 @@ BLOCKED, BLOCKED_ROWS = 0.4, 3
 _OFF_TRIES, _OFF_PAUSE = 20, 0.05
 #: s beyond its waits that a stand is busy between two signs of life; and while it switches off.
 LONGEST_BUSY, LONGEST_OFF = 2.0, 20.0
-#: Items in RAM that tests depend on: back to their defaults before torque comes on, and after it is off.
-_REGISTERS = (
-    *("profile_velocity", "profile_acceleration", "velocity_p_gain", "velocity_i_gain", "position_p_gain"),
-    *("position_i_gain", "position_d_gain", "feedforward_1st_gain", "feedforward_2nd_gain"),
-)
 
 
 class Stand:
@@ -148,12 +143,8 @@ class Stand:
         if tripped := [joint for joint in JOINTS if joint in self._armed and held.get(joint, 0) < 0]:
             raise TrippedError(
                 f"{', '.join(tripped)}: stopped by the Bus Watchdog: this computer, or the bus, was silent for longer than "
-                f"{self._watchdog_count * WATCHDOG_UNIT:g} s"
+                f"{watchdog_count(self.hardware.safety.watchdog) * WATCHDOG_UNIT:g} s"
             )
-
-    @property
-    def _watchdog_count(self) -> int:
-        return math.ceil(self.hardware.safety.watchdog / WATCHDOG_UNIT - 1e-9)
 
     def _judge(self, readings: JointReadings) -> None:
         silent = ~readings.answered
@@ -198,10 +189,7 @@ class Stand:
     def prepare(self, joints: Iterable[str]) -> None:
         """Set what a test depends on: gains and profiles at their defaults, legs slow, all of the PWM, setpoints at rest."""
         for joint in joints:
-            for item in _REGISTERS:
-                default = self.servos.table(joint)[item].default
-                assert isinstance(default, int)
-                self.servos.set(joint, item, default)
+            self.servos.reset_tuning(joint)
             self.servos.set(joint, "goal_pwm", self.servos.get(joint, "pwm_limit"))
             if joint in LEGS:
                 speed = max(1, round(LEAN_SPEED / self.servos.table(joint).per_count("profile_velocity")))
@@ -221,7 +209,7 @@ class Stand:
             self.servos.set(joint, "torque_enable", 1)
         self._armed.update(joints)
         for joint in sorted(joints, key=lambda joint: JOINTS.index(joint) % len(LEGS)):  # no bus is silent for long meanwhile
-            self.servos.set(joint, "bus_watchdog", self._watchdog_count)
+            self.servos.set(joint, "bus_watchdog", watchdog_count(self.hardware.safety.watchdog))
 
     def switch_off(self, joints: Iterable[str]) -> None:
         """Switch single motors off, and disarm their watchdogs; what they are to do stays in their registers."""

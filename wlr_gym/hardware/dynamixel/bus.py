@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -49,9 +50,9 @@ class Statistics:
     """
 
     exchanges: int = 0
-    missing: dict[int, int] = field(default_factory=dict)
-    alerts: dict[int, int] = field(default_factory=dict)
-    stale: dict[int, int] = field(default_factory=dict)
+    missing: Counter[int] = field(default_factory=Counter)
+    alerts: Counter[int] = field(default_factory=Counter)
+    stale: Counter[int] = field(default_factory=Counter)
     crc_errors: int = 0
     discarded: int = 0
     fallbacks: int = 0
@@ -219,12 +220,12 @@ class BusGroup:
         self._note_port()
         where = f"bus {self.name}, id {id}: {what}"
         if status is None:
-            self._count(self.statistics.missing, id)
+            self.statistics.missing[id] += 1
             if not self._port.quiet:
                 raise RestlessLineError(f"{where}: no answer, the line is never quiet: check wiring, are two ports swapped?")
             raise NoAnswerError(f"{where}: no answer")
         if status.alert:
-            self._count(self.statistics.alerts, id)
+            self.statistics.alerts[id] += 1
         if status.fault:
             raise RefusedError(f"{where}: refused ({_ERROR_NAMES.get(status.fault, status.fault)})", status)
         return status
@@ -266,8 +267,7 @@ class BusGroup:
             self._fast_failures = 0
         self._note_port()
         now = self._clock()
-        for id in self.servos.keys() - found.keys():
-            self._count(self.statistics.missing, id)
+        self.statistics.missing.update(self.servos.keys() - found.keys())
         self._ask_last(found)
         readings = {id: self._reading(block, status, now) for id, status in found.items()}
         oldest = now - self._asked_at + STALE  # an answer may have waited for us, but was not given before we asked
@@ -286,12 +286,12 @@ class BusGroup:
         if "realtime_tick" in counts:
             age, restarted = self._clocks[status.id].age(counts["realtime_tick"], now, now - self._asked_at)
         if status.alert:
-            self._count(self.statistics.alerts, status.id)
+            self.statistics.alerts[status.id] += 1
         return BlockReading(counts, status.alert, age, restarted)
 
     def _is_good(self, id: int, reading: BlockReading, oldest: float) -> bool:
         if reading.age > oldest:
-            self._count(self.statistics.stale, id)
+            self.statistics.stale[id] += 1
             self._port.suspect = 1
             return False
         return True
@@ -338,9 +338,6 @@ class BusGroup:
 
     # ---- book-keeping ----
 
-    def _count(self, counts: dict[int, int], id: int) -> None:
-        counts[id] = counts.get(id, 0) + 1
-
     def _note_port(self) -> None:
         self.statistics.crc_errors = self._port.parser.crc_errors
         self.statistics.discarded = self._port.discarded
@@ -349,20 +346,3 @@ class BusGroup:
 def _identity(ping: Status) -> tuple[int, int]:
     """Model number and firmware version in the answer to a ping."""
     return int.from_bytes(ping.data[:2], "little"), ping.data[2]
-
-
-def open_all(groups: Iterable[BusGroup]) -> None:
-    """Open several groups; none stays open when one of them cannot be.
-
-    Raises:
-        InputError: a port is not there, or cannot be opened.
-    """
-    opened: list[BusGroup] = []
-    try:
-        for group in groups:
-            group.open()
-            opened.append(group)
-    except BaseException:
-        for group in opened:
-            group.close()
-        raise

@@ -125,17 +125,14 @@ def word(value: int) -> bytes:
 
 def encode(id: int, instruction: int, parameters: bytes = b"") -> bytes:
     """Return one packet as bytes for the line."""
-    return _frame(id, stuff(bytes([instruction]) + parameters))
+    body = stuff(bytes([instruction]) + parameters)
+    packet = HEADER + bytes([id]) + word(len(body) + 2) + body
+    return packet + word(crc16(packet))
 
 
 def encode_status(id: int, error: int, data: bytes = b"") -> bytes:
     """Return one servo's answer as bytes for the line."""
     return encode(id, Instruction.STATUS, bytes([error]) + data)
-
-
-def _frame(id: int, body: bytes) -> bytes:
-    packet = HEADER + bytes([id]) + word(len(body) + 2) + body
-    return packet + word(crc16(packet))
 
 
 def ping(id: int = BROADCAST) -> bytes:

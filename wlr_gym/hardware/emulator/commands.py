@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.hardware.dynamixel.tables import HARDWARE_ERRORS
+from wlr_gym.hardware.dynamixel.tables import error_names
 from wlr_gym.hardware.emulator.faults import FAULTS
 from wlr_gym.hardware.emulator.machine import Machine
 
@@ -50,8 +50,7 @@ def _status(machine: Machine) -> str:
     """One line per servo: torque, mode, position, velocity, supply, temperature, errors."""
     lines = [f"{machine.time:.3f} s"]
     for joint, servo in machine.servos.items():
-        bits = servo["hardware_error_status"]
-        errors = ", ".join(name for bit, name in HARDWARE_ERRORS.items() if bits & bit) or "no error"
+        errors = ", ".join(error_names(servo["hardware_error_status"])) or "no error"
         power = "no power" if servo.dead else "torque on" if servo["torque_enable"] else "torque off"
         lines.append(
             f"{joint:9} id {servo['id']:3}  {power:10}  mode {servo['operating_mode']:2}"

@@ -27,7 +27,7 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
         MissingPackageError: dynamixel-sdk is not installed.
     """
     require_package("dynamixel_sdk", "robot")
-    from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryImu, MemoryPort, StreamDevice
+    from wlr_gym.hardware.emulator.memory import EmulatedWorld, MemoryPort, StreamDevice, memory_imu
 
     world, hardware = EmulatedWorld(machine), machine.hardware
     names = {bus.port: name for name, bus in hardware.buses.items()}
@@ -41,14 +41,13 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
     flow, sensor = hardware.flow, machine.robot.sensors.flow
     stream = eye = None
     if flow is not None and sensor is not None:
-        stream = FlowStream(flow, sensor, world.now, lambda _: StreamDevice(world, "flow"))
+        stream = FlowStream(flow, sensor, world.now, lambda *_: StreamDevice(world, "flow"))
     if camera is not None:
         from wlr_gym.hardware.emulator.camera import EmulatedCamera
 
         require_package("cv2", "vision")
         eye = EmulatedCamera(machine, camera)
-    imu = MemoryImu(world, hardware.imu)
-    return Link(servos, imu, world, is_serial=False, finish=machine.close, flow=stream, camera=eye)
+    return Link(servos, memory_imu(world, hardware.imu), world, is_serial=False, finish=machine.close, flow=stream, camera=eye)
 
 
 def with_flow_port(robot: Robot, hardware: Hardware) -> Hardware:

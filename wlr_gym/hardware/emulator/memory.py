@@ -14,7 +14,6 @@ from wlr_gym.hardware.config import ImuPort
 from wlr_gym.hardware.dynamixel.port import DynamixelPort
 from wlr_gym.hardware.emulator.line import Emission
 from wlr_gym.hardware.emulator.machine import Machine
-from wlr_gym.hardware.imu.reading import ImuGoneError
 from wlr_gym.hardware.imu.stream import ImuStream
 
 
@@ -83,76 +82,6 @@ class EmulatedWorld:
         return data
 
 
-class _Device:
-    """What :class:`DynamixelPort` uses of ``serial.Serial``."""
-
-    def __init__(self, world: EmulatedWorld, name: str, baud_rate: int) -> None:
-        self._world, self._name, self._baud_rate = world, name, baud_rate
-        self._connection = world.connect(name)
-
-    def write(self, packet: Any) -> int:
-        self._world.require(self._name, self._connection)
-        data = bytes(packet)
-        machine = self._world.machine
-        self._world.queue(self._name, machine.lines[self._name].receive(data, machine.time, self._baud_rate))
-        return len(data)
-
-    def wait_and_read(self, seconds: float) -> bytes:
-        """Return what came in, waiting up to ``seconds``, and a tick at least when there is nothing."""
-        world = self._world
-        end = world.now() + seconds
-        while True:
-            world.require(self._name, self._connection)
-            if data := world.arrived(self._name):
-                return data
-            world.step()
-            if world.now() > end - 1e-9:
-                world.require(self._name, self._connection)
-                return world.arrived(self._name)
-
-    def reset_input_buffer(self) -> None:
-        self._world.require(self._name, self._connection)
-        self._world.arrived(self._name)
-
-    def close(self) -> None:
-        pass
-
-
-class MemoryPort(DynamixelPort):
-    """The port of one emulated bus.
-
-    Args:
-        world: the robot.
-        name: of its bus.
-        baud_rate: bit/s.
-        patience: s of emulated time; see :class:`DynamixelPort`.
-    """
-
-    def __init__(self, world: EmulatedWorld, name: str, baud_rate: int, patience: float) -> None:
-        super().__init__(name, baud_rate, patience)
-        self._world = world
-
-    def openPort(self) -> bool:  # noqa: N802
-        """Connect."""
-        self.ser: Any = _Device(self._world, self.port_name, self.baudrate)
-        self.tx_time_per_byte = 1000.0 / self.baudrate * 10.0
-        self.is_open, self.gone = True, False
-        return True
-
-    def getCurrentTime(self) -> float:  # noqa: N802
-        """Return emulated ms."""
-        return self._world.now() * 1e3
-
-    def _write(self, data: bytes) -> int:
-        return self.ser.write(data)
-
-    def _wait_and_read(self, length: int, seconds: float) -> bytes:
-        try:
-            return self.ser.wait_and_read(seconds)
-        except (OSError, AttributeError) as error:
-            raise self._lost(error) from None
-
-
 class StreamDevice:
     """What a sensor's stream uses of ``serial.Serial``.
 
@@ -177,30 +106,69 @@ class StreamDevice:
         """Disconnect."""
 
 
-class MemoryImu(ImuStream):
-    """The emulated IMU's stream.
+class _BusDevice(StreamDevice):
+    """What :class:`DynamixelPort` uses of ``serial.Serial``."""
+
+    def __init__(self, world: EmulatedWorld, name: str, baud_rate: int) -> None:
+        super().__init__(world, name)
+        self._baud_rate = baud_rate
+
+    def write(self, packet: Any) -> int:
+        self._world.require(self._name, self._connection)
+        data = bytes(packet)
+        machine = self._world.machine
+        self._world.queue(self._name, machine.lines[self._name].receive(data, machine.time, self._baud_rate))
+        return len(data)
+
+    def wait_and_read(self, seconds: float) -> bytes:
+        """Return what came in, waiting up to ``seconds``, and a tick at least when there is nothing."""
+        world = self._world
+        end = world.now() + seconds
+        while True:
+            world.require(self._name, self._connection)
+            if data := world.arrived(self._name):
+                return data
+            world.step()
+            if world.now() > end - 1e-9:
+                world.require(self._name, self._connection)
+                return world.arrived(self._name)
+
+
+class MemoryPort(DynamixelPort):
+    """The port of one emulated bus.
 
     Args:
         world: the robot.
-        port: ranges and calibration.
+        name: of its bus.
+        baud_rate: bit/s.
+        patience: s of emulated time; see :class:`DynamixelPort`.
     """
 
-    def __init__(self, world: EmulatedWorld, port: ImuPort) -> None:
-        super().__init__(port, world.now)
+    def __init__(self, world: EmulatedWorld, name: str, baud_rate: int, patience: float) -> None:
+        super().__init__(name, baud_rate, patience)
         self._world = world
-        self._connection = 0
 
-    def open(self) -> None:
+    def openPort(self) -> bool:  # noqa: N802
         """Connect."""
-        self._reset()
-        self._connection = self._world.connect("imu")
+        self.ser: Any = _BusDevice(self._world, self.port_name, self.baudrate)
+        self.tx_time_per_byte = 1000.0 / self.baudrate * 10.0
+        self.is_open, self.gone = True, False
+        return True
 
-    def close(self) -> None:
-        """Disconnect."""
+    def getCurrentTime(self) -> float:  # noqa: N802
+        """Return emulated ms."""
+        return self._world.now() * 1e3
 
-    def _received(self) -> bytes:
+    def _write(self, data: bytes) -> int:
+        return self.ser.write(data)
+
+    def _wait_and_read(self, length: int, seconds: float) -> bytes:
         try:
-            self._world.require("imu", self._connection)
-        except OSError as error:
-            raise ImuGoneError(f"IMU port is gone: {error}") from None
-        return self._world.arrived("imu")
+            return self.ser.wait_and_read(seconds)
+        except (OSError, AttributeError) as error:
+            raise self._lost(error) from None
+
+
+def memory_imu(world: EmulatedWorld, port: ImuPort) -> ImuStream:
+    """Return the stream of the emulated IMU; ``port``: ranges and calibration."""
+    return ImuStream(port, world.now, lambda *_: StreamDevice(world, "imu"))

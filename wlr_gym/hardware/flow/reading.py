@@ -23,10 +23,6 @@ SILENCE = 0.1
 FROZEN = 40
 
 
-class FlowGoneError(ConnectionError):
-    """The flow sensor's port does not work any more: unplugged, dead driver."""
-
-
 @dataclass(frozen=True)
 class CountedMotion:
     """What the chip counted from one of its frames to a later one.
@@ -80,6 +76,11 @@ class FlowStatistics:
     lost: int = 0
     errors: int = 0
     refused: dict[str, int] = field(default_factory=dict)
+
+    def refuse(self, trouble: str) -> None:
+        """Count a reading that is not valid."""
+        kind = trouble.partition(":")[0]
+        self.refused[kind] = self.refused.get(kind, 0) + 1
 
 
 class FlowConversion:
@@ -150,8 +151,7 @@ class FlowReader:
             return FlowReading(self._flow, quality, max(0.0, now - self._end), is_new=True)
         trouble = gone or next((fault for _, fault in reversed(faults) if fault), "") or self._silence(now)
         if trouble:
-            kind = trouble.partition(":")[0]
-            self.statistics.refused[kind] = self.statistics.refused.get(kind, 0) + 1
+            self.statistics.refuse(trouble)
         return FlowReading(self._flow, 0.0, max(0.0, now - self._end), is_new=False, trouble=trouble)
 
     def _silence(self, now: float) -> str:

@@ -5,26 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from wlr_gym.base.errors import require_package
 from wlr_gym.hardware.config import FlowPort
 from wlr_gym.hardware.flow.frames import FlowFrame, FlowFrameParser
 from wlr_gym.hardware.flow.reading import CountedMotion, FlowReader, FlowReading, FlowStatistics
-from wlr_gym.hardware.framing import Device, StreamClock, drained
+from wlr_gym.hardware.framing import RECENT, Device, StreamClock, drained
 from wlr_gym.hardware.ports import open_serial
 from wlr_gym.robot.sensors import FlowSensor
-
-#: s since the port was last empty, up to which frames are hardly older than that: they relate the clocks.
-RECENT = 0.1
-
-
-def open_device(port: FlowPort) -> Device:
-    """Open the serial port.
-
-    Raises:
-        InputError: it is not there, cannot be opened, or another program has it.
-    """
-    require_package("serial", "robot")
-    return open_serial(port.port, port.baud_rate, "flow port")
 
 
 class FlowStream:
@@ -34,7 +20,7 @@ class FlowStream:
         port: device, baud rate, axes, calibration.
         sensor: of the robot's file.
         clock: s; what ages are told by.
-        make_device: opens the port; the emulator in memory puts its own here.
+        make_device: opens the port, of its path, bit/s and name; the emulator in memory puts its own here.
     """
 
     def __init__(
@@ -42,7 +28,7 @@ class FlowStream:
         port: FlowPort,
         sensor: FlowSensor,
         clock: Callable[[], float] = time.monotonic,
-        make_device: Callable[[FlowPort], Device] = open_device,
+        make_device: Callable[[str, int, str], Device] = open_serial,
     ) -> None:
         self._port, self._sensor, self._clock, self._make_device = port, sensor, clock, make_device
         self._device: Device | None = None
@@ -66,9 +52,9 @@ class FlowStream:
         """Open the port and throw away what piled up in it.
 
         Raises:
-            InputError: it is not there, or cannot be opened.
+            InputError: it is not there, cannot be opened, or another program has it.
         """
-        self._device = self._make_device(self._port)
+        self._device = self._make_device(self._port.port, self._port.baud_rate, "flow port")
         self._device.reset_input_buffer()
         self._reset()
 

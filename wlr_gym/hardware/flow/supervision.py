@@ -119,9 +119,7 @@ class FlowSupervision:
             self._judge()
         if not self._verdict:
             return replace(reading, note=self._note) if self._note else reading
-        refused = self._flow.statistics.refused
-        kind = self._verdict.partition(":")[0]
-        refused[kind] = refused.get(kind, 0) + 1
+        self._flow.statistics.refuse(self._verdict)
         return replace(reading, quality=0.0, is_new=False, trouble=self._verdict)
 
     def _judge(self) -> None:

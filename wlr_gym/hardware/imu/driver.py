@@ -37,10 +37,6 @@ class Imu(Protocol):
         """
         ...
 
-    def __enter__(self) -> Imu: ...
-
-    def __exit__(self, *error: object) -> None: ...
-
 
 def make_imu(port: ImuPort, clock: Callable[[], float] = time.monotonic) -> Imu:
     """Return the IMU the hardware file names, not yet connected.

@@ -76,10 +76,7 @@ class FrameParser(NumberedFrames):
 
     def feed(self, data: bytes) -> list[ImuFrame]:
         """Take bytes; return the frames they complete."""
-        return [_frame(*content) for content, _ in self.take(data)]
-
-
-def _frame(
-    sequence: int, microseconds: int, ax: int, ay: int, az: int, temperature: int, gx: int, gy: int, gz: int
-) -> ImuFrame:
-    return ImuFrame(sequence, microseconds, (ax, ay, az), temperature, (gx, gy, gz))
+        return [
+            ImuFrame(sequence, microseconds, (ax, ay, az), temperature, (gx, gy, gz))
+            for (sequence, microseconds, ax, ay, az, temperature, gx, gy, gz), _ in self.take(data)
+        ]

@@ -160,13 +160,6 @@ class Mpu6050:
             self._bus.close()
             self._bus = None
 
-    def __enter__(self) -> Mpu6050:
-        self.open()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
     def read(self) -> ImuReading | None:
         """Read the chip; see :class:`wlr_gym.hardware.imu.driver.Imu`.
 

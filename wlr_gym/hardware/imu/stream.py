@@ -5,25 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from wlr_gym.base.errors import require_package
 from wlr_gym.hardware.config import ImuPort
-from wlr_gym.hardware.framing import Device, StreamClock, drained
+from wlr_gym.hardware.framing import RECENT, Device, StreamClock, drained
 from wlr_gym.hardware.imu.frames import FrameParser, ImuFrame
 from wlr_gym.hardware.imu.reading import Conversion, ImuGoneError, ImuReading, ImuStatistics
 from wlr_gym.hardware.ports import open_serial
-
-#: s since the port was last empty, up to which frames are hardly older than that: they relate the clocks.
-RECENT = 0.1
-
-
-def open_device(port: ImuPort) -> Device:
-    """Open the serial port.
-
-    Raises:
-        InputError: it is not there, cannot be opened, or another program has it.
-    """
-    require_package("serial", "robot")
-    return open_serial(port.port, port.baud_rate, "IMU port")
 
 
 class ImuStream:
@@ -32,7 +18,7 @@ class ImuStream:
     Args:
         port: device, baud rate, ranges, calibration.
         clock: s; what ages are told by.
-        make_device: opens the port; the emulator in memory puts its own here.
+        make_device: opens the port, of its path, bit/s and name; the emulator in memory puts its own here.
 
     Attributes:
         statistics: what came since the port was opened.
@@ -42,7 +28,7 @@ class ImuStream:
         self,
         port: ImuPort,
         clock: Callable[[], float] = time.monotonic,
-        make_device: Callable[[ImuPort], Device] = open_device,
+        make_device: Callable[[str, int, str], Device] = open_serial,
     ) -> None:
         self._port = port
         self._clock = clock
@@ -62,10 +48,10 @@ class ImuStream:
         """Open the port and throw away what piled up in it.
 
         Raises:
-            InputError: it is not there, or cannot be opened.
+            InputError: it is not there, cannot be opened, or another program has it.
         """
         self._reset()
-        self._device = self._make_device(self._port)
+        self._device = self._make_device(self._port.port, self._port.baud_rate, "IMU port")
         self._device.reset_input_buffer()
         self._emptied_at = self._clock()
 
@@ -74,13 +60,6 @@ class ImuStream:
         if self._device is not None:
             self._device.close()
             self._device = None
-
-    def __enter__(self) -> ImuStream:
-        self.open()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def frames(self) -> list[ImuFrame]:
         """Return all frames that came since the last call; does not wait.

@@ -27,18 +27,6 @@ from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 
 Array = NDArray[np.float64]
 
-#: Items in RAM that a run depends on; set to their defaults (profiles off) before torque comes on.
-_PREPARED = (
-    "profile_velocity",
-    "profile_acceleration",
-    "velocity_p_gain",
-    "velocity_i_gain",
-    "position_p_gain",
-    "position_i_gain",
-    "position_d_gain",
-    "feedforward_1st_gain",
-    "feedforward_2nd_gain",
-)
 #: s of Bus Watchdog per count (e-manual).
 WATCHDOG_UNIT = 0.02
 #: s an answer may take at least while nothing moves: where no control step waits for it, a slow computer is no dead servo.
@@ -49,6 +37,11 @@ CALM_SPEED = 2.0
 _ARM_TRIES = 10
 #: s between tries to switch off servos that do not confirm it.
 _OFF_PAUSE = 0.05
+
+
+def watchdog_count(seconds: float) -> int:
+    """Return the count of Bus Watchdog; rounded up: what is judged by the limit has not tripped yet."""
+    return math.ceil(seconds / WATCHDOG_UNIT - 1e-9)
 
 
 class CommandLimiter:
@@ -147,7 +140,7 @@ class CommandLimiter:
             goal_pwm = self._prepare()
             self.ratings = replace(
                 self.ratings,
-                watchdog=self._watchdog_count,
+                watchdog=watchdog_count(self.limits.watchdog),
                 goal_pwm=goal_pwm,
                 pwm_share=self.__servos.joint_map.pwm_share(goal_pwm),
                 profile=self.profile,
@@ -176,7 +169,7 @@ class CommandLimiter:
 
     def _arm_watchdogs(self) -> None:
         """Arm all watchdogs at once, and see that they are: where one bus is waited for, those of the other one would trip."""
-        count = self._watchdog_count
+        count = watchdog_count(self.limits.watchdog)
         wrong: list[str] = []
         for _ in range(_ARM_TRIES):
             self.__servos.write_item("bus_watchdog", dict.fromkeys(JOINTS, count))
@@ -186,10 +179,6 @@ class CommandLimiter:
                 return
         raise NoAnswerError(f"the watchdog of {', '.join(wrong)} does not say that it is armed")
 
-    @property
-    def _watchdog_count(self) -> int:
-        return math.ceil(self.limits.watchdog / WATCHDOG_UNIT - 1e-9)  # up: what is judged by the limit has not tripped yet
-
     def _prepare(self) -> Array:
         """Set the registers that a run depends on; return Goal PWM (8,) in counts."""
         servos = self.__servos
@@ -197,10 +186,7 @@ class CommandLimiter:
         for k, joint in enumerate(JOINTS):
             goal_pwm[k] = servos.get(joint, "pwm_limit")
             servos.set(joint, "goal_pwm", int(goal_pwm[k]))
-            for item in _PREPARED:
-                default = servos.table(joint)[item].default
-                assert isinstance(default, int)
-                servos.set(joint, item, default)
+            servos.reset_tuning(joint)
             for item, value in self._profile_of(joint).items():
                 count = round(value / servos.table(joint).per_count(item))
                 servos.set(joint, item, count if value == 0.0 else max(1, count))  # 0 would be no profile at all

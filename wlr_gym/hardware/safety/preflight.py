@@ -15,7 +15,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.calibration import ACCEL_REST, GYRO_REST, motion
 from wlr_gym.hardware.config import Bus, FlowPort, Hardware, ImuPort
 from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError, RestlessLineError
-from wlr_gym.hardware.dynamixel.tables import load_table
+from wlr_gym.hardware.dynamixel.tables import error_names, load_table
 from wlr_gym.hardware.flow.driver import Flow
 from wlr_gym.hardware.imu.driver import Imu
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
@@ -42,8 +42,8 @@ _UNTIMED_READS = 5
 _OWN_SHARE = 0.9
 #: How an emulated robot does without real time.
 STEPPED = "end other programs, or drive it in emulated time, where nothing is late: wlr deploy --emulated --stepped"
-#: s an IMU is looked at.
-LOOK_TIME = 1.0
+#: s a sensor is looked at; and between two readings of the IMU, and of the flow sensor.
+_LOOK_TIME, _IMU_PERIOD, _FLOW_PERIOD = 1.0, 0.005, 0.02
 #: rad/s: mean flow below which the floor is at rest: two counts per frame of 121 a second are 0.5.
 FLOW_REST = 0.1
 #: s from emptying the IMU's port until what comes is of now.
@@ -163,7 +163,7 @@ def _check_state(servos: Servos, hardware: Hardware, bus: Bus, joint: str) -> It
     )
     temperature = servos.get(joint, "present_temperature")
     yield Check(joint, "temperature", temperature < WARM, f"{temperature} degC", f"below {WARM} degC", "Let it cool down.")
-    errors = servos.hardware_errors(joint)
+    errors = error_names(servos.get(joint, "hardware_error_status"))
     remedy = "Find the cause, let the servo cool, then reboot it; the latch is there for a reason."
     yield Check(joint, "hardware error", not errors, ", ".join(errors) or "none", "none", remedy)
     latched = servos.get(joint, "bus_watchdog") < 0
@@ -266,7 +266,7 @@ class ImuSamples(NamedTuple):
     seconds: float
 
 
-def sample_imu(imu: Imu, clock: Clock, seconds: float = LOOK_TIME, period: float = 0.005) -> ImuSamples:
+def sample_imu(imu: Imu, clock: Clock, seconds: float = _LOOK_TIME) -> ImuSamples:
     """Listen to an IMU and return each new reading once.
 
     Raises:
@@ -275,8 +275,8 @@ def sample_imu(imu: Imu, clock: Clock, seconds: float = LOOK_TIME, period: float
     imu.read()  # what came before does not count
     seen, start = imu.statistics.readings, clock.now()
     rows: list[NDArray[np.float64]] = []
-    for tick in range(1, round(seconds / period) + 1):
-        clock.wait_until(start + tick * period)
+    for tick in range(1, round(seconds / _IMU_PERIOD) + 1):
+        clock.wait_until(start + tick * _IMU_PERIOD)
         reading = imu.read()
         if reading is not None and imu.statistics.readings > seen:
             seen = imu.statistics.readings
@@ -286,21 +286,20 @@ def sample_imu(imu: Imu, clock: Clock, seconds: float = LOOK_TIME, period: float
     return ImuSamples(table[:, :3], table[:, 3:6], temperature, clock.now() - start)
 
 
-def check_imu(imu: Imu, port: ImuPort, clock: Clock, seconds: float = LOOK_TIME) -> list[Check]:
+def check_imu(imu: Imu, port: ImuPort, clock: Clock) -> list[Check]:
     """Listen to the IMU of a robot that stands still on a level floor.
 
     Args:
         imu: open.
         port: what it should be.
         clock: what it is timed by.
-        seconds: for how long.
     """
     try:
         imu.read()  # what piled up does not count ...
         clock.wait_until(clock.now() + SETTLE_TIME)
         imu.read()  # ... nor what was thrown away behind it
         before = imu.statistics.readings, imu.statistics.lost, imu.statistics.errors
-        samples = sample_imu(imu, clock, seconds)
+        samples = sample_imu(imu, clock)
     except ImuGoneError as error:
         return [Check("imu", "readings", False, str(error), "some", "Plug it in again, check its cable.")]
     if not len(samples.gyro):
@@ -322,22 +321,20 @@ def check_imu(imu: Imu, port: ImuPort, clock: Clock, seconds: float = LOOK_TIME)
     return checks + _check_rest(samples)
 
 
-def check_flow(flow: Flow, port: FlowPort, clock: Clock, seconds: float = LOOK_TIME, period: float = 0.02) -> list[Check]:
+def check_flow(flow: Flow, port: FlowPort, clock: Clock) -> list[Check]:
     """Listen to the optical-flow sensor of a robot that stands still on its floor.
 
     Args:
         flow: open.
         port: what it should be.
         clock: what it is timed by.
-        seconds: for how long.
-        period: s between two readings.
     """
     flow.read()  # what came before does not count
     before = flow.statistics.lost, flow.statistics.errors
-    start, count = clock.now(), round(seconds / period)
+    start, count = clock.now(), round(_LOOK_TIME / _FLOW_PERIOD)
     readings = []
     for tick in range(1, count + 1):
-        clock.wait_until(start + tick * period)
+        clock.wait_until(start + tick * _FLOW_PERIOD)
         readings.append(flow.read())
     good = [reading for reading in readings if reading.is_new]
     trouble = next((reading.trouble for reading in reversed(readings) if reading.trouble), "")

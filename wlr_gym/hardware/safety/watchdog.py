@@ -38,33 +38,45 @@ LOOK_TIME = 0.05
 _PAUSE = 0.05
 
 
-class WatchdogProcess:
-    """The watchdog process, seen from the driving one.
+class Guard:
+    """The watchdog process, seen from the driving one: from its start until torque is off.
 
     Args:
         robot, hardware: ids and ports.
-        log: folder in which the process notes what it did (``guard.jsonl``); None = nowhere.
+        is_wanted: False = there is none, and nothing here does anything.
 
     Attributes:
-        trouble: why it takes no signs of life; empty = it does.
-
-    Raises:
-        InputError: the process does not start.
+        process: None = it does not run.
+        trouble: why it takes no signs of life; empty = it does, or there is none.
     """
 
-    def __init__(self, robot: Robot, hardware: Hardware, log: Path | None = None) -> None:
+    def __init__(self, robot: Robot, hardware: Hardware, is_wanted: bool = True) -> None:
+        self.process: subprocess.Popen[bytes] | None = None
+        self.trouble = ""
+        self._robot, self._hardware, self._is_wanted = robot, hardware, is_wanted
+
+    def start(self, log: Path | None = None) -> None:
+        """Start the process, if it does not run.
+
+        Args:
+            log: folder in which the process notes what it did (``guard.jsonl``); None = nowhere.
+
+        Raises:
+            InputError: the process does not start.
+        """
+        if not self._is_wanted or self.process is not None:
+            return
         buses = [
             {
                 "name": name,
                 "port": bus.port,
                 "baud_rate": bus.baud_rate,
                 "model": bus.model,
-                "ids": [robot.dynamixel_ids[joint] for joint in bus.joints],
+                "ids": [self._robot.dynamixel_ids[joint] for joint in bus.joints],
             }
-            for name, bus in hardware.buses.items()
+            for name, bus in self._hardware.buses.items()
         ]
-        self.trouble = ""
-        self.process = subprocess.Popen(
+        process = subprocess.Popen(
             [sys.executable, "-m", "wlr_gym.hardware.safety.watchdog"],
             stdin=subprocess.PIPE,
             bufsize=0,
@@ -72,19 +84,22 @@ class WatchdogProcess:
             start_new_session=True,  # a Ctrl-C at the terminal is for the driving process
         )
         spec = {"buses": buses, "log": None if log is None else str((log / "guard.jsonl").resolve())}
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
+        assert process.stdin is not None
+        assert process.stdout is not None
         with contextlib.suppress(OSError):
-            self.process.stdin.write(json.dumps(spec).encode() + b"\n")
-        is_up = select.select([self.process.stdout], [], [], START_TIME)[0]
-        if not is_up or self.process.stdout.readline() != b"ready\n":
-            self.process.kill()
-            self.process.wait()
+            process.stdin.write(json.dumps(spec).encode() + b"\n")
+        is_up = select.select([process.stdout], [], [], START_TIME)[0]
+        if not is_up or process.stdout.readline() != b"ready\n":
+            process.kill()
+            process.wait()
             raise InputError("the watchdog process does not start; without it nothing is driven")
-        os.set_blocking(self.process.stdin.fileno(), False)  # a control step waits for nobody
+        os.set_blocking(process.stdin.fileno(), False)  # a control step waits for nobody
+        self.process = process
 
     def expect(self, seconds: float) -> None:
         """Give a sign of life: the next one comes within ``seconds``, or this process hangs; inf = there may be none."""
+        if self.process is None:
+            return
         assert self.process.stdin is not None
         try:
             os.write(self.process.stdin.fileno(), f"{seconds:g}\n".encode())
@@ -93,49 +108,15 @@ class WatchdogProcess:
 
     def release(self) -> None:
         """Report that torque is off, and let the process end."""
+        if self.process is None:
+            return
         assert self.process.stdin is not None
         with contextlib.suppress(OSError):
             self.process.stdin.write(b"done\n")
             self.process.stdin.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(2.0)
-
-
-class Guard:
-    """The watchdog process of a control loop, from its start until torque is off.
-
-    Args:
-        robot, hardware: see :class:`WatchdogProcess`.
-        is_wanted: False = there is none, and nothing here does anything.
-
-    Attributes:
-        process: None = it does not run.
-    """
-
-    def __init__(self, robot: Robot, hardware: Hardware, is_wanted: bool) -> None:
-        self.process: WatchdogProcess | None = None
-        self._robot, self._hardware, self._is_wanted = robot, hardware, is_wanted
-
-    def start(self, log: Path | None) -> None:
-        """Start the process, if it does not run; see :class:`WatchdogProcess`."""
-        if self._is_wanted and self.process is None:
-            self.process = WatchdogProcess(self._robot, self._hardware, log)
-
-    def expect(self, seconds: float) -> None:
-        """Give a sign of life; see :meth:`WatchdogProcess.expect`."""
-        if self.process is not None:
-            self.process.expect(seconds)
-
-    @property
-    def trouble(self) -> str:
-        """Why the process takes no signs of life; empty = it does, or there is none."""
-        return "" if self.process is None else self.process.trouble
-
-    def release(self) -> None:
-        """Let the process end: torque is off."""
-        if self.process is not None:
-            self.process.release()
-            self.process = None
+        self.process, self.trouble = None, ""
 
 
 def switch_off(groups: list[BusGroup], seconds: float) -> dict[str, set[int]]:
