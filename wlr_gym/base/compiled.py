@@ -8,6 +8,14 @@ from typing import Any
 from numba import njit
 from numba.core.caching import FunctionCache
 
+#: Decorator of a kernel that only other kernels call: without what Python would call it by, which takes time to compile.
+inner_kernel: Any = njit(  # numba's stubs lack two of the options
+    cache=True,
+    nogil=True,
+    no_cpython_wrapper=True,
+    no_cfunc_wrapper=True,  # pyright: ignore[reportCallIssue]
+)
+
 
 class _Kept(FunctionCache):
     """Machine code beside the source; what another version left there and cannot be read any more counts as none.

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.base.compiled import inner_kernel
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.rings import CONTRAST, RADIUS_ERROR, RESIDUAL, SHARE, brightness, fit_marker
 from wlr_gym.perception.markers.targets import CODE_NAMES, ring_radii
@@ -159,25 +160,24 @@ def _distinct(found: list[Detection]) -> list[Detection]:
 @njit(cache=True, nogil=True)
 def _match(image: Any, ellipse: Any, radii: Any, profiles: Any, grid: Any, scores: Any) -> None:
     """Correlate the mean profile around an ellipse with every code, taking the ellipse for each of its edges."""
-    count = grid.shape[0]
-    profile = np.empty(count)
+    profile = np.empty(grid.shape[0])
     for edge in range(3):
         for code in range(radii.shape[0]):
             if edge > 0 or code == 0:  # taken for the outer edge, the profile is the same for every code
-                _profile(image, ellipse, grid / radii[code, edge], profile)
-            scores[code, edge] = _correlation(profile, profiles[code])
+                _profile(image, ellipse, grid, radii[code, edge], profile)
+            scores[code, edge] = _correlation(profile, profiles, code)
 
 
-@njit(cache=True, nogil=True)
-def _profile(image: Any, ellipse: Any, rho: Any, profile: Any) -> None:
-    """Mean brightness along ellipses scaled by ``rho``; NaN where half of one lies outside the image."""
-    for i in range(rho.shape[0]):
-        total, known = 0.0, 0
+@inner_kernel
+def _profile(image: Any, ellipse: Any, grid: Any, radius: float, profile: Any) -> None:
+    """Mean brightness along ellipses scaled by ``grid`` / ``radius``; NaN where half of one lies outside the image."""
+    for i in range(grid.shape[0]):
+        rho, total, known = grid[i] / radius, 0.0, 0
         for j in range(16):
             angle = 2.0 * math.pi * j / 16
             c, s = math.cos(angle), math.sin(angle)
-            x = ellipse[0] + rho[i] * (ellipse[2] * c + ellipse[3] * s)
-            y = ellipse[1] + rho[i] * (ellipse[4] * c + ellipse[5] * s)
+            x = ellipse[0] + rho * (ellipse[2] * c + ellipse[3] * s)
+            y = ellipse[1] + rho * (ellipse[4] * c + ellipse[5] * s)
             value = brightness(image, x, y)
             if not math.isnan(value):
                 total += value
@@ -185,8 +185,17 @@ def _profile(image: Any, ellipse: Any, rho: Any, profile: Any) -> None:
         profile[i] = total / known if known >= 8 else math.nan
 
 
-@njit(cache=True, nogil=True)
-def _correlation(a: Any, b: Any) -> float:
-    x, y = a - a.mean(), b - b.mean()
-    size = (x @ x) * (y @ y)
-    return (x @ y) / math.sqrt(size) if size > 0.0 else -1.0
+@inner_kernel
+def _correlation(profile: Any, profiles: Any, code: int) -> float:
+    count = profile.shape[0]
+    mean, mean_code = 0.0, 0.0
+    for i in range(count):
+        mean += profile[i] / count
+        mean_code += profiles[code, i] / count
+    xx, xy, yy = 0.0, 0.0, 0.0
+    for i in range(count):
+        x, y = profile[i] - mean, profiles[code, i] - mean_code
+        xx += x * x
+        xy += x * y
+        yy += y * y
+    return xy / math.sqrt(xx * yy) if xx * yy > 0.0 else -1.0

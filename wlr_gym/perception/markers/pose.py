@@ -21,8 +21,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.base.compiled import inner_kernel
 from wlr_gym.perception.markers.camera import Camera, distort
 from wlr_gym.perception.markers.detection import Detection
+from wlr_gym.perception.markers.rings import solve_normal
 from wlr_gym.perception.markers.targets import Target, ring_radii
 
 Array = NDArray[np.float64]
@@ -104,10 +106,11 @@ def solve_pose(
     while len(indices) >= MINIMUM_MARKERS:
         data = _measurements([(index, seen[index]) for index in indices], target)
         turn, place = rotation.copy(), position.copy()
-        covariance, squares = np.empty((6, 6)), np.empty(len(data[0]))
-        if not _least_squares(*data, turn, place, covariance, squares):
+        measured, roots, places, radii, owners = data
+        covariance, errors = np.empty((6, 6)), np.empty((len(owners), 2))
+        if not _least_squares(measured, roots, places, radii, turn, place, covariance, errors.reshape(-1)):
             return None
-        owners = data[-1]
+        squares = np.sum(errors**2, axis=1)
         per_marker = np.array([squares[owners == index].sum() / (2 * (owners == index).sum()) for index in indices])
         chi_square = float(squares.sum() / max(1, 2 * len(squares) - 6))
         wrong = [i for i in indices if not _looks_right(seen[i], target, i, turn, place)]
@@ -242,83 +245,89 @@ def circle_centres(places: Any, radii: Any, rotation: Any, position: Any, centre
 
 
 @njit(cache=True, nogil=True)
-def turned(rotation: Any, turn: Any) -> Any:
-    """exp(turn) rotation, with ``turn`` (3,) a rotation vector."""
-    angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
-    if angle < 1e-12:
-        a, b = 1.0, 0.5
-    else:
+def move(rotation: Any, position: Any, step: Any, new_rotation: Any, new_position: Any) -> None:
+    """Move a pose by ``step`` (6,), a rotation vector, then a shift; the new pose may be in the same arrays as the old one."""
+    x, y, z = step[0], step[1], step[2]
+    angle = math.sqrt(x * x + y * y + z * z)
+    a, b = 1.0, 0.5
+    if angle >= 1e-12:
         a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
-    x, y, z = turn[0], turn[1], turn[2]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return rotation + (a * cross + b * (cross @ cross)) @ rotation
+    for k in range(3):
+        p, q, r = rotation[0, k], rotation[1, k], rotation[2, k]
+        u, v, w = y * r - z * q, z * p - x * r, x * q - y * p
+        new_rotation[0, k] = p + (a * u + b * (y * w - z * v))
+        new_rotation[1, k] = q + (a * v + b * (z * u - x * w))
+        new_rotation[2, k] = r + (a * w + b * (x * v - y * u))
+        new_position[k] = position[k] + step[3 + k]
 
 
-@njit(cache=True, nogil=True)
+@inner_kernel
 def _residuals(measured: Any, roots: Any, places: Any, radii: Any, rotation: Any, position: Any, out: Any) -> float:
-    centres = np.empty_like(measured)
+    centres = np.empty(measured.shape)
     circle_centres(places, radii, rotation, position, centres)
     total = 0.0
     for k in range(measured.shape[0]):
         dx, dy = measured[k, 0] - centres[k, 0], measured[k, 1] - centres[k, 1]
-        out[2 * k] = roots[k, 0, 0] * dx + roots[k, 0, 1] * dy
-        out[2 * k + 1] = roots[k, 1, 0] * dx + roots[k, 1, 1] * dy
-        total += out[2 * k] ** 2 + out[2 * k + 1] ** 2
+        p, q = roots[k, 0, 0] * dx + roots[k, 0, 1] * dy, roots[k, 1, 0] * dx + roots[k, 1, 1] * dy
+        out[2 * k], out[2 * k + 1] = p, q
+        total += p * p + q * q
     return total
 
 
 @njit(cache=True, nogil=True)
 def _least_squares(
-    measured: Any, roots: Any, places: Any, radii: Any, owners: Any, rotation: Any, position: Any, covariance: Any, squares: Any
+    measured: Any, roots: Any, places: Any, radii: Any, rotation: Any, position: Any, covariance: Any, residual: Any
 ) -> bool:
-    """Levenberg-Marquardt over a turn and a shift in the camera frame; pose in place, covariance of it, squares per circle."""
-    rows = 2 * measured.shape[0]
-    residual, moved, jacobian = np.empty(rows), np.empty(rows), np.empty((rows, 6))
-    damping, normal = 1e-4, np.eye(6)
-    attempt, attempt_rotation, attempt_position = 0.0, rotation, position
+    """Levenberg-Marquardt over a turn and a shift in the camera frame; pose in place, covariance of it, residuals (2 K,)."""
+    rows = residual.shape[0]
+    moved, jacobian, step, gradient = np.empty(rows), np.empty((6, rows)), np.empty(6), np.empty(6)
+    normal, damped, turn, place = np.empty((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
+    damping, attempt = 1e-4, 0.0
     cost = _residuals(measured, roots, places, radii, rotation, position, residual)
     for _ in range(30):
         for k in range(6):
-            step = np.zeros(6)
+            step[:] = 0.0
             step[k] = 1e-6
-            _residuals(measured, roots, places, radii, turned(rotation, step[:3]), position + step[3:], moved)
+            move(rotation, position, step, turn, place)
+            _residuals(measured, roots, places, radii, turn, place, moved)
             for i in range(rows):
-                jacobian[i, k] = (moved[i] - residual[i]) / 1e-6
-        normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
-        change, improved = np.zeros(6), False
+                jacobian[k, i] = (moved[i] - residual[i]) / 1e-6
+        for a in range(6):
+            gradient[a] = 0.0
+            for i in range(rows):
+                gradient[a] += jacobian[a, i] * residual[i]
+            for b in range(6):
+                normal[a, b] = 0.0
+                for i in range(rows):
+                    normal[a, b] += jacobian[a, i] * jacobian[b, i]
+        improved = False
         for _ in range(8):
-            damped = normal.copy()
-            for k in range(6):
-                damped[k, k] *= 1.0 + damping
-            change = -np.linalg.inv(damped) @ gradient  # "solve", and assigning to slices, take seconds to compile
-            attempt_rotation, attempt_position = turned(rotation, change[:3]), position + change[3:]
-            attempt = _residuals(measured, roots, places, radii, attempt_rotation, attempt_position, moved)
-            if attempt <= cost:
-                improved = True
-                break
+            for a in range(6):
+                step[a] = -gradient[a]
+                for b in range(6):
+                    damped[a, b] = normal[a, b]
+                damped[a, a] *= 1.0 + damping
+            if solve_normal(damped, step):
+                move(rotation, position, step, turn, place)
+                attempt = _residuals(measured, roots, places, radii, turn, place, moved)
+                if attempt <= cost:
+                    improved = True
+                    break
             damping *= 10.0
         if not improved:
             break
-        gain = cost - attempt
-        cost = attempt
-        for i in range(3):
-            position[i] = attempt_position[i]
-            for j in range(3):
-                rotation[i, j] = attempt_rotation[i, j]
+        move(rotation, position, step, rotation, position)
         for i in range(rows):
             residual[i] = moved[i]
+        gain = cost - attempt
+        cost = attempt
         damping = max(1e-9, damping / 10.0)
         if gain < 1e-6 * (1.0 + cost):
             break
-    if not (math.isfinite(cost) and position[2] > 0.0):
-        return False
-    inverse = np.linalg.inv(normal)
-    for i in range(6):
-        for j in range(6):
-            covariance[i, j] = inverse[i, j]
-    for k in range(squares.shape[0]):
-        squares[k] = residual[2 * k] ** 2 + residual[2 * k + 1] ** 2
-    return True
+    for a in range(6):
+        for b in range(6):
+            covariance[a, b] = normal[a, b]
+    return math.isfinite(cost) and position[2] > 0.0 and solve_normal(covariance, gradient)
 
 
 @njit(cache=True, nogil=True)

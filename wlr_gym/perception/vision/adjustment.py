@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.perception.markers.detection import Detection
-from wlr_gym.perception.markers.pose import TargetPose, turned
+from wlr_gym.perception.markers.pose import TargetPose, move
 from wlr_gym.perception.markers.targets import Target, ring_radii
 
 Array = NDArray[np.float64]
@@ -129,8 +129,7 @@ def adjust(target: Target, views: Sequence[TargetView], height: int, readout: fl
         steps, change, covariance = _step(residual, by_pose, by_shared, weight, information, right)
         shared = shared + change
         for k, step in enumerate(steps):
-            rotations[k] = turned(rotations[k], step[:3])
-            positions[k] = positions[k] + step[3:]
+            move(rotations[k], positions[k], step, rotations[k], positions[k])
         if np.abs(change).max() < 1e-7:
             break
     places = shared[:_READOUT].reshape(-1, 3)

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from wlr_gym.base.compiled import inner_kernel
 from wlr_gym.base.errors import InputError
 
 Array = NDArray[np.float64]
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 _DENSITIES = np.arange(-6.0, 8.1, 0.5)
 _GATE = 100.0  # squared deviations from the prediction, in its variance
 _MOST_REJECTED = 4  # in a row; then the signal has really jumped
+#: What white jerk of density 1 adds to the covariance of value, rate and acceleration in 1 s is 1 over these.
+_SHARES = np.array([[20.0, 8.0, 6.0], [8.0, 3.0, 2.0], [6.0, 2.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,18 +96,29 @@ def _smoothed(
     return states, spreads
 
 
-@njit(cache=True, nogil=True)
-def _transition(step: float, density: float, matrix: Any, noise: Any) -> None:
-    """Write the change over a step and its noise; ``matrix`` is 0 but for what is written."""
-    matrix[0, 0] = matrix[1, 1] = matrix[2, 2] = 1.0
-    matrix[0, 1] = matrix[1, 2] = step
-    matrix[0, 2] = 0.5 * step * step
-    noise[0, 0] = density * step**5 / 20
-    noise[0, 1] = noise[1, 0] = density * step**4 / 8
-    noise[0, 2] = noise[2, 0] = density * step**3 / 6
-    noise[1, 1] = density * step**3 / 3
-    noise[1, 2] = noise[2, 1] = density * step**2 / 2
-    noise[2, 2] = density * step
+@inner_kernel
+def _sandwich(matrix: Any, spread: Any, result: Any) -> None:
+    """Write ``matrix`` ``spread`` ``matrix``^T, all (3, 3); the result may be in the same array as ``spread``."""
+    half = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            half[i, j] = matrix[i, 0] * spread[0, j] + matrix[i, 1] * spread[1, j] + matrix[i, 2] * spread[2, j]
+    for i in range(3):
+        for j in range(3):
+            result[i, j] = half[i, 0] * matrix[j, 0] + half[i, 1] * matrix[j, 1] + half[i, 2] * matrix[j, 2]
+
+
+@inner_kernel
+def _predict(step: float, density: float, spread: Any, matrix: Any, ahead: Any) -> None:
+    """Write the change over a step to ``matrix``, and the covariance after it to ``ahead``, which may be ``spread``."""
+    for i in range(3):
+        for j in range(3):
+            matrix[i, j] = 1.0 if i == j else 0.0
+    matrix[0, 1], matrix[1, 2], matrix[0, 2] = step, step, 0.5 * step * step
+    _sandwich(matrix, spread, ahead)
+    for i in range(3):
+        for j in range(3):  # white jerk for the step's time
+            ahead[i, j] += density * step ** (5 - i - j) / _SHARES[i, j]
 
 
 @njit(cache=True, nogil=True)
@@ -112,14 +126,17 @@ def _filter(
     time: Any, values: Any, variances: Any, density: float, jump: float, rejected: Any, states: Any, spreads: Any
 ) -> float:
     """Kalman filter; returns the log likelihood. Filtered states and covariances go to ``states``, ``spreads`` unless empty."""
-    matrix, noise = np.zeros((3, 3)), np.zeros((3, 3))
-    state, spread = np.zeros(3), np.diag(np.array([1e4, 1e2, 1e2]))
+    matrix, spread, state, gain = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    for k in range(3):
+        state[k] = 0.0
+        for j in range(3):
+            spread[k, j] = (1e4 if k == 0 else 1e2) if k == j else 0.0
     likelihood, in_a_row = 0.0, 0
     for i in range(time.shape[0]):
         if i > 0 and time[i] > time[i - 1]:
-            _transition(time[i] - time[i - 1], density, matrix, noise)
-            state = matrix @ state
-            spread = matrix @ spread @ matrix.T + noise
+            _predict(time[i] - time[i - 1], density, spread, matrix, spread)
+            state[0] += matrix[0, 1] * state[1] + matrix[0, 2] * state[2]
+            state[1] += matrix[1, 2] * state[2]
         rejected[i] = False
         if not math.isnan(values[i]):
             total = spread[0, 0] + variances[i]
@@ -130,12 +147,12 @@ def _filter(
                 likelihood -= 0.5 * (_GATE + math.log(total))
             else:
                 in_a_row = 0
-                gain = spread[:, 0] / total
-                state = state + gain * error
-                change = np.eye(3)
                 for k in range(3):
-                    change[k, 0] -= gain[k]
-                spread = change @ spread @ change.T
+                    gain[k] = spread[k, 0] / total
+                    state[k] += gain[k] * error
+                    for j in range(3):
+                        matrix[k, j] = (1.0 if k == j else 0.0) - (gain[k] if j == 0 else 0.0)
+                _sandwich(matrix, spread, spread)
                 for k in range(3):
                     for j in range(3):
                         spread[k, j] += variances[i] * gain[k] * gain[j]
@@ -148,19 +165,42 @@ def _filter(
     return likelihood
 
 
+@inner_kernel
+def _divide(matrix: Any, spread: Any) -> None:
+    """Write ``matrix`` ``spread``^-1 to ``matrix``, by columns; ``spread`` is positive definite and used up."""
+    for i in range(3):
+        for k in range(3):
+            if k != i:
+                share = spread[i, k] / spread[i, i]
+                for j in range(3):
+                    spread[j, k] -= share * spread[j, i]
+                    matrix[j, k] -= share * matrix[j, i]
+    for i in range(3):
+        for j in range(3):
+            matrix[j, i] /= spread[i, i]
+
+
 @njit(cache=True, nogil=True)
 def _smooth_back(time: Any, density: float, states: Any, spreads: Any) -> None:
-    matrix, noise = np.zeros((3, 3)), np.zeros((3, 3))
+    matrix, ahead, gain, change = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    off = np.empty(3)
     for i in range(time.shape[0] - 2, -1, -1):
-        _transition(time[i + 1] - time[i], density, matrix, noise)
-        ahead = matrix @ spreads[i] @ matrix.T + noise
+        state, spread, later, later_spread = states[i], spreads[i], states[i + 1], spreads[i + 1]
         if time[i + 1] == time[i]:
-            state, spread = states[i + 1], spreads[i + 1]
-        else:
-            gain = (np.linalg.inv(ahead) @ (matrix @ spreads[i])).T  # "solve", and assigning to slices, take seconds to compile
-            state = states[i] + gain @ (states[i + 1] - matrix @ states[i])
-            spread = spreads[i] + gain @ (spreads[i + 1] - ahead) @ gain.T
+            for k in range(3):
+                state[k] = later[k]
+                for j in range(3):
+                    spread[k, j] = later_spread[k, j]
+            continue
+        _predict(time[i + 1] - time[i], density, spread, matrix, ahead)
         for k in range(3):
-            states[i, k] = state[k]
+            off[k] = later[k] - (matrix[k, 0] * state[0] + matrix[k, 1] * state[1] + matrix[k, 2] * state[2])
             for j in range(3):
-                spreads[i, k, j] = spread[k, j]
+                change[k, j] = later_spread[k, j] - ahead[k, j]
+                gain[k, j] = spread[k, 0] * matrix[j, 0] + spread[k, 1] * matrix[j, 1] + spread[k, 2] * matrix[j, 2]
+        _divide(gain, ahead)
+        _sandwich(gain, change, change)
+        for k in range(3):
+            state[k] += gain[k, 0] * off[0] + gain[k, 1] * off[1] + gain[k, 2] * off[2]
+            for j in range(3):
+                spread[k, j] += change[k, j]
