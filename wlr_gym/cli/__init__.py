@@ -5,6 +5,7 @@ The options of ``wlr train`` are ``train.TrainOptions``, and so on.
 
 from __future__ import annotations
 
+import gc
 import importlib
 import keyword
 import os
@@ -60,6 +61,7 @@ NESTED = {("vision", "check")}
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``wlr`` and return its exit code: 0 done, 1 failed, 2 bad input, 130 interrupted."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    _prepare_compilation()
     try:
         return _dispatch(words)
     except (InputError, MissingPackageError) as error:
@@ -73,6 +75,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
+
+
+def _prepare_compilation() -> None:
+    """Save numba time: it colours messages that nobody reads while it compiles, and leaves much to the garbage collector."""
+    os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
+    gc.set_threshold(max(50_000, gc.get_threshold()[0]))
 
 
 def _output_is_closed() -> bool:
