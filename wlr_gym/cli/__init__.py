@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _prepare_compilation() -> None:
-    """Save a sixth of what numba needs to compile: it colours messages that nobody reads, and makes much for the collector."""
+    """Save numba time: it colours messages that nobody reads while it compiles, and leaves much to the garbage collector."""
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
     gc.set_threshold(max(50_000, gc.get_threshold()[0]))
 
