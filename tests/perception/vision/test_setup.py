@@ -4,6 +4,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
 from contextlib import nullcontext
 
@@ -352,3 +354,12 @@ def test_bench_reports_every_bar(tmp_path):
     rows = json.loads(file.read_text())["vision"]
     assert {row["method"].split()[0] for row in rows} == {"ours", "paper's", "tags"}
     assert all(row["met"] for row in rows if row["bar"] is not None and "frames per second" not in row["what"])
+
+
+@pytest.mark.slow
+def test_process_ends_well_after_apriltag_3():
+    """The package's destructor frees memory and then uses it: a crash at the end of the process, or later."""
+    pytest.importorskip("pupil_apriltags")
+    code = "from wlr_gym.studies.bench.vision_tags import tag_kinds, tag_poses; print(tag_poses(0.0, 4, tag_kinds()[-1])[1])"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (0, "all four in 4 of 4 frames\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import math
 from collections.abc import Callable
 from functools import cache
@@ -79,11 +80,12 @@ def _opencv(dictionary: Any) -> Finder:
     return find
 
 
-@cache  # the package crashes once a second detector is made
+@cache  # a detector must not be destroyed: the package frees its tags first, then uses them
 def _apriltag_3() -> Finder:
     """AprilTag 3 at full resolution with refined edges; its corners go round the other way."""
     settings = {"quad_decimate": 1.0, "quad_sigma": 0.0, "refine_edges": 1, "decode_sharpening": 0.25}
     detector = import_module("pupil_apriltags").Detector("tag36h11", **settings)
+    atexit.register(setattr, detector, "tag_detector_ptr", None)  # then its destructor does nothing
 
     def find(image: Image) -> dict[int, Array]:
         found = detector.detect(np.ascontiguousarray(image))
